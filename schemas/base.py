@@ -1,0 +1,49 @@
+"""The base of every configuration model, and the small value types that they share."""
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+Array = NDArray[np.float64]
+"""Any float64 array; the shape stands in the docstring that uses it."""
+
+Pose = NDArray[np.float64]
+"""[4, 4] float64 rigid transform, metres; `T_a_b` takes coordinates in frame b to coordinates in frame a."""
+
+
+class Frozen(BaseModel):
+    """A model that cannot change and that refuses keys it does not know."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class Range(NamedTuple):
+    """A closed interval, written `[low, high]` in a job file."""
+
+    low: float
+    high: float
+
+
+def _ordered(value: Range) -> Range:
+    if not value.low <= value.high:
+        raise ValueError(f"the range [{value.low}, {value.high}] is empty: write the smaller number first")
+    return value
+
+
+Interval = Annotated[Range, AfterValidator(_ordered)]
+"""A `Range` whose ends are in order."""
+
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+PositiveInt = Annotated[int, Field(ge=1)]
+NonNegativeInt = Annotated[int, Field(ge=0)]
+
+
+def frozen_array(values: object, dtype: type = np.float64) -> NDArray:
+    """A read-only copy of `values`: what frozen dataclasses hold, so that no step can change another's data."""
+    array: NDArray = np.array(values, dtype=dtype)
+    array.setflags(write=False)
+    return array

@@ -1,0 +1,112 @@
+"""What a commit is: the record that a range is done, and the terms that every commit of a dataset shares."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from pydantic import ConfigDict, Field
+
+from schemas.base import Frozen, NonNegativeInt, PositiveInt
+from schemas.errors import FailureKind
+
+Outcome = Literal["made", "intrinsic", "environmental"]
+"""How a scene ended: made, or the kind of its failure."""
+
+
+class Span(Frozen):
+    """The scenes of one commit: all of [start, stop), or, in a retry, those of `scenes` alone."""
+
+    start: NonNegativeInt
+    stop: PositiveInt
+    retry: NonNegativeInt = 0
+    """0 for the range itself; k for the k-th later try of its environmental failures."""
+    scenes: tuple[int, ...] = ()
+    """The scenes of a retry, in order; empty for a whole range."""
+
+    @property
+    def scene_ids(self) -> tuple[int, ...]:
+        """Every scene that this commit must hold, in order."""
+        return self.scenes if self.retry else tuple(range(self.start, self.stop))
+
+
+class CommitTerms(Frozen):
+    """What all commits of a dataset have in common; stored in every record."""
+
+    job_digest: str
+    fingerprint: str
+    """Of the stack that made the range."""
+    fingerprint_mode: Literal["strict", "record"] = "strict"
+    layout: Literal["files", "tar"] = "files"
+    first_scene: NonNegativeInt = 0
+    """With `range_size` the grid on which ranges lie."""
+    range_size: PositiveInt = 16
+
+
+class FileEntry(Frozen):
+    """A published file: its path below the output folder, its size and its SHA-256 in hex."""
+
+    path: str
+    bytes: NonNegativeInt
+    sha256: str
+
+
+class TableEntry(Frozen):
+    """A table of the range: its rows and the digest of its canonical rows."""
+
+    rows: NonNegativeInt
+    digest: str
+
+
+class SceneMark(Frozen):
+    """How a scene ended, with the digest of its rows in every table that is a function of job and seed (but assets).
+
+    The rows of `views` name the digest of every image, so two attempts at a scene made the same bytes if and only if
+    their marks are equal.
+    """
+
+    scene_id: NonNegativeInt
+    outcome: Outcome
+    digest: str
+
+
+class CommitRecord(Frozen):
+    """`manifest/_commits/<start>.json`: the decision that one attempt, and no other, is this range.
+
+    Keys that a later minor version added are ignored; a later `schema_version` is refused by the reader.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+
+    kind: Literal["verso-commit"] = "verso-commit"
+    schema_version: PositiveInt
+    span: Span
+    attempt: str
+    terms: CommitTerms
+    files: tuple[FileEntry, ...]
+    """Images (or tars), shapes and the range's tables, sorted by path."""
+    tables: dict[str, TableEntry]
+    scenes: tuple[SceneMark, ...] = Field(min_length=1)
+
+
+@dataclass(frozen=True)
+class CommitResult:
+    """What came of an attempt: whether it won, the record that stands, and, where the loser made other bytes, how."""
+
+    won: bool
+    record: CommitRecord
+    conflict: str | None = None
+
+
+@dataclass(frozen=True)
+class CommitSummary:
+    """The part of a record that planning needs: a million scenes' worth fits in memory."""
+
+    start: int
+    stop: int
+    retry: int
+    attempt: str
+    fingerprint: str
+    made: int
+    failed: tuple[tuple[int, FailureKind], ...]
+    """(scene id, kind), in order."""
+    scenes: tuple[int, ...] = ()
+    """The scenes of a retry; empty for a whole range."""

@@ -1,0 +1,74 @@
+"""What a Verso process must find in its environment, and how it gets it.
+
+numpy, OpenBLAS, Mesa and Python's own hashing read these variables once, while they load; setting them later does
+nothing. So a command that finds another environment starts itself again, once, before it imports anything heavy.
+The launcher and the console script both pass through here; deploy/Dockerfile repeats the table as ENV lines, because
+there it must also hold for what is started without us (`ray start`), and a test keeps the two alike.
+"""
+
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final
+
+STACK_ENVIRONMENT: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        # numpy's exp and arctan give other bits with AVX-512. These are the groups that numpy 2.4 can switch at run
+        # time and has no use for below AVX-512; it is silent about those the machine lacks, and warns about others.
+        "NPY_DISABLE_CPU_FEATURES": "X86_V4,AVX512_ICL,AVX512_SPR",
+        # llvmpipe otherwise takes the widest vectors it finds, and its interpolation rounds differently with them.
+        "LP_NATIVE_VECTOR_WIDTH": "256",
+        # llvmpipe renders on the caller's thread: one worker, one core.
+        "LP_NUM_THREADS": "0",
+        # `import pyrender` imports pyglet's window, which wants X libraries unless told that there is no display.
+        "PYGLET_HEADLESS": "1",
+        "PYOPENGL_PLATFORM": "egl",
+        "RAY_USAGE_STATS_ENABLED": "0",
+        # Parallelism is by scene. Threads inside a scene only fight over the cores, and change the order of sums.
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        # The order of a set of strings must not differ from one process to the next.
+        "PYTHONHASHSEED": "0",
+    }
+)
+
+# OpenBLAS picks its kernels by processor: inverses, SVDs and products of 50 x 50 differ in the last bits between its
+# AVX-512 and its AVX2 kernels. It does not check what it is told, so a processor without AVX2 must not be told this.
+WITH_AVX2: Final[Mapping[str, str]] = MappingProxyType({"OPENBLAS_CORETYPE": "Haswell"})
+
+# A user who compares stacks sets this to 1 and keeps the environment as it is.
+KEEP: Final = "VERSO_KEEP_ENV"
+
+
+def stack_environment(flags: frozenset[str]) -> dict[str, str]:
+    """The variables that a process on a processor with these flags should have."""
+    return {**STACK_ENVIRONMENT, **(WITH_AVX2 if "avx2" in flags else {})}
+
+
+def settings_to_change(environ: Mapping[str, str], flags: frozenset[str]) -> dict[str, str]:
+    """The variables in which `environ` differs from the stack's; none where the user asked to keep it."""
+    if environ.get(KEEP) == "1":
+        return {}
+    return {name: value for name, value in stack_environment(flags).items() if environ.get(name) != value}
+
+
+def processor_flags(cpuinfo: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
+    """The features of this machine's first core as Linux names them; empty where it does not say."""
+    try:
+        with cpuinfo.open() as lines:
+            first = next((line for line in lines if line.startswith("flags")), "")
+    except OSError:
+        return frozenset()
+    return frozenset(first.partition(":")[2].split())
+
+
+def enter_stack_environment() -> None:
+    """Return at once if the environment is the stack's; else run this same command line again in it.
+
+    For a command's own start only: the process is replaced, with the same interpreter, options and arguments.
+    """
+    changes = settings_to_change(os.environ, processor_flags())
+    if changes:
+        os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], {**os.environ, **changes})

@@ -1,0 +1,115 @@
+"""Every error that the project raises on purpose.
+
+    VersoError
+    +-- InputError          the command line, the job file or an asset folder is wrong        exit 2
+    |   +-- JobError        a key of the job file: names the file, the key, the value
+    |   +-- AssetSourceError  a folder of assets that cannot be used at all
+    |   +-- OutputError     the output folder belongs to another job, or cannot be written
+    +-- RunError            it ran, but something is missing or wrong                         exit 1
+    |   +-- MachineError    this machine lacks something (GL, disk, a Ray that answers)
+    |   +-- CommitConflict  two attempts at one range made different bytes
+    |   +-- CorruptError    a stored file does not match its checksum or cannot be read
+    |   +-- FingerprintError  a worker's stack makes other bytes than the dataset's
+    +-- SceneError          this scene cannot be made: a row in `failures`, never a crash
+        +-- MeshError       a mesh from outside was refused at the door
+        +-- StartError      no valid start state
+        +-- SettleError     the object did not come to rest on the table
+        +-- ViewError       a camera does not see what it must
+        +-- LabelError      a check found labels that disagree
+
+A message says what failed, the number measured, and the setting to change. All arguments go to `Exception.__init__`,
+because an exception that crosses processes is rebuilt from them.
+"""
+
+from typing import Literal
+
+FailureKind = Literal["intrinsic", "environmental"]
+
+
+class VersoError(Exception):
+    """The root: a failure that has a clear message for the user."""
+
+    exit_code = 1
+
+
+class InputError(VersoError):
+    """What the user gave is wrong; nothing was started."""
+
+    exit_code = 2
+
+
+class JobError(InputError):
+    """A job file that cannot be used; the message names the file, the key, the value and what is allowed."""
+
+
+class AssetSourceError(InputError):
+    """A source of assets with nothing usable in it."""
+
+
+class OutputError(InputError):
+    """An output folder that belongs to another job or cannot be written."""
+
+
+class RunError(VersoError):
+    """The work ran, and something is missing or wrong."""
+
+
+class MachineError(RunError):
+    """This machine lacks something that the work needs; the message says how to get it."""
+
+
+class CommitConflict(RunError):
+    """Two attempts at one range made different bytes."""
+
+
+class CorruptError(RunError):
+    """A stored file that cannot be read or does not match its checksum."""
+
+
+class FingerprintError(RunError):
+    """A worker whose stack makes other bytes than the one that began the dataset."""
+
+
+class SceneError(VersoError):
+    """This scene cannot be made. It becomes a row in `failures`; `reason` is a short stable word, `detail` a sentence."""
+
+    stage = "scene"
+    kind: FailureKind = "intrinsic"
+
+    def __init__(self, reason: str, detail: str) -> None:
+        super().__init__(reason, detail)
+        self.reason = reason
+        self.detail = detail
+
+    def __str__(self) -> str:
+        return f"{self.stage}: {self.reason}: {self.detail}"
+
+
+class MeshError(SceneError):
+    """A mesh from outside that was refused at the door."""
+
+    stage = "assets"
+
+
+class StartError(SceneError):
+    """No valid start state."""
+
+    stage = "plan"
+
+
+class SettleError(SceneError):
+    """The object did not come to rest on the table."""
+
+    stage = "settle"
+
+
+class ViewError(SceneError):
+    """A camera that does not see what it must."""
+
+    stage = "views"
+
+
+class LabelError(SceneError):
+    """A check found labels that disagree."""
+
+    stage = "check"

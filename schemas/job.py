@@ -1,0 +1,385 @@
+"""The job file: one tree of frozen models, parsed once. A step gets its own branch and no other.
+
+Every key has a default except `name`; `extra = forbid` everywhere, so a misspelt key is an error and not a silence.
+Keys under `run`, and `scenes`, do not change what a scene is: they are outside its settings digest.
+"""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from schemas.base import (
+    Frozen,
+    Interval,
+    NonNegative,
+    NonNegativeInt,
+    Positive,
+    PositiveInt,
+    Range,
+    Share,
+)
+
+Category = Literal["bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box"]
+CATEGORIES: tuple[Category, ...] = ("bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box")
+
+
+class ProceduralSource(Frozen):
+    """The built-in shapes, made from a seed."""
+
+    source: Literal["procedural"]
+    """Which kind of source this is."""
+    weight: Positive = 1.0
+    """Share of this source among the sources that offer a scene's category."""
+    seed: NonNegativeInt = 0
+    """Seed of the shapes; instance n of a category is the same in every dataset with this seed."""
+    instances: PositiveInt = 1_000_000
+    """How many distinct instances of each category there are to choose from."""
+    size: Literal["article", "metric"] = "article"
+    """`article`: bounding-box diagonal `diagonal_m`; `metric`: the size such a thing really has. Tables are metric."""
+    diagonal_m: Positive = 0.25
+    """Bounding-box diagonal of every object where `size` is `article`."""
+
+
+class ShapeNetSource(Frozen):
+    """A folder with the user's own copy of ShapeNetCore, version 1 or 2."""
+
+    source: Literal["shapenet"]
+    """Which kind of source this is."""
+    weight: Positive = 1.0
+    """Share of this source among the sources that offer a scene's category."""
+    folder: str
+    """The folder that holds the synset folders (02876657, ...), relative to the job file."""
+    scale: Positive | None = None
+    """Multiplies the normalised units; default 0.25 for objects and 1.5 for tables, as in the article."""
+    licence: str = "ShapeNet terms of use: non-commercial research"
+    """What the `assets` table says of these shapes."""
+    copy_assets: bool = False
+    """Whether the cleaned shapes may be written into the dataset."""
+
+
+class FolderSource(Frozen):
+    """A folder of URDFs or meshes, with a map from file patterns to categories."""
+
+    source: Literal["urdf"]
+    """Which kind of source this is."""
+    weight: Positive = 1.0
+    """Share of this source among the sources that offer a scene's category."""
+    folder: str
+    """A folder relative to the job file, or `pybullet_data` for the meshes inside that package."""
+    category_map: dict[str, str] = Field(default_factory=dict)
+    """Category by file pattern (glob relative to `folder`); the first match wins. Empty: the map that is built in for
+    `pybullet_data`."""
+    up: Literal["x", "y", "z"] = "z"
+    """Which axis of the source points up."""
+    scale: Positive = 1.0
+    """Multiplies the source's coordinates: 0.001 for millimetres."""
+    diagonal_m: Positive | None = None
+    """Resize every object to this bounding-box diagonal; None keeps its own size."""
+    licence: str = "unknown"
+    """What the `assets` table says of these shapes."""
+    copy_assets: bool = False
+    """Whether the cleaned shapes may be written into the dataset."""
+
+
+Source = Annotated[ProceduralSource | ShapeNetSource | FolderSource, Field(discriminator="source")]
+
+
+class SplitShares(Frozen):
+    """Shares of instances (not of scenes) in train, val and test."""
+
+    train: Share = 0.8
+    """Share for training."""
+    val: Share = 0.1
+    """Share for validation."""
+    test: Share = 0.1
+    """Share for testing."""
+
+    @model_validator(mode="after")
+    def _sums_to_one(self) -> "SplitShares":
+        total = self.train + self.val + self.test
+        if not math.isclose(total, 1.0, abs_tol=1e-9):
+            raise ValueError(f"train + val + test is {total:g}, and must be 1")
+        return self
+
+
+class MeshLimits(Frozen):
+    """Caps on meshes from outside: one that is over a cap is skipped and counted."""
+
+    max_file_mb: Positive = 256.0
+    """Largest mesh file, MB."""
+    max_vertices: PositiveInt = 5_000_000
+    """Most vertices."""
+    max_faces: PositiveInt = 5_000_000
+    """Most faces."""
+    max_texture_px: PositiveInt = 8192
+    """Longest side of a texture, pixels."""
+
+
+class Assets(Frozen):
+    """Where objects and tables come from; sources are mixed by weight."""
+
+    objects: tuple[Source, ...] = Field(default=(ProceduralSource(source="procedural"),), min_length=1)
+    """Sources of objects."""
+    tables: tuple[Source, ...] = Field(default=(ProceduralSource(source="procedural"),), min_length=1)
+    """Sources of tables."""
+    split: SplitShares = SplitShares()
+    """Shares of instances in train, val and test."""
+    limits: MeshLimits = MeshLimits()
+    """Caps on meshes from outside."""
+    density_kg_m3: Positive = 600.0
+    """Of a watertight solid."""
+    shell_kg_m2: Positive = 3.0
+    """Surface density of a mesh that is not watertight, which is weighed as a thin shell."""
+
+
+class Start(Frozen):
+    """How an object begins."""
+
+    pose: Literal["upright", "tumbled", "placed"] = "upright"
+    """upright: uniform yaw; tumbled: uniform rotation; placed: set down at rest, no drop unless it would tip."""
+    offset_m: Interval = Range(-0.25, 0.25)
+    """Along x and along y from the centre of the table top."""
+    clearance_m: Interval = Range(0.005, 0.05)
+    """Height of the lowest point above the table at the start of a drop."""
+    max_redraws: NonNegativeInt = 20
+    """How often a position with no table under the centre of mass is drawn again."""
+
+
+class Rest(Frozen):
+    """When an object counts as resting: it drifts and turns more slowly than this for the whole window."""
+
+    speed_mm_s: Positive = 1.0
+    """Bound on the drift of the object's farthest point."""
+    spin_rad_s: Positive = 0.01
+    """Bound on the rate at which it turns."""
+    window_s: Positive = 0.25
+    """How long both must hold."""
+
+
+class Physics(Frozen):
+    """PyBullet's settings."""
+
+    step_hz: Annotated[int, Field(ge=30, le=20_000)] = 960
+    """Steps a second."""
+    solver_iterations: Annotated[int, Field(ge=1, le=10_000)] = 100
+    """Iterations of the contact solver in each step."""
+    max_settle_s: Positive = 8.0
+    """Simulated time after which an object that still moves is a failure."""
+    rest: Rest = Rest()
+    """When an object counts as resting."""
+    margin_mm: NonNegative = 0.1
+    """Collision margin of mesh shapes."""
+    friction: NonNegative = 0.7
+    """Of each body; contact friction is the product of the two."""
+    rolling_friction: NonNegative = 0.0005
+    """Lever arms, metres: the torque against rolling is this times the contact force."""
+    spinning_friction: NonNegative = 0.0005
+    """The same against spinning about the contact's normal."""
+    restitution: Share = 0.0
+    """Of each body; the restitution of a contact is the product of the two."""
+    snap_rad: NonNegative = 0.02
+    """The final correction turns the object by at most this angle onto the face that it stands on."""
+
+
+class Orbit(Frozen):
+    """Where input cameras stand: spherical coordinates about the centre of the table top [A]."""
+
+    inclination_rad: Interval = Range(0.7, 0.9)
+    """Angle of the optical axis below the horizontal."""
+    yaw_rad: Interval = Range(-math.pi, math.pi)
+    """Direction from the table to the camera."""
+    radius_m: Positive = 2.5
+    """Distance from the centre of the table top."""
+
+
+class Sensor(Frozen):
+    """A pinhole camera. cx, cy count from the image's left and upper edge: pixel centres lie at +0.5 [A, D]."""
+
+    width: Annotated[int, Field(ge=1, le=4096)] = 640
+    """Pixels."""
+    height: Annotated[int, Field(ge=1, le=4096)] = 480
+    """Pixels."""
+    fx: Positive = 525.0
+    """Focal length, pixels."""
+    fy: Positive = 525.0
+    """Focal length, pixels."""
+    cx: float = 320.0
+    """Principal point, pixels from the left edge."""
+    cy: float = 240.0
+    """Principal point, pixels from the upper edge."""
+
+
+class DepthCamera(Frozen):
+    """The depth camera's place in the RGB camera's optical axes, metres; same rotation [A]."""
+
+    offset_m: tuple[float, float, float] = (-0.051, 0.001, -0.001)
+    """Translation in the RGB camera's optical axes."""
+
+
+class Mirror(Frozen):
+    """The camera on the other side [A, C]."""
+
+    T_z_m: Positive = 1.3
+    """Distance of the mirror camera from the point that it looks at."""
+    front: Literal["percentile", "median", "nearest"] = "percentile"
+    """How d_z, the distance to the object's front surface, is read from the object's stored input depth."""
+    percentile: Annotated[float, Field(ge=0, le=100)] = 2.0
+    """Of the object's depth pixels, for `front: percentile`."""
+
+
+class Cameras(Frozen):
+    """Every camera of a pair."""
+
+    orbit: Orbit = Orbit()
+    """Where input cameras stand."""
+    sensor: Sensor = Sensor()
+    """The pinhole camera of every view."""
+    depth: DepthCamera = DepthCamera()
+    """The depth camera that is not aligned with the RGB camera."""
+    mirror: Mirror = Mirror()
+    """The camera on the other side."""
+
+
+class Patch(Frozen):
+    """Size of the crop about each object, pixels [A]."""
+
+    width: PositiveInt = 128
+    """Pixels."""
+    height: PositiveInt = 96
+    """Pixels."""
+
+
+class Projection(Frozen):
+    """How the input cloud is carried into the mirror view."""
+
+    splat: Annotated[int, Field(ge=1, le=15)] = 1
+    """Side of the square of pixels that each point fills; odd."""
+    hidden_point_removal: bool = False
+    """Leave out points whose surface faces away from the mirror camera."""
+
+    @field_validator("splat")
+    @classmethod
+    def _odd(cls, value: int) -> int:
+        if value % 2 == 0:
+            raise ValueError(
+                f"splat {value} is even: a point's square needs a middle pixel, use {value - 1} or {value + 1}"
+            )
+        return value
+
+
+class Images(Frozen):
+    """Encodings [C, D]."""
+
+    depth_units_per_m: Positive = 5000.0
+    """Units of a depth image in a metre."""
+    depth_range_m: Interval = Range(0.2, 8.0)
+    """Depth outside this open interval is stored as 0."""
+    patch: Patch = Patch()
+    """Size of the crop about each object."""
+    projection: Projection = Projection()
+    """How the input cloud is carried into the mirror view."""
+    png_level: Annotated[int, Field(ge=0, le=9)] = 1
+    """Compression level of the PNG files; pixels do not change."""
+
+    @model_validator(mode="after")
+    def _fits_16_bits(self) -> "Images":
+        if self.depth_range_m.high * self.depth_units_per_m > 65_535:
+            raise ValueError(
+                f"depth_range_m ends at {self.depth_range_m.high:g} m, which is {self.depth_range_m.high * self.depth_units_per_m:.0f} "
+                f"units of depth_units_per_m {self.depth_units_per_m:g}: a 16-bit image holds at most 65535"
+            )
+        return self
+
+
+class Render(Frozen):
+    """RGB."""
+
+    tier: Literal["flat"] = "flat"
+    """flat: albedo and soft light from a few directions."""
+
+
+class Check(Frozen):
+    """What is checked before a scene is committed."""
+
+    raycast_share: Share = 0.01
+    """Share of scenes, chosen by scene id, whose depth and masks are compared with a ray caster."""
+    mirror_agreement_mm: Positive = 1.0
+    """Largest median difference between input depth carried into the mirror view and the mirror depth."""
+
+
+class Output(Frozen):
+    """How files are laid out."""
+
+    layout: Literal["files", "tar"] = "files"
+    """`tar`: one tar for each range and category, required on object stores."""
+
+
+class Run(Frozen):
+    """How the work is driven. None of these keys changes a byte of the dataset."""
+
+    workers: PositiveInt | None = None
+    """None: the cores that this container may use, or the cluster's."""
+    shard_size: PositiveInt | None = None
+    """Scenes in a Ray task; rounded up to whole ranges. None: 64, and fewer where that would leave workers idle."""
+    range_size: PositiveInt = 16
+    """Scenes in a commit; recorded at the first run."""
+    max_failure_share: Share = 0.01
+    """Above this share of failed scenes the run exits 1, and stops early once that is certain."""
+    max_attempts: PositiveInt = 3
+    """Tries of a range whose worker dies, before the scene it died in is recorded as an environmental failure."""
+    scene_timeout_s: Positive = 120.0
+    """A worker that takes longer over one scene is killed."""
+    fingerprint: Literal["strict", "record"] = "strict"
+    """`strict` refuses workers whose stack makes other bytes; `record` allows them and stores which made what."""
+
+
+class Job(Frozen):
+    """A whole job file."""
+
+    verso: Literal[1] = 1
+    """schema_version."""
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+    """Names the dataset; the default output folder is data/<name>."""
+    seed: NonNegativeInt = 0
+    """Seed of everything that is drawn in a scene."""
+    scenes: PositiveInt = 64
+    """How many scenes; more than before extends a dataset."""
+    first_scene: NonNegativeInt = 0
+    """Id of the first scene."""
+    pairs_per_scene: Annotated[int, Field(ge=1, le=1000)] = 1
+    """Input and mirror poses of each scene."""
+    categories: dict[Category, Positive] = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)
+    """Weights; a list of names means equal weights."""
+    assets: Assets = Assets()
+    """Where shapes come from."""
+    start: Start = Start()
+    """How an object begins."""
+    physics: Physics = Physics()
+    """How it comes to rest."""
+    cameras: Cameras = Cameras()
+    """Who looks at it."""
+    images: Images = Images()
+    """What is stored."""
+    render: Render = Render()
+    """How RGB looks."""
+    check: Check = Check()
+    """What is checked before a scene is committed."""
+    output: Output = Output()
+    """How files are laid out."""
+    run: Run = Run()
+    """How the work is driven: changes no byte of the dataset."""
+
+    @field_validator("categories", mode="before")
+    @classmethod
+    def _from_list(cls, value: object) -> object:
+        if isinstance(value, list):
+            if len(set(map(str, value))) != len(value):
+                raise ValueError(f"{value} names a category twice")
+            return dict.fromkeys(value, 1.0)
+        return value
+
+    @property
+    def stop_scene(self) -> int:
+        """One past the last scene id."""
+        return self.first_scene + self.scenes

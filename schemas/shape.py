@@ -1,0 +1,131 @@
+"""Shapes in memory: parts with materials, and what is known of an asset. Arrays are read-only."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array, Pose
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Bare triangles: vertices [V, 3] float64 metres, faces [F, 3] int32."""
+
+    vertices: Array
+    faces: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class Hull:
+    """A convex hull: its vertices [V, 3] float64, and the unit outward normals [F, 3] of its triangles."""
+
+    vertices: Array
+    normals: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """A surface in the terms of glTF's metallic-roughness model.
+
+    `base_color` is sRGB with straight alpha, each in [0, 1]; it multiplies the texture and the vertex colours.
+    `texture` is [h, w, 3 or 4] uint8 sRGB, row 0 at the top; uv (0, 0) is its lower left corner (OpenGL, trimesh).
+    """
+
+    base_color: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
+    metallic: float = 0.0
+    roughness: float = 0.6
+    texture: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One triangle mesh with one material.
+
+    vertices [V, 3] float64 metres; faces [F, 3] int32, counter-clockwise seen from outside; normals [V, 3] float64 unit
+    shading normals or None (flat); uv [V, 2] float64 or None; colors [V, 4] uint8 sRGB or None.
+    """
+
+    name: str
+    vertices: Array
+    faces: NDArray[np.int32]
+    material: Material = Material()
+    normals: Array | None = None
+    uv: Array | None = None
+    colors: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """The parts of one rigid thing, all in one frame."""
+
+    parts: tuple[Part, ...]
+
+    @property
+    def vertices(self) -> Array:
+        """[V, 3] float64: the vertices of every part, in order."""
+        return np.concatenate([part.vertices for part in self.parts])
+
+    @property
+    def faces(self) -> NDArray[np.int32]:
+        """[F, 3] int32 into `vertices`."""
+        starts = np.cumsum([0] + [len(part.vertices) for part in self.parts[:-1]])
+        return np.concatenate([part.faces + start for part, start in zip(self.parts, starts, strict=True)]).astype(
+            np.int32
+        )
+
+    @property
+    def mesh(self) -> Mesh:
+        """All parts as one mesh, without their materials."""
+        return Mesh(self.vertices, self.faces)
+
+    @property
+    def bounds(self) -> Array:
+        """[2, 3] float64: lower and upper corner of the axis-aligned bounding box."""
+        vertices = self.vertices
+        return np.stack([vertices.min(axis=0), vertices.max(axis=0)])
+
+
+@dataclass(frozen=True, eq=False)
+class MassProperties:
+    """Of the true mesh, not of its collision shape.
+
+    mass_kg; com [3] metres in the object frame; inertia [3, 3] kg m^2 about the centre of mass, object axes.
+    `solid` tells a watertight solid from a mesh treated as a thin shell.
+    """
+
+    mass_kg: float
+    com: Array
+    inertia: Array
+    solid: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Asset:
+    """A shape that is ready for a scene: cleaned, metric, in the object frame (dataset.md section 1).
+
+    `source` names where it comes from (`procedural`, `shapenet`, `urdf`), `path` the file within that source or None,
+    `sha256` the digest of the source file, or of the generated arrays where there is none. `T_source_to_object` takes
+    the source's coordinates, *after* multiplying them by `scale`, to the object frame. `shareable` says whether the
+    cleaned mesh may be written into the dataset. `volume_m3` is None where the mesh is not watertight.
+    """
+
+    instance_id: str
+    category: str
+    source: str
+    licence: str
+    path: str | None
+    sha256: str
+    shape: Shape
+    mass: MassProperties
+    T_source_to_object: Pose
+    scale: float
+    watertight: bool
+    volume_m3: float | None
+    shareable: bool
+
+    @property
+    def extents_m(self) -> Array:
+        """[3] float64: size of the bounding box along the object axes."""
+        lower, upper = self.shape.bounds
+        return upper - lower

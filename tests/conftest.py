@@ -1,0 +1,119 @@
+"""What every test shares: which tests run here, and where the figures that they measure go."""
+
+import functools
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any, Protocol
+
+import pytest
+from hypothesis import settings
+
+from schemas.environment import processor_flags, settings_to_change
+
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+# The same examples on every run: a failure is a change of the code, not of the dice. No deadline on shared cores.
+settings.register_profile("verso", deadline=None, derandomize=True)
+settings.load_profile("verso")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    group = parser.getgroup("verso")
+    group.addoption("--scope", choices=("default", "ci", "all"), default="default", help="see `./verso test --help`")
+    group.addoption("--figures", type=Path, metavar="FILE", help="write what the tests measured, as a JSON list")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    figures_file = config.getoption("--figures")
+    if figures_file and not hasattr(config, "workerinput"):  # with several processes, the first one writes
+        config.pluginmanager.register(FiguresWriter(figures_file))
+
+
+def pytest_report_header() -> list[str]:
+    changes = settings_to_change(os.environ, processor_flags())
+    return [f"environment: not the stack's, bits may differ: {' '.join(sorted(changes))}"] if changes else []
+
+
+# ---------------------------------------------------------------------------------------------- which tests run here
+
+
+@functools.cache
+def docker_answers() -> bool:
+    try:
+        return (
+            shutil.which("docker") is not None
+            and not subprocess.run(["docker", "info"], capture_output=True, timeout=20, check=False).returncode
+        )
+    except subprocess.TimeoutExpired:
+        return False
+
+
+def why_skip(markers: set[str], scope: str) -> str:
+    """The first reason why a test with these markers cannot or should not run; empty if it runs."""
+    if "slow" in markers and scope != "all":
+        return "slow: runs with --all"
+    if markers & {"docker", "root"} and scope == "default":
+        return "needs root or Docker: runs with --ci"
+    if "docker" in markers and not docker_answers():
+        return "no Docker engine answers"
+    if "root" in markers and os.geteuid() != 0:
+        return "this user is not root"
+    if "shared_data" in markers and not SHARED_DATA.is_dir():
+        return "no ../shared/data beside the checkout"
+    return ""
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    for item in items:
+        if reason := why_skip({marker.name for marker in item.iter_markers()}, config.getoption("--scope")):
+            item.add_marker(pytest.mark.skip(reason=reason))
+
+
+# ---------------------------------------------------------------------------------------------- figures
+
+
+class RecordFigure(Protocol):
+    def __call__(self, name: str, outcome: str, figure: float | None = None, bound: float | None = None) -> None: ...
+
+
+@pytest.fixture
+def record_figure(request: pytest.FixtureRequest) -> RecordFigure:
+    """`record_figure(name, outcome, figure, bound)`: what a case came to, for `./verso test --figures FILE`."""
+    figures: list[dict[str, Any]] = []
+    request.node.user_properties.append(("figures", figures))
+
+    def record(name: str, outcome: str, figure: float | None = None, bound: float | None = None) -> None:
+        # Plain floats, because numpy's do not travel between test processes.
+        plain = [None if number is None else float(number) for number in (figure, bound)]
+        figures.append({"name": name, "outcome": outcome, "figure": plain[0], "bound": plain[1]})
+
+    return record
+
+
+class FiguresWriter:
+    """Collects the figures from all test processes and writes them in one piece when the run ends."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.rows: list[dict[str, Any]] = []
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.when == "call" or (report.when == "setup" and not report.passed):
+            for name, figures in report.user_properties:
+                if name == "figures":
+                    self.rows += self._of_test(report, figures)
+
+    @staticmethod
+    def _of_test(report: pytest.TestReport, figures: Any) -> list[dict[str, Any]]:
+        """A case that failed says so, whatever it had recorded; one that recorded nothing is still in the list."""
+        if not figures:
+            test = report.nodeid.rpartition("::")[2]
+            return [{"name": test, "outcome": report.outcome, "figure": None, "bound": None}]
+        return [{**row, "outcome": "failed"} if report.failed else row for row in figures]
+
+    def pytest_sessionfinish(self) -> None:
+        self.rows.sort(key=lambda row: row["name"])
+        self.file.write_text(json.dumps(self.rows, indent=1) + "\n")

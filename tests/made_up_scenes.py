@@ -1,0 +1,208 @@
+"""Scenes whose files and rows are made up: what the store is tested with, quick and deterministic."""
+
+import hashlib
+
+import numpy as np
+
+from schemas.commit import CommitTerms, Span
+from schemas.layout import IMAGES, asset_path, file_pose_id, image_path, input_pose_id, patch_path
+from schemas.scene import SceneOutput
+from workers.store.attempt import Attempt, begin_attempt
+from workers.store.store import Store
+
+CATEGORIES = ("bottle", "camera", "mug")
+TERMS = CommitTerms(job_digest="j" * 64, fingerprint="stack-a", range_size=4)
+
+
+def terms(**changes) -> CommitTerms:
+    return TERMS.model_copy(update=changes)
+
+
+def numbers_of(*keys: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence(7, spawn_key=keys))
+
+
+def bytes_of(path: str, size: int = 200) -> bytes:
+    """Bytes that belong to a path and to no other."""
+    return b"".join(hashlib.sha256(f"{path}{i}".encode()).digest() for i in range(-(-size // 32)))[:size]
+
+
+def matrix_of(*keys: int) -> list[float]:
+    return [*numbers_of(*keys).normal(size=12).tolist(), -0.0, 0.0, 0.0, 1.0]
+
+
+def file_row(path: str, data: bytes) -> dict[str, object]:
+    return {"path": path, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+
+
+def category_of(scene_id: int) -> str:
+    return CATEGORIES[int(numbers_of(scene_id).integers(len(CATEGORIES)))]
+
+
+def made_scene(scene_id: int, salt: str = "", images=IMAGES, shapes: bool = True) -> SceneOutput:
+    """A scene that went well; `salt` changes its images, as another stack would; fewer `images` make it smaller."""
+    category = category_of(scene_id)
+    pose_id = input_pose_id(scene_id, 0, 1)
+    files: list[tuple[str, bytes]] = []
+    by_role: dict[str, list[dict[str, object]]] = {}
+    for image in images:
+        for name in (image_path, patch_path):
+            path = name(category, image.content, file_pose_id(image.role, pose_id))
+            data = bytes_of(path + salt, 100 + scene_id % 7)
+            files.append((path, data))
+            by_role.setdefault(image.role, []).append(file_row(path, data))
+    instance, table = f"{category}-{scene_id % 3}", "table-0"
+    if shapes:
+        files.append((asset_path(category, instance), bytes_of(instance, 300)))
+    views = [_view(scene_id, category, pose_id, role, rows) for role, rows in by_role.items()]
+    objects = [
+        _object(view, region, *thing)
+        for view in views
+        for region, thing in ((2, ("table", table)), (3, (category, instance)))
+    ]
+    return SceneOutput(
+        scene_id=scene_id,
+        files=tuple(files),
+        rows={
+            "scenes": [_scene(scene_id, category, instance, table)],
+            "views": views,
+            "objects": objects,
+            "assets": [_asset(category, instance, shapes), _asset("table", table, False)],
+            "timings": [timing(scene_id, category)],
+        },
+    )
+
+
+def failed_scene(scene_id: int, kind: str = "intrinsic") -> SceneOutput:
+    category = category_of(scene_id)
+    row = {
+        "scene_id": scene_id,
+        "category": category,
+        "stage": "settle",
+        "kind": kind,
+        "reason": "left_table" if kind == "intrinsic" else "killed",
+        "detail": "it fell",
+        "attempts": 1 if kind == "intrinsic" else 3,
+    }
+    return SceneOutput(scene_id=scene_id, files=(), rows={"failures": [row], "timings": [timing(scene_id, category)]})
+
+
+def fails(scene_id: int) -> bool:
+    """Every eleventh scene cannot be made."""
+    return scene_id % 11 == 5
+
+
+def scene(scene_id: int) -> SceneOutput:
+    """Made or failed, always the same."""
+    return failed_scene(scene_id) if fails(scene_id) else made_scene(scene_id)
+
+
+def small_scene(scene_id: int) -> SceneOutput:
+    """As `scene`, with two images and their patches."""
+    return failed_scene(scene_id) if fails(scene_id) else made_scene(scene_id, images=(IMAGES[0], IMAGES[6]))
+
+
+def attempt_at(store: Store, start: int, stop: int, settings: CommitTerms = TERMS, make=scene, **span) -> Attempt:
+    """An attempt with all its scenes added, ready to commit."""
+    attempt = begin_attempt(store, Span(start=start, stop=stop, **span), settings)
+    for scene_id in attempt.span.scene_ids:
+        attempt.begin_scene(scene_id)
+        attempt.add_scene(make(scene_id))
+    return attempt
+
+
+def timing(scene_id: int, category: str) -> dict[str, object]:
+    """Differs on every call, as clocks do."""
+    seconds = float(np.random.default_rng().uniform())
+    stages = [{"name": "settle", "seconds": seconds}]
+    return {"scene_id": scene_id, "category": category, "stages": stages, "effects": [], "total_s": seconds}
+
+
+def _scene(scene_id: int, category: str, instance: str, table: str) -> dict[str, object]:
+    return {
+        "scene_id": scene_id,
+        "category": category,
+        "instance_id": instance,
+        "source": "procedural",
+        "table_id": table,
+        "object_scale": 0.25,
+        "T_world_obj": matrix_of(scene_id, 1),
+        "T_world_table": matrix_of(scene_id, 2),
+        "pose": "upright",
+        "redraws": scene_id % 3,
+        "effects": ["drop", "snap"],
+        "skipped": [{"effect": "tip", "why": "stands"}],
+        "penetration_mm": 0.01,
+        "hover_gap_mm": -0.0,
+        "support_margin_mm": 12.5,
+        "residual_speed_mm_s": 0.1,
+        "recheck_move_mm": None if scene_id % 2 else 0.02,
+        "settle_s": 0.7,
+        "raycast_checked": scene_id % 2 == 0,
+        "settings_digest": "d" * 64,
+    }
+
+
+def _view(scene_id: int, category: str, pose_id: int, role: str, files: list[dict[str, object]]) -> dict[str, object]:
+    projected = role == "projected"
+    return {
+        "pose_id": pose_id + 1 if role == "mirror" else pose_id,
+        "parent_id": pose_id,
+        "role": role,
+        "scene_id": scene_id,
+        "category": category,
+        "T_world_cam": matrix_of(scene_id, 3, len(role)),
+        "inclination_rad": 0.8,
+        "yaw_rad": 1.0 / 3.0,
+        "width": 640,
+        "height": 480,
+        "fx": 525.0,
+        "fy": 525.0,
+        "cx": 320.0,
+        "cy": 240.0,
+        "cx_opencv": 319.5,
+        "cy_opencv": 239.5,
+        "depth_units_per_m": 5000.0,
+        "d_z_m": 2.4,
+        "files": files,
+        "object_pixels": 530,
+        "visible_fraction": 1.0,
+        "mirror_agreement": {"median_mm": 0.06, "share": 0.99} if role == "mirror" else None,
+        "projected_filled_share": 0.5 if projected else None,
+        "projected_hidden_share": 0.4 if projected else None,
+        "patch_object_fraction": None,
+    }
+
+
+def _object(view: dict, region: int, category: str, instance: str) -> dict[str, object]:
+    return {
+        "pose_id": view["pose_id"],
+        "role": view["role"],
+        "region_id": region,
+        "scene_id": view["scene_id"],
+        "category": category,
+        "instance_id": instance,
+        "u": 300 + region,
+        "v": -1,
+        "T_cam_obj": matrix_of(view["scene_id"], 4, region),
+        "bbox_xywh": [1, 2, 3, 4],
+        "pixels": 500,
+        "visible_fraction": 0.9,
+    }
+
+
+def _asset(category: str, instance: str, shapes: bool) -> dict[str, object]:
+    return {
+        "instance_id": instance,
+        "category": category,
+        "source": "procedural",
+        "licence": "CC0-1.0",
+        "path": asset_path(category, instance) if shapes else None,
+        "sha256": hashlib.sha256(instance.encode()).hexdigest(),
+        "extents_m": [0.1, 0.2, 1 / 3],
+        "volume_m3": None,
+        "watertight": False,
+        "T_source_to_object": matrix_of(len(instance)),
+        "scale": 1.0,
+        "split": "train",
+    }

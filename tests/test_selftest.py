@@ -1,0 +1,128 @@
+import json
+import shutil
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from services import selftest
+
+SUITE = """
+import numpy
+import pytest
+
+def test_passes():
+    pass
+
+@pytest.mark.slow
+def test_slow():
+    pass
+
+def test_measures(record_figure):
+    record_figure("plane", "made", numpy.float32(0.25), 1)
+
+def test_measures_and_fails(record_figure):
+    record_figure("sphere", "made", 7, 5)
+    assert MEASURED < 5
+
+def test_fails_before_it_measures(record_figure):
+    assert MEASURED < 5
+"""
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """A small project with this project's conftest, which `selftest` takes for its own."""
+    (tmp_path / "tests").mkdir()
+    shutil.copy(Path(__file__).with_name("conftest.py"), tmp_path / "tests")
+    (tmp_path / "pyproject.toml").write_text('[tool.pytest.ini_options]\nmarkers = ["slow: slow"]\naddopts = "-ra"\n')
+    (tmp_path / "schemas").symlink_to(selftest.ROOT / "schemas")
+    (tmp_path / "services").symlink_to(selftest.ROOT / "services")
+    monkeypatch.setattr(selftest, "ROOT", tmp_path)
+    monkeypatch.setattr(selftest, "_static_checks", lambda: {"static": [sys.executable, "-c", "print('checked')"]})
+    monkeypatch.setattr(selftest, "usable_cores", lambda: 2)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def write_suite(project: Path, measured: int) -> None:
+    (project / "tests" / "test_suite.py").write_text(f"MEASURED = {measured}\n{SUITE}")
+
+
+def test_all_passing_is_0_and_skips_are_explained(project, capfd):
+    write_suite(project, measured=3)
+    assert selftest.main([]) == 0
+    out = capfd.readouterr().out
+    assert "checked" in out
+    assert "4 passed, 0 failed, 1 skipped" in out
+    assert "   1 x slow: runs with --all" in out
+
+
+def test_all_runs_the_slow_tests_too(project, capfd):
+    write_suite(project, measured=3)
+    assert selftest.main(["--all"]) == 0
+    assert "5 passed, 0 failed, 0 skipped" in capfd.readouterr().out
+
+
+def test_a_failing_test_is_1(project, capfd):
+    write_suite(project, measured=9)
+    assert selftest.main(["tests"]) == 1
+    assert "2 passed, 2 failed, 1 skipped" in capfd.readouterr().out
+
+
+def test_a_failing_check_is_1_although_every_test_passes(project, monkeypatch, capfd):
+    write_suite(project, measured=3)
+    monkeypatch.setattr(selftest, "_static_checks", lambda: {"static": [sys.executable, "-c", "raise SystemExit(3)"]})
+    assert selftest.main([]) == 1
+    assert "static       FAILED" in capfd.readouterr().out
+
+
+def test_a_path_narrows_to_its_tests_and_skips_the_checks(project, capfd):
+    write_suite(project, measured=3)
+    assert selftest.main(["tests/test_suite.py::test_passes"]) == 0
+    out = capfd.readouterr().out
+    assert "checked" not in out
+    assert "1 passed, 0 failed" in out
+
+
+def test_an_expression_narrows_by_name(project, capfd):
+    write_suite(project, measured=9)
+    assert selftest.main(["-k", "passes"]) == 0
+    assert "1 passed, 0 failed" in capfd.readouterr().out
+
+
+def test_finding_no_test_is_not_success(project, capfd):
+    (project / "tests" / "test_empty.py").touch()
+    assert selftest.main([]) == 1
+    assert "no test was found" in capfd.readouterr().out
+
+
+def test_a_path_that_does_not_exist_is_2(project, capfd):
+    assert selftest.main(["tests/absent.py"]) == 2
+    assert "tests/absent.py" in capfd.readouterr().err
+
+
+def test_outside_a_checkout_it_says_where_the_tests_are(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(selftest, "ROOT", tmp_path)
+    assert selftest.main([]) == 2
+    assert "checkout" in capfd.readouterr().err
+
+
+def test_figures_of_all_processes_come_in_one_list_and_a_failed_case_says_so(project, monkeypatch):
+    write_suite(project, measured=9)
+    elsewhere = project / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    selftest.main(["../tests", "--figures", "figures.json"])
+    assert json.loads((elsewhere / "figures.json").read_text()) == [
+        {"name": "plane", "outcome": "made", "figure": 0.25, "bound": 1.0},
+        {"name": "sphere", "outcome": "failed", "figure": 7.0, "bound": 5.0},
+        {"name": "test_fails_before_it_measures", "outcome": "failed", "figure": None, "bound": None},
+    ]
+
+
+def test_a_run_that_died_before_writing_counts_nothing(tmp_path):
+    assert selftest.Tally.read(tmp_path / "absent.xml") == selftest.Tally(0, 0, Counter())
+    (tmp_path / "torn.xml").write_text("<testsuites><testsu")
+    assert selftest.Tally.read(tmp_path / "torn.xml") == selftest.Tally(0, 0, Counter())

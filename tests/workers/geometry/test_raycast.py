@@ -1,0 +1,190 @@
+"""The ray caster against planes, spheres and segments in closed form."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from schemas.base import frozen_array
+from schemas.camera import Camera, Intrinsics
+from schemas.scene import Placed
+from schemas.shape import Part, Shape
+from workers.geometry.camera import orbit_pose
+from workers.geometry.frames import pose, translation, uniform_rotation
+from workers.geometry.raycast import NEAR_M, cast_view, edge_distance_px, first_hit
+
+K = Intrinsics(width=160, height=120, fx=130.0, fy=140.0, cx=77.3, cy=62.1)
+EYE = np.eye(4)
+
+
+def shape_of(vertices: object, faces: object) -> Shape:
+    return Shape((Part("part", frozen_array(vertices), frozen_array(faces, np.int32)),))
+
+
+def mesh(body: trimesh.Trimesh) -> Shape:
+    return shape_of(body.vertices, body.faces)
+
+
+def square(z: float, half: float = 50.0) -> Shape:
+    return shape_of([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]], [[0, 1, 2], [0, 2, 3]])
+
+
+def rays(k: Intrinsics):
+    """[H, W, 3] float64: directions with z = 1 through the pixel centres."""
+    v, u = np.mgrid[0 : k.height, 0 : k.width] + 0.5
+    return np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones_like(u)], axis=2)
+
+
+def test_depth_of_a_tilted_plane_is_exact_to_ten_picometres():
+    """Embree's own float32 distance would be off by ten thousand times as much."""
+    h = 30.0
+    floor = Placed(1, shape_of([[-h, -h, 0], [h, -h, 0], [h, h, 0], [-h, h, 0]], [[0, 1, 2], [0, 2, 3]]), EYE)
+    T = orbit_pose(np.array([0.1, -0.2, 0.8]), 0.75, 2.0, 2.5)
+    depth, region, cosine = cast_view([floor], Camera(K, T))
+    normal = T[:3, :3].T @ [0.0, 0.0, 1.0]
+    across = rays(K) @ normal
+    assert (region == 1).all()
+    assert np.abs(depth - -T[2, 3] / across).max() < 1e-11
+    np.testing.assert_allclose(cosine, np.abs(across) / np.linalg.norm(rays(K), axis=2), rtol=1e-6)
+
+
+def test_depth_of_a_fine_sphere_is_that_of_the_sphere():
+    ball = trimesh.creation.icosphere(6, 0.3)
+    centre = np.array([0.1, 0.05, 2.0])
+    depth, region, cosine = cast_view([Placed(3, mesh(ball), translation(*centre))], Camera(K, EYE))
+    d = rays(K)
+    b, a, c = d @ centre, (d**2).sum(axis=2), centre @ centre - 0.3**2
+    discriminant = b**2 - a * c
+    z = (b - np.sqrt(np.maximum(discriminant, 0.0))) / a
+    well = (discriminant > 0.0) & (cosine > 0.3)
+    assert well.sum() > 500
+    assert (region[well] == 3).all() and not region[discriminant < 0].any()
+    assert np.abs(depth - z)[well].max() < 3e-4, "64 edges from pole to pole: 0.1 mm inside the sphere"
+
+
+def test_rays_go_through_pixel_centres():
+    k = Intrinsics(width=8, height=6, fx=1.0, fy=1.0, cx=0.0, cy=0.0)  # at z = 1 a metre is a pixel
+    tile = Placed(
+        5, shape_of([[2.6, 1.4, 1], [5.4, 1.4, 1], [5.4, 3.6, 1], [2.6, 3.6, 1]], [[0, 1, 2], [0, 2, 3]]), EYE
+    )
+    expected = np.zeros((6, 8), np.uint8)
+    expected[1:4, 3:5] = 5
+    np.testing.assert_array_equal(cast_view([tile], Camera(k, EYE))[1], expected)
+
+
+def test_of_coplanar_faces_the_lowest_region_id_wins_in_any_order():
+    low, high = square(2.0, 0.4), square(2.0, 0.3)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        T = pose(uniform_rotation(rng), np.array([0.0, 0.0, 2.5])) @ translation(0, 0, -2.0)
+        things = [Placed(9, high, T), Placed(4, low, T)]
+        for order in (things, things[::-1]):
+            region = cast_view(order, Camera(K, EYE))[1]
+            assert set(np.unique(region)) <= {0, 4}
+            assert (region == 4).any()
+
+
+def test_a_gap_of_ten_micrometres_is_seen():
+    things = [Placed(2, square(2.0), EYE), Placed(3, square(2.0 - 1e-5), EYE)]
+    assert (cast_view(things, Camera(K, EYE))[1] == 3).all()
+
+
+def test_both_sides_of_a_face_are_hit():
+    face = [[-9, -9, 2], [9, -9, 2], [0, 20, 2]]
+    for order in ([0, 1, 2], [0, 2, 1]):
+        assert (cast_view([Placed(3, shape_of(face, [order]), EYE)], Camera(K, EYE))[1] == 3).all()
+
+
+def test_what_lies_before_the_near_plane_is_passed_through():
+    things = [Placed(3, square(NEAR_M - 1e-3), EYE), Placed(4, square(1.0), EYE)]
+    depth, region, _ = cast_view(things, Camera(K, EYE))
+    assert (region == 4).all()
+    np.testing.assert_allclose(depth, 1.0, atol=1e-12)
+
+
+def test_where_nothing_is_hit_everything_is_zero():
+    for things in ([], [Placed(3, square(-1.0), EYE)]):
+        assert all(not image.any() for image in cast_view(things, Camera(K, EYE)))
+
+
+def test_a_thing_partly_behind_the_camera_is_seen_where_it_is_in_front():
+    """A wall along the line of sight, 0.3 m to the right: its depth at column u is 0.3 fx / (u - cx)."""
+    wall = shape_of([[0.3, -9, -5], [0.3, -9, 50], [0.3, 9, 50], [0.3, 9, -5]], [[0, 1, 2], [0, 2, 3]])
+    depth, region, _ = cast_view([Placed(3, wall, EYE)], Camera(K, EYE))
+    u = np.arange(K.width) + 0.5 - K.cx
+    expected = np.where(
+        (u > 0) & (0.3 * K.fx / np.where(u > 0, u, 1.0) < 50), 0.3 * K.fx / np.where(u > 0, u, 1.0), 0.0
+    )
+    np.testing.assert_allclose(depth[60], expected, rtol=1e-9)
+    assert ((region[60] == 3) == (expected > 0)).all()
+
+
+def test_a_closed_mesh_lets_no_ray_through():
+    """20,480 triangles, most under a pixel: inside the outline there is no hole."""
+    ball = trimesh.creation.icosphere(5, 0.5)
+    region = cast_view([Placed(3, mesh(ball), translation(0, 0, 1.5))], Camera(K, EYE))[1]
+    d = rays(K)
+    inside = np.arctan(np.linalg.norm(d[:, :, :2], axis=2)) < np.arcsin(0.5 / 1.5) - 0.01
+    assert (region[inside] == 3).all()
+
+
+def test_first_hit_measures_in_lengths_of_the_direction():
+    things = [Placed(2, square(2.0), EYE), Placed(3, square(1.5, 0.2), EYE)]
+    origins = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 3], [0, 0, 0]])
+    directions = np.array([[0.0, 0, 0.5], [0, 0, 1], [0, 0, -1], [0, 0, -1]])
+    hits = first_hit(things, origins, directions)
+    np.testing.assert_allclose(hits.distance, [3.0, 2.0, 1.0, np.inf])
+    np.testing.assert_array_equal(hits.region, [3, 2, 2, 0])
+    np.testing.assert_allclose(hits.incidence_cos, [1, 1, 1, 0])
+
+
+# ---------------------------------------------------------------------------------------------------------- edges
+
+
+def test_edge_distance_is_that_to_the_projected_segment():
+    k = Intrinsics(width=20, height=20, fx=1.0, fy=1.0, cx=0.0, cy=0.0)
+    triangle = Placed(3, shape_of([[4, 4, 1], [12, 4, 1], [4, 12, 1]], [[0, 1, 2]]), EYE)
+    pixels = np.array([[5, 5], [1, 7], [1, 1], [11, 11], [3, 4]])
+    found = edge_distance_px([triangle], Camera(k, EYE), pixels)
+    slope = np.sqrt(2.0)
+    np.testing.assert_allclose(found, [1.5, 2.5, 2.5 * slope, 7 / slope, 0.5])
+
+
+def test_edges_are_cut_at_the_near_plane():
+    """An edge from 1 m ahead to 1 m behind, 0.1 m to the right: its image runs out to the right and never comes back."""
+    k = Intrinsics(width=100, height=100, fx=10.0, fy=10.0, cx=50.0, cy=50.0)
+    sliver = Placed(3, shape_of([[0.1, 0, 1], [0.1, 0, -1], [0.1, 1e-9, -1]], [[0, 1, 2]]), EYE)
+    found = edge_distance_px([sliver], Camera(k, EYE), np.array([[50, 60], [50, 40], [50, 80]]))
+    np.testing.assert_allclose(found[:2], [0.5, np.hypot(10.5, 0.5)], atol=1e-6)
+    assert found[2] == pytest.approx(np.hypot(80.5 - 50 - 0.1 * 10 / NEAR_M, 0.5), abs=1e-6)
+    behind = Placed(3, square(-1.0), EYE)
+    assert np.isinf(edge_distance_px([behind], Camera(k, EYE), np.array([[5, 5]]))).all()
+
+
+@pytest.mark.parametrize("split", [False, True], ids=["shared-vertices", "split-vertices"])
+def test_the_outline_of_a_sphere_is_its_circle(split):
+    """Seams split vertices; the edges along them are no outline."""
+    k = Intrinsics(width=160, height=160, fx=130.0, fy=130.0, cx=80.0, cy=80.0)
+    ball = trimesh.creation.icosphere(5, 0.5)
+    faces = np.arange(3 * len(ball.faces)).reshape(-1, 3)
+    thing = Placed(3, shape_of(ball.triangles.reshape(-1, 3), faces) if split else mesh(ball), translation(0, 0, 2.5))
+    pixels = np.array([[80, 80], [80, 100], [30, 82], [5, 150]])
+    circle = 130.0 * np.tan(np.arcsin(0.5 / 2.5))
+    expected = np.abs(np.linalg.norm(pixels + 0.5 - 80.0, axis=1) - circle)
+    found = edge_distance_px([thing], Camera(k, EYE), pixels, outline_only=True)
+    assert np.abs(found - expected).max() < 0.1
+    assert edge_distance_px([thing], Camera(k, EYE), pixels)[:2].max() < 0.3, "inside, other edges are near"
+
+
+def test_an_open_border_belongs_to_the_outline_and_a_flat_diagonal_does_not():
+    k = Intrinsics(width=20, height=20, fx=1.0, fy=1.0, cx=10.0, cy=10.0)
+    pixels = np.array([[9, 9], [9, 2]])
+    tile = Placed(3, square(1.0, 8.0), EYE)
+    np.testing.assert_allclose(edge_distance_px([tile], Camera(k, EYE), pixels), [0.0, 0.5], atol=1e-12)
+    np.testing.assert_allclose(edge_distance_px([tile], Camera(k, EYE), pixels, outline_only=True), [7.5, 0.5])
+
+
+def test_many_pixels_and_edges_are_taken_in_pieces_with_the_same_result():
+    ball = Placed(3, mesh(trimesh.creation.icosphere(3, 0.5)), translation(0.1, 0.0, 2.5))
+    pixels = np.argwhere(np.ones((20, 20)))
+    whole = edge_distance_px([ball], Camera(K, EYE), pixels)
+    np.testing.assert_array_equal(whole, edge_distance_px([ball], Camera(K, EYE), pixels, chunk=1000))

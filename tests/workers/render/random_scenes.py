@@ -1,0 +1,143 @@
+"""Scenes from a seed, with shapes of their own: tables on legs, and objects with thin, small, open and round parts."""
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from schemas.base import Array, Pose, frozen_array
+from schemas.camera import Camera, Intrinsics
+from schemas.job import CATEGORIES, Assets
+from schemas.scene import Appearance, Light, Placed
+from schemas.shape import Material, Part, Shape
+from workers.assets.catalogue import Catalogue, choose_object, choose_table, load_asset, open_catalogue
+from workers.geometry.camera import orbit_pose
+from workers.geometry.frames import UP, pose, rotation_about, transform, uniform_rotation
+from workers.geometry.mirror import mirror_pose
+
+VGA = Intrinsics(width=640, height=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
+FLOOR_HALF_M = 30.0
+
+APPEARANCE = Appearance(
+    ambient=(0.3, 0.3, 0.3),
+    lights=(
+        Light(frozen_array([0.36, 0.48, 0.8]), (0.6, 0.6, 0.55)),
+        Light(frozen_array([-0.6, 0.0, 0.8]), (0.2, 0.2, 0.25)),
+    ),
+    background=(0.2, 0.3, 0.4),
+)
+
+
+def part_of(mesh: trimesh.Trimesh, color: tuple[float, float, float] = (0.7, 0.7, 0.7), smooth: bool = False) -> Part:
+    """One part in the mesh's own frame."""
+    normals = frozen_array(mesh.vertex_normals) if smooth else None
+    material = Material(base_color=(*color, 1.0))
+    return Part("part", frozen_array(mesh.vertices), frozen_array(mesh.faces, np.int32), material, normals)
+
+
+def shape_of(*meshes: trimesh.Trimesh) -> Shape:
+    """A part for each mesh."""
+    return Shape(tuple(part_of(mesh) for mesh in meshes))
+
+
+def quad(corners: object, turned: bool = False) -> Shape:
+    """Four corners in order as two triangles; `turned` takes the other diagonal."""
+    faces = [[1, 2, 3], [1, 3, 0]] if turned else [[0, 1, 2], [0, 2, 3]]
+    return Shape((Part("quad", frozen_array(corners), frozen_array(faces, np.int32)),))
+
+
+def floor() -> Placed:
+    """A level square of 60 m at z = 0, region 1."""
+    h = FLOOR_HALF_M
+    return Placed(1, quad([[-h, -h, 0], [h, -h, 0], [h, h, 0], [-h, h, 0]]), np.eye(4))
+
+
+def table_shape(rng: np.random.Generator) -> tuple[Shape, float]:
+    """(a table that stands on z = 0, the height of its top): a box or a disc on four legs or on a foot."""
+    height, thickness, color = rng.uniform(0.4, 0.8), rng.uniform(0.01, 0.05), tuple(rng.uniform(0.2, 0.8, 3))
+    size = rng.uniform([0.7, 0.7], [1.4, 1.0])
+    if rng.random() < 0.5:
+        top = trimesh.creation.box((*size, thickness))
+        spots = [(x * 0.45 * size[0], y * 0.45 * size[1]) for x in (-1, 1) for y in (-1, 1)]
+        legs = [trimesh.creation.cylinder(rng.uniform(0.01, 0.03), height - thickness, sections=12) for _ in spots]
+    else:
+        top = trimesh.creation.cylinder(size[1] / 2, thickness, sections=int(rng.integers(20, 90)))
+        spots, legs = [(0.0, 0.0)], [trimesh.creation.box((0.06, 0.06, height - thickness))]
+    top.apply_translation((0, 0, height - thickness / 2))
+    for leg, (x, y) in zip(legs, spots, strict=True):
+        leg.apply_translation((x, y, (height - thickness) / 2))
+    return Shape(tuple(part_of(mesh, color) for mesh in (top, *legs))), height
+
+
+def object_shape(rng: np.random.Generator) -> Shape:
+    """One of eight kinds of thing, about 0.25 m across."""
+    s = rng.uniform(0.07, 0.13)
+    kind = int(rng.integers(8))
+    cylinder, box = trimesh.creation.cylinder, trimesh.creation.box
+    if kind == 0:
+        meshes = [trimesh.creation.icosphere(int(rng.integers(2, 6)), s)]
+    elif kind == 1:
+        meshes = [cylinder(0.5 * s, 2 * s, sections=int(rng.integers(8, 200)))]
+    elif kind == 2:
+        meshes = [trimesh.creation.torus(0.8 * s, 0.25 * s, int(rng.integers(16, 64)), int(rng.integers(8, 48)))]
+    elif kind == 3:  # a camera of boxes and small cylinders that run into one another
+        meshes = [box((1.6 * s, 0.5 * s, s)), cylinder(0.4 * s, 0.8 * s, sections=64), box((0.1 * s, 0.1 * s, 1.2 * s))]
+    elif kind == 4:  # rods of a millimetre or two
+        meshes = [cylinder(rng.uniform(0.0005, 0.002), 2 * s, sections=6) for _ in range(6)]
+        for mesh in meshes:
+            mesh.apply_transform(pose(uniform_rotation(rng), rng.uniform(-0.3 * s, 0.3 * s, 3)))
+    elif kind == 5:  # a bowl without thickness: an open surface, seen from both sides
+        meshes = [trimesh.creation.icosphere(4, s)]
+        meshes[0].update_faces((meshes[0].triangles_center[:, 2] < 0.1 * s))
+    elif kind == 6:
+        meshes = [trimesh.creation.annulus(0.6 * s, 0.65 * s, 1.8 * s, sections=int(rng.integers(24, 128)))]
+    else:  # two thin boards, like an open laptop
+        meshes = [box((2 * s, 1.4 * s, 0.004)), box((2 * s, 0.003, 1.4 * s))]
+        meshes[1].apply_translation((0, 0.7 * s, 0.7 * s))
+    return Shape(tuple(part_of(mesh, tuple(rng.uniform(0.1, 0.9, 3)), smooth=kind in (0, 2)) for mesh in meshes))
+
+
+def stand(shape: Shape, rotation: Array, x: float, y: float, height: float) -> Pose:
+    """[4, 4] float64: turned, and set down so that its lowest vertex is at `height` exactly."""
+    turned = transform(pose(rotation, np.zeros(3)), shape.vertices)
+    return pose(rotation, np.array([x, y, height - turned[:, 2].min()]))
+
+
+def random_things(rng: np.random.Generator) -> tuple[list[Placed], float]:
+    """(floor, a table, one to three objects on it, the height of the table's top)."""
+    table, height = table_shape(rng)
+    things = [floor(), Placed(2, table, np.eye(4))]
+    for region_id in range(3, 4 + int(rng.integers(3))):
+        shape = object_shape(rng)
+        upright = rng.random() < 0.5
+        rotation = rotation_about(UP, rng.uniform(-np.pi, np.pi)) if upright else uniform_rotation(rng)
+        things.append(Placed(region_id, shape, stand(shape, rotation, *rng.uniform(-0.25, 0.25, 2), height)))
+    return things, height
+
+
+def orbit_and_mirror(rng: np.random.Generator, height: float, k: Intrinsics = VGA) -> tuple[Camera, Camera]:
+    """An input camera of the dataset's orbit about the middle of the table top, and a mirror camera across from it."""
+    T = orbit_pose(np.array([0.0, 0.0, height]), rng.uniform(0.7, 0.9), rng.uniform(-np.pi, np.pi), 2.5)
+    return Camera(k, T), Camera(k, mirror_pose(T, rng.uniform(2.1, 2.7)))
+
+
+def procedural_things(rng: np.random.Generator) -> tuple[list[Placed], float]:
+    """(floor, a built-in table, one built-in object of any category on it, the height of the table's top)."""
+    catalogue = built_in_assets()
+    table = load_asset(catalogue, choose_table(catalogue, rng))
+    category = CATEGORIES[int(rng.integers(len(CATEGORIES)))]
+    thing = load_asset(catalogue, choose_object(catalogue, category, rng))
+    height = float(table.extents_m[2])
+    turn = rotation_about(UP, rng.uniform(-np.pi, np.pi)) if rng.random() < 0.8 else uniform_rotation(rng)
+    return [
+        floor(),
+        Placed(2, table.shape, stand(table.shape, np.eye(3), 0.0, 0.0, 0.0)),
+        Placed(3, thing.shape, stand(thing.shape, turn, *rng.uniform(-0.25, 0.25, 2), height)),
+    ], height
+
+
+@functools.cache
+def built_in_assets() -> Catalogue:
+    """The catalogue of a job that names no sources."""
+    return open_catalogue(Assets(), Path(), CATEGORIES)

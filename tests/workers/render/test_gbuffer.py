@@ -1,0 +1,425 @@
+"""Labels and colours of simple scenes, against arithmetic and against the ray caster."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from schemas.base import frozen_array
+from schemas.camera import Camera, Intrinsics
+from schemas.errors import MachineError
+from schemas.scene import Appearance, Light, Placed
+from schemas.shape import Material, Part, Shape
+from tests.workers.render.random_scenes import (
+    APPEARANCE,
+    VGA,
+    floor,
+    object_shape,
+    part_of,
+    quad,
+    random_things,
+    shape_of,
+)
+from tests.workers.render.random_scenes import orbit_and_mirror
+from workers.geometry import raycast
+from workers.geometry.camera import orbit_pose
+from workers.geometry.frames import pose, translation, uniform_rotation
+from workers.geometry.raycast import cast_view
+from workers.render import programs
+from workers.render.batches import decode_srgb, encode_srgb
+from workers.render.context import open_context
+from workers.render.gbuffer import Renderer, shared_renderer
+
+PLANE_MM = 0.001
+"""float32 depth of a plane some metres away: a few units in the last place."""
+
+EYE = np.eye(4)
+"""A camera at the world's origin that looks along z, x to the right, y down."""
+
+WHITE = Appearance(ambient=(1.0, 1.0, 1.0), lights=(), background=(0.0, 0.0, 0.0))
+STEP = 1.0 / 255.0
+
+
+def camera(k: Intrinsics = VGA, T=EYE) -> Camera:
+    return Camera(k, T)
+
+
+def small(width: int, height: int, **moved: float) -> Intrinsics:
+    """A camera of this many pixels with the middle in the middle, 45 degrees to the sides."""
+    k = {"fx": width / 2, "fy": width / 2, "cx": width / 2, "cy": height / 2, **moved}
+    return Intrinsics(width=width, height=height, **k)
+
+
+def facing(z: float, half: float = 100.0) -> Shape:
+    """A square across the optical axis."""
+    return quad([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
+
+
+def plane_depth(k: Intrinsics, normal, offset: float):
+    """Depth of the plane normal . p = offset at every pixel's centre."""
+    v, u = np.mgrid[0 : k.height, 0 : k.width] + 0.5
+    return offset / (normal[0] * (u - k.cx) / k.fx + normal[1] * (v - k.cy) / k.fy + normal[2])
+
+
+def test_depth_of_a_floor_of_sixty_metres_is_that_of_its_plane(renderer):
+    T = orbit_pose(np.array([0.0, 0.0, 0.7]), 0.7, 1.1, 2.5)
+    normal = T[:3, :3].T @ [0.0, 0.0, 1.0]
+    seen = renderer.draw([floor()], APPEARANCE, camera(T=T))
+    assert (seen.region == 1).all()
+    assert np.abs(seen.depth_m - plane_depth(VGA, normal, -T[2, 3])).max() * 1e3 < 2 * PLANE_MM
+
+
+def test_depth_is_taken_at_pixel_centres(renderer):
+    """On a plane this steep half a pixel is 5 mm of depth."""
+    normal = np.array([0.0, 1.0, 0.4])
+    h = 3.0
+    corners = [[x, y, (1.0 - normal[1] * y) / normal[2]] for x, y in ((-h, -0.2), (h, -0.2), (h, 0.9), (-h, 0.9))]
+    k = VGA.model_copy(update={"cx": 317.2, "cy": 251.9})
+    seen = renderer.draw([Placed(7, quad(corners), EYE)], APPEARANCE, camera(k))
+    hit = seen.region == 7
+    expected = plane_depth(k, normal, 1.0)
+    assert hit.mean() > 0.5
+    assert np.abs(seen.depth_m - expected)[hit].max() * 1e3 < PLANE_MM
+    assert np.abs(expected[1:] - expected[:-1])[hit[1:]].min() * 1e3 > 1.0, "the plane is too flat to tell half pixels"
+
+
+def test_a_mask_ends_between_the_pixel_centres_on_both_sides_of_an_edge(renderer):
+    k = small(20, 10, fx=10.0, fy=10.0, cx=0.0, cy=0.0)  # at z = 10 a metre is a pixel
+    edges = {7.49: 7, 7.51: 8, 7.98: 8, 8.49: 8, 8.51: 9}
+    for right, columns in edges.items():
+        square = quad([[2, 3, 10], [right, 3, 10], [right, 6, 10], [2, 6, 10]])
+        region = renderer.draw([Placed(3, square, EYE)], APPEARANCE, camera(k)).region
+        expected = np.zeros((10, 20), bool)
+        expected[3:6, 2:columns] = True
+        np.testing.assert_array_equal(region == 3, expected, err_msg=f"right edge at {right}")
+
+
+def test_right_is_right_and_down_is_down(renderer):
+    things = [Placed(i, facing(2.0, 0.1), translation(*at, 0.0)) for i, at in ((3, (1, 0)), (4, (0, 1)), (5, (-1, 0)))]
+    region = renderer.draw(things, APPEARANCE, camera(small(100, 100))).region
+    assert [region[50, 75], region[75, 50], region[50, 25], region[25, 50]] == [3, 4, 5, 0]
+
+
+def test_a_sphere_of_triangles_agrees_with_rays(renderer):
+    things = [Placed(3, shape_of(trimesh.creation.icosphere(4, 0.1)), translation(0.2, -0.1, 1.5))]
+    seen = renderer.draw(things, APPEARANCE, camera())
+    depth, region, cosine = cast_view(things, camera())
+    np.testing.assert_array_equal(seen.region, region)
+    steep = cosine > 0.17
+    assert np.abs(seen.depth_m - depth)[steep].max() * 1e3 < 0.01
+    middle = seen.depth_m[int(240 - 525 * 0.1 / 1.5), int(320 + 525 * 0.2 / 1.5)]
+    assert middle == pytest.approx(1.4, abs=2e-3)
+
+
+def test_moving_the_principal_point_by_whole_pixels_moves_the_image(renderer):
+    rng = np.random.default_rng(5)
+    things, height = random_things(rng)
+    T = orbit_and_mirror(rng, height)[0].T_world_cam
+    moved = VGA.model_copy(update={"cx": VGA.cx + 40.0, "cy": VGA.cy - 25.0})
+    a, b = (renderer.draw(things, APPEARANCE, camera(k, T)) for k in (VGA, moved))
+    assert (a.region[25:, :-40] != b.region[:-25, 40:]).mean() < 1e-4
+    assert np.median(np.abs(a.depth_m[25:, :-40] - b.depth_m[:-25, 40:])) * 1e3 < PLANE_MM
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (4096, 2), (3, 4096), (641, 479)])
+def test_any_image_size_agrees_with_rays(renderer, width, height):
+    rng = np.random.default_rng(1)
+    f = max(width, height)
+    k = Intrinsics(width=width, height=height, fx=0.8 * f, fy=0.9 * f, cx=0.47 * width, cy=0.55 * height)
+    things, table = random_things(rng)
+    view = Camera(k, orbit_and_mirror(rng, table)[0].T_world_cam)
+    seen = renderer.draw(things, APPEARANCE, view)
+    depth, region, _ = cast_view(things, view)
+    assert seen.rgb.shape == (height, width, 3) and seen.depth_m.shape == seen.region.shape == (height, width)
+    different = np.argwhere(seen.region != region)
+    assert (raycast.edge_distance_px(things, view, different) < 1 / 64).all()
+    floor_seen = (region == 1) & (seen.region == 1)
+    assert np.abs(seen.depth_m - depth)[floor_seen].max(initial=0.0) < 2e-6 * max(1.0, depth.max())
+
+
+def test_both_sides_of_a_face_are_drawn_and_lit(renderer):
+    """The same square seen from its front and from its back, lit from the camera's side, with shading normals or none."""
+    key = Appearance((0.0, 0.0, 0.0), (Light(frozen_array([0.0, 0.0, -1.0]), (0.5, 0.5, 0.5)),), (0.0, 0.0, 0.0))
+    for normals in (None, frozen_array([[0.0, 0.0, 1.0]] * 4)):
+        (part,) = facing(2.0).parts
+        front = Part("square", part.vertices, part.faces, Material(roughness=1.0), normals)
+        back = Part(
+            "square", part.vertices, frozen_array(part.faces[:, ::-1], np.int32), Material(roughness=1.0), normals
+        )
+        seen = [renderer.draw([Placed(3, Shape((p,)), EYE)], key, camera(small(8, 8))) for p in (front, back)]
+        assert all((view.region == 3).all() for view in seen)
+        np.testing.assert_array_equal(seen[0].rgb, seen[1].rgb)
+        assert seen[0].rgb.min() > 60
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["same-triangles", "other-triangles"])
+def test_of_coplanar_faces_the_lowest_region_id_wins(renderer, turned):
+    """Two overlapping squares in one plane, in 60 random poses and seen at up to 80 degrees; the order given is no help."""
+    corners = np.array([[-0.4, -0.3, 0.0], [0.4, -0.3, 0.0], [0.4, 0.3, 0.0], [-0.4, 0.3, 0.0]])
+    low, high = quad(corners), quad(corners * 0.8 + [0.05, 0.02, 0.0], turned)
+    wrong = pixels = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        T = pose(uniform_rotation(rng), np.array([*rng.uniform(-0.2, 0.2, 2), rng.uniform(0.5, 4.0)]))
+        # The second shape stands elsewhere in its own frame, so that its plane is rounded in another way.
+        shift = translation(*rng.uniform(-1.0, 1.0, 2), 0.0)
+        moved = Shape(tuple(Part("p", frozen_array(p.vertices - shift[:3, 3]), p.faces) for p in high.parts))
+        things = [Placed(9, moved, T @ shift), Placed(4, low, T)]
+        seen = renderer.draw(things, APPEARANCE, camera())
+        inside = renderer.draw(things[1:], APPEARANCE, camera()).region == 4
+        wrong += int((inside & (seen.region != 4)).sum())
+        pixels += int(inside.sum())
+    assert pixels > 500_000
+    assert wrong == 0
+
+
+def test_the_base_of_a_thing_on_a_table_belongs_to_the_table_seen_from_below(renderer):
+    """A single-sided table top without thickness, and a box that stands on it with no gap, seen from under the table."""
+    top = Placed(2, quad([[-0.5, -0.4, 0.7], [0.5, -0.4, 0.7], [0.5, 0.4, 0.7], [-0.5, 0.4, 0.7]]), np.eye(4))
+    box = Placed(3, shape_of(trimesh.creation.box((0.2, 0.15, 0.1))), translation(0.03, 0.02, 0.75))
+    beyond = Placed(4, shape_of(trimesh.creation.box((0.2, 0.2, 0.1))), translation(0.5, 0.0, 0.75))
+    view = camera(T=orbit_pose(np.array([0.0, 0.0, 0.7]), -0.6, 0.4, 1.2))
+    seen = renderer.draw([box, beyond, top], APPEARANCE, view)
+    depth, region, _ = cast_view([box, beyond, top], view)
+    assert not (region == 3).any()
+    assert (region == 4).sum() > 1000, "half of the second box hangs over the edge"
+    same = seen.region == region
+    assert (raycast.edge_distance_px([box, beyond, top], view, np.argwhere(~same)) < 1 / 64).all()
+    assert np.abs(seen.depth_m - depth)[same].max() * 1e3 < 0.05
+
+
+def test_a_gap_of_a_twentieth_of_a_millimetre_is_a_gap(renderer):
+    """A tile that lies 0.05 mm above a table is seen whole, although its region id is the higher one."""
+    table = Placed(2, facing(2.0, 1.0), EYE)
+    tile = Placed(40, facing(2.0, 0.201), translation(0, 0, -5e-5))
+    seen = renderer.draw([table, tile], APPEARANCE, camera())
+    v, u = np.mgrid[0:480, 0:640] + 0.5
+    inside = (np.abs(u - 320) < 0.201 / 2 * 525) & (np.abs(v - 240) < 0.201 / 2 * 525)
+    np.testing.assert_array_equal(seen.region == 40, inside)
+
+
+def test_what_is_nearer_than_the_near_plane_is_not_seen_by_renderer_or_rays(renderer):
+    assert programs.NEAR_M == raycast.NEAR_M
+    things = [Placed(3, facing(0.049), EYE), Placed(4, facing(0.051, 0.02), EYE), Placed(5, facing(1.0), EYE)]
+    seen = renderer.draw(things, APPEARANCE, camera(small(64, 64)))
+    depth, region, _ = cast_view(things, camera(small(64, 64)))
+    assert set(np.unique(region)) == {4, 5}
+    np.testing.assert_array_equal(seen.region, region)
+    np.testing.assert_allclose(seen.depth_m, depth, atol=1e-6)
+
+
+def test_where_nothing_is_hit_region_and_depth_are_zero_and_the_background_shows(renderer):
+    seen = renderer.draw([], APPEARANCE, camera(small(5, 4)))
+    assert not seen.region.any() and not seen.depth_m.any()
+    expected = np.round(encode_srgb(np.array(APPEARANCE.background)) * 255)
+    np.testing.assert_array_equal(seen.rgb, np.broadcast_to(expected, (4, 5, 3)))
+
+
+def test_regions_are_never_blended(renderer):
+    rng = np.random.default_rng(11)
+    things, height = random_things(rng)
+    ids = [1, 2, 77, 128, 255]
+    things = [Placed(i, thing.shape, thing.T_world_shape) for i, thing in zip(ids, things, strict=False)]
+    seen = renderer.draw(things, APPEARANCE, orbit_and_mirror(rng, height)[0])
+    assert set(np.unique(seen.region)) <= {0, *ids}
+
+
+# ---------------------------------------------------------------------------------------------------------- colour
+
+
+@pytest.mark.parametrize("level", [0.0, 0.02, 0.2, 0.5, 0.9, 1.0])
+def test_under_white_light_a_rough_surface_shows_its_base_color(renderer, level):
+    """4 % of the light is mirrored and not albedo: ambient light adds it."""
+    (part,) = facing(2.0).parts
+    material = Material(base_color=(level, 0.5, 1.0 - level, 1.0))
+    seen = renderer.draw(
+        [Placed(3, Shape((Part("p", part.vertices, part.faces, material),)), EYE)], WHITE, camera(small(4, 4))
+    )
+    expected = encode_srgb(np.minimum(decode_srgb(np.array([level, 0.5, 1.0 - level])) + 0.04, 1.0)) * 255
+    assert np.abs(seen.rgb[2, 2] - expected).max() <= 0.7
+
+
+def test_light_falls_off_with_the_cosine(renderer):
+    (part,) = facing(2.0).parts
+    shape = Shape((Part("p", part.vertices, part.faces, Material((1.0, 1.0, 1.0, 1.0), roughness=1.0)),))
+    for angle in (0.0, 0.5, 1.0, 1.4):
+        light = Light(frozen_array([np.sin(angle), 0.0, -np.cos(angle)]), (0.5, 0.5, 0.5))
+        seen = renderer.draw([Placed(3, shape, EYE)], Appearance((0.0,) * 3, (light,), (0.0,) * 3), camera(small(9, 9)))
+        linear = decode_srgb(seen.rgb[4, 4] / 255.0)
+        assert linear == pytest.approx(0.5 * np.cos(angle), abs=0.02), f"at {angle} rad"
+
+
+def test_a_texture_stands_upright_and_multiplies_colours(renderer):
+    """uv (0, 0) is the texture's lower left corner; the square's lower left corner in the image has it."""
+    texture = np.zeros((64, 64, 3), np.uint8)
+    texture[:32, :32], texture[:32, 32:], texture[32:, :32], texture[32:, 32:] = (
+        (255, 0, 0),
+        (0, 255, 0),
+        (0, 0, 255),
+        255,
+    )
+    vertices = frozen_array([[-1, 1, 2], [1, 1, 2], [1, -1, 2], [-1, -1, 2]])  # y is down
+    uv, faces = frozen_array([[0, 0], [1, 0], [1, 1], [0, 1]]), frozen_array([[0, 1, 2], [0, 2, 3]], np.int32)
+    for image in (texture, np.dstack([texture, np.full((64, 64), 255, np.uint8)])):
+        material = Material((1.0, 1.0, 0.5, 1.0), texture=image)
+        shape = Shape((Part("p", vertices, faces, material, uv=uv),))
+        seen = renderer.draw([Placed(3, shape, EYE)], WHITE, camera(small(40, 40)))
+        high, low, half = 255, encode_srgb(np.array(0.04)) * 255, encode_srgb(decode_srgb(np.array(0.5)) + 0.04) * 255
+        expected = {
+            (15, 15): (high, low, low),
+            (15, 25): (low, high, low),
+            (25, 15): (low, low, half),
+            (25, 25): (high, high, half),
+        }
+        for (row, column), color in expected.items():
+            assert np.abs(seen.rgb[row, column] - np.array(color)).max() <= 2
+
+
+def test_vertex_colours_are_interpolated_in_linear_light(renderer):
+    (part,) = facing(2.0, 2.0).parts
+    colors = frozen_array([[0, 0, 0, 255], [255, 255, 255, 255], [255, 255, 255, 255], [0, 0, 0, 255]], np.uint8)
+    shape = Shape((Part("p", part.vertices, part.faces, Material((1.0, 1.0, 1.0, 1.0)), colors=colors),))
+    seen = renderer.draw([Placed(3, shape, EYE)], WHITE, camera(small(101, 101)))
+    linear = decode_srgb(seen.rgb[50, :, 1] / 255.0)
+    expected = np.minimum((np.arange(101) + 0.5) / 101 + 0.04, 1.0)
+    assert np.abs(linear - expected)[:95].max() < 0.02
+
+
+def test_many_triangles_look_like_few(renderer):
+    """Two programs draw batches of few and of many triangles: a square of 2 and of 3,200 gives the same image."""
+    (part,) = facing(2.0, 1.0).parts
+    fine = trimesh.Trimesh(part.vertices, part.faces, process=False)
+    for _ in range(6):
+        fine = fine.subdivide()
+    assert len(fine.faces) > 3000
+    lights = (Light(frozen_array([0.3, 0.2, -0.93]), (0.6, 0.5, 0.4)),)
+    look = Appearance((0.2, 0.2, 0.2), lights, (0.0, 0.0, 0.0))
+    a, b = (renderer.draw([Placed(3, s, EYE)], look, camera()) for s in (Shape((part,)), Shape((part_of(fine),))))
+    np.testing.assert_array_equal(a.region, b.region)
+    assert np.abs(a.rgb.astype(int) - b.rgb).max() <= 1
+    assert np.abs(a.depth_m - b.depth_m).max() * 1e3 < PLANE_MM
+
+
+def test_too_many_lights_are_refused(renderer):
+    lights = (Light(frozen_array([0.0, 0.0, 1.0]), (0.1, 0.1, 0.1)),) * 7
+    with pytest.raises(ValueError, match="7 lights: the renderer takes at most 6"):
+        renderer.draw([floor()], Appearance((0.1,) * 3, lights, (0.0,) * 3), camera())
+
+
+# ---------------------------------------------------------------------------------------------------------- counting
+
+
+def test_an_unoccluded_thing_in_the_frame_counts_as_many_pixels_as_its_region(renderer):
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        thing = Placed(3, object_shape(rng), pose(uniform_rotation(rng), np.array([0.1, -0.05, 1.2])))
+        alone = renderer.draw([thing], APPEARANCE, camera())
+        assert renderer.count_pixels(thing, camera()) == pytest.approx((alone.region == 3).sum(), abs=2)
+
+
+def test_pixels_outside_the_frame_and_behind_others_are_counted(renderer):
+    """A disc pushed over the edges of the image keeps its count, whole pixel by whole pixel."""
+    disc = Placed(3, shape_of(trimesh.creation.cylinder(0.2, 0.01, sections=200)), translation(0.0, 0.0, 1.0))
+    whole = renderer.count_pixels(disc, camera())
+    assert whole == pytest.approx(np.pi * (0.2 * 525 / 0.995) ** 2, rel=2e-3)
+    for moved in ({"cx": -50.0}, {"cx": 640.0}, {"cy": 480.0}, {"cx": -100.0, "cy": 570.0}):
+        k = VGA.model_copy(update=moved)
+        assert renderer.count_pixels(disc, camera(k)) == pytest.approx(whole, abs=3)
+    assert (
+        renderer.draw([disc], APPEARANCE, camera(VGA.model_copy(update={"cx": -100.0, "cy": 570.0}))).region == 3
+    ).sum() < whole / 100
+
+
+def test_a_count_over_several_tiles_is_that_of_a_wider_camera(renderer):
+    k, T = small(700, 300), orbit_pose(np.zeros(3), 0.5, 0.3, 0.6)
+    thing = Placed(2, shape_of(trimesh.creation.box((0.9, 0.7, 0.02))), np.eye(4))
+    wide = k.model_copy(update={"width": 2100, "height": 900, "cx": k.cx + 700, "cy": k.cy + 300})
+    assert renderer.count_pixels(thing, Camera(k, T)) == pytest.approx(
+        (cast_view([thing], Camera(wide, T))[1] == 2).sum(), abs=3
+    )
+
+
+def test_of_a_thing_that_reaches_behind_the_camera_the_part_in_front_is_counted(renderer):
+    k = small(60, 40)
+    wide = k.model_copy(update={"width": 180, "height": 120, "cx": k.cx + 60, "cy": k.cy + 40})
+    rod = Placed(2, shape_of(trimesh.creation.box((0.1, 0.1, 4.0))), translation(0.3, 0.2, 1.0))
+    behind = Placed(2, rod.shape, translation(0.0, 0.0, -5.0))
+    assert renderer.count_pixels(rod, camera(k)) == pytest.approx((cast_view([rod], camera(wide))[1] == 2).sum(), abs=2)
+    assert renderer.count_pixels(behind, camera(k)) == 0
+
+
+# ---------------------------------------------------------------------------------------------------------- reuse
+
+
+def test_drawing_again_gives_the_same_bytes(renderer):
+    """Also after other scenes, other sizes, counts, and after the shapes were pushed out of the GPU's store."""
+    rng = np.random.default_rng(21)
+    things, height = random_things(rng)
+    view = orbit_and_mirror(rng, height)[0]
+    first = renderer.draw(things, APPEARANCE, view)
+    for seed in range(30):
+        others, _ = random_things(np.random.default_rng(100 + seed))
+        renderer.draw(others, APPEARANCE, camera(small(100 + seed, 50), view.T_world_cam))
+        renderer.count_pixels(others[-1], view)
+    again = renderer.draw(things, APPEARANCE, view)
+    for name in ("rgb", "depth_m", "region"):
+        assert getattr(first, name).tobytes() == getattr(again, name).tobytes(), name
+
+
+def test_what_is_returned_is_frozen_and_not_the_next_views(renderer):
+    first = renderer.draw([floor()], WHITE, camera(T=orbit_pose(np.zeros(3), 0.8, 0.0, 2.5)))
+    kept = first.rgb.copy(), first.depth_m.copy(), first.region.copy()
+    renderer.draw([], APPEARANCE, camera())
+    for image, copy in zip((first.rgb, first.depth_m, first.region), kept, strict=True):
+        np.testing.assert_array_equal(image, copy)
+        assert not image.flags.writeable and image.flags.c_contiguous
+
+
+def test_shapes_and_framebuffers_on_the_gpu_are_bounded(renderer):
+    first = shape_of(trimesh.creation.icosphere(1, 0.1))
+    renderer.draw([Placed(3, first, translation(0, 0, 1))], APPEARANCE, camera(small(16, 16)))
+    assert first in renderer._shapes
+    for n in range(100):
+        shape = shape_of(trimesh.creation.icosphere(1, 0.1))
+        renderer.draw([Placed(3, shape, translation(0, 0, 1))], APPEARANCE, camera(small(16 + 8 * n, 512)))
+    assert len(renderer._shapes) <= 64
+    assert first not in renderer._shapes
+    assert sum(target.bytes for target in renderer._targets._stored.values()) <= 64 * 2**20
+
+
+def test_memory_stays_flat_over_scenes_with_new_meshes(renderer, record_figure):
+    """300 scenes, each with a new 5,000-face object and a new texture; the first 100 fill the stores."""
+    texture = np.zeros((256, 256, 3), np.uint8)
+    view, resident = camera(small(160, 120)), []
+    for n in range(300):
+        mesh = trimesh.creation.icosphere(4, 0.1)
+        (part,) = facing(2.0).parts
+        textured = Part("p", part.vertices, part.faces, Material(texture=texture.copy()), uv=part.vertices[:, :2])
+        things = [Placed(3, shape_of(mesh), translation(0, 0, 1)), Placed(2, Shape((textured,)), EYE)]
+        renderer.draw(things, APPEARANCE, view)
+        renderer.count_pixels(things[0], view)
+        if n % 100 == 99:
+            resident.append(resident_mib())
+    growth = resident[2] - resident[1]
+    record_figure("render memory growth over 100 scenes, MiB", "passed", growth, 8.0)
+    assert growth < 8.0, f"resident memory, MiB: {resident}"
+
+
+def resident_mib() -> float:
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * 4096 / 2**20
+
+
+def test_there_is_one_renderer_a_process(renderer):
+    assert shared_renderer() is renderer
+    assert renderer.name
+
+
+def test_a_machine_without_gl_is_told_what_to_install(monkeypatch):
+    def missing(name: str):
+        raise ImportError("libEGL.so.1: cannot open shared object file")
+
+    monkeypatch.setattr("workers.render.context.importlib.import_module", missing)
+    with pytest.raises(MachineError, match=r"libEGL.so.1.*apt-get install -y libgl1 libegl1 libgl1-mesa-dri"):
+        open_context()
+    with pytest.raises(MachineError):
+        Renderer()

@@ -1,0 +1,105 @@
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from schemas.errors import CorruptError
+from schemas.manifest import SCHEMAS, TABLES
+from tests.made_up_scenes import failed_scene, made_scene
+from workers.store.manifest import decode_table, encode_table, sorted_rows, table_of_rows
+
+
+def rows_of(table: str) -> list[dict]:
+    return (failed_scene(5) if table == "failures" else made_scene(3)).rows[table]
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_rows_come_back_from_parquet_as_they_went_in(table):
+    plain = rows_of(table)
+    rows = table_of_rows(table, plain)
+    again = decode_table(table, encode_table(rows), "x")
+    assert again.equals(rows)
+    assert again.schema.equals(SCHEMAS[table], check_metadata=True)
+    assert again.to_pylist() == plain
+
+
+def test_numpy_values_are_taken_as_plain_ones():
+    row = rows_of("scenes")[0]
+    other = {**row, "scene_id": np.int64(3), "settle_s": np.float64(0.7), "T_world_obj": np.array(row["T_world_obj"])}
+    other["raycast_checked"] = np.bool_(row["raycast_checked"])
+    assert table_of_rows("scenes", [other]).equals(table_of_rows("scenes", [row]))
+
+
+@pytest.mark.parametrize(
+    ("table", "change", "message"),
+    [
+        ("scenes", {"colour": "red"}, "other columns than the schema: colour"),
+        ("scenes", {"settle_s": None}, "scenes.settle_s is missing in 1 of 1 rows"),
+        ("scenes", {"settle_s": float("nan")}, "scenes.settle_s is not finite: nan"),
+        ("scenes", {"T_world_obj": [float("inf")] * 16}, "scenes.T_world_obj is not finite: inf"),
+        ("scenes", {"T_world_obj": [0.0] * 15}, "scenes: .*16"),
+        ("scenes", {"scene_id": "three"}, "scenes: .*three"),
+        ("scenes", {"scene_id": 2**63}, "scenes: "),
+        ("views", {"files": [{"path": None, "bytes": 1, "sha256": ""}]}, "views.files.path is missing"),
+        ("views", {"mirror_agreement": {"median_mm": float("nan"), "share": 1.0}}, "mirror_agreement.median_mm is not fin"),
+        ("assets", {"volume_m3": float("-inf")}, "assets.volume_m3 is not finite"),
+    ],
+)
+def test_a_row_that_breaks_the_schema_is_refused_by_column(table, change, message):
+    with pytest.raises(ValueError, match=message):
+        table_of_rows(table, [{**rows_of(table)[0], **change}])
+
+
+def test_a_missing_column_is_not_taken_as_null():
+    row = {key: value for key, value in rows_of("scenes")[0].items() if key != "recheck_move_mm"}
+    with pytest.raises(ValueError, match="recheck_move_mm"):
+        table_of_rows("scenes", [row])
+
+
+def test_rows_are_sorted_by_their_key_and_two_of_one_key_are_refused():
+    rows = rows_of("objects")
+    table = sorted_rows("objects", table_of_rows("objects", rows[::-1]))
+    keys = list(zip(*(table.column(name).to_pylist() for name in ("pose_id", "role", "region_id")), strict=True))
+    assert keys == sorted(keys)
+    with pytest.raises(ValueError, match="objects: two rows have the key pose_id, role, region_id"):
+        sorted_rows("objects", table_of_rows("objects", [*rows, rows[3]]))
+
+
+@pytest.mark.parametrize("table", ["scenes", "failures"])
+def test_a_flipped_bit_anywhere_is_found_or_harmless(table):
+    rows = table_of_rows(table, rows_of(table))
+    data = encode_table(rows)
+    found = 0
+    for position in range(0, len(data), 7):
+        damaged = bytearray(data)
+        damaged[position] ^= 1 << (position % 8)
+        try:
+            again = decode_table(table, bytes(damaged), "manifest/_ranges/0/x.parquet")
+        except CorruptError as error:
+            assert "manifest/_ranges/0/x.parquet" in str(error)
+            found += 1
+        else:
+            assert again.equals(rows), f"byte {position}"
+    assert found > len(data) / 7 / 10
+
+
+def test_a_torn_file_and_another_table_are_told_by_name():
+    data = encode_table(table_of_rows("scenes", rows_of("scenes")))
+    for damaged in (data[: len(data) // 2], b"", b"PAR1" + bytes(20) + b"PAR1"):
+        with pytest.raises(CorruptError, match="here.parquet cannot be read"):
+            decode_table("scenes", damaged, "here.parquet")
+    with pytest.raises(CorruptError, match="lacks the column pose_id of the table views"):
+        decode_table("views", data, "here.parquet")
+
+
+def test_rows_of_an_older_version_get_null_for_columns_that_came_later():
+    rows = table_of_rows("scenes", rows_of("scenes")).drop_columns("recheck_move_mm")
+    again = decode_table("scenes", encode_table(rows), "x")
+    assert again.schema.equals(SCHEMAS["scenes"])
+    assert again.column("recheck_move_mm").to_pylist() == [None]
+
+
+def test_files_carry_the_schema_version_and_page_checksums():
+    metadata = pq.ParquetFile(pa.BufferReader(encode_table(table_of_rows("scenes", rows_of("scenes"))))).schema_arrow.metadata
+    assert metadata[b"schema_version"] == b"1"
+    assert metadata[b"verso_table"] == b"scenes"

@@ -1,0 +1,161 @@
+"""Pure: closed triangle solids, made by lofting rings and joined by manifold3d's exact booleans.
+
+Only +, -, *, / and square roots touch coordinates here and in `curves`: they give the same bits on every processor.
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import manifold3d  # type: ignore[import-not-found]
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array
+
+Indices = NDArray[np.int64]
+
+SMOOTH_COSINE = 0.8
+"""Neighbouring bands that turn by less than about 37 degrees are shaded as one smooth surface."""
+_SURFACES = 64
+_SMOOTHS = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A closed surface, counter-clockwise seen from outside.
+
+    vertices [V, 3] float64 metres; faces [F, 3] int64; surface [F] int64: which look a face has; smooth [F] int64:
+    faces of one number share shading normals where they meet.
+    """
+
+    vertices: Array
+    faces: Indices
+    surface: Indices
+    smooth: Indices
+
+    def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Solid":
+        """The solid shifted, metres."""
+        return self.placed(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.array([x, y, z]))
+
+    def placed(self, axes: Array, origin: Array) -> "Solid":
+        """The solid with its x, y, z along the rows of `axes` [3, 3] (a right-handed turn) and its origin at `origin`."""
+        x, y, z = self.vertices[:, 0:1], self.vertices[:, 1:2], self.vertices[:, 2:3]
+        return Solid(x * axes[0] + y * axes[1] + z * axes[2] + origin, self.faces, self.surface, self.smooth)
+
+
+@functools.cache
+def circle(count: int) -> Array:
+    """[count, 2] float64: points of the unit circle, counter-clockwise from (1, 0); quarters are exact."""
+    points = []
+    for k in range(count):
+        quarter, rest = divmod(4 * k, count)
+        angle = math.pi * rest / (2 * count)
+        c, s = math.cos(angle), math.sin(angle)
+        points.append(((c, s), (-s, c), (-c, -s), (s, -c))[quarter])
+    table = np.array(points)
+    table.setflags(write=False)
+    return table
+
+
+@functools.cache
+def _tube_faces(rings: int, count: int) -> tuple[Indices, Indices]:
+    """Faces of a tube and the band [F] of each: 0 the fan at the start, then band by band, last the fan at the end."""
+    j = np.arange(count)
+    nxt = (j + 1) % count
+    base = np.arange(rings - 1)[:, None] * count
+    a, b, c, d = base + j, base + nxt, base + count + nxt, base + count + j
+    body = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], axis=2).reshape(-1, 3)
+    start, end, top = rings * count, rings * count + 1, (rings - 1) * count
+    first = np.stack([np.full(count, start), nxt, j], -1)
+    last = np.stack([np.full(count, end), top + j, top + nxt], -1)
+    faces = np.concatenate([first, body, last])
+    band = np.repeat(np.arange(rings + 1), [count, *[2 * count] * (rings - 1), count])
+    faces.setflags(write=False)
+    band.setflags(write=False)
+    return faces, band
+
+
+def loft(
+    rings: Array, start: Array, end: Array, surface: Sequence[int] | Indices, smooth: Sequence[int] | Indices
+) -> Solid:
+    """The tube through rings [L, n, 3] (each counter-clockwise seen from the end), closed by fans to two points.
+
+    surface and smooth have one number for each band [L + 1]: the fan at the start, L - 1 bands, the fan at the end.
+    """
+    levels, count = rings.shape[:2]
+    faces, band = _tube_faces(levels, count)
+    vertices = np.concatenate([rings.reshape(-1, 3), start[None], end[None]])
+    return Solid(vertices, faces, np.asarray(surface, dtype=np.int64)[band], np.asarray(smooth, dtype=np.int64)[band])
+
+
+def lathe(profile: Array, surface: Sequence[int] | Indices, count: int = 48, section: Array | None = None) -> Solid:
+    """The solid of revolution of a profile [P, 2] of (radius, height), metres, from the axis to the axis.
+
+    Outside lies to the right along the profile: outwards along the bottom, up the wall, back to the axis. `surface`
+    has one number for each segment [P - 1]. `section` [P - 2, n, 2] replaces the unit circle ring by ring.
+    """
+    inner = profile[1:-1]
+    outline = circle(count)[None] if section is None else section
+    level = np.broadcast_to(inner[:, 1][:, None, None], (len(inner), outline.shape[1], 1))
+    rings = np.concatenate([outline * inner[:, 0][:, None, None], level], axis=2)
+    start, end = np.array([0.0, 0.0, profile[0, 1]]), np.array([0.0, 0.0, profile[-1, 1]])
+    return loft(rings, start, end, surface, smooth_runs(profile))
+
+
+def smooth_runs(profile: Array) -> Indices:
+    """[P - 1] int64: the number of the smooth run that each segment of a polyline [P, 2] belongs to."""
+    step = np.diff(profile, axis=0)
+    length = np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2)
+    along = step / np.where(length == 0.0, 1.0, length)[:, None]
+    cosine = along[1:, 0] * along[:-1, 0] + along[1:, 1] * along[:-1, 1]
+    return np.concatenate([[0], np.cumsum(cosine < SMOOTH_COSINE)]).astype(np.int64)
+
+
+def together(solids: Sequence[Solid]) -> Solid:
+    """Solids that do not touch one another, as one: booleans take them in one step."""
+    starts = np.cumsum([0, *(len(solid.vertices) for solid in solids[:-1])])
+    smooths = np.cumsum([0, *(int(solid.smooth.max()) + 1 for solid in solids[:-1])])
+    return Solid(
+        np.concatenate([solid.vertices for solid in solids]),
+        np.concatenate([solid.faces + start for solid, start in zip(solids, starts, strict=True)]),
+        np.concatenate([solid.surface for solid in solids]),
+        np.concatenate([solid.smooth + first for solid, first in zip(solids, smooths, strict=True)]),
+    )
+
+
+def union(solids: Sequence[Solid]) -> Solid:
+    """All the solids as one, without what lies inside; MeshError never: a bad solid is a bug and raises ValueError."""
+    return _from_manifold(manifold3d.Manifold.batch_boolean(_tagged(solids), manifold3d.OpType.Add))
+
+
+def difference(solid: Solid, cutters: Sequence[Solid]) -> Solid:
+    """The solid without the cutters; the cuts have the cutters' surfaces."""
+    return _from_manifold(manifold3d.Manifold.batch_boolean(_tagged([solid, *cutters]), manifold3d.OpType.Subtract))
+
+
+def _tagged(solids: Sequence[Solid]) -> list[manifold3d.Manifold]:
+    """The solids in manifold3d, each face with its surface and a smooth number of its own solid's in its face id."""
+    manifolds = []
+    first = 0
+    for solid in solids:
+        tag = (solid.smooth + first) * _SURFACES + solid.surface
+        first += int(solid.smooth.max()) + 1
+        mesh = manifold3d.Mesh64(
+            vert_properties=np.ascontiguousarray(solid.vertices),
+            tri_verts=solid.faces.astype(np.uint64),
+            face_id=tag.astype(np.uint64),
+        )
+        manifold = manifold3d.Manifold(mesh)
+        if manifold.status() != manifold3d.Error.NoError:
+            raise ValueError(f"not a closed solid: {manifold.status()}")
+        manifolds.append(manifold)
+    return manifolds
+
+
+def _from_manifold(manifold: manifold3d.Manifold) -> Solid:
+    mesh = manifold.to_mesh64()
+    tag = np.asarray(mesh.face_id, dtype=np.int64)
+    vertices = np.array(mesh.vert_properties[:, :3], dtype=np.float64)
+    return Solid(vertices, np.asarray(mesh.tri_verts, dtype=np.int64), tag % _SURFACES, tag // _SURFACES)

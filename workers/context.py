@@ -1,0 +1,34 @@
+"""What a worker process holds while it makes scenes: the job, its assets, the renderer."""
+
+import hashlib
+import json
+from dataclasses import dataclass
+
+from schemas.job import Job
+from workers.assets.catalogue import Catalogue
+from workers.render.gbuffer import Renderer
+
+OUTSIDE_SETTINGS = {"name", "scenes", "first_scene", "run", "output", "verso"}
+"""Keys of a job that do not change what a scene is."""
+
+
+@dataclass(frozen=True, eq=False)
+class WorkerContext:
+    """One for each process: the renderer has the process's one GL context."""
+
+    job: Job
+    catalogue: Catalogue
+    renderer: Renderer
+    settings_digest: str
+
+
+def settings_digest(job: Job, catalogue_digest: str) -> str:
+    """SHA-256, hex, of everything that decides what a scene is: settings and assets, not how many or how driven.
+
+    Where an asset folder lies is left out: the same files elsewhere are the same assets.
+    """
+    settings = job.model_dump(mode="json", exclude=OUTSIDE_SETTINGS)
+    for source in (*settings["assets"]["objects"], *settings["assets"]["tables"]):
+        source.pop("folder", None)
+    text = json.dumps([settings, catalogue_digest], sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()

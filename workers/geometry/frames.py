@@ -1,0 +1,90 @@
+"""Rigid transforms. World: z up, metres, floor at z = 0. Optical frame: x right, y down, z forward."""
+
+import math
+
+import numpy as np
+
+from schemas.base import Array, Pose
+
+UP = np.array([0.0, 0.0, 1.0])
+"""The world's up: the floor's normal."""
+
+
+def pose(rotation: Array, position: Array) -> Pose:
+    """[4, 4] float64 from a [3, 3] rotation and a [3] position."""
+    T = np.eye(4)
+    T[:3, :3] = rotation
+    T[:3, 3] = position
+    return T
+
+
+def translation(x: float, y: float, z: float) -> Pose:
+    """[4, 4] float64."""
+    return pose(np.eye(3), np.array([x, y, z]))
+
+
+def rotation_about(axis: Array, angle_rad: float) -> Array:
+    """[3, 3] float64: right-handed turn about a unit axis (Rodrigues' formula)."""
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle_rad) * K + (1.0 - math.cos(angle_rad)) * (K @ K)
+
+
+def half_turn(axis: Array) -> Array:
+    """[3, 3] float64: the turn by pi about a unit axis, 2 a a^T - I, exact where sin(pi) is not."""
+    return 2.0 * np.outer(axis, axis) - np.eye(3)
+
+
+def invert(T: Pose) -> Pose:
+    """[4, 4] float64: the inverse of a rigid transform."""
+    R = T[:3, :3].T
+    return pose(R, -R @ T[:3, 3])
+
+
+def transform(T: Pose, points: Array) -> Array:
+    """[N, 3] float64: points taken through a rigid transform.
+
+    Written out as sums of products, because a matrix product may add in another order on another machine.
+    """
+    x, y, z = points[:, 0], points[:, 1], points[:, 2]
+    return np.stack([T[i, 0] * x + T[i, 1] * y + T[i, 2] * z + T[i, 3] for i in range(3)], axis=1)
+
+
+def rotation_from_quaternion(xyzw: Array) -> Array:
+    """[3, 3] float64 from a quaternion (x, y, z, w) of any length but zero."""
+    x, y, z, w = np.asarray(xyzw, dtype=np.float64) / math.sqrt(sum(float(c) ** 2 for c in xyzw))
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def uniform_rotation(rng: np.random.Generator) -> Array:
+    """[3, 3] float64: uniform over all rotations (a normal 4-vector has a uniform direction)."""
+    return rotation_from_quaternion(rng.standard_normal(4))
+
+
+def rotation_between(a: Array, b: Array) -> Array:
+    """[3, 3] float64: the smallest turn that takes unit vector a to unit vector b.
+
+    Where b = -a every axis in the plane across a serves; the one nearest the x axis (or y, along x) is taken.
+    """
+    axis = np.cross(a, b)
+    sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
+    if sine < 1e-15:
+        if cosine > 0:
+            return np.eye(3)
+        other = np.array([1.0, 0.0, 0.0]) if abs(a[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+        across = np.cross(a, other)
+        return half_turn(across / np.linalg.norm(across))
+    return rotation_about(axis / sine, math.atan2(sine, cosine))
+
+
+def angle_between(A: Array, B: Array) -> float:
+    """Angle, radians in [0, pi], of the turn between two rotations [3, 3]; accurate also where it is tiny."""
+    D = A.T @ B
+    sine = 0.5 * np.linalg.norm([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
+    return math.atan2(float(sine), 0.5 * (float(np.trace(D)) - 1.0))

@@ -1,0 +1,222 @@
+"""A ray caster in float64 on Embree: the slow, independent answer to what a camera sees at its pixel centres.
+
+Embree, in its watertight mode, only says which triangle a ray meets; where it meets it is computed again in float64
+from that triangle's plane, so that neither Embree's float32 distance nor anything of the rasteriser limits it. Each
+thing is cast on its own, which is how ties between coplanar faces of two things can be seen and given to the lower
+region id. Both sides of every face count.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from numpy.typing import NDArray
+
+from schemas.base import Array
+from schemas.camera import Camera
+from schemas.scene import Placed
+from workers.geometry.frames import invert, transform
+
+NEAR_M = 0.05
+"""Surfaces nearer than this, along the optical axis, are not seen: the near plane of the fast renderer."""
+
+COPLANAR_M = 1e-6
+"""Two surfaces less than this apart, measured along the normal, are one: ten times what float32 coordinates of a scene
+a few metres across resolve, and a hundredth of the smallest gap that physics leaves."""
+
+GRAZING = 1e-6
+"""Cosine of incidence below which a plane no longer says where the ray meets the triangle; Embree's distance then does."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """Where rays first meet a surface.
+
+    distance [N] float64, in lengths of each ray's direction, inf where nothing is met; region [N] uint8, 0 there;
+    incidence_cos [N] float32, cosine of the angle between ray and face normal in [0, 1], 0 there.
+    """
+
+    distance: Array
+    region: NDArray[np.uint8]
+    incidence_cos: NDArray[np.float32]
+
+
+def cast_view(things: Sequence[Placed], camera: Camera) -> tuple[Array, NDArray[np.uint8], NDArray[np.float32]]:
+    """What the camera sees through every pixel's centre (column + 0.5, row + 0.5).
+
+    Returns depth_m [H, W] float64, z along the optical axis in metres, 0 where nothing is hit; region [H, W] uint8;
+    incidence_cos [H, W] float32. Surfaces with z below `NEAR_M` are passed through.
+    """
+    intrinsics = camera.intrinsics
+    rows, columns = np.mgrid[0 : intrinsics.height, 0 : intrinsics.width]
+    rays = np.ones((rows.size, 3))
+    rays[:, 0] = (columns.ravel() + 0.5 - intrinsics.cx) / intrinsics.fx
+    rays[:, 1] = (rows.ravel() + 0.5 - intrinsics.cy) / intrinsics.fy
+    best = _nothing(len(rays))
+    for thing in _ascending(things):
+        mesh = _in_camera(thing, camera)
+        pixels = _pixels_in_reach(mesh.vertices, camera)
+        _keep_nearer(best, pixels, *_cast(mesh, NEAR_M * rays[pixels], rays[pixels]), thing.region_id, offset=NEAR_M)
+    depth = np.where(np.isinf(best.distance), 0.0, best.distance)
+    shape = (intrinsics.height, intrinsics.width)
+    return depth.reshape(shape), best.region.reshape(shape), best.incidence_cos.reshape(shape)
+
+
+def first_hit(things: Sequence[Placed], origins: Array, directions: Array) -> Hits:
+    """The first surface that each ray meets; origins and directions [N, 3] float64, world, metres.
+
+    Keep origins within some metres of the things: Embree holds coordinates in float32.
+    """
+    best = _nothing(len(origins))
+    everything = np.arange(len(origins))
+    for thing in _ascending(things):
+        mesh = _Mesh(transform(thing.T_world_shape, thing.shape.vertices), thing.shape.faces)
+        _keep_nearer(best, everything, *_cast(mesh, origins, directions), thing.region_id)
+    return best
+
+
+def edge_distance_px(
+    things: Sequence[Placed], camera: Camera, pixels: NDArray, outline_only: bool = False, chunk: int = 4_000_000
+) -> Array:
+    """Distance, pixels, from each pixel's centre to the nearest projected triangle edge of any thing; [N] float64.
+
+    pixels [N, 2] are (row, column). Edges are cut at the near plane; inf where no edge is in front of the camera. With
+    `outline_only`, only edges at which a mask can end count: those of a boundary, of a fold (more than two faces), and
+    those between a face that is seen from its front and one that is seen from its back. At most `chunk` distances are
+    held at once. Lines along which surfaces cut through one another are not edges of either.
+    """
+    centres = np.asarray(pixels, dtype=np.float64)[:, ::-1] + 0.5
+    nearest = np.full(len(centres), np.inf)
+    for thing in things:
+        mesh = _in_camera(thing, camera)
+        starts, ends = _project_edges(mesh, _outline(mesh) if outline_only else _edges(mesh), camera)
+        step = max(1, chunk // max(1, len(centres)))
+        for first in range(0, len(starts), step):
+            part = slice(first, first + step)
+            np.minimum(nearest, _segment_distance(centres, starts[part], ends[part]), out=nearest)
+    return nearest
+
+
+@dataclass(frozen=True, eq=False)
+class _Mesh:
+    """vertices [V, 3] float64 in some frame; faces [F, 3] int32."""
+
+    vertices: Array
+    faces: NDArray[np.int32]
+
+
+def _ascending(things: Sequence[Placed]) -> list[Placed]:
+    return sorted(things, key=lambda thing: thing.region_id)
+
+
+def _in_camera(thing: Placed, camera: Camera) -> _Mesh:
+    return _Mesh(transform(invert(camera.T_world_cam) @ thing.T_world_shape, thing.shape.vertices), thing.shape.faces)
+
+
+def _nothing(count: int) -> Hits:
+    return Hits(np.full(count, np.inf), np.zeros(count, np.uint8), np.zeros(count, np.float32))
+
+
+def _pixels_in_reach(vertices: Array, camera: Camera) -> NDArray[np.int64]:
+    """Flat indices of the pixels whose rays can meet a mesh: its projected bounding box, a pixel wider on each side."""
+    k = camera.intrinsics
+    if (vertices[:, 2] <= NEAR_M).any():
+        return np.arange(k.width * k.height)
+    u = k.fx * vertices[:, 0] / vertices[:, 2] + k.cx
+    v = k.fy * vertices[:, 1] / vertices[:, 2] + k.cy
+    left, right = np.clip([np.floor(u.min()) - 1, np.ceil(u.max()) + 1], 0, k.width).astype(np.int64)
+    top, bottom = np.clip([np.floor(v.min()) - 1, np.ceil(v.max()) + 1], 0, k.height).astype(np.int64)
+    return (np.arange(top, bottom)[:, None] * k.width + np.arange(left, right)).ravel()
+
+
+def _cast(mesh: _Mesh, origins: Array, directions: Array) -> tuple[Array, Array]:
+    """(distance, incidence_cos), each [N] float64: distance inf and cosine 0 where the ray meets nothing."""
+    distance, cosine = np.full(len(origins), np.inf), np.zeros(len(origins))
+    if not len(origins) or not len(mesh.faces):
+        return distance, cosine  # Embree does not take empty scenes
+    scene = EmbreeScene(robust=True)
+    geometry = TriangleMesh(scene, mesh.vertices.astype(np.float32), np.ascontiguousarray(mesh.faces, dtype=np.int32))
+    found = scene.run(origins.astype(np.float32), directions.astype(np.float32), output=1)
+    del geometry
+    hit = np.flatnonzero(found["primID"] >= 0)
+    normals, offsets = _planes(mesh)
+    face, o, d = found["primID"][hit], origins[hit], directions[hit]
+    n = normals[face]
+    towards = np.einsum("ij,ij->i", n, d)
+    cosine[hit] = np.abs(towards) / np.sqrt(np.einsum("ij,ij->i", d, d))
+    steep = cosine[hit] > GRAZING
+    exact = (offsets[face] - np.einsum("ij,ij->i", n, o)) / np.where(steep, towards, 1.0)
+    distance[hit] = np.where(steep, exact, found["tfar"][hit].astype(np.float64))
+    return distance, cosine
+
+
+def _planes(mesh: _Mesh) -> tuple[Array, Array]:
+    """(normals [F, 3], offsets [F]): unit normal n of each face, 0 where it has no area, and n . p of its points p."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
+    return normals, np.einsum("ij,ij->i", normals, a)
+
+
+def _keep_nearer(
+    best: Hits, rays: NDArray[np.int64], distance: Array, cosine: Array, region_id: int, *, offset: float = 0.0
+) -> None:
+    """Write into `best` the hits that are nearer by more than `COPLANAR_M` along the normal than what stands there."""
+    distance = distance + offset
+    nearer = distance + COPLANAR_M / np.maximum(cosine, GRAZING) < best.distance[rays]
+    won = rays[nearer]
+    best.distance[won] = distance[nearer]
+    best.region[won] = region_id
+    best.incidence_cos[won] = cosine[nearer]
+
+
+def _edges(mesh: _Mesh) -> NDArray[np.int64]:
+    """[E, 2]: the vertex pairs of every edge, once each."""
+    pairs = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
+    key = np.unique(pairs[:, 0] * len(mesh.vertices) + pairs[:, 1])
+    return np.stack(np.divmod(key, len(mesh.vertices)), axis=1)
+
+
+def _outline(mesh: _Mesh) -> NDArray[np.int64]:
+    """[E, 2]: edges without exactly two faces, or whose two faces show the camera different sides.
+
+    Vertices at one place are one vertex here, because seams of texture and shading split them.
+    """
+    _, first, welded = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
+    faces = welded.reshape(-1)[mesh.faces].astype(np.int64)
+    front = _planes(mesh)[1] < 0.0
+    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    turned = directed[:, 0] > directed[:, 1]
+    pairs = np.sort(directed, axis=1)
+    side = np.where(np.repeat(front, 3), 1, -1) * np.where(turned, -1, 1)
+    key, group, count = np.unique(pairs[:, 0] * len(first) + pairs[:, 1], return_inverse=True, return_counts=True)
+    balance = np.bincount(group.reshape(-1), weights=side, minlength=len(key))
+    kept = key[(count != 2) | (balance != 0)]
+    return first[np.stack(np.divmod(kept, len(first)), axis=1)]
+
+
+def _project_edges(mesh: _Mesh, edges: NDArray[np.int64], camera: Camera) -> tuple[Array, Array]:
+    """(starts, ends), each [E', 2] float64: image coordinates of the parts of edges in front of the near plane."""
+    a, b = mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]]
+    seen = (a[:, 2] > NEAR_M) | (b[:, 2] > NEAR_M)
+    a, b = a[seen], b[seen]
+    k, ends = camera.intrinsics, []
+    for near, far in ((a, b), (b, a)):
+        gap = np.where(far[:, 2] == near[:, 2], 1.0, far[:, 2] - near[:, 2])
+        share = np.where(near[:, 2] < NEAR_M, (NEAR_M - near[:, 2]) / gap, 0.0)[:, None]
+        cut = near + share * (far - near)
+        z = np.maximum(cut[:, 2], NEAR_M)
+        ends.append(np.stack([k.fx * cut[:, 0] / z + k.cx, k.fy * cut[:, 1] / z + k.cy], axis=1))
+    return ends[0], ends[1]
+
+
+def _segment_distance(points: Array, starts: Array, ends: Array) -> Array:
+    """[N] float64: distance from each point to the nearest of the segments."""
+    along = ends - starts
+    length2 = np.maximum((along**2).sum(axis=1), 1e-300)
+    offset = points[:, None, :] - starts
+    share = np.clip((offset * along).sum(axis=2) / length2, 0.0, 1.0)
+    return np.sqrt((((offset - share[:, :, None] * along) ** 2).sum(axis=2)).min(axis=1, initial=np.inf))

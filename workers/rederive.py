@@ -1,0 +1,216 @@
+"""Labels derived again from what is stored: the images, the rows and the job, and nothing of the renderer."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array, frozen_array
+from schemas.camera import Camera, Intrinsics, Role
+from schemas.job import Job
+from schemas.layout import IMAGES, file_pose_id, image_path, patch_path
+from schemas.scene import REGION_FIRST_OBJECT, ObjectLabel, View
+from workers.geometry.camera import image_coordinates
+from workers.geometry.frames import invert
+from workers.scene.derive import agree_across, bounding_box, crop_box, derive_projected, projection_shares
+from workers.scene.views import front_distance, place_aligned_camera, place_mirror_camera, stored_depth_m
+
+SAME = 1e-12
+"""Poses and distances that are computed again from the same doubles agree to rounding."""
+
+Row = Mapping[str, Any]
+ReadImage = Callable[[str], NDArray]
+DTYPES = {"rgb": np.uint8, "depth": np.uint16, "region": np.uint8}
+
+
+def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], scene: Row, read: ReadImage) -> list[str]:
+    """Everything of one pair that does not follow from the rest of it, a sentence each; empty where all does.
+
+    `views` holds the pair's four rows by role, `objects` its rows of that table, `read` returns an image by its path.
+    """
+    faults: list[str] = []
+    loaded = {role: _load(row, read, faults) for role, row in views.items()}
+    if faults:
+        return faults
+    stored = {role: _view(row, loaded[role], _labels(objects, row)) for role, row in views.items()}
+    for role, view in stored.items():
+        if role != "projected":
+            faults += _check_labels(view, scene)
+            faults += _check_images(view)
+        faults += _check_patches(view, stored, job, read, views[role])
+    return faults + _check_cameras(job, stored, views) + _check_projection(job, stored, views)
+
+
+def _load(row: Row, read: ReadImage, faults: list[str]) -> dict[str, NDArray]:
+    """A view's images by kind of pixel, with their sizes and types checked."""
+    images: dict[str, NDArray] = {}
+    for image in IMAGES:
+        if image.role != row["role"]:
+            continue
+        path = image_path(row["category"], image.content, file_pose_id(row["role"], row["parent_id"]))
+        pixels = read(path)
+        shape = (row["height"], row["width"], 3)[: 3 if image.pixels == "rgb" else 2]
+        if pixels.shape != shape or pixels.dtype != DTYPES[image.pixels]:
+            faults.append(
+                f"{path}: is {pixels.dtype} {pixels.shape}, and must be {DTYPES[image.pixels].__name__} {shape}"
+            )
+        images[image.pixels] = pixels
+    return images
+
+
+def camera_of(row: Row) -> Camera:
+    """The camera that a row of `views` describes."""
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    return Camera(
+        Intrinsics(**{name: row[name] for name in names}), frozen_array(np.reshape(row["T_world_cam"], (4, 4)))
+    )
+
+
+def _labels(objects: list[Row], view: Row) -> tuple[ObjectLabel, ...]:
+    rows = [row for row in objects if (row["pose_id"], row["role"]) == (view["pose_id"], view["role"])]
+    return tuple(
+        ObjectLabel(
+            row["region_id"],
+            row["category"],
+            row["instance_id"],
+            np.reshape(row["T_cam_obj"], (4, 4)),
+            row["u"],
+            row["v"],
+            tuple(row["bbox_xywh"]),
+            row["pixels"],
+            row["visible_fraction"],
+        )
+        for row in sorted(rows, key=lambda row: row["region_id"])
+    )
+
+
+def _view(row: Row, images: Mapping[str, NDArray], labels: tuple[ObjectLabel, ...]) -> View:
+    role: Role = row["role"]
+    return View(
+        role,
+        row["pose_id"],
+        row["parent_id"],
+        camera_of(row),
+        images["rgb"],
+        images["depth"],
+        images.get("region"),
+        labels,
+    )
+
+
+def _differs(a: Array, b: Array) -> bool:
+    return bool(np.abs(np.asarray(a) - np.asarray(b)).max() > SAME)
+
+
+def _check_labels(view: View, scene: Row) -> list[str]:
+    """Rows of `objects` against the mask and the poses."""
+    assert view.region is not None
+    where, faults = f"pose {view.pose_id} ({view.role})", []
+    worlds = {
+        label.region_id: scene["T_world_obj" if label.region_id >= REGION_FIRST_OBJECT else "T_world_table"]
+        for label in view.labels
+    }
+    for label in view.labels:
+        mask = view.region == label.region_id
+        name = f"{where}, region {label.region_id}"
+        if int(mask.sum()) != label.pixels:
+            faults.append(f"{name}: the mask has {int(mask.sum())} pixels, objects says {label.pixels}")
+        if bounding_box(mask) != label.bbox_xywh:
+            faults.append(f"{name}: the mask's box is {bounding_box(mask)}, objects says {label.bbox_xywh}")
+        if image_coordinates(label.T_cam_obj, view.camera.intrinsics) != (label.u, label.v):
+            faults.append(f"{name}: T_cam_obj projects to another pixel than ({label.u}, {label.v})")
+        if _differs(invert(view.camera.T_world_cam) @ np.reshape(worlds[label.region_id], (4, 4)), label.T_cam_obj):
+            faults.append(f"{name}: T_cam_obj does not follow from the camera's and the object's poses")
+        if not 0.0 <= label.visible_fraction <= 1.0:
+            faults.append(f"{name}: visible_fraction {label.visible_fraction} is no share")
+    return faults
+
+
+def _check_images(view: View) -> list[str]:
+    """Masks against depth, and against the regions that objects names."""
+    assert view.region is not None
+    known = {0, 1} | {label.region_id for label in view.labels}
+    foreign = set(np.unique(view.region).tolist()) - known
+    faults = (
+        [f"pose {view.pose_id} ({view.role}): the mask has regions {sorted(foreign)} that objects lacks"]
+        if foreign
+        else []
+    )
+    if (view.depth[view.region == 0] != 0).any():
+        faults.append(f"pose {view.pose_id} ({view.role}): depth where the mask says that nothing was hit")
+    return faults
+
+
+def _check_patches(view: View, stored: Mapping[str, View], job: Job, read: ReadImage, row: Row) -> list[str]:
+    """Patches are crops of the images, and are there exactly where the crop stays inside."""
+    labels = [
+        label
+        for label in (stored["mirror"] if view.role == "projected" else view).labels
+        if label.region_id >= REGION_FIRST_OBJECT
+    ]
+    pixels: dict[str, NDArray | None] = {"rgb": view.rgb, "depth": view.depth, "region": view.region}
+    listed = {file["path"] for file in row["files"]}
+    faults, expected = [], set()
+    for image in (image for image in IMAGES if image.role == view.role):
+        number = file_pose_id(view.role, view.parent_id)
+        expected.add(image_path(row["category"], image.content, number))
+        for label in labels:
+            box = crop_box(label, view.camera, job.images.patch)
+            index = None if len(labels) == 1 else label.region_id - REGION_FIRST_OBJECT
+            path = patch_path(row["category"], image.content, number, index)
+            if box is None:
+                continue
+            expected.add(path)
+            full = pixels[image.pixels]
+            if path in listed and full is not None and not np.array_equal(read(path), full[box]):
+                faults.append(f"{path}: is not the crop of its image")
+    if expected != listed:
+        faults.append(
+            f"pose {view.pose_id} ({view.role}): files {sorted(expected ^ listed)} should be there, or should not"
+        )
+    return faults
+
+
+def _check_cameras(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> list[str]:
+    """d_z from the input's stored depth; the aligned and mirror poses from it."""
+    first, faults = stored["input"], []
+    assert first.region is not None
+    depth_m = stored_depth_m(first.depth, job.images)
+    d_z = front_distance(depth_m, first.region >= REGION_FIRST_OBJECT, job.cameras.mirror)
+    poses = {
+        "aligned": place_aligned_camera(first.camera, job.cameras.depth),
+        "mirror": place_mirror_camera(first.camera, d_z, job.cameras.mirror),
+    }
+    poses["projected"] = poses["mirror"]
+    for role, camera in poses.items():
+        if _differs(camera.T_world_cam, stored[role].camera.T_world_cam):
+            faults.append(
+                f"pose {stored[role].pose_id} ({role}): T_world_cam does not follow from the input pose and d_z"
+            )
+    for role, row in views.items():
+        if abs(row["d_z_m"] - d_z) > SAME:
+            faults.append(f"pose {row['pose_id']} ({role}): d_z_m is {row['d_z_m']}, the input depth gives {d_z}")
+    return faults
+
+
+def _check_projection(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> list[str]:
+    """The projected images to the byte, and the agreement of the two views."""
+    first, mirror, projected = stored["input"], stored["mirror"], stored["projected"]
+    where, faults = f"pose {projected.pose_id} (projected)", []
+    rgb, depth = derive_projected(first, mirror.camera, job.images)
+    if not np.array_equal(rgb, projected.rgb) or not np.array_equal(depth, projected.depth):
+        faults.append(f"{where}: the stored input depth projects to other images")
+    shares = projection_shares(depth, mirror.depth, job.images)
+    if _differs(
+        np.array(shares), np.array([views["projected"][f"projected_{name}_share"] for name in ("filled", "hidden")])
+    ):
+        faults.append(f"{where}: the shares filled and hidden are {shares}, and not what views says")
+    agreement = agree_across(first, mirror, job.images, job.check.mirror_agreement_mm, REGION_FIRST_OBJECT)
+    told = views["mirror"]["mirror_agreement"]
+    found = None if agreement.median_mm is None else (agreement.median_mm, agreement.share)
+    if (told is None) != (found is None) or (
+        found and _differs(np.array(found), np.array([told["median_mm"], told["share"]]))
+    ):
+        faults.append(f"pose {mirror.pose_id} (mirror): the two views agree to {found}, views says {told}")
+    return faults

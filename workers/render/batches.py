@@ -1,0 +1,110 @@
+"""Shapes packed for the GPU: pure functions from parts to interleaved vertices and indices.
+
+The depth of a face is computed from its plane (see gbuffer.py), and a plane belongs to a face while GPUs shade vertices.
+So each face owns one vertex, the last of its three, from which flat attributes are taken: as a mesh has about half as
+many vertices as faces, about half of the faces find a vertex of their own and the rest get a copy of one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array
+from schemas.shape import Part, Shape
+
+COLUMNS = {"position": 3, "normal_metallic": 4, "albedo_roughness": 4, "uv": 2, "face_plane": 4}
+"""Floats of each attribute, in the order of the shader's locations."""
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """What one draw call draws.
+
+    vertices [V, 17] float32 in the columns of `COLUMNS`; the normal is 0 where the face's own is meant; the plane of a
+    face is (n, n . p) in the shape's frame, n of unit length or 0 where the face has no area. indices [F, 3] uint32,
+    whose last column never repeats. texture [h, w, 3 or 4] uint8 sRGB, row 0 at the top, or None.
+    """
+
+    vertices: NDArray[np.float32]
+    indices: NDArray[np.uint32]
+    texture: NDArray[np.uint8] | None
+
+
+def pack_shape(shape: Shape) -> tuple[Batch, ...]:
+    """As few batches as textures allow: all parts without one go into one."""
+    by_texture: dict[int, list[Part]] = {}
+    for part in shape.parts:
+        by_texture.setdefault(id(_texture(part)), []).append(part)
+    return tuple(_pack(parts) for parts in by_texture.values())
+
+
+def own_vertices(faces: NDArray, vertex_count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(faces [F, 3] int64, source [V'] int64): each face turned so that its last vertex is no other face's last.
+
+    `source` says of which vertex each new vertex is a copy; the first `vertex_count` are the vertices themselves.
+    """
+    turned = faces.astype(np.int64)
+    owner = np.full(vertex_count, -1)
+    homeless = np.arange(len(faces))
+    for last in (2, 0, 1):
+        wanted = faces[homeless, last]
+        free = homeless[owner[wanted] < 0]
+        owner[faces[free, last]] = free
+        won = owner[faces[homeless, last]] == homeless
+        winners = homeless[won]
+        turned[winners] = faces[winners][:, [(last + 1) % 3, (last + 2) % 3, last]]
+        homeless = homeless[~won]
+    source = np.concatenate([np.arange(vertex_count), turned[homeless, 2]])
+    turned[homeless, 2] = vertex_count + np.arange(len(homeless))
+    return turned, source
+
+
+def decode_srgb(encoded: Array) -> Array:
+    """Linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def encode_srgb(linear: Array) -> Array:
+    """sRGB values in [0, 1] of linear light, which is clipped to [0, 1] (IEC 61966-2-1)."""
+    linear = np.clip(linear, 0.0, 1.0)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def _texture(part: Part) -> NDArray[np.uint8] | None:
+    return part.material.texture if part.uv is not None else None
+
+
+def _pack(parts: list[Part]) -> Batch:
+    packed, indices, start = [], [], 0
+    for part in parts:
+        faces, source = own_vertices(part.faces, len(part.vertices))
+        vertices = _vertex_columns(part)[source]
+        vertices[faces[:, 2], -4:] = _planes(part)
+        packed.append(vertices)
+        indices.append(faces + start)
+        start += len(vertices)
+    return Batch(
+        np.concatenate(packed).astype(np.float32), np.concatenate(indices).astype(np.uint32), _texture(parts[0])
+    )
+
+
+def _vertex_columns(part: Part) -> Array:
+    """[V, 17] float64, the plane still 0."""
+    count, material = len(part.vertices), part.material
+    albedo = np.tile(decode_srgb(np.array(material.base_color[:3])), (count, 1))
+    if part.colors is not None:
+        albedo = albedo * decode_srgb(part.colors[:, :3] / 255.0)
+    normals = part.normals if part.normals is not None else np.zeros((count, 3))
+    uv = part.uv if part.uv is not None else np.zeros((count, 2))
+    metallic, roughness = np.full((count, 1), material.metallic), np.full((count, 1), material.roughness)
+    return np.concatenate([part.vertices, normals, metallic, albedo, roughness, uv, np.zeros((count, 4))], axis=1)
+
+
+def _planes(part: Part) -> Array:
+    """[F, 4] float64: unit normal and its product with a point of the face, in the part's frame; 0 without area."""
+    a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
+    return np.concatenate([normals, np.einsum("ij,ij->i", normals, a)[:, None]], axis=1)

@@ -1,0 +1,220 @@
+"""What lives on the GPU: shapes and framebuffers, and bounded stores of both.
+
+Everything takes `gl`, the module that `open_context` loaded: nothing here loads OpenGL when it is imported.
+"""
+
+import ctypes
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import ModuleType
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.shape import Shape
+from workers.render.batches import COLUMNS, Batch, pack_shape
+
+FLOAT_BYTES = 4
+
+MAX_TEXTURE_PX = 2048
+"""A larger texture is made smaller before it is uploaded: at most this many pixels wide and high."""
+
+FEW_TRIANGLES = 1000
+"""Up to here a batch is drawn by the variant of the label pass that is fast for each pixel, above by the other."""
+
+TARGET_PIXEL_BYTES = 12
+"""Colour 4, z 4, depth 4."""
+
+
+@dataclass(frozen=True)
+class Uploaded:
+    """One batch on the GPU."""
+
+    vertex_array: int
+    buffers: tuple[int, int]
+    texture: int | None
+    index_count: int
+    bytes: int
+
+    @property
+    def few_triangles(self) -> bool:
+        """Which variant of the label pass draws it fastest."""
+        return self.index_count <= 3 * FEW_TRIANGLES
+
+    def free(self, gl: ModuleType) -> None:
+        """Give the GPU's memory back."""
+        gl.glDeleteVertexArrays(1, [self.vertex_array])
+        gl.glDeleteBuffers(2, self.buffers)
+        if self.texture is not None:
+            gl.glDeleteTextures(1, [self.texture])
+
+
+class ShapeStore:
+    """Shapes on the GPU, by identity; the longest unused go when there are too many or they are too big.
+
+    A stored shape is held, so that no other object can take its id.
+    """
+
+    def __init__(self, gl: ModuleType, max_shapes: int = 64, max_bytes: int = 256 * 2**20) -> None:
+        self._gl = gl
+        self._max_shapes, self._max_bytes = max_shapes, max_bytes
+        self._stored: OrderedDict[int, tuple[Shape, tuple[Uploaded, ...]]] = OrderedDict()
+        self.bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._stored)
+
+    def __contains__(self, shape: Shape) -> bool:
+        return id(shape) in self._stored
+
+    def fetch(self, shape: Shape) -> tuple[Uploaded, ...]:
+        """The shape's batches, uploaded now if they are not there."""
+        if shape in self:
+            self._stored.move_to_end(id(shape))
+            return self._stored[id(shape)][1]
+        batches = tuple(_upload(self._gl, batch) for batch in pack_shape(shape))
+        self._stored[id(shape)] = (shape, batches)
+        self.bytes += sum(batch.bytes for batch in batches)
+        return batches
+
+    def trim(self, in_use: int) -> None:
+        """Free the longest unused until the bounds hold, but not the `in_use` shapes that were fetched last."""
+        while len(self._stored) > in_use and (len(self._stored) > self._max_shapes or self.bytes > self._max_bytes):
+            self._drop_oldest()
+
+    def clear(self) -> None:
+        """Free everything."""
+        while self._stored:
+            self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        _, (_, batches) = self._stored.popitem(last=False)
+        for batch in batches:
+            self.bytes -= batch.bytes
+            batch.free(self._gl)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A framebuffer without multisampling: colour with the region id as its fourth byte, linear z, and depth."""
+
+    width: int
+    height: int
+    framebuffer: int
+    attachments: tuple[int, int, int]
+
+    @staticmethod
+    def of_size(gl: ModuleType, width: int, height: int) -> "Target":
+        """Made, bound and complete; raises RuntimeError where the driver refuses it."""
+        colour, z, depth = (int(name) for name in gl.glGenRenderbuffers(3))
+        framebuffer = int(gl.glGenFramebuffers(1))
+        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, framebuffer)
+        for name, form, point in (
+            (colour, gl.GL_RGBA8, gl.GL_COLOR_ATTACHMENT0),
+            (z, gl.GL_R32F, gl.GL_COLOR_ATTACHMENT1),
+            (depth, gl.GL_DEPTH_COMPONENT32F, gl.GL_DEPTH_ATTACHMENT),
+        ):
+            gl.glBindRenderbuffer(gl.GL_RENDERBUFFER, name)
+            gl.glRenderbufferStorage(gl.GL_RENDERBUFFER, form, width, height)
+            gl.glFramebufferRenderbuffer(gl.GL_FRAMEBUFFER, point, gl.GL_RENDERBUFFER, name)
+        gl.glDrawBuffers(2, [gl.GL_COLOR_ATTACHMENT0, gl.GL_COLOR_ATTACHMENT1])
+        status = int(gl.glCheckFramebufferStatus(gl.GL_FRAMEBUFFER))
+        if status != gl.GL_FRAMEBUFFER_COMPLETE:
+            raise RuntimeError(f"a framebuffer of {width} x {height} is not complete: status {status:#x}")
+        return Target(width, height, framebuffer, (colour, z, depth))
+
+    @property
+    def bytes(self) -> int:
+        """On the GPU."""
+        return TARGET_PIXEL_BYTES * self.width * self.height
+
+    def free(self, gl: ModuleType) -> None:
+        """Give the GPU's memory back."""
+        gl.glDeleteFramebuffers(1, [self.framebuffer])
+        gl.glDeleteRenderbuffers(3, self.attachments)
+
+
+class TargetStore:
+    """One framebuffer a size; the longest unused go when they are too big together."""
+
+    def __init__(self, gl: ModuleType, max_bytes: int = 64 * 2**20) -> None:
+        self._gl = gl
+        self._max_bytes = max_bytes
+        self._stored: OrderedDict[tuple[int, int], Target] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._stored)
+
+    def bind(self, width: int, height: int) -> None:
+        """Draw into, and read from, the whole of the framebuffer of this size."""
+        gl, size = self._gl, (width, height)
+        if size not in self._stored:
+            self._stored[size] = Target.of_size(gl, width, height)
+        self._stored.move_to_end(size)
+        while len(self._stored) > 1 and sum(target.bytes for target in self._stored.values()) > self._max_bytes:
+            self._stored.popitem(last=False)[1].free(gl)
+        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self._stored[size].framebuffer)
+        gl.glViewport(0, 0, width, height)
+
+    def clear(self) -> None:
+        """Free everything."""
+        for target in self._stored.values():
+            target.free(self._gl)
+        self._stored.clear()
+
+
+def _upload(gl: ModuleType, batch: Batch) -> Uploaded:
+    vertex_array = int(gl.glGenVertexArrays(1))
+    vertex_buffer, index_buffer = (int(name) for name in gl.glGenBuffers(2))
+    gl.glBindVertexArray(vertex_array)
+    gl.glBindBuffer(gl.GL_ARRAY_BUFFER, vertex_buffer)
+    gl.glBufferData(gl.GL_ARRAY_BUFFER, batch.vertices.nbytes, batch.vertices, gl.GL_STATIC_DRAW)
+    gl.glBindBuffer(gl.GL_ELEMENT_ARRAY_BUFFER, index_buffer)
+    gl.glBufferData(gl.GL_ELEMENT_ARRAY_BUFFER, batch.indices.nbytes, batch.indices, gl.GL_STATIC_DRAW)
+    stride, offset = FLOAT_BYTES * batch.vertices.shape[1], 0
+    for location, size in enumerate(COLUMNS.values()):
+        gl.glVertexAttribPointer(location, size, gl.GL_FLOAT, gl.GL_FALSE, stride, ctypes.c_void_p(offset))
+        gl.glEnableVertexAttribArray(location)
+        offset += FLOAT_BYTES * size
+    gl.glBindVertexArray(0)
+    levels = () if batch.texture is None else mip_levels(batch.texture)
+    texture = _upload_texture(gl, levels) if levels else None
+    size = batch.vertices.nbytes + batch.indices.nbytes + sum(level.nbytes for level in levels)
+    return Uploaded(vertex_array, (vertex_buffer, index_buffer), texture, batch.indices.size, size)
+
+
+def mip_levels(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
+    """An image [h, w, 3 or 4] and its copies at half the size down to one pixel, [h', w', 4] uint8, area means.
+
+    The first is the image itself, or the largest that fits into `MAX_TEXTURE_PX`; row 0 is the lowest, OpenGL's.
+    """
+    level: NDArray = np.ascontiguousarray(image[::-1])
+    if level.shape[2] == 3:
+        level = cv2.cvtColor(level, cv2.COLOR_RGB2RGBA)
+    shrink = min(1.0, MAX_TEXTURE_PX / max(level.shape[:2]))
+    width, height = (max(1, round(shrink * level.shape[axis])) for axis in (1, 0))
+    levels = []
+    while True:
+        if level.shape[:2] != (height, width):
+            level = cv2.resize(level, (width, height), interpolation=cv2.INTER_AREA)
+        levels.append(level)
+        if width == height == 1:
+            return tuple(levels)
+        width, height = max(1, width // 2), max(1, height // 2)
+
+
+def _upload_texture(gl: ModuleType, levels: Sequence[NDArray[np.uint8]]) -> int:
+    """An sRGB texture, repeated, interpolated between its pixels and between its levels."""
+    texture = int(gl.glGenTextures(1))
+    gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
+    gl.glPixelStorei(gl.GL_UNPACK_ALIGNMENT, 1)
+    for i, level in enumerate(levels):
+        height, width = level.shape[:2]
+        form = (gl.GL_RGBA, gl.GL_UNSIGNED_BYTE, level)
+        gl.glTexImage2D(gl.GL_TEXTURE_2D, i, gl.GL_SRGB8_ALPHA8, width, height, 0, *form)
+    gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MIN_FILTER, gl.GL_LINEAR_MIPMAP_LINEAR)
+    gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MAG_FILTER, gl.GL_LINEAR)
+    gl.glBindTexture(gl.GL_TEXTURE_2D, 0)
+    return texture

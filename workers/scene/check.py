@@ -1,0 +1,74 @@
+"""Labels are checked before they are committed: every pair across its two views, a share of scenes by casting rays."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.camera import Camera
+from schemas.errors import LabelError
+from schemas.job import Check, Job
+from schemas.scene import REGION_FIRST_OBJECT, GBuffer, Pair, PosedScene
+from workers.geometry.raycast import cast_view, edge_distance_px
+from workers.scene.randomness import Stream, stream
+
+EDGE_PX = 1.0 / 64.0
+"""A pixel centre this near a projected edge may fall to either side: the rasteriser keeps vertices to 1/256 pixel."""
+
+PLANE_P999_MM = 0.01
+OBJECT_MEDIAN_MM = 0.01
+OBJECT_P99_MM = 0.05
+"""Bounds on depth before quantisation, each a small part of a stored unit (0.2 mm)."""
+
+STEEPEST_COS = math.cos(math.radians(80.0))
+"""Beyond 80 degrees of incidence a thousandth of a pixel moves depth by more than the bound."""
+
+
+def is_raycast_scene(job: Job, scene_id: int) -> bool:
+    """Whether this scene belongs to the share that is checked against the ray caster: a function of seed and id."""
+    return bool(stream(job.seed, scene_id, Stream.RAYCAST_CHECK).random() < job.check.raycast_share)
+
+
+def check_against_rays(scene: PosedScene, camera: Camera, buffer: GBuffer) -> None:
+    """Hold depth and regions of one rendered view against cast rays, region by region. Raises LabelError."""
+    depth, region, cosine = cast_view(scene.things, camera)
+    rows, columns = np.nonzero(region != buffer.region)
+    if len(rows):
+        away = edge_distance_px(scene.things, camera, np.stack([rows, columns], axis=1))
+        if (away > EDGE_PX).any():
+            worst = int(np.argmax(away))
+            raise LabelError(
+                "mask_disagrees",
+                f"pixel ({columns[worst]}, {rows[worst]}) is region {buffer.region[rows[worst], columns[worst]]} in the mask and "
+                f"{region[rows[worst], columns[worst]]} by ray, {away[worst]:.3f} px from the nearest edge",
+            )
+    same = (region == buffer.region) & (region > 0)
+    error_mm = np.abs(buffer.depth_m.astype(np.float64) - depth) * 1e3
+    for region_id in np.unique(region[same]):
+        _check_depth(int(region_id), error_mm[same & (region == region_id) & (cosine > STEEPEST_COS)])
+
+
+def _check_depth(region_id: int, error_mm: NDArray[np.float64]) -> None:
+    if len(error_mm) == 0:
+        return
+    is_object = region_id >= REGION_FIRST_OBJECT
+    bounds = [(50.0, OBJECT_MEDIAN_MM), (99.0, OBJECT_P99_MM)] if is_object else [(99.9, PLANE_P999_MM)]
+    for percentile, bound in bounds:
+        found = float(np.percentile(error_mm, percentile))
+        if found > bound:
+            raise LabelError(
+                "depth_disagrees",
+                f"region {region_id}: {percentile:g} % of depths are within {found:.4f} mm of the ray's, the bound is {bound} mm",
+            )
+
+
+def check_pair(pair: Pair, check: Check) -> None:
+    """Hold a pair's two views against each other. Raises LabelError."""
+    agreement = pair.agreement
+    for what, median in (("the object", agreement.median_mm), ("the scene", agreement.scene_median_mm)):
+        if median is not None and median > check.mirror_agreement_mm:
+            raise LabelError(
+                "views_disagree",
+                f"input depth of {what} carried into the mirror view is off by {median:.3f} mm in the median, "
+                f"check.mirror_agreement_mm is {check.mirror_agreement_mm:g}",
+            )

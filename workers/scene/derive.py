@@ -1,0 +1,138 @@
+"""What follows from rendered views: the projected view, patches, labels, agreement. Pure."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array
+from schemas.camera import Camera
+from schemas.job import Images, Patch
+from schemas.scene import Agreement, ObjectLabel, View
+from workers.geometry.camera import image_coordinates, project
+from workers.geometry.frames import invert
+from workers.geometry.normals import facing_cosine
+from workers.geometry.project import Projected, cloud_in_camera, forward_project, in_frame, sample_inverse_depth
+from workers.scene.views import quantise_depth, stored_depth_m
+
+FEWEST_POINTS = 50
+"""With fewer co-visible pixels an agreement is not worth a figure."""
+
+FACING = 0.1
+"""A surface whose normal is more than 84 degrees from the mirror camera counts as turned away."""
+
+HIDDEN_M = 0.01
+"""A carried point this far behind what the mirror camera sees is hidden, and not in disagreement."""
+
+SCENE_STRIDE = 4
+"""Floor and table have hundreds of times the pixels that their median needs."""
+
+
+def derive_projected(source: View, mirror: Camera, images: Images) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+    """RGB [H, W, 3] uint8 and depth [H, W] uint16 of the stored input cloud seen from the mirror camera; holes 0."""
+    projected = carry_depth(source, mirror, images)
+    rgb = np.zeros((*projected.depth_m.shape, 3), np.uint8)
+    filled = projected.source >= 0
+    rgb[filled] = source.rgb.reshape(-1, 3)[projected.source[filled]]
+    return rgb, quantise_depth(projected.depth_m, images)
+
+
+def carry_depth(source: View, target: Camera, images: Images) -> Projected:
+    """The stored input cloud in another camera, with the job's splat and hidden-point removal."""
+    depth_m = stored_depth_m(source.depth, images)
+    if images.projection.hidden_point_removal and source.region is not None:
+        # A point whose surface faces away from the new camera is the back of something nearer to it.
+        everywhere = np.arange(depth_m.size)
+        facing = facing_cosine(depth_m, source.region, everywhere, source.camera, target.position).reshape(
+            depth_m.shape
+        )
+        depth_m = np.where(np.nan_to_num(facing, nan=-1.0) > 0.0, depth_m, 0.0)
+    return forward_project(depth_m, source.camera, target, images.projection.splat)
+
+
+def projection_shares(projected: NDArray[np.uint16], mirror: NDArray[np.uint16], images: Images) -> tuple[float, float]:
+    """Share of pixels that the projection fills, and of those the share that lies behind what the mirror camera sees."""
+    filled = projected > 0
+    hidden = filled & (mirror > 0) & (projected > mirror + HIDDEN_M * images.depth_units_per_m)
+    return float(filled.mean()), float(hidden.sum() / max(1, filled.sum()))
+
+
+def crop_box(label: ObjectLabel, camera: Camera, patch: Patch) -> tuple[slice, slice] | None:
+    """(rows, columns) of the crop centred on the object's image coordinates; None where it would leave the image."""
+    if label.u < 0:
+        return None
+    left, top = label.u - patch.width // 2, label.v - patch.height // 2
+    right, bottom = left + patch.width, top + patch.height
+    if left < 0 or top < 0 or right > camera.intrinsics.width or bottom > camera.intrinsics.height:
+        return None
+    return slice(top, bottom), slice(left, right)
+
+
+def label_region(
+    thing: tuple[int, str, str, Array],
+    camera: Camera,
+    region: NDArray[np.uint8],
+    count_alone: Callable[[], int],
+) -> ObjectLabel:
+    """The label of one thing (region id, category, instance id, T_world_obj [4, 4]) in one view.
+
+    `count_alone` counts its own unoccluded pixels, also outside the frame; it is asked only where any is seen.
+    """
+    region_id, category, instance_id, T_world_obj = thing
+    T_cam_obj = invert(camera.T_world_cam) @ T_world_obj
+    u, v = image_coordinates(T_cam_obj, camera.intrinsics)
+    mask = region == region_id
+    pixels = int(mask.sum())
+    alone = count_alone() if pixels else 1
+    return ObjectLabel(
+        region_id, category, instance_id, T_cam_obj, u, v, bounding_box(mask), pixels, pixels / max(alone, pixels, 1)
+    )
+
+
+def bounding_box(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:
+    """(x, y, width, height) in pixels of what is True; all 0 where nothing is."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if len(rows) == 0:
+        return 0, 0, 0, 0
+    return int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)
+
+
+def agree_across(source: View, mirror: View, images: Images, bound_mm: float, first_object: int) -> Agreement:
+    """Carry the stored input depth into the mirror view and compare it with the stored mirror depth.
+
+    Interpolated bilinearly in 1/z among four pixels of one region. A pixel counts as co-visible where its surface
+    faces the mirror camera too, its own region is there in the mirror view, and it does not lie `HIDDEN_M` behind.
+    Every pixel of an object is compared, and of the rest one in `SCENE_STRIDE` squared.
+    """
+    assert source.region is not None and mirror.region is not None
+    depth_m = stored_depth_m(source.depth, images)
+    pixels = _sample_pixels(source.region, first_object)
+    facing = facing_cosine(depth_m, source.region, pixels, source.camera, mirror.camera.position)
+    chosen = np.zeros(depth_m.size)
+    towards_both = pixels[np.nan_to_num(facing, nan=-1.0) > FACING]
+    chosen[towards_both] = depth_m.ravel()[towards_both]
+    points, index = cloud_in_camera(chosen.reshape(depth_m.shape), source.camera, mirror.camera)
+    keep = points[:, 2] > 0.0
+    points, index = points[keep], index[keep]
+    u, v = project(points, mirror.camera.intrinsics)
+    inside = in_frame(u, v, mirror.camera.intrinsics)
+    points, index, u, v = points[inside], index[inside], u[inside], v[inside]
+    seen, region = sample_inverse_depth(stored_depth_m(mirror.depth, images), mirror.region, u, v)
+    own = source.region.ravel()[index]
+    both = (seen > 0.0) & (region == own) & (points[:, 2] < seen + HIDDEN_M)
+    difference_mm = np.abs(points[both, 2] - seen[both]) * 1e3
+    of_object = difference_mm[own[both] >= first_object]
+    enough = len(of_object) >= FEWEST_POINTS
+    return Agreement(
+        median_mm=float(np.median(of_object)) if enough else None,
+        share=float((of_object <= bound_mm).mean()) if enough else None,
+        points=len(of_object),
+        scene_median_mm=float(np.median(difference_mm)) if len(difference_mm) >= FEWEST_POINTS else None,
+    )
+
+
+def _sample_pixels(region: NDArray[np.uint8], first_object: int) -> NDArray[np.int64]:
+    """Flat indices, ascending: every pixel of an object, and a grid over everything else."""
+    chosen = region >= first_object
+    chosen[::SCENE_STRIDE, ::SCENE_STRIDE] = True
+    return np.flatnonzero(chosen)

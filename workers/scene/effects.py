@@ -1,0 +1,73 @@
+"""What a scene calls for: which effects ran, which did not, and why. Data in one table, one entry an effect."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from schemas.job import Job
+from schemas.scene import ScenePlan, Settled
+
+
+@dataclass(frozen=True, eq=False)
+class Facts:
+    """What an effect's predicate may look at."""
+
+    job: Job
+    plan: ScenePlan
+    settled: tuple[Settled, ...]
+    raycast_checked: bool
+
+
+@dataclass(frozen=True)
+class Effect:
+    """`skipped_because(facts)` is None where the effect ran, else the reason why the scene did not call for it."""
+
+    name: str
+    skipped_because: Callable[[Facts], str | None]
+
+
+def _always(_: Facts) -> None:
+    return None
+
+
+def _dynamics(facts: Facts) -> str | None:
+    return "placed in a statically stable pose" if facts.settled[0].support == "placed" else None
+
+
+def _table_mesh(facts: Facts) -> str | None:
+    reasons = {
+        "placed": "placed in a statically stable pose",
+        "flat_top": "the whole motion stayed over the table's convex flat top",
+    }
+    return reasons.get(facts.settled[0].support)
+
+
+def _splat(facts: Facts) -> str | None:
+    return "images.projection.splat is 1" if facts.job.images.projection.splat == 1 else None
+
+
+def _hidden_points(facts: Facts) -> str | None:
+    asked = facts.job.images.projection.hidden_point_removal
+    return None if asked else "images.projection.hidden_point_removal is off"
+
+
+def _raycast(facts: Facts) -> str | None:
+    return None if facts.raycast_checked else "not in the share check.raycast_share"
+
+
+EFFECTS: tuple[Effect, ...] = (
+    Effect("dynamics", _dynamics),
+    Effect("table_mesh_collision", _table_mesh),
+    Effect("depth_camera", _always),
+    Effect("mirror", _always),
+    Effect("projection", _always),
+    Effect("splat", _splat),
+    Effect("hidden_point_removal", _hidden_points),
+    Effect("raycast_check", _raycast),
+)
+
+
+def write_receipt(facts: Facts) -> tuple[list[str], list[dict[str, str]]]:
+    """(names of the effects that ran, [{effect, why}] of those that did not), in the table's order."""
+    reasons = [(effect.name, effect.skipped_because(facts)) for effect in EFFECTS]
+    ran = [name for name, why in reasons if why is None]
+    return ran, [{"effect": name, "why": why} for name, why in reasons if why is not None]

@@ -1,0 +1,24 @@
+"""Named streams of random numbers: one for each step, append-only, so that adding a camera never moves an object."""
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class Stream(IntEnum):
+    """Every use of chance in a scene. A new one gets the next number; a number is never used for anything else."""
+
+    CATEGORY = 0
+    OBJECT = 1
+    TABLE = 2
+    START = 3
+    REDRAW = 4
+    CAMERA = 5
+    APPEARANCE = 6
+    RAYCAST_CHECK = 7
+    RECHECK = 8
+
+
+def stream(seed: int, scene_id: int, name: Stream) -> np.random.Generator:
+    """The generator of one step of one scene: a function of the dataset's seed, the scene and the step alone."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(scene_id, int(name))))

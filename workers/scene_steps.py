@@ -1,0 +1,157 @@
+"""One scene from its id to what is written: the list of steps, readable in one glance."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from schemas.camera import Camera
+from schemas.layout import input_pose_id
+from schemas.scene import (
+    REGION_FIRST_OBJECT,
+    REGION_TABLE,
+    GBuffer,
+    ObjectLabel,
+    Pair,
+    PosedScene,
+    ScenePlan,
+    Settled,
+    View,
+)
+from workers.assets.catalogue import choose_object, choose_table, load_asset
+from workers.context import WorkerContext
+from workers.scene.check import check_against_rays, check_pair, is_raycast_scene
+from workers.scene.derive import agree_across, derive_projected, label_region, projection_shares
+from workers.scene.plan import choose_category, plan_scene
+from workers.scene.randomness import Stream, stream
+from workers.scene.settle import settle
+from workers.scene.views import (
+    front_distance,
+    place_aligned_camera,
+    place_mirror_camera,
+    pose_scene,
+    quantise_depth,
+    stored_depth_m,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A finished scene before it is encoded."""
+
+    plan: ScenePlan
+    settled: tuple[Settled, ...]
+    posed: PosedScene
+    pairs: tuple[Pair, ...]
+    raycast_checked: bool
+
+
+@dataclass(frozen=True)
+class Stopwatch:
+    """Seconds by stage; a stage that runs twice adds up."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Adds the time that the block takes to the stage's."""
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
+
+
+def make_scene(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Scene:
+    """Plan, settle, look, derive, check. Raises SceneError where this scene cannot be made."""
+    job = context.job
+    with watch.stage("assets"):
+        plan = plan_with_assets(context, scene_id)
+    with watch.stage("physics"):
+        settled = settle_objects(context, plan)
+    posed = pose_scene(plan, settled)
+    checked = is_raycast_scene(job, scene_id)
+    pairs = tuple(
+        make_pair(SceneView(context, plan, posed, checked, watch), camera, number)
+        for number, camera in enumerate(plan.input_cameras)
+    )
+    with watch.stage("check"):
+        for pair in pairs:
+            check_pair(pair, job.check)
+    return Scene(plan, settled, posed, pairs, checked)
+
+
+def plan_with_assets(context: WorkerContext, scene_id: int) -> ScenePlan:
+    """Draw category, object and table, load them, and draw everything else."""
+    job, catalogue = context.job, context.catalogue
+    category = choose_category(job, scene_id)
+    asset = load_asset(catalogue, choose_object(catalogue, category, stream(job.seed, scene_id, Stream.OBJECT)))
+    table = load_asset(catalogue, choose_table(catalogue, stream(job.seed, scene_id, Stream.TABLE)))
+    return plan_scene(job, scene_id, table, asset)
+
+
+def settle_objects(context: WorkerContext, plan: ScenePlan) -> tuple[Settled, ...]:
+    """Every object at rest."""
+    return tuple(settle(start, plan.table, context.job.physics) for start in plan.objects)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneView:
+    """What rendering a pair of a settled scene needs."""
+
+    context: WorkerContext
+    plan: ScenePlan
+    posed: PosedScene
+    raycast_checked: bool
+    watch: Stopwatch
+
+
+def make_pair(scene: SceneView, camera: Camera, number: int) -> Pair:
+    """All four views of one pair. Raises ViewError where the input camera sees no object."""
+    job, watch = scene.context.job, scene.watch
+    parent = input_pose_id(scene.plan.scene_id, number, job.pairs_per_scene)
+    first = render_view(scene, "input", (parent, parent), camera)
+    aligned_camera = place_aligned_camera(camera, job.cameras.depth)
+    aligned = render_view(scene, "aligned", (parent, parent), aligned_camera)
+    assert first.region is not None
+    depth_m = stored_depth_m(first.depth, job.images)
+    d_z_m = front_distance(depth_m, first.region >= REGION_FIRST_OBJECT, job.cameras.mirror)
+    mirror = render_view(scene, "mirror", (parent + 1, parent), place_mirror_camera(camera, d_z_m, job.cameras.mirror))
+    with watch.stage("projection"):
+        rgb, depth = derive_projected(first, mirror.camera, job.images)
+        filled, hidden = projection_shares(depth, mirror.depth, job.images)
+    with watch.stage("check"):
+        agreement = agree_across(first, mirror, job.images, job.check.mirror_agreement_mm, REGION_FIRST_OBJECT)
+    projected = View("projected", parent, parent, mirror.camera, rgb, depth, None, ())
+    return Pair(d_z_m, first, aligned, mirror, projected, agreement, filled, hidden)
+
+
+def render_view(scene: SceneView, role: str, ids: tuple[int, int], camera: Camera) -> View:
+    """One rendered view: images as stored, and labels of the table and of every object."""
+    job, renderer = scene.context.job, scene.context.renderer
+    with scene.watch.stage("render"):
+        buffer = renderer.draw(scene.posed.things, scene.posed.appearance, camera)
+    if scene.raycast_checked:
+        with scene.watch.stage("raycast"):
+            check_against_rays(scene.posed, camera, buffer)
+    with scene.watch.stage("labels"):
+        labels = label_view(scene, camera, buffer)
+        depth = quantise_depth(buffer.depth_m, job.images)
+    return View(role, *ids, camera, buffer.rgb, depth, buffer.region, labels)  # type: ignore[arg-type]
+
+
+def label_view(scene: SceneView, camera: Camera, buffer: GBuffer) -> tuple[ObjectLabel, ...]:
+    """Labels of the table and of every object, in order of region id."""
+    table = scene.plan.table.asset
+    names = {REGION_TABLE: ("table", table.instance_id)}
+    names.update({start.region_id: (start.asset.category, start.asset.instance_id) for start in scene.plan.objects})
+    return tuple(
+        label_region(
+            (thing.region_id, *names[thing.region_id], thing.T_world_shape),
+            camera,
+            buffer.region,
+            lambda thing=thing: scene.context.renderer.count_pixels(thing, camera),  # type: ignore[misc]
+        )
+        for thing in scene.posed.things
+        if thing.region_id >= REGION_TABLE
+    )

@@ -1,0 +1,131 @@
+"""The canonical bytes of table rows: the same rows in the same order give the same digest, however they are stored.
+
+Each column is a few streams, hashed as they come: which values are there (one byte each), lengths of strings and lists,
+and the values themselves (doubles as IEEE-754 little-endian, so -0.0 is not 0.0; integers as 8 bytes little-endian;
+booleans as one byte; strings as UTF-8). A missing value counts as absent and as zero or empty; what lies below an
+absent list is no part of the stream. A column's digest is the hash of its streams' digests, a table's digest the hash
+of its name, its number of rows and its columns in the order of the schema. How rows were cut into batches is no part
+of it.
+"""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from schemas.manifest import SCHEMAS
+
+_PRIMITIVES: dict[pa.DataType, tuple[str, float | bool]] = {
+    pa.float64(): ("<f8", 0.0),
+    pa.int64(): ("<i8", 0),
+    pa.bool_(): ("|u1", False),
+}
+"""How a value is written, and what stands where there is none."""
+
+
+class _Stream:
+    """The running digest of one column, or of one level of a nested column."""
+
+    def __init__(self, kind: pa.DataType) -> None:
+        self._kind = kind
+        self._present = hashlib.sha256()
+        self._lengths = hashlib.sha256()
+        self._values = hashlib.sha256()
+        self._children = [_Stream(child) for child in _child_types(kind)]
+
+    def update(self, array: pa.Array) -> None:
+        """Takes the next values of the column."""
+        gaps = array.null_count > 0
+        self._present.update(_bytes_of(array.is_valid(), "|u1") if gaps else b"\1" * len(array))
+        if pa.types.is_struct(self._kind):
+            for child, part in zip(self._children, array.flatten(), strict=True):
+                child.update(part)
+        elif _is_list(self._kind):
+            lengths = pc.list_value_length(array)
+            self._lengths.update(_bytes_of(pc.fill_null(lengths, 0) if gaps else lengths, "<i8"))
+            self._children[0].update(array.flatten())
+        elif pa.types.is_string(self._kind):
+            filled = pc.fill_null(array, "") if gaps else array
+            self._lengths.update(_bytes_of(pc.binary_length(filled), "<i8"))
+            self._values.update(_text_of(filled))
+        else:
+            dtype, nothing = _PRIMITIVES[self._kind]
+            self._values.update(
+                _bytes_of(pc.fill_null(array, pa.scalar(nothing, self._kind)) if gaps else array, dtype)
+            )
+
+    def digest(self) -> bytes:
+        """[32] bytes: of everything so far."""
+        streams = [stream.digest() for stream in (self._present, self._lengths, self._values)]
+        return hashlib.sha256(b"".join([*streams, *(child.digest() for child in self._children)])).digest()
+
+
+class TableDigest:
+    """The digest of one table, fed batch by batch in row order."""
+
+    def __init__(self, table: str) -> None:
+        self._name = table
+        self._schema = SCHEMAS[table]
+        self._streams = [_Stream(field.type) for field in self._schema]
+        self.rows = 0
+
+    def update(self, rows: pa.Table | pa.RecordBatch) -> None:
+        """Takes the next rows, which must have exactly the table's columns, in any number of chunks."""
+        for batch in rows.to_batches() if isinstance(rows, pa.Table) else [rows]:
+            self.rows += batch.num_rows
+            for stream, name in zip(self._streams, self._schema.names, strict=True):
+                stream.update(batch.column(name))
+
+    def hexdigest(self) -> str:
+        """64 hex characters: of all rows so far."""
+        total = hashlib.sha256(f"verso rows 1\n{self._name}\n{self.rows}\n".encode())
+        for stream, field in zip(self._streams, self._schema, strict=True):
+            total.update(f"{field.name}\n{_tag(field.type)}\n".encode() + stream.digest())
+        return total.hexdigest()
+
+
+def rows_digest(table: str, rows: pa.Table) -> str:
+    """64 hex characters: the digest of these rows of `table`."""
+    digest = TableDigest(table)
+    digest.update(rows)
+    return digest.hexdigest()
+
+
+def joint_digest(parts: Mapping[str, str] | Sequence[tuple[str, str]]) -> str:
+    """64 hex characters: one digest of several named ones, in the order given."""
+    pairs = parts.items() if isinstance(parts, Mapping) else parts
+    return hashlib.sha256("".join(f"{name}\n{digest}\n" for name, digest in pairs).encode()).hexdigest()
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind))
+
+
+def _child_types(kind: pa.DataType) -> list[pa.DataType]:
+    if pa.types.is_struct(kind):
+        return [kind.field(i).type for i in range(kind.num_fields)]
+    return [kind.value_type] if _is_list(kind) else []
+
+
+def _tag(kind: pa.DataType) -> str:
+    """A name of a type that does not change with Arrow's version."""
+    if pa.types.is_struct(kind):
+        return "{" + ",".join(f"{kind.field(i).name}:{_tag(kind.field(i).type)}" for i in range(kind.num_fields)) + "}"
+    if _is_list(kind):
+        return f"[{_tag(kind.value_type)}]"
+    return "text" if pa.types.is_string(kind) else _PRIMITIVES[kind][0]
+
+
+def _bytes_of(array: pa.Array, dtype: str) -> bytes:
+    return np.asarray(array.to_numpy(zero_copy_only=False)).astype(dtype, copy=False).tobytes()
+
+
+def _text_of(array: pa.StringArray) -> bytes:
+    """The UTF-8 bytes of all strings, one after another, without a copy for each."""
+    if not len(array):
+        return b""
+    _, offsets, data = array.buffers()
+    ends = np.frombuffer(offsets, dtype=np.int32)[array.offset : array.offset + len(array) + 1]
+    return b"" if data is None else memoryview(data)[int(ends[0]) : int(ends[-1])].tobytes()

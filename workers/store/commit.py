@@ -1,0 +1,229 @@
+"""Decide, then publish: records are put if absent, and what a record names is then renamed into place by anyone.
+
+The record is the only decision. It is linked from the attempt's own folder, so an attempt whose folder was swept cannot
+commit any more. Publishing is a roll-forward: it can be done by any process, at any time, any number of times.
+"""
+
+import contextlib
+import hashlib
+import json
+import re
+from collections.abc import Iterator
+
+from pydantic import ValidationError
+
+from schemas.commit import CommitRecord, CommitSummary, FileEntry
+from schemas.errors import CommitConflict, CorruptError, OutputError
+from schemas.layout import ASSETS, COMMITS, commit_path, staging_path
+from schemas.manifest import SCHEMA_VERSION
+from workers.store.store import Store, fenced_key
+
+_NAME = re.compile(r"(\d{10,})(?:\.retry-(\d+))?\.json")
+_SEAL = b',"seal":"'
+"""The last key of a record: the SHA-256 of all bytes before it."""
+
+
+def encode_record(record: CommitRecord) -> bytes:
+    """Canonical JSON with a seal, so that a damaged record is found."""
+    body = json.dumps(record.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    head = body[:-1].encode()
+    return head + _SEAL + hashlib.sha256(head).hexdigest().encode() + b'"}\n'
+
+
+def decode_record(data: bytes, name: str) -> CommitRecord:
+    """The record in a file.
+
+    Raises CorruptError naming it where it is torn, altered or foreign; OutputError where a newer version wrote it.
+    """
+    try:
+        return CommitRecord.model_validate(_unsealed(data, name))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise CorruptError(f"{name} is not a commit record: {where}: {first['msg']}") from error
+
+
+def commit_names(store: Store) -> list[tuple[int, int, str]]:
+    """(start, retry, key) of every commit record, in the order in which they apply.
+
+    Raises CorruptError naming a file that does not belong there.
+    """
+    found = []
+    for entry in store.files(COMMITS):
+        name = entry.key.rpartition("/")[2]
+        if name.startswith("."):
+            continue
+        match = _NAME.fullmatch(name)
+        if match is None or commit_path(int(match[1]), int(match[2] or 0)) != entry.key:
+            raise CorruptError(f"{entry.key} in {store.name} is not a commit of this program: move it away")
+        found.append((int(match[1]), int(match[2] or 0), entry.key))
+    return sorted(found)
+
+
+def read_record(store: Store, start: int, retry: int = 0) -> CommitRecord | None:
+    """The record of a range, or None where it is not committed. Raises as `decode_record`."""
+    key = commit_path(start, retry)
+    try:
+        data = store.read(key)
+    except FileNotFoundError:
+        return None
+    record = decode_record(data, key)
+    if (record.span.start, record.span.retry) != (start, retry):
+        raise CorruptError(
+            f"{key} holds the record of another range: {commit_path(record.span.start, record.span.retry)}"
+        )
+    return record
+
+
+def iter_records(store: Store) -> Iterator[CommitRecord]:
+    """Every record, one at a time, each range followed by its retries."""
+    for start, retry, key in commit_names(store):
+        record = read_record(store, start, retry)
+        if record is None:
+            raise CorruptError(f"{key} vanished while it was read")
+        yield record
+
+
+def read_summary(store: Store, start: int, retry: int = 0) -> CommitSummary:
+    """What planning needs of a record, without its list of files. Raises as `decode_record`."""
+    key = commit_path(start, retry)
+    raw = _unsealed(store.read(key), key)
+    try:
+        span, scenes = raw["span"], raw["scenes"]
+        if (span["start"], span["retry"]) != (start, retry):
+            raise CorruptError(f"{key} holds the record of another range")
+        failed = tuple((scene["scene_id"], scene["outcome"]) for scene in scenes if scene["outcome"] != "made")
+        return CommitSummary(
+            start=start,
+            stop=span["stop"],
+            retry=retry,
+            attempt=raw["attempt"],
+            fingerprint=raw["terms"]["fingerprint"],
+            made=len(scenes) - len(failed),
+            failed=failed,
+            scenes=tuple(span["scenes"]),
+        )
+    except (KeyError, TypeError) as error:
+        raise CorruptError(f"{key} is not a commit record: {error!r}") from error
+
+
+def publish(store: Store, record: CommitRecord) -> None:
+    """Moves what the record names from its staging to its final place, then drops the staging. Idempotent.
+
+    Raises CorruptError naming a file that is nowhere or has the wrong size, CommitConflict where a shape that ranges
+    share was published with another size by the same stack.
+    """
+    staging = staging_path(record.span.start, record.attempt)
+    for entry in record.files:
+        final = store.size(entry.path) if _is_shared(entry.path) else None
+        if final is not None:
+            if final != entry.bytes and record.terms.fingerprint_mode == "strict":
+                raise CommitConflict(
+                    f"{entry.path} has {final} bytes, and {entry.bytes} in the range from scene {record.span.start}, "
+                    f"made by {record.terms.fingerprint}: two attempts at one shape differ"
+                )
+            continue
+        if not _move(store, staging, entry.path, entry.bytes):
+            _check_final(store, entry)
+    store.sync_folders_of(entry.path for entry in record.files)
+    store.remove_tree(staging)
+    store.remove_tree(fenced_key(staging))
+
+
+def compare_records(mine: CommitRecord, winner: CommitRecord) -> str | None:
+    """How two attempts at the same scenes differ, naming both fingerprints; None where they made the same.
+
+    Scenes that failed environmentally in either are left out: a killed scene says nothing about bytes.
+    """
+    theirs = {scene.scene_id: scene for scene in winner.scenes}
+    different = [
+        scene.scene_id
+        for scene in mine.scenes
+        if (other := theirs.get(scene.scene_id)) is not None
+        and "environmental" not in (scene.outcome, other.outcome)
+        and (scene.outcome, scene.digest) != (other.outcome, other.digest)
+    ]
+    shapes = {entry.path: entry.sha256 for entry in winner.files if _is_shared(entry.path)}
+    paths = [entry.path for entry in mine.files if shapes.get(entry.path, entry.sha256) != entry.sha256]
+    if not different and not paths:
+        return None
+    what = [f"scene {scene_id}" for scene_id in different] + paths
+    return (
+        f"two attempts made other bytes at {', '.join(what[:5])}{' and more' if len(what) > 5 else ''}: "
+        f"{winner.attempt} (committed) on fingerprint {winner.terms.fingerprint}, "
+        f"{mine.attempt} on fingerprint {mine.terms.fingerprint}"
+    )
+
+
+def _unsealed(data: bytes, name: str) -> dict:
+    """The JSON object of a record whose seal is whole and whose version is not newer than ours."""
+    head, mark, seal = data.rpartition(_SEAL)
+    try:
+        raw = json.loads(data)
+    except ValueError as error:
+        raise CorruptError(
+            f"{name} is torn or not JSON ({error}): restore it from a copy, or begin a new --out"
+        ) from error
+    if not isinstance(raw, dict) or raw.get("kind") != "verso-commit" or not isinstance(raw.get("schema_version"), int):
+        raise CorruptError(f"{name} is not a commit record of this program: move it away")
+    if raw["schema_version"] > SCHEMA_VERSION:
+        raise OutputError(
+            f"{name} has schema_version {raw['schema_version']}, and this program reads up to {SCHEMA_VERSION}: "
+            "install a newer verso"
+        )
+    if not mark or seal != hashlib.sha256(head).hexdigest().encode() + b'"}\n':
+        raise CorruptError(f"{name} was altered after it was written: its seal does not match")
+    return raw
+
+
+def _move(store: Store, staging: str, path: str, size: int) -> bool:
+    """Renames one file into place; False where it is not staged (any more)."""
+    for folder in (staging, fenced_key(staging)):
+        source = f"{folder}/{path}"
+        staged = store.size(source)
+        if staged is None:
+            continue
+        if staged != size:
+            raise CorruptError(f"{source} has {staged} bytes, and its commit says {size}")
+        try:
+            store.rename(source, path)
+        except FileNotFoundError:
+            continue
+        return True
+    return False
+
+
+def read_committed(store: Store, record: CommitRecord, path: str) -> bytes:
+    """The bytes of one of the record's files, published or not yet. Raises CorruptError naming one that is missing."""
+    staging = staging_path(record.span.start, record.attempt)
+    for key in (
+        path,
+        f"{staging}/{path}",
+        f"{fenced_key(staging)}/{path}",
+        path,
+    ):  # it moves from staging to the end of this list
+        with contextlib.suppress(FileNotFoundError):
+            return store.read(key)
+    raise CorruptError(f"{path} is committed and missing: restore it from a copy")
+
+
+def check_published(store: Store, record: CommitRecord) -> None:
+    """Raises CorruptError naming a file of the record that is not in its final place with its size.
+
+    A shape that a mix of stacks shares keeps the size of whichever was first.
+    """
+    for entry in record.files:
+        _check_final(store, entry, record.terms.fingerprint_mode == "strict" or not _is_shared(entry.path))
+
+
+def _check_final(store: Store, entry: FileEntry, exact: bool = True) -> None:
+    final = store.size(entry.path)
+    if final is None:
+        raise CorruptError(f"{entry.path} is named by a commit and is neither staged nor published")
+    if final != entry.bytes and exact:
+        raise CorruptError(f"{entry.path} has {final} bytes, and its commit says {entry.bytes}")
+
+
+def _is_shared(path: str) -> bool:
+    """Whether several ranges may make this file, with the same bytes."""
+    return path.startswith(f"{ASSETS}/")

@@ -1,0 +1,20 @@
+"""From what a user writes after --out to the store it means."""
+
+import re
+
+from workers.store.local import LocalStore
+from workers.store.store import Store
+
+_URL = re.compile(r"[a-z][a-z0-9+.-]+://")
+
+
+def open_store(out: str) -> Store:
+    """A folder, or an object store where `out` is a URL such as s3://bucket/path. Nothing is read or written yet.
+
+    Raises OutputError for a URL of a kind that is not known.
+    """
+    if not _URL.match(out):
+        return LocalStore(out)
+    from workers.store.objects import open_object_store  # obstore loads only where it is needed
+
+    return open_object_store(out)

@@ -1,0 +1,72 @@
+"""Names in layout `tar`: one archive for each range and category, and what its members are called.
+
+`mug/RGB00042.png` is the member `00042.RGB.png` of `mug/<start>.tar`, its patch `mug/patches/RGB00042.png` the member
+`00042.RGB.patch.png`, and with several objects `00042.RGB.patch.obj1.png`. Up to the first point is the pose id, so
+tools that group members by it (WebDataset among them) see one sample for each pose.
+"""
+
+import io
+import re
+import tarfile
+from collections.abc import Iterator
+
+from schemas.errors import CorruptError
+from schemas.layout import IMAGES, range_key
+
+_PATH = re.compile(
+    r"(?P<category>[^/]+)/(?P<patch>patches/)?(?P<content>[A-Za-z]+)(?P<pose>\d{5,})(?:obj(?P<object>\d+))?\.png"
+)
+_MEMBER = re.compile(r"(?P<pose>\d{5,})\.(?P<content>[A-Za-z]+)(?P<patch>\.patch)?(?:\.obj(?P<object>\d+))?\.png")
+_CONTENTS: list[str] = list(dict.fromkeys(image.content for image in IMAGES))
+
+
+def tar_path(category: str, start: int, retry: int = 0) -> str:
+    """`mug/0000000016.tar`: the images of one category that one commit holds."""
+    return f"{category}/{range_key(start)}{f'.retry-{retry}' if retry else ''}.tar"
+
+
+def member_of(path: str) -> tuple[str, str]:
+    """(category, member name) of an image. Raises ValueError where the path is not an image's."""
+    found = _match(_PATH, path)
+    suffix = "" if found["object"] is None else f".obj{found['object']}"
+    return found["category"], f"{found['pose']}.{found['content']}{'.patch' if found['patch'] else ''}{suffix}.png"
+
+
+def path_of(category: str, member: str) -> str:
+    """The image that a member is. Raises ValueError where the name is not a member's."""
+    found = _match(_MEMBER, member)
+    suffix = "" if found["object"] is None else f"obj{found['object']}"
+    return f"{category}/{'patches/' if found['patch'] else ''}{found['content']}{found['pose']}{suffix}.png"
+
+
+def member_order(path: str) -> tuple[int, int, bool, int]:
+    """Sorts the images of a scene: by pose, then in the order of the article's figure 1, each before its patches."""
+    found = _match(_PATH, path)
+    return int(found["pose"]), _CONTENTS.index(found["content"]), bool(found["patch"]), int(found["object"] or 0)
+
+
+def member_header(name: str, size: int) -> tarfile.TarInfo:
+    """A header that depends on nothing but name and size."""
+    header = tarfile.TarInfo(name)
+    header.size = size
+    header.mtime = 0
+    header.mode = 0o644
+    return header
+
+
+def read_tar(category: str, data: bytes, name: str) -> Iterator[tuple[str, bytes]]:
+    """(image path, bytes) of every member, in order. Raises CorruptError naming the archive where it is damaged."""
+    try:
+        with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as archive:
+            for header in archive:
+                file = archive.extractfile(header)
+                yield path_of(category, header.name), file.read() if file else b""
+    except (tarfile.TarError, ValueError, EOFError) as error:
+        raise CorruptError(f"{name} is not a whole archive of images: {error}") from error
+
+
+def _match(pattern: re.Pattern[str], name: str) -> re.Match[str]:
+    found = pattern.fullmatch(name)
+    if found is None or found["content"] not in _CONTENTS:
+        raise ValueError(f"{name!r} is not the name of an image")
+    return found
