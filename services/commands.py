@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import json
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from schemas.errors import OutputError
@@ -20,7 +21,8 @@ def run(options: argparse.Namespace) -> int:
 
     job = load_job(options.job, _changes(options))
     out = options.out or f"data/{job.name}"
-    request = RunRequest(job, options.job.parent, out, options.address, options.retry_failed)
+    absolute = out if "://" in out else str(Path(out).resolve())
+    request = RunRequest(job, options.job.parent, absolute, options.address, options.retry_failed)
     if options.dry_run:
         print("\n".join(describe_plan(request)))
         return 0

@@ -12,16 +12,20 @@ _OVERHEAD = 150
 """Bytes that Python spends on one pair beside its contents."""
 
 
+LIMIT_BYTES = 32 << 20
+"""Of pairs that wait in memory."""
+
+
 class ExternalSort:
     """Pairs of bytes, given in any order and read back in order of key, then of value; duplicates stay.
 
-    Memory stays near `limit_bytes`, disk use near the size of all pairs. Who owns `folder` removes it.
+    Memory stays near `limit_bytes` (default LIMIT_BYTES), disk use near the size of all pairs. Who owns `folder` removes it.
     """
 
-    def __init__(self, folder: Path, name: str, limit_bytes: int = 32 << 20) -> None:
+    def __init__(self, folder: Path, name: str, limit_bytes: int | None = None) -> None:
         self._folder = folder
         self._name = name
-        self._limit = limit_bytes
+        self._limit = limit_bytes or LIMIT_BYTES
         self._pairs: list[tuple[bytes, bytes]] = []
         self._bytes = 0
         self._runs: list[Path] = []

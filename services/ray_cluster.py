@@ -3,6 +3,7 @@
 import contextlib
 import os
 import socket
+import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -39,21 +40,20 @@ def private_ray(workers: int) -> Iterator[Slots]:
     """
     # A token that an earlier Ray left in the home folder would be asked of our own workers.
     os.environ["RAY_AUTH_MODE"] = "disabled"  # noqa: TID251 - Ray reads this setting nowhere else
-    with _project_first(), tempfile.TemporaryDirectory(prefix="vr", ignore_cleanup_errors=True) as folder:
-        ray.init(
-            address="local",
-            num_cpus=workers,
-            include_dashboard=False,
-            object_store_memory=OBJECT_STORE_BYTES,
-            log_to_driver=False,
-            configure_logging=False,
-            _temp_dir=folder,
-            _node_ip_address="127.0.0.1",
-        )
-        try:
+    with _quiet_stdout(), tempfile.TemporaryDirectory(prefix="vr", ignore_cleanup_errors=True) as folder:
+        with _project_first():
+            ray.init(
+                address="local",
+                num_cpus=workers,
+                include_dashboard=False,
+                object_store_memory=OBJECT_STORE_BYTES,
+                log_to_driver=False,
+                configure_logging=False,
+                _temp_dir=folder,
+                _node_ip_address="127.0.0.1",
+            )
+        with _shut_down():
             yield Slots(workers, PREFETCH * workers)
-        finally:
-            ray.shutdown()
 
 
 @contextlib.contextmanager
@@ -63,19 +63,35 @@ def cluster_ray(address: str, workers: int | None) -> Iterator[Slots]:
     Raises MachineError where nobody answers at the address.
     """
     _probe(address)
+    with _quiet_stdout():
+        try:
+            with _project_first():
+                ray.init(address=address, log_to_driver=False, configure_logging=False)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            raise MachineError(f"--address {address}: {error}") from error
+        with _shut_down():
+            yield _cluster_slots(address, workers)
+
+
+def _cluster_slots(address: str, workers: int | None) -> Slots:
+    cores = int(ray.cluster_resources().get("CPU", 0))
+    if cores < 1:
+        raise MachineError(f"--address {address}: the cluster has no CPU to run on")
+    # A shard that waits could be started by any free core, so fewer workers than cores means none that waits.
+    return Slots(workers, workers) if workers and workers < cores else Slots(cores, PREFETCH * cores)
+
+
+@contextlib.contextmanager
+def _shut_down() -> Iterator[None]:
     try:
-        with _project_first():
-            ray.init(address=address, log_to_driver=False, configure_logging=False)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        raise MachineError(f"--address {address}: {error}") from error
-    try:
-        cores = int(ray.cluster_resources().get("CPU", 0))
-        if cores < 1:
-            raise MachineError(f"--address {address}: the cluster has no CPU to run on")
-        # A shard that waits could be started by any free core, so fewer workers than cores means none that waits.
-        yield Slots(workers, workers) if workers and workers < cores else Slots(cores, PREFETCH * cores)
+        yield
     finally:
         ray.shutdown()
+
+
+def _quiet_stdout() -> contextlib.AbstractContextManager[object]:
+    """Ray tells of dead workers on the driver's standard output, which belongs to the command's answer."""
+    return contextlib.redirect_stdout(sys.stderr)
 
 
 @contextlib.contextmanager

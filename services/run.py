@@ -33,7 +33,8 @@ USUAL_SHARD = 64
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What the user asked for; relative asset folders are resolved from `job_folder`."""
+    """What the user asked for; relative asset folders are resolved from `job_folder`. `out` is a URL or an absolute path,
+    because workers stand elsewhere."""
 
     job: Job
     job_folder: Path
@@ -107,9 +108,7 @@ def _missing_spans(store: Store, job: Job, retry_failed: bool) -> list[Span]:
 
 def _order(request: RunRequest, record: JobRecord) -> ShardOrder:
     """The pattern of every shard's order."""
-    local = isinstance(open_store(request.out), LocalStore)
-    out = str(Path(request.out).resolve()) if local else request.out
-    return ShardOrder(out=out, job=record.job, terms=_terms(record), spans=())
+    return ShardOrder(out=request.out, job=record.job, terms=_terms(record), spans=())
 
 
 def _make(order: ShardOrder, catalogue: Catalogue, spans: Sequence[Span], slots: Slots, tally: Tally) -> None:

@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import sys
-from collections import OrderedDict
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +11,7 @@ import numpy as np
 from schemas.errors import AssetSourceError, MeshError
 from schemas.job import Assets, FolderSource, ProceduralSource, ShapeNetSource, SplitShares
 from schemas.shape import Asset
+from workers.assets.cache import AssetCache
 from workers.assets.procedural.make import VERSION, instance_id, make_asset
 from workers.assets.shapenet import list_shapenet, load_shapenet
 from workers.assets.sources import TABLE, Entry, Listing, Weights
@@ -215,27 +214,10 @@ def _source(catalogue: Catalogue, number: int, category: str) -> tuple[AnySource
 
 def load_asset(catalogue: Catalogue, ref: InstanceRef) -> Asset:
     """The asset, from this process's cache if it is there; MeshError where its mesh is refused."""
-    key = (catalogue.digest, ref)
-    if key in _cache:
-        _cache.move_to_end(key)
-        return _cache[key]
-    asset = _load(catalogue, ref)
-    _cache[key] = asset
-    while len(_cache) > 1 and sum(map(asset_bytes, _cache.values())) > CACHE_BYTES:
-        _cache.popitem(last=False)
-    return asset
+    return _cache.get((catalogue.digest, ref), lambda: _load(catalogue, ref))
 
 
-_cache: OrderedDict[tuple[str, InstanceRef], Asset] = OrderedDict()
-
-
-def asset_bytes(asset: Asset) -> int:
-    """Memory that an asset's arrays take."""
-    total = sys.getsizeof(asset)
-    for part in asset.shape.parts:
-        arrays = (part.vertices, part.faces, part.normals, part.uv, part.colors, part.material.texture)
-        total += sum(array.nbytes for array in arrays if array is not None)
-    return total
+_cache = AssetCache(CACHE_BYTES)
 
 
 def _load(catalogue: Catalogue, ref: InstanceRef) -> Asset:

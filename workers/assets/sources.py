@@ -3,7 +3,7 @@
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,6 +26,9 @@ from workers.assets.reading import (
 
 TABLE = "table"
 """The category name of tables."""
+
+UNKNOWN = "unknown"
+"""The licence of a source whose user states none."""
 
 UP_AXES: Mapping[str, Array] = {
     "x": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
@@ -163,17 +166,22 @@ def volume(mass: MassProperties, density_kg_m3: float) -> float | None:
     return mass.mass_kg / density_kg_m3 if mass.solid else None
 
 
-def licence_of(path: Path, root: Path, stated: str) -> str:
-    """The stated licence; where none is stated, the nearest licence file from the mesh's folder up to the source's."""
-    if stated != "unknown":
-        return stated
-    for folder in [path.parent, *path.parent.parents]:
-        if not folder.is_relative_to(root):
-            break
-        for file in sorted(folder.iterdir()):
-            if file.is_file() and file.stem.lower() in ("license", "licence", "copying"):
-                return f"see {file.relative_to(root).as_posix()}"
+def licence_of(path: Path, root: Path, stated: str, files: Collection[Path]) -> str:
+    """The stated licence; where none is stated, the nearest licence file from the mesh's folder up to the source's.
+
+    `files`: the licence files in the source, as `licence_files` gives them.
+    """
+    if stated == UNKNOWN:
+        for folder in path.parents:
+            for file in files:
+                if file.parent == folder:
+                    return f"see {file.relative_to(root).as_posix()}"
     return stated
+
+
+def licence_files(paths: Iterable[Path]) -> list[Path]:
+    """Those of the files whose name is a licence's."""
+    return sorted(path for path in paths if path.stem.lower() in ("license", "licence", "copying"))
 
 
 def found_in(folder: Path, most: int = 5) -> str:

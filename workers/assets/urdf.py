@@ -3,17 +3,16 @@
 import hashlib
 import importlib.util
 from collections.abc import Collection, Mapping
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 from schemas.errors import AssetSourceError, MeshError
 from schemas.job import CATEGORIES, FolderSource, MeshLimits
 from schemas.shape import Asset
 from workers.assets.mesh import load_shape
-from workers.assets.reading import MESH_SUFFIXES
 from workers.assets.robot import find_mesh, load_urdf, mesh_names, parse_urdf
 from workers.assets.sources import (
     TABLE,
+    UNKNOWN,
     UP_AXES,
     Entry,
     Listing,
@@ -22,6 +21,7 @@ from workers.assets.sources import (
     check_unchanged,
     found_in,
     hashed,
+    licence_files,
     licence_of,
     mesh_files,
     placed_asset,
@@ -58,16 +58,29 @@ def list_folder(settings: FolderSource, folder: Path, categories: Collection[str
         category: [] for category in sorted(set(category_map.values()) & set(categories))
     }
     skipped = []
-    for path in sorted(p for p in folder.rglob("*") if p.suffix.lower() in (".urdf", *MESH_SUFFIXES)):
-        relative = path.relative_to(folder).as_posix()
-        category = next((c for pattern, c in category_map.items() if fnmatchcase(relative, pattern)), None)
+    licences = licence_files(folder.rglob("*")) if settings.licence == UNKNOWN else []
+    for path, category in sorted(_matches(category_map, folder).items()):
         if category not in entries:
             continue
         try:
-            entries[category].append(_entry(settings, folder, path, limits))
+            entries[category].append(_entry(settings, folder, path, limits, licences))
         except MeshError as error:
             skipped.append(error.reason)
     return Listing(folder, {category: tuple(found) for category, found in entries.items()}, tally(skipped))
+
+
+def _matches(category_map: Mapping[str, str], folder: Path) -> dict[Path, str]:
+    """The category of every file inside the folder that a pattern finds; the first pattern wins."""
+    matches: dict[Path, str] = {}
+    for pattern, category in category_map.items():
+        try:
+            found = [path for path in folder.glob(pattern) if path.is_file()]
+        except (ValueError, NotImplementedError) as error:
+            raise AssetSourceError(f"category_map: {pattern!r} is not a pattern below the folder: {error}") from error
+        for path in found:
+            if path.resolve().is_relative_to(folder):
+                matches.setdefault(path.resolve(), category)
+    return matches
 
 
 def _map_of(settings: FolderSource, folder: Path) -> Mapping[str, str]:
@@ -88,7 +101,7 @@ def _map_of(settings: FolderSource, folder: Path) -> Mapping[str, str]:
     return category_map
 
 
-def _entry(settings: FolderSource, folder: Path, path: Path, limits: MeshLimits) -> Entry:
+def _entry(settings: FolderSource, folder: Path, path: Path, limits: MeshLimits, licences: list[Path]) -> Entry:
     paths = [path]
     if path.suffix.lower() == ".urdf":
         for name in mesh_names(parse_urdf(path)):
@@ -96,9 +109,8 @@ def _entry(settings: FolderSource, folder: Path, path: Path, limits: MeshLimits)
     else:
         paths = mesh_files(path, folder, limits)
     files = hashed(dict.fromkeys(paths), folder)
-    return Entry(
-        _instance_id(settings, files[0].path, files[0].sha256), files, licence_of(path, folder, settings.licence)
-    )
+    identity = _instance_id(settings, files[0].path, files[0].sha256)
+    return Entry(identity, files, licence_of(path, folder, settings.licence, licences))
 
 
 def _instance_id(settings: FolderSource, relative: str, sha256: str) -> str:

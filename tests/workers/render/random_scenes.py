@@ -89,7 +89,7 @@ def object_shape(rng: np.random.Generator) -> Shape:
             mesh.apply_transform(pose(uniform_rotation(rng), rng.uniform(-0.3 * s, 0.3 * s, 3)))
     elif kind == 5:  # a bowl without thickness: an open surface, seen from both sides
         meshes = [trimesh.creation.icosphere(4, s)]
-        meshes[0].update_faces((meshes[0].triangles_center[:, 2] < 0.1 * s))
+        meshes[0].update_faces(meshes[0].triangles_center[:, 2] < 0.1 * s)
     elif kind == 6:
         meshes = [trimesh.creation.annulus(0.6 * s, 0.65 * s, 1.8 * s, sections=int(rng.integers(24, 128)))]
     else:  # two thin boards, like an open laptop
@@ -105,14 +105,21 @@ def stand(shape: Shape, rotation: Array, x: float, y: float, height: float) -> P
 
 
 def random_things(rng: np.random.Generator) -> tuple[list[Placed], float]:
-    """(floor, a table, one to three objects on it, the height of the table's top)."""
+    """(floor, a table, one to three objects on it, the height of the table's top).
+
+    Objects do not touch one another: along a line where two surfaces cut through each other there is no edge.
+    """
     table, height = table_shape(rng)
     things = [floor(), Placed(2, table, np.eye(4))]
-    for region_id in range(3, 4 + int(rng.integers(3))):
+    taken: list[Array] = []
+    for _ in range(1 + int(rng.integers(3))):
         shape = object_shape(rng)
         upright = rng.random() < 0.5
         rotation = rotation_about(UP, rng.uniform(-np.pi, np.pi)) if upright else uniform_rotation(rng)
-        things.append(Placed(region_id, shape, stand(shape, rotation, *rng.uniform(-0.25, 0.25, 2), height)))
+        radius, spot = float(np.linalg.norm(shape.vertices, axis=1).max()), rng.uniform(-0.25, 0.25, 2)
+        if all(np.hypot(*(spot - other[:2])) > radius + other[2] for other in taken):
+            taken.append(np.array([*spot, radius]))
+            things.append(Placed(2 + len(taken), shape, stand(shape, rotation, *spot, height)))
     return things, height
 
 

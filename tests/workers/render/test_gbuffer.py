@@ -14,12 +14,12 @@ from tests.workers.render.random_scenes import (
     VGA,
     floor,
     object_shape,
+    orbit_and_mirror,
     part_of,
     quad,
     random_things,
     shape_of,
 )
-from tests.workers.render.random_scenes import orbit_and_mirror
 from workers.geometry import raycast
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import pose, translation, uniform_rotation

@@ -22,6 +22,10 @@ NEAR_EDGE_SHARE = 2e-5
 PLANE_P999_MM = 0.01
 OBJECT_MEDIAN_MM = 0.01
 OBJECT_P99_MM = 0.05
+FARTHEST_M = 10.0
+"""The floor of the dataset's cameras reaches to 9 m; what lies beyond 8 m is not stored. float32 itself has steps of
+0.004 mm beyond 32 m."""
+
 STEEPEST_COS = math.cos(math.radians(80.0))
 
 BOUNDS = {
@@ -65,7 +69,7 @@ def score(renderer: Renderer, make: Scenes, seeds: Iterable[int]) -> dict[str, f
         figures = {"mask: farthest disagreement from an edge, px": float(away.max(initial=0.0))}
         error_mm = np.abs(seen.depth_m.astype(np.float64) - depth) * 1e3
         for region_id in np.unique(region[region > 0]):
-            same = (region == region_id) & (seen.region == region_id)
+            same = (region == region_id) & (seen.region == region_id) & (depth < FARTHEST_M)
             figures |= depth_figures(int(region_id), error_mm[same], cosine[same])
             for name, figure in figures.items():
                 worst[name] = max(worst[name], figure)
@@ -87,7 +91,7 @@ def depth_figures(region_id: int, error_mm: np.ndarray, cosine: np.ndarray) -> d
 
 
 def hold(record_figure: Callable, kind: str, worst: dict[str, float], scenes: int) -> None:
-    assert set(worst) == set(BOUNDS), "every region was seen"
+    assert set(worst) == set(BOUNDS), "some region was never seen"
     missed = {name: worst[name] for name, bound in BOUNDS.items() if not worst[name] <= bound}
     for name, bound in BOUNDS.items():
         record_figure(f"{kind}, {scenes} scenes: {name}", "failed" if name in missed else "passed", worst[name], bound)

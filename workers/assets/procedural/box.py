@@ -4,14 +4,24 @@ from collections.abc import Callable
 
 import numpy as np
 
-from schemas.base import Array
 from workers.assets.procedural.finish import Model, Surface
+from workers.assets.procedural.gift import (
+    BOTTOM,
+    EXTRA,
+    LID,
+    OTHER,
+    SIDE,
+    TOP,
+    drawn_size,
+    make_lidded,
+    on_front,
+    on_top,
+)
 from workers.assets.procedural.look import (
     BLACK,
     WHITE,
     Color,
     chance,
-    ink_on,
     metal,
     mixed,
     near,
@@ -22,34 +32,17 @@ from workers.assets.procedural.look import (
     vivid,
     wood_colors,
 )
-from workers.assets.procedural.paint import (
-    Picture,
-    band_height,
-    bands,
-    blank,
-    blend,
-    dots,
-    label,
-    noise,
-    rgb,
-    upright_stripes,
-    wood,
-)
-from workers.assets.procedural.solid import Solid, circle, difference, lathe, together, union
+from workers.assets.procedural.paint import Picture, band_height, bands, blank, blend, label, noise, rgb, wood
+from workers.assets.procedural.solid import difference, union
 from workers.assets.procedural.vessel import bevelled, prism, sides_apart
-
-SIDE, LID, TOP, BOTTOM, EXTRA, OTHER = 0, 1, 2, 3, 4, 5
-
-Size = tuple[float, float, float]
-"""Width along x, depth along y, height; metres."""
 
 
 def make_box(rng: np.random.Generator) -> Model:
     """A closed box, 60 to 400 mm, of board, tinplate or wood."""
     builders: tuple[Callable[[np.random.Generator], Model], ...] = (
         _carton,
-        _lidded,
-        _lidded,
+        make_lidded,
+        make_lidded,
         _packet,
         _packet,
         _tin,
@@ -58,33 +51,9 @@ def make_box(rng: np.random.Generator) -> Model:
     return builders[int(rng.integers(len(builders)))](rng)
 
 
-def _size(
-    rng: np.random.Generator, width: tuple[float, float], depth: tuple[float, float], height: tuple[float, float]
-) -> Size:
-    """Width in metres; depth and height as shares of the width."""
-    w = float(rng.uniform(*width))
-    return w, w * float(rng.uniform(*depth)), w * float(rng.uniform(*height))
-
-
-def _flat_on_top(name: str, picture: Picture, size: Size, roughness: float) -> Surface:
-    """A picture laid once over the top."""
-    w, d, _ = size
-    return Surface(
-        name, textured(picture, roughness), "plane", origin=(-w / 2, -d / 2, 0.0), across=(w, 0, 0), up=(0, d, 0)
-    )
-
-
-def _on_front(name: str, material_of: Surface, size: Size, back: bool) -> Surface:
-    """The same picture on the front or the back, read from outside."""
-    w, d, h = size
-    sign = -1.0 if back else 1.0
-    origin = (-sign * w / 2, sign * -d / 2, 0.0)
-    return Surface(name, material_of.material, "plane", origin=origin, across=(sign * w, 0, 0), up=(0, 0, h))
-
-
 def _carton(rng: np.random.Generator) -> Model:
     """A cardboard carton: four flaps above, a slot between them, tape along it."""
-    size = _size(rng, (0.16, 0.4), (0.55, 0.95), (0.4, 0.95))
+    size = drawn_size(rng, (0.16, 0.4), (0.55, 0.95), (0.4, 0.95))
     w, d, h = size
     board = near(rng, (0.72, 0.56, 0.38), 0.05)
     crease = float(rng.uniform(0.0015, 0.003))
@@ -107,11 +76,11 @@ def _carton(rng: np.random.Generator) -> Model:
     front = Surface("front", textured(printed, 0.85))
     grain = Surface("sides", paper, "grain", size=max(size))
     surfaces = (
-        _on_front("front", front, size, back=False),
+        on_front("front", front, size, back=False),
         grain,
-        _flat_on_top("top", top, size, 0.7),
+        on_top("top", top, size, 0.7),
         Surface("bottom", solid_color(board, 0.85)),
-        _on_front("back", front, size, back=True),
+        on_front("back", front, size, back=True),
         Surface("slot", solid_color(mixed(board, BLACK, 0.5), 0.9)),
     )
     return Model(body, surfaces)
@@ -123,83 +92,9 @@ def _board(rng: np.random.Generator, color: Color) -> Picture:
     return blend(mixed(color, WHITE, 0.08), mixed(color, BLACK, 0.12), share)
 
 
-def _lidded(rng: np.random.Generator) -> Model:
-    """A box whose lid is a little wider than it: a shoe box, or a gift box with a ribbon."""
-    size = _size(rng, (0.08, 0.34), (0.5, 1.0), (0.3, 0.8))
-    w, d, h = size
-    step, deep = float(rng.uniform(0.0015, 0.003)), h * float(rng.uniform(0.15, 0.5))
-    b = 0.0012
-    profile = np.array(
-        [[step + b, 0.0], [step, b], [step, 0.5 * (h - deep)], [step, h - deep], [0.0, h - deep], [0.0, h - b], [b, h]]
-    )
-    body = prism(
-        profile, (w, d), float(rng.uniform(0.0035, 0.006)), [BOTTOM, SIDE, SIDE, SIDE, BOTTOM, LID, LID, TOP], 3, (6, 6)
-    )
-    color: Color = pick(rng, (vivid(rng), pale(rng), WHITE, BLACK))
-    cover = color if chance(rng, 0.4) else near(rng, vivid(rng))
-    roughness = float(rng.uniform(0.4, 0.8))
-    side = Surface("side", solid_color(color, roughness))
-    top = Surface("top", solid_color(cover, roughness))
-    ribbon = Surface("ribbon", solid_color(vivid(rng), 0.35))
-    if chance(rng, 0.5):
-        body = union([body, *_ribbon(rng, size)])
-    elif chance(rng, 0.7):
-        top = _flat_on_top("top", label(rng, cover, height=128, width=128, faces=1), size, roughness)
-    if chance(rng, 0.4):
-        patterns = (
-            dots(rng, color, mixed(color, ink_on(rng, color), 0.7), 256),
-            upright_stripes(rng, [color, mixed(color, WHITE, 0.5)]),
-        )
-        side = Surface("side", textured(patterns[int(rng.integers(2))], roughness), "grain", size=max(size))
-    surfaces = (
-        side,
-        Surface("lid", solid_color(cover, roughness)),
-        top,
-        Surface("bottom", solid_color(mixed(color, BLACK, 0.2), 0.8)),
-        ribbon,
-    )
-    return Model(body, surfaces)
-
-
-def _ribbon(rng: np.random.Generator, size: Size) -> list[Solid]:
-    """Two bands around the box and a bow of two loops and a knot."""
-    w, d, h = size
-    width, lift = min(w, d) * float(rng.uniform(0.08, 0.16)), 0.0009
-    bands_around = [
-        prism(np.array([[0.0, 0.0], [0.0, h + lift]]), (w + 2 * lift, width), 0.0008, [EXTRA] * 3, 1),
-        prism(np.array([[0.0, 0.0], [0.0, h + lift]]), (width, d + 2 * lift), 0.0008, [EXTRA] * 3, 1),
-    ]
-    if chance(rng, 0.3):
-        return bands_around
-    loop = min(w, d) * float(rng.uniform(0.13, 0.2))
-    bow = []
-    for sign in (-1.0, 1.0):
-        petal = _egg(np.array([loop, 0.55 * width, 0.5 * loop]))
-        turn = float(rng.uniform(0.2, 0.6))
-        axes = _turned(sign, turn)
-        bow.append(petal.placed(axes, np.array([sign * 1.08 * loop, 0.0, h + 0.3 * loop])))
-    knot = _egg(np.array([0.4 * loop, 0.6 * width, 0.42 * loop])).moved(z=h + 0.25 * loop)
-    return [*bands_around, together(bow), knot]
-
-
-def _turned(sign: float, slope: float) -> Array:
-    """[3, 3]: axes turned about y so that x rises by `slope` towards the side `sign`."""
-    length = float(np.sqrt(1.0 + slope * slope))
-    c, s = 1.0 / length, sign * slope / length
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-
-
-def _egg(radii: Array) -> Solid:
-    """An ellipsoid about the origin."""
-    half = circle(16)[4:13]
-    profile = np.stack([-half[:, 0], -half[:, 1]], axis=1)
-    ball = lathe(profile, [EXTRA] * (len(profile) - 1), 12)
-    return Solid(ball.vertices * radii, ball.faces, ball.surface, ball.smooth)
-
-
 def _packet(rng: np.random.Generator) -> Model:
     """A printed packet: cereals, crackers, tea; a closing seam along the top."""
-    size = _size(rng, (0.06, 0.2), (0.25, 0.6), (0.9, 1.55))
+    size = drawn_size(rng, (0.06, 0.2), (0.25, 0.6), (0.9, 1.55))
     w, d, h = size
     b = 0.0015
     profile = np.array([[b, 0.0], [0.0, b], [0.0, 0.5 * h], [0.0, h - b], [b, h]])
@@ -215,11 +110,11 @@ def _packet(rng: np.random.Generator) -> Model:
     second = bands(rng, [paper, mixed(paper, WHITE, 0.6)]) if chance(rng, 0.4) else blank(8, 8, near(rng, paper))
     side = Surface("sides", textured(second, gloss), "plane", origin=(0, -d / 2, 0), across=(0, d, 0), up=(0, 0, h))
     surfaces = (
-        _on_front("front", front, size, back=False),
+        on_front("front", front, size, back=False),
         side,
         Surface("top", solid_color(near(rng, paper, 0.02), gloss)),
         Surface("bottom", solid_color(paper, 0.7)),
-        _on_front("back", front, size, back=True),
+        on_front("back", front, size, back=True),
         Surface("seam", solid_color(mixed(paper, BLACK, 0.5), 0.8)),
     )
     return Model(body, surfaces)
@@ -227,7 +122,7 @@ def _packet(rng: np.random.Generator) -> Model:
 
 def _tin(rng: np.random.Generator) -> Model:
     """A tinplate box with round corners and a pressed lid."""
-    size = _size(rng, (0.08, 0.25), (0.5, 1.0), (0.25, 0.9))
+    size = drawn_size(rng, (0.08, 0.25), (0.5, 1.0), (0.25, 0.9))
     w, d, h = size
     radius = min(w, d) * float(rng.uniform(0.12, 0.45))
     deep, b, step = min(0.02, 0.25 * h), 0.003, 0.0012
@@ -262,7 +157,7 @@ def _tin(rng: np.random.Generator) -> Model:
 
 def _chest(rng: np.random.Generator) -> Model:
     """A wooden box: boards with grooves between them, a seam below the lid, perhaps a clasp."""
-    size = _size(rng, (0.12, 0.35), (0.5, 0.9), (0.4, 0.85))
+    size = drawn_size(rng, (0.12, 0.35), (0.5, 0.9), (0.4, 0.85))
     w, d, h = size
     lid, groove, boards = h * float(rng.uniform(0.2, 0.35)), 0.0016, int(rng.integers(1, 4))
     b = 0.002

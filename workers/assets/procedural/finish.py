@@ -9,7 +9,7 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.shape import Material, Part, Shape
-from workers.assets.procedural.solid import Indices, Solid
+from workers.assets.procedural.solid import TRIG_DIGITS, Indices, Solid
 
 Wrap = Literal["none", "cylinder", "plane", "grain"]
 
@@ -131,10 +131,10 @@ def _texture_variants(
 def _turns(vertices: Array, faces: Indices) -> Array:
     """[V] float64: for the points that the faces name, the angle about the z axis in turns, in [0, 1).
 
-    Python's atan2 and not numpy's, which gives other bits with other vector instructions.
+    Python's atan2, rounded, and not numpy's, which gives other bits with other vector instructions.
     """
     turn = np.zeros(len(vertices))
     used = np.unique(faces)
-    angles = [math.atan2(y, x) / (2.0 * math.pi) for x, y in vertices[used, :2].tolist()]
+    angles = [round(math.atan2(y, x) / (2.0 * math.pi), TRIG_DIGITS) for x, y in vertices[used, :2].tolist()]
     turn[used] = [angle + 1.0 if angle < 0.0 else angle for angle in angles]
     return turn

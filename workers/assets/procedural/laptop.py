@@ -22,7 +22,7 @@ from workers.assets.procedural.look import (
     vivid,
 )
 from workers.assets.procedural.paint import Picture, blank, blend, noise, rgb, write_lines
-from workers.assets.procedural.solid import Solid, difference, lathe, together, union
+from workers.assets.procedural.solid import TRIG_DIGITS, Solid, difference, lathe, together, union
 from workers.assets.procedural.vessel import bevelled, prism
 
 CASE, LID, SCREEN, BEZEL, DECK, PAD = 0, 1, 2, 3, 4, 5
@@ -42,7 +42,7 @@ def make_laptop(rng: np.random.Generator) -> Model:
     lid = _screen(rng, (width, depth), lid_thick, radius)
     # The screen lies closed on the base, turns about the hinge's axis and stands behind the keys.
     hinge = np.array([0.0, 0.5 * depth - 0.5 * thick, thick + 0.15 * lid_thick])
-    c, s = math.cos(angle), math.sin(angle)
+    c, s = round(math.cos(angle), TRIG_DIGITS), round(math.sin(angle), TRIG_DIGITS)
     axes = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
     opened = lid.placed(axes, hinge)
     barrel = _hinge(width * float(rng.uniform(0.55, 0.8)), 0.5 * thick, hinge)

@@ -78,7 +78,8 @@ def _handle(rng: np.random.Generator, wall: Wall) -> Solid:
     start, stop = (end - 0.5 * wall.thickness_m * normal for end, normal in zip(ends, out, strict=True))
     reach = (high - low) * float(rng.uniform(0.55, 0.95))
     path = _path(rng, start, out[0], stop, out[1], max(reach, 0.022))
-    thick_ends = 1.0 + float(rng.uniform(0.0, 0.25)) * (2.0 * np.linspace(0.0, 1.0, len(path)) - 1.0) ** 4
+    along = 2.0 * np.linspace(0.0, 1.0, len(path)) - 1.0
+    thick_ends = 1.0 + float(rng.uniform(0.0, 0.25)) * (along * along) * (along * along)
     section = squircle(12, int(rng.integers(2))) * np.array([half_width, half_depth]) / 1.25
     return rod(path, section, HANDLE, (out[0], -out[1]), thick_ends)
 

@@ -1,6 +1,7 @@
 """Pure: closed triangle solids, made by lofting rings and joined by manifold3d's exact booleans.
 
 Only +, -, *, / and square roots touch coordinates here and in `curves`: they give the same bits on every processor.
+Sines and cosines are rounded to `TRIG_DIGITS`, because C libraries and processors differ in the last bit of theirs.
 """
 
 import functools
@@ -18,8 +19,10 @@ Indices = NDArray[np.int64]
 
 SMOOTH_COSINE = 0.8
 """Neighbouring bands that turn by less than about 37 degrees are shaded as one smooth surface."""
+TRIG_DIGITS = 14
+"""A point of the unit circle is off by less than 1e-14 of its radius."""
 _SURFACES = 64
-_SMOOTHS = 256
+"""More surfaces than any model has: a face's tag is smooth number * _SURFACES + surface number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +55,7 @@ def circle(count: int) -> Array:
     for k in range(count):
         quarter, rest = divmod(4 * k, count)
         angle = math.pi * rest / (2 * count)
-        c, s = math.cos(angle), math.sin(angle)
+        c, s = round(math.cos(angle), TRIG_DIGITS), round(math.sin(angle), TRIG_DIGITS)
         points.append(((c, s), (-s, c), (-c, -s), (s, -c))[quarter])
     table = np.array(points)
     table.setflags(write=False)
