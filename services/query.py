@@ -29,6 +29,8 @@ _LOCKED = {
 }
 """SQL sees the six tables and no file, no network, no variable of this process."""
 
+_NO_QUESTION = 'there is no question: write SQL, for example "select category, count(*) from scenes group by 1"'
+
 Rows: TypeAlias = ds.Dataset | pa.Table
 
 _FORMAT = ds.ParquetFileFormat(
@@ -47,6 +49,8 @@ def query(store: Store, sql: str) -> pa.Table:
         _register(connection, store)
         connection.execute("SET lock_configuration = true")
         try:
+            if not connection.extract_statements(sql):
+                raise InputError(_NO_QUESTION)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # that a copy is made
                 return connection.execute(sql).to_arrow_table()

@@ -62,7 +62,9 @@ def test_rows_within_a_category_are_in_order(merged):
     store, _ = merged
     for table in TABLES:
         for folder in (store.root / "manifest" / table).iterdir():
-            rows = pa.concat_tables([pa.parquet.read_table(path, partitioning=None) for path in sorted(folder.iterdir())])
+            rows = pa.concat_tables(
+                [pa.parquet.read_table(path, partitioning=None) for path in sorted(folder.iterdir())]
+            )
             keys = list(zip(*(rows.column(key).to_pylist() for key in SORT_KEYS[table]), strict=True))
             assert keys == sorted(set(keys))
 
@@ -105,7 +107,18 @@ def test_cameras_has_every_camera_in_order_with_both_conventions(merged):
     assert len(rows) == len(views)
     for row, view in zip(rows, views, strict=True):
         assert row["role"] == view["role"]
-        for name in ("pose_id", "parent_id", "width", "height", "fx", "cx", "cy", "cx_opencv", "cy_opencv", "depth_units_per_m"):
+        for name in (
+            "pose_id",
+            "parent_id",
+            "width",
+            "height",
+            "fx",
+            "cx",
+            "cy",
+            "cx_opencv",
+            "cy_opencv",
+            "depth_units_per_m",
+        ):
             assert float(row[name]) == view[name]
         assert [float(row[f"T{i}{j}"]) for i in range(4) for j in range(4)] == view["T_world_cam"]
 
@@ -163,7 +176,14 @@ def test_the_digest_is_what_its_definition_says(merged):
 
 @pytest.mark.parametrize(
     "how",
-    [{"size": 1}, {"size": 7}, {"size": 100}, {"order": -1}, {"layout": "tar"}, {"layout": "tar", "size": 5, "order": -1}],
+    [
+        {"size": 1},
+        {"size": 7},
+        {"size": 100},
+        {"order": -1},
+        {"layout": "tar"},
+        {"layout": "tar", "size": 5, "order": -1},
+    ],
     ids=str,
 )
 def test_the_digest_does_not_depend_on_ranges_order_layout_or_attempts(merged, tmp_path, how):
@@ -225,7 +245,9 @@ def changed_row(scene_id):
 
 def changed_shape(scene_id):
     output = scene(scene_id)
-    return dataclasses.replace(output, files=tuple((p, d[::-1] if p.startswith("assets/") else d) for p, d in output.files))
+    return dataclasses.replace(
+        output, files=tuple((p, d[::-1] if p.startswith("assets/") else d) for p, d in output.files)
+    )
 
 
 def changed_failure(scene_id):
@@ -312,7 +334,7 @@ def own_shape(scene_id):
 @pytest.mark.parametrize("make", [own_description, own_shape])
 def test_two_ranges_of_one_stack_that_make_one_asset_differently_are_a_conflict(tmp_path, make):
     store = dataset_at(tmp_path, 0, 8, make=make)
-    with pytest.raises(CommitConflict, match="differently|two digests"):
+    with pytest.raises(CommitConflict, match=r"differently|two digests"):
         merge(store, 0, 8)
     assert read_success(store) is None
 

@@ -48,7 +48,8 @@ def look_of(mesh: trimesh.Trimesh, linear: bool) -> tuple[Look, tuple[str, ...]]
         uv = getattr(visual, "uv", None)
         usable = uv is not None and np.shape(uv) == (len(mesh.vertices), 2) and bool(np.isfinite(uv).all())
         material, notes = _material(visual.material, textured=usable)
-        return Look(material, np.asarray(uv, dtype=np.float64) if usable else None), notes
+        colors = _attribute_colors(visual.vertex_attributes.get("color"), len(mesh.vertices), linear)
+        return Look(material, np.asarray(uv, dtype=np.float64) if usable else None, colors), notes
     if visual.kind == "vertex" and len(visual.vertex_colors) == len(mesh.vertices):
         return Look(_white(), colors=_colors(visual.vertex_colors, linear)), ()
     if visual.kind == "face" and len(visual.face_colors) == len(mesh.faces):
@@ -65,6 +66,21 @@ def _colors(values: NDArray, linear: bool) -> NDArray[np.uint8]:
     if linear:
         rgba[:, :3] = np.round(255.0 * srgb_from_linear(rgba[:, :3] / 255.0)).astype(np.uint8)
     return rgba
+
+
+def _attribute_colors(values: NDArray | None, count: int, linear: bool) -> NDArray[np.uint8] | None:
+    """Vertex colours that come beside a material, as stored: floats, or whole numbers that fill their type."""
+    if values is None or np.shape(values) not in ((count, 3), (count, 4)):
+        return None
+    whole = np.issubdtype(values.dtype, np.integer)
+    share = np.ones((count, 4))
+    share[:, : values.shape[1]] = values / np.iinfo(values.dtype).max if whole else values
+    if not np.isfinite(share).all():
+        return None
+    share = np.clip(share, 0.0, 1.0)
+    if linear:
+        share[:, :3] = srgb_from_linear(share[:, :3])
+    return np.round(255.0 * share).astype(np.uint8)
 
 
 def _material(source: object, textured: bool) -> tuple[Material, tuple[str, ...]]:

@@ -84,7 +84,7 @@ def _apply(linear: Array, vertices: Array) -> Array:
 
 def _pieces(path: Path, scene: trimesh.Scene, limits: MeshLimits) -> tuple[list[_Piece], list[str]]:
     """Every mesh of the scene where its node puts it."""
-    shown = [(scene.graph[node], node) for node in sorted(scene.graph.nodes_geometry)]
+    shown = [(scene.graph[node], node) for node in scene.graph.nodes_geometry]
     meshes = [(matrix, scene.geometry[name]) for (matrix, name), _ in shown]
     meshes = [(matrix, mesh) for matrix, mesh in meshes if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     check_counts(path, sum(len(m.vertices) for _, m in meshes), sum(len(m.faces) for _, m in meshes), limits)

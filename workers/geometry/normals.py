@@ -35,3 +35,24 @@ def facing_cosine(
     cosine = np.full(len(pixels), np.nan)
     np.divide((normal * towards).sum(axis=1), length, out=cosine, where=known & (length > 0.0))
     return cosine
+
+
+def is_smooth(depth_m: Array, region: NDArray[np.uint8], pixels: NDArray[np.int64], bound_m: float) -> NDArray[np.bool_]:
+    """[N] bool: whether a pixel (flat index) and its four neighbours see one smooth surface of one region.
+
+    On a plane 1/z is linear in the image; what its second differences leave, times z squared, is the step in depth that
+    a plane does not explain, and must stay below `bound_m` along rows and along columns.
+    """
+    height, width = depth_m.shape
+    rows, columns = np.divmod(pixels, width)
+    inner = (rows > 0) & (rows < height - 1) & (columns > 0) & (columns < width - 1)
+    at = np.where(inner, pixels, width + 1)
+    flat, ids = depth_m.ravel(), region.ravel()
+    smooth = inner & (flat[at] > 0.0)
+    z = np.where(smooth, flat[at], 1.0)
+    for step in (1, width):
+        a, b = flat[at + step], flat[at - step]
+        smooth &= (a > 0.0) & (b > 0.0) & (ids[at + step] == ids[at]) & (ids[at - step] == ids[at])
+        bend = 1.0 / np.where(a > 0.0, a, 1.0) + 1.0 / np.where(b > 0.0, b, 1.0) - 2.0 / z
+        smooth &= np.abs(bend) * z * z < bound_m
+    return smooth

@@ -17,6 +17,9 @@ COLUMNS = {"position": 3, "normal_metallic": 4, "albedo_roughness": 4, "uv": 2, 
 """Floats of each attribute, in the order of the shader's locations."""
 
 
+MATTE_ROUGHNESS = 0.8
+
+
 @dataclass(frozen=True, eq=False)
 class Batch:
     """What one draw call draws.
@@ -29,6 +32,8 @@ class Batch:
     vertices: NDArray[np.float32]
     indices: NDArray[np.uint32]
     texture: NDArray[np.uint8] | None
+    matte: bool
+    """Nothing in it is metal or smoother than `MATTE_ROUGHNESS`."""
 
 
 def pack_shape(shape: Shape) -> tuple[Batch, ...]:
@@ -65,6 +70,10 @@ def decode_srgb(encoded: Array) -> Array:
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
+SRGB_STEPS = decode_srgb(np.arange(256) / 255.0)
+"""[256] float64: linear light of every 8-bit sRGB value."""
+
+
 def encode_srgb(linear: Array) -> Array:
     """sRGB values in [0, 1] of linear light, which is clipped to [0, 1] (IEC 61966-2-1)."""
     linear = np.clip(linear, 0.0, 1.0)
@@ -84,21 +93,26 @@ def _pack(parts: list[Part]) -> Batch:
         packed.append(vertices)
         indices.append(faces + start)
         start += len(vertices)
-    return Batch(
-        np.concatenate(packed).astype(np.float32), np.concatenate(indices).astype(np.uint32), _texture(parts[0])
-    )
+    matte = all(p.material.metallic == 0.0 and p.material.roughness >= MATTE_ROUGHNESS for p in parts)
+    return Batch(np.concatenate(packed), np.concatenate(indices).astype(np.uint32), _texture(parts[0]), matte)
 
 
-def _vertex_columns(part: Part) -> Array:
-    """[V, 17] float64, the plane still 0."""
-    count, material = len(part.vertices), part.material
-    albedo = np.tile(decode_srgb(np.array(material.base_color[:3])), (count, 1))
+def _vertex_columns(part: Part) -> NDArray[np.float32]:
+    """[V, 17] float32 in the columns of `COLUMNS`; what a part does not have, and the plane, is 0."""
+    material = part.material
+    albedo = decode_srgb(np.array(material.base_color[:3]))
     if part.colors is not None:
-        albedo = albedo * decode_srgb(part.colors[:, :3] / 255.0)
-    normals = part.normals if part.normals is not None else np.zeros((count, 3))
-    uv = part.uv if part.uv is not None else np.zeros((count, 2))
-    metallic, roughness = np.full((count, 1), material.metallic), np.full((count, 1), material.roughness)
-    return np.concatenate([part.vertices, normals, metallic, albedo, roughness, uv, np.zeros((count, 4))], axis=1)
+        albedo = albedo * SRGB_STEPS[part.colors[:, :3]]
+    columns = np.zeros((len(part.vertices), sum(COLUMNS.values())), np.float32)
+    columns[:, 0:3] = part.vertices
+    if part.normals is not None:
+        columns[:, 3:6] = part.normals
+    columns[:, 6] = material.metallic
+    columns[:, 7:10] = albedo
+    columns[:, 10] = material.roughness
+    if part.uv is not None:
+        columns[:, 11:13] = part.uv
+    return columns
 
 
 def _planes(part: Part) -> Array:

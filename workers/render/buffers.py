@@ -36,6 +36,7 @@ class Uploaded:
     buffers: tuple[int, int]
     texture: int | None
     index_count: int
+    matte: bool
     bytes: int
 
     @property
@@ -182,7 +183,7 @@ def _upload(gl: ModuleType, batch: Batch) -> Uploaded:
     levels = () if batch.texture is None else mip_levels(batch.texture)
     texture = _upload_texture(gl, levels) if levels else None
     size = batch.vertices.nbytes + batch.indices.nbytes + sum(level.nbytes for level in levels)
-    return Uploaded(vertex_array, (vertex_buffer, index_buffer), texture, batch.indices.size, size)
+    return Uploaded(vertex_array, (vertex_buffer, index_buffer), texture, batch.indices.size, batch.matte, size)
 
 
 def mip_levels(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:

@@ -84,10 +84,11 @@ class Renderer:
         self._clear(camera.intrinsics, appearance)
         T_cam_world = invert(camera.T_world_cam)
         ranks = {region: rank for rank, region in enumerate(sorted({thing.region_id for thing in things}))}
+        lights = light_slots(appearance)
         by_variant: dict[Variant, list[tuple[Placed, Uploaded]]] = {}
         for thing in things:
             for batch in self._shapes.fetch(thing.shape):
-                variant = Variant(batch.texture is not None, batch.few_triangles, light_slots(appearance))
+                variant = Variant(batch.texture is not None, batch.few_triangles, batch.matte, lights)
                 by_variant.setdefault(variant, []).append((thing, batch))
         for variant, draws in by_variant.items():
             program = self._program(variant)

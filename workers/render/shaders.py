@@ -17,6 +17,7 @@ class Variant(NamedTuple):
 
     textured: bool
     few_triangles: bool
+    matte: bool
     lights: int
 
 
@@ -105,19 +106,24 @@ uniform sampler2D albedo_map;
 layout(location = 0) out vec4 out_color_region;
 layout(location = 1) out float out_z;
 
-// Radiance towards the eye: Lambert, and a highlight about the mirrored ray that widens and dims with roughness.
+// Radiance towards the eye: Lambert, and a highlight about the mirrored ray that widens and dims with roughness; on a
+// matte surface it would be under 0.02 of the light, and is left out.
 vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float roughness) {
     vec3 diffuse = albedo * (1.0 - metallic);
     vec3 mirror = mix(vec3(0.04), albedo, metallic);
+    vec3 sum = v_ambient * (diffuse + mirror);
+#if MATTE
+    for (int i = 0; i < LIGHTS; ++i) sum += v_light_color[i] * diffuse * max(dot(normal, v_light_towards[i]), 0.0);
+#else
     float width = roughness * roughness + 0.01;
     vec3 bounced = 2.0 * dot(normal, towards_eye) * normal - towards_eye;
-    vec3 sum = v_ambient * (diffuse + mirror);
     for (int i = 0; i < LIGHTS; ++i) {
         float level = max(dot(normal, v_light_towards[i]), 0.0);
         float miss = 1.0 - dot(bounced, v_light_towards[i]);
         float lobe = width / (width + 8.0 * miss);
         sum += v_light_color[i] * level * (diffuse + mirror * (0.25 / width * lobe * lobe));
     }
+#endif
     return sum;
 }
 
@@ -173,6 +179,7 @@ void main() { out_color_region = vec4(1.0); }
 
 def label_sources(variant: Variant) -> tuple[str, str]:
     """(vertex, fragment) shader of the label pass."""
-    defines = {"TEXTURED": variant.textured, "FEW_TRIANGLES": variant.few_triangles, "LIGHTS": variant.lights}
-    head = "#version 410 core\n" + "".join(f"#define {name} {int(value)}\n" for name, value in defines.items())
+    head = "#version 410 core\n" + "".join(
+        f"#define {name.upper()} {int(v)}\n" for name, v in variant._asdict().items()
+    )
     return head + _VERTEX, head + _FRAGMENT

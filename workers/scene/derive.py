@@ -11,7 +11,7 @@ from schemas.job import Images, Patch
 from schemas.scene import Agreement, ObjectLabel, View
 from workers.geometry.camera import image_coordinates, project
 from workers.geometry.frames import invert
-from workers.geometry.normals import facing_cosine
+from workers.geometry.normals import facing_cosine, is_smooth
 from workers.geometry.project import Projected, cloud_in_camera, forward_project, in_frame, sample_inverse_depth
 from workers.scene.views import quantise_depth, stored_depth_m
 
@@ -24,7 +24,12 @@ FACING = 0.1
 HIDDEN_M = 0.01
 """A carried point this far behind what the mirror camera sees is hidden, and not in disagreement."""
 
-SCENE_STRIDE = 4
+SMOOTH_INPUT_M = 0.002
+SMOOTH_MIRROR_M = 0.001
+"""Depth that bends by more from one pixel to the next (some 4.8 mm apart in the input view, 2.5 mm in the mirror's) has an
+edge there: a sphere of 35 mm bends by 0.7 and 0.2 mm."""
+
+SCENE_STRIDE = 8
 """Floor and table have hundreds of times the pixels that their median needs."""
 
 
@@ -101,7 +106,9 @@ def agree_across(source: View, mirror: View, images: Images, bound_mm: float, fi
     """Carry the stored input depth into the mirror view and compare it with the stored mirror depth.
 
     Interpolated bilinearly in 1/z among four pixels of one region. A pixel counts as co-visible where its surface
-    faces the mirror camera too, its own region is there in the mirror view, and it does not lie `HIDDEN_M` behind.
+    faces the mirror camera too, its own region is there in the mirror view, and it does not lie `HIDDEN_M` behind; and
+    only where each image shows one smooth surface, judged by itself: across the rim of a mug, a pixel or two wide, there
+    is nothing to interpolate.
     Every pixel of an object is compared, and of the rest one in `SCENE_STRIDE` squared.
     """
     assert source.region is not None and mirror.region is not None
@@ -109,7 +116,8 @@ def agree_across(source: View, mirror: View, images: Images, bound_mm: float, fi
     pixels = _sample_pixels(source.region, first_object)
     facing = facing_cosine(depth_m, source.region, pixels, source.camera, mirror.camera.position)
     chosen = np.zeros(depth_m.size)
-    towards_both = pixels[np.nan_to_num(facing, nan=-1.0) > FACING]
+    both_sides = (np.nan_to_num(facing, nan=-1.0) > FACING) & is_smooth(depth_m, source.region, pixels, SMOOTH_INPUT_M)
+    towards_both = pixels[both_sides]
     chosen[towards_both] = depth_m.ravel()[towards_both]
     points, index = cloud_in_camera(chosen.reshape(depth_m.shape), source.camera, mirror.camera)
     keep = points[:, 2] > 0.0
@@ -117,7 +125,9 @@ def agree_across(source: View, mirror: View, images: Images, bound_mm: float, fi
     u, v = project(points, mirror.camera.intrinsics)
     inside = in_frame(u, v, mirror.camera.intrinsics)
     points, index, u, v = points[inside], index[inside], u[inside], v[inside]
-    seen, region = sample_inverse_depth(stored_depth_m(mirror.depth, images), mirror.region, u, v)
+    mirror_m = stored_depth_m(mirror.depth, images)
+    seen, region = sample_inverse_depth(mirror_m, mirror.region, u, v)
+    seen = np.where(_smooth_around(mirror_m, mirror.region, u, v), seen, 0.0)
     own = source.region.ravel()[index]
     both = (seen > 0.0) & (region == own) & (points[:, 2] < seen + HIDDEN_M)
     difference_mm = np.abs(points[both, 2] - seen[both]) * 1e3
@@ -136,3 +146,14 @@ def _sample_pixels(region: NDArray[np.uint8], first_object: int) -> NDArray[np.i
     chosen = region >= first_object
     chosen[::SCENE_STRIDE, ::SCENE_STRIDE] = True
     return np.flatnonzero(chosen)
+
+
+def _smooth_around(depth_m: Array, region: NDArray[np.uint8], u: Array, v: Array) -> NDArray[np.bool_]:
+    """[N] bool: whether the four pixels about each image coordinate see one smooth surface."""
+    height, width = depth_m.shape
+    column = np.clip(np.floor(u - 0.5).astype(np.int64), 0, width - 2)
+    row = np.clip(np.floor(v - 0.5).astype(np.int64), 0, height - 2)
+    smooth = np.ones(len(u), bool)
+    for step in (0, 1, width, width + 1):
+        smooth &= is_smooth(depth_m, region, row * width + column + step, SMOOTH_MIRROR_M)
+    return smooth

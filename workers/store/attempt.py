@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 import pyarrow as pa
 
 from schemas.commit import CommitRecord, CommitResult, CommitTerms, FileEntry, Outcome, SceneMark, Span, TableEntry
-from schemas.errors import RunError
+from schemas.errors import OutputError, RunError
 from schemas.layout import ASSETS, commit_path, range_table_path, staging_path
 from schemas.manifest import DETERMINISTIC_TABLES, SCHEMA_VERSION, SCHEMAS, TABLES
 from schemas.scene import SceneOutput
@@ -32,8 +32,13 @@ _UNSAFE = re.compile(r"[\x00-\x1f\x7f\\]")
 def begin_attempt(store: Store, span: Span, terms: CommitTerms, label: str = "") -> "Attempt":
     """A new attempt at `span` with a folder of its own.
 
-    `label` goes into its name, so that whoever started it can recognise it.
+    `label` goes into its name, so that whoever started it can recognise it. Raises OutputError where the store cannot
+    hold the layout.
     """
+    if store.tar_only and terms.layout != "tar":
+        raise OutputError(
+            f"{store.name} is an object store, which needs output.layout: tar; the job says {terms.layout}"
+        )
     host = re.sub(r"[^A-Za-z0-9_.]", "_", socket.gethostname())
     name = "-".join(part for part in (f"r{span.retry}", label, host, str(os.getpid()), uuid.uuid4().hex[:12]) if part)
     store.open_staging(staging_path(span.start, name))

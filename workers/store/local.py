@@ -22,6 +22,8 @@ _VANISHED_TRIES = 3
 class LocalStore:
     """A folder on a file system that has hard links."""
 
+    tar_only = False
+
     def __init__(self, root: str | os.PathLike[str]) -> None:
         self.root = Path(root)
         self.name = str(root)

@@ -32,6 +32,8 @@ class Store(Protocol):
 
     name: str
     """The place, as a user writes it."""
+    tar_only: bool
+    """True where a file of its own for each image would be too many."""
 
     def prepare(self) -> None:
         """Makes the output folder and proves the primitive. Raises OutputError naming the place and a remedy."""
@@ -49,9 +51,10 @@ class Store(Protocol):
         """Returns when all that was written under `staging` survives a loss of power."""
 
     def put_if_absent(self, key: str, data: bytes, staging: str | None = None) -> bool:
-        """Stores `data` whole and durably at `key` unless something is there; False where there is.
+        """Stores `data` whole and durably at `key` unless something is there; False where something else is.
 
-        With `staging`, raises FileNotFoundError if that folder was swept first (where the place can tell).
+        With `staging`, raises FileNotFoundError if that folder was swept first. A disk is always right about that; an
+        object store may miss a sweep that happens in the same moment.
         """
 
     def write_whole(self, key: str, data: bytes, durable: bool = True) -> None:
@@ -66,7 +69,7 @@ class Store(Protocol):
     def fence(self, staging: str) -> str | None:
         """Moves an attempt's folder, once and for all, to `fenced_key`, out of its reach; None where there was nothing.
 
-        An attempt that is fenced can neither write nor commit (where the place can tell).
+        On a disk, an attempt that is fenced can neither write nor commit.
         """
 
     def read(self, key: str) -> bytes:

@@ -32,7 +32,7 @@ def test_moving_a_solid_moves_its_centre_of_mass_and_nothing_else():
 
 
 def test_turning_a_solid_turns_its_inertia():
-    R = trimesh.transformations.random_rotation_matrix([0.3, 0.7, 0.1])
+    R = trimesh.transformations.random_rotation_matrix(np.array([0.3, 0.7, 0.1]))
     mesh = trimesh.creation.box((0.2, 0.3, 0.5), transform=R)
     mass = mass_properties(shape_of(mesh), 600.0, 3.0)
     expected = R[:3, :3] @ box_inertia(18.0, 0.2, 0.3, 0.5) @ R[:3, :3].T
@@ -102,7 +102,7 @@ def test_an_open_box_is_five_plates():
 
 def test_a_solid_of_any_shape_agrees_with_trimesh():
     mesh = trimesh.creation.annulus(0.03, 0.05, 0.1)
-    mesh.apply_transform(trimesh.transformations.random_rotation_matrix([0.1, 0.2, 0.9]))
+    mesh.apply_transform(trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.2, 0.9])))
     mesh.apply_translation((0.4, 0.1, -0.2))
     mesh.density = 600.0
     mass = solid_mass(mesh.vertices, mesh.faces, 600.0)

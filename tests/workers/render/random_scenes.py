@@ -18,6 +18,7 @@ from workers.geometry.mirror import mirror_pose
 
 VGA = Intrinsics(width=640, height=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
 FLOOR_HALF_M = 30.0
+PLAIN = Material()
 
 APPEARANCE = Appearance(
     ambient=(0.3, 0.3, 0.3),
@@ -41,16 +42,18 @@ def shape_of(*meshes: trimesh.Trimesh) -> Shape:
     return Shape(tuple(part_of(mesh) for mesh in meshes))
 
 
-def quad(corners: object, turned: bool = False) -> Shape:
+def quad(corners: object, turned: bool = False, material: Material = PLAIN) -> Shape:
     """Four corners in order as two triangles; `turned` takes the other diagonal."""
     faces = [[1, 2, 3], [1, 3, 0]] if turned else [[0, 1, 2], [0, 2, 3]]
-    return Shape((Part("quad", frozen_array(corners), frozen_array(faces, np.int32)),))
+    return Shape((Part("quad", frozen_array(corners), frozen_array(faces, np.int32), material),))
 
 
 def floor() -> Placed:
     """A level square of 60 m at z = 0, region 1."""
     h = FLOOR_HALF_M
-    return Placed(1, quad([[-h, -h, 0], [h, -h, 0], [h, h, 0], [-h, h, 0]]), np.eye(4))
+    return Placed(
+        1, quad([[-h, -h, 0], [h, -h, 0], [h, h, 0], [-h, h, 0]], material=Material(roughness=0.9)), np.eye(4)
+    )
 
 
 def table_shape(rng: np.random.Generator) -> tuple[Shape, float]:

@@ -149,7 +149,16 @@ def test_a_scene_is_refused_that_has(store, what):
 
 @pytest.mark.parametrize(
     "path",
-    ["/etc/passwd", "../out.png", "mug/../../x.png", "_staging/x.png", ".hidden", "mug//x.png", "mug\\x.png", "mug/a\nb.png"],
+    [
+        "/etc/passwd",
+        "../out.png",
+        "mug/../../x.png",
+        "_staging/x.png",
+        ".hidden",
+        "mug//x.png",
+        "mug\\x.png",
+        "mug/a\nb.png",
+    ],
 )
 def test_a_scene_cannot_write_outside_its_place(store, path):
     attempt = begin_attempt(store, Span(start=0, stop=2), terms())
@@ -194,7 +203,9 @@ def test_a_loser_touches_nothing_and_agrees_where_it_made_the_same(store, tmp_pa
     first = attempt_at(store, 0, 4)
     second = attempt_at(store, 0, 4)
     winner = first.commit().record
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file() and STAGING not in path.parts}
+    before = {
+        path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file() and STAGING not in path.parts
+    }
     lost = second.commit()
     assert not lost.won
     assert lost.record == winner

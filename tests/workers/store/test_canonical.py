@@ -18,7 +18,7 @@ INTEGERS = st.integers(-(2**63), 2**63 - 1)
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=5)
 
 
-def values_of(kind: pa.DataType, nullable: bool) -> st.SearchStrategy:
+def values_of(kind, nullable):
     """Values that Arrow can hold in a column of this type."""
     if pa.types.is_struct(kind):
         fields = [kind.field(i) for i in range(kind.num_fields)]
@@ -33,7 +33,7 @@ def values_of(kind: pa.DataType, nullable: bool) -> st.SearchStrategy:
     return st.none() | values if nullable else values
 
 
-def rows_of(table: str) -> st.SearchStrategy:
+def rows_of(table):
     row = st.fixed_dictionaries({field.name: values_of(field.type, field.nullable) for field in SCHEMAS[table]})
     return st.lists(row, max_size=4)
 
@@ -57,14 +57,20 @@ def plain_column(kind: pa.DataType, values: list) -> bytes:
         lengths, data = b"".join(struct.pack("<q", len(text)) for text in texts), b"".join(texts)
     else:
         code = {pa.float64(): "<d", pa.int64(): "<q", pa.bool_(): "?"}[kind]
-        data = b"".join(struct.pack(code, value or 0) if value is None else struct.pack(code, value) for value in values)
+        data = b"".join(
+            struct.pack(code, value or 0) if value is None else struct.pack(code, value) for value in values
+        )
     streams = [hashlib.sha256(stream).digest() for stream in (present, lengths, data)]
     return hashlib.sha256(b"".join([*streams, *children])).digest()
 
 
 def plain_tag(kind: pa.DataType) -> str:
     if pa.types.is_struct(kind):
-        return "{" + ",".join(f"{kind.field(i).name}:{plain_tag(kind.field(i).type)}" for i in range(kind.num_fields)) + "}"
+        return (
+            "{"
+            + ",".join(f"{kind.field(i).name}:{plain_tag(kind.field(i).type)}" for i in range(kind.num_fields))
+            + "}"
+        )
     if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
         return f"[{plain_tag(kind.value_type)}]"
     return {pa.float64(): "<f8", pa.int64(): "<i8", pa.string(): "text", pa.bool_(): "|u1"}[kind]
@@ -102,13 +108,15 @@ def test_a_digest_does_not_change_with_how_parquet_stores_the_rows(table):
         assert rows_digest(table, pq.read_table(pa.BufferReader(file.getvalue()))) == expected
 
 
-def different_views() -> dict[str, list[dict]]:
+def different_views():
     base = made_scene(3).rows["views"]
     first, *others = base
     files = first["files"]
     changes = {
         "a path": {"files": [{**files[0], "path": "mug/other.png"}, *files[1:]]},
-        "a moved letter": {"files": [{**files[0], "path": files[0]["path"][:-1], "sha256": "g" + files[0]["sha256"]}, *files[1:]]},
+        "a moved letter": {
+            "files": [{**files[0], "path": files[0]["path"][:-1], "sha256": "g" + files[0]["sha256"]}, *files[1:]]
+        },
         "a dropped file": {"files": files[1:]},
         "files in another order": {"files": files[::-1]},
         "the last bit of a double": {"yaw_rad": first["yaw_rad"] + 2**-54},

@@ -73,7 +73,7 @@ def test_a_torn_record_is_refused_by_name(store):
     attempt_at(store, 0, 2).commit()
     data = store.read(commit_path(0))
     (store.root / commit_path(0)).write_bytes(data[: len(data) // 2])
-    with pytest.raises(CorruptError, match="0000000000.json is torn"):
+    with pytest.raises(CorruptError, match=r"0000000000.json is torn"):
         read_record(store, 0)
 
 
@@ -94,13 +94,15 @@ def test_a_record_of_a_newer_version_is_refused_and_one_with_more_keys_is_read(s
 def test_a_record_under_another_name_is_refused(store):
     attempt_at(store, 0, 2).commit()
     (store.root / commit_path(0)).rename(store.root / commit_path(2))
-    with pytest.raises(CorruptError, match="0000000002.json holds the record of another range"):
+    with pytest.raises(CorruptError, match=r"0000000002.json holds the record of another range"):
         read_record(store, 2)
-    with pytest.raises(CorruptError, match="0000000002.json holds the record of another range"):
+    with pytest.raises(CorruptError, match=r"0000000002.json holds the record of another range"):
         read_summary(store, 2)
 
 
-@pytest.mark.parametrize("name", ["notes.txt", "0.json", "00000000000.json", "0000000000.retry-0.json", "sub/0000000000.json"])
+@pytest.mark.parametrize(
+    "name", ["notes.txt", "0.json", "00000000000.json", "0000000000.retry-0.json", "sub/0000000000.json"]
+)
 def test_a_file_that_is_no_commit_is_told_by_name(store, name):
     path = store.root / "manifest/_commits" / name
     path.parent.mkdir(exist_ok=True)
@@ -112,7 +114,13 @@ def test_a_file_that_is_no_commit_is_told_by_name(store, name):
 def test_commits_are_listed_by_number_with_retries_after_their_range(store):
     for key in (commit_path(20), commit_path(3, 2), commit_path(3), commit_path(3, 10), commit_path(10**10)):
         store.write_whole(key, b"")
-    assert [(start, retry) for start, retry, _ in commit_names(store)] == [(3, 0), (3, 2), (3, 10), (20, 0), (10**10, 0)]
+    assert [(start, retry) for start, retry, _ in commit_names(store)] == [
+        (3, 0),
+        (3, 2),
+        (3, 10),
+        (20, 0),
+        (10**10, 0),
+    ]
 
 
 def test_what_is_decided_is_published_by_anyone_any_number_of_times(store, undecided, tmp_path):

@@ -30,7 +30,10 @@ def test_every_level_gives_back_the_pixels_and_their_type(pixels, level):
 @given(image_arrays())
 def test_another_decoder_reads_the_same_pixels_with_red_first(pixels):
     with Image.open(io.BytesIO(encode_png(pixels, 1))) as image:
-        assert image.mode == {("uint8", 3): "RGB", ("uint8", 2): "L", ("uint16", 2): "I;16"}[(pixels.dtype.name, pixels.ndim)]
+        assert (
+            image.mode
+            == {("uint8", 3): "RGB", ("uint8", 2): "L", ("uint16", 2): "I;16"}[(pixels.dtype.name, pixels.ndim)]
+        )
         np.testing.assert_array_equal(np.asarray(image), pixels)
 
 
@@ -50,7 +53,12 @@ def test_the_same_pixels_give_the_same_bytes_whatever_their_layout_in_memory():
 
 @pytest.mark.parametrize(
     "pixels",
-    [np.zeros((4, 4, 4), np.uint8), np.zeros((4, 4), np.float32), np.zeros((4, 4, 3), np.uint16), np.zeros((0, 4), np.uint8)],
+    [
+        np.zeros((4, 4, 4), np.uint8),
+        np.zeros((4, 4), np.float32),
+        np.zeros((4, 4, 3), np.uint16),
+        np.zeros((0, 4), np.uint8),
+    ],
     ids=["alpha", "float", "16-bit colour", "empty"],
 )
 def test_an_image_that_has_no_encoding_is_refused(pixels):

@@ -84,7 +84,9 @@ def end_and_start_again(root: Path, layout: str, step: int, power: bool, undistu
     assert not leftovers(root), f"step {step}"
 
 
-some_or_every = pytest.mark.parametrize("stride", [SOME, pytest.param(1, marks=pytest.mark.slow)], ids=["some", "every"])
+some_or_every = pytest.mark.parametrize(
+    "stride", [SOME, pytest.param(1, marks=pytest.mark.slow)], ids=["some", "every"]
+)
 
 
 @some_or_every
@@ -121,7 +123,7 @@ def test_swept_by_another_coordinator_at_any_step_an_attempt_commits_all_or_noth
         store = LocalStore(root)
         with disk():
             store.prepare()
-        with disk(at=step, then=lambda: sweep(LocalStore(root), fenced=None)) as watched:
+        with disk(at=step, then=lambda root=root: sweep(LocalStore(root), fenced=None)) as watched:
             try:
                 won = attempt_at(store, FIRST, FIRST + RANGE, settings, small_scene).commit().won
             except RunError:
@@ -148,27 +150,27 @@ def test_an_attempt_that_commits_while_it_is_swept_commits_all_or_nothing(dies, 
     while True:
         root = tmp_path / str(step)
         store = LocalStore(root)
-        won = []
+        won, attempts = [], []
 
-        def commit(won=won):
+        def commit(won=won, attempts=attempts):
             with monkeypatch.context() as patch:
                 if dies:
                     patch.setattr("workers.store.attempt.publish", lambda store, record: None)
                 try:
-                    won.append(attempt.commit().won)
+                    won.append(attempts[0].commit().won)
                 except RunError:
                     won.append(False)
 
         with disk():
             store.prepare()
-            attempt = attempt_at(store, FIRST, FIRST + RANGE, settings, small_scene)
+            attempts.append(attempt_at(store, FIRST, FIRST + RANGE, settings, small_scene))
         with disk(at=step, then=commit) as watched:
             sweep(LocalStore(root), fenced=None)
         if watched.steps <= step:
             break
         outcomes.add(won[0])
         with disk():
-            assert [record.attempt for record in iter_records(store)] == [attempt.name] * won[0], f"step {step}"
+            assert [record.attempt for record in iter_records(store)] == [attempts[0].name] * won[0], f"step {step}"
             assert work(root, "files") == undisturbed["files"][0], f"step {step}"
         assert not leftovers(root), f"step {step}"
         step += 1

@@ -143,7 +143,7 @@ def test_a_real_vfat_is_refused(tmp_path):
     except (OSError, subprocess.CalledProcessError) as error:
         pytest.skip(f"no vfat can be mounted here: {error}")
     try:
-        with pytest.raises(OutputError, match="vfat.*hard link"):
+        with pytest.raises(OutputError, match=r"vfat.*hard link"):
             LocalStore(mount / "out").prepare()
     finally:
         subprocess.run(["umount", str(mount)], check=True)

@@ -26,7 +26,8 @@ def test_of_two_processes_that_commit_the_same_ranges_one_wins_each_and_nothing_
     store = LocalStore(tmp_path)
     store.prepare()
     racers = [
-        subprocess.Popen([sys.executable, "-c", RACER, str(tmp_path), name], stdout=subprocess.PIPE, text=True) for name in "ab"
+        subprocess.Popen([sys.executable, "-c", RACER, str(tmp_path), name], stdout=subprocess.PIPE, text=True)
+        for name in "ab"
     ]
     told = [racer.communicate(timeout=120)[0].splitlines() for racer in racers]
     assert [racer.returncode for racer in racers] == [0, 0]
@@ -41,4 +42,4 @@ def test_of_two_processes_that_commit_the_same_ranges_one_wins_each_and_nothing_
     for record in records:
         check_published(store, record)
     sweep(store)
-    assert not [entry for entry in store.files("_staging")]
+    assert not list(store.files("_staging"))

@@ -44,7 +44,9 @@ def test_member_names_are_those_of_the_contract():
     assert tar_path("mug", 16, retry=2) == "mug/0000000016.retry-2.tar"
 
 
-@pytest.mark.parametrize("path", ["mug/picture00001.png", "mug/RGB1.png", "mug/RGB00001.jpg", "RGB00001.png", "a/b/RGB00001.png"])
+@pytest.mark.parametrize(
+    "path", ["mug/picture00001.png", "mug/RGB1.png", "mug/RGB00001.jpg", "RGB00001.png", "a/b/RGB00001.png"]
+)
 def test_a_name_that_is_no_image_has_no_place_in_a_tar(path):
     with pytest.raises(ValueError, match="is not the name of an image"):
         member_of(path)
@@ -84,7 +86,9 @@ def test_members_have_no_time_or_owner_and_are_sorted_by_pose(store, tmp_path):
         }
         poses = [int(m.name.split(".")[0]) for m in members]
         assert poses == sorted(poses)
-        assert [m.name for m in members][:4] == [f"{poses[0]:05d}.{n}.png" for n in ("RGB", "RGB.patch", "depth", "depth.patch")]
+        assert [m.name for m in members][:4] == [
+            f"{poses[0]:05d}.{n}.png" for n in ("RGB", "RGB.patch", "depth", "depth.patch")
+        ]
 
 
 def test_images_of_a_range_without_tars_are_read_alike(store):
@@ -97,10 +101,10 @@ def test_images_of_a_range_without_tars_are_read_alike(store):
 def test_a_torn_or_foreign_tar_is_told_by_name(store, tmp_path):
     attempt_at(store, 0, 4, TAR).commit()
     data = next(tmp_path.glob("*/*.tar")).read_bytes()
-    with pytest.raises(CorruptError, match="here.tar is not a whole archive"):
+    with pytest.raises(CorruptError, match=r"here.tar is not a whole archive"):
         list(read_tar("mug", data[:700], "here.tar"))
     foreign = io.BytesIO()
     with tarfile.open(fileobj=foreign, mode="w") as archive:
         archive.addfile(tarfile.TarInfo("../../etc/passwd"))
-    with pytest.raises(CorruptError, match="here.tar is not a whole archive"):
+    with pytest.raises(CorruptError, match=r"here.tar is not a whole archive"):
         list(read_tar("mug", foreign.getvalue(), "here.tar"))

@@ -1,0 +1,109 @@
+"""Input depth carried into the mirror view, on whole scenes: visibility by ray casting, interpolation written out here.
+
+The bound is the one that the quantisation of both images allows: 0.1 mm in the median, for the scene and for the object
+alone wherever fifty of its pixels are seen by both cameras. A pixel is compared where the point and the four mirror
+pixels about it lie on one surface, told by the triangles that rays meet there: the rim of a mug is about a
+pixel wide, and what lies between a rim's pixel and the next is on neither.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from schemas.errors import SceneError
+from schemas.scene import Pair, PosedScene
+from services.jobfile import load_job
+from workers.assets.catalogue import open_catalogue
+from workers.context import WorkerContext, settings_digest
+from workers.render.gbuffer import shared_renderer
+from workers.scene_steps import Stopwatch, make_scene
+
+JOB = load_job(Path(__file__).resolve().parents[1] / "deploy" / "jobs" / "tabletop.yaml")
+MEDIAN_MM = 0.1
+FEWEST = 50
+SEEN_M = 0.0005
+"""A point counts as seen by the mirror camera if nothing lies further than this in front of it."""
+
+ONE_SURFACE = np.cos(np.radians(20.0))
+"""Normals of neighbouring facets of a lathed shape are up to 12 degrees apart, of two sides of an edge far more."""
+
+ONE_PLANE_M = 0.0005
+"""And a neighbouring pixel's surface, some 2.5 mm away, leaves the tangent plane by less than this: a sphere of 6 mm does."""
+
+
+def cast(scene: PosedScene, origin: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(distance in lengths of `towards`, unit normal) where rays first meet the scene; inf and 0 where they do not."""
+    meshes = [
+        trimesh.Trimesh(trimesh.transform_points(t.shape.vertices, t.T_world_shape), t.shape.faces, process=False)
+        for t in scene.things
+    ]
+    mesh = trimesh.util.concatenate(meshes)
+    hit, ray, where = mesh.ray.intersects_id(
+        np.broadcast_to(origin, towards.shape), towards, multiple_hits=False, return_locations=True
+    )
+    distance, normal = np.full(len(towards), np.inf), np.zeros(towards.shape)
+    distance[ray] = np.linalg.norm(where - origin, axis=1) / np.linalg.norm(towards[ray], axis=1)
+    normal[ray] = mesh.face_normals[hit]
+    return distance, normal
+
+
+def differences_mm(pair: Pair, scene: PosedScene, object_only: bool) -> np.ndarray:
+    """|carried input depth - mirror depth| of co-visible pixels, interpolated bilinearly in 1/z on one surface."""
+    first, mirror = pair.input, pair.mirror
+    assert first.region is not None and mirror.region is not None
+    k, R, eye = first.camera.intrinsics, mirror.camera.T_world_cam[:3, :3], mirror.camera.T_world_cam[:3, 3]
+    step = 1 if object_only else 7
+    rows, columns = (index[::step] for index in np.nonzero((first.region >= (3 if object_only else 1)) & (first.depth > 0)))
+    z = first.depth[rows, columns] / 5000.0
+    rays = np.stack([(columns + 0.5 - k.cx) / k.fx, (rows + 0.5 - k.cy) / k.fy, np.ones(len(z))], axis=1)
+    world = (rays * z[:, None]) @ first.camera.T_world_cam[:3, :3].T + first.camera.T_world_cam[:3, 3]
+    distance, normal = cast(scene, eye, world - eye)
+    visible = np.abs(distance - 1.0) * np.linalg.norm(world - eye, axis=1) < SEEN_M
+    local, own, normal = (world - eye)[visible] @ R, first.region[rows, columns][visible], normal[visible]
+    x, y = k.fx * local[:, 0] / local[:, 2] + k.cx - 0.5, k.fy * local[:, 1] / local[:, 2] + k.cy - 0.5
+    j, i = np.floor(x).astype(int), np.floor(y).astype(int)
+    good = (i >= 0) & (j >= 0) & (i < k.height - 1) & (j < k.width - 1)
+    inverse = np.zeros(len(local))
+    for di, dj in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        a, b = np.where(good, i + di, 0), np.where(good, j + dj, 0)
+        pixel = np.stack([(b + 0.5 - k.cx) / k.fx, (a + 0.5 - k.cy) / k.fy, np.ones(len(a))], axis=1) @ R.T
+        reached, facing = cast(scene, eye, pixel)
+        met = np.where(np.isinf(reached), 0, reached)[:, None] * pixel
+        off = np.abs(((met - local @ R.T) * normal).sum(axis=1))
+        good &= (mirror.region[a, b] == own) & (mirror.depth[a, b] > 0)
+        good &= ((facing * normal).sum(axis=1) > ONE_SURFACE) & (off < ONE_PLANE_M)
+        weight = (1 - np.abs(y - i - di)) * (1 - np.abs(x - j - dj))
+        inverse += weight * 5000.0 / np.maximum(mirror.depth[a, b], 1)
+    return np.abs(local[good, 2] - 1.0 / inverse[good]) * 1e3
+
+
+def worst_medians(scenes: range) -> tuple[float, float, int]:
+    """Largest median over scenes of the whole scene and of the object alone, and in how many the object counted."""
+    catalogue = open_catalogue(JOB.assets, Path(), tuple(JOB.categories))
+    context = WorkerContext(JOB, catalogue, shared_renderer(), settings_digest(JOB, catalogue.digest))
+    whole, alone = [], []
+    for scene_id in scenes:
+        try:
+            scene = make_scene(context, scene_id, Stopwatch())
+        except SceneError:
+            continue
+        for pair in scene.pairs:
+            whole.append(float(np.median(differences_mm(pair, scene.posed, object_only=False))))
+            of_object = differences_mm(pair, scene.posed, object_only=True)
+            if len(of_object) >= FEWEST:
+                alone.append(float(np.median(of_object)))
+    return max(whole), max(alone), len(alone)
+
+
+@pytest.mark.parametrize(
+    "scenes", [pytest.param(range(12), id="12"), pytest.param(range(200), id="200", marks=pytest.mark.slow)]
+)
+def test_input_depth_carried_into_the_mirror_view_agrees(scenes, record_figure):
+    whole, alone, counted = worst_medians(scenes)
+    record_figure(f"two views, whole scene, {len(scenes)} scenes", "must agree", whole, MEDIAN_MM)
+    record_figure(f"two views, object alone, {counted} of {len(scenes)} scenes", "must agree", alone, MEDIAN_MM)
+    assert counted >= len(scenes) // 2
+    assert whole <= MEDIAN_MM
+    assert alone <= MEDIAN_MM
