@@ -28,6 +28,7 @@ class Bucket:
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
+    wbufsize = 1 << 16  # one packet for each answer
     bucket: Bucket
 
     def log_message(self, format, *arguments) -> None:

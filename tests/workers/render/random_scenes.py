@@ -101,10 +101,10 @@ def object_shape(rng: np.random.Generator) -> Shape:
     return Shape(tuple(part_of(mesh, tuple(rng.uniform(0.1, 0.9, 3)), smooth=kind in (0, 2)) for mesh in meshes))
 
 
-def stand(shape: Shape, rotation: Array, x: float, y: float, height: float) -> Pose:
+def stand(shape: Shape, rotation: Array, spot: Array, height: float) -> Pose:
     """[4, 4] float64: turned, and set down so that its lowest vertex is at `height` exactly."""
     turned = transform(pose(rotation, np.zeros(3)), shape.vertices)
-    return pose(rotation, np.array([x, y, height - turned[:, 2].min()]))
+    return pose(rotation, np.array([*spot, height - turned[:, 2].min()]))
 
 
 def random_things(rng: np.random.Generator) -> tuple[list[Placed], float]:
@@ -122,7 +122,7 @@ def random_things(rng: np.random.Generator) -> tuple[list[Placed], float]:
         radius, spot = float(np.linalg.norm(shape.vertices, axis=1).max()), rng.uniform(-0.25, 0.25, 2)
         if all(np.hypot(*(spot - other[:2])) > radius + other[2] for other in taken):
             taken.append(np.array([*spot, radius]))
-            things.append(Placed(2 + len(taken), shape, stand(shape, rotation, *spot, height)))
+            things.append(Placed(2 + len(taken), shape, stand(shape, rotation, spot, height)))
     return things, height
 
 
@@ -142,8 +142,8 @@ def procedural_things(rng: np.random.Generator) -> tuple[list[Placed], float]:
     turn = rotation_about(UP, rng.uniform(-np.pi, np.pi)) if rng.random() < 0.8 else uniform_rotation(rng)
     return [
         floor(),
-        Placed(2, table.shape, stand(table.shape, np.eye(3), 0.0, 0.0, 0.0)),
-        Placed(3, thing.shape, stand(thing.shape, turn, *rng.uniform(-0.25, 0.25, 2), height)),
+        Placed(2, table.shape, stand(table.shape, np.eye(3), np.zeros(2), 0.0)),
+        Placed(3, thing.shape, stand(thing.shape, turn, rng.uniform(-0.25, 0.25, 2), height)),
     ], height
 
 

@@ -40,9 +40,10 @@ def test_tiles_cover_the_window_once_on_the_same_pixel_grid():
         x, y = k.cx - tile.cx, k.cy - tile.cy
         assert x == round(x) and y == round(y)
         seen[round(y) + 300 : round(y) + 300 + tile.height, round(x) + 700 : round(x) + 700 + tile.width] += 1
-    left, right, top, bottom = (c + s * e / 1.45 for c, s, e in ((340.25, 350.5, -1.5), (340.25, 350.5, 1.5), (160.75, 351.5, -1), (160.75, 351.5, 1)))  # fmt: skip
+    # The box's nearer side, 1.45 m away, has the larger image; the surroundings begin at (-700, -300).
+    half = np.array([1.5 * k.fx, 1.0 * k.fy]) / 1.45
+    left, top = np.floor(np.array([k.cx, k.cy]) - half).astype(int) + (700, 300)
+    right, bottom = np.ceil(np.array([k.cx, k.cy]) + half).astype(int) + (700, 300)
     expected = np.zeros_like(seen)
-    expected[
-        int(np.floor(top)) + 300 : int(np.ceil(bottom)) + 300, int(np.floor(left)) + 700 : int(np.ceil(right)) + 700
-    ] = 1
+    expected[top:bottom, left:right] = 1
     np.testing.assert_array_equal(seen, expected)

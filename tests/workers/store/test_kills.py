@@ -19,7 +19,7 @@ from workers.store.sweep import sweep
 
 FIRST, STOP, RANGE = 4, 7, 2
 LAYOUTS = ("files", "tar")
-SOME = 6
+SOME = 9
 """Every so many steps by default; `--all` takes each of them."""
 
 

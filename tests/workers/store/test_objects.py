@@ -166,9 +166,10 @@ def test_ended_at_any_call_and_started_again_it_makes_the_same_dataset(stride, t
     keys = {entry.key for entry in whole.files("")}
     for at in range(0, watched.calls, stride):
         store = ObjectStore(MemoryStore(), "memory://")
-        with monkeypatch.context() as patch, pytest.raises(Killed):
+        with monkeypatch.context() as patch:
             patch.setattr(objects, "obstore", Watched(at))
-            make_all(store, TAR, small_scene, 6)
+            with pytest.raises(Killed):
+                make_all(store, TAR, small_scene, 6)
         assert make_all(store, TAR, small_scene, 6) == expected, f"call {at}"
         assert {entry.key for entry in store.files("")} == keys, f"call {at}"
 
@@ -186,8 +187,11 @@ def test_a_rename_that_was_ended_half_way_is_done_again(monkeypatch):
 
 
 def test_a_store_that_ignores_the_condition_is_refused_by_name():
-    with s3_server(Bucket(conditional=False)) as bucket, pytest.raises(
-        OutputError, match=r"s3://mine does not refuse a second put .* Use a store with conditional puts"
+    with (
+        s3_server(Bucket(conditional=False)) as bucket,
+        pytest.raises(
+            OutputError, match=r"s3://mine does not refuse a second put .* Use a store with conditional puts"
+        ),
     ):
         ObjectStore(bucket, "s3://mine").prepare()
 
@@ -233,7 +237,7 @@ def test_a_store_that_stops_answering_is_told_by_name(monkeypatch):
         raise obstore.exceptions.GenericError("no route to host\nDebug source: ...")
 
     monkeypatch.setattr(obstore, "put", fails)
-    with pytest.raises(MachineError, match="^mug/a in memory://mine: no route to host$"):
+    with pytest.raises(MachineError, match=r"^mug/a in memory://mine: no route to host$"):
         store.write_whole("mug/a", b"")
 
 

@@ -1,0 +1,118 @@
+"""Contact sheets: a page of what a dataset holds, for a person to look at.
+
+    python -m services.sheet OUT FILE.jpg [SCENES]
+"""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from schemas.layout import image_path, patch_path
+from services.stored import Row, StoredRange, file_reader, iter_stored, read_image
+from workers.store.opening import open_store
+from workers.store.store import Store
+
+CELL = (256, 192)
+"""Width and height of a picture on the sheet, pixels."""
+
+MARGIN = 4
+HEADING = 26
+LEFT = 92
+
+COLUMNS = ("input RGB", "input depth", "input mask", "mirror RGB", "mirror depth", "mirror mask", "projected RGB", "patches")
+
+REGION_COLORS = np.array([[255, 255, 255], [205, 205, 205], [160, 120, 80], [230, 70, 40]], np.uint8)
+"""Nothing, floor, table, object."""
+
+DEPTH_STRETCH = (2.0, 98.0)
+"""Percentiles of a depth image that are drawn as its nearest and its farthest colour."""
+
+Picture = NDArray[np.uint8]
+
+
+def draw_sheet(store: Store, scenes: int) -> Picture:
+    """[H, W, 3] uint8: a row for each of the first scenes of every category, with the images of its first pair."""
+    rows = [(category, cells) for category, cells in _choose(store, scenes)]
+    width = LEFT + len(COLUMNS) * (CELL[0] + MARGIN)
+    page = Image.new("RGB", (width, HEADING + len(rows) * (CELL[1] + MARGIN)), "white")
+    pen, font = ImageDraw.Draw(page), ImageFont.load_default(15)
+    for column, title in enumerate(COLUMNS):
+        pen.text((LEFT + column * (CELL[0] + MARGIN) + 4, 5), title, "black", font)
+    for number, (category, cells) in enumerate(rows):
+        top = HEADING + number * (CELL[1] + MARGIN)
+        pen.text((6, top + 6), category, "black", font)
+        for column, cell in enumerate(cells):
+            page.paste(Image.fromarray(cell), (LEFT + column * (CELL[0] + MARGIN), top))
+    return np.asarray(page)
+
+
+def _choose(store: Store, scenes: int) -> list[tuple[str, list[Picture]]]:
+    """The first scenes of each category, by category."""
+    chosen: dict[str, list[list[Picture]]] = {}
+    for stored in iter_stored(store):
+        read = file_reader(store, stored)
+        for scene in stored.rows["scenes"]:
+            category = scene["category"]
+            if len(chosen.setdefault(category, [])) < scenes:
+                chosen[category].append(_cells(read, stored, scene))
+    return [(category, cells) for category in sorted(chosen) for cells in chosen[category]]
+
+
+def _cells(read: Callable[[str], bytes], stored: StoredRange, scene: Row) -> list[Picture]:
+    """The pictures of one scene's first pair."""
+    views = [row for row in stored.rows["views"] if row["scene_id"] == scene["scene_id"]]
+    e, category = min(row["parent_id"] for row in views), scene["category"]
+    listed = {file["path"] for row in views for file in row["files"]}
+
+    def image(content: str, number: int) -> NDArray:
+        return read_image(read, image_path(category, content, number))  # type: ignore[arg-type]
+
+    cells = []
+    for number in (e, e + 1):
+        cells += [_fit(image("RGB", number)), _fit(_paint_depth(image("depth", number))), _fit(_paint_regions(image("segment", number)))]
+    cells.append(_fit(image("RGBprojected", e)))
+    patches = [patch_path(category, "RGB", number) for number in (e, e + 1)]  # type: ignore[arg-type]
+    cells.append(_stack([read_image(read, path) for path in patches if path in listed]))
+    return cells
+
+
+def _fit(picture: NDArray) -> Picture:
+    shrunk: Picture = cv2.resize(picture, CELL, interpolation=cv2.INTER_AREA)
+    return shrunk
+
+
+def _stack(patches: list[NDArray]) -> Picture:
+    """Patches one over the other, pixel for pixel, in the middle of a cell."""
+    cell = np.full((CELL[1], CELL[0], 3), 245, np.uint8)
+    for number, patch in enumerate(patches):
+        height, width = min(patch.shape[0], CELL[1] // 2), min(patch.shape[1], CELL[0])
+        left = (CELL[0] - width) // 2
+        cell[number * height : (number + 1) * height, left : left + width] = patch[:height, :width]
+    return cell
+
+
+def _paint_depth(depth: NDArray) -> Picture:
+    """Near warm, far cold, none black."""
+    known = depth > 0
+    if not known.any():
+        return np.zeros((*depth.shape, 3), np.uint8)
+    low, high = np.percentile(depth[known], DEPTH_STRETCH)
+    share = np.clip((depth - low) / max(high - low, 1.0), 0.0, 1.0)
+    painted: Picture = cv2.applyColorMap((255 * (1.0 - share)).astype(np.uint8), cv2.COLORMAP_TURBO)[:, :, ::-1].copy()
+    painted[~known] = 0
+    return painted
+
+
+def _paint_regions(region: NDArray) -> Picture:
+    painted: Picture = REGION_COLORS[np.minimum(region, len(REGION_COLORS) - 1)]
+    return painted
+
+
+if __name__ == "__main__":
+    sheet = draw_sheet(open_store(sys.argv[1]), int(sys.argv[3]) if len(sys.argv) > 3 else 1)
+    Image.fromarray(sheet).save(Path(sys.argv[2]), quality=88)
