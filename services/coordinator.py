@@ -1,5 +1,6 @@
 """Drives shards through Ray: a bounded number in flight, every report looked at, attempts counted here and nowhere else."""
 
+import logging
 import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ from schemas.commit import Span
 from schemas.errors import CommitConflict, RunError, VersoError
 from schemas.layout import commit_path, staging_path
 from schemas.report import Blame, Reason, ShardOrder, ShardReport
+from services.progress import log_event
 from workers.assets.catalogue import Catalogue
 from workers.shard import TIMED_OUT, run_shard
 from workers.store.attempt import attempts_at, blamed_scene
@@ -175,12 +177,14 @@ class _Drive:
         scene, timed_out = self._evidence(span)
         reason: Reason = "time" if timed_out else "memory" if isinstance(error, OutOfMemoryError) else "killed"
         self._tally.lost_workers[reason] += 1
+        told = " ".join(str(error).split())[:300]
+        log_event("worker lost", logging.WARNING, range=span.start, scene=scene, reason=reason, error=told)
         if scene is None:
             self._losses[span.start] += 1
             if self._losses[span.start] >= self._limits.attempts:
                 raise RunError(
                     f"the worker for the scenes from {span.start} died {self._losses[span.start]} times before it began one "
-                    f"({' '.join(str(error).split())[:300]}): see `verso doctor`"
+                    f"({told}): see `verso doctor`"
                 )
             return
         self._deaths[scene] += 1

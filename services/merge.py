@@ -10,14 +10,14 @@ from pathlib import Path
 
 from schemas.commit import CommitRecord
 from schemas.errors import CorruptError, RunError
-from schemas.layout import COMMITS, MANIFEST, STAGING, SUCCESS_FILE
+from schemas.layout import MANIFEST, STAGING, SUCCESS_FILE
 from schemas.manifest import DETERMINISTIC_TABLES, SCHEMA_VERSION, TABLES
 from services.commits import iter_ranges, range_rows
 from services.digest import dataset_digest
 from services.merge_poses import PoseFiles
 from services.merge_shared import AssetRows, FileList
 from services.merge_tables import MergedTable
-from workers.store.commit import check_published
+from workers.store.commit import check_published, commit_names
 from workers.store.store import Store
 from workers.store.sweep import sweep
 
@@ -170,8 +170,8 @@ def _merged_already(store: Store, asked: Mapping[str, object]) -> dict | None:
 def _commits_digest(store: Store) -> str:
     """Tells one set of commits from another: a record never changes, so names and sizes are enough."""
     total = hashlib.sha256()
-    for entry in store.files(COMMITS):
-        total.update(f"{entry.key} {entry.bytes}\n".encode())
+    for _, _, key in commit_names(store):
+        total.update(f"{key} {store.size(key)}\n".encode())
     return total.hexdigest()
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import socket
 import sys
 import tempfile
@@ -50,10 +51,19 @@ def private_ray(workers: int) -> Iterator[Slots]:
                 log_to_driver=False,
                 configure_logging=False,
                 _temp_dir=folder,
+                _plasma_directory=_object_store_folder(folder),
                 _node_ip_address="127.0.0.1",
             )
         with _shut_down():
             yield Slots(workers, PREFETCH * workers)
+
+
+def _object_store_folder(temporary: str) -> str:
+    """Shared memory where there is enough of it; a container often has 64 MiB, and Ray then warns of slow storage, which
+    is of no matter to reports of a kilobyte."""
+    shared = Path("/dev/shm")
+    roomy = shared.exists() and shutil.disk_usage(shared).free > 2 * OBJECT_STORE_BYTES
+    return str(shared) if roomy else temporary
 
 
 @contextlib.contextmanager

@@ -49,7 +49,7 @@ def replay_scene(store: Store, scene_id: int) -> Replay:
     context = open_context(record)
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
     same_stack = take_fingerprint(context.renderer) == theirs
-    output = run_scene(context, scene_id, None, Stopwatch())
+    output = run_scene(context, scene_id, Stopwatch())
     differences = _compare_files(store, stored, output, same_stack)
     if same_stack:
         differences += _compare_rows(stored, output)

@@ -64,6 +64,16 @@ def disk(at: int = -1, then: Callable[[], object] | None = None) -> Iterator[Dis
         yield watched
 
 
+@pytest.fixture(scope="module")
+def unflushed() -> Iterator[None]:
+    """Nothing is flushed in this module: for tests that lose no power, which a busy disk would slow down."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda descriptor: None)
+        patch.setattr(durable, "_syncfs", lambda folder: True)
+        patch.setattr(durable, "_trusts_syncfs", lambda folder: True)
+        yield
+
+
 def lose_power(watched: Disk, root: Path) -> None:
     """Empties every file below `root` whose bytes were never flushed."""
     for parent, _, names in os.walk(root):

@@ -14,6 +14,7 @@ from typing import IO
 from schemas.commit import Span
 from schemas.errors import FingerprintError, SceneError
 from schemas.fingerprint import Fingerprint
+from schemas.job import Job
 from schemas.layout import FINGERPRINT_FILE, staging_path
 from schemas.report import Blame, ShardOrder, ShardReport, SpanReport
 from schemas.scene import SceneOutput
@@ -67,9 +68,12 @@ def run_span(context: WorkerContext, store: Store, order: ShardOrder, span: Span
     failed: Counter[str] = Counter()
     with _traceback_file(store, attempt) as tracebacks:
         for scene_id in span.scene_ids:
-            attempt.begin_scene(scene_id)
-            with _time_limit(context.job.run.scene_timeout_s, tracebacks):
-                output = run_scene(context, scene_id, blamed.get(scene_id), total)
+            if scene_id in blamed:
+                output = record_blame(context.job, blamed[scene_id])
+            else:
+                attempt.begin_scene(scene_id)
+                with _time_limit(context.job.run.scene_timeout_s, tracebacks):
+                    output = run_scene(context, scene_id, total)
             failed.update(f"{row['kind']}: {row['reason']}" for row in output.rows.get("failures", ()))
             with total.stage("write"):
                 attempt.add_scene(output)
@@ -86,13 +90,17 @@ def run_span(context: WorkerContext, store: Store, order: ShardOrder, span: Span
     )
 
 
-def run_scene(context: WorkerContext, scene_id: int, blame: Blame | None, total: Stopwatch) -> SceneOutput:
+def record_blame(job: Job, blame: Blame) -> SceneOutput:
+    """The row of a scene that is not tried again: it is not begun either, so that nobody is killed in it."""
+    error = BlamedScene(blame.reason, blame.detail)
+    return failed_scene(blame.scene_id, choose_category(job, blame.scene_id), error, blame.attempts)
+
+
+def run_scene(context: WorkerContext, scene_id: int, total: Stopwatch) -> SceneOutput:
     """One scene, made or told why not."""
     category = choose_category(context.job, scene_id)
     watch = Stopwatch()
     try:
-        if blame is not None:
-            return failed_scene(scene_id, category, BlamedScene(blame.reason, blame.detail), blame.attempts)
         output = record_scene(context, make_scene(context, scene_id, watch), watch)
     except SceneError as error:
         output = failed_scene(scene_id, category, error)

@@ -106,6 +106,17 @@ def test_an_error_can_be_read_by_a_program(capsys):
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["kind"] == "JobError"
 
 
+def test_a_machine_without_gl_is_told_what_to_install():
+    environment = {**os.environ, "__EGL_VENDOR_LIBRARY_DIRS": "/nowhere"}
+    done = subprocess.run(
+        [sys.executable, "-m", "services.cli", "doctor"], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert "no off-screen OpenGL" in done.stdout
+    assert "apt-get install -y libgl1 libegl1 libgl1-mesa-dri" in done.stdout
+    assert "Traceback" not in done.stdout + done.stderr
+
+
 @pytest.mark.ray
 def test_the_first_command_of_the_readme_makes_a_dataset_and_the_others_read_it(tmp_path):
     """From the shell, as a user would, with a small job."""

@@ -7,6 +7,8 @@ from services.commits import iter_ranges, range_rows
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene
 from workers.store.local import LocalStore
 
+pytestmark = pytest.mark.usefixtures("unflushed")
+
 
 @pytest.fixture
 def store(tmp_path):

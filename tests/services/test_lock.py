@@ -178,6 +178,16 @@ def test_of_many_that_take_over_a_dead_holder_one_gets_it(store):
     assert most == [1] * 6
 
 
+def test_a_contender_that_is_late_leaves_the_new_holder_alone(store):
+    old, new, late = elsewhere("old"), elsewhere("new"), elsewhere("late")
+    write(store, new)
+    assert not module._take_over(store, old, late, 0.01)
+    assert read_holder(store) == new
+    write(store, old)
+    assert module._take_over(store, old, late, 0.01)
+    assert read_holder(store) == late
+
+
 def test_a_claim_of_a_contender_that_died_is_not_in_the_way_for_ever(store):
     write(store, elsewhere())
     real = LocalStore.write_whole

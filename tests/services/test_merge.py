@@ -19,6 +19,9 @@ from services.merge import merge, read_success, reopen
 from services.merge_poses import escaped, object_lines
 from tests.made_up_scenes import attempt_at, failed_scene, fails, made_scene, scene, terms
 from workers.store.local import LocalStore
+from workers.store.manifest import table_of_rows
+
+pytestmark = pytest.mark.usefixtures("unflushed")
 
 FIRST, STOP = 3, 30
 ROLE_ORDER = ["input", "aligned", "mirror", "projected"]
@@ -191,13 +194,38 @@ def test_the_digest_does_not_depend_on_ranges_order_layout_or_attempts(merged, t
 
 
 def test_the_digest_does_not_depend_on_the_size_of_merged_files(merged, tmp_path, monkeypatch):
-    for name, value in (("ROWS_PER_FILE", 10), ("ROWS_PER_GROUP", 4), ("ROWS_PER_BLOCK", 3)):
+    for name, value in (("ROWS_PER_FILE", 10), ("ROWS_PER_GROUP", 7), ("ROWS_PER_BLOCK", 3)):
         monkeypatch.setattr(merge_tables, name, value)
     assert merge(dataset_at(tmp_path), FIRST, STOP) == merged[1]
     files = sorted((tmp_path / "manifest/views").glob("*/*.parquet"))
     assert max(pa.parquet.read_metadata(path).num_rows for path in files) == 10
     again = ds.dataset(tmp_path / "manifest/views", partitioning="hive").to_table()
     assert again.num_rows == merged[1].rows["views"]
+
+
+@pytest.mark.parametrize("order", [[3, 4, 4], [4, 3], [3, 7, 6]], ids=["twice", "backwards", "across blocks"])
+def test_rows_that_come_twice_or_out_of_order_are_refused(tmp_path, monkeypatch, order):
+    monkeypatch.setattr(merge_tables, "ROWS_PER_BLOCK", 2)
+    table = merge_tables.MergedTable("scenes", tmp_path)
+
+    def add_all():
+        for scene_id in order:
+            table.add(table_of_rows("scenes", made_scene(scene_id).rows["scenes"]))
+        table.finish(["mug"])
+
+    with pytest.raises(CorruptError, match=r"scenes: the key \(scene_id\) = .* comes after .* the ranges do not join"):
+        add_all()
+    table.close()
+
+
+def test_scenes_whose_pose_ids_collide_are_refused(tmp_path):
+    def colliding(scene_id):
+        output = scene(scene_id)
+        views = [{**row, "pose_id": row["pose_id"] % 8} for row in output.rows.get("views", [])]
+        return dataclasses.replace(output, rows={**output.rows, "views": views})
+
+    with pytest.raises(CorruptError, match="views: the key"):
+        merge(dataset_at(tmp_path, 0, 8, make=colliding), 0, 8)
 
 
 def test_a_dataset_extended_twice_has_the_digest_of_one_made_at_once(merged, tmp_path):

@@ -16,6 +16,8 @@ from services.query_formats import format_rows
 from tests.made_up_scenes import attempt_at, failed_scene, fails, scene
 from workers.store.local import LocalStore
 
+pytestmark = pytest.mark.usefixtures("unflushed")
+
 STOP = 12
 
 

@@ -8,6 +8,8 @@ from services.ranges import committed_ranges, effective_failures, list_commits, 
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene
 from workers.store.local import LocalStore
 
+pytestmark = pytest.mark.usefixtures("unflushed")
+
 
 def test_ranges_lie_on_the_grid_and_the_last_is_cut_short():
     assert plan_ranges(5, 14, 4, []) == [(5, 9), (9, 13), (13, 14)]

@@ -5,7 +5,10 @@ import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,7 +18,7 @@ import pytest
 
 from schemas.errors import OutputError, RunError
 from schemas.job import Job
-from services.jobfile import validate_job
+from services.jobfile import load_job, validate_job
 from services.query import query
 from services.ray_cluster import Slots, private_ray
 from services.replay import replay_scene
@@ -26,6 +29,8 @@ from workers.store.images import decode_png
 from workers.store.local import LocalStore
 
 pytestmark = pytest.mark.ray
+
+ROOT = Path(__file__).resolve().parents[2]
 
 SMALL = {
     "name": "small",
@@ -71,6 +76,29 @@ def made(cluster, tmp_path_factory) -> tuple[Path, str]:
 )
 def test_workers_shards_and_ranges_do_not_change_the_dataset(made, tmp_path, slots, run):
     assert make(tmp_path / "again", slots=slots, run=run) == made[1]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_the_first_job_is_one_dataset_however_it_is_made(cluster, tmp_path):
+    """All 64 full-size scenes of tabletop.yaml: workers 1 and 2, shards of 1, 7 and 64, ranges of 4 and 16, extended."""
+    job = load_job(ROOT / "deploy" / "jobs" / "tabletop.yaml")
+
+    def digest(name: str, slots: int, **run: int) -> str:
+        out = tmp_path / name
+        changed = job.model_copy(update={"scenes": run.pop("scenes", 64), "run": job.run.model_copy(update=run)})
+        made = run_job(RunRequest(changed, Path(), str(out)), contextlib.nullcontext(Slots(slots, slots)))
+        if changed.scenes == 64:
+            shutil.rmtree(out)
+        return made.merged.digest
+
+    found = {
+        digest(f"{slots}-{shard}-{size}", slots, shard_size=shard, range_size=size)
+        for slots, shard, size in [(1, 64, 16), (2, 1, 4), (2, 7, 16), (2, 64, 4), (1, 7, 4), (2, 1, 16)]
+    }
+    digest("grown", 2, scenes=24, range_size=16)
+    found.add(digest("grown", 2, scenes=64, range_size=16))
+    assert len(found) == 1
 
 
 def test_a_dataset_that_was_extended_is_the_one_made_at_once(made, tmp_path):
@@ -207,14 +235,14 @@ def test_every_pairs_images_have_their_sizes_and_types(made):
 def test_a_scene_that_kills_its_worker_becomes_a_row_and_the_rest_is_made(made, tmp_path):
     """The worker is killed for real, as the kernel would, each time it begins scene 6."""
     out = tmp_path / "deadly"
-    changes = {"run": {"range_size": 4, "max_failure_share": 0.5}}
+    changes = {"run": {"range_size": 4, "max_failure_share": 0.5, "max_attempts": 2}}
     with deadly_scene(out, 6) as killed:
         result = run_job(request(out, **changes), contextlib.nullcontext(Slots(2, 2)))
-    assert len(killed) == 3
+    assert len(killed) == 2
     assert result.merged.scenes == {"made": 23, "intrinsic": 0, "environmental": 1}
     assert not (out / "_SUCCESS").exists()
     (row,) = query(LocalStore(out), "select * from failures").to_pylist()
-    assert (row["scene_id"], row["kind"], row["reason"], row["attempts"]) == (6, "environmental", "killed", 3)
+    assert (row["scene_id"], row["kind"], row["reason"], row["attempts"]) == (6, "environmental", "killed", 2)
     job = request(out, **changes).job
     retried = run_job(RunRequest(job, Path(), str(out), retry_failed=True), contextlib.nullcontext(Slots(2, 2)))
     assert retried.merged.digest == made[1]
@@ -230,8 +258,8 @@ def deadly_scene(out: Path, scene_id: int) -> Iterator[list[int]]:
 
     def watch() -> None:
         while not over.wait(0.002):
-            for note in out.glob("_staging/*/*/_current"):
-                with contextlib.suppress(OSError, ValueError):
+            with contextlib.suppress(OSError, ValueError):  # folders come and go while we look
+                for note in out.glob("_staging/*/*/_current"):
                     pid = int(note.parent.name.split("-")[-2])
                     if pid not in killed and json.loads(note.read_text()).get("scene_id") == scene_id:
                         os.kill(pid, signal.SIGKILL)
@@ -244,6 +272,37 @@ def deadly_scene(out: Path, scene_id: int) -> Iterator[list[int]]:
     finally:
         over.set()
         watcher.join()
+
+
+def test_an_interrupted_run_says_so_leaves_no_process_and_goes_on_where_it_stopped(made, tmp_path):
+    """Ctrl-C in a terminal: the whole process group gets SIGINT."""
+    (tmp_path / "small.yaml").write_text(json.dumps({**SMALL, "run": {"range_size": 4}}))
+    out = tmp_path / "stopped"
+    command = [sys.executable, "-m", "services.cli", "run", str(tmp_path / "small.yaml"), "--out", str(out), "--shard-size", "4"]
+    run = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    deadline = time.monotonic() + 120
+    while not list(out.glob("manifest/_commits/*.json")) and run.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(run.pid, signal.SIGINT)
+    _, told = run.communicate(timeout=60)
+    assert run.returncode == 1, told
+    assert "interrupted; what is committed is kept" in told
+    assert "Traceback" not in told
+    kept = len(list(out.glob("manifest/_commits/*.json")))
+    assert 1 <= kept < 6
+    assert not processes_of(run.pid)
+    assert make(out, run={"range_size": 4}) == made[1]
+
+
+def processes_of(session: int) -> list[str]:
+    """Command lines of what still runs in a session."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            after_name = stat.read_text().rpartition(")")[2].split()
+            if int(after_name[3]) == session and after_name[0] != "Z":
+                found.append((stat.parent / "cmdline").read_text())
+    return found
 
 
 def test_too_many_failures_stop_the_run_early_and_lose_nothing(cluster, tmp_path):

@@ -9,6 +9,8 @@ from services.status import read_status
 from tests.made_up_scenes import attempt_at, failed_scene, scene
 from workers.store.local import LocalStore
 
+pytestmark = pytest.mark.usefixtures("unflushed")
+
 
 @pytest.fixture
 def store(tmp_path):

@@ -16,7 +16,10 @@ from obstore.exceptions import AlreadyExistsError, BaseError, NotSupportedError
 from obstore.store import from_url
 
 from schemas.errors import MachineError, OutputError
-from workers.store.store import TEMPORARY, Entry, fenced_key
+from workers.store.store import PROBE_PREFIX, TEMPORARY, Entry, fenced_key
+
+_PROBES = 3
+"""A coordinator that already works here may sweep a probe away between its two puts."""
 
 _BEGUN = "_begun"
 """In an attempt's folder from its beginning until it is swept."""
@@ -44,21 +47,25 @@ class ObjectStore:
 
     def prepare(self) -> None:
         """Proves that a put can be refused where something is (see `Store`)."""
-        key = f"{TEMPORARY}/probe-{uuid.uuid4().hex}"
         try:
-            obstore.put(self._bucket, key, b"first", mode="create")
-            try:
-                obstore.put(self._bucket, key, b"second", mode="create")
-                refused = False
-            except AlreadyExistsError:
-                refused = True
-            obstore.delete(self._bucket, key)
+            refused = any(self._refuses_a_second_put() for _ in range(_PROBES))
         except (NotSupportedError, NotImplementedError) as error:
             raise OutputError(self._unfit()) from error
         except (BaseError, OSError) as error:
             raise OutputError(f"{self.name} cannot be written: {_first_line(error)}") from error
         if not refused:
             raise OutputError(self._unfit())
+
+    def _refuses_a_second_put(self) -> bool:
+        key = f"{TEMPORARY}/{PROBE_PREFIX}{uuid.uuid4().hex}"
+        obstore.put(self._bucket, key, b"first", mode="create")
+        try:
+            obstore.put(self._bucket, key, b"second", mode="create")
+        except AlreadyExistsError:
+            return True
+        finally:
+            self.remove(key)
+        return False
 
     def open_staging(self, staging: str) -> None:
         """Marks the attempt as begun."""

@@ -9,10 +9,10 @@ from schemas.errors import OutputError
 from schemas.layout import COMMITS
 from workers.store.durable import sync_file, sync_folder
 from workers.store.mounts import file_system_of
-from workers.store.store import TEMPORARY
+from workers.store.store import PROBE_PREFIX, TEMPORARY
 
-PROBE_PREFIX = ".probe-"
-"""Names that a killed probe may leave beside the commits; they are swept."""
+_TRIES = 3
+"""A coordinator that already works here may sweep the probe's files away: they are then written again."""
 
 
 def probe_folder(root: Path) -> None:
@@ -20,6 +20,12 @@ def probe_folder(root: Path) -> None:
 
     Raises OutputError naming what failed, the type of the file system and a remedy.
     """
+    for last in range(_TRIES):
+        with contextlib.suppress(*([FileNotFoundError] if last < _TRIES - 1 else [])):
+            return _probe_once(root)
+
+
+def _probe_once(root: Path) -> None:
     token = uuid.uuid4().hex
     source = root / TEMPORARY / f"{PROBE_PREFIX}{token}"
     target = root / COMMITS / f"{PROBE_PREFIX}{token}"
@@ -38,6 +44,8 @@ def probe_folder(root: Path) -> None:
         os.replace(source, target)
         if source.exists() or target.read_bytes() != b"probe":
             raise OSError("the renamed file reads back differently")
+    except FileNotFoundError:
+        raise
     except OSError as error:
         raise OutputError(
             f"{root} is on a file system of type {file_system_of(root)} that fails at {step} "

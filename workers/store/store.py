@@ -14,6 +14,9 @@ from schemas.layout import STAGING
 TEMPORARY = f"{STAGING}/_tmp"
 """Files on their way to `put_if_absent` and `write_whole`; one that a killed process left is swept."""
 
+PROBE_PREFIX = ".probe-"
+"""Names that a killed probe may leave in `_tmp` and beside the commits; they are swept."""
+
 
 def fenced_key(staging: str) -> str:
     """Where the folder of a fenced attempt lies."""

@@ -6,7 +6,7 @@ from schemas.errors import CorruptError
 from schemas.layout import COMMITS, STAGING, commit_path, staging_path
 from workers.store.attempt import retry_of_attempt
 from workers.store.commit import publish, read_record
-from workers.store.store import TEMPORARY, Entry, Store, fenced_key
+from workers.store.store import PROBE_PREFIX, TEMPORARY, Store, fenced_key
 
 _FENCED = ".fenced"
 
@@ -56,6 +56,6 @@ def _settle(store: Store, start: int, attempt: str, given_up: bool) -> bool:
 
 def _sweep_temporaries(store: Store) -> None:
     """Drops what killed processes left beside the attempts; a living one writes its temporary file again."""
-    leftovers: list[Entry] = [entry for entry in store.files(COMMITS) if entry.key.rpartition("/")[2].startswith(".")]
-    for entry in [*leftovers, *store.files(TEMPORARY)]:
+    probes = [entry for entry in store.files(COMMITS) if entry.key.startswith(f"{COMMITS}/{PROBE_PREFIX}")]
+    for entry in [*probes, *store.files(TEMPORARY)]:
         store.remove(entry.key)

@@ -86,7 +86,7 @@ def test_a_missing_folder_is_refused_when_the_catalogue_opens(tmp_path):
 def test_a_folder_whose_meshes_are_all_broken_is_refused_when_the_catalogue_opens(tmp_path):
     for k in range(4):
         write(tmp_path / "things" / f"mug{k}.obj", "v 0 0 0\n")
-    with pytest.raises(AssetSourceError, match="none of the first 3 meshes for 'mug' can be used: .*no_faces"):
+    with pytest.raises(AssetSourceError, match=r"none of the first 3 meshes for 'mug' can be used: .*no_faces"):
         opened(tmp_path, objects=(folder(),))
 
 

@@ -42,8 +42,8 @@ def test_tiles_cover_the_window_once_on_the_same_pixel_grid():
         seen[round(y) + 300 : round(y) + 300 + tile.height, round(x) + 700 : round(x) + 700 + tile.width] += 1
     # The box's nearer side, 1.45 m away, has the larger image; the surroundings begin at (-700, -300).
     half = np.array([1.5 * k.fx, 1.0 * k.fy]) / 1.45
-    left, top = np.floor(np.array([k.cx, k.cy]) - half).astype(int) + (700, 300)
-    right, bottom = np.ceil(np.array([k.cx, k.cy]) + half).astype(int) + (700, 300)
+    left, top = np.floor(np.array([k.cx, k.cy]) - half).astype(int) + np.array([700, 300])
+    right, bottom = np.ceil(np.array([k.cx, k.cy]) + half).astype(int) + np.array([700, 300])
     expected = np.zeros_like(seen)
     expected[top:bottom, left:right] = 1
     np.testing.assert_array_equal(seen, expected)

@@ -14,6 +14,8 @@ from workers.store.commit import read_record
 from workers.store.local import LocalStore
 from workers.store.manifest import decode_table
 
+pytestmark = pytest.mark.usefixtures("unflushed")
+
 
 @pytest.fixture
 def store(tmp_path):
@@ -83,6 +85,23 @@ def test_a_scene_is_blamed_from_its_beginning_until_the_commit(store):
     attempt.commit()
     assert blamed_scene(store, 0, attempt.name) is None
     assert attempts_at(store, 0) == []
+
+
+def test_a_worker_that_dies_while_it_commits_blames_no_scene(store, monkeypatch):
+    attempt = attempt_at(store, 0, 4)
+    assert blamed_scene(store, 0, attempt.name) == 3
+
+    class Died(BaseException):
+        pass
+
+    def dies(staging):
+        raise Died
+
+    monkeypatch.setattr(store, "make_durable", dies)
+    with pytest.raises(Died):
+        attempt.commit()
+    assert attempts_at(store, 0) == [attempt.name]
+    assert blamed_scene(store, 0, attempt.name) is None
 
 
 @pytest.mark.parametrize("torn", [b"", b"{", b"[1]", b'{"scene_id": "x"}'])

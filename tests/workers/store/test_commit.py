@@ -19,6 +19,8 @@ from workers.store.commit import (
 from workers.store.local import LocalStore
 from workers.store.sweep import sweep
 
+pytestmark = pytest.mark.usefixtures("unflushed")
+
 
 @pytest.fixture
 def store(tmp_path):

@@ -11,6 +11,7 @@ from workers.store.local import LocalStore
 from workers.store.mounts import file_system_of
 from workers.store.opening import open_store
 from workers.store.store import TEMPORARY
+from workers.store.sweep import sweep
 
 
 @pytest.fixture
@@ -192,3 +193,18 @@ def test_opening_a_folder_loads_no_object_store(tmp_path):
     subprocess.run([sys.executable, "-c", code], check=True)
     assert isinstance(open_store(str(tmp_path)), LocalStore)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_probe_whose_files_are_swept_by_a_coordinator_at_work_is_made_again(tmp_path, monkeypatch):
+    store = LocalStore(tmp_path)
+    store.prepare()
+    real, swept = os.link, []
+
+    def link(source, target):
+        if not swept:
+            swept.append(sweep(store))
+        real(source, target)
+
+    monkeypatch.setattr(os, "link", link)
+    store.prepare()
+    assert swept

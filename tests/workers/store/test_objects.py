@@ -24,6 +24,8 @@ from workers.store.opening import open_store
 from workers.store.packing import read_images
 from workers.store.sweep import sweep
 
+pytestmark = pytest.mark.usefixtures("unflushed")
+
 TAR = terms(layout="tar")
 STOP = 10
 
@@ -252,3 +254,18 @@ def test_a_url_that_names_a_store_is_opened_with_its_prefix():
     assert isinstance(store, ObjectStore)
     assert store.name == "s3://bucket/a/dataset"
     assert store._bucket.prefix == "a/dataset"
+
+
+def test_a_probe_that_is_swept_by_a_coordinator_at_work_is_made_again(monkeypatch):
+    store = ObjectStore(MemoryStore(), "memory://")
+    real, swept = obstore.put, []
+
+    def put(*arguments, **named):
+        done = real(*arguments, **named)
+        if not swept:
+            swept.append(sweep(store))
+        return done
+
+    monkeypatch.setattr(obstore, "put", put)
+    store.prepare()
+    assert swept

@@ -12,6 +12,8 @@ from workers.store.local import LocalStore
 from workers.store.packing import read_images
 from workers.store.tars import member_of, path_of, read_tar, tar_path
 
+pytestmark = pytest.mark.usefixtures("unflushed")
+
 TAR = terms(layout="tar")
 
 

@@ -181,7 +181,8 @@ def _grip(rng: np.random.Generator, size: tuple[float, float, float], kind: int)
     w = width * float(rng.uniform(0.15, 0.18))
     top = height * float(rng.uniform(0.86, 0.93))
     # Its base lies just above the body's: the camera stands on its body, and no two planes coincide.
-    profile = np.array([[0.0015, 0.0012], [0.0, 0.0025], [0.0, top - 0.004], [0.0016, top - 0.001], [0.004, top]])
+    b = min(0.0016, 0.1 * grip_depth)
+    profile = np.array([[b, 0.0012], [0.0, 0.0012 + b], [0.0, top - 2.5 * b], [b, top - 0.6 * b], [2.5 * b, top]])
     grip = prism(profile, (w, grip_depth), 0.45 * min(w, grip_depth), [SKIN] * 6, 5)
     return grip.moved(x=-0.5 * width + 0.52 * w, y=-0.5 * depth - 0.12 * grip_depth if kind else -0.5 * depth)
 

@@ -54,10 +54,11 @@ def cut_into_parts(solid: Solid, surfaces: Sequence[Surface], centre: Array, sca
     """
     vertices = (solid.vertices - centre) * scale
     a, b, c = (vertices[solid.faces[:, k]] for k in range(3))
-    across = np.cross(b - a, c - a)
+    sides = (b - a, c - b, a - c)
+    across = np.cross(sides[0], -sides[2])
     shaded, point = _dense(solid.smooth[:, None] * len(vertices) + solid.faces)
     point %= len(vertices)
-    normals = _shading_normals(shaded, across, len(point))
+    normals = _shading_normals(shaded, across, sides, len(point))
     parts = []
     for number, surface in enumerate(surfaces):
         chosen = np.flatnonzero(solid.surface == number)
@@ -87,10 +88,18 @@ def _dense(keys: Indices) -> tuple[Indices, Indices]:
     return number[keys], np.flatnonzero(seen)
 
 
-def _shading_normals(corners: Indices, across: Array, count: int) -> Array:
-    """[count, 3] float64: for each point the unit sum of the area vectors [F, 3] of the faces [F, 3] around it."""
+def _shading_normals(corners: Indices, across: Array, sides: tuple[Array, Array, Array], count: int) -> Array:
+    """[count, 3] float64: for each point the unit mean of the normals of the faces [F, 3] around it.
+
+    A face counts by its area vector over the squares of the two sides that meet in the point, which is exact on
+    spheres and does not mind how a rectangle is cut in two (Max, "Weights for computing vertex normals from facet
+    normals", 1999).
+    """
+    square = [side[:, 0] ** 2 + side[:, 1] ** 2 + side[:, 2] ** 2 for side in sides]
+    pairs = np.stack([square[2] * square[0], square[0] * square[1], square[1] * square[2]], axis=1)
+    weight = 1.0 / np.where(pairs == 0.0, 1.0, pairs)
     flat = corners.ravel()
-    summed = np.stack([np.bincount(flat, np.repeat(across[:, axis], 3), count) for axis in range(3)], axis=1)
+    summed = np.stack([np.bincount(flat, (across[:, k : k + 1] * weight).ravel(), count) for k in range(3)], axis=1)
     length = np.sqrt(summed[:, 0] ** 2 + summed[:, 1] ** 2 + summed[:, 2] ** 2)
     return summed / np.where(length == 0.0, 1.0, length)[:, None]
 

@@ -22,7 +22,7 @@ from workers.assets.procedural.look import (
 )
 from workers.assets.procedural.paint import Picture, band_height, bands, blank, dots, label, speckled, upright_stripes
 from workers.assets.procedural.solid import Solid, circle, lathe, union
-from workers.assets.procedural.vessel import BASE, INSIDE, OUTSIDE, Wall, rod, wall_around
+from workers.assets.procedural.vessel import BASE, INSIDE, OUTSIDE, Wall, bend_radius, rod, wall_around
 
 EAR = 3
 SEGMENTS = 40
@@ -84,7 +84,7 @@ def _with_thread(wall: Wall, height: float) -> Wall:
 def _pot(rng: np.random.Generator) -> Wall:
     """A pot or vase: radii drawn at foot, belly, neck and lip."""
     height = float(rng.uniform(0.12, 0.32))
-    belly = height * float(rng.uniform(0.26, 0.46))
+    belly = height * float(rng.uniform(0.26, 0.42))
     thickness = float(rng.uniform(0.004, 0.007))
     bottom = thickness + 0.003
     foot = belly * float(rng.uniform(0.5, 0.75))
@@ -123,7 +123,7 @@ def _ears(rng: np.random.Generator, wall: Wall) -> list[Solid]:
     start, stop = (end - 0.5 * wall.thickness_m * normal for end, normal in zip(ends, out, strict=True))
     reach = (heights[0] - heights[1]) * float(rng.uniform(0.6, 1.0))
     path = bezier(start, start + reach * out[0], stop + reach * out[1], stop, 11)
-    section = circle(10) * np.array([half, 0.6 * half])
+    section = circle(10) * np.array([half, min(0.6 * half, 0.8 * bend_radius(path, (out[0], -out[1])))])
     ear = rod(path, section, EAR, (out[0], -out[1]))
     turned = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
     return [ear, ear.placed(turned, np.zeros(3))]

@@ -94,7 +94,7 @@ def _surfaces(
         (0.12, 0.12, 0.13),
         (0.84, 0.78, 0.72),
     )
-    color: Color = near(rng, pick(rng, silver), 0.03) if chance(rng, 0.85) else vivid(rng)
+    color: Color = near(rng, pick(rng, silver), 0.03) if chance(rng, 0.88) else mixed(vivid(rng), (0.5, 0.5, 0.5), 0.4)
     metallic = 0.8 if chance(rng, 0.6) else 0.0
     case = solid_color(color, float(rng.uniform(0.35, 0.55)), metallic)
     key = BLACK if chance(rng, 0.7) else mixed(color, WHITE, 0.5)

@@ -22,7 +22,7 @@ from workers.assets.procedural.look import (
 )
 from workers.assets.procedural.paint import Picture, band_height, bands, dots, label, speckled, upright_stripes
 from workers.assets.procedural.solid import Solid, lathe, union
-from workers.assets.procedural.vessel import BASE, INSIDE, OUTSIDE, Wall, rod, wall_around
+from workers.assets.procedural.vessel import BASE, INSIDE, OUTSIDE, Wall, bend_radius, rod, wall_around
 
 HANDLE = 3
 
@@ -36,7 +36,7 @@ def make_mug(rng: np.random.Generator) -> Model:
 
 def _body(rng: np.random.Generator) -> Wall:
     height = float(rng.uniform(0.055, 0.07) if chance(rng, 0.2) else rng.uniform(0.078, 0.115))
-    radius = height * float(rng.uniform(0.36, 0.52))
+    radius = min(height * float(rng.uniform(0.36, 0.52)), float(rng.uniform(0.042, 0.05)))
     thickness = float(rng.uniform(0.003, 0.005))
     bottom = thickness + float(rng.uniform(0.001, 0.004))
     kind = int(rng.integers(5))
@@ -72,12 +72,13 @@ def _handle(rng: np.random.Generator, wall: Wall) -> Solid:
     half_width = min(float(rng.uniform(0.005, 0.0095)), 0.12 * span)
     # The end of the rod stays within the wall: half a chord of the wall's circle sinks by w^2 / 2r.
     half_width = min(half_width, float(np.sqrt(0.6 * wall.thickness_m * wall.radius_at(low))))
-    half_depth = half_width * float(rng.uniform(0.5, 0.85))
+    slender = float(rng.uniform(0.5, 0.85))
     ends = [np.array([wall.radius_at(z), z]) for z in (high, low)]
     out = [wall.normal_at(z) for z in (high, low)]
     start, stop = (end - 0.5 * wall.thickness_m * normal for end, normal in zip(ends, out, strict=True))
-    reach = (high - low) * float(rng.uniform(0.55, 0.95))
+    reach = (high - low) * float(rng.uniform(0.5, 0.8))
     path = _path(rng, start, out[0], stop, out[1], max(reach, 0.022))
+    half_depth = min(half_width * slender, 0.8 * bend_radius(path, (out[0], -out[1])))
     along = 2.0 * np.linspace(0.0, 1.0, len(path)) - 1.0
     thick_ends = 1.0 + float(rng.uniform(0.0, 0.25)) * (along * along) * (along * along)
     section = squircle(12, int(rng.integers(2))) * np.array([half_width, half_depth]) / 1.25

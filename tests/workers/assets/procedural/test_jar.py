@@ -1,0 +1,24 @@
+"""Jars: open, hollow, narrower at the neck than at the belly."""
+
+import numpy as np
+import pytest
+
+from tests.workers.assets.procedural.hollow import bottom_heights
+from workers.assets.procedural.make import make_model
+from workers.assets.procedural.vessel import OUTSIDE
+
+
+@pytest.mark.parametrize("index", range(25))
+def test_a_jar_is_open_down_to_a_bottom_as_thick_as_a_wall(index):
+    inner, outer = bottom_heights("jar", index)
+    assert 0.002 < inner - outer < 0.012
+    assert outer < 0.004
+
+
+@pytest.mark.parametrize("index", range(25))
+def test_a_jar_has_a_neck(index):
+    solid = make_model("jar", 0, index).solid
+    points = solid.vertices[solid.faces[solid.surface == OUTSIDE]].reshape(-1, 3)
+    radius, z = np.hypot(points[:, 0], points[:, 1]), points[:, 2] / points[:, 2].max()
+    neck = radius[(z > 0.78) & (z < 0.93)]
+    assert neck.min() < 0.97 * radius[z < 0.75].max()
