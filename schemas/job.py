@@ -284,9 +284,10 @@ class Images(Frozen):
 
     @model_validator(mode="after")
     def _fits_16_bits(self) -> "Images":
-        if self.depth_range_m.high * self.depth_units_per_m > 65_535:
+        units = self.depth_range_m.high * self.depth_units_per_m
+        if units > 65_535:
             raise ValueError(
-                f"depth_range_m ends at {self.depth_range_m.high:g} m, which is {self.depth_range_m.high * self.depth_units_per_m:.0f} "
+                f"depth_range_m ends at {self.depth_range_m.high:g} m, which is {units:.0f} "
                 f"units of depth_units_per_m {self.depth_units_per_m:g}: a 16-bit image holds at most 65535"
             )
         return self

@@ -141,8 +141,10 @@ class GBuffer:
 
 @dataclass(frozen=True, eq=False)
 class ObjectLabel:
-    """What one view says of one region: `T_cam_obj` [4, 4], the pixel (u, v) of the object's origin or (-1, -1), the
-    bounding box and count of its pixels, and the share of its own unoccluded pixels (also outside the frame) seen.
+    """What one view says of one region.
+
+    `T_cam_obj` [4, 4], the pixel (u, v) of the object's origin or (-1, -1), the bounding box and count of its pixels,
+    and the share of its own unoccluded pixels (also outside the frame) that is seen.
     """
 
     region_id: int

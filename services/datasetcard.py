@@ -1,12 +1,11 @@
 """OUT/DATASET.md: what a dataset is, what made it, and whose shapes are in it."""
 
-from workers.assets.catalogue import Catalogue
-
 from schemas.fingerprint import Fingerprint
 from schemas.job import ProceduralSource
 from schemas.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE
 from services.jobrecord import JobRecord
 from services.merge import MergeResult
+from workers.assets.catalogue import Catalogue
 from workers.store.store import Store
 
 ARTICLE = (

@@ -59,8 +59,10 @@ def private_ray(workers: int) -> Iterator[Slots]:
 
 
 def _object_store_folder(temporary: str) -> str:
-    """Shared memory where there is enough of it; a container often has 64 MiB, and Ray then warns of slow storage, which
-    is of no matter to reports of a kilobyte."""
+    """Shared memory where there is enough of it.
+
+    A container often has 64 MiB, and Ray then warns of slow storage, which is of no matter to reports of a kilobyte.
+    """
     shared = Path("/dev/shm")
     roomy = shared.exists() and shutil.disk_usage(shared).free > 2 * OBJECT_STORE_BYTES
     return str(shared) if roomy else temporary

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from workers.assets.catalogue import open_catalogue
 
 from schemas.errors import MachineError
 from schemas.fingerprint import Fingerprint
@@ -14,6 +13,7 @@ from schemas.manifest import DETERMINISTIC_TABLES
 from schemas.scene import SceneOutput
 from services.jobrecord import JobRecord, require_job
 from services.stored import StoredRange, file_reader, find_scene
+from workers.assets.catalogue import open_catalogue
 from workers.context import WorkerContext, settings_digest
 from workers.fingerprint import take_fingerprint
 from workers.render.gbuffer import shared_renderer

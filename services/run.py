@@ -7,8 +7,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from workers.assets.catalogue import Catalogue, open_catalogue
-
 from schemas.commit import CommitTerms, Span
 from schemas.job import Job
 from schemas.layout import FINGERPRINT_FILE, JOB_FILE
@@ -22,6 +20,7 @@ from services.merge import MergeResult, merge, reopen
 from services.progress import ProgressLine, event_log, log_event
 from services.ranges import committed_ranges, list_commits, plan_ranges, plan_retries
 from services.ray_cluster import Slots, cluster_ray, private_ray
+from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.store.local import LocalStore
 from workers.store.opening import open_store
 from workers.store.store import Store
@@ -33,8 +32,11 @@ USUAL_SHARD = 64
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What the user asked for; relative asset folders are resolved from `job_folder`. `out` is a URL or an absolute path,
-    because workers stand elsewhere."""
+    """What the user asked for.
+
+    Relative asset folders are resolved from `job_folder`; `out` is a URL or an absolute path, because workers stand
+    elsewhere.
+    """
 
     job: Job
     job_folder: Path
@@ -148,8 +150,9 @@ def _fair_shard(scenes: int, slots: int) -> int:
 
 
 def group_shards(spans: Sequence[Span], shard_size: int) -> Iterator[tuple[Span, ...]]:
-    """Whole ranges in order, together until they hold at least `shard_size` scenes; made one at a time as they are asked
-    for.
+    """Whole ranges in order, together until they hold at least `shard_size` scenes.
+
+    Made one at a time, as they are asked for.
     """
     shard: list[Span] = []
     for span in spans:

@@ -1,6 +1,6 @@
 """Contact sheets: a page of what a dataset holds, for a person to look at.
 
-    python -m services.sheet OUT FILE.jpg [SCENES]
+python -m services.sheet OUT FILE.jpg [SCENES]
 """
 
 import sys
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from schemas.layout import image_path, patch_path
+from schemas.layout import Content, image_path, patch_path
 from services.stored import Row, StoredRange, file_reader, iter_stored, read_image
 from workers.store.opening import open_store
 from workers.store.store import Store
@@ -24,7 +24,16 @@ MARGIN = 4
 HEADING = 26
 LEFT = 92
 
-COLUMNS = ("input RGB", "input depth", "input mask", "mirror RGB", "mirror depth", "mirror mask", "projected RGB", "patches")
+COLUMNS = (
+    "input RGB",
+    "input depth",
+    "input mask",
+    "mirror RGB",
+    "mirror depth",
+    "mirror mask",
+    "projected RGB",
+    "patches",
+)
 
 REGION_COLORS = np.array([[255, 255, 255], [205, 205, 205], [160, 120, 80], [230, 70, 40]], np.uint8)
 """Nothing, floor, table, object."""
@@ -69,21 +78,22 @@ def _cells(read: Callable[[str], bytes], stored: StoredRange, scene: Row) -> lis
     e, category = min(row["parent_id"] for row in views), scene["category"]
     listed = {file["path"] for row in views for file in row["files"]}
 
-    def image(content: str, number: int) -> NDArray:
-        return read_image(read, image_path(category, content, number))  # type: ignore[arg-type]
+    def image(content: Content, number: int) -> NDArray:
+        return read_image(read, image_path(category, content, number))
 
     cells = []
     for number in (e, e + 1):
-        cells += [_fit(image("RGB", number)), _fit(_paint_depth(image("depth", number))), _fit(_paint_regions(image("segment", number)))]
+        cells.append(_fit(image("RGB", number)))
+        cells.append(_fit(_paint_depth(image("depth", number))))
+        cells.append(_fit(_paint_regions(image("segment", number))))
     cells.append(_fit(image("RGBprojected", e)))
-    patches = [patch_path(category, "RGB", number) for number in (e, e + 1)]  # type: ignore[arg-type]
+    patches = [patch_path(category, "RGB", number) for number in (e, e + 1)]
     cells.append(_stack([read_image(read, path) for path in patches if path in listed]))
     return cells
 
 
 def _fit(picture: NDArray) -> Picture:
-    shrunk: Picture = cv2.resize(picture, CELL, interpolation=cv2.INTER_AREA)
-    return shrunk
+    return np.asarray(cv2.resize(picture, CELL, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _stack(patches: list[NDArray]) -> Picture:
@@ -103,7 +113,8 @@ def _paint_depth(depth: NDArray) -> Picture:
         return np.zeros((*depth.shape, 3), np.uint8)
     low, high = np.percentile(depth[known], DEPTH_STRETCH)
     share = np.clip((depth - low) / max(high - low, 1.0), 0.0, 1.0)
-    painted: Picture = cv2.applyColorMap((255 * (1.0 - share)).astype(np.uint8), cv2.COLORMAP_TURBO)[:, :, ::-1].copy()
+    bgr = cv2.applyColorMap((255 * (1.0 - share)).astype(np.uint8), cv2.COLORMAP_TURBO)
+    painted = np.ascontiguousarray(bgr[:, :, ::-1], np.uint8)
     painted[~known] = 0
     return painted
 

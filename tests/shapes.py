@@ -1,5 +1,7 @@
 """Simple assets with mass properties in closed form or from trimesh, for tests that need no catalogue."""
 
+from typing import Any
+
 import numpy as np
 import trimesh
 
@@ -19,7 +21,7 @@ def shape_of(*meshes: trimesh.Trimesh) -> Shape:
 
 def asset_of(*meshes: trimesh.Trimesh, category: str = "box", mass_kg: float = 0.5) -> Asset:
     """An asset in the meshes' own frame; its mass properties are those of the solid that they enclose together."""
-    whole = trimesh.util.concatenate(list(meshes))
+    whole: Any = trimesh.util.concatenate(list(meshes))
     mass = MassProperties(
         mass_kg, frozen_array(whole.center_mass), frozen_array(whole.moment_inertia * mass_kg / whole.volume), True
     )

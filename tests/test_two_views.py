@@ -7,6 +7,7 @@ pixel wide, and what lies between a rim's pixel and the next is on neither.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +40,7 @@ def cast(scene: PosedScene, origin: np.ndarray, towards: np.ndarray) -> tuple[np
         trimesh.Trimesh(trimesh.transform_points(t.shape.vertices, t.T_world_shape), t.shape.faces, process=False)
         for t in scene.things
     ]
-    mesh = trimesh.util.concatenate(meshes)
+    mesh: Any = trimesh.util.concatenate(meshes)
     hit, ray, where = mesh.ray.intersects_id(
         np.broadcast_to(origin, towards.shape), towards, multiple_hits=False, return_locations=True
     )
@@ -55,7 +56,9 @@ def differences_mm(pair: Pair, scene: PosedScene, object_only: bool) -> np.ndarr
     assert first.region is not None and mirror.region is not None
     k, R, eye = first.camera.intrinsics, mirror.camera.T_world_cam[:3, :3], mirror.camera.T_world_cam[:3, 3]
     step = 1 if object_only else 7
-    rows, columns = (index[::step] for index in np.nonzero((first.region >= (3 if object_only else 1)) & (first.depth > 0)))
+    rows, columns = (
+        index[::step] for index in np.nonzero((first.region >= (3 if object_only else 1)) & (first.depth > 0))
+    )
     z = first.depth[rows, columns] / 5000.0
     rays = np.stack([(columns + 0.5 - k.cx) / k.fx, (rows + 0.5 - k.cy) / k.fy, np.ones(len(z))], axis=1)
     world = (rays * z[:, None]) @ first.camera.T_world_cam[:3, :3].T + first.camera.T_world_cam[:3, 3]

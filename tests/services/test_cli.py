@@ -33,7 +33,11 @@ def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]
         (["run", TABLETOP, "--set", "physics.step_hz=fast"], 2, ["physics.step_hz", "'fast'", "integer"]),
         (["run", TABLETOP, "--scenes", "-3"], 2, ["--scenes", "-3"]),
         (["run", TABLETOP, "--set", "scenes=0"], 2, ["scenes", "0", "greater than or equal to 1"]),
-        (["run", TABLETOP, "--set", "cameras.orbit.radius_m=-1"], 2, ["cameras.orbit.radius_m", "-1", "greater than 0"]),
+        (
+            ["run", TABLETOP, "--set", "cameras.orbit.radius_m=-1"],
+            2,
+            ["cameras.orbit.radius_m", "-1", "greater than 0"],
+        ),
         (["run", TABLETOP, "--set", "start.offset_m=[0.2, 0.1]"], 2, ["start.offset_m", "empty"]),
         (["run", TABLETOP, "--set", "categories=[sofa]"], 2, ["categories.sofa", "'mug'"]),
         (
@@ -41,7 +45,11 @@ def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]
             2,
             ["/nowhere/at/all"],
         ),
-        (["run", TABLETOP, "--set", "assets.objects.0={source: shapenet, folder: .}"], 2, ["deploy/jobs", "synset folders"]),
+        (
+            ["run", TABLETOP, "--set", "assets.objects.0={source: shapenet, folder: .}"],
+            2,
+            ["deploy/jobs", "synset folders"],
+        ),
         (["run"], 2, ["JOB.yaml"]),
         (["fly"], 2, ["fly", "run"]),
         (["query", "nowhere", "select 1"], 2, ["nowhere", "job.yaml"]),
@@ -64,7 +72,9 @@ def test_a_folder_without_a_usable_mesh_is_refused_with_what_was_found(capsys, t
     assets.mkdir()
     (assets / "broken.obj").write_text("f 1 2 3\n")
     source = f"assets.objects.0={{source: urdf, folder: {assets}, category_map: {{'*.obj': mug}}}}"
-    code, text = told(capsys, "run", TABLETOP, "--set", source, "--set", "categories=[mug]", "--out", str(tmp_path / "out"))
+    code, text = told(
+        capsys, "run", TABLETOP, "--set", source, "--set", "categories=[mug]", "--out", str(tmp_path / "out")
+    )
     assert code == 2
     assert str(assets) in text or "broken" in text
     assert not (tmp_path / "out").exists()
@@ -109,7 +119,12 @@ def test_an_error_can_be_read_by_a_program(capsys):
 def test_a_machine_without_gl_is_told_what_to_install():
     environment = {**os.environ, "__EGL_VENDOR_LIBRARY_DIRS": "/nowhere"}
     done = subprocess.run(
-        [sys.executable, "-m", "services.cli", "doctor"], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-m", "services.cli", "doctor"],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 1
     assert "no off-screen OpenGL" in done.stdout

@@ -278,7 +278,17 @@ def test_an_interrupted_run_says_so_leaves_no_process_and_goes_on_where_it_stopp
     """Ctrl-C in a terminal: the whole process group gets SIGINT."""
     (tmp_path / "small.yaml").write_text(json.dumps({**SMALL, "run": {"range_size": 4}}))
     out = tmp_path / "stopped"
-    command = [sys.executable, "-m", "services.cli", "run", str(tmp_path / "small.yaml"), "--out", str(out), "--shard-size", "4"]
+    command = [
+        sys.executable,
+        "-m",
+        "services.cli",
+        "run",
+        str(tmp_path / "small.yaml"),
+        "--out",
+        str(out),
+        "--shard-size",
+        "4",
+    ]
     run = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True)
     deadline = time.monotonic() + 120
     while not list(out.glob("manifest/_commits/*.json")) and run.poll() is None and time.monotonic() < deadline:

@@ -37,7 +37,9 @@ def facing_cosine(
     return cosine
 
 
-def is_smooth(depth_m: Array, region: NDArray[np.uint8], pixels: NDArray[np.int64], bound_m: float) -> NDArray[np.bool_]:
+def is_smooth(
+    depth_m: Array, region: NDArray[np.uint8], pixels: NDArray[np.int64], bound_m: float
+) -> NDArray[np.bool_]:
     """[N] bool: whether a pixel (flat index) and its four neighbours see one smooth surface of one region.
 
     On a plane 1/z is linear in the image; what its second differences leave, times z squared, is the step in depth that

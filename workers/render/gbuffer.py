@@ -8,7 +8,7 @@ and it takes a draw call for each part.
 **Depth.** Rasterisers move vertices to the nearest 1/256 px and interpolate in float32 from there. Instead, each
 fragment intersects the ray through its pixel's centre with the plane of its face, made in float64: z = d / (n . ray).
 Only where a face is seen so nearly edge-on that its plane says nothing does the interpolated z stand in. Measured over
-200 scenes against float64 rays, p99.9 on the table falls from 0.1 to below 0.001 mm.
+200 scenes against float64 rays, p99.9 falls from 0.008 to 0.0015 mm on the floor and from 0.012 to 0.003 mm on tables.
 
 **Order.** The depth test works on that same z, held as near / z, which in float32 keeps seven digits at any distance.
 Things of a higher region id stand back along the face's normal by `STAND_BACK` of their distance for each lower id, so
@@ -34,9 +34,9 @@ from workers.render.programs import Program, light_slots
 from workers.render.shaders import COUNT_FRAGMENT, COUNT_VERTEX, Variant, label_sources
 from workers.render.window import TILE_PX, tiles
 
-STAND_BACK = 1e-6
-"""Share of its distance, along its normal, by which a face stands back for each lower region id in the scene. float32
-planes are good to a tenth of it; at 2.5 m it is 2.5 micrometres."""
+STAND_BACK = 2e-6
+"""Share of its distance, along its normal, by which a face stands back for each lower region id in the scene: 5
+micrometres at 2.5 m. A quarter of it is the least that kept 400 pairs of coplanar squares apart."""
 
 _shared: "Renderer | None" = None
 

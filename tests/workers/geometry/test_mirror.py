@@ -12,7 +12,7 @@ from workers.geometry.mirror import article_product, mirror_pose
 
 def random_camera(seed: int, roll: bool) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    T = look_at(rng.uniform(-3, 3, 3) + [0, 0, 4], rng.uniform(-0.5, 0.5, 3))
+    T = look_at(rng.uniform((-3, -3, 1), (3, 3, 7)), rng.uniform(-0.5, 0.5, 3))
     if roll:
         T = T @ pose(rotation_about(np.array([0.0, 0.0, 1.0]), rng.uniform(-3, 3)), np.zeros(3))
     return T

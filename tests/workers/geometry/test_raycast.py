@@ -150,12 +150,12 @@ def test_edge_distance_is_that_to_the_projected_segment():
 
 
 def test_edges_are_cut_at_the_near_plane():
-    """An edge from 1 m ahead to 1 m behind, 0.1 m to the right: its image runs out to the right and never comes back."""
+    """A level edge from 1 m ahead to 1 m behind: its image runs to the right and ends where the edge is NEAR_M ahead."""
     k = Intrinsics(width=100, height=100, fx=10.0, fy=10.0, cx=50.0, cy=50.0)
-    sliver = Placed(3, shape_of([[0.1, 0, 1], [0.1, 0, -1], [0.1, 1e-9, -1]], [[0, 1, 2]]), EYE)
-    found = edge_distance_px([sliver], Camera(k, EYE), np.array([[50, 60], [50, 40], [50, 80]]))
-    np.testing.assert_allclose(found[:2], [0.5, np.hypot(10.5, 0.5)], atol=1e-6)
-    assert found[2] == pytest.approx(np.hypot(80.5 - 50 - 0.1 * 10 / NEAR_M, 0.5), abs=1e-6)
+    sliver = Placed(3, shape_of([[0.1, 0, 1], [0.5, 0, -1], [0.5, 1e-9, -1]], [[0, 1, 2]]), EYE)
+    end = 50.0 + 10.0 * (0.1 + 0.4 * (1.0 - NEAR_M) / 2.0) / NEAR_M
+    found = edge_distance_px([sliver], Camera(k, EYE), np.array([[50, 60], [50, 40], [50, 120]]))
+    np.testing.assert_allclose(found, [0.5, np.hypot(10.5, 0.5), np.hypot(120.5 - end, 0.5)], atol=1e-6)
     behind = Placed(3, square(-1.0), EYE)
     assert np.isinf(edge_distance_px([behind], Camera(k, EYE), np.array([[5, 5]]))).all()
 

@@ -214,13 +214,15 @@ def test_where_nothing_is_hit_region_and_depth_are_zero_and_the_background_shows
     np.testing.assert_array_equal(seen.rgb, np.broadcast_to(expected, (4, 5, 3)))
 
 
-def test_regions_are_never_blended(renderer):
-    rng = np.random.default_rng(11)
-    things, height = random_things(rng)
-    ids = [1, 2, 77, 128, 255]
-    things = [Placed(i, thing.shape, thing.T_world_shape) for i, thing in zip(ids, things, strict=False)]
-    seen = renderer.draw(things, APPEARANCE, orbit_and_mirror(rng, height)[0])
-    assert set(np.unique(seen.region)) <= {0, *ids}
+def test_every_region_id_of_a_byte_comes_back(renderer):
+    """255 squares side by side in front of a larger one of id 1, each a region of its own."""
+    spots = {i: ((i % 16 - 7.5) / 10.0, (i // 16 - 7.5) / 10.0) for i in range(2, 256)}
+    things = [Placed(i, facing(1.0, 0.04), translation(x, y, 0.0)) for i, (x, y) in spots.items()]
+    seen = renderer.draw([*things, Placed(1, facing(1.1), EYE)], WHITE, camera(small(320, 320)))
+    for i, (x, y) in spots.items():
+        row, column = int(160 + 160 * y), int(160 + 160 * x)
+        assert seen.region[row, column] == i
+    assert set(np.unique(seen.region)) == set(range(1, 256)), "and nothing is blended between neighbours"
 
 
 # ---------------------------------------------------------------------------------------------------------- colour
@@ -246,6 +248,17 @@ def test_light_falls_off_with_the_cosine(renderer):
         seen = renderer.draw([Placed(3, shape, EYE)], Appearance((0.0,) * 3, (light,), (0.0,) * 3), camera(small(9, 9)))
         linear = decode_srgb(seen.rgb[4, 4] / 255.0)
         assert linear == pytest.approx(0.5 * np.cos(angle), abs=0.02), f"at {angle} rad"
+
+
+def test_light_comes_from_where_it_comes_from_in_the_world(renderer):
+    """A matte floor under a slanting light has one colour, that of the world's cosine, from wherever it is seen."""
+    light = Light(frozen_array([0.6, 0.0, 0.8]), (0.5, 0.5, 0.5))
+    look = Appearance((0.0,) * 3, (light,), (0.0,) * 3)
+    grey = decode_srgb(np.array(0.7))
+    for inclination, yaw in ((0.8, 0.0), (0.8, 2.0), (0.4, -1.0), (1.5, 0.7)):
+        view = camera(small(9, 9), orbit_pose(np.zeros(3), inclination, yaw, 2.0))
+        linear = decode_srgb(renderer.draw([floor()], look, view).rgb[4, 4] / 255.0)
+        assert linear == pytest.approx(0.5 * 0.8 * grey, abs=0.005)
 
 
 def test_a_texture_stands_upright_and_multiplies_colours(renderer):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from schemas.camera import Camera, Intrinsics
+from schemas.camera import Camera, Intrinsics, Role
 from schemas.job import Images, Patch, Projection
 from schemas.scene import ObjectLabel, View
 from workers.geometry.camera import orbit_pose, unproject
@@ -27,7 +27,7 @@ HERE = Camera(K, orbit_pose(np.array([0, 0, 0.0]), 0.8, 0.7, 2.5))
 THERE = Camera(K, mirror_pose(HERE.T_world_cam, 2.5))
 
 
-def plane_view(role: str, camera: Camera, height_m: float = 0.0, region: int = 3) -> View:
+def plane_view(role: Role, camera: Camera, height_m: float = 0.0, region: int = 3) -> View:
     """A view of the plane z = height, exact at pixel centres."""
     rows, columns = np.mgrid[0 : K.height, 0 : K.width]
     rays = unproject(rows.ravel(), columns.ravel(), np.ones(rows.size), K) @ camera.T_world_cam[:3, :3].T
