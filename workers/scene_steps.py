@@ -133,7 +133,7 @@ def render_view(scene: SceneView, role: str, ids: tuple[int, int], camera: Camer
         buffer = renderer.draw(scene.posed.things, scene.posed.appearance, camera)
     if scene.raycast_checked:
         with scene.watch.stage("raycast"):
-            check_against_rays(scene.posed, camera, buffer)
+            check_against_rays(scene.posed, camera, buffer, job.images.depth_range_m)
     with scene.watch.stage("labels"):
         labels = label_view(scene, camera, buffer)
         depth = quantise_depth(buffer.depth_m, job.images)

@@ -40,15 +40,13 @@ def forward_project(depth_m: Array, source: Camera, target: Camera, splat: int =
     The target pixel is the floor of (u, v); nearest z wins, ties to the lowest source index; holes stay 0
     (dataset.md "Projection"). With `splat` n > 1 each point fills a square of n x n pixels.
     """
-    points, index = cloud_in_camera(depth_m, source, target)
     height, width = target.intrinsics.height, target.intrinsics.width
-    ahead = points[:, 2] > 0.0
-    points, index = points[ahead], index[ahead]
-    u, v = project(points, target.intrinsics)
     reach = splat // 2
-    near = (u >= -reach) & (u < width + reach) & (v >= -reach) & (v < height + reach)
-    z, index = points[near, 2], index[near]
-    column, row = np.floor(u[near]).astype(np.int64), np.floor(v[near]).astype(np.int64)
+    u, v, z_all = _dense_image_of(depth_m, source, target)
+    near = (z_all > 0.0) & (u >= -reach) & (u < width + reach) & (v >= -reach) & (v < height + reach)
+    index = np.flatnonzero(near & (depth_m > 0.0))
+    z = z_all.ravel()[index]
+    column, row = np.floor(u.ravel()[index]).astype(np.int64), np.floor(v.ravel()[index]).astype(np.int64)
     if reach:
         dy, dx = (d.ravel() for d in np.mgrid[-reach : reach + 1, -reach : reach + 1])
         column, row = (column[:, None] + dx).ravel(), (row[:, None] + dy).ravel()
@@ -56,6 +54,21 @@ def forward_project(depth_m: Array, source: Camera, target: Camera, splat: int =
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         column, row, z, index = column[inside], row[inside], z[inside], index[inside]
     return _nearest(row * width + column, z, index, (height, width))
+
+
+def _dense_image_of(depth_m: Array, source: Camera, target: Camera) -> tuple[Array, Array, Array]:
+    """(u, v, z), each [H, W] float64: where each pixel's point lies in the target, also where there is no point.
+
+    The same sums as `cloud_in_camera`, in the same order, over whole images: gathering the points first costs three
+    times as much as the arithmetic on the pixels that have none.
+    """
+    T = invert(target.T_world_cam) @ source.T_world_cam
+    k, m = source.intrinsics, target.intrinsics
+    x = (np.arange(k.width) + 0.5 - k.cx) / k.fx * depth_m
+    y = ((np.arange(k.height) + 0.5 - k.cy) / k.fy)[:, None] * depth_m
+    X, Y, Z = (T[i, 0] * x + T[i, 1] * y + T[i, 2] * depth_m + T[i, 3] for i in range(3))
+    ahead = np.where(Z > 0.0, Z, 1.0)
+    return m.fx * X / ahead + m.cx, m.fy * Y / ahead + m.cy, Z
 
 
 def _nearest(pixel: NDArray[np.int64], z: Array, index: NDArray[np.int64], shape: tuple[int, int]) -> Projected:

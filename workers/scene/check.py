@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.base import Range
 from schemas.camera import Camera
 from schemas.errors import LabelError
 from schemas.job import Check, Job
@@ -20,6 +21,9 @@ OBJECT_MEDIAN_MM = 0.01
 OBJECT_P99_MM = 0.05
 """Bounds on depth before quantisation, each a small part of a stored unit (0.2 mm)."""
 
+ONE_SURFACE_MM = 0.02
+"""Where two things touch or cut through one another no edge marks the line, and surfaces this near are both the answer."""
+
 STEEPEST_COS = math.cos(math.radians(80.0))
 """Beyond 80 degrees of incidence a thousandth of a pixel moves depth by more than the bound."""
 
@@ -29,23 +33,29 @@ def is_raycast_scene(job: Job, scene_id: int) -> bool:
     return bool(stream(job.seed, scene_id, Stream.RAYCAST_CHECK).random() < job.check.raycast_share)
 
 
-def check_against_rays(scene: PosedScene, camera: Camera, buffer: GBuffer) -> None:
-    """Hold depth and regions of one rendered view against cast rays, region by region. Raises LabelError."""
+def check_against_rays(scene: PosedScene, camera: Camera, buffer: GBuffer, depth_range_m: Range) -> None:
+    """Hold depth and regions of one rendered view against cast rays, region by region. Raises LabelError.
+
+    Depth is compared where it would be stored: a floor tens of metres away is seen in a wide view, is stored as 0, and
+    is beyond what float32 resolves to the bound.
+    """
     depth, region, cosine = cast_view(scene.things, camera)
-    rows, columns = np.nonzero(region != buffer.region)
+    error_mm = np.abs(buffer.depth_m.astype(np.float64) - depth) * 1e3
+    rows, columns = np.nonzero((region != buffer.region) & (error_mm > ONE_SURFACE_MM))
     if len(rows):
         away = edge_distance_px(scene.things, camera, np.stack([rows, columns], axis=1))
-        if (away > EDGE_PX).any():
-            worst = int(np.argmax(away))
+        worst = int(np.argmax(away))
+        if away[worst] > EDGE_PX:
+            at = rows[worst], columns[worst]
             raise LabelError(
                 "mask_disagrees",
-                f"pixel ({columns[worst]}, {rows[worst]}) is region {buffer.region[rows[worst], columns[worst]]} in the mask and "
-                f"{region[rows[worst], columns[worst]]} by ray, {away[worst]:.3f} px from the nearest edge",
+                f"pixel ({at[1]}, {at[0]}) is region {buffer.region[at]} in the mask and {region[at]} by ray, "
+                f"{away[worst]:.3f} px from the nearest edge",
             )
-    same = (region == buffer.region) & (region > 0)
-    error_mm = np.abs(buffer.depth_m.astype(np.float64) - depth) * 1e3
+    stored = (depth > depth_range_m.low) & (depth < depth_range_m.high)
+    same = (region == buffer.region) & (region > 0) & stored & (cosine > STEEPEST_COS)
     for region_id in np.unique(region[same]):
-        _check_depth(int(region_id), error_mm[same & (region == region_id) & (cosine > STEEPEST_COS)])
+        _check_depth(int(region_id), error_mm[same & (region == region_id)])
 
 
 def _check_depth(region_id: int, error_mm: NDArray[np.float64]) -> None:

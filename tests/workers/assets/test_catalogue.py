@@ -44,10 +44,10 @@ def test_the_same_draw_gives_the_same_instance_and_one_stream_uses_two_numbers(t
 def test_sources_are_mixed_by_weight_and_instances_evenly(tmp_path):
     for k in range(3):
         write(tmp_path / "things" / f"mug{k}.obj", CUBE)
-    catalogue = opened(tmp_path, objects=(BUILT_IN.model_copy(update={"weight": 1.0}), folder(weight=3.0)))
+    catalogue = opened(tmp_path, objects=(folder(weight=3.0), BUILT_IN.model_copy(update={"weight": 1.0})))
     rng = np.random.default_rng(0)
     refs = [choose_object(catalogue, "mug", rng) for _ in range(4000)]
-    from_folder = [ref.index for ref in refs if ref.source == 1]
+    from_folder = [ref.index for ref in refs if ref.source == 0]
     # A binomial of 4000 draws at 3/4 has a standard deviation of 27.
     assert len(from_folder) == pytest.approx(3000, abs=5 * 27)
     assert np.bincount(from_folder) == pytest.approx(np.full(3, 1000), abs=5 * 27)

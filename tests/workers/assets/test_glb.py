@@ -29,6 +29,8 @@ def test_the_file_holds_the_same_geometry_in_the_object_frame(category):
     asset = make_asset(category, SOURCE, 3, 600.0)
     scene = read(asset_glb(asset))
     meshes = list(scene.geometry.values())
+    for part, mesh in zip(asset.shape.parts, meshes, strict=True):
+        assert mesh.vertex_normals == pytest.approx(part.normals, abs=1e-6)
     assert sum(len(mesh.faces) for mesh in meshes) == len(asset.shape.faces)
     assert scene.bounds == pytest.approx(asset.shape.bounds, abs=1e-7)
     assert sum(mesh.area for mesh in meshes) == pytest.approx(welded(asset.shape).area, rel=1e-5)

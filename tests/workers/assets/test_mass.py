@@ -100,6 +100,18 @@ def test_an_open_box_is_five_plates():
     assert mass.inertia[2, 2] == pytest.approx(plate * (8 / 12 + 4 * (4 / 12 + 1)), rel=1e-12)
 
 
+def test_a_cone_balances_at_a_quarter_of_its_height_with_the_inertia_of_the_textbook():
+    r, h, segments = 0.3, 0.8, 256
+    mesh = trimesh.creation.cone(r, h, sections=segments)
+    mass = solid_mass(mesh.vertices, mesh.faces, 500.0)
+    m = 500.0 * math.pi * r * r * h / 3
+    assert mass.mass_kg == pytest.approx(m, rel=2e-4)
+    assert mass.com == pytest.approx([0, 0, h / 4], abs=1e-4)
+    # About the centre of mass: 3/80 m (4 r^2 + h^2) across, 3/10 m r^2 along the axis.
+    across, along = 3 / 80 * m * (4 * r * r + h * h), 0.3 * m * r * r
+    assert np.diag(mass.inertia) == pytest.approx([across, across, along], rel=1e-3)
+
+
 def test_a_solid_of_any_shape_agrees_with_trimesh():
     mesh = trimesh.creation.annulus(0.03, 0.05, 0.1)
     mesh.apply_transform(trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.2, 0.9])))

@@ -65,12 +65,15 @@ def test_primitives_have_the_volumes_of_the_textbook(tmp_path):
 
 def test_links_stand_where_their_joints_put_them(tmp_path):
     box = visual('<box size="1 1 1"/>')
-    joint = '<joint name="{0}{1}" type="fixed"><parent link="{0}"/><child link="{1}"/><origin xyz="0 0 2"/></joint>'
-    body = (
-        "".join(f'<link name="{name}">{box}</link>' for name in "abc") + joint.format("b", "c") + joint.format("a", "b")
+    joint = (
+        '<joint name="{0}{1}" type="fixed"><parent link="{0}"/><child link="{1}"/>'
+        '<origin xyz="0 0 2" rpy="{2} 0 0"/></joint>'
     )
-    shape = load(urdf(tmp_path, body))
-    assert [part.vertices[:, 2].mean() for part in shape.parts] == pytest.approx([0, 2, 4])
+    links = "".join(f'<link name="{name}">{box}</link>' for name in "abc")
+    shape = load(urdf(tmp_path, links + joint.format("b", "c", 0) + joint.format("a", "b", math.pi / 2)))
+    # b stands 2 above a and is turned about x: its own up, along which c stands 2 further, is -y.
+    middles = np.array([part.vertices.mean(axis=0) for part in shape.parts])
+    assert middles == pytest.approx(np.array([[0, 0, 0], [0, 0, 2], [0, -2, 2]]), abs=1e-12)
 
 
 def test_joints_that_go_round_in_a_circle_are_refused(tmp_path):

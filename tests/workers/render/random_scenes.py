@@ -19,6 +19,7 @@ from workers.geometry.mirror import mirror_pose
 VGA = Intrinsics(width=640, height=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
 FLOOR_HALF_M = 30.0
 PLAIN = Material()
+EYE = np.eye(4)
 
 APPEARANCE = Appearance(
     ambient=(0.3, 0.3, 0.3),
@@ -28,6 +29,25 @@ APPEARANCE = Appearance(
     ),
     background=(0.2, 0.3, 0.4),
 )
+
+
+WHITE = Appearance(ambient=(1.0, 1.0, 1.0), lights=(), background=(0.0, 0.0, 0.0))
+
+
+def camera(k: Intrinsics = VGA, T: Pose = EYE) -> Camera:
+    """A camera at the world's origin that looks along z, x to the right, y down, unless T says where."""
+    return Camera(k, T)
+
+
+def small(width: int, height: int, **moved: float) -> Intrinsics:
+    """A camera of this many pixels with the middle in the middle, 45 degrees to the sides."""
+    k = {"fx": width / 2, "fy": width / 2, "cx": width / 2, "cy": height / 2, **moved}
+    return Intrinsics(width=width, height=height, **k)
+
+
+def facing(z: float, half: float = 100.0) -> Shape:
+    """A square across the optical axis."""
+    return quad([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
 
 
 def part_of(mesh: trimesh.Trimesh, color: tuple[float, float, float] = (0.7, 0.7, 0.7), smooth: bool = False) -> Part:

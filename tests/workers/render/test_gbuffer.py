@@ -1,4 +1,4 @@
-"""Labels and colours of simple scenes, against arithmetic and against the ray caster."""
+"""Depth and regions of simple scenes, against arithmetic and against the ray caster."""
 
 import numpy as np
 import pytest
@@ -6,52 +6,31 @@ import trimesh
 
 from schemas.base import frozen_array
 from schemas.camera import Camera, Intrinsics
-from schemas.errors import MachineError
 from schemas.scene import Appearance, Light, Placed
 from schemas.shape import Material, Part, Shape
 from tests.workers.render.random_scenes import (
     APPEARANCE,
+    EYE,
     VGA,
+    WHITE,
+    camera,
+    facing,
     floor,
-    object_shape,
     orbit_and_mirror,
-    part_of,
     quad,
     random_things,
     shape_of,
+    small,
 )
 from workers.geometry import raycast
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import pose, translation, uniform_rotation
 from workers.geometry.raycast import cast_view
 from workers.render import programs
-from workers.render.batches import decode_srgb, encode_srgb
-from workers.render.context import open_context
-from workers.render.gbuffer import Renderer, shared_renderer
+from workers.render.batches import encode_srgb
 
 PLANE_MM = 0.001
 """float32 depth of a plane some metres away: a few units in the last place."""
-
-EYE = np.eye(4)
-"""A camera at the world's origin that looks along z, x to the right, y down."""
-
-WHITE = Appearance(ambient=(1.0, 1.0, 1.0), lights=(), background=(0.0, 0.0, 0.0))
-STEP = 1.0 / 255.0
-
-
-def camera(k: Intrinsics = VGA, T=EYE) -> Camera:
-    return Camera(k, T)
-
-
-def small(width: int, height: int, **moved: float) -> Intrinsics:
-    """A camera of this many pixels with the middle in the middle, 45 degrees to the sides."""
-    k = {"fx": width / 2, "fy": width / 2, "cx": width / 2, "cy": height / 2, **moved}
-    return Intrinsics(width=width, height=height, **k)
-
-
-def facing(z: float, half: float = 100.0) -> Shape:
-    """A square across the optical axis."""
-    return quad([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
 
 
 def plane_depth(k: Intrinsics, normal, offset: float):
@@ -223,216 +202,3 @@ def test_every_region_id_of_a_byte_comes_back(renderer):
         row, column = int(160 + 160 * y), int(160 + 160 * x)
         assert seen.region[row, column] == i
     assert set(np.unique(seen.region)) == set(range(1, 256)), "and nothing is blended between neighbours"
-
-
-# ---------------------------------------------------------------------------------------------------------- colour
-
-
-@pytest.mark.parametrize("level", [0.0, 0.02, 0.2, 0.5, 0.9, 1.0])
-def test_under_white_light_a_rough_surface_shows_its_base_color(renderer, level):
-    """4 % of the light is mirrored and not albedo: ambient light adds it."""
-    (part,) = facing(2.0).parts
-    material = Material(base_color=(level, 0.5, 1.0 - level, 1.0))
-    seen = renderer.draw(
-        [Placed(3, Shape((Part("p", part.vertices, part.faces, material),)), EYE)], WHITE, camera(small(4, 4))
-    )
-    expected = encode_srgb(np.minimum(decode_srgb(np.array([level, 0.5, 1.0 - level])) + 0.04, 1.0)) * 255
-    assert np.abs(seen.rgb[2, 2] - expected).max() <= 0.7
-
-
-def test_light_falls_off_with_the_cosine(renderer):
-    (part,) = facing(2.0).parts
-    shape = Shape((Part("p", part.vertices, part.faces, Material((1.0, 1.0, 1.0, 1.0), roughness=1.0)),))
-    for angle in (0.0, 0.5, 1.0, 1.4):
-        light = Light(frozen_array([np.sin(angle), 0.0, -np.cos(angle)]), (0.5, 0.5, 0.5))
-        seen = renderer.draw([Placed(3, shape, EYE)], Appearance((0.0,) * 3, (light,), (0.0,) * 3), camera(small(9, 9)))
-        linear = decode_srgb(seen.rgb[4, 4] / 255.0)
-        assert linear == pytest.approx(0.5 * np.cos(angle), abs=0.02), f"at {angle} rad"
-
-
-def test_light_comes_from_where_it_comes_from_in_the_world(renderer):
-    """A matte floor under a slanting light has one colour, that of the world's cosine, from wherever it is seen."""
-    light = Light(frozen_array([0.6, 0.0, 0.8]), (0.5, 0.5, 0.5))
-    look = Appearance((0.0,) * 3, (light,), (0.0,) * 3)
-    grey = decode_srgb(np.array(0.7))
-    for inclination, yaw in ((0.8, 0.0), (0.8, 2.0), (0.4, -1.0), (1.5, 0.7)):
-        view = camera(small(9, 9), orbit_pose(np.zeros(3), inclination, yaw, 2.0))
-        linear = decode_srgb(renderer.draw([floor()], look, view).rgb[4, 4] / 255.0)
-        assert linear == pytest.approx(0.5 * 0.8 * grey, abs=0.005)
-
-
-def test_a_texture_stands_upright_and_multiplies_colours(renderer):
-    """uv (0, 0) is the texture's lower left corner; the square's lower left corner in the image has it."""
-    texture = np.zeros((64, 64, 3), np.uint8)
-    texture[:32, :32], texture[:32, 32:], texture[32:, :32], texture[32:, 32:] = (
-        (255, 0, 0),
-        (0, 255, 0),
-        (0, 0, 255),
-        255,
-    )
-    vertices = frozen_array([[-1, 1, 2], [1, 1, 2], [1, -1, 2], [-1, -1, 2]])  # y is down
-    uv, faces = frozen_array([[0, 0], [1, 0], [1, 1], [0, 1]]), frozen_array([[0, 1, 2], [0, 2, 3]], np.int32)
-    for image in (texture, np.dstack([texture, np.full((64, 64), 255, np.uint8)])):
-        material = Material((1.0, 1.0, 0.5, 1.0), texture=image)
-        shape = Shape((Part("p", vertices, faces, material, uv=uv),))
-        seen = renderer.draw([Placed(3, shape, EYE)], WHITE, camera(small(40, 40)))
-        high, low, half = 255, encode_srgb(np.array(0.04)) * 255, encode_srgb(decode_srgb(np.array(0.5)) + 0.04) * 255
-        expected = {
-            (15, 15): (high, low, low),
-            (15, 25): (low, high, low),
-            (25, 15): (low, low, half),
-            (25, 25): (high, high, half),
-        }
-        for (row, column), color in expected.items():
-            assert np.abs(seen.rgb[row, column] - np.array(color)).max() <= 2
-
-
-def test_vertex_colours_are_interpolated_in_linear_light(renderer):
-    (part,) = facing(2.0, 2.0).parts
-    colors = frozen_array([[0, 0, 0, 255], [255, 255, 255, 255], [255, 255, 255, 255], [0, 0, 0, 255]], np.uint8)
-    shape = Shape((Part("p", part.vertices, part.faces, Material((1.0, 1.0, 1.0, 1.0)), colors=colors),))
-    seen = renderer.draw([Placed(3, shape, EYE)], WHITE, camera(small(101, 101)))
-    linear = decode_srgb(seen.rgb[50, :, 1] / 255.0)
-    expected = np.minimum((np.arange(101) + 0.5) / 101 + 0.04, 1.0)
-    assert np.abs(linear - expected)[:95].max() < 0.02
-
-
-def test_many_triangles_look_like_few(renderer):
-    """Two programs draw batches of few and of many triangles: a square of 2 and of 3,200 gives the same image."""
-    (part,) = facing(2.0, 1.0).parts
-    fine = trimesh.Trimesh(part.vertices, part.faces, process=False)
-    for _ in range(6):
-        fine = fine.subdivide()
-    assert len(fine.faces) > 3000
-    lights = (Light(frozen_array([0.3, 0.2, -0.93]), (0.6, 0.5, 0.4)),)
-    look = Appearance((0.2, 0.2, 0.2), lights, (0.0, 0.0, 0.0))
-    a, b = (renderer.draw([Placed(3, s, EYE)], look, camera()) for s in (Shape((part,)), Shape((part_of(fine),))))
-    np.testing.assert_array_equal(a.region, b.region)
-    assert np.abs(a.rgb.astype(int) - b.rgb).max() <= 1
-    assert np.abs(a.depth_m - b.depth_m).max() * 1e3 < PLANE_MM
-
-
-def test_too_many_lights_are_refused(renderer):
-    lights = (Light(frozen_array([0.0, 0.0, 1.0]), (0.1, 0.1, 0.1)),) * 7
-    with pytest.raises(ValueError, match="7 lights: the renderer takes at most 6"):
-        renderer.draw([floor()], Appearance((0.1,) * 3, lights, (0.0,) * 3), camera())
-
-
-# ---------------------------------------------------------------------------------------------------------- counting
-
-
-def test_an_unoccluded_thing_in_the_frame_counts_as_many_pixels_as_its_region(renderer):
-    for seed in range(6):
-        rng = np.random.default_rng(seed)
-        thing = Placed(3, object_shape(rng), pose(uniform_rotation(rng), np.array([0.1, -0.05, 1.2])))
-        alone = renderer.draw([thing], APPEARANCE, camera())
-        assert renderer.count_pixels(thing, camera()) == pytest.approx((alone.region == 3).sum(), abs=2)
-
-
-def test_pixels_outside_the_frame_and_behind_others_are_counted(renderer):
-    """A disc pushed over the edges of the image keeps its count, whole pixel by whole pixel."""
-    disc = Placed(3, shape_of(trimesh.creation.cylinder(0.2, 0.01, sections=200)), translation(0.0, 0.0, 1.0))
-    whole = renderer.count_pixels(disc, camera())
-    assert whole == pytest.approx(np.pi * (0.2 * 525 / 0.995) ** 2, rel=2e-3)
-    for moved in ({"cx": -50.0}, {"cx": 640.0}, {"cy": 480.0}, {"cx": -100.0, "cy": 570.0}):
-        k = VGA.model_copy(update=moved)
-        assert renderer.count_pixels(disc, camera(k)) == pytest.approx(whole, abs=3)
-    assert (
-        renderer.draw([disc], APPEARANCE, camera(VGA.model_copy(update={"cx": -100.0, "cy": 570.0}))).region == 3
-    ).sum() < whole / 100
-
-
-def test_a_count_over_several_tiles_is_that_of_a_wider_camera(renderer):
-    k, T = small(700, 300), orbit_pose(np.zeros(3), 0.5, 0.3, 0.6)
-    thing = Placed(2, shape_of(trimesh.creation.box((0.9, 0.7, 0.02))), np.eye(4))
-    wide = k.model_copy(update={"width": 2100, "height": 900, "cx": k.cx + 700, "cy": k.cy + 300})
-    assert renderer.count_pixels(thing, Camera(k, T)) == pytest.approx(
-        (cast_view([thing], Camera(wide, T))[1] == 2).sum(), abs=3
-    )
-
-
-def test_of_a_thing_that_reaches_behind_the_camera_the_part_in_front_is_counted(renderer):
-    k = small(60, 40)
-    wide = k.model_copy(update={"width": 180, "height": 120, "cx": k.cx + 60, "cy": k.cy + 40})
-    rod = Placed(2, shape_of(trimesh.creation.box((0.1, 0.1, 4.0))), translation(0.3, 0.2, 1.0))
-    behind = Placed(2, rod.shape, translation(0.0, 0.0, -5.0))
-    assert renderer.count_pixels(rod, camera(k)) == pytest.approx((cast_view([rod], camera(wide))[1] == 2).sum(), abs=2)
-    assert renderer.count_pixels(behind, camera(k)) == 0
-
-
-# ---------------------------------------------------------------------------------------------------------- reuse
-
-
-def test_drawing_again_gives_the_same_bytes(renderer):
-    """Also after other scenes, other sizes, counts, and after the shapes were pushed out of the GPU's store."""
-    rng = np.random.default_rng(21)
-    things, height = random_things(rng)
-    view = orbit_and_mirror(rng, height)[0]
-    first = renderer.draw(things, APPEARANCE, view)
-    for seed in range(30):
-        others, _ = random_things(np.random.default_rng(100 + seed))
-        renderer.draw(others, APPEARANCE, camera(small(100 + seed, 50), view.T_world_cam))
-        renderer.count_pixels(others[-1], view)
-    again = renderer.draw(things, APPEARANCE, view)
-    for name in ("rgb", "depth_m", "region"):
-        assert getattr(first, name).tobytes() == getattr(again, name).tobytes(), name
-
-
-def test_what_is_returned_is_frozen_and_not_the_next_views(renderer):
-    first = renderer.draw([floor()], WHITE, camera(T=orbit_pose(np.zeros(3), 0.8, 0.0, 2.5)))
-    kept = first.rgb.copy(), first.depth_m.copy(), first.region.copy()
-    renderer.draw([], APPEARANCE, camera())
-    for image, copy in zip((first.rgb, first.depth_m, first.region), kept, strict=True):
-        np.testing.assert_array_equal(image, copy)
-        assert not image.flags.writeable and image.flags.c_contiguous
-
-
-def test_shapes_and_framebuffers_on_the_gpu_are_bounded(renderer):
-    first = shape_of(trimesh.creation.icosphere(1, 0.1))
-    renderer.draw([Placed(3, first, translation(0, 0, 1))], APPEARANCE, camera(small(16, 16)))
-    assert first in renderer._shapes
-    for n in range(100):
-        shape = shape_of(trimesh.creation.icosphere(1, 0.1))
-        renderer.draw([Placed(3, shape, translation(0, 0, 1))], APPEARANCE, camera(small(16 + 8 * n, 512)))
-    assert len(renderer._shapes) <= 64
-    assert first not in renderer._shapes
-    assert sum(target.bytes for target in renderer._targets._stored.values()) <= 64 * 2**20
-
-
-def test_memory_stays_flat_over_scenes_with_new_meshes(renderer, record_figure):
-    """300 scenes, each with a new 5,000-face object and a new texture; the first 100 fill the stores."""
-    texture = np.zeros((256, 256, 3), np.uint8)
-    view, resident = camera(small(160, 120)), []
-    for n in range(300):
-        mesh = trimesh.creation.icosphere(4, 0.1)
-        (part,) = facing(2.0).parts
-        textured = Part("p", part.vertices, part.faces, Material(texture=texture.copy()), uv=part.vertices[:, :2])
-        things = [Placed(3, shape_of(mesh), translation(0, 0, 1)), Placed(2, Shape((textured,)), EYE)]
-        renderer.draw(things, APPEARANCE, view)
-        renderer.count_pixels(things[0], view)
-        if n % 100 == 99:
-            resident.append(resident_mib())
-    growth = resident[2] - resident[1]
-    record_figure("render memory growth over 100 scenes, MiB", "passed", growth, 8.0)
-    assert growth < 8.0, f"resident memory, MiB: {resident}"
-
-
-def resident_mib() -> float:
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * 4096 / 2**20
-
-
-def test_there_is_one_renderer_a_process(renderer):
-    assert shared_renderer() is renderer
-    assert renderer.name
-
-
-def test_a_machine_without_gl_is_told_what_to_install(monkeypatch):
-    def missing(name: str):
-        raise ImportError("libEGL.so.1: cannot open shared object file")
-
-    monkeypatch.setattr("workers.render.context.importlib.import_module", missing)
-    with pytest.raises(MachineError, match=r"libEGL.so.1.*apt-get install -y libgl1 libegl1 libgl1-mesa-dri"):
-        open_context()
-    with pytest.raises(MachineError):
-        Renderer()

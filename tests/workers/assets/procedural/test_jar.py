@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from shapely.geometry import Polygon
 
 from tests.workers.assets.procedural.hollow import bottom_heights
+from workers.assets.procedural.jar import _glass_jar, _pot
 from workers.assets.procedural.make import make_model
 from workers.assets.procedural.vessel import OUTSIDE
 
@@ -22,3 +24,9 @@ def test_a_jar_has_a_neck(index):
     radius, z = np.hypot(points[:, 0], points[:, 1]), points[:, 2] / points[:, 2].max()
     neck = radius[(z > 0.78) & (z < 0.93)]
     assert neck.min() < 0.97 * radius[z < 0.75].max()
+
+
+@pytest.mark.parametrize("make", [_glass_jar, _pot])
+def test_no_wall_crosses_itself(make):
+    for seed in range(300):
+        assert Polygon(make(np.random.default_rng(seed)).profile).is_valid, seed

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from shapely.geometry import Polygon
 
 from tests.workers.assets.oracles import hits
 from tests.workers.assets.procedural.hollow import bottom_heights
 from workers.assets.procedural.make import make_model
-from workers.assets.procedural.mug import HANDLE
+from workers.assets.procedural.mug import HANDLE, _body, _handle
 from workers.assets.procedural.vessel import INSIDE
 
 
@@ -34,3 +35,15 @@ def test_the_handle_stays_out_of_the_hollow_and_leaves_room_for_a_finger(index):
     gap = distances[2] - distances[1]  # from the inside of the handle to the wall
     assert sides[:3].tolist() == [-1, 1, -1]
     assert gap > 0.012
+
+
+def test_no_wall_crosses_itself_and_no_handle_folds_at_its_bends():
+    for seed in range(1000):
+        rng = np.random.default_rng(seed)
+        wall = _body(rng)
+        assert Polygon(wall.profile).is_valid, seed
+        handle = _handle(rng, wall)
+        rings = handle.vertices[:-2].reshape(-1, 12, 3)
+        along = np.diff(rings, axis=0)  # from each ring to the next, at twelve places around
+        middle = np.diff(rings.mean(axis=1), axis=0)[:, None]
+        assert ((along * middle).sum(axis=2) > 0).all(), seed  # where it folds, its inner side runs back

@@ -1,0 +1,93 @@
+"""A check that cannot fail is none: labels that are wrong by little are found."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from schemas.base import Range
+from schemas.camera import Camera, Intrinsics
+from schemas.errors import LabelError
+from schemas.job import Job
+from schemas.scene import Agreement, GBuffer, PosedScene
+from workers.geometry.camera import orbit_pose
+from workers.geometry.raycast import cast_view
+from workers.scene.check import check_against_rays, check_pair, is_raycast_scene
+from workers.scene.plan import plan_scene
+from workers.scene.settle import settle
+from workers.scene.views import pose_scene
+
+from tests.shapes import asset_of, box, table
+
+STORED = Range(0.2, 8.0)
+CAMERA = Camera(
+    Intrinsics(width=160, height=120, fx=262.0, fy=262.0, cx=80.0, cy=60.0), orbit_pose(np.array([0, 0, 0.7]), 0.8, 1.0, 2.5)
+)
+
+
+@pytest.fixture(scope="module")
+def scene() -> PosedScene:
+    plan = plan_scene(Job.model_validate({"name": "t", "start": {"offset_m": [0, 0]}}), 0, table(), asset_of(box(0.2, 0.2, 0.25)))
+    return pose_scene(plan, (settle(plan.objects[0], plan.table, Job(name="t").physics),))
+
+
+@pytest.fixture(scope="module")
+def truth(scene) -> GBuffer:
+    """What a perfect renderer would have made."""
+    depth, region, _ = cast_view(scene.things, CAMERA)
+    return GBuffer(np.zeros((120, 160, 3), np.uint8), depth.astype(np.float32), region)
+
+
+def test_right_labels_pass(scene, truth):
+    assert (truth.region == 3).sum() > 200
+    check_against_rays(scene, CAMERA, truth, STORED)
+
+
+@pytest.mark.parametrize(("region_id", "error_m"), [(1, 2e-5), (2, 2e-5), (3, 2e-5)])
+def test_depth_that_is_off_by_twenty_micrometres_is_found_in_every_region(scene, truth, region_id, error_m):
+    wrong = truth.depth_m + np.where(truth.region == region_id, np.float32(error_m), np.float32(0))
+    with pytest.raises(LabelError, match=f"region {region_id}"):
+        check_against_rays(scene, CAMERA, dataclasses.replace(truth, depth_m=wrong), STORED)
+
+
+def test_half_a_pixel_of_shift_is_found(scene, truth):
+    shifted = Camera(CAMERA.intrinsics.model_copy(update={"cx": 79.5}), CAMERA.T_world_cam)
+    depth, region, _ = cast_view(scene.things, shifted)
+    with pytest.raises(LabelError):
+        check_against_rays(scene, CAMERA, GBuffer(truth.rgb, depth.astype(np.float32), region), STORED)
+
+
+def test_one_wrong_pixel_away_from_every_edge_is_found(scene, truth):
+    region, depth = truth.region.copy(), truth.depth_m.copy()
+    row, column = (int(np.median(index)) for index in np.nonzero(region == 3))
+    region[row, column] = 2
+    depth[row, column] += 0.01
+    with pytest.raises(LabelError, match=rf"pixel \({column}, {row}\) is region 2 in the mask and 3 by ray"):
+        check_against_rays(scene, CAMERA, GBuffer(truth.rgb, depth, region), STORED)
+
+
+def test_the_share_of_checked_scenes_is_the_jobs_and_a_function_of_the_scene():
+    job = Job.model_validate({"name": "t", "check": {"raycast_share": 0.1}})
+    chosen = [is_raycast_scene(job, scene) for scene in range(3000)]
+    assert abs(np.mean(chosen) - 0.1) < 4 * np.sqrt(0.09 / 3000)
+    assert chosen[:50] == [is_raycast_scene(job, scene) for scene in range(50)]
+    everything = Job.model_validate({"name": "t", "check": {"raycast_share": 1}})
+    assert all(is_raycast_scene(everything, scene) for scene in range(50))
+
+
+class PairLike:
+    """check_pair looks at nothing but the agreement."""
+
+    def __init__(self, object_mm: float | None, scene_mm: float | None) -> None:
+        self.agreement = Agreement(object_mm, 1.0, 100, scene_mm)
+
+
+@pytest.mark.parametrize(("object_mm", "scene_mm", "what"), [(1.5, 0.1, "the object"), (0.1, 1.5, "the scene")])
+def test_views_that_disagree_are_a_failure_that_says_by_how_much(object_mm, scene_mm, what):
+    with pytest.raises(LabelError, match=f"of {what} carried into the mirror view is off by 1.500 mm"):
+        check_pair(PairLike(object_mm, scene_mm), Job(name="t").check)
+
+
+def test_views_that_agree_or_have_nothing_to_compare_pass():
+    check_pair(PairLike(0.1, 0.1), Job(name="t").check)
+    check_pair(PairLike(None, None), Job(name="t").check)
