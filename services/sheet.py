@@ -1,6 +1,6 @@
 """Contact sheets: a page of what a dataset holds, for a person to look at.
 
-python -m services.sheet OUT FILE.jpg [SCENES]
+python -m services.sheet OUT FILE.jpg [SCENES [CATEGORY]]
 """
 
 import sys
@@ -44,9 +44,9 @@ DEPTH_STRETCH = (2.0, 98.0)
 Picture = NDArray[np.uint8]
 
 
-def draw_sheet(store: Store, scenes: int) -> Picture:
-    """[H, W, 3] uint8: a row for each of the first scenes of every category, with the images of its first pair."""
-    rows = [(category, cells) for category, cells in _choose(store, scenes)]
+def draw_sheet(store: Store, scenes: int, category: str | None = None) -> Picture:
+    """[H, W, 3] uint8: a row for each of the first scenes of every category (or of one), with its first pair's images."""
+    rows = _choose(store, scenes, category)
     width = LEFT + len(COLUMNS) * (CELL[0] + MARGIN)
     page = Image.new("RGB", (width, HEADING + len(rows) * (CELL[1] + MARGIN)), "white")
     pen, font = ImageDraw.Draw(page), ImageFont.load_default(15)
@@ -60,13 +60,15 @@ def draw_sheet(store: Store, scenes: int) -> Picture:
     return np.asarray(page)
 
 
-def _choose(store: Store, scenes: int) -> list[tuple[str, list[Picture]]]:
+def _choose(store: Store, scenes: int, only: str | None) -> list[tuple[str, list[Picture]]]:
     """The first scenes of each category, by category."""
     chosen: dict[str, list[list[Picture]]] = {}
     for stored in iter_stored(store):
         read = file_reader(store, stored)
         for scene in stored.rows["scenes"]:
             category = scene["category"]
+            if only not in (None, category):
+                continue
             if len(chosen.setdefault(category, [])) < scenes:
                 chosen[category].append(_cells(read, stored, scene))
     return [(category, cells) for category in sorted(chosen) for cells in chosen[category]]
@@ -125,5 +127,6 @@ def _paint_regions(region: NDArray) -> Picture:
 
 
 if __name__ == "__main__":
-    sheet = draw_sheet(open_store(sys.argv[1]), int(sys.argv[3]) if len(sys.argv) > 3 else 1)
+    scenes = int(sys.argv[3]) if len(sys.argv) > 3 else 1
+    sheet = draw_sheet(open_store(sys.argv[1]), scenes, sys.argv[4] if len(sys.argv) > 4 else None)
     Image.fromarray(sheet).save(Path(sys.argv[2]), quality=88)

@@ -70,8 +70,8 @@ def _count(settings: AnySource, listing: Listing | None, category: str) -> int:
 def open_catalogue(assets: Assets, job_folder: Path, categories: Collection[str]) -> Catalogue:
     """Looks into every source now; raises AssetSourceError where a folder or a category cannot be served.
 
-    Cost: every mesh and texture of the categories asked for is read once to hash it, about a second a gigabyte from
-    cache; nothing for procedural sources. Workers take the opened catalogue and read only what they load.
+    Cost: every mesh and texture of the categories asked for is read to hash it, about two seconds a gigabyte where
+    disks allow; nothing for procedural sources. Workers take the opened catalogue and read only what they load.
     """
     listed: dict[str, Listing | None] = {}
     objects = tuple(_listing(source, job_folder, categories, assets, listed) for source in assets.objects)

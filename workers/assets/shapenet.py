@@ -44,7 +44,7 @@ _MESHES = ("models/model_normalized.obj", "model.obj")
 def list_shapenet(settings: ShapeNetSource, folder: Path, categories: Collection[str], limits: MeshLimits) -> Listing:
     """Every model of the categories that ShapeNetCore has; AssetSourceError where the folder is not ShapeNetCore's.
 
-    Reads and hashes the meshes and textures of these categories: about a second for each gigabyte that is cached.
+    Reads and hashes the meshes and textures of these categories: about two seconds for each gigabyte, where disks allow.
     """
     if not folder.is_dir():
         raise AssetSourceError(

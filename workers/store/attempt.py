@@ -11,22 +11,22 @@ from collections.abc import Iterator, Mapping
 
 import pyarrow as pa
 
-from schemas.commit import CommitRecord, CommitResult, CommitTerms, FileEntry, Outcome, SceneMark, Span, TableEntry
+from schemas.commit import CommitRecord, CommitResult, CommitTerms, FileEntry, SceneMark, Span, TableEntry
 from schemas.errors import OutputError, RunError
-from schemas.layout import ASSETS, commit_path, range_table_path, staging_path
-from schemas.manifest import DETERMINISTIC_TABLES, SCHEMA_VERSION, SCHEMAS, TABLES
+from schemas.layout import commit_path, range_table_path, staging_path
+from schemas.manifest import SCHEMA_VERSION, SCHEMAS, TABLES
 from schemas.scene import SceneOutput
-from workers.store.canonical import joint_digest, rows_digest
+from workers.store.canonical import rows_digest
 from workers.store.commit import compare_records, encode_record, publish, read_record
 from workers.store.manifest import encode_table, sorted_rows, table_of_rows
 from workers.store.packing import FilePacking, Packing, TarPacking
+from workers.store.scene_rows import check_files, distinct_assets, outcome_of, scene_digest
 from workers.store.store import Store
 
 CURRENT = "_current"
 """In an attempt's folder: which scene it is working on, for whoever finds the worker dead."""
 
 _NAME = re.compile(r"r(\d+)-.+")
-_UNSAFE = re.compile(r"[\x00-\x1f\x7f\\]")
 
 
 def begin_attempt(store: Store, span: Span, terms: CommitTerms, label: str = "") -> "Attempt":
@@ -100,9 +100,9 @@ class Attempt:
         tables = {table: table_of_rows(table, output.rows.get(table, ())) for table in TABLES}
         if unknown := output.rows.keys() - tables.keys():
             raise ValueError(f"scene {output.scene_id} has rows for unknown tables: {', '.join(sorted(unknown))}")
-        outcome = _outcome(output.scene_id, tables)
+        outcome = outcome_of(output.scene_id, tables)
         entries = {path: FileEntry(path=path, bytes=len(data), sha256=_sha256(data)) for path, data in output.files}
-        _check_files(output, tables["views"], entries)
+        check_files(output, tables["views"], entries)
         for path in self._files.keys() & entries.keys():
             if self._files[path] != entries[path]:
                 raise ValueError(f"{path} was written twice with different bytes")
@@ -112,7 +112,7 @@ class Attempt:
         for table, rows in tables.items():
             self._rows[table].append(rows)
         self._scenes[output.scene_id] = SceneMark(
-            scene_id=output.scene_id, outcome=outcome, digest=_scene_digest(tables)
+            scene_id=output.scene_id, outcome=outcome, digest=scene_digest(tables)
         )
 
     def commit(self) -> CommitResult:
@@ -140,7 +140,7 @@ class Attempt:
         """The record of this attempt, with all that it names written."""
         tables, files = {}, {}
         for table in TABLES:
-            rows = sorted_rows(table, _distinct(table, pa.concat_tables(self._rows[table]).combine_chunks()))
+            rows = sorted_rows(table, distinct_assets(table, pa.concat_tables(self._rows[table]).combine_chunks()))
             data = encode_table(rows)
             path = range_table_path(self.span.start, table, self.span.retry)
             with self._while_ours():
@@ -195,57 +195,3 @@ class Attempt:
 
 def _sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
-
-
-def _outcome(scene_id: int, tables: Mapping[str, pa.Table]) -> Outcome:
-    """How the scene ended. Raises ValueError unless its rows say exactly one thing, about this scene only."""
-    for table, rows in tables.items():
-        if "scene_id" in rows.column_names and set(rows.column("scene_id").to_pylist()) - {scene_id}:
-            raise ValueError(f"scene {scene_id} has rows of another scene in {table}")
-    made, failed = tables["scenes"].num_rows, tables["failures"].num_rows
-    if made + failed != 1 or tables["timings"].num_rows > 1:
-        raise ValueError(
-            f"scene {scene_id} has {made} rows in scenes and {failed} in failures, and must have one in all"
-        )
-    if made:
-        return "made"
-    if extra := [table for table in ("views", "objects", "assets") if tables[table].num_rows]:
-        raise ValueError(f"scene {scene_id} failed and has rows in {', '.join(extra)}")
-    kind = tables["failures"].column("kind")[0].as_py()
-    if kind not in ("intrinsic", "environmental"):
-        raise ValueError(f"scene {scene_id} failed with the unknown kind {kind!r}")
-    return kind
-
-
-def _check_files(output: SceneOutput, views: pa.Table, entries: Mapping[str, FileEntry]) -> None:
-    """Raises ValueError unless the rows of `views` and the files agree: paths, sizes, digests, each path once."""
-    if len(entries) != len(output.files):
-        raise ValueError(f"scene {output.scene_id} writes a path twice")
-    for path in entries:
-        if _UNSAFE.search(path) or any(part in ("", ".", "..") for part in path.split("/")) or path[0] in "_.":
-            raise ValueError(f"{path!r} is not a path that a scene may write")
-    named = [file for files in views.column("files").to_pylist() for file in files]
-    images = {path: entry.model_dump() for path, entry in entries.items() if not path.startswith(f"{ASSETS}/")}
-    if len({file["path"] for file in named}) != len(named) or {file["path"]: file for file in named} != images:
-        wrong = sorted({file["path"] for file in named}.symmetric_difference(images)) or [
-            "sizes, digests or repetitions"
-        ]
-        raise ValueError(f"scene {output.scene_id}: files and the rows of views disagree about {', '.join(wrong[:5])}")
-
-
-def _distinct(table: str, rows: pa.Table) -> pa.Table:
-    """Rows of `assets` once each, where scenes share them; other tables as they are.
-
-    Two rows of one asset that differ stay, and are refused as a repeated key.
-    """
-    if table != "assets" or rows.num_rows < 2:
-        return rows
-    seen: dict[str, int] = {}
-    for index, row in enumerate(rows.to_pylist()):
-        seen.setdefault(json.dumps(row), index)
-    return rows.take(list(seen.values()))
-
-
-def _scene_digest(tables: Mapping[str, pa.Table]) -> str:
-    names = [table for table in DETERMINISTIC_TABLES if table != "assets" and tables[table].num_rows]
-    return joint_digest([(table, rows_digest(table, sorted_rows(table, tables[table]))) for table in names])

@@ -9,8 +9,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO
 
-from schemas.errors import MachineError, OutputError
+from schemas.errors import OutputError
 from schemas.layout import COMMITS, RANGES, STAGING
+from workers.store.disk_errors import told_plainly
 from workers.store.durable import sync_file, sync_folder, sync_tree
 from workers.store.probe import probe_folder
 from workers.store.store import TEMPORARY, Entry, fenced_key
@@ -228,24 +229,8 @@ class LocalStore:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(temporary)
 
-    @contextlib.contextmanager
-    def _told(self, key: str) -> Iterator[None]:
-        """Turns what a user can mend (a full disk, a missing right) into an error that says so."""
-        try:
-            yield
-        except OSError as error:
-            if error.errno in _BROKEN:
-                raise MachineError(f"{key} in {self.name} could not be written: {_BROKEN[error.errno]}") from error
-            raise
-
-
-_BROKEN = {
-    errno.ENOSPC: "the disk is full; free some space and start again, nothing finished is lost",
-    errno.EDQUOT: "the disk quota is used up; free some space and start again, nothing finished is lost",
-    errno.EROFS: "the file system is read-only",
-    errno.EACCES: "permission denied",
-    errno.EIO: "the disk reports an input/output error; check it before going on",
-}
+    def _told(self, key: str) -> contextlib.AbstractContextManager[None]:
+        return told_plainly(f"{key} in {self.name} could not be written")
 
 
 def _unless(error: type[BaseException], suppressed: bool) -> contextlib.AbstractContextManager[None]:

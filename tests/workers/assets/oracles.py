@@ -84,3 +84,15 @@ f 3 4 8 7
 f 4 1 5 8
 """
 """An OBJ file: the unit cube in quadrilaterals, wound outwards."""
+
+
+def textured_cube(folder: Path, picture: str = "skin.png", more: str = "") -> Path:
+    """The cube as an OBJ file whose material has a picture, each face over the whole of it."""
+    write(folder / "cube.mtl", f"newmtl skin\nKd 1 1 1\n{more}map_Kd {picture}\n")
+    corners = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+    body = CUBE.replace("\nf", "\nusemtl skin\nf", 1)
+    body = "\n".join(
+        "f " + " ".join(f"{v}/{k + 1}" for k, v in enumerate(line.split()[1:])) if line.startswith("f ") else line
+        for line in body.splitlines()
+    )
+    return write(folder / "cube.obj", "mtllib cube.mtl\n" + corners + body + "\n")

@@ -1,5 +1,7 @@
 """Placing a cleaned shape, and remembering files."""
 
+import pickle
+
 import numpy as np
 import pytest
 import trimesh
@@ -11,6 +13,7 @@ from workers.assets.sources import (
     UP_AXES,
     Entry,
     Placement,
+    SourceFile,
     Weights,
     check_unchanged,
     found_in,
@@ -23,8 +26,7 @@ from workers.assets.sources import (
 
 
 def place(mesh, placement):
-    entry = Entry("id", (), "MIT")
-    entry = Entry("id", hashed_nothing(), "MIT")
+    entry = Entry("id", (SourceFile("a.obj", 1, "0" * 64),), "MIT")
     return placed_asset(
         shape_of(mesh),
         placement,
@@ -34,12 +36,6 @@ def place(mesh, placement):
         shareable=False,
         weights=Weights(600.0, 3.0),
     )
-
-
-def hashed_nothing():
-    from workers.assets.sources import SourceFile
-
-    return (SourceFile("a.obj", 1, "0" * 64),)
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z"])
@@ -81,11 +77,13 @@ def test_a_file_that_changed_since_is_noticed(tmp_path):
     entry = Entry("id", hashed([path], tmp_path), "MIT")
     check_unchanged(tmp_path, entry)
     write(path, CUBE + "# more\n")
-    with pytest.raises(MeshError, match="changed"):
+    with pytest.raises(MeshError, match="changed") as changed:
         check_unchanged(tmp_path, entry)
     path.unlink()
-    with pytest.raises(MeshError, match="missing"):
+    with pytest.raises(MeshError, match="missing") as missing:
         check_unchanged(tmp_path, entry)
+    # Neither is a function of job and seed, and it stays so on the way to another process.
+    assert {pickle.loads(pickle.dumps(error.value)).kind for error in (changed, missing)} == {"environmental"}
 
 
 def test_an_obj_comes_with_its_materials_and_their_textures(tmp_path):
