@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.camera import Camera, Intrinsics
-from workers.geometry.camera import project, unproject
+from workers.geometry.camera import unproject
 from workers.geometry.frames import invert, transform
 
 

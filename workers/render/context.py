@@ -7,7 +7,8 @@ from typing import Any
 from schemas.errors import MachineError
 
 REMEDY = (
-    "rendering needs OpenGL 4.1 through EGL. On Debian or Ubuntu: apt-get install -y libgl1 libegl1 libgl1-mesa-dri libglu1-mesa. "
+    "rendering needs OpenGL 4.1 through EGL. On Debian or Ubuntu: "
+    "apt-get install -y libgl1 libegl1 libgl1-mesa-dri libglu1-mesa. "
     "`verso doctor` says what else is missing"
 )
 

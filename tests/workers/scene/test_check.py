@@ -10,6 +10,7 @@ from schemas.camera import Camera, Intrinsics
 from schemas.errors import LabelError
 from schemas.job import Job
 from schemas.scene import Agreement, GBuffer, PosedScene
+from tests.shapes import asset_of, box, table
 from workers.geometry.camera import orbit_pose
 from workers.geometry.raycast import cast_view
 from workers.scene.check import check_against_rays, check_pair, is_raycast_scene
@@ -17,17 +18,18 @@ from workers.scene.plan import plan_scene
 from workers.scene.settle import settle
 from workers.scene.views import pose_scene
 
-from tests.shapes import asset_of, box, table
-
 STORED = Range(0.2, 8.0)
 CAMERA = Camera(
-    Intrinsics(width=160, height=120, fx=262.0, fy=262.0, cx=80.0, cy=60.0), orbit_pose(np.array([0, 0, 0.7]), 0.8, 1.0, 2.5)
+    Intrinsics(width=160, height=120, fx=262.0, fy=262.0, cx=80.0, cy=60.0),
+    orbit_pose(np.array([0, 0, 0.7]), 0.8, 1.0, 2.5),
 )
 
 
 @pytest.fixture(scope="module")
 def scene() -> PosedScene:
-    plan = plan_scene(Job.model_validate({"name": "t", "start": {"offset_m": [0, 0]}}), 0, table(), asset_of(box(0.2, 0.2, 0.25)))
+    plan = plan_scene(
+        Job.model_validate({"name": "t", "start": {"offset_m": [0, 0]}}), 0, table(), asset_of(box(0.2, 0.2, 0.25))
+    )
     return pose_scene(plan, (settle(plan.objects[0], plan.table, Job(name="t").physics),))
 
 
