@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -75,6 +76,9 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     """
     begun = time.monotonic()
     catalogue = open_catalogue(request.job.assets, request.job_folder, tuple(request.job.categories))
+    for folder, reasons in catalogue.skipped.items():
+        left_out = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
+        print(f"verso: left out of {folder}: {left_out}", file=sys.stderr)
     store = open_store(request.out)
     refuse_foreign(store)
     store.prepare()
