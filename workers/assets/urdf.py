@@ -53,6 +53,7 @@ def list_folder(settings: FolderSource, folder: Path, categories: Collection[str
 
     Reads and hashes these files and all that they refer to.
     """
+    folder = folder.resolve()  # what lies in it is compared with its resolved path
     category_map = _map_of(settings, folder)
     entries: dict[str, list[Entry]] = {
         category: [] for category in sorted(set(category_map.values()) & set(categories))
