@@ -19,6 +19,7 @@ from schemas.base import (
     Range,
     Share,
 )
+from schemas.sensor import SensorEffects
 
 Category = Literal["bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box"]
 CATEGORIES: tuple[Category, ...] = ("bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box")
@@ -364,6 +365,8 @@ class Job(Frozen):
     """What is stored."""
     render: Render = Render()
     """How RGB looks."""
+    sensor: SensorEffects = SensorEffects()
+    """What the sensors add to exact images; nothing by default."""
     check: Check = Check()
     """What is checked before a scene is committed."""
     output: Output = Output()

@@ -195,7 +195,8 @@ class Pair:
     """An input pose and its mirror pose with all their views.
 
     filled_share: of the mirror image's pixels, those that the projection fills; hidden_share: of the filled ones,
-    those that show a surface behind what the mirror camera sees.
+    those that show a surface behind what the mirror camera sees. `agreement` is of the stored images;
+    `exact_agreement` of what they were before the sensors' effects, and the same where there are none.
     """
 
     d_z_m: float
@@ -204,6 +205,7 @@ class Pair:
     mirror: View
     projected: View
     agreement: Agreement
+    exact_agreement: Agreement
     filled_share: float
     hidden_share: float
 

@@ -25,9 +25,13 @@ class WorkerContext:
 def settings_digest(job: Job, catalogue_digest: str) -> str:
     """SHA-256, hex, of everything that decides what a scene is: settings and assets, not how many or how driven.
 
-    Where an asset folder lies is left out: the same files elsewhere are the same assets.
+    Where an asset folder lies is left out: the same files elsewhere are the same assets. So are effects that are off, as
+    they decide nothing.
     """
     settings = job.model_dump(mode="json", exclude=OUTSIDE_SETTINGS)
+    settings["sensor"] = {name: effect for name, effect in settings["sensor"].items() if effect is not None}
+    if not settings["sensor"]:
+        del settings["sensor"]
     for source in (*settings["assets"]["objects"], *settings["assets"]["tables"]):
         source.pop("folder", None)
     text = json.dumps([settings, catalogue_digest], sort_keys=True, separators=(",", ":"))

@@ -198,7 +198,7 @@ def _check_projection(job: Job, stored: Mapping[str, View], views: Mapping[str, 
     """The projected images to the byte, and the agreement of the two views."""
     first, mirror, projected = stored["input"], stored["mirror"], stored["projected"]
     where, faults = f"pose {projected.pose_id} (projected)", []
-    rgb, depth = derive_projected(first, mirror.camera, job.images)
+    rgb, depth = derive_projected(first, mirror.camera, job.images, job.sensor.distortion)
     if not np.array_equal(rgb, projected.rgb) or not np.array_equal(depth, projected.depth):
         faults.append(f"{where}: the stored input depth projects to other images")
     shares = projection_shares(depth, mirror.depth, job.images)

@@ -6,10 +6,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from schemas.camera import Camera
+from schemas.job import Job
 from schemas.layout import input_pose_id
 from schemas.scene import (
     REGION_FIRST_OBJECT,
     REGION_TABLE,
+    Agreement,
     GBuffer,
     ObjectLabel,
     Pair,
@@ -33,6 +35,7 @@ from workers.scene.views import (
     quantise_depth,
     stored_depth_m,
 )
+from workers.sensing import sense_view
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,24 +113,40 @@ def make_pair(scene: SceneView, camera: Camera, number: int) -> Pair:
     """All four views of one pair. Raises ViewError where the input camera sees no object."""
     job, watch = scene.context.job, scene.watch
     parent = input_pose_id(scene.plan.scene_id, number, job.pairs_per_scene)
-    first = render_view(scene, "input", (parent, parent), camera)
+    exact_first = render_view(scene, "input", (parent, parent), camera)
+    first = sense(scene, exact_first, number)
     aligned_camera = place_aligned_camera(camera, job.cameras.depth)
-    aligned = render_view(scene, "aligned", (parent, parent), aligned_camera)
+    aligned = sense(scene, render_view(scene, "aligned", (parent, parent), aligned_camera), number)
     assert first.region is not None
     depth_m = stored_depth_m(first.depth, job.images)
     d_z_m = front_distance(depth_m, first.region >= REGION_FIRST_OBJECT, job.cameras.mirror)
-    mirror = render_view(scene, "mirror", (parent + 1, parent), place_mirror_camera(camera, d_z_m, job.cameras.mirror))
+    mirror_camera = place_mirror_camera(camera, d_z_m, job.cameras.mirror)
+    exact_mirror = render_view(scene, "mirror", (parent + 1, parent), mirror_camera)
+    mirror = sense(scene, exact_mirror, number)
     with watch.stage("projection"):
-        rgb, depth = derive_projected(first, mirror.camera, job.images)
+        rgb, depth = derive_projected(first, mirror.camera, job.images, job.sensor.distortion)
         filled, hidden = projection_shares(depth, mirror.depth, job.images)
     with watch.stage("check"):
-        agreement = agree_across(first, mirror, job.images, job.check.mirror_agreement_mm, REGION_FIRST_OBJECT)
+        agreement = compare_views(job, first, mirror)
+        noisy = job.sensor.depth_noise is not None
+        exact_agreement = compare_views(job, exact_first, exact_mirror) if noisy else agreement
     projected = View("projected", parent, parent, mirror.camera, rgb, depth, None, ())
-    return Pair(d_z_m, first, aligned, mirror, projected, agreement, filled, hidden)
+    return Pair(d_z_m, first, aligned, mirror, projected, agreement, exact_agreement, filled, hidden)
+
+
+def sense(scene: SceneView, exact: View, number: int) -> View:
+    """An exact view as the job's sensors store it."""
+    with scene.watch.stage("sensor"):
+        return sense_view(scene.context.job, exact, scene.plan.scene_id, number)
+
+
+def compare_views(job: Job, first: View, mirror: View) -> Agreement:
+    """How well an input and a mirror view agree."""
+    return agree_across(first, mirror, job.images, job.check.mirror_agreement_mm, REGION_FIRST_OBJECT)
 
 
 def render_view(scene: SceneView, role: str, ids: tuple[int, int], camera: Camera) -> View:
-    """One rendered view: images as stored, and labels of the table and of every object."""
+    """One rendered view: exact images in their stored encodings, and labels of the table and of every object."""
     job, renderer = scene.context.job, scene.context.renderer
     with scene.watch.stage("render"):
         buffer = renderer.draw(scene.posed.things, scene.posed.appearance, camera)

@@ -73,8 +73,8 @@ def _check_depth(region_id: int, error_mm: NDArray[np.float64]) -> None:
 
 
 def check_pair(pair: Pair, check: Check) -> None:
-    """Hold a pair's two views against each other. Raises LabelError."""
-    agreement = pair.agreement
+    """Hold a pair's two views, as they were before the sensors' effects, against each other. Raises LabelError."""
+    agreement = pair.exact_agreement
     for what, median in (("the object", agreement.median_mm), ("the scene", agreement.scene_median_mm)):
         if median is not None and median > check.mirror_agreement_mm:
             raise LabelError(

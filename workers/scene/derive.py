@@ -9,7 +9,9 @@ from schemas.base import Array
 from schemas.camera import Camera
 from schemas.job import Images, Patch
 from schemas.scene import Agreement, ObjectLabel, View
+from schemas.sensor import Distortion
 from workers.geometry.camera import image_coordinates, project
+from workers.geometry.distortion import distort
 from workers.geometry.frames import invert
 from workers.geometry.normals import facing_cosine, is_smooth
 from workers.geometry.project import Projected, cloud_in_camera, forward_project, in_frame, sample_inverse_depth
@@ -33,13 +35,31 @@ SCENE_STRIDE = 8
 """Floor and table have hundreds of times the pixels that their median needs."""
 
 
-def derive_projected(source: View, mirror: Camera, images: Images) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+def derive_projected(
+    source: View, mirror: Camera, images: Images, lens: Distortion | None = None
+) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
     """RGB [H, W, 3] uint8 and depth [H, W] uint16 of the stored input cloud seen from the mirror camera; holes 0."""
     projected = carry_depth(source, mirror, images)
     rgb = np.zeros((*projected.depth_m.shape, 3), np.uint8)
     filled = projected.source >= 0
-    rgb[filled] = source.rgb.reshape(-1, 3)[projected.source[filled]]
+    rgb[filled] = colours_of(source, projected.source[filled], lens)
     return rgb, quantise_depth(projected.depth_m, images)
+
+
+def colours_of(source: View, pixels: NDArray[np.int64], lens: Distortion | None) -> NDArray[np.uint8]:
+    """[N, 3] uint8: stored colours of depth pixels (flat indices).
+
+    Behind a lens a depth pixel's colour is that of the RGB pixel that its centre is drawn in, black outside the picture.
+    """
+    if lens is None:
+        return source.rgb.reshape(-1, 3)[pixels]
+    k = source.camera.intrinsics
+    rows, columns = np.divmod(pixels, k.width)
+    u, v = distort(columns + 0.5, rows + 0.5, lens, k)
+    inside = in_frame(u, v, k)
+    colours = np.zeros((len(pixels), 3), np.uint8)
+    colours[inside] = source.rgb[np.floor(v[inside]).astype(np.int64), np.floor(u[inside]).astype(np.int64)]
+    return colours
 
 
 def carry_depth(source: View, target: Camera, images: Images) -> Projected:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from schemas.job import Job
 from schemas.scene import ScenePlan, Settled
+from schemas.sensor import SensorEffects
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +55,11 @@ def _raycast(facts: Facts) -> str | None:
     return None if facts.raycast_checked else "not in the share check.raycast_share"
 
 
+def _sensor(name: str) -> Callable[[Facts], str | None]:
+    """A sensor effect runs in every scene where the job asks for it."""
+    return lambda facts: f"sensor.{name} is off" if getattr(facts.job.sensor, name) is None else None
+
+
 EFFECTS: tuple[Effect, ...] = (
     Effect("dynamics", _dynamics),
     Effect("table_mesh_collision", _table_mesh),
@@ -63,6 +69,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("splat", _splat),
     Effect("hidden_point_removal", _hidden_points),
     Effect("raycast_check", _raycast),
+    *(Effect(f"sensor_{name}", _sensor(name)) for name in SensorEffects.model_fields),
 )
 
 

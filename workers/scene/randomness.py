@@ -17,8 +17,14 @@ class Stream(IntEnum):
     APPEARANCE = 6
     RAYCAST_CHECK = 7
     RECHECK = 8
+    SENSOR_DEPTH = 9
+    SENSOR_RGB = 10
+    SENSOR_EXPOSURE = 11
 
 
-def stream(seed: int, scene_id: int, name: Stream) -> np.random.Generator:
-    """The generator of one step of one scene: a function of the dataset's seed, the scene and the step alone."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(scene_id, int(name))))
+def stream(seed: int, scene_id: int, name: Stream, *within: int) -> np.random.Generator:
+    """The generator of one step of one scene: a function of the dataset's seed, the scene and the step alone.
+
+    `within` names a part of a step that must not depend on how many parts there are: (pair, role) for a view's noise.
+    """
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(scene_id, int(name), *within)))
