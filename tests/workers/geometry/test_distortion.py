@@ -23,7 +23,8 @@ def coefficients(lens: Distortion) -> np.ndarray:
 
 
 def grid() -> tuple[np.ndarray, np.ndarray]:
-    return tuple(axis.ravel() for axis in np.meshgrid(np.linspace(0.5, 639.5, 33), np.linspace(0.5, 479.5, 25)))
+    u, v = np.meshgrid(np.linspace(0.5, 639.5, 33), np.linspace(0.5, 479.5, 25))
+    return u.ravel(), v.ravel()
 
 
 @pytest.mark.parametrize("lens", LENSES)
