@@ -304,7 +304,8 @@ class Check(Frozen):
     """What is checked before a scene is committed."""
 
     raycast_share: Share = 0.01
-    """Share of scenes, chosen by scene id, whose depth and masks are compared with a ray caster."""
+    """Share of scenes, chosen by scene id, whose depth and masks are compared with a ray caster, and whose objects are
+    released again to see that they stay where they are."""
     mirror_agreement_mm: Positive = 1.0
     """Largest median difference between input depth carried into the mirror view and the mirror depth."""
 

@@ -63,6 +63,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("splat", _splat),
     Effect("hidden_point_removal", _hidden_points),
     Effect("raycast_check", _raycast),
+    Effect("release_again", _raycast),
 )
 
 

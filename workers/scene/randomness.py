@@ -16,7 +16,6 @@ class Stream(IntEnum):
     CAMERA = 5
     APPEARANCE = 6
     RAYCAST_CHECK = 7
-    RECHECK = 8
 
 
 def stream(seed: int, scene_id: int, name: Stream) -> np.random.Generator:
