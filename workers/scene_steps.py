@@ -143,7 +143,7 @@ def render_view(scene: SceneView, role: str, ids: tuple[int, int], camera: Camer
     """One rendered view: images as stored, and labels of the table and of every object."""
     job, renderer = scene.context.job, scene.context.renderer
     with scene.watch.stage("render"):
-        buffer = renderer.draw(scene.posed.things, scene.posed.appearance, camera)
+        buffer = renderer.draw(scene.posed.things, scene.posed.appearance, camera, job.render)
     if scene.raycast_checked:
         with scene.watch.stage("raycast"):
             check_against_rays(scene.posed, camera, buffer, job.images.depth_range_m)

@@ -54,6 +54,10 @@ def _raycast(facts: Facts) -> str | None:
     return None if facts.raycast_checked else "not in the share check.raycast_share"
 
 
+def _raster(facts: Facts) -> str | None:
+    return "render.tier is flat" if facts.job.render.tier == "flat" else None
+
+
 EFFECTS: tuple[Effect, ...] = (
     Effect("dynamics", _dynamics),
     Effect("table_mesh_collision", _table_mesh),
@@ -64,6 +68,9 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("hidden_point_removal", _hidden_points),
     Effect("raycast_check", _raycast),
     Effect("release_again", _raycast),
+    Effect("shadows", _raster),
+    Effect("ambient_occlusion", _raster),
+    Effect("antialiasing", _raster),
 )
 
 
