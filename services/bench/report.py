@@ -84,7 +84,8 @@ def _describe_memory(memory: dict[str, Any] | None) -> list[str]:
         return []
     return [
         f"memory                  {memory['settled_mb']:.0f} MB after {memory['settled_after']} scenes, "
-        f"{memory['last_mb']:.0f} MB after {memory['scenes']} ({memory['grown']:+.1%}), at most {memory['peak_mb']:.0f} MB; time for a scene "
+        f"{memory['last_mb']:.0f} MB after {memory['scenes']} ({memory['grown']:+.1%}), at most "
+        f"{memory['peak_mb']:.0f} MB; time for a scene "
         f"{memory['slowed']:+.1%}"
     ]
 

@@ -9,6 +9,7 @@ from schemas.errors import RunError, SceneError
 from schemas.job import Job
 from schemas.report import ShardOrder
 from services.bench.ratios import Lap
+from workers.allocator import keep_freed_memory
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.context import WorkerContext, settings_digest
 from workers.render.gbuffer import shared_renderer
@@ -83,4 +84,5 @@ def bench_order(job: Job, out: Path) -> ShardOrder:
 
 
 def _context(job: Job, catalogue: Catalogue) -> WorkerContext:
+    keep_freed_memory()
     return WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
