@@ -31,7 +31,7 @@ def encode_png(pixels: Pixels, level: int = FAST_LEVEL) -> bytes:
     if 0 in pixels.shape:
         raise ValueError(f"an image of shape {pixels.shape} has no pixels")
     # OpenCV takes BGR, and turns channels round thirty times as fast as numpy copies them in reverse.
-    whole = np.ascontiguousarray(pixels)
+    whole: NDArray = np.ascontiguousarray(pixels)
     turned = cv2.cvtColor(whole, cv2.COLOR_RGB2BGR) if colored else whole
     done, data = cv2.imencode(".png", turned, _settings(pixels, level))
     if not done:
