@@ -1,7 +1,9 @@
 """What follows from rendered views: the projected view, patches, labels, agreement. Pure."""
 
 from collections.abc import Callable
+from typing import cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,10 +38,13 @@ SCENE_STRIDE = 8
 def derive_projected(source: View, mirror: Camera, images: Images) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
     """RGB [H, W, 3] uint8 and depth [H, W] uint16 of the stored input cloud seen from the mirror camera; holes 0."""
     projected = carry_depth(source, mirror, images)
-    rgb = np.zeros((*projected.depth_m.shape, 3), np.uint8)
-    filled = projected.source >= 0
-    rgb[filled] = source.rgb.reshape(-1, 3)[projected.source[filled]]
-    return rgb, quantise_depth(projected.depth_m, images)
+    # Pixels travel as one number of four bytes each: three times as fast as rows of three.
+    colors = cv2.cvtColor(source.rgb, cv2.COLOR_RGB2RGBA).view(np.uint32).ravel()
+    filled = np.flatnonzero(projected.source >= 0)
+    carried = np.zeros(projected.depth_m.shape, np.uint32)
+    carried.ravel()[filled] = colors[projected.source.ravel()[filled]]
+    rgba = carried.view(np.uint8).reshape(*carried.shape, 4)
+    return cast(NDArray[np.uint8], cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB)), quantise_depth(projected.depth_m, images)
 
 
 def carry_depth(source: View, target: Camera, images: Images) -> Projected:
