@@ -183,6 +183,8 @@ class Renderer:
                 stand_back = STAND_BACK * ranks[thing.region_id]
                 program.set_thing(view.T_cam_world @ thing.T_world_shape, thing.region_id, stand_back)
                 self._draw_batch(batch)
+        if view.raster:
+            self._lit().release()
 
     def _refine(self, drawn: GBuffer, things: Sequence[Placed], view: ViewOf, samples: int) -> GBuffer:
         """The same with holes cut out of colour and its edges made smooth."""
