@@ -7,6 +7,9 @@ one for what objects stand on (how open the sky is, and on the floor the shadow)
 KNEE = 0.8
 """Up to this much light the picture is proportional to it; above, it bends towards 1 and never reaches it."""
 
+ASIDE_M = 0.014
+"""How far in front of a wall its surroundings are looked up: somewhat more than a pixel of the heights' grid."""
+
 LIT_VERTEX = """
 uniform mat4 level_from_shape;     // to (u, v, height above the level in units of its map)
 uniform vec3 up;                   // the world's, in the optical frame
@@ -17,6 +20,7 @@ uniform mat4 shadow_from_shape;    // to (u, v, depth) of the shadow map
 uniform mat3 shadow_normal;        // inverse transpose of its linear part
 out vec3 v_shadow;
 flat out vec2 v_slope;
+flat out vec2 v_aside;
 #endif
 #if FEW_TRIANGLES
 flat out vec3 v_up;
@@ -30,13 +34,14 @@ void pass_light() {
     // A face's plane n . p = d is one in the map too, where depth falls off by n_xy / n_z.
     vec3 n = shadow_normal * face_plane.xyz;
     v_slope = abs(n.z) > 1e-6 * length(n) ? clamp(-n.xy / n.z, -40.0, 40.0) : vec2(0.0);
+    v_aside = ASIDE_M * (mat3(level_from_shape) * face_plane.xyz).xy;
 #endif
 #if FEW_TRIANGLES
     v_up = up;
     v_below = below;
 #endif
 }
-"""
+""".replace("ASIDE_M", str(ASIDE_M))
 
 LIT_FRAGMENT = """
 in vec3 v_level;
@@ -54,6 +59,7 @@ uniform sampler2D level_map;
 #if !GROUND
 in vec3 v_shadow;
 flat in vec2 v_slope;
+flat in vec2 v_aside;
 uniform sampler2DShadow shadow_map;
 uniform vec3 softness;             // radius of the filter in the shadow map; what its depths are off by; its pixel
 const vec2 RING[4] = vec2[4](vec2(0.92, 0.38), vec2(-0.38, 0.92), vec2(-0.92, -0.38), vec2(0.38, -0.92));
@@ -82,12 +88,14 @@ vec3 compress(vec3 c) {
 
 // Lambert, GGX's lobe as in the flat tier with Schlick's Fresnel, and a sky over a ground (hemispherical ambient).
 vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float roughness) {
-    vec4 level = textureLod(level_map, v_level.xy, 0.0);
 #if GROUND
+    vec4 level = textureLod(level_map, v_level.xy, 0.0);
     float open = level.r, lit = level.a;
 #else
-    float rise = v_level.z / max(level.b, 0.004);
-    float open = v_level.z < -0.01 ? 1.0 : mix(level.r, level.g, clamp(rise, 0.0, 1.0));
+    // A wall asks in front of itself, where the map does not jump; the higher above what lies there, the more is open.
+    vec4 level = textureLod(level_map, v_level.xy + v_aside, 0.0);
+    float open = mix(level.r, level.g, clamp(v_level.z / max(level.b, 0.004), 0.0, 1.0));
+    open = v_level.z < -0.01 ? 1.0 : mix(open, 1.0, clamp(2.5 * (v_level.z - level.b), 0.0, 1.0));
     float lit = key_share(level.a);
 #endif
     vec3 diffuse = albedo * (1.0 - metallic);
