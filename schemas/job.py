@@ -299,10 +299,10 @@ class Render(Frozen):
 
     tier: Tier = "raster"
     """raster: textured floors, a key light with soft shadows, contact shadows, transparent texels cut out, smooth edges;
-    flat: albedo and light from two directions, in half the time. Depth and masks are the same in both."""
+    flat: albedo and light from two directions, in less than half the time. Depth and masks are the same in both."""
     samples: Literal[1, 4] = 1
     """Of colour in a pixel that shows an edge, for tier raster: 1 smooths edges by their neighbours, 4 draws them at three
-    more points, for more than the price of another image. Labels are the pixel centre's either way."""
+    more points, which takes twice as long. Labels are the pixel centre's either way."""
 
 
 class Check(Frozen):

@@ -158,7 +158,7 @@ def level_of(vertices: Array) -> float:
     return float(vertices[:, 2].min())
 
 
-def soft_radius(light: Box) -> tuple[float, float]:
-    """(radius of the filter, bias) in units of the light's box."""
+def soft_radius(light: Box) -> tuple[float, float, float]:
+    """(radius of the filter, bias, side of a pixel of the shadow map) in units of the light's box."""
     size = light.bounds[1] - light.bounds[0]
-    return SOFT_M / float(math.sqrt(size[0] * size[1])), BIAS_M / float(size[2])
+    return SOFT_M / float(math.sqrt(size[0] * size[1])), BIAS_M / float(size[2]), 1.0 / SHADOW_PX

@@ -16,6 +16,9 @@ that of coplanar faces the lowest region id wins, whatever their triangles.
 
 **Rows.** Row 0 of the framebuffer is the image's top row: y runs down in clip space, nothing is flipped, and window
 coordinates are image coordinates with pixel centres at +0.5. Both sides of every face are drawn.
+
+**Tiers.** `raster` shades the same fragments by lighting.py; what it does to colour afterwards (smoothing.py, and
+transparent texels cut out) leaves depth and region alone: to labels every face is solid.
 """
 
 from collections.abc import Sequence
@@ -183,6 +186,8 @@ class Renderer:
                 stand_back = STAND_BACK * ranks[thing.region_id]
                 program.set_thing(view.T_cam_world @ thing.T_world_shape, thing.region_id, stand_back)
                 self._draw_batch(batch)
+        if view.raster:
+            self._lit().release()
 
     def _refine(self, drawn: GBuffer, things: Sequence[Placed], view: ViewOf, samples: int) -> GBuffer:
         """The same with holes cut out of colour and its edges made smooth."""

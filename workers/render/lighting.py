@@ -7,15 +7,21 @@ one for what objects stand on (how open the sky is, and on the floor the shadow)
 KNEE = 0.8
 """Up to this much light the picture is proportional to it; above, it bends towards 1 and never reaches it."""
 
+ASIDE_M = 0.014
+"""How far in front of a wall its surroundings are looked up: somewhat more than a pixel of the heights' grid."""
+
 LIT_VERTEX = """
 uniform mat4 level_from_shape;     // to (u, v, height above the level in units of its map)
-uniform mat4 shadow_from_shape;    // to (u, v, depth) of the shadow map
 uniform vec3 up;                   // the world's, in the optical frame
 uniform vec3 below;
 out vec3 v_level;
+#if !GROUND
+uniform mat4 shadow_from_shape;    // to (u, v, depth) of the shadow map
+uniform mat3 shadow_normal;        // inverse transpose of its linear part
 out vec3 v_shadow;
 flat out vec2 v_slope;
-
+flat out vec2 v_aside;
+#endif
 #if FEW_TRIANGLES
 flat out vec3 v_up;
 flat out vec3 v_below;
@@ -23,21 +29,22 @@ flat out vec3 v_below;
 
 void pass_light() {
     v_level = (level_from_shape * vec4(position, 1.0)).xyz;
+#if !GROUND
     v_shadow = (shadow_from_shape * vec4(position, 1.0)).xyz;
-    // A plane n . p = d stays one in the map: its normal there is the inverse transpose's, and depth's slope -n_xy / n_z.
-    vec3 n = transpose(inverse(mat3(shadow_from_shape))) * face_plane.xyz;
-    v_slope = abs(n.z) > 1e-6 * length(n) ? clamp(-n.xy / n.z, -8.0, 8.0) : vec2(0.0);
+    // A face's plane n . p = d is one in the map too, where depth falls off by n_xy / n_z.
+    vec3 n = shadow_normal * face_plane.xyz;
+    v_slope = abs(n.z) > 1e-6 * length(n) ? clamp(-n.xy / n.z, -40.0, 40.0) : vec2(0.0);
+    v_aside = ASIDE_M * (mat3(level_from_shape) * face_plane.xyz).xy;
+#endif
 #if FEW_TRIANGLES
     v_up = up;
     v_below = below;
 #endif
 }
-"""
+""".replace("ASIDE_M", str(ASIDE_M))
 
 LIT_FRAGMENT = """
 in vec3 v_level;
-in vec3 v_shadow;
-flat in vec2 v_slope;
 #if FEW_TRIANGLES
 flat in vec3 v_up;
 flat in vec3 v_below;
@@ -48,10 +55,13 @@ uniform vec3 below;
 #define v_below below
 #endif
 uniform sampler2D level_map;
-uniform sampler2DShadow shadow_map;
-uniform vec2 softness;             // radius of the filter in the shadow map; what its depths are off by
 
 #if !GROUND
+in vec3 v_shadow;
+flat in vec2 v_slope;
+flat in vec2 v_aside;
+uniform sampler2DShadow shadow_map;
+uniform vec3 softness;             // radius of the filter in the shadow map; what its depths are off by; its pixel
 const vec2 RING[4] = vec2[4](vec2(0.92, 0.38), vec2(-0.38, 0.92), vec2(-0.92, -0.38), vec2(0.38, -0.92));
 
 // How much of the key light arrives. On the level it is in the map; elsewhere each tap compares with the face's own
@@ -59,10 +69,12 @@ const vec2 RING[4] = vec2[4](vec2(0.92, 0.38), vec2(-0.38, 0.92), vec2(-0.92, -0
 float key_share(float on_map) {
     bool on_level = abs(v_level.z) < 0.01, inside = all(lessThan(abs(v_level.xy - 0.5), vec2(0.5)));
     int taps = on_level ? (inside ? 0 : 1) : 4;
+    // The map's pixels hold the depth of their centres, up to a pixel away from where they are compared.
+    float depth = v_shadow.z - softness.y - dot(abs(v_slope), vec2(softness.z));
     float sum = 0.0;
     for (int i = 0; i < taps; ++i) {
         vec2 d = RING[i] * softness.x;
-        sum += textureLod(shadow_map, vec3(v_shadow.xy + d, min(v_shadow.z + dot(v_slope, d) - softness.y, 1.0)), 0.0);
+        sum += textureLod(shadow_map, vec3(v_shadow.xy + d, min(depth + dot(v_slope, d), 1.0)), 0.0);
     }
     return taps == 0 ? on_map : sum / float(taps);
 }
@@ -76,12 +88,14 @@ vec3 compress(vec3 c) {
 
 // Lambert, GGX's lobe as in the flat tier with Schlick's Fresnel, and a sky over a ground (hemispherical ambient).
 vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float roughness) {
-    vec4 level = textureLod(level_map, v_level.xy, 0.0);
 #if GROUND
+    vec4 level = textureLod(level_map, v_level.xy, 0.0);
     float open = level.r, lit = level.a;
 #else
-    float rise = v_level.z / max(level.b, 0.004);
-    float open = v_level.z < -0.01 ? 1.0 : mix(level.r, level.g, clamp(rise, 0.0, 1.0));
+    // A wall asks in front of itself, where the map does not jump; the higher above what lies there, the more is open.
+    vec4 level = textureLod(level_map, v_level.xy + v_aside, 0.0);
+    float open = mix(level.r, level.g, clamp(v_level.z / max(level.b, 0.004), 0.0, 1.0));
+    open = v_level.z < -0.01 ? 1.0 : mix(open, 1.0, clamp(2.5 * (v_level.z - level.b), 0.0, 1.0));
     float lit = key_share(level.a);
 #endif
     vec3 diffuse = albedo * (1.0 - metallic);

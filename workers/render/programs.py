@@ -51,12 +51,14 @@ class Program:
         gl.glUniform1i(self._place("level_map"), 1)
         gl.glUniform1i(self._place("shadow_map"), 2)
 
-    def set_maps(self, level_from_shape: Pose, shadow_from_shape: Pose, softness: tuple[float, float]) -> None:
+    def set_maps(self, level_from_shape: Pose, shadow_from_shape: Pose, softness: tuple[float, float, float]) -> None:
         """Where a thing lies in the maps of the raster tier."""
         gl = self._gl
         gl.glUniformMatrix4fv(self._place("level_from_shape"), 1, True, level_from_shape.astype(np.float32))
         gl.glUniformMatrix4fv(self._place("shadow_from_shape"), 1, True, shadow_from_shape.astype(np.float32))
-        gl.glUniform2f(self._place("softness"), *softness)
+        normal = np.linalg.pinv(shadow_from_shape[:3, :3]).T.astype(np.float32)
+        gl.glUniformMatrix3fv(self._place("shadow_normal"), 1, True, normal)
+        gl.glUniform3f(self._place("softness"), *softness)
 
     def set_cast(self, clip_from_shape: Pose) -> None:
         """Where a thing lies in an orthographic view."""

@@ -40,6 +40,7 @@ class SceneLight:
         self._shadow = self._depth_texture()
         self._floor, self._stand, self._open = (self._color_texture() for _ in range(3))
         self._upload(self._open, np.full((1, 1, 4), (255, 255, 0, 255), np.uint8))
+        self._quick = self._floor_sampler()
         self._framebuffer = int(gl.glGenFramebuffers(1))
         gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self._framebuffer)
         gl.glFramebufferTexture2D(gl.GL_FRAMEBUFFER, gl.GL_DEPTH_ATTACHMENT, gl.GL_TEXTURE_2D, self._shadow, 0)
@@ -69,17 +70,23 @@ class SceneLight:
             gl.glActiveTexture(gl.GL_TEXTURE0 + unit)
             gl.glBindTexture(gl.GL_TEXTURE_2D, name)
         gl.glActiveTexture(gl.GL_TEXTURE0)
+        gl.glBindSampler(0, self._quick if ground else 0)
         flat = np.zeros((4, 4))
         program.set_maps(
             flat if level is None else level.unit_from_world @ thing.T_world_shape,
             np.diag([0.0, 0.0, 0.0, 1.0]) if baked.light is None else baked.light.unit_from_world @ thing.T_world_shape,
-            (0.0, 1.0) if baked.light is None else baking.soft_radius(baked.light),
+            (0.0, 1.0, 0.0) if baked.light is None else baking.soft_radius(baked.light),
         )
+
+    def release(self) -> None:
+        """Leave the albedo's texture unit as the flat tier wants it."""
+        self._gl.glBindSampler(0, 0)
 
     def free(self) -> None:
         """Give the GPU's memory back."""
         self._gl.glDeleteFramebuffers(1, [self._framebuffer])
         self._gl.glDeleteTextures(4, [self._shadow, self._floor, self._stand, self._open])
+        self._gl.glDeleteSamplers(1, [self._quick])
         self._program.free()
 
     def _bake(self, things: Sequence[Placed], appearance: Appearance) -> Baked:
@@ -128,6 +135,14 @@ class SceneLight:
         depth = np.empty((size, size), np.float32)
         gl.glReadPixels(0, 0, size, size, gl.GL_DEPTH_COMPONENT, gl.GL_FLOAT, depth)
         return depth
+
+    def _floor_sampler(self) -> int:
+        """Reads one level of a texture at a time: on a floor that fills the image the second costs 2 ms."""
+        gl = self._gl
+        name = int(np.ravel(gl.glGenSamplers(1))[0])
+        gl.glSamplerParameteri(name, gl.GL_TEXTURE_MIN_FILTER, gl.GL_LINEAR_MIPMAP_NEAREST)
+        gl.glSamplerParameteri(name, gl.GL_TEXTURE_MAG_FILTER, gl.GL_LINEAR)
+        return name
 
     def _depth_texture(self) -> int:
         gl = self._gl

@@ -56,9 +56,9 @@ def _tiles(rng: np.random.Generator) -> tuple[Array, float]:
 
 def _concrete(rng: np.random.Generator) -> tuple[Array, float]:
     """Blotches of several sizes and fine grit."""
-    blotch = _noise(rng, 4, 4) * 0.06 + _noise(rng, 12, 12) * 0.05 + _noise(rng, 64, 64) * 0.03
+    blotch = _noise(rng, 4, 4) * 0.03 + _noise(rng, 12, 12) * 0.03 + _noise(rng, 64, 64) * 0.03
     grey = rng.uniform(0.4, 0.7) * np.array([1.0, 1.0, 1.0]) + rng.uniform(-0.03, 0.03) * np.array([1.0, 0.0, -1.0])
-    return grey * (1.0 + blotch + _noise(rng, 256, 256) * 0.02)[..., None], 0.9
+    return grey * (1.0 + blotch + _noise(rng, 256, 256) * 0.04)[..., None], 0.9
 
 
 def _carpet(rng: np.random.Generator) -> tuple[Array, float]:
