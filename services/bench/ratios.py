@@ -64,11 +64,14 @@ def slope_ratio(slow: Sequence[Lap], fast: Sequence[Lap], slope: Slope = by_cloc
     return Spread.of([slope(a) / slope(b) for a, b in zip(slow, fast, strict=True)])
 
 
-def stage_table(laps: Sequence[Lap]) -> dict[str, float]:
-    """Milliseconds per scene by stage, median over laps, in the order in which stages first came; `rest` is the remainder."""
+def stage_table(laps: Sequence[Lap], middle: Callable[[list[float]], float] = median) -> dict[str, float]:
+    """Milliseconds per scene by stage, the median over laps; `rest` is the remainder.
+
+    With `middle=mean` a stage that few scenes have, such as casting rays, shows what it costs all of them.
+    """
     names = list(dict.fromkeys(name for lap in laps for name in lap.stages_s))
-    table = {name: median(lap.stages_s.get(name, 0.0) / lap.scenes * 1e3 for lap in laps) for name in names}
-    table["rest"] = median((lap.wall_s - sum(lap.stages_s.values())) / lap.scenes * 1e3 for lap in laps)
+    table = {name: middle([lap.stages_s.get(name, 0.0) / lap.scenes * 1e3 for lap in laps]) for name in names}
+    table["rest"] = middle([(lap.wall_s - sum(lap.stages_s.values())) / lap.scenes * 1e3 for lap in laps])
     return table
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from statistics import median
+from statistics import mean, median
 from typing import Any
 
 from services.bench.measure import Measured
@@ -36,6 +36,7 @@ def _side(laps: Sequence[Lap]) -> dict[str, Any]:
         "ms_per_scene": median(lap.slope_s for lap in laps) * 1e3,
         "cpu_ms_per_scene": median(by_processor(lap) for lap in laps) * 1e3,
         "stages_ms": stage_table(laps),
+        "stages_mean_ms": stage_table(laps, mean),
     }
 
 
@@ -72,7 +73,8 @@ def _table(what: str, side: dict[str, Any]) -> list[str]:
     total = side["ms_per_scene"]
     head = f"{what:28} {total:8.1f} ms a scene, {1e3 / total:.2f} scenes/s ({side['cpu_ms_per_scene']:.1f} ms of processor)"
     stages = sorted(side["stages_ms"].items(), key=lambda stage: (stage[0] == "rest", -stage[1]))
-    return [head, *(f"  {name:26} {ms:8.2f} ms {ms / total:6.1%}" for name, ms in stages)]
+    means = side["stages_mean_ms"]
+    return [head, *(f"  {name:26} {ms:8.2f} ms {ms / total:6.1%}, mean {means[name]:.2f} ms" for name, ms in stages)]
 
 
 def _spread(spread: dict[str, float]) -> str:

@@ -1,5 +1,7 @@
 """The arithmetic of a benchmark, on times that were made up."""
 
+from statistics import fmean
+
 import pytest
 
 from services.bench.ratios import (
@@ -30,6 +32,7 @@ def test_a_round_without_its_partner_is_refused():
 def test_stages_are_per_scene_and_what_is_left_is_shown():
     laps = [Lap(2, 1.0, 1.0, {"render": 0.5, "write": 0.25}), Lap(4, 2.0, 2.0, {"render": 1.0})]
     assert stage_table(laps) == {"render": 250.0, "write": 62.5, "rest": 187.5}
+    assert stage_table([*laps, Lap(1, 1.0, 1.0, {"rays": 0.75})], fmean)["rays"] == 250.0
 
 
 def test_idle_share_is_what_no_shard_used():
