@@ -26,6 +26,9 @@ Content = Literal[
     "RGB", "depth", "segment", "RGBaligned", "depthAligned", "segmentAligned", "RGBprojected", "depthProjected"
 ]
 
+PixelKind = Literal["rgb", "depth", "region"]
+"""Which of a view's arrays an image shows."""
+
 
 @dataclass(frozen=True)
 class Image:
@@ -33,7 +36,7 @@ class Image:
 
     content: Content
     role: Role
-    pixels: Literal["rgb", "depth", "region"]
+    pixels: PixelKind
 
 
 IMAGES: tuple[Image, ...] = (

@@ -66,12 +66,17 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """What only RGB depends on: `ambient` linear RGB radiance, lights, and the floor's colour (in its `Placed` shape)."""
+    """What only RGB depends on, beside the floor's surface, which is in its `Placed` shape; linear RGB radiance.
+
+    `ambient` comes from everywhere in the flat tier, from above in the raster tier, where `below` comes from below. The
+    first light is the key light: in the raster tier it throws shadows.
+    """
 
     ambient: tuple[float, float, float]
     lights: tuple[Light, ...]
     background: tuple[float, float, float]
     """Linear RGB where nothing is hit."""
+    below: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

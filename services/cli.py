@@ -52,6 +52,7 @@ def build_parser() -> argparse.ArgumentParser:
         commands, "test", "lint, types, layer rules and tests", "verso test tests/hard_cases --figures f.json"
     )
     test.add_argument("anything", nargs="*")
+    _add_bench(commands)
     doctor = _command(commands, "doctor", "what this machine has, and what is missing", "verso doctor")
     doctor.set_defaults(handler="services.doctor:main")
     return parser
@@ -141,6 +142,29 @@ def _add_scene_commands(commands: "argparse._SubParsersAction") -> None:
     scene.add_argument("scene", type=_index, metavar="SCENE")
     scene.add_argument("--glb", type=Path, required=True, metavar="FILE")
     scene.set_defaults(handler="services.commands:scene")
+
+
+def _add_bench(commands: "argparse._SubParsersAction") -> None:
+    bench = _command(
+        commands,
+        "bench",
+        "time by stage on one core, beside the script that people write today and the least that is possible",
+        "verso bench deploy/jobs/tabletop.yaml --scenes 64 --memory 2000 --workers 2",
+    )
+    bench.add_argument("job", type=Path, metavar="JOB.yaml", nargs="?", help="default: a job of built-in shapes")
+    bench.add_argument("--scenes", type=_count, metavar="N", default=48, help="how many scenes each side makes")
+    bench.add_argument(
+        "--folder", type=Path, metavar="DIR", default=Path("data"), help="on the disk to measure (default: data)"
+    )
+    bench.add_argument("--memory", type=_count, metavar="N", help="also watch one worker's memory over N scenes")
+    bench.add_argument("--workers", type=_count, metavar="N", help="also compare N workers with one, through Ray")
+    bench.add_argument(
+        "--scaling-scenes", type=_count, metavar="N", default=512, help="how many scenes that comparison makes"
+    )
+    bench.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes", help="change a key of the job"
+    )
+    bench.set_defaults(handler="services.bench.command:main")
 
 
 def _count(text: str) -> int:

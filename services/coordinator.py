@@ -143,7 +143,7 @@ class _Drive:
 
     def _collect(self, ref: "ray.ObjectRef", spans: tuple[Span, ...]) -> None:
         try:
-            self._tally.add(ray.get(ref))
+            report: ShardReport = ray.get(ref)
         except RayTaskError as error:
             if isinstance(error.cause, VersoError):
                 raise error.cause from error
@@ -151,6 +151,11 @@ class _Drive:
         except RayError as error:
             self._lose(spans, error)
             return
+        self._tally.add(report)
+        for span in report.spans:
+            log_event(
+                "range committed", range=span.start, stop=span.stop, won=span.won, made=span.made, failed=span.failed
+            )
         if self._tally.conflicts:
             raise CommitConflict(self._tally.conflicts[0])
         if self._tally.failed.total() > self._limits.failures:

@@ -1,6 +1,7 @@
 """What is written of a scene: encoded files, and one row or more in each manifest table. Pure."""
 
 import hashlib
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,7 @@ from schemas.base import Pose
 from schemas.camera import Camera
 from schemas.errors import SceneError
 from schemas.job import Job, Patch
-from schemas.layout import IMAGES, asset_path, file_pose_id, image_path, patch_path
+from schemas.layout import IMAGES, PixelKind, asset_path, file_pose_id, image_path, patch_path
 from schemas.scene import REGION_FIRST_OBJECT, ObjectLabel, Pair, SceneOutput, View
 from schemas.shape import Asset
 from workers.assets.catalogue import split_of
@@ -51,26 +52,31 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
 
 def encode_view(view: View, pair: Pair, job: Job) -> Files:
     """The view's images and their patches as PNG, by path."""
-    category = pair.input.labels[-1].category
     files: Files = []
+    for path, kind, box in image_boxes(view, pair, job):
+        pixels = _pixels(view, kind)
+        part = pixels if box is None else np.ascontiguousarray(pixels[box])
+        files.append((path, encode_png(part, job.images.png_level)))
+    return files
+
+
+def image_boxes(view: View, pair: Pair, job: Job) -> Iterator[tuple[str, PixelKind, tuple[slice, slice] | None]]:
+    """Path, kind of pixels and crop (rows, columns; None for all) of each image of the view and of its patches."""
+    category = pair.input.labels[-1].category
+    number = file_pose_id(view.role, view.parent_id)
+    objects = _object_labels(view, pair)
     for image in IMAGES:
         if image.role != view.role:
             continue
-        pixels = _pixels(view, image.pixels)
-        number = file_pose_id(view.role, view.parent_id)
-        level = job.images.png_level
-        files.append((image_path(category, image.content, number), encode_png(pixels, level)))
-        objects = _object_labels(view, pair)
+        yield image_path(category, image.content, number), image.pixels, None
         for label in objects:
             box = crop_box(label, view.camera, job.images.patch)
             if box is not None:
                 index = None if len(objects) == 1 else label.region_id - REGION_FIRST_OBJECT
-                patch = np.ascontiguousarray(pixels[box])
-                files.append((patch_path(category, image.content, number, index), encode_png(patch, level)))
-    return files
+                yield patch_path(category, image.content, number, index), image.pixels, box
 
 
-def _pixels(view: View, kind: str) -> NDArray:
+def _pixels(view: View, kind: PixelKind) -> NDArray:
     images: dict[str, NDArray | None] = {"rgb": view.rgb, "depth": view.depth, "region": view.region}
     pixels = images[kind]
     assert pixels is not None

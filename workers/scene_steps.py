@@ -1,5 +1,6 @@
 """One scene from its id to what is written: the list of steps, readable in one glance."""
 
+import dataclasses
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,7 +27,7 @@ from workers.scene.check import check_against_rays, check_pair, is_raycast_scene
 from workers.scene.derive import agree_across, derive_projected, label_region, projection_shares
 from workers.scene.plan import choose_category, plan_scene
 from workers.scene.randomness import Stream, stream
-from workers.scene.settle import settle
+from workers.scene.settle import recheck, settle
 from workers.scene.views import (
     front_distance,
     place_aligned_camera,
@@ -70,10 +71,13 @@ def make_scene(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Scene
     job = context.job
     with watch.stage("assets"):
         plan = plan_with_assets(context, scene_id)
+    checked = is_raycast_scene(job, scene_id)
     with watch.stage("physics"):
         settled = settle_objects(context, plan)
+    if checked:
+        with watch.stage("recheck"):
+            settled = recheck_objects(context, plan, settled)
     posed = pose_scene(plan, settled)
-    checked = is_raycast_scene(job, scene_id)
     pairs = tuple(
         make_pair(SceneView(context, plan, posed, checked, watch), camera, number)
         for number, camera in enumerate(plan.input_cameras)
@@ -96,6 +100,15 @@ def plan_with_assets(context: WorkerContext, scene_id: int) -> ScenePlan:
 def settle_objects(context: WorkerContext, plan: ScenePlan) -> tuple[Settled, ...]:
     """Every object at rest."""
     return tuple(settle(start, plan.table, context.job.physics) for start in plan.objects)
+
+
+def recheck_objects(context: WorkerContext, plan: ScenePlan, settled: tuple[Settled, ...]) -> tuple[Settled, ...]:
+    """Every object released again where it rests, with how far it moved."""
+    physics = context.job.physics
+    return tuple(
+        dataclasses.replace(rest, recheck_move_mm=recheck(start, rest, plan.table, physics))
+        for start, rest in zip(plan.objects, settled, strict=True)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +162,7 @@ def render_view(scene: SceneView, role: str, ids: tuple[int, int], camera: Camer
     """One rendered view: exact images in their stored encodings, and labels of the table and of every object."""
     job, renderer = scene.context.job, scene.context.renderer
     with scene.watch.stage("render"):
-        buffer = renderer.draw(scene.posed.things, scene.posed.appearance, camera)
+        buffer = renderer.draw(scene.posed.things, scene.posed.appearance, camera, job.render)
     if scene.raycast_checked:
         with scene.watch.stage("raycast"):
             check_against_rays(scene.posed, camera, buffer, job.images.depth_range_m)

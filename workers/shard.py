@@ -18,6 +18,7 @@ from schemas.job import Job
 from schemas.layout import FINGERPRINT_FILE, staging_path
 from schemas.report import Blame, ShardOrder, ShardReport, SpanReport
 from schemas.scene import SceneOutput
+from workers.allocator import keep_freed_memory
 from workers.assets.catalogue import Catalogue
 from workers.context import WorkerContext, settings_digest
 from workers.fingerprint import take_fingerprint
@@ -44,6 +45,7 @@ class BlamedScene(SceneError):
 def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
     """Make and commit every range of the order. What a scene cannot be is a row; anything else propagates."""
     begun = time.perf_counter()
+    keep_freed_memory()
     context = WorkerContext(order.job, catalogue, shared_renderer(), settings_digest(order.job, catalogue.digest))
     fingerprint = _fingerprint()
     store = open_store(order.out)

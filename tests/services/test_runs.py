@@ -131,6 +131,13 @@ def test_the_finished_folder_holds_what_was_promised(made):
     assert (out / "DATASET.md").read_text().count(digest) == 1
     scenes = pyarrow.dataset.dataset(out / "manifest" / "scenes", partitioning="hive").to_table().to_pylist()
     assert sorted(row["scene_id"] for row in scenes) == list(range(24))
+    checked = [row for row in scenes if row["raycast_checked"]]
+    assert 0 < len(checked) < 24
+    assert all(0 < row["recheck_move_mm"] < 0.3 for row in checked)
+    assert all(row["recheck_move_mm"] is None for row in scenes if not row["raycast_checked"])
+    assert max(row["penetration_mm"] for row in scenes) < 1e-6
+    assert max(row["hover_gap_mm"] for row in scenes) < 1e-6
+    assert min(row["support_margin_mm"] for row in scenes) > 0
     assert not list((out / "_staging").glob("*/*"))
 
 

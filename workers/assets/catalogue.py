@@ -19,6 +19,8 @@ from workers.assets.urdf import list_folder, load_folder_entry, locate_folder
 
 AnySource = ProceduralSource | ShapeNetSource | FolderSource
 
+SELDOM_AGAIN = 10_000
+"""Of more instances than this hardly one comes again: keeping them fills a worker's memory and saves nothing."""
 CACHE_BYTES = 256 * 1024 * 1024
 """How much memory the assets that a process keeps at hand may take."""
 PROBES = 3
@@ -214,6 +216,9 @@ def _source(catalogue: Catalogue, number: int, category: str) -> tuple[AnySource
 
 def load_asset(catalogue: Catalogue, ref: InstanceRef) -> Asset:
     """The asset, from this process's cache if it is there; MeshError where its mesh is refused."""
+    settings, _ = _source(catalogue, ref.source, ref.category)
+    if isinstance(settings, ProceduralSource) and settings.instances > SELDOM_AGAIN:
+        return _load(catalogue, ref)
     return _cache.get((catalogue.digest, ref), lambda: _load(catalogue, ref))
 
 

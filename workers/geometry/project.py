@@ -10,6 +10,9 @@ from schemas.camera import Camera, Intrinsics
 from workers.geometry.camera import unproject
 from workers.geometry.frames import invert, transform
 
+ROWS = 32
+"""Rows of an image that are worked on at once, so that what is in between stays in the processor's cache."""
+
 
 @dataclass(frozen=True, eq=False)
 class Projected:
@@ -42,11 +45,12 @@ def forward_project(depth_m: Array, source: Camera, target: Camera, splat: int =
     """
     height, width = target.intrinsics.height, target.intrinsics.width
     reach = splat // 2
-    u, v, z_all = _dense_image_of(depth_m, source, target)
-    near = (z_all > 0.0) & (u >= -reach) & (u < width + reach) & (v >= -reach) & (v < height + reach)
-    index = np.flatnonzero(near & (depth_m > 0.0))
-    z = z_all.ravel()[index]
-    column, row = np.floor(u.ravel()[index]).astype(np.int64), np.floor(v.ravel()[index]).astype(np.int64)
+    T = invert(target.T_world_cam) @ source.T_world_cam
+    strips = [
+        _carry_strip(depth_m[first : first + ROWS], first, (source.intrinsics, target.intrinsics, T), reach)
+        for first in range(0, len(depth_m), ROWS)
+    ]
+    column, row, z, index = (np.concatenate(part) for part in zip(*strips, strict=True))
     if reach:
         dy, dx = (d.ravel() for d in np.mgrid[-reach : reach + 1, -reach : reach + 1])
         column, row = (column[:, None] + dx).ravel(), (row[:, None] + dy).ravel()
@@ -56,19 +60,24 @@ def forward_project(depth_m: Array, source: Camera, target: Camera, splat: int =
     return _nearest(row * width + column, z, index, (height, width))
 
 
-def _dense_image_of(depth_m: Array, source: Camera, target: Camera) -> tuple[Array, Array, Array]:
-    """(u, v, z), each [H, W] float64: where each pixel's point lies in the target, also where there is no point.
+def _carry_strip(
+    depth_m: Array, first: int, cameras: tuple[Intrinsics, Intrinsics, Array], reach: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, NDArray[np.int64]]:
+    """(column, row, z, source index), each [N], of the points of some rows from `first` on that fall near the target.
 
-    The same sums as `cloud_in_camera`, in the same order, over whole images: gathering the points first costs three
-    times as much as the arithmetic on the pixels that have none.
+    `cameras`: source, target, and T_target_source. The same sums as `cloud_in_camera`, in the same order, over all
+    pixels of the rows: gathering the points first costs three times as much as the arithmetic on those that have none.
     """
-    T = invert(target.T_world_cam) @ source.T_world_cam
-    k, m = source.intrinsics, target.intrinsics
+    k, m, T = cameras
     x = (np.arange(k.width) + 0.5 - k.cx) / k.fx * depth_m
-    y = ((np.arange(k.height) + 0.5 - k.cy) / k.fy)[:, None] * depth_m
+    y = ((np.arange(first, first + len(depth_m)) + 0.5 - k.cy) / k.fy)[:, None] * depth_m
     X, Y, Z = (T[i, 0] * x + T[i, 1] * y + T[i, 2] * depth_m + T[i, 3] for i in range(3))
     ahead = np.where(Z > 0.0, Z, 1.0)
-    return m.fx * X / ahead + m.cx, m.fy * Y / ahead + m.cy, Z
+    u, v = m.fx * X / ahead + m.cx, m.fy * Y / ahead + m.cy
+    near = (Z > 0.0) & (u >= -reach) & (u < m.width + reach) & (v >= -reach) & (v < m.height + reach)
+    index = np.flatnonzero(near & (depth_m > 0.0))
+    column, row = (np.floor(c.ravel()[index]).astype(np.int64) for c in (u, v))
+    return column, row, Z.ravel()[index], index + first * k.width
 
 
 def _nearest(pixel: NDArray[np.int64], z: Array, index: NDArray[np.int64], shape: tuple[int, int]) -> Projected:

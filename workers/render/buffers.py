@@ -38,6 +38,8 @@ class Uploaded:
     index_count: int
     matte: bool
     bytes: int
+    holes: bool = False
+    """Its texture has texels that are cut out of colour."""
 
     @property
     def few_triangles(self) -> bool:
@@ -183,7 +185,20 @@ def _upload(gl: ModuleType, batch: Batch) -> Uploaded:
     levels = () if batch.texture is None else mip_levels(batch.texture)
     texture = _upload_texture(gl, levels) if levels else None
     size = batch.vertices.nbytes + batch.indices.nbytes + sum(level.nbytes for level in levels)
-    return Uploaded(vertex_array, (vertex_buffer, index_buffer), texture, batch.indices.size, batch.matte, size)
+    return Uploaded(
+        vertex_array,
+        (vertex_buffer, index_buffer),
+        texture,
+        batch.indices.size,
+        batch.matte,
+        size,
+        has_holes(batch.texture),
+    )
+
+
+def has_holes(texture: NDArray[np.uint8] | None) -> bool:
+    """Whether a texture [h, w, 3 or 4] has texels that are more transparent than not."""
+    return texture is not None and texture.shape[2] == 4 and bool((texture[..., 3] < 128).any())
 
 
 def mip_levels(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:

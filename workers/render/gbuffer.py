@@ -16,27 +16,38 @@ that of coplanar faces the lowest region id wins, whatever their triangles.
 
 **Rows.** Row 0 of the framebuffer is the image's top row: y runs down in clip space, nothing is flipped, and window
 coordinates are image coordinates with pixel centres at +0.5. Both sides of every face are drawn.
+
+**Tiers.** `raster` shades the same fragments by lighting.py; what it does to colour afterwards (smoothing.py, and
+transparent texels cut out) leaves depth and region alone: to labels every face is solid.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.base import Pose
 from schemas.camera import Camera, Intrinsics
-from schemas.scene import Appearance, GBuffer, Placed
+from schemas.job import Render
+from schemas.scene import REGION_FLOOR, Appearance, GBuffer, Placed
 from workers.geometry.frames import invert
 from workers.render.batches import encode_srgb
 from workers.render.buffers import ShapeStore, TargetStore, Uploaded
+from workers.render.colour import ColourTarget
 from workers.render.context import open_context
 from workers.render.programs import Program, light_slots
+from workers.render.scenelight import SceneLight
 from workers.render.shaders import COUNT_FRAGMENT, COUNT_VERTEX, Variant, label_sources
+from workers.render.smoothing import OFFSETS_PX, blend, edges, smooth
 from workers.render.window import TILE_PX, tiles
 
 STAND_BACK = 2e-6
 """Share of its distance, along its normal, by which a face stands back for each lower region id in the scene: 5
 micrometres at 2.5 m. A quarter of it is the least that kept 400 pairs of coplanar squares apart."""
+
+FLAT = Render(tier="flat")
 
 _shared: "Renderer | None" = None
 
@@ -50,6 +61,20 @@ def shared_renderer() -> "Renderer":
     if _shared is None or _shared.closed:
         _shared = Renderer()
     return _shared
+
+
+@dataclass(frozen=True, eq=False)
+class ViewOf:
+    """What a pass over the things of a scene draws them with."""
+
+    appearance: Appearance
+    k: Intrinsics
+    T_cam_world: Pose
+    raster: bool
+
+    def moved(self, x: float, y: float) -> "ViewOf":
+        """The view that at a pixel's centre sees what this one sees (x, y) pixels beside it."""
+        return replace(self, k=self.k.model_copy(update={"cx": self.k.cx - x, "cy": self.k.cy - y}))
 
 
 class Renderer:
@@ -67,6 +92,8 @@ class Renderer:
         self._shapes = ShapeStore(gl)
         self._targets = TargetStore(gl)
         self._programs: dict[Variant, Program] = {}
+        self._scene_light: SceneLight | None = None
+        self._colour_target: ColourTarget | None = None
         self._rgba = np.empty((0, 0, 4), np.uint8)
         self._counter = Program(gl, COUNT_VERTEX, COUNT_FRAGMENT)
         for setting in (gl.GL_CULL_FACE, gl.GL_BLEND, gl.GL_DITHER, gl.GL_MULTISAMPLE):
@@ -75,32 +102,26 @@ class Renderer:
         gl.glProvokingVertex(gl.GL_LAST_VERTEX_CONVENTION)
         gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
 
-    def draw(self, things: Sequence[Placed], appearance: Appearance, camera: Camera) -> GBuffer:
+    def draw(self, things: Sequence[Placed], appearance: Appearance, camera: Camera, render: Render = FLAT) -> GBuffer:
         """What the camera sees at the centre of every pixel; region and depth are 0 where nothing is hit.
 
-        Faces nearer than 0.05 m along the optical axis are not seen. Raises ValueError above six lights.
+        Depth and region do not depend on `render`. Faces nearer than 0.05 m along the optical axis are not seen. Raises
+        ValueError above six lights.
         """
         self._platform.make_current()
+        raster = render.tier == "raster"
+        if raster:
+            self._lit().prepare(things, appearance)
+        view = ViewOf(appearance, camera.intrinsics, invert(camera.T_world_cam), raster)
         self._clear(camera.intrinsics, appearance)
-        T_cam_world = invert(camera.T_world_cam)
-        ranks = {region: rank for rank, region in enumerate(sorted({thing.region_id for thing in things}))}
-        lights = light_slots(appearance)
-        by_variant: dict[Variant, list[tuple[Placed, Uploaded]]] = {}
-        for thing in things:
-            for batch in self._shapes.fetch(thing.shape):
-                variant = Variant(batch.texture is not None, batch.few_triangles, batch.matte, lights)
-                by_variant.setdefault(variant, []).append((thing, batch))
-        for variant, draws in by_variant.items():
-            program = self._program(variant)
-            program.use()
-            program.set_view(camera.intrinsics)
-            program.set_light(appearance, T_cam_world)
-            for thing, batch in draws:
-                stand_back = STAND_BACK * ranks[thing.region_id]
-                program.set_thing(T_cam_world @ thing.T_world_shape, thing.region_id, stand_back)
-                self._draw_batch(batch)
+        self._draw_things(things, view, labels=True)
+        drawn = self._read(camera.intrinsics)
+        if raster:
+            drawn = self._refine(drawn, things, view, render.samples)
         self._shapes.trim(in_use=len(things))
-        return self._read(camera.intrinsics)
+        for image in (drawn.rgb, drawn.depth_m, drawn.region):
+            image.setflags(write=False)
+        return drawn
 
     def count_pixels(self, thing: Placed, camera: Camera) -> int:
         """Pixels that a thing alone would cover, also outside the image, with nothing in front of it.
@@ -135,10 +156,73 @@ class Renderer:
         self._platform.make_current()
         self._shapes.clear()
         self._targets.clear()
-        for program in (*self._programs.values(), self._counter):
-            program.free()
+        for held in (*self._programs.values(), self._counter, self._scene_light, self._colour_target):
+            if held is not None:
+                held.free()
         self._platform.delete_context()
         self.closed = True
+
+    def _draw_things(self, things: Sequence[Placed], view: ViewOf, labels: bool) -> None:
+        """Draw into what is bound; in colour alone nearer things first, so that what they hide is not shaded."""
+        ranks = {region: rank for rank, region in enumerate(sorted({thing.region_id for thing in things}))}
+        lights = light_slots(view.appearance)
+        by_variant: dict[Variant, list[tuple[Placed, Uploaded]]] = {}
+        for thing in things if labels else reversed(things):
+            ground = view.raster and thing.region_id == REGION_FLOOR
+            for batch in self._shapes.fetch(thing.shape):
+                looks = (batch.texture is not None, batch.few_triangles, batch.matte, lights)
+                variant = Variant(*looks, view.raster, ground, labels, batch.holes and not labels)
+                by_variant.setdefault(variant, []).append((thing, batch))
+        for variant, draws in by_variant.items():
+            program = self._program(variant)
+            program.use()
+            program.set_view(view.k)
+            program.set_light(view.appearance, view.T_cam_world)
+            if view.raster:
+                program.set_ambience(view.appearance, view.T_cam_world)
+            for thing, batch in draws:
+                if view.raster:
+                    self._lit().bind(program, thing)
+                stand_back = STAND_BACK * ranks[thing.region_id]
+                program.set_thing(view.T_cam_world @ thing.T_world_shape, thing.region_id, stand_back)
+                self._draw_batch(batch)
+        if view.raster:
+            self._lit().release()
+
+    def _refine(self, drawn: GBuffer, things: Sequence[Placed], view: ViewOf, samples: int) -> GBuffer:
+        """The same with holes cut out of colour and its edges made smooth."""
+        rgb = drawn.rgb
+        if any(batch.holes for thing in things for batch in self._shapes.fetch(thing.shape)):
+            rgb = cv2.cvtColor(self._draw_colour(things, view, None), cv2.COLOR_RGBA2RGB)  # type: ignore[assignment]
+            self._colour().release()
+        mask = edges(rgb, drawn.region)
+        if samples == 1:
+            smooth(rgb, mask)
+        else:
+            self._colour().select(mask, view.k)
+            moved = [self._draw_colour(things, view.moved(*offset), mask) for offset in OFFSETS_PX]
+            self._colour().release()
+            blend(rgb, moved, mask)
+        return GBuffer(rgb, drawn.depth_m, drawn.region)
+
+    def _draw_colour(self, things: Sequence[Placed], view: ViewOf, mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+        """[H, W, 4] uint8 sRGB; where there is a mask, it was selected before."""
+        target = self._colour()
+        if mask is None:
+            target.select(None, view.k)
+        target.clear(view.appearance)
+        self._draw_things(things, view, labels=False)
+        return target.read()
+
+    def _lit(self) -> SceneLight:
+        if self._scene_light is None:
+            self._scene_light = SceneLight(self._gl, self._shapes)
+        return self._scene_light
+
+    def _colour(self) -> ColourTarget:
+        if self._colour_target is None:
+            self._colour_target = ColourTarget(self._gl)
+        return self._colour_target
 
     def _clear(self, k: Intrinsics, appearance: Appearance) -> None:
         gl = self._gl
@@ -173,6 +257,4 @@ class Renderer:
         # OpenCV takes channels apart 20 times faster than a numpy slice is copied, and faster than GL_RGB is read.
         rgb: NDArray = cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB)
         region: NDArray = cv2.extractChannel(rgba, 3)
-        for image in (rgb, depth, region):
-            image.setflags(write=False)
         return GBuffer(rgb, depth, region)

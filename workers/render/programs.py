@@ -43,11 +43,33 @@ class Program:
         gl.glUniform3fv(self._place("light_towards"), count, towards)
         gl.glUniform3fv(self._place("light_color"), count, color)
 
+    def set_ambience(self, appearance: Appearance, T_cam_world: Pose) -> None:
+        """The world's up and the light from below, for the raster tier, and the units of its textures."""
+        gl = self._gl
+        gl.glUniform3f(self._place("up"), *T_cam_world[:3, 2])
+        gl.glUniform3f(self._place("below"), *appearance.below)
+        gl.glUniform1i(self._place("level_map"), 1)
+        gl.glUniform1i(self._place("shadow_map"), 2)
+
+    def set_maps(self, level_from_shape: Pose, shadow_from_shape: Pose, softness: tuple[float, float, float]) -> None:
+        """Where a thing lies in the maps of the raster tier."""
+        gl = self._gl
+        gl.glUniformMatrix4fv(self._place("level_from_shape"), 1, True, level_from_shape.astype(np.float32))
+        gl.glUniformMatrix4fv(self._place("shadow_from_shape"), 1, True, shadow_from_shape.astype(np.float32))
+        normal = np.linalg.pinv(shadow_from_shape[:3, :3]).T.astype(np.float32)
+        gl.glUniformMatrix3fv(self._place("shadow_normal"), 1, True, normal)
+        gl.glUniform3f(self._place("softness"), *softness)
+
+    def set_cast(self, clip_from_shape: Pose) -> None:
+        """Where a thing lies in an orthographic view."""
+        self._gl.glUniformMatrix4fv(self._place("clip_from_shape"), 1, True, clip_from_shape.astype(np.float32))
+
     def set_thing(self, T_cam_shape: Pose, region_id: int, stand_back: float) -> None:
         """Where a thing is, its region id, and the share of its distance by which it is pushed back in the test."""
         matrix = T_cam_shape.astype(np.float32)
         self._gl.glUniformMatrix4fv(self._place("cam_from_shape"), 1, True, matrix)
         self._gl.glUniform2f(self._place("thing"), region_id / 255.0, stand_back)
+        self._gl.glUniform1f(self._place("thing_apart"), 10.0 * stand_back * NEAR_M)
 
     def free(self) -> None:
         """Give the GPU's memory back."""

@@ -8,6 +8,8 @@ there are two variants of one text: flat inputs where triangles are few, uniform
 
 from typing import NamedTuple
 
+from workers.render.lighting import LIT_FRAGMENT, LIT_VERTEX
+
 MAX_LIGHTS = 6
 """What the 60 floats that OpenGL 4.1 promises between the two shaders have room for."""
 
@@ -19,6 +21,14 @@ class Variant(NamedTuple):
     few_triangles: bool
     matte: bool
     lights: int
+    raster: bool = False
+    """With shadows and occlusion (lighting.py)."""
+    ground: bool = False
+    """A floor, whose shadow lies in its level's map: for `raster` only."""
+    labels: bool = True
+    """False: colour alone, tested by the depth that the rasteriser interpolates, so that hidden fragments cost nothing."""
+    cutout: bool = False
+    """Its texture has holes. Apart from the rest, because a program that may discard is not spared hidden fragments."""
 
 
 _VERTEX = """
@@ -34,6 +44,9 @@ out vec4 v_normal_metallic;
 out vec4 v_albedo_roughness;
 out vec2 v_uv;
 flat out vec4 v_plane;
+#if !LABELS
+uniform float thing_apart;
+#endif
 
 #if FEW_TRIANGLES
 uniform vec4 view;
@@ -60,8 +73,15 @@ void pass_on() {
 void pass_on() {}
 #endif
 
+#if RASTER
+LIT_VERTEX
+#endif
+
 void main() {
     pass_on();
+#if RASTER
+    pass_light();
+#endif
     mat3 turn = mat3(cam_from_shape);
     vec3 shift = cam_from_shape[3].xyz;
     vec3 face_normal = turn * face_plane.xyz;
@@ -70,11 +90,15 @@ void main() {
     v_albedo_roughness = albedo_roughness;
     v_uv = uv;
     gl_Position = clip_from_cam * vec4(turn * position + shift, 1.0);
+#if !LABELS
+    gl_Position.z += thing_apart;
+#endif
 }
 """
 
 _FRAGMENT = """
 const float NEAR_M = 0.05;         // any length serves: it scales what the depth test compares
+const float HOLE = 0.5;          // texels more transparent than this are holes in colour, never in labels
 const float GRAZING = 0.01;        // cosine of incidence below which a face's plane says nothing about z
 
 in vec4 v_normal_metallic;
@@ -104,8 +128,13 @@ uniform vec3 light_color[LIGHTS];
 uniform sampler2D albedo_map;
 
 layout(location = 0) out vec4 out_color_region;
+#if LABELS
 layout(location = 1) out float out_z;
+#endif
 
+#if RASTER
+LIT_FRAGMENT
+#else
 // Radiance towards the eye: Lambert, and GGX's lobe (Walter et al. 2007) with its masking term taken as 1. The lobe is
 // written by the angle between the mirrored ray and the light, 1 - cos = 2 sin^2 of the half vector's, which saves the
 // half vectors. On a matte surface it is under 0.03 of the light, and is left out.
@@ -127,6 +156,7 @@ vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float rou
 #endif
     return sum;
 }
+#endif
 
 // The curve is within 0.1 of a step of 8 bits of 1.055 c^(1 / 2.4) - 0.055, and square roots cost a third of powers.
 vec3 encode_srgb(vec3 c) {
@@ -142,8 +172,10 @@ void main() {
     float across = dot(v_plane.xyz, ray);
     float cosine = abs(across) * per_length;
     float z = cosine > GRAZING ? v_plane.w / across : 1.0 / gl_FragCoord.w;
+#if LABELS
     out_z = z;
     gl_FragDepth = NEAR_M / (z * (1.0 + v_thing.y / max(cosine, GRAZING)));
+#endif
 
     vec3 face_normal = across > 0.0 ? -v_plane.xyz : v_plane.xyz;
     vec3 normal = v_normal_metallic.xyz;
@@ -152,9 +184,16 @@ void main() {
     normal = dot(normal, face_normal) < 0.0 ? -normal : normal;
     vec3 albedo = v_albedo_roughness.rgb;
 #if TEXTURED
-    albedo *= texture(albedo_map, v_uv).rgb;
+    vec4 texel = texture(albedo_map, v_uv);
+    albedo *= texel.rgb;
+#if CUTOUT && !LABELS
+    if (texel.a < HOLE) discard;
+#endif
 #endif
     vec3 light = shade(normal, -ray * per_length, albedo, v_normal_metallic.w, v_albedo_roughness.w);
+#if RASTER
+    light = compress(light);
+#endif
     out_color_region = vec4(encode_srgb(light), v_thing.x);
 }
 """
@@ -183,4 +222,5 @@ def label_sources(variant: Variant) -> tuple[str, str]:
     head = "#version 410 core\n" + "".join(
         f"#define {name.upper()} {int(v)}\n" for name, v in variant._asdict().items()
     )
-    return head + _VERTEX, head + _FRAGMENT
+    vertex, fragment = _VERTEX.replace("LIT_VERTEX", LIT_VERTEX), _FRAGMENT.replace("LIT_FRAGMENT", LIT_FRAGMENT)
+    return head + vertex, head + fragment

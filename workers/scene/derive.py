@@ -1,7 +1,9 @@
 """What follows from rendered views: the projected view, patches, labels, agreement. Pure."""
 
 from collections.abc import Callable
+from typing import cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,10 +42,18 @@ def derive_projected(
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
     """RGB [H, W, 3] uint8 and depth [H, W] uint16 of the stored input cloud seen from the mirror camera; holes 0."""
     projected = carry_depth(source, mirror, images)
-    rgb = np.zeros((*projected.depth_m.shape, 3), np.uint8)
-    filled = projected.source >= 0
-    rgb[filled] = colours_of(source, projected.source[filled], lens)
-    return rgb, quantise_depth(projected.depth_m, images)
+    if lens is not None:
+        rgb = np.zeros((*projected.depth_m.shape, 3), np.uint8)
+        seen = projected.source >= 0
+        rgb[seen] = colours_of(source, projected.source[seen], lens)
+        return rgb, quantise_depth(projected.depth_m, images)
+    # Pixels travel as one number of four bytes each: three times as fast as rows of three.
+    colors = cv2.cvtColor(source.rgb, cv2.COLOR_RGB2RGBA).view(np.uint32).ravel()
+    filled = np.flatnonzero(projected.source >= 0)
+    carried = np.zeros(projected.depth_m.shape, np.uint32)
+    carried.ravel()[filled] = colors[projected.source.ravel()[filled]]
+    rgba = carried.view(np.uint8).reshape(*carried.shape, 4)
+    return cast(NDArray[np.uint8], cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB)), quantise_depth(projected.depth_m, images)
 
 
 def colours_of(source: View, pixels: NDArray[np.int64], lens: Distortion | None) -> NDArray[np.uint8]:

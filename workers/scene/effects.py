@@ -60,6 +60,10 @@ def _sensor(name: str) -> Callable[[Facts], str | None]:
     return lambda facts: f"sensor.{name} is off" if getattr(facts.job.sensor, name) is None else None
 
 
+def _raster(facts: Facts) -> str | None:
+    return "render.tier is flat" if facts.job.render.tier == "flat" else None
+
+
 EFFECTS: tuple[Effect, ...] = (
     Effect("dynamics", _dynamics),
     Effect("table_mesh_collision", _table_mesh),
@@ -69,6 +73,10 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("splat", _splat),
     Effect("hidden_point_removal", _hidden_points),
     Effect("raycast_check", _raycast),
+    Effect("release_again", _raycast),
+    Effect("shadows", _raster),
+    Effect("ambient_occlusion", _raster),
+    Effect("antialiasing", _raster),
     *(Effect(f"sensor_{name}", _sensor(name)) for name in SensorEffects.model_fields),
 )
 

@@ -8,8 +8,8 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.camera import Camera, Intrinsics
 from schemas.errors import StartError
 from schemas.job import Cameras, Job
-from schemas.scene import REGION_FIRST_OBJECT, Appearance, Light, ObjectStart, ScenePlan, Table
-from schemas.shape import Asset, Hull, Material, Mesh, Part, Shape
+from schemas.scene import REGION_FIRST_OBJECT, ObjectStart, ScenePlan, Table
+from schemas.shape import Asset, Hull, Mesh
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import (
     UP,
@@ -21,13 +21,10 @@ from workers.geometry.frames import (
 )
 from workers.geometry.heights import heights_at
 from workers.geometry.hull import convex_hull
+from workers.scene.appearance import draw_look
 from workers.scene.contact import support_margin, touching
 from workers.scene.randomness import Stream, stream
 from workers.scene.support import place_table, support_height
-
-FLOOR_HALF_M = 30.0
-"""Half the floor's side. The lowest ray of an input camera (0.7 rad less half the field of view) meets the floor some
-11 m away, a corner ray at 13 m."""
 
 RECESS_M = 0.05
 """Table this far below its top still counts as table under an object: a tray's bottom does, a lower shelf does not."""
@@ -47,15 +44,15 @@ def plan_scene(job: Job, scene_id: int, table_asset: Asset, asset: Asset) -> Sce
     table = place_table(table_asset)
     rng = stream(job.seed, scene_id, Stream.CAMERA)
     centre = np.array([0.0, 0.0, table.top.height_m])
-    look = stream(job.seed, scene_id, Stream.APPEARANCE)
+    floor, appearance = draw_look(stream(job.seed, scene_id, Stream.APPEARANCE), job.render.tier)
     return ScenePlan(
         scene_id=scene_id,
         category=asset.category,
         table=table,
-        floor=draw_floor(look),
+        floor=floor,
         objects=(draw_start(job, scene_id, asset, table),),
         input_cameras=tuple(draw_camera(rng, job.cameras, centre) for _ in range(job.pairs_per_scene)),
-        appearance=draw_appearance(look),
+        appearance=appearance,
     )
 
 
@@ -102,32 +99,3 @@ def draw_camera(rng: np.random.Generator, cameras: Cameras, centre: Array) -> Ca
     yaw = rng.uniform(cameras.orbit.yaw_rad.low, cameras.orbit.yaw_rad.high)
     T = orbit_pose(centre, inclination, yaw, cameras.orbit.radius_m)
     return Camera(Intrinsics.of(cameras.sensor), frozen_array(T))
-
-
-def draw_floor(rng: np.random.Generator) -> Shape:
-    """A level square at z = 0 in a muted colour."""
-    h = FLOOR_HALF_M
-    value, warmth = rng.uniform(0.35, 0.75), rng.uniform(-0.08, 0.08)
-    color = (value + warmth, value, value - warmth, 1.0)
-    corners = frozen_array([[-h, -h, 0.0], [h, -h, 0.0], [h, h, 0.0], [-h, h, 0.0]])
-    faces = frozen_array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return Shape((Part("floor", corners, faces, Material(base_color=color, roughness=0.9)),))
-
-
-def draw_appearance(rng: np.random.Generator) -> Appearance:
-    """A key light from above and a weaker fill from the other side."""
-    azimuth, elevation = rng.uniform(-math.pi, math.pi), rng.uniform(0.8, 1.3)
-    strength = rng.uniform(0.55, 0.8)
-    return Appearance(
-        ambient=(0.32, 0.33, 0.35),
-        lights=(
-            Light(_direction(azimuth, elevation), (strength, strength * 0.97, strength * 0.92)),
-            Light(_direction(azimuth + 2.4, 0.6), (0.18, 0.19, 0.21)),
-        ),
-        background=(0.8, 0.85, 0.9),
-    )
-
-
-def _direction(azimuth: float, elevation: float) -> Array:
-    level = math.cos(elevation)
-    return frozen_array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])

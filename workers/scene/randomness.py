@@ -16,10 +16,9 @@ class Stream(IntEnum):
     CAMERA = 5
     APPEARANCE = 6
     RAYCAST_CHECK = 7
-    RECHECK = 8
-    SENSOR_DEPTH = 9
-    SENSOR_RGB = 10
-    SENSOR_EXPOSURE = 11
+    SENSOR_DEPTH = 8
+    SENSOR_RGB = 9
+    SENSOR_EXPOSURE = 10
 
 
 def stream(seed: int, scene_id: int, name: Stream, *within: int) -> np.random.Generator:

@@ -170,3 +170,13 @@ def test_instances_fall_into_splits_by_their_shares_and_stay_there():
         assert splits.count(name) == pytest.approx(expected, abs=330)
     assert split_of("mug-0-000123", shares) == split_of("mug-0-000123", shares)
     assert {split_of(name, SplitShares(train=0, val=0, test=1)) for name in ids[:100]} == {"test"}
+
+
+@pytest.mark.parametrize(("instances", "kept"), [(1_000_000, False), (100, True)])
+def test_shapes_of_which_hardly_one_comes_again_are_not_kept(tmp_path, instances, kept):
+    source = ProceduralSource(source="procedural", instances=instances)
+    catalogue = open_catalogue(Assets(objects=(source,), tables=(source,)), tmp_path, ("mug",))
+    ref = choose_object(catalogue, "mug", np.random.default_rng(1))
+    first, second = load_asset(catalogue, ref), load_asset(catalogue, ref)
+    assert (first is second) == kept
+    assert first.sha256 == second.sha256

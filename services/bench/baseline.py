@@ -1,0 +1,195 @@
+"""The script that people write today: stock PyBullet, stock pyrender, plain numpy, `cv2.imwrite`.
+
+Run as a process of its own (`python -m services.bench.baseline`), because stock pyrender ends EGL for its whole process
+when it is done. It reads one line of JSON for each scene, `{"scene": FILE, "out": FOLDER}`, makes the scene's images,
+and answers with one line of seconds by stage. It uses none of our code.
+"""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+vars(np)["infty"] = np.inf  # pyrender 0.1.45 was written before numpy 2
+
+import pybullet  # noqa: E402
+import pyrender  # noqa: E402
+import trimesh  # noqa: E402
+from numpy.typing import NDArray  # noqa: E402
+
+STEP_HZ, SECONDS = 240, 3.0
+OPTICAL_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+TABLE, OBJECT = 2, 3
+FLOOR = 1
+
+Images = dict[str, NDArray]
+
+
+def load(description: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The meshes of a scene as pyrender wants them."""
+    floor: Any = trimesh.Trimesh(description["floor"]["vertices"], description["floor"]["faces"], process=False)
+    floor.visual.face_colors = [round(255 * c) for c in description["floor"]["color"]]
+    loaded: dict[str, Any] = {name: trimesh.load(folder / f"{name}.glb") for name in ("table", "object")}
+    meshes = {name: scene.dump() for name, scene in loaded.items()}
+    return {**meshes, "floor": [floor]}
+
+
+def simulate(description: dict[str, Any], folder: Path) -> NDArray:
+    """Drop the object onto the table for three seconds; its pose [4, 4] afterwards."""
+    pybullet.resetSimulation()
+    pybullet.setGravity(0, 0, -9.81)
+    pybullet.setTimeStep(1.0 / STEP_HZ)
+    _load_urdf(folder / "table.urdf", np.array(description["T_world_table"]), fixed=True)
+    body = _load_urdf(folder / "object.urdf", np.array(description["T_world_obj"]))
+    for _ in range(round(STEP_HZ * SECONDS)):
+        pybullet.stepSimulation()
+    position, quaternion = pybullet.getBasePositionAndOrientation(body)
+    T = np.eye(4)
+    T[:3, :3] = np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
+    com = np.array(pybullet.getDynamicsInfo(body, -1)[3])
+    T[:3, 3] = np.array(position) - T[:3, :3] @ com
+    return T
+
+
+def _load_urdf(path: Path, T: NDArray, fixed: bool = False) -> int:
+    quaternion = trimesh.transformations.quaternion_from_matrix(T)
+    place = (T[:3, 3].tolist(), [*quaternion[1:], quaternion[0]])
+    body: int = pybullet.loadURDF(str(path), *place, useFixedBase=fixed)
+    return body
+
+
+def build(description: dict[str, Any], meshes: dict[str, Any], T_world_obj: NDArray) -> tuple[Any, dict[Any, Any]]:
+    """The pyrender scene, and the colour of each node in a segmentation pass."""
+    scene = pyrender.Scene(ambient_light=[0.3, 0.3, 0.3], bg_color=[0.8, 0.85, 0.9])
+    poses = {"floor": np.eye(4), "table": np.array(description["T_world_table"]), "object": T_world_obj}
+    colors = {}
+    for region, name in ((FLOOR, "floor"), (TABLE, "table"), (OBJECT, "object")):
+        mesh = pyrender.Mesh.from_trimesh(meshes[name], smooth=False)
+        colors[scene.add(mesh, pose=poses[name])] = (region, region, region)
+    light = np.eye(4)
+    light[:3, :3] = trimesh.transformations.euler_matrix(0.6, 0.3, 0.0)[:3, :3]
+    scene.add(pyrender.DirectionalLight(intensity=3.0), pose=light)
+    return scene, colors
+
+
+def render(scene: Any, colors: dict, renderer: Any, k: dict[str, float], T_world_cam: NDArray) -> Images:
+    """Colour, depth and segmentation from one camera."""
+    camera = pyrender.IntrinsicsCamera(k["fx"], k["fy"], k["cx"], k["cy"], znear=0.05, zfar=100.0)
+    node = scene.add(camera, pose=T_world_cam @ OPTICAL_TO_OPENGL)
+    rgb, depth = renderer.render(scene)
+    region, _ = renderer.render(scene, flags=pyrender.RenderFlags.SEG, seg_node_map=colors)
+    scene.remove_node(node)
+    return {"rgb": rgb, "depth": depth, "region": np.ascontiguousarray(region[..., 0])}
+
+
+def project(view: Images, k: dict[str, float], T_target_source: NDArray) -> Images:
+    """The input cloud seen from another camera: the farthest points first, so that the nearest stay."""
+    height, width = view["depth"].shape
+    v, u = np.mgrid[0:height, 0:width]
+    z = view["depth"].astype(np.float64)
+    x, y = (u + 0.5 - k["cx"]) / k["fx"] * z, (v + 0.5 - k["cy"]) / k["fy"] * z
+    valid = z > 0
+    points = np.stack([x[valid], y[valid], z[valid]], axis=1) @ T_target_source[:3, :3].T + T_target_source[:3, 3]
+    colors = view["rgb"][valid]
+    keep = points[:, 2] > 0
+    points, colors = points[keep], colors[keep]
+    column = np.floor(k["fx"] * points[:, 0] / points[:, 2] + k["cx"]).astype(int)
+    row = np.floor(k["fy"] * points[:, 1] / points[:, 2] + k["cy"]).astype(int)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    column, row, points, colors = column[inside], row[inside], points[inside], colors[inside]
+    order = np.argsort(-points[:, 2])
+    depth, rgb = np.zeros((height, width)), np.zeros((height, width, 3), np.uint8)
+    depth[row[order], column[order]] = points[order, 2]
+    rgb[row[order], column[order]] = colors[order]
+    return {"rgb": rgb, "depth": depth}
+
+
+def write(views: dict[str, Images], images: list[dict[str, Any]], units: float, out: Path) -> None:
+    """Every image and its patch, as PNG with OpenCV's defaults."""
+    for image in images:
+        pixels = views[image["view"]][image["pixels"]]
+        if image["crop"]:
+            top, bottom, left, right = image["crop"]
+            pixels = pixels[top:bottom, left:right]
+        if image["pixels"] == "depth":
+            pixels = np.clip(pixels * units, 0, 65535).astype(np.uint16)
+        elif image["pixels"] == "rgb":
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+        path = out / image["path"]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), pixels)
+
+
+class Script:
+    """What the script keeps from one scene to the next: its renderer and PyBullet's world."""
+
+    def __init__(self) -> None:
+        pybullet.connect(pybullet.DIRECT)
+        self._renderer: Any = None
+
+    def make(self, description: dict[str, Any], meshes: dict[str, Any], folder: Path, out: Path) -> dict[str, float]:
+        """One scene's images; seconds by stage."""
+        seconds: dict[str, float] = {}
+        k = description["intrinsics"]
+        if self._renderer is None:
+            self._renderer = pyrender.OffscreenRenderer(k["width"], k["height"])
+        T_world_obj = _timed(seconds, "physics", lambda: simulate(description, folder))
+        scene, colors = _timed(seconds, "scene", lambda: build(description, meshes, T_world_obj))
+        for pair in description["pairs"]:
+            cameras = {role: np.array(T) for role, T in pair["cameras"].items()}
+            views = _timed(
+                seconds,
+                "render",
+                lambda cameras=cameras: {  # type: ignore[misc]
+                    role: render(scene, colors, self._renderer, k, T) for role, T in cameras.items()
+                },
+            )
+            T_mirror_input = np.linalg.inv(cameras["mirror"]) @ cameras["input"]
+            views["projected"] = _timed(
+                seconds,
+                "projection",
+                lambda views=views, T=T_mirror_input: project(views["input"], k, T),  # type: ignore[misc]
+            )
+            _timed(
+                seconds,
+                "write",
+                lambda views=views, pair=pair: write(  # type: ignore[misc]
+                    views, pair["images"], description["depth_units_per_m"], out
+                ),
+            )
+        return seconds
+
+
+def _timed(seconds: dict[str, float], stage: str, work: Callable[[], Any]) -> Any:
+    begun = time.perf_counter()
+    result = work()
+    seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - begun
+    return result
+
+
+def main() -> None:
+    """Answer one line with one line until there are no more. PyBullet talks on standard output, so that is moved."""
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    script = Script()
+    print(json.dumps({"ready": True}), file=answers)
+    for line in sys.stdin:
+        asked = json.loads(line)
+        path, before = Path(asked["scene"]), time.perf_counter()
+        description = json.loads(path.read_text())
+        meshes = load(description, path.parent)
+        wall, cpu = time.perf_counter(), time.process_time()
+        stages = script.make(description, meshes, path.parent, Path(asked["out"]))
+        answer = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu, "stages_s": stages}
+        answer["load_s"] = wall - before
+        print(json.dumps(answer), file=answers)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,67 @@
+"""`verso bench`: measures, prints, and answers in JSON."""
+
+import argparse
+import json
+import shlex
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from schemas.errors import InputError
+from schemas.job import Job
+from services.bench.machine import other_systems
+from services.bench.measure import bench_folder, measure
+from services.bench.report import describe, summarise
+from services.jobfile import load_job, set_key, validate_job
+from workers.store.mounts import file_system_of
+
+
+def main(options: argparse.Namespace) -> int:
+    """Measure what the options ask for; 0, or an error where a side cannot be run at all."""
+    job, job_folder = _job(options)
+    with bench_folder(options.folder) as folder:
+        figures = {
+            "ok": True,
+            "command": shlex.join(["verso", *sys.argv[1:]]),
+            "job": job.name,
+            "file_system": file_system_of(folder),
+            **summarise(measure(job, job_folder, folder, options.scenes)),
+            "memory": _memory(options, job, job_folder, folder),
+            "scaling": _scaling(options, job, job_folder, folder),
+            "other_systems": other_systems(),
+        }
+    print("\n".join(describe(figures)))
+    if options.json:
+        print(json.dumps(figures))
+    return 0
+
+
+def _job(options: argparse.Namespace) -> tuple[Job, Path]:
+    """The job to measure, and where its relative folders are resolved from. Raises InputError for tars."""
+    if options.job is None:
+        tree: dict[str, Any] = {"name": "bench"}
+        for change in options.changes:
+            set_key(tree, change)
+        job, folder = validate_job(tree, "the default job"), Path()
+    else:
+        job, folder = load_job(options.job, options.changes), options.job.parent
+    if job.output.layout != "files":
+        raise InputError(f"output.layout is {job.output.layout!r}: the benchmark compares files, leave it at 'files'")
+    return job, folder
+
+
+def _memory(options: argparse.Namespace, job: Job, job_folder: Path, folder: Path) -> dict[str, Any] | None:
+    if options.memory is None:
+        return None
+    from services.bench.memory import measure_memory
+
+    return asdict(measure_memory(job, job_folder, folder / "memory", options.memory))
+
+
+def _scaling(options: argparse.Namespace, job: Job, job_folder: Path, folder: Path) -> dict[str, Any] | None:
+    if options.workers is None:
+        return None
+    from services.bench.scaling import measure_scaling
+
+    return asdict(measure_scaling(job, job_folder, folder, options.workers, options.scaling_scenes))

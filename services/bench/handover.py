@@ -1,0 +1,78 @@
+"""What the straightforward script is given of a scene: the same shapes, start and cameras, as files that it can load."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from schemas.base import Pose
+from schemas.job import Job
+from schemas.scene import Pair, Placed
+from schemas.shape import Asset, Mesh, Shape
+from workers.assets.glb import asset_glb
+from workers.records import image_boxes
+from workers.scene_steps import Scene
+
+URDF = """<robot name="{name}"><link name="base">
+<inertial><origin xyz="{com}"/><mass value="{mass}"/>
+<inertia ixx="{i[0]}" iyy="{i[1]}" izz="{i[2]}" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><geometry><mesh filename="{name}.obj"/></geometry></collision>
+</link></robot>
+"""
+
+
+def hand_over(scene: Scene, job: Job, folder: Path) -> Path:
+    """Write `scene.json` and the files it names, once, outside any clock. Returns its path."""
+    folder.mkdir(parents=True)
+    start, table = scene.plan.objects[0], scene.plan.table
+    for name, asset in (("object", start.asset), ("table", table.asset)):
+        (folder / f"{name}.glb").write_bytes(asset_glb(asset))
+        (folder / f"{name}.obj").write_text(_obj(asset.shape.mesh))
+        (folder / f"{name}.urdf").write_text(_urdf(name, asset))
+    sensor = job.cameras.sensor
+    described = {
+        "T_world_table": _matrix(table.T_world_table),
+        "T_world_obj": _matrix(start.T_world_obj),
+        "floor": _floor(scene.posed.things[0]),
+        "intrinsics": {key: getattr(sensor, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
+        "depth_units_per_m": job.images.depth_units_per_m,
+        "pairs": [_pair(pair, job) for pair in scene.pairs],
+    }
+    path = folder / "scene.json"
+    path.write_text(json.dumps(described))
+    return path
+
+
+def _pair(pair: Pair, job: Job) -> dict[str, object]:
+    """Poses of the three cameras, and of every image its path, view, kind of pixels and crop (or none)."""
+    cameras = {view.role: _matrix(view.camera.T_world_cam) for view in pair.views if view.role != "projected"}
+    images = []
+    for view in pair.views:
+        for path, kind, box in image_boxes(view, pair, job):
+            crop = None if box is None else [box[0].start, box[0].stop, box[1].start, box[1].stop]
+            images.append({"path": path, "view": view.role, "pixels": kind, "crop": crop})
+    return {"cameras": cameras, "images": images}
+
+
+def _matrix(T: Pose) -> list[list[float]]:
+    return np.asarray(T).tolist()
+
+
+def _floor(placed: Placed) -> dict[str, object]:
+    shape: Shape = placed.shape
+    return {
+        "vertices": shape.vertices.tolist(),
+        "faces": shape.faces.tolist(),
+        "color": list(shape.parts[0].material.base_color),
+    }
+
+
+def _obj(mesh: Mesh) -> str:
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices]
+    lines += [f"f {a} {b} {c}" for a, b, c in mesh.faces + 1]
+    return "\n".join(lines) + "\n"
+
+
+def _urdf(name: str, asset: Asset) -> str:
+    com = " ".join(f"{x:.9g}" for x in asset.mass.com)
+    return URDF.format(name=name, com=com, mass=asset.mass.mass_kg, i=np.diag(asset.mass.inertia).tolist())

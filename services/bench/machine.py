@@ -1,0 +1,72 @@
+"""What a benchmark ran on, and how it keeps to one core of it."""
+
+import contextlib
+import os
+import platform
+import time
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+LIBRARIES = ("numpy", "opencv-contrib-python-headless", "pybullet", "pyrender", "pyarrow", "trimesh", "PyOpenGL", "ray")
+OTHER_SYSTEMS = {"Blender Cycles": "bpy", "MuJoCo": "mujoco"}
+"""Systems whose rows could stand beside ours, and the package of each."""
+
+
+@contextlib.contextmanager
+def pinned(core: int | None = None) -> Iterator[int]:
+    """Keeps this thread, and what it starts, on one core while the block runs: by default the last that it may use."""
+    before = os.sched_getaffinity(0)
+    chosen = max(before) if core is None else core
+    os.sched_setaffinity(0, {chosen})
+    try:
+        yield chosen
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def describe_machine(renderer: str) -> dict[str, object]:
+    """Cores, processor, OpenGL device, load and versions: what a figure means nothing without."""
+    return {
+        "cores": os.cpu_count(),
+        "usable_cores": len(os.sched_getaffinity(0)),
+        "cpu": _processor(),
+        "memory_gib": round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30, 1),
+        "gl_renderer": renderer,
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.release()}",
+        "load_1min": os.getloadavg()[0],
+        "versions": {name: found for name in LIBRARIES if (found := _version(name)) is not None},
+    }
+
+
+def other_systems() -> dict[str, str]:
+    """Version by name of the other systems that are installed, `not installed` for the rest. Nothing is imported."""
+    return {name: _version(package) or "not installed" for name, package in OTHER_SYSTEMS.items()}
+
+
+def process_age_s() -> float:
+    """Seconds since this process began, to a hundredth."""
+    began = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - began
+
+
+def resident_mb() -> float:
+    """Memory that this process holds, MB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def _processor(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
+    try:
+        lines = cpuinfo.read_text().splitlines()
+    except OSError:
+        return "unknown"
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

@@ -1,0 +1,88 @@
+"""Our side: whole scenes of a job, through the real path, onto a real disk."""
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from schemas.commit import CommitRecord, CommitTerms, Span
+from schemas.errors import RunError, SceneError
+from schemas.job import Job
+from schemas.report import ShardOrder
+from services.bench.ratios import Lap
+from workers.allocator import keep_freed_memory
+from workers.assets.catalogue import Catalogue, open_catalogue
+from workers.context import WorkerContext, settings_digest
+from workers.render.gbuffer import shared_renderer
+from workers.scene_steps import Scene, Stopwatch, make_scene
+from workers.shard import run_span
+from workers.store.commit import read_record
+from workers.store.local import LocalStore
+
+
+@dataclass(eq=False)
+class Workbench:
+    """A worker's context and a dataset's folder, ready to make one range after another."""
+
+    context: WorkerContext
+    store: LocalStore
+    order: ShardOrder
+    next_scene: int = field(default=0)
+
+    def next_span(self, scenes: int) -> Span:
+        """The next range: scenes that were not made before, so that no shape is at hand already."""
+        span = Span(start=self.next_scene, stop=self.next_scene + scenes)
+        self.next_scene = span.stop
+        return span
+
+    def run(self, span: Span) -> Lap:
+        """Make and commit a range. Raises RunError where none of its scenes could be made."""
+        watch = Stopwatch()
+        wall, cpu = time.perf_counter(), time.process_time()
+        report = run_span(self.context, self.store, self.order, span, watch)
+        lap = Lap(report.made, time.perf_counter() - wall, time.process_time() - cpu, watch.seconds)
+        if not report.made:
+            raise RunError(f"none of the scenes {span.start} to {span.stop - 1} could be made: {report.failed}")
+        return lap
+
+    def record(self, span: Span) -> CommitRecord:
+        """What the range left on disk."""
+        record = read_record(self.store, span.start)
+        assert record is not None
+        return record
+
+    def scenes(self, span: Span) -> list[Scene]:
+        """The same scenes once more in memory, those that can be made, for the sides that we are compared with."""
+        made = []
+        for scene_id in span.scene_ids:
+            try:
+                made.append(make_scene(self.context, scene_id, Stopwatch()))
+            except SceneError:
+                continue
+        return made
+
+
+def open_workbench(job: Job, job_folder: Path, out: Path) -> Workbench:
+    """A workbench for the job's scenes in an empty folder."""
+    catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
+    store = LocalStore(out)
+    store.prepare()
+    order = bench_order(job, out)
+    return Workbench(_context(job, catalogue), store, order, job.first_scene)
+
+
+def bench_order(job: Job, out: Path) -> ShardOrder:
+    """The pattern of every shard of a benchmark."""
+    terms = CommitTerms(
+        job_digest="bench",
+        fingerprint="bench",
+        fingerprint_mode=job.run.fingerprint,
+        layout=job.output.layout,
+        first_scene=job.first_scene,
+        range_size=job.run.range_size,
+    )
+    return ShardOrder(out=str(out), job=job, terms=terms, spans=())
+
+
+def _context(job: Job, catalogue: Catalogue) -> WorkerContext:
+    keep_freed_memory()
+    return WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))

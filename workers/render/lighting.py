@@ -1,0 +1,151 @@
+"""GLSL of the `raster` tier: one light with shadows, the others and the sky dimmed where things stand close.
+
+All that needs more than the surface itself comes from what baking.py makes once a scene: a *level* map for the floor and
+one for what objects stand on (how open the sky is, and on the floor the shadow), and the key light's shadow map.
+"""
+
+KNEE = 0.8
+"""Up to this much light the picture is proportional to it; above, it bends towards 1 and never reaches it."""
+
+ASIDE_M = 0.014
+"""How far in front of a wall its surroundings are looked up: somewhat more than a pixel of the heights' grid."""
+
+LIT_VERTEX = """
+uniform mat4 level_from_shape;     // to (u, v, height above the level in units of its map)
+uniform vec3 up;                   // the world's, in the optical frame
+uniform vec3 below;
+out vec3 v_level;
+#if !GROUND
+uniform mat4 shadow_from_shape;    // to (u, v, depth) of the shadow map
+uniform mat3 shadow_normal;        // inverse transpose of its linear part
+out vec3 v_shadow;
+flat out vec2 v_slope;
+flat out vec2 v_aside;
+#endif
+#if FEW_TRIANGLES
+flat out vec3 v_up;
+flat out vec3 v_below;
+#endif
+
+void pass_light() {
+    v_level = (level_from_shape * vec4(position, 1.0)).xyz;
+#if !GROUND
+    v_shadow = (shadow_from_shape * vec4(position, 1.0)).xyz;
+    // A face's plane n . p = d is one in the map too, where depth falls off by n_xy / n_z.
+    vec3 n = shadow_normal * face_plane.xyz;
+    v_slope = abs(n.z) > 1e-6 * length(n) ? clamp(-n.xy / n.z, -40.0, 40.0) : vec2(0.0);
+    v_aside = ASIDE_M * (mat3(level_from_shape) * face_plane.xyz).xy;
+#endif
+#if FEW_TRIANGLES
+    v_up = up;
+    v_below = below;
+#endif
+}
+""".replace("ASIDE_M", str(ASIDE_M))
+
+LIT_FRAGMENT = """
+in vec3 v_level;
+#if FEW_TRIANGLES
+flat in vec3 v_up;
+flat in vec3 v_below;
+#else
+uniform vec3 up;
+uniform vec3 below;
+#define v_up up
+#define v_below below
+#endif
+uniform sampler2D level_map;
+
+#if !GROUND
+in vec3 v_shadow;
+flat in vec2 v_slope;
+flat in vec2 v_aside;
+uniform sampler2DShadow shadow_map;
+uniform vec3 softness;             // radius of the filter in the shadow map; what its depths are off by; its pixel
+const vec2 RING[4] = vec2[4](vec2(0.92, 0.38), vec2(-0.38, 0.92), vec2(-0.92, -0.38), vec2(0.38, -0.92));
+
+// How much of the key light arrives. On the level it is in the map; elsewhere each tap compares with the face's own
+// plane, so that no face shades itself. A loop, because llvmpipe skips one that no fragment enters, and no branch.
+float key_share(float on_map) {
+    bool on_level = abs(v_level.z) < 0.01, inside = all(lessThan(abs(v_level.xy - 0.5), vec2(0.5)));
+    int taps = on_level ? (inside ? 0 : 1) : 4;
+    // The map's pixels hold the depth of their centres, up to a pixel away from where they are compared.
+    float depth = v_shadow.z - softness.y - dot(abs(v_slope), vec2(softness.z));
+    float sum = 0.0;
+    for (int i = 0; i < taps; ++i) {
+        vec2 d = RING[i] * softness.x;
+        sum += textureLod(shadow_map, vec3(v_shadow.xy + d, min(depth + dot(v_slope, d), 1.0)), 0.0);
+    }
+    return taps == 0 ? on_map : sum / float(taps);
+}
+#endif
+
+// Light that is as bright as it is below the knee, and above it runs into 1.
+vec3 compress(vec3 c) {
+    vec3 over = max(c - KNEE, 0.0) / (1.0 - KNEE);
+    return min(c, KNEE) + (1.0 - KNEE) * over / (1.0 + over);
+}
+
+// Lambert, GGX's lobe as in the flat tier with Schlick's Fresnel, and a sky over a ground (hemispherical ambient).
+vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float roughness) {
+#if GROUND
+    vec4 level = textureLod(level_map, v_level.xy, 0.0);
+    float open = level.r, lit = level.a;
+#else
+    // A wall asks in front of itself, where the map does not jump; the higher above what lies there, the more is open.
+    vec4 level = textureLod(level_map, v_level.xy + v_aside, 0.0);
+    float open = mix(level.r, level.g, clamp(v_level.z / max(level.b, 0.004), 0.0, 1.0));
+    open = v_level.z < -0.01 ? 1.0 : mix(open, 1.0, clamp(2.5 * (v_level.z - level.b), 0.0, 1.0));
+    float lit = key_share(level.a);
+#endif
+    vec3 diffuse = albedo * (1.0 - metallic);
+    vec3 mirror = mix(vec3(0.04), albedo, metallic);
+    vec3 around = mix(v_below, v_ambient, 0.5 + 0.5 * dot(normal, v_up)) * open;
+#if MATTE
+    vec3 sum = around * (diffuse + mirror);
+    sum += lit * v_light_color[0] * diffuse * max(dot(normal, v_light_towards[0]), 0.0);
+    for (int i = 1; i < LIGHTS; ++i) sum += open * v_light_color[i] * diffuse * max(dot(normal, v_light_towards[i]), 0.0);
+#else
+    float facing = clamp(dot(normal, towards_eye), 0.0, 1.0), miss_eye = 1.0 - facing;
+    float grazing = miss_eye * miss_eye * miss_eye * miss_eye * miss_eye * (1.0 - roughness);
+    mirror += (1.0 - mirror) * grazing;
+    float width = max(roughness * roughness * roughness * roughness, 0.002);
+    vec3 bounced = 2.0 * dot(normal, towards_eye) * normal - towards_eye;
+    vec3 sum = around * diffuse + mix(v_below, v_ambient, 0.5 + 0.5 * dot(bounced, v_up)) * open * mirror;
+    for (int i = 0; i < LIGHTS; ++i) {
+        float reach = max(dot(normal, v_light_towards[i]), 0.0) * (i == 0 ? lit : open);
+        float miss = 1.0 - dot(bounced, v_light_towards[i]);
+        float lobe = width / mix(0.5 * miss, 1.0, width);
+        sum += v_light_color[i] * reach * (diffuse + mirror * (0.25 / width * lobe * lobe));
+    }
+#endif
+    return sum;
+}
+""".replace("KNEE", str(KNEE))
+
+CAST_VERTEX = """
+#version 410 core
+layout(location = 0) in vec3 position;
+uniform mat4 clip_from_shape;
+
+void main() { gl_Position = clip_from_shape * vec4(position, 1.0); }
+"""
+
+CAST_FRAGMENT = """
+#version 410 core
+void main() {}
+"""
+
+MASK_VERTEX = """
+#version 410 core
+void main() {
+    vec2 corner = vec2(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0);
+    gl_Position = vec4(corner, 0.0, 1.0);
+}
+"""
+
+MASK_FRAGMENT = """
+#version 410 core
+uniform sampler2D mask;
+void main() { if (texelFetch(mask, ivec2(gl_FragCoord.xy), 0).r == 0.0) discard; }
+"""

@@ -1,0 +1,181 @@
+"""The GPU's side of a scene's light: the shadow map and two level maps of the scene drawn last, and no other's.
+
+Views of one scene follow one another, so one scene is all that is kept; the textures are made once and overwritten.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Pose
+from schemas.scene import REGION_FLOOR, Appearance, Placed
+from workers.render import baking
+from workers.render.baking import LEVEL_PX, MAP_PX, SHADOW_PX, Box
+from workers.render.buffers import ShapeStore
+from workers.render.lighting import CAST_FRAGMENT, CAST_VERTEX
+from workers.render.programs import Program
+
+LEVEL_UNIT, SHADOW_UNIT = 1, 2
+"""Texture units; unit 0 is the albedo's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Baked:
+    """Where the maps lie in the world; `light` is None where nothing casts a shadow."""
+
+    light: Box | None
+    floor: Box | None
+    stand: Box | None
+
+
+class SceneLight:
+    """Makes and holds the maps; `prepare` before drawing a view, `bind` before drawing a thing of it."""
+
+    def __init__(self, gl: ModuleType, shapes: ShapeStore) -> None:
+        self._gl, self._shapes = gl, shapes
+        self._program = Program(gl, CAST_VERTEX, CAST_FRAGMENT)
+        self._shadow = self._depth_texture()
+        self._floor, self._stand, self._open = (self._color_texture() for _ in range(3))
+        self._upload(self._open, np.full((1, 1, 4), (255, 255, 0, 255), np.uint8))
+        self._quick = self._floor_sampler()
+        self._framebuffer = int(gl.glGenFramebuffers(1))
+        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self._framebuffer)
+        gl.glFramebufferTexture2D(gl.GL_FRAMEBUFFER, gl.GL_DEPTH_ATTACHMENT, gl.GL_TEXTURE_2D, self._shadow, 0)
+        gl.glDrawBuffer(gl.GL_NONE)
+        self._key: tuple[object, ...] = ()
+        self._held: tuple[object, ...] = ()
+        self._baked = Baked(None, None, None)
+        self.bakes = 0
+        """How often maps were made."""
+
+    def prepare(self, things: Sequence[Placed], appearance: Appearance) -> None:
+        """Make the scene's maps, unless they are there. Binds a framebuffer of its own where it does."""
+        key = (id(appearance), *((id(t.shape), t.T_world_shape.tobytes(), t.region_id) for t in things))
+        if key == self._key:
+            return
+        self._key, self._held = key, (appearance, *(thing.shape for thing in things))
+        self._baked = self._bake(things, appearance)
+        self.bakes += 1
+
+    def bind(self, program: Program, thing: Placed) -> None:
+        """The maps that a thing is lit with, for the program in use."""
+        gl, baked = self._gl, self._baked
+        ground = thing.region_id == REGION_FLOOR
+        level = baked.floor if ground else baked.stand
+        texture = self._open if level is None else self._floor if ground else self._stand
+        for unit, name in ((LEVEL_UNIT, texture), (SHADOW_UNIT, self._shadow)):
+            gl.glActiveTexture(gl.GL_TEXTURE0 + unit)
+            gl.glBindTexture(gl.GL_TEXTURE_2D, name)
+        gl.glActiveTexture(gl.GL_TEXTURE0)
+        gl.glBindSampler(0, self._quick if ground else 0)
+        flat = np.zeros((4, 4))
+        program.set_maps(
+            flat if level is None else level.unit_from_world @ thing.T_world_shape,
+            np.diag([0.0, 0.0, 0.0, 1.0]) if baked.light is None else baked.light.unit_from_world @ thing.T_world_shape,
+            (0.0, 1.0, 0.0) if baked.light is None else baking.soft_radius(baked.light),
+        )
+
+    def release(self) -> None:
+        """Leave the albedo's texture unit as the flat tier wants it."""
+        self._gl.glBindSampler(0, 0)
+
+    def free(self) -> None:
+        """Give the GPU's memory back."""
+        self._gl.glDeleteFramebuffers(1, [self._framebuffer])
+        self._gl.glDeleteTextures(4, [self._shadow, self._floor, self._stand, self._open])
+        self._gl.glDeleteSamplers(1, [self._quick])
+        self._program.free()
+
+    def _bake(self, things: Sequence[Placed], appearance: Appearance) -> Baked:
+        gl = self._gl
+        solid, objects = baking.casters(things), baking.standing(things)
+        if not solid or not appearance.lights:
+            return Baked(None, None, None)
+        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self._framebuffer)
+        gl.glEnable(gl.GL_DEPTH_TEST)
+        self._program.use()
+        towards, vertices = appearance.lights[0].direction, baking.bounds_of(solid)
+        below = [thing for thing in solid if thing not in objects] or solid
+        floor = baking.level_box(vertices, 0.0, towards, baking.FLOOR_REACH_M)
+        floor_heights = self._heights(below, floor, True), self._heights(below, floor, False)
+        stand, stand_heights = None, None
+        if objects:
+            upper = baking.bounds_of(objects)
+            stand = baking.level_box(upper, baking.level_of(upper), towards, baking.STAND_REACH_M)
+            top = self._heights(objects, stand, True)
+            stand_heights = top, np.zeros_like(top)
+        light = baking.light_box(vertices, towards)
+        depth = self._cast(solid, light.clip_from_world, SHADOW_PX, nearest=True)
+        gl.glDepthFunc(gl.GL_GREATER)
+        for box, heights, texture in ((floor, floor_heights, self._floor), (stand, stand_heights, self._stand)):
+            if box is not None and heights is not None:
+                lit = baking.level_shadow(depth, light, box, towards)
+                self._upload(texture, baking.level_pixels(*heights, box, lit))
+        return Baked(light, floor, stand)
+
+    def _heights(self, things: list[Placed], box: Box, top: bool) -> NDArray[np.float32]:
+        """[N, N] float32 in units of the box: the highest, or lowest, of what stands there; 0 where nothing does."""
+        heights = self._cast(things, box.clip_from_world, LEVEL_PX, nearest=not top)
+        return heights if top else np.where(heights < 1.0, heights, np.float32(0.0))
+
+    def _cast(self, things: list[Placed], clip_from_world: Pose, size: int, nearest: bool) -> NDArray[np.float32]:
+        """[size, size] float32: least depth (or greatest) of things in an orthographic view; 1 (or 0) where none is."""
+        gl = self._gl
+        gl.glViewport(0, 0, size, size)
+        gl.glDepthFunc(gl.GL_LESS if nearest else gl.GL_GREATER)
+        gl.glClearBufferfv(gl.GL_DEPTH, 0, np.full(1, 1.0 if nearest else 0.0, np.float32))
+        for thing in things:
+            self._program.set_cast(clip_from_world @ thing.T_world_shape)
+            for batch in self._shapes.fetch(thing.shape):
+                gl.glBindVertexArray(batch.vertex_array)
+                gl.glDrawElements(gl.GL_TRIANGLES, batch.index_count, gl.GL_UNSIGNED_INT, None)
+        depth = np.empty((size, size), np.float32)
+        gl.glReadPixels(0, 0, size, size, gl.GL_DEPTH_COMPONENT, gl.GL_FLOAT, depth)
+        return depth
+
+    def _floor_sampler(self) -> int:
+        """Reads one level of a texture at a time: on a floor that fills the image the second costs 2 ms."""
+        gl = self._gl
+        name = int(np.ravel(gl.glGenSamplers(1))[0])
+        gl.glSamplerParameteri(name, gl.GL_TEXTURE_MIN_FILTER, gl.GL_LINEAR_MIPMAP_NEAREST)
+        gl.glSamplerParameteri(name, gl.GL_TEXTURE_MAG_FILTER, gl.GL_LINEAR)
+        return name
+
+    def _depth_texture(self) -> int:
+        gl = self._gl
+        name = self._texture(gl.GL_LINEAR, (1.0, 1.0, 1.0, 1.0))
+        gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_COMPARE_MODE, gl.GL_COMPARE_REF_TO_TEXTURE)
+        gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_COMPARE_FUNC, gl.GL_LEQUAL)
+        form = (gl.GL_DEPTH_COMPONENT32F, SHADOW_PX, SHADOW_PX, 0, gl.GL_DEPTH_COMPONENT, gl.GL_FLOAT, None)
+        gl.glTexImage2D(gl.GL_TEXTURE_2D, 0, *form)
+        return name
+
+    def _color_texture(self) -> int:
+        return self._texture(self._gl.GL_LINEAR, (1.0, 1.0, 0.0, 1.0))
+
+    def _texture(self, filtering: int, border: tuple[float, float, float, float]) -> int:
+        """A texture, bound, that shows `border` outside of [0, 1]."""
+        gl = self._gl
+        name = int(gl.glGenTextures(1))
+        gl.glBindTexture(gl.GL_TEXTURE_2D, name)
+        for setting in (gl.GL_TEXTURE_MIN_FILTER, gl.GL_TEXTURE_MAG_FILTER):
+            gl.glTexParameteri(gl.GL_TEXTURE_2D, setting, filtering)
+        for setting in (gl.GL_TEXTURE_WRAP_S, gl.GL_TEXTURE_WRAP_T):
+            gl.glTexParameteri(gl.GL_TEXTURE_2D, setting, gl.GL_CLAMP_TO_BORDER)
+        gl.glTexParameterfv(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_BORDER_COLOR, np.array(border, np.float32))
+        return name
+
+    def _upload(self, texture: int, pixels: NDArray[np.uint8]) -> None:
+        gl = self._gl
+        gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
+        gl.glPixelStorei(gl.GL_UNPACK_ALIGNMENT, 1)
+        height, width = pixels.shape[:2]
+        form = (gl.GL_RGBA8, width, height, 0, gl.GL_RGBA, gl.GL_UNSIGNED_BYTE, np.ascontiguousarray(pixels))
+        gl.glTexImage2D(gl.GL_TEXTURE_2D, 0, *form)
+
+
+MAP_BYTES = 4 * (SHADOW_PX**2 + 2 * MAP_PX**2 + 1)
+"""All that is ever held."""
