@@ -81,7 +81,7 @@ class PairLike:
     """check_pair looks at nothing but the agreement."""
 
     def __init__(self, object_mm: float | None, scene_mm: float | None) -> None:
-        self.agreement = Agreement(object_mm, 1.0, 100, scene_mm)
+        self.exact_agreement = Agreement(object_mm, 1.0, 100, scene_mm)
 
 
 @pytest.mark.parametrize(("object_mm", "scene_mm", "what"), [(1.5, 0.1, "the object"), (0.1, 1.5, "the scene")])
