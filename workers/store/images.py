@@ -1,11 +1,11 @@
 """Images as PNG bytes and back: lossless, and the same bytes for the same pixels."""
 
 import struct
-import zlib
 from typing import cast
 
 import cv2
 import numpy as np
+from isal import isal_zlib
 from numpy.typing import NDArray
 
 from schemas.errors import CorruptError
@@ -19,6 +19,9 @@ _CHUNK = struct.Struct(">I4s")
 FAST_LEVEL = 1
 """The level of `png_level` that asks for speed."""
 
+_NONE, _SUB = 0, 1
+"""PNG filters of a row: as it is, and the difference from the pixel to the left."""
+
 
 def encode_png(pixels: Pixels, level: int = FAST_LEVEL) -> bytes:
     """PNG bytes of [H, W, 3] uint8 RGB, [H, W] uint8 or [H, W] uint16. Raises ValueError for anything else.
@@ -30,10 +33,47 @@ def encode_png(pixels: Pixels, level: int = FAST_LEVEL) -> bytes:
         raise ValueError(f"an image of shape {pixels.shape} and type {pixels.dtype} has no encoding here")
     if 0 in pixels.shape:
         raise ValueError(f"an image of shape {pixels.shape} has no pixels")
-    # OpenCV takes BGR, and turns channels round thirty times as fast as numpy copies them in reverse.
     whole: NDArray = np.ascontiguousarray(pixels)
-    turned = cv2.cvtColor(whole, cv2.COLOR_RGB2BGR) if colored else whole
-    done, data = cv2.imencode(".png", turned, _settings(pixels, level))
+    return _encode_fast(whole) if level == FAST_LEVEL else _encode_small(whole, level)
+
+
+def _encode_fast(pixels: NDArray) -> bytes:
+    """By ISA-L's deflate, which takes a quarter to a tenth of the time of OpenCV's, for files of the same size.
+
+    640 x 480, one core, rendered images, against the best settings of OpenCV: textured RGB 2.1 ms and 233 KiB (8.4 ms,
+    231 KiB), projected RGB 1.2 ms and 151 KiB (4.8, 143), depth 0.26 ms and 17 KiB (1.1, 12), projected depth 0.46 ms
+    and 25 KiB (1.5, 22), region ids 0.08 ms and 3 KiB (0.46, 4).
+    """
+    height, width = pixels.shape[:2]
+    head = struct.pack(">IIBBBBB", width, height, 8 * pixels.itemsize, 2 if pixels.ndim == 3 else 0, 0, 0, 0)
+    body = isal_zlib.compress(_filter_rows(pixels).reshape(-1), 1)
+    return b"".join((_SIGNATURE, *_chunk(b"IHDR", head), *_chunk(b"IDAT", body), *_chunk(b"IEND", b"")))
+
+
+def _filter_rows(pixels: NDArray) -> NDArray[np.uint8]:
+    """[H, 1 + row bytes]: each row behind the number of its PNG filter, `sub` for colour with shades and else `none`."""
+    samples = pixels.byteswap() if pixels.itemsize == 2 else pixels
+    row_bytes = samples.view(np.uint8).reshape(len(pixels), -1)
+    rows = np.empty((len(pixels), 1 + row_bytes.shape[1]), np.uint8)
+    if pixels.ndim == 3 and not _is_flat(pixels):
+        rows[:, 0] = _SUB
+        rows[:, 1:4] = row_bytes[:, :3]
+        np.subtract(row_bytes[:, 3:], row_bytes[:, :-3], out=rows[:, 4:])
+    else:
+        rows[:, 0] = _NONE
+        rows[:, 1:] = row_bytes
+    return rows
+
+
+def _chunk(kind: bytes, data: bytes) -> tuple[bytes, bytes, bytes]:
+    """A PNG chunk: length and kind, data, CRC-32 of kind and data."""
+    return _CHUNK.pack(len(data), kind), data, isal_zlib.crc32(data, isal_zlib.crc32(kind)).to_bytes(4, "big")
+
+
+def _encode_small(pixels: NDArray, level: int) -> bytes:
+    # OpenCV takes BGR, and turns channels round thirty times as fast as numpy copies them in reverse.
+    turned = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
+    done, data = cv2.imencode(".png", turned, [cv2.IMWRITE_PNG_COMPRESSION, level])
     if not done:
         raise ValueError(f"an image of shape {pixels.shape} could not be encoded")
     return data.tobytes()
@@ -59,30 +99,9 @@ def _check_chunks(data: bytes, name: str) -> None:
     while kind != b"IEND":
         size, kind = _CHUNK.unpack(data[position : position + _CHUNK.size].ljust(_CHUNK.size))
         end = position + _CHUNK.size + size
-        if data[end : end + 4] != zlib.crc32(data[position + 4 : end]).to_bytes(4, "big"):
+        if data[end : end + 4] != isal_zlib.crc32(data[position + 4 : end]).to_bytes(4, "big"):
             raise CorruptError(f"{name} is torn or altered at byte {position}: a PNG chunk fails its checksum")
         position = end + 4
-
-
-def _settings(pixels: Pixels, level: int) -> list[int]:
-    """OpenCV's parameters: for the fast level, those that suit a picture of flat areas, or one with noise.
-
-    640 x 480, one core, rendered images against OpenCV's defaults: RGB 2.7 ms and 52 KiB (5.3 ms, 42 KiB), depth 1.2 ms
-    and 11 KiB (2.7, 9), region ids 0.5 ms and 4 KiB (1.0, 3), projected RGB 3.0 ms and 65 KiB (6.6, 206), projected
-    depth 1.5 ms and 22 KiB (4.1, 131). With sensor-like noise the defaults are right: RGB 7.9 ms and 479 KiB, and level
-    1 with OpenCV's own filters takes 18 ms and 531 KiB.
-    """
-    if level != FAST_LEVEL:
-        return [cv2.IMWRITE_PNG_COMPRESSION, level]
-    if _is_flat(pixels):
-        strategy, row_filter = cv2.IMWRITE_PNG_STRATEGY_DEFAULT, cv2.IMWRITE_PNG_FILTER_NONE
-    else:
-        strategy, row_filter = cv2.IMWRITE_PNG_STRATEGY_RLE, cv2.IMWRITE_PNG_FILTER_SUB
-    return [
-        *(cv2.IMWRITE_PNG_COMPRESSION, level),
-        *(cv2.IMWRITE_PNG_STRATEGY, strategy),
-        *(cv2.IMWRITE_PNG_FILTER, row_filter),
-    ]
 
 
 def _is_flat(pixels: Pixels) -> bool:
