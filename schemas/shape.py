@@ -57,9 +57,13 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """The parts of one rigid thing, all in one frame."""
+    """The parts of one rigid thing, all in one frame.
+
+    `closed`: together they are closed bodies, wound outwards, so that from outside no back of a face is seen.
+    """
 
     parts: tuple[Part, ...]
+    closed: bool = False
 
     @property
     def vertices(self) -> Array:

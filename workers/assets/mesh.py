@@ -73,7 +73,7 @@ def transform_shape(shape: Shape, linear: Array, offset: Array) -> Shape:
         faces = frozen_array(part.faces[:, ::-1], np.int32) if mirrored else part.faces
         vertices = frozen_array(_apply(linear, part.vertices) + offset)
         parts.append(replace(part, vertices=vertices, faces=faces, normals=normals))
-    return Shape(tuple(parts))
+    return Shape(tuple(parts), shape.closed)
 
 
 def _apply(linear: Array, vertices: Array) -> Array:
@@ -164,7 +164,8 @@ def clean_shape(path: Path, pieces: list[_Piece]) -> tuple[Shape, bool, list[str
             raise MeshError("no_faces", f"{path} has only faces without area")
     notes = [f"{len(kept) - len(faces)} doubled or empty faces dropped"] if len(faces) < len(kept) else []
     parts = [_part(piece, faces[owner == k] - starts[k]) for k, piece in enumerate(pieces) if (owner == k).any()]
-    return Shape(tuple(parts)), watertight, notes
+    closed = watertight and bool((bodies.volume > 0.0).all())
+    return Shape(tuple(parts), closed), watertight, notes
 
 
 def _settle_winding(vertices: Array, faces: Indices, owner: Indices, point: Indices) -> tuple[Indices, Indices, Bodies]:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.base import Array
 from schemas.shape import Shape
 from workers.render.batches import COLUMNS, Batch, pack_shape
 
@@ -54,6 +55,20 @@ class Uploaded:
             gl.glDeleteTextures(1, [self.texture])
 
 
+@dataclass(frozen=True, eq=False)
+class UploadedShape:
+    """A shape on the GPU: its batches, the corners [8, 3] of its bounding box, and whether its bodies are closed."""
+
+    batches: tuple[Uploaded, ...]
+    corners: Array
+    closed: bool
+
+    @property
+    def bytes(self) -> int:
+        """On the GPU."""
+        return sum(batch.bytes for batch in self.batches)
+
+
 class ShapeStore:
     """Shapes on the GPU, by identity; the longest unused go when there are too many or they are too big.
 
@@ -63,7 +78,7 @@ class ShapeStore:
     def __init__(self, gl: ModuleType, max_shapes: int = 64, max_bytes: int = 256 * 2**20) -> None:
         self._gl = gl
         self._max_shapes, self._max_bytes = max_shapes, max_bytes
-        self._stored: OrderedDict[int, tuple[Shape, tuple[Uploaded, ...]]] = OrderedDict()
+        self._stored: OrderedDict[int, tuple[Shape, UploadedShape]] = OrderedDict()
         self.bytes = 0
 
     def __len__(self) -> int:
@@ -72,15 +87,17 @@ class ShapeStore:
     def __contains__(self, shape: Shape) -> bool:
         return id(shape) in self._stored
 
-    def fetch(self, shape: Shape) -> tuple[Uploaded, ...]:
-        """The shape's batches, uploaded now if they are not there."""
+    def fetch(self, shape: Shape) -> UploadedShape:
+        """The shape, uploaded now if it is not there."""
         if shape in self:
             self._stored.move_to_end(id(shape))
             return self._stored[id(shape)][1]
         batches = tuple(_upload(self._gl, batch) for batch in pack_shape(shape))
-        self._stored[id(shape)] = (shape, batches)
-        self.bytes += sum(batch.bytes for batch in batches)
-        return batches
+        corners = np.stack(np.meshgrid(*shape.bounds.T, indexing="ij"), axis=-1).reshape(-1, 3)
+        uploaded = UploadedShape(batches, corners, shape.closed)
+        self._stored[id(shape)] = (shape, uploaded)
+        self.bytes += uploaded.bytes
+        return uploaded
 
     def trim(self, in_use: int) -> None:
         """Free the longest unused until the bounds hold, but not the `in_use` shapes that were fetched last."""
@@ -93,9 +110,9 @@ class ShapeStore:
             self._drop_oldest()
 
     def _drop_oldest(self) -> None:
-        _, (_, batches) = self._stored.popitem(last=False)
-        for batch in batches:
-            self.bytes -= batch.bytes
+        _, (_, uploaded) = self._stored.popitem(last=False)
+        self.bytes -= uploaded.bytes
+        for batch in uploaded.batches:
             batch.free(self._gl)
 
 

@@ -43,7 +43,6 @@ class ColourTarget:
         if self.size != (k.width, k.height):
             self._resize(k.width, k.height)
         gl.glViewport(0, 0, k.width, k.height)
-        gl.glDepthFunc(gl.GL_LESS)
         if mask is None:
             return
         gl.glBindTexture(gl.GL_TEXTURE_2D, self._mask)
@@ -70,7 +69,7 @@ class ColourTarget:
         gl = self._gl
         background = np.append(encode_srgb(np.array(appearance.background)), 0.0)
         gl.glClearBufferfv(gl.GL_COLOR, 0, background.astype(np.float32))
-        gl.glClearBufferfv(gl.GL_DEPTH, 0, np.ones(1, np.float32))
+        gl.glClearBufferfv(gl.GL_DEPTH, 0, np.zeros(1, np.float32))
 
     def read(self) -> NDArray[np.uint8]:
         """[H, W, 4] uint8 sRGB."""
@@ -83,7 +82,6 @@ class ColourTarget:
     def release(self) -> None:
         """Leave the tests as the label pass wants them."""
         self._gl.glDisable(self._gl.GL_STENCIL_TEST)
-        self._gl.glDepthFunc(self._gl.GL_GREATER)
 
     def free(self) -> None:
         """Give the GPU's memory back."""

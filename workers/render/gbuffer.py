@@ -34,10 +34,10 @@ from schemas.job import Render
 from schemas.scene import REGION_FLOOR, Appearance, GBuffer, Placed
 from workers.geometry.frames import invert
 from workers.render.batches import encode_srgb
-from workers.render.buffers import ShapeStore, TargetStore, Uploaded
+from workers.render.buffers import ShapeStore, TargetStore, Uploaded, UploadedShape
 from workers.render.colour import ColourTarget
 from workers.render.context import open_context
-from workers.render.programs import Program, light_slots
+from workers.render.programs import NEAR_M, Program, light_slots
 from workers.render.scenelight import SceneLight
 from workers.render.shaders import COUNT_FRAGMENT, COUNT_VERTEX, Variant, label_sources
 from workers.render.smoothing import OFFSETS_PX, blend, edges, smooth
@@ -46,6 +46,10 @@ from workers.render.window import TILE_PX, tiles
 STAND_BACK = 2e-6
 """Share of its distance, along its normal, by which a face stands back for each lower region id in the scene: 5
 micrometres at 2.5 m. A quarter of it is the least that kept 400 pairs of coplanar squares apart."""
+
+FLOOR_AHEAD = 1e-5
+"""Share of its distance by which the floor is taken to be nearer than it is. Its depth in the test is the rasteriser's,
+exact to 3e-6 of the distance, so that what things hide of it is not shaded; what is stored is the plane's, as everywhere."""
 
 FLAT = Render(tier="flat")
 
@@ -98,6 +102,7 @@ class Renderer:
         self._counter = Program(gl, COUNT_VERTEX, COUNT_FRAGMENT)
         for setting in (gl.GL_CULL_FACE, gl.GL_BLEND, gl.GL_DITHER, gl.GL_MULTISAMPLE):
             gl.glDisable(setting)
+        gl.glFrontFace(gl.GL_CW)  # y runs down
         gl.glDepthFunc(gl.GL_GREATER)
         gl.glProvokingVertex(gl.GL_LAST_VERTEX_CONVENTION)
         gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
@@ -134,18 +139,21 @@ class Renderer:
         gl.glDisable(gl.GL_DEPTH_TEST)
         T_cam_shape = invert(camera.T_world_cam) @ thing.T_world_shape
         self._counter.use()
+        uploaded = self._shapes.fetch(thing.shape)
         for tile in tiles(thing.shape, T_cam_shape, camera.intrinsics):
             self._targets.bind(TILE_PX, TILE_PX)
             gl.glViewport(0, 0, tile.width, tile.height)
             gl.glClearBufferfv(gl.GL_COLOR, 0, np.zeros(4, np.float32))
             self._counter.set_view(tile)
-            self._counter.set_thing(T_cam_shape, 0, 0.0)
-            for batch in self._shapes.fetch(thing.shape):
+            self._counter.set_thing(T_cam_shape, 0, 0.0, 0.0)
+            self._cull(uploaded, T_cam_shape)
+            for batch in uploaded.batches:
                 self._draw_batch(batch)
             covered = np.empty((tile.height, tile.width), np.uint8)
             gl.glReadBuffer(gl.GL_COLOR_ATTACHMENT0)
             gl.glReadPixels(0, 0, tile.width, tile.height, gl.GL_RED, gl.GL_UNSIGNED_BYTE, covered)
             count += int(np.count_nonzero(covered))
+        gl.glDisable(gl.GL_CULL_FACE)
         self._shapes.trim(in_use=1)
         return count
 
@@ -163,16 +171,17 @@ class Renderer:
         self.closed = True
 
     def _draw_things(self, things: Sequence[Placed], view: ViewOf, labels: bool) -> None:
-        """Draw into what is bound; in colour alone nearer things first, so that what they hide is not shaded."""
+        """Draw into what is bound: the floor last, so that what things hide of it is not shaded."""
         ranks = {region: rank for rank, region in enumerate(sorted({thing.region_id for thing in things}))}
         lights = light_slots(view.appearance)
-        by_variant: dict[Variant, list[tuple[Placed, Uploaded]]] = {}
-        for thing in things if labels else reversed(things):
-            ground = view.raster and thing.region_id == REGION_FLOOR
-            for batch in self._shapes.fetch(thing.shape):
+        by_variant: dict[Variant, list[tuple[Placed, UploadedShape, Uploaded]]] = {}
+        for thing in reversed(things):
+            ground = thing.region_id == REGION_FLOOR
+            shape = self._shapes.fetch(thing.shape)
+            for batch in shape.batches:
                 looks = (batch.texture is not None, batch.few_triangles, batch.matte, lights)
                 variant = Variant(*looks, view.raster, ground, labels, batch.holes and not labels)
-                by_variant.setdefault(variant, []).append((thing, batch))
+                by_variant.setdefault(variant, []).append((thing, shape, batch))
         for variant, draws in by_variant.items():
             program = self._program(variant)
             program.use()
@@ -180,19 +189,23 @@ class Renderer:
             program.set_light(view.appearance, view.T_cam_world)
             if view.raster:
                 program.set_ambience(view.appearance, view.T_cam_world)
-            for thing, batch in draws:
+            for thing, shape, batch in draws:
                 if view.raster:
                     self._lit().bind(program, thing)
                 stand_back = STAND_BACK * ranks[thing.region_id]
-                program.set_thing(view.T_cam_world @ thing.T_world_shape, thing.region_id, stand_back)
+                ahead = FLOOR_AHEAD if variant.ground else -10.0 * stand_back
+                T_cam_shape = view.T_cam_world @ thing.T_world_shape
+                program.set_thing(T_cam_shape, thing.region_id, stand_back, ahead)
+                self._cull(shape, T_cam_shape, through_holes=not labels)
                 self._draw_batch(batch)
+        self._gl.glDisable(self._gl.GL_CULL_FACE)
         if view.raster:
             self._lit().release()
 
     def _refine(self, drawn: GBuffer, things: Sequence[Placed], view: ViewOf, samples: int) -> GBuffer:
         """The same with holes cut out of colour and its edges made smooth."""
         rgb = drawn.rgb
-        if any(batch.holes for thing in things for batch in self._shapes.fetch(thing.shape)):
+        if any(batch.holes for thing in things for batch in self._shapes.fetch(thing.shape).batches):
             rgb = cv2.cvtColor(self._draw_colour(things, view, None), cv2.COLOR_RGBA2RGB)  # type: ignore[assignment]
             self._colour().release()
         mask = edges(rgb, drawn.region)
@@ -237,6 +250,13 @@ class Renderer:
         if variant not in self._programs:
             self._programs[variant] = Program(self._gl, *label_sources(variant))
         return self._programs[variant]
+
+    def _cull(self, shape: UploadedShape, T_cam_shape: Pose, through_holes: bool = False) -> None:
+        """Leave out the backs of closed bodies, which nobody sees: unless the near plane cuts into them, or a texture."""
+        gl = self._gl
+        whole = bool((shape.corners @ T_cam_shape[2, :3] + T_cam_shape[2, 3] > NEAR_M).all())
+        cut = through_holes and any(batch.holes for batch in shape.batches)
+        (gl.glEnable if shape.closed and whole and not cut else gl.glDisable)(gl.GL_CULL_FACE)
 
     def _draw_batch(self, batch: Uploaded) -> None:
         gl = self._gl

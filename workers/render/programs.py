@@ -64,12 +64,16 @@ class Program:
         """Where a thing lies in an orthographic view."""
         self._gl.glUniformMatrix4fv(self._place("clip_from_shape"), 1, True, clip_from_shape.astype(np.float32))
 
-    def set_thing(self, T_cam_shape: Pose, region_id: int, stand_back: float) -> None:
-        """Where a thing is, its region id, and the share of its distance by which it is pushed back in the test."""
+    def set_thing(self, T_cam_shape: Pose, region_id: int, stand_back: float, ahead: float) -> None:
+        """Where a thing is, its region id, and shares of its distance for the depth test.
+
+        `stand_back` is how far it is pushed back where its fragments make their own depth, `ahead` how much nearer it is
+        taken where the rasteriser interpolates it.
+        """
         matrix = T_cam_shape.astype(np.float32)
         self._gl.glUniformMatrix4fv(self._place("cam_from_shape"), 1, True, matrix)
         self._gl.glUniform2f(self._place("thing"), region_id / 255.0, stand_back)
-        self._gl.glUniform1f(self._place("thing_apart"), 10.0 * stand_back * NEAR_M)
+        self._gl.glUniform1f(self._place("ahead"), 2.0 * NEAR_M * ahead)
 
     def free(self) -> None:
         """Give the GPU's memory back."""
@@ -90,14 +94,14 @@ def light_slots(appearance: Appearance) -> int:
 def clip_from_cam(k: Intrinsics) -> Pose:
     """[4, 4] float64: optical frame to clip space with x right and y *down*; nothing is cut off at the far end.
 
-    Window x = (x_clip / w + 1) * width / 2 = fx * X / Z + cx, and likewise y. z_clip = Z - 2 near is at least -w = -Z
-    exactly where Z >= near, and never reaches w.
+    Window x = (x_clip / w + 1) * width / 2 = fx * X / Z + cx, and likewise y. z_clip = 2 near - Z is at most w = Z exactly
+    where Z >= near, and always above -w; window depth is near / Z, which falls with distance.
     """
     return np.array(
         [
             [2.0 * k.fx / k.width, 0.0, 2.0 * k.cx / k.width - 1.0, 0.0],
             [0.0, 2.0 * k.fy / k.height, 2.0 * k.cy / k.height - 1.0, 0.0],
-            [0.0, 0.0, 1.0, -2.0 * NEAR_M],
+            [0.0, 0.0, -1.0, 2.0 * NEAR_M],
             [0.0, 0.0, 1.0, 0.0],
         ]
     )

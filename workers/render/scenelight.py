@@ -129,7 +129,7 @@ class SceneLight:
         gl.glClearBufferfv(gl.GL_DEPTH, 0, np.full(1, 1.0 if nearest else 0.0, np.float32))
         for thing in things:
             self._program.set_cast(clip_from_world @ thing.T_world_shape)
-            for batch in self._shapes.fetch(thing.shape):
+            for batch in self._shapes.fetch(thing.shape).batches:
                 gl.glBindVertexArray(batch.vertex_array)
                 gl.glDrawElements(gl.GL_TRIANGLES, batch.index_count, gl.GL_UNSIGNED_INT, None)
         depth = np.empty((size, size), np.float32)

@@ -24,7 +24,7 @@ class Variant(NamedTuple):
     raster: bool = False
     """With shadows and occlusion (lighting.py)."""
     ground: bool = False
-    """A floor, whose shadow lies in its level's map: for `raster` only."""
+    """A floor: its depth in the test is the rasteriser's, so that what things hide of it is not shaded."""
     labels: bool = True
     """False: colour alone, tested by the depth that the rasteriser interpolates, so that hidden fragments cost nothing."""
     cutout: bool = False
@@ -44,8 +44,8 @@ out vec4 v_normal_metallic;
 out vec4 v_albedo_roughness;
 out vec2 v_uv;
 flat out vec4 v_plane;
-#if !LABELS
-uniform float thing_apart;
+#if GROUND || !LABELS
+uniform float ahead;
 #endif
 
 #if FEW_TRIANGLES
@@ -90,8 +90,8 @@ void main() {
     v_albedo_roughness = albedo_roughness;
     v_uv = uv;
     gl_Position = clip_from_cam * vec4(turn * position + shift, 1.0);
-#if !LABELS
-    gl_Position.z += thing_apart;
+#if GROUND || !LABELS
+    gl_Position.z += ahead;
 #endif
 }
 """
@@ -174,7 +174,9 @@ void main() {
     float z = cosine > GRAZING ? v_plane.w / across : 1.0 / gl_FragCoord.w;
 #if LABELS
     out_z = z;
+#if !GROUND
     gl_FragDepth = NEAR_M / (z * (1.0 + v_thing.y / max(cosine, GRAZING)));
+#endif
 #endif
 
     vec3 face_normal = across > 0.0 ? -v_plane.xyz : v_plane.xyz;

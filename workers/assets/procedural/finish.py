@@ -68,7 +68,7 @@ def cut_into_parts(solid: Solid, surfaces: Sequence[Surface], centre: Array, sca
             index, origin = _dense(corners * 3 + variant)
             uv = None if coordinates is None else coordinates(point[origin // 3], origin % 3)
             parts.append(_part(surface, vertices[point[origin // 3]], index, normals[origin // 3], uv))
-    return Shape(tuple(parts))
+    return Shape(tuple(parts), closed=True)
 
 
 def _part(surface: Surface, vertices: Array, faces: Indices, normals: Array, uv: Array | None) -> Part:
