@@ -13,7 +13,8 @@ from schemas.layout import IMAGES, file_pose_id, image_path, patch_path
 from schemas.scene import REGION_FIRST_OBJECT, ObjectLabel, View
 from workers.geometry.camera import image_coordinates
 from workers.geometry.frames import invert
-from workers.scene.derive import agree_across, bounding_box, crop_box, derive_projected, projection_shares
+from workers.geometry.pixels import measure_regions
+from workers.scene.derive import agree_across, crop_box, derive_projected, projection_shares
 from workers.scene.views import front_distance, place_aligned_camera, place_mirror_camera, stored_depth_m
 
 SAME = 1e-12
@@ -111,13 +112,14 @@ def _check_labels(view: View, scene: Row) -> list[str]:
         label.region_id: scene["T_world_obj" if label.region_id >= REGION_FIRST_OBJECT else "T_world_table"]
         for label in view.labels
     }
+    extents = measure_regions(view.region)
     for label in view.labels:
-        mask = view.region == label.region_id
+        pixels, box = extents[label.region_id]
         name = f"{where}, region {label.region_id}"
-        if int(mask.sum()) != label.pixels:
-            faults.append(f"{name}: the mask has {int(mask.sum())} pixels, objects says {label.pixels}")
-        if bounding_box(mask) != label.bbox_xywh:
-            faults.append(f"{name}: the mask's box is {bounding_box(mask)}, objects says {label.bbox_xywh}")
+        if pixels != label.pixels:
+            faults.append(f"{name}: the mask has {pixels} pixels, objects says {label.pixels}")
+        if box != label.bbox_xywh:
+            faults.append(f"{name}: the mask's box is {box}, objects says {label.bbox_xywh}")
         if image_coordinates(label.T_cam_obj, view.camera.intrinsics) != (label.u, label.v):
             faults.append(f"{name}: T_cam_obj projects to another pixel than ({label.u}, {label.v})")
         if _differs(invert(view.camera.T_world_cam) @ np.reshape(worlds[label.region_id], (4, 4)), label.T_cam_obj):

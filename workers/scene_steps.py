@@ -23,6 +23,7 @@ from schemas.scene import (
 )
 from workers.assets.catalogue import choose_object, choose_table, load_asset
 from workers.context import WorkerContext
+from workers.geometry.pixels import measure_regions
 from workers.scene.check import check_against_rays, check_pair, is_raycast_scene
 from workers.scene.derive import agree_across, derive_projected, label_region, projection_shares
 from workers.scene.plan import choose_category, plan_scene
@@ -174,14 +175,14 @@ def render_view(scene: SceneView, role: str, ids: tuple[int, int], camera: Camer
 
 def label_view(scene: SceneView, camera: Camera, buffer: GBuffer) -> tuple[ObjectLabel, ...]:
     """Labels of the table and of every object, in order of region id."""
-    table = scene.plan.table.asset
+    table, extents = scene.plan.table.asset, measure_regions(buffer.region)
     names = {REGION_TABLE: ("table", table.instance_id)}
     names.update({start.region_id: (start.asset.category, start.asset.instance_id) for start in scene.plan.objects})
     return tuple(
         label_region(
             (thing.region_id, *names[thing.region_id], thing.T_world_shape),
             camera,
-            buffer.region,
+            extents[thing.region_id],
             lambda thing=thing: scene.context.renderer.count_pixels(thing, camera),  # type: ignore[misc]
         )
         for thing in scene.posed.things

@@ -9,9 +9,7 @@ from schemas.base import Array
 from schemas.camera import Camera, Intrinsics
 from workers.geometry.camera import unproject
 from workers.geometry.frames import invert, transform
-
-ROWS = 32
-"""Rows of an image that are worked on at once, so that what is in between stays in the processor's cache."""
+from workers.geometry.loops import compiled
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,16 +23,14 @@ class Projected:
     source: NDArray[np.int64]
 
 
-def cloud_in_camera(depth_m: Array, source: Camera, target: Camera) -> tuple[Array, NDArray[np.int64]]:
-    """Points [N, 3] float64 in the target's frame, and the flat source index [N] of each, in ascending order.
+def carry_pixels(depth_m: Array, pixels: NDArray[np.int64], source: Camera, target: Camera) -> Array:
+    """[N, 3] float64: points in the target's frame of the source's pixels (flat indices [N]).
 
-    depth_m [H, W] float64 is z along the source's axis, 0 where there is none.
+    depth_m [H, W] float64 is z along the source's axis.
     """
-    index = np.flatnonzero(depth_m)
-    rows, columns = np.divmod(index, depth_m.shape[1])
-    points = unproject(rows, columns, depth_m.ravel()[index], source.intrinsics)
-    T_target_source = invert(target.T_world_cam) @ source.T_world_cam
-    return transform(T_target_source, points), index
+    rows, columns = np.divmod(pixels, depth_m.shape[1])
+    points = unproject(rows, columns, depth_m.ravel()[pixels], source.intrinsics)
+    return transform(invert(target.T_world_cam) @ source.T_world_cam, points)
 
 
 def forward_project(depth_m: Array, source: Camera, target: Camera, splat: int = 1) -> Projected:
@@ -43,58 +39,47 @@ def forward_project(depth_m: Array, source: Camera, target: Camera, splat: int =
     The target pixel is the floor of (u, v); nearest z wins, ties to the lowest source index; holes stay 0
     (dataset.md "Projection"). With `splat` n > 1 each point fills a square of n x n pixels.
     """
-    height, width = target.intrinsics.height, target.intrinsics.width
-    reach = splat // 2
+    m = target.intrinsics
+    depth, index = np.zeros((m.height, m.width)), np.full((m.height, m.width), -1, np.int64)
     T = invert(target.T_world_cam) @ source.T_world_cam
-    strips = [
-        _carry_strip(depth_m[first : first + ROWS], first, (source.intrinsics, target.intrinsics, T), reach)
-        for first in range(0, len(depth_m), ROWS)
-    ]
-    column, row, z, index = (np.concatenate(part) for part in zip(*strips, strict=True))
-    if reach:
-        dy, dx = (d.ravel() for d in np.mgrid[-reach : reach + 1, -reach : reach + 1])
-        column, row = (column[:, None] + dx).ravel(), (row[:, None] + dy).ravel()
-        z, index = np.repeat(z, splat * splat), np.repeat(index, splat * splat)
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        column, row, z, index = column[inside], row[inside], z[inside], index[inside]
-    return _nearest(row * width + column, z, index, (height, width))
+    k = source.intrinsics
+    _carry(depth_m, (k.cx, k.cy, k.fx, k.fy), T, (m.cx, m.cy, m.fx, m.fy), splat // 2, depth, index)
+    return Projected(depth, index)
 
 
-def _carry_strip(
-    depth_m: Array, first: int, cameras: tuple[Intrinsics, Intrinsics, Array], reach: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, NDArray[np.int64]]:
-    """(column, row, z, source index), each [N], of the points of some rows from `first` on that fall near the target.
-
-    `cameras`: source, target, and T_target_source. The same sums as `cloud_in_camera`, in the same order, over all
-    pixels of the rows: gathering the points first costs three times as much as the arithmetic on those that have none.
-    """
-    k, m, T = cameras
-    x = (np.arange(k.width) + 0.5 - k.cx) / k.fx * depth_m
-    y = ((np.arange(first, first + len(depth_m)) + 0.5 - k.cy) / k.fy)[:, None] * depth_m
-    X, Y, Z = (T[i, 0] * x + T[i, 1] * y + T[i, 2] * depth_m + T[i, 3] for i in range(3))
-    ahead = np.where(Z > 0.0, Z, 1.0)
-    u, v = m.fx * X / ahead + m.cx, m.fy * Y / ahead + m.cy
-    near = (Z > 0.0) & (u >= -reach) & (u < m.width + reach) & (v >= -reach) & (v < m.height + reach)
-    index = np.flatnonzero(near & (depth_m > 0.0))
-    column, row = (np.floor(c.ravel()[index]).astype(np.int64) for c in (u, v))
-    return column, row, Z.ravel()[index], index + first * k.width
-
-
-def _nearest(pixel: NDArray[np.int64], z: Array, index: NDArray[np.int64], shape: tuple[int, int]) -> Projected:
-    """Of the points that fall on one pixel keep the nearest, then the lowest index.
-
-    `index` ascends, so writing from the far end of a stable order by z leaves the winner; no sort of all keys is
-    needed: the smallest z of each pixel first, then the smallest index among those that have it.
-    """
-    depth = np.full(shape[0] * shape[1], np.inf)
-    np.minimum.at(depth, pixel, z)
-    winner = z == depth[pixel]
-    source = np.full(depth.shape, np.iinfo(np.int64).max)
-    np.minimum.at(source, pixel[winner], index[winner])
-    hole = np.isinf(depth)
-    depth[hole] = 0.0
-    source[hole] = -1
-    return Projected(depth.reshape(shape), source.reshape(shape))
+@compiled
+def _carry(
+    depth_m: Array,
+    k: tuple[float, float, float, float],
+    T_target_source: Array,
+    m: tuple[float, float, float, float],
+    reach: int,
+    depth: Array,
+    index: NDArray[np.int64],
+) -> None:
+    """Fill depth and index; k and m: cx, cy, fx, fy of source and target. Sums in the order of `carry_pixels`."""
+    height, width = depth.shape
+    T = T_target_source
+    for i in range(depth_m.shape[0]):
+        ray_y = (i + 0.5 - k[1]) / k[3]
+        for j in range(depth_m.shape[1]):
+            z = depth_m[i, j]
+            if not z > 0.0:
+                continue
+            x, y = (j + 0.5 - k[0]) / k[2] * z, ray_y * z
+            Z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+            if not Z > 0.0:
+                continue
+            u = m[2] * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / Z + m[0]
+            v = m[3] * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / Z + m[1]
+            if not (-reach <= u < width + reach and -reach <= v < height + reach):
+                continue
+            column, row = int(np.floor(u)), int(np.floor(v))
+            for at_row in range(max(row - reach, 0), min(row + reach + 1, height)):
+                for at in range(max(column - reach, 0), min(column + reach + 1, width)):
+                    if index[at_row, at] < 0 or depth[at_row, at] > Z:
+                        depth[at_row, at] = Z
+                        index[at_row, at] = i * depth_m.shape[1] + j
 
 
 def sample_inverse_depth(

@@ -37,11 +37,12 @@ from workers.render.batches import encode_srgb
 from workers.render.buffers import ShapeStore, TargetStore, Uploaded, UploadedShape
 from workers.render.colour import ColourTarget
 from workers.render.context import open_context
+from workers.render.counting import PixelCounter
 from workers.render.programs import NEAR_M, Program, light_slots
 from workers.render.scenelight import SceneLight
-from workers.render.shaders import COUNT_FRAGMENT, COUNT_VERTEX, Variant, label_sources
+from workers.render.shaders import Variant, label_sources
 from workers.render.smoothing import OFFSETS_PX, blend, edges, smooth
-from workers.render.window import TILE_PX, tiles
+from workers.render.window import tiles
 
 STAND_BACK = 2e-6
 """Share of its distance, along its normal, by which a face stands back for each lower region id in the scene: 5
@@ -99,7 +100,7 @@ class Renderer:
         self._scene_light: SceneLight | None = None
         self._colour_target: ColourTarget | None = None
         self._rgba = np.empty((0, 0, 4), np.uint8)
-        self._counter = Program(gl, COUNT_VERTEX, COUNT_FRAGMENT)
+        self._counter = PixelCounter(gl)
         for setting in (gl.GL_CULL_FACE, gl.GL_BLEND, gl.GL_DITHER, gl.GL_MULTISAMPLE):
             gl.glDisable(setting)
         gl.glFrontFace(gl.GL_CW)  # y runs down
@@ -134,26 +135,14 @@ class Renderer:
         The pixel grid is the image's, continued on all sides by one width and one height of the image: what lies
         beyond that, as of a thing that reaches behind the camera, is not counted.
         """
-        gl, count = self._gl, 0
         self._platform.make_current()
-        gl.glDisable(gl.GL_DEPTH_TEST)
         T_cam_shape = invert(camera.T_world_cam) @ thing.T_world_shape
-        self._counter.use()
-        uploaded = self._shapes.fetch(thing.shape)
-        for tile in tiles(thing.shape, T_cam_shape, camera.intrinsics):
-            self._targets.bind(TILE_PX, TILE_PX)
-            gl.glViewport(0, 0, tile.width, tile.height)
-            gl.glClearBufferfv(gl.GL_COLOR, 0, np.zeros(4, np.float32))
-            self._counter.set_view(tile)
-            self._counter.set_thing(T_cam_shape, 0, 0.0, 0.0)
-            self._cull(uploaded, T_cam_shape)
-            for batch in uploaded.batches:
-                self._draw_batch(batch)
-            covered = np.empty((tile.height, tile.width), np.uint8)
-            gl.glReadBuffer(gl.GL_COLOR_ATTACHMENT0)
-            gl.glReadPixels(0, 0, tile.width, tile.height, gl.GL_RED, gl.GL_UNSIGNED_BYTE, covered)
-            count += int(np.count_nonzero(covered))
-        gl.glDisable(gl.GL_CULL_FACE)
+        self._counter.program.use()
+        self._counter.program.set_thing(T_cam_shape, 0, 0.0, 0.0)
+        shape = self._shapes.fetch(thing.shape)
+        self._cull(shape, T_cam_shape)
+        count = sum(self._counter.count(shape, tile) for tile in tiles(thing.shape, T_cam_shape, camera.intrinsics))
+        self._gl.glDisable(self._gl.GL_CULL_FACE)
         self._shapes.trim(in_use=1)
         return count
 

@@ -213,9 +213,7 @@ void main() {
 
 COUNT_FRAGMENT = """
 #version 410 core
-layout(location = 0) out vec4 out_color_region;
-
-void main() { out_color_region = vec4(1.0); }
+void main() {}
 """
 
 

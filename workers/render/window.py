@@ -12,7 +12,7 @@ from schemas.shape import Shape
 from workers.geometry.frames import transform
 from workers.render.programs import NEAR_M
 
-TILE_PX = 512
+TILE_PX = 1024
 """Side of the square of pixels that is counted at a time."""
 
 

@@ -10,9 +10,7 @@ from schemas.job import DepthCamera, Images, Mirror
 from schemas.scene import REGION_FLOOR, REGION_TABLE, Placed, PosedScene, ScenePlan, Settled
 from workers.geometry.frames import UP, translation
 from workers.geometry.mirror import mirror_pose
-
-ROWS = 32
-"""Rows of an image that are worked on at once, so that what is in between stays in the processor's cache."""
+from workers.geometry.pixels import round_depth
 
 
 def pose_scene(plan: ScenePlan, settled: tuple[Settled, ...]) -> PosedScene:
@@ -29,15 +27,7 @@ def pose_scene(plan: ScenePlan, settled: tuple[Settled, ...]) -> PosedScene:
 def quantise_depth(depth_m: NDArray[np.floating], images: Images) -> NDArray[np.uint16]:
     """[H, W] uint16: z in units, to the nearest; 0 where nothing was hit or z is outside the stored range (open)."""
     low, high = images.depth_range_m
-    units = np.empty(depth_m.shape, np.uint16)
-    for first in range(0, len(depth_m), ROWS):
-        z = depth_m[first : first + ROWS].astype(np.float64)
-        outside = ~((z > low) & (z < high))  # nan too
-        z *= images.depth_units_per_m
-        np.rint(z, out=z)
-        z[outside] = 0.0
-        units[first : first + ROWS] = z
-    return units
+    return round_depth(depth_m, low, high, images.depth_units_per_m)
 
 
 def stored_depth_m(depth: NDArray[np.uint16], images: Images) -> Array:

@@ -10,9 +10,9 @@ from workers.geometry.camera import orbit_pose, unproject
 from workers.geometry.frames import translation
 from workers.geometry.mirror import mirror_pose
 from workers.geometry.normals import facing_cosine
+from workers.geometry.pixels import Extent
 from workers.scene.derive import (
     agree_across,
-    bounding_box,
     carry_depth,
     crop_box,
     derive_projected,
@@ -123,18 +123,12 @@ def test_a_patch_is_centred_on_the_object_and_left_out_where_it_would_leave_the_
 
 
 def test_a_label_counts_boxes_and_shares_its_own_pixels():
-    region = np.zeros((120, 160), np.uint8)
-    region[10:20, 30:35] = 3
     T = HERE.T_world_cam @ translation(0.001, 0.001, 2.0)
-    made = label_region((3, "mug", "m", T), HERE, region, lambda: 100)
+    made = label_region((3, "mug", "m", T), HERE, Extent(50, (30, 10, 5, 10)), lambda: 100)
     assert (made.u, made.v) == (80, 60)
     assert made.bbox_xywh == (30, 10, 5, 10)
     assert (made.pixels, made.visible_fraction) == (50, 0.5)
-    unseen = label_region((4, "mug", "m", T), HERE, region, lambda: pytest.fail("asked although nothing is seen"))
+    unseen = label_region(
+        (4, "mug", "m", T), HERE, Extent(0, (0, 0, 0, 0)), lambda: pytest.fail("asked although nothing is seen")
+    )
     assert (unseen.pixels, unseen.visible_fraction, unseen.bbox_xywh) == (0, 0.0, (0, 0, 0, 0))
-
-
-def test_the_box_of_one_pixel_is_one_pixel():
-    mask = np.zeros((5, 7), bool)
-    mask[4, 6] = True
-    assert bounding_box(mask) == (6, 4, 1, 1)

@@ -1,0 +1,76 @@
+"""Loops over pixels against what they mean, written with numpy."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from workers.geometry.loops import compiled
+from workers.geometry.pixels import Extent, count_filled, measure_regions, round_depth, take_colours
+
+
+def test_every_region_is_counted_and_boxed():
+    rng = np.random.default_rng(1)
+    region = rng.integers(0, 6, (50, 70)).astype(np.uint8)
+    region[:, 40:] = 2
+    region[4:9, 3:30] = 255
+    extents = measure_regions(region)
+    assert len(extents) == 256
+    for region_id, (pixels, (x, y, width, height)) in enumerate(extents):
+        rows, columns = np.nonzero(region == region_id)
+        assert pixels == len(rows)
+        if pixels:
+            assert (x, y) == (columns.min(), rows.min())
+            assert (x + width, y + height) == (columns.max() + 1, rows.max() + 1)
+        else:
+            assert (x, y, width, height) == (0, 0, 0, 0)
+
+
+def test_the_box_of_one_pixel_is_one_pixel():
+    region = np.zeros((5, 7), np.uint8)
+    region[4, 6] = 9
+    assert measure_regions(region)[9] == Extent(1, (6, 4, 1, 1))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_depth_is_rounded_to_the_nearest_unit_and_is_zero_outside_the_open_range(dtype):
+    depth = np.array([[0.0, 0.2, 0.2001, 1.00005, 1.0003, 7.9999, 8.0, np.nan, np.inf, -1.0]], dtype)
+    exact = depth.astype(np.float64)
+    expected = np.where((exact > 0.2) & (exact < 8.0), np.rint(exact * 5000.0), 0.0)
+    assert round_depth(depth, 0.2, 8.0, 5000.0).tolist() == expected.astype(int).tolist()
+    halves = np.array([[0.5, 1.5, 2.5]], dtype)
+    assert round_depth(halves, 0.0, 9.0, 1.0).tolist() == [[0, 2, 2]], "ties go to even"
+
+
+def test_colours_come_from_where_the_source_says_and_holes_are_black():
+    rgb = np.random.default_rng(2).integers(0, 256, (4, 5, 3)).astype(np.uint8)
+    source = np.array([[19, -1], [0, 7]])
+    assert take_colours(rgb, source).tolist() == [
+        [rgb[3, 4].tolist(), [0, 0, 0]],
+        [rgb[0, 0].tolist(), rgb[1, 2].tolist()],
+    ]
+
+
+def test_what_is_filled_and_what_lies_behind_is_counted():
+    projected = np.array([[0, 10, 20, 65535, 30]], np.uint16)
+    seen = np.array([[5, 0, 14, 65500, 30]], np.uint16)
+    assert count_filled(projected, seen, 5.5) == (4, 2)
+
+
+def test_a_loop_is_compiled_also_where_nothing_can_be_kept_on_disk():
+    program = "from workers.geometry import loops; print(loops.compiled(eval('lambda x: x + 1'))(41))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "42"
+
+
+def test_a_compiled_loop_adds_in_the_order_that_is_written():
+    @compiled
+    def total(values: np.ndarray) -> float:
+        result = 0.0
+        for value in values:
+            result += value
+        return result
+
+    values = np.array([1e16, 1.0, -1e16] * 9)
+    assert total(values) == sum(values.tolist())
