@@ -3,9 +3,9 @@
 **Shadow map.** The depth of everything but the floor as the key light sees it, `SHADOW_PX` square, fitted to the things.
 
 **Level maps.** One for the floor, about the table; one for the level that the objects stand on, about the objects. Each
-comes from the heights of things seen from straight above (and, on the floor, below), read back at `LEVEL_PX` square.
-RGBA8: openness of the level, openness of what is on top, the top's height in units of `LevelMap.height_m`, and share of
-key light: on the floor the table's shadow, as wide at its edge as a lamp of `LAMP_RAD` makes it from a table's height.
+comes from the heights of things (heightfield.py) at `LEVEL_PX` square. RGBA8: openness of the level, openness of what is
+on top, the top's height in units of the box's, and share of key light: on the floor the table's shadow, as wide at its
+edge as a lamp of `LAMP_RAD` makes it from a table's height.
 """
 
 import math
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from schemas.base import Array, Pose
 from schemas.scene import REGION_FIRST_OBJECT, REGION_FLOOR, Placed
 from workers.geometry.frames import transform
+from workers.render.heightfield import column_heights
 from workers.render.occlusion import openness
 
 SHADOW_PX = 768
@@ -93,20 +94,24 @@ def level_box(vertices: Array, level_m: float, towards: Array, reach_m: float) -
 
 
 def level_pixels(
-    top: NDArray[np.float32], under: NDArray[np.float32], box: Box, lit: NDArray[np.uint8]
+    vertices: Array, faces: NDArray[np.int32], box: Box, lit: NDArray[np.uint8], hollow: bool
 ) -> NDArray[np.uint8]:
     """[MAP_PX, MAP_PX, 4] uint8 of a level's map.
 
-    top, under [N, N]: heights in units of the box, 0 where nothing is; lit [MAP_PX, MAP_PX]: share of the key light.
+    `hollow`: light comes in below what stands there, as under a table; else it reaches down to the level.
+    Vertices [V, 3] in the world and faces [F, 3] of what stands on the level or over it; lit [MAP_PX, MAP_PX]: share of
+    the key light.
     """
     size = box.bounds[1] - box.bounds[0]
-    step_m, height_m = float(size[0]) / len(top), np.float32(size[2])
-    high, low = top * height_m, under * height_m
-    nothing = np.zeros_like(high)
-    on_level = openness(high, low, nothing, step_m)
-    on_top = openness(high, nothing, high, step_m) if not under.any() else on_level
+    step_m = float(size[0]) / LEVEL_PX
+    top, under = column_heights(vertices, faces, box.bounds[0], step_m, LEVEL_PX)
+    nothing = np.zeros_like(top)
+    under = under if hollow else nothing
+    on_level = openness(top, under, nothing, step_m)
+    on_top = openness(top, nothing, top, step_m) if not under.any() else on_level
     soft = [cv2.GaussianBlur(image, (0, 0), 0.8) for image in (on_level, on_top)]
-    image = cv2.resize(np.stack([*soft, top], axis=-1), (MAP_PX, MAP_PX), interpolation=cv2.INTER_LINEAR)
+    heights = top / np.float32(size[2])
+    image = cv2.resize(np.stack([*soft, heights], axis=-1), (MAP_PX, MAP_PX), interpolation=cv2.INTER_LINEAR)
     return np.dstack([np.rint(255.0 * np.clip(image, 0.0, 1.0)).astype(np.uint8), lit])
 
 
@@ -138,9 +143,12 @@ def level_shadow(depth: NDArray[np.float32], light: Box, level: Box, towards: Ar
     return np.rint(255.0 * (1.0 - np.clip(narrow + share * (wide - narrow), 0.0, 1.0))).astype(np.uint8)
 
 
-def bounds_of(things: Sequence[Placed]) -> Array:
-    """[N, 3]: vertices in the world."""
-    return np.concatenate([transform(thing.T_world_shape, thing.shape.vertices) for thing in things])
+def triangles_of(things: Sequence[Placed]) -> tuple[Array, NDArray[np.int32]]:
+    """(vertices [V, 3] in the world, faces [F, 3]) of all of them."""
+    vertices = [transform(thing.T_world_shape, thing.shape.vertices) for thing in things]
+    starts = np.cumsum([0, *(len(one) for one in vertices)])[:-1]
+    faces = [thing.shape.faces + start for thing, start in zip(things, starts, strict=True)]
+    return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
 
 
 def casters(things: Sequence[Placed]) -> list[Placed]:

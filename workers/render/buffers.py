@@ -7,6 +7,7 @@ import ctypes
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from types import ModuleType
 
 import cv2
@@ -93,7 +94,7 @@ class ShapeStore:
             self._stored.move_to_end(id(shape))
             return self._stored[id(shape)][1]
         batches = tuple(_upload(self._gl, batch) for batch in pack_shape(shape))
-        corners = np.stack(np.meshgrid(*shape.bounds.T, indexing="ij"), axis=-1).reshape(-1, 3)
+        corners = np.array(list(product(*shape.bounds.T)))
         uploaded = UploadedShape(batches, corners, shape.closed)
         self._stored[id(shape)] = (shape, uploaded)
         self.bytes += uploaded.bytes
@@ -239,7 +240,7 @@ def mip_levels(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
 
 
 def _upload_texture(gl: ModuleType, levels: Sequence[NDArray[np.uint8]]) -> int:
-    """An sRGB texture, repeated, interpolated between its pixels and between its levels."""
+    """An sRGB texture, repeated, interpolated between its pixels; of its levels the nearest is read."""
     texture = int(gl.glGenTextures(1))
     gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
     gl.glPixelStorei(gl.GL_UNPACK_ALIGNMENT, 1)
@@ -247,7 +248,7 @@ def _upload_texture(gl: ModuleType, levels: Sequence[NDArray[np.uint8]]) -> int:
         height, width = level.shape[:2]
         form = (gl.GL_RGBA, gl.GL_UNSIGNED_BYTE, level)
         gl.glTexImage2D(gl.GL_TEXTURE_2D, i, gl.GL_SRGB8_ALPHA8, width, height, 0, *form)
-    gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MIN_FILTER, gl.GL_LINEAR_MIPMAP_LINEAR)
+    gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MIN_FILTER, gl.GL_LINEAR_MIPMAP_NEAREST)
     gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MAG_FILTER, gl.GL_LINEAR)
     gl.glBindTexture(gl.GL_TEXTURE_2D, 0)
     return texture

@@ -188,8 +188,6 @@ class Renderer:
                 self._cull(shape, T_cam_shape, through_holes=not labels)
                 self._draw_batch(batch)
         self._gl.glDisable(self._gl.GL_CULL_FACE)
-        if view.raster:
-            self._lit().release()
 
     def _refine(self, drawn: GBuffer, things: Sequence[Placed], view: ViewOf, samples: int) -> GBuffer:
         """The same with holes cut out of colour and its edges made smooth."""

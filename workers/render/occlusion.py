@@ -6,16 +6,16 @@ between them lies sin^2 b - sin^2 a (integral of 2 sin cos). Openness is the mea
 """
 
 import math
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from workers.geometry.loops import compiled
+
 DIRECTIONS = 8
 REACHES = (1.0, 2.0, 3.5, 5.5, 8.5, 12.5, 18.0)
 """Distances that are looked at, in steps of the grid."""
-
-MARGIN = 19
-"""Steps of the grid around it that are taken as empty."""
 
 
 def openness(
@@ -23,22 +23,46 @@ def openness(
 ) -> NDArray[np.float32]:
     """[N, N] in [0, 1]: share of the sky seen from height `base` [N, N] above the level, looking up.
 
-    top, under [N, N] metres above the level, both 0 where there is nothing.
+    top, under [N, N] metres above the level, both 0 where there is nothing, as around the grid.
     """
+    return _openness(top, under, base, _looks(), np.float32(step_m * step_m))
+
+
+@cache
+def _looks() -> NDArray[np.int64]:
+    """[DIRECTIONS, len(REACHES), 2]: steps (dx, dy) of the grid that are looked at."""
+    angles = [2.0 * math.pi * (turn + 0.5) / DIRECTIONS for turn in range(DIRECTIONS)]
+    looks = [[(round(r * math.cos(a)), round(r * math.sin(a))) for r in REACHES] for a in angles]
+    return np.array(looks)
+
+
+@compiled
+def _openness(
+    top: NDArray[np.float32],
+    under: NDArray[np.float32],
+    base: NDArray[np.float32],
+    looks: NDArray[np.int64],
+    step2: np.float32,
+) -> NDArray[np.float32]:
     size = len(top)
-    wide_top, wide_under = (np.pad(image, MARGIN) for image in (top, under))
-    hidden = np.zeros_like(top)
-    for turn in range(DIRECTIONS):
-        angle = 2.0 * math.pi * (turn + 0.5) / DIRECTIONS
-        high, low = np.zeros_like(top), np.ones_like(top)
-        for reach in REACHES:
-            dx, dy = round(reach * math.cos(angle)), round(reach * math.sin(angle))
-            square = np.float32((dx * dx + dy * dy) * step_m * step_m)
-            window = np.s_[MARGIN + dy : MARGIN + dy + size, MARGIN + dx : MARGIN + dx + size]
-            rise = np.maximum(wide_top[window] - base, 0.0) ** 2
-            foot = np.maximum(wide_under[window] - base, 0.0) ** 2
-            upper = rise / (rise + square)
-            np.maximum(high, upper, out=high)
-            np.minimum(low, np.where(upper > 0.0, foot / (foot + square), 1.0), out=low)
-        hidden += np.maximum(high - low, 0.0)
-    return (1.0 - hidden / DIRECTIONS).astype(np.float32)
+    one, zero = np.float32(1.0), np.float32(0.0)
+    sky = np.empty_like(top)
+    for y in range(size):
+        for x in range(size):
+            hidden = zero
+            for turn in range(looks.shape[0]):
+                high, low = zero, one
+                for reach in range(looks.shape[1]):
+                    dx, dy = looks[turn, reach, 0], looks[turn, reach, 1]
+                    if not (0 <= x + dx < size and 0 <= y + dy < size):
+                        break
+                    rise = top[y + dy, x + dx] - base[y, x]
+                    if rise <= zero:
+                        continue
+                    square = np.float32(dx * dx + dy * dy) * step2
+                    foot = max(under[y + dy, x + dx] - base[y, x], zero)
+                    high = max(high, rise * rise / (rise * rise + square))
+                    low = min(low, foot * foot / (foot * foot + square))
+                hidden += max(high - low, zero)
+            sky[y, x] = one - hidden / np.float32(looks.shape[0])
+    return sky

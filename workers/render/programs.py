@@ -1,8 +1,10 @@
 """GLSL programs and their uniforms: how a camera, its light and a thing's pose reach the GPU."""
 
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.base import Pose
 from schemas.camera import Intrinsics
@@ -11,6 +13,31 @@ from workers.render.shaders import MAX_LIGHTS
 
 NEAR_M = 0.05
 """Surfaces nearer than this, along the optical axis, are not seen. There is no far plane."""
+
+
+class ThingMaps(NamedTuple):
+    """Where a thing lies in the maps of its scene's light: matrices in float32, row-major.
+
+    level_from_shape, shadow_from_shape [4, 4]: to (u, v, height or depth) in units of the map; shadow_normal [3, 3]: the
+    inverse transpose of the latter's linear part; softness: radius of the filter in the shadow map, what its depths are
+    off by, and its pixel.
+    """
+
+    level_from_shape: NDArray[np.float32]
+    shadow_from_shape: NDArray[np.float32]
+    shadow_normal: NDArray[np.float32]
+    softness: tuple[float, float, float]
+
+    @staticmethod
+    def of(level_from_shape: Pose, shadow_from_shape: Pose, softness: tuple[float, float, float]) -> "ThingMaps":
+        """The same from float64."""
+        normal = np.linalg.pinv(shadow_from_shape[:3, :3]).T
+        return ThingMaps(
+            level_from_shape.astype(np.float32),
+            shadow_from_shape.astype(np.float32),
+            normal.astype(np.float32),
+            softness,
+        )
 
 
 class Program:
@@ -51,14 +78,13 @@ class Program:
         gl.glUniform1i(self._place("level_map"), 1)
         gl.glUniform1i(self._place("shadow_map"), 2)
 
-    def set_maps(self, level_from_shape: Pose, shadow_from_shape: Pose, softness: tuple[float, float, float]) -> None:
+    def set_maps(self, maps: ThingMaps) -> None:
         """Where a thing lies in the maps of the raster tier."""
         gl = self._gl
-        gl.glUniformMatrix4fv(self._place("level_from_shape"), 1, True, level_from_shape.astype(np.float32))
-        gl.glUniformMatrix4fv(self._place("shadow_from_shape"), 1, True, shadow_from_shape.astype(np.float32))
-        normal = np.linalg.pinv(shadow_from_shape[:3, :3]).T.astype(np.float32)
-        gl.glUniformMatrix3fv(self._place("shadow_normal"), 1, True, normal)
-        gl.glUniform3f(self._place("softness"), *softness)
+        gl.glUniformMatrix4fv(self._place("level_from_shape"), 1, True, maps.level_from_shape)
+        gl.glUniformMatrix4fv(self._place("shadow_from_shape"), 1, True, maps.shadow_from_shape)
+        gl.glUniformMatrix3fv(self._place("shadow_normal"), 1, True, maps.shadow_normal)
+        gl.glUniform3f(self._place("softness"), *maps.softness)
 
     def set_cast(self, clip_from_shape: Pose) -> None:
         """Where a thing lies in an orthographic view."""

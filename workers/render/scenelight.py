@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from schemas.base import Pose
 from schemas.scene import REGION_FLOOR, Appearance, Placed
 from workers.render import baking
-from workers.render.baking import LEVEL_PX, MAP_PX, SHADOW_PX, Box
+from workers.render.baking import MAP_PX, SHADOW_PX, Box
 from workers.render.buffers import ShapeStore
 from workers.render.lighting import CAST_FRAGMENT, CAST_VERTEX
-from workers.render.programs import Program
+from workers.render.programs import Program, ThingMaps
 
 LEVEL_UNIT, SHADOW_UNIT = 1, 2
 """Texture units; unit 0 is the albedo's."""
@@ -40,7 +40,6 @@ class SceneLight:
         self._shadow = self._depth_texture()
         self._floor, self._stand, self._open = (self._color_texture() for _ in range(3))
         self._upload(self._open, np.full((1, 1, 4), (255, 255, 0, 255), np.uint8))
-        self._quick = self._floor_sampler()
         self._framebuffer = int(gl.glGenFramebuffers(1))
         gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self._framebuffer)
         gl.glFramebufferTexture2D(gl.GL_FRAMEBUFFER, gl.GL_DEPTH_ATTACHMENT, gl.GL_TEXTURE_2D, self._shadow, 0)
@@ -48,6 +47,7 @@ class SceneLight:
         self._key: tuple[object, ...] = ()
         self._held: tuple[object, ...] = ()
         self._baked = Baked(None, None, None)
+        self._places: dict[int, tuple[Placed, ThingMaps]] = {}
         self.bakes = 0
         """How often maps were made."""
 
@@ -57,6 +57,7 @@ class SceneLight:
         if key == self._key:
             return
         self._key, self._held = key, (appearance, *(thing.shape for thing in things))
+        self._places.clear()
         self._baked = self._bake(things, appearance)
         self.bakes += 1
 
@@ -70,79 +71,63 @@ class SceneLight:
             gl.glActiveTexture(gl.GL_TEXTURE0 + unit)
             gl.glBindTexture(gl.GL_TEXTURE_2D, name)
         gl.glActiveTexture(gl.GL_TEXTURE0)
-        gl.glBindSampler(0, self._quick if ground else 0)
-        flat = np.zeros((4, 4))
-        program.set_maps(
-            flat if level is None else level.unit_from_world @ thing.T_world_shape,
-            np.diag([0.0, 0.0, 0.0, 1.0]) if baked.light is None else baked.light.unit_from_world @ thing.T_world_shape,
-            (0.0, 1.0, 0.0) if baked.light is None else baking.soft_radius(baked.light),
-        )
-
-    def release(self) -> None:
-        """Leave the albedo's texture unit as the flat tier wants it."""
-        self._gl.glBindSampler(0, 0)
+        if id(thing) not in self._places:
+            self._places[id(thing)] = (thing, self._place(thing))
+        program.set_maps(self._places[id(thing)][1])
 
     def free(self) -> None:
         """Give the GPU's memory back."""
         self._gl.glDeleteFramebuffers(1, [self._framebuffer])
         self._gl.glDeleteTextures(4, [self._shadow, self._floor, self._stand, self._open])
-        self._gl.glDeleteSamplers(1, [self._quick])
         self._program.free()
 
     def _bake(self, things: Sequence[Placed], appearance: Appearance) -> Baked:
-        gl = self._gl
         solid, objects = baking.casters(things), baking.standing(things)
         if not solid or not appearance.lights:
             return Baked(None, None, None)
-        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self._framebuffer)
-        gl.glEnable(gl.GL_DEPTH_TEST)
-        self._program.use()
-        towards, vertices = appearance.lights[0].direction, baking.bounds_of(solid)
+        towards, triangles = appearance.lights[0].direction, baking.triangles_of(solid)
+        light = baking.light_box(triangles[0], towards)
+        depth = self._cast(solid, light.clip_from_world)
+        floor = baking.level_box(triangles[0], 0.0, towards, baking.FLOOR_REACH_M)
         below = [thing for thing in solid if thing not in objects] or solid
-        floor = baking.level_box(vertices, 0.0, towards, baking.FLOOR_REACH_M)
-        floor_heights = self._heights(below, floor, True), self._heights(below, floor, False)
-        stand, stand_heights = None, None
-        if objects:
-            upper = baking.bounds_of(objects)
-            stand = baking.level_box(upper, baking.level_of(upper), towards, baking.STAND_REACH_M)
-            top = self._heights(objects, stand, True)
-            stand_heights = top, np.zeros_like(top)
-        light = baking.light_box(vertices, towards)
-        depth = self._cast(solid, light.clip_from_world, SHADOW_PX, nearest=True)
-        gl.glDepthFunc(gl.GL_GREATER)
-        for box, heights, texture in ((floor, floor_heights, self._floor), (stand, stand_heights, self._stand)):
-            if box is not None and heights is not None:
-                lit = baking.level_shadow(depth, light, box, towards)
-                self._upload(texture, baking.level_pixels(*heights, box, lit))
+        lit = baking.level_shadow(depth, light, floor, towards)
+        self._upload(self._floor, baking.level_pixels(*baking.triangles_of(below), floor, lit, hollow=True))
+        if not objects:
+            return Baked(light, floor, None)
+        upper, faces = baking.triangles_of(objects)
+        stand = baking.level_box(upper, baking.level_of(upper), towards, baking.STAND_REACH_M)
+        lit = baking.level_shadow(depth, light, stand, towards)
+        self._upload(self._stand, baking.level_pixels(upper, faces, stand, lit, hollow=False))
         return Baked(light, floor, stand)
 
-    def _heights(self, things: list[Placed], box: Box, top: bool) -> NDArray[np.float32]:
-        """[N, N] float32 in units of the box: the highest, or lowest, of what stands there; 0 where nothing does."""
-        heights = self._cast(things, box.clip_from_world, LEVEL_PX, nearest=not top)
-        return heights if top else np.where(heights < 1.0, heights, np.float32(0.0))
+    def _place(self, thing: Placed) -> ThingMaps:
+        """Where a thing lies in the maps that light it."""
+        baked = self._baked
+        level = baked.floor if thing.region_id == REGION_FLOOR else baked.stand
+        if baked.light is None:
+            return ThingMaps.of(np.zeros((4, 4)), np.diag([0.0, 0.0, 0.0, 1.0]), (0.0, 1.0, 0.0))
+        level_from_shape = np.zeros((4, 4)) if level is None else level.unit_from_world @ thing.T_world_shape
+        shadow_from_shape = baked.light.unit_from_world @ thing.T_world_shape
+        return ThingMaps.of(level_from_shape, shadow_from_shape, baking.soft_radius(baked.light))
 
-    def _cast(self, things: list[Placed], clip_from_world: Pose, size: int, nearest: bool) -> NDArray[np.float32]:
-        """[size, size] float32: least depth (or greatest) of things in an orthographic view; 1 (or 0) where none is."""
+    def _cast(self, things: list[Placed], clip_from_world: Pose) -> NDArray[np.float32]:
+        """[SHADOW_PX, SHADOW_PX] float32: least depth of things in an orthographic view; 1 where there is none."""
         gl = self._gl
-        gl.glViewport(0, 0, size, size)
-        gl.glDepthFunc(gl.GL_LESS if nearest else gl.GL_GREATER)
-        gl.glClearBufferfv(gl.GL_DEPTH, 0, np.full(1, 1.0 if nearest else 0.0, np.float32))
+        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self._framebuffer)
+        gl.glViewport(0, 0, SHADOW_PX, SHADOW_PX)
+        gl.glEnable(gl.GL_DEPTH_TEST)
+        gl.glDepthFunc(gl.GL_LESS)
+        gl.glClearBufferfv(gl.GL_DEPTH, 0, np.ones(1, np.float32))
+        self._program.use()
         for thing in things:
             self._program.set_cast(clip_from_world @ thing.T_world_shape)
             for batch in self._shapes.fetch(thing.shape).batches:
                 gl.glBindVertexArray(batch.vertex_array)
                 gl.glDrawElements(gl.GL_TRIANGLES, batch.index_count, gl.GL_UNSIGNED_INT, None)
-        depth = np.empty((size, size), np.float32)
-        gl.glReadPixels(0, 0, size, size, gl.GL_DEPTH_COMPONENT, gl.GL_FLOAT, depth)
+        depth = np.empty((SHADOW_PX, SHADOW_PX), np.float32)
+        gl.glReadPixels(0, 0, SHADOW_PX, SHADOW_PX, gl.GL_DEPTH_COMPONENT, gl.GL_FLOAT, depth)
+        gl.glDepthFunc(gl.GL_GREATER)
         return depth
-
-    def _floor_sampler(self) -> int:
-        """Reads one level of a texture at a time: on a floor that fills the image the second costs 2 ms."""
-        gl = self._gl
-        name = int(np.ravel(gl.glGenSamplers(1))[0])
-        gl.glSamplerParameteri(name, gl.GL_TEXTURE_MIN_FILTER, gl.GL_LINEAR_MIPMAP_NEAREST)
-        gl.glSamplerParameteri(name, gl.GL_TEXTURE_MAG_FILTER, gl.GL_LINEAR)
-        return name
 
     def _depth_texture(self) -> int:
         gl = self._gl
