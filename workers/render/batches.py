@@ -19,6 +19,11 @@ COLUMNS = {"position": 3, "normal_metallic": 4, "albedo_roughness": 4, "uv": 2, 
 
 MATTE_ROUGHNESS = 0.8
 
+SAME_LEVEL_M = 1e-4
+
+_PLANE_Z = -2
+"""The column with the z of a face's normal."""
+
 
 @dataclass(frozen=True, eq=False)
 class Batch:
@@ -34,6 +39,8 @@ class Batch:
     texture: NDArray[np.uint8] | None
     matte: bool
     """Nothing in it is metal or smoother than `MATTE_ROUGHNESS`."""
+    top_faces: int = 0
+    """The first so many faces are level, look up, and lie within `SAME_LEVEL_M` of the shape's highest point."""
 
 
 def pack_shape(shape: Shape) -> tuple[Batch, ...]:
@@ -41,7 +48,8 @@ def pack_shape(shape: Shape) -> tuple[Batch, ...]:
     by_texture: dict[int, list[Part]] = {}
     for part in shape.parts:
         by_texture.setdefault(id(_texture(part)), []).append(part)
-    return tuple(_pack(parts) for parts in by_texture.values())
+    highest = max(float(part.vertices[:, 2].max()) for part in shape.parts)
+    return tuple(_pack(parts, highest) for parts in by_texture.values())
 
 
 def own_vertices(faces: NDArray, vertex_count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -84,7 +92,7 @@ def _texture(part: Part) -> NDArray[np.uint8] | None:
     return part.material.texture if part.uv is not None else None
 
 
-def _pack(parts: list[Part]) -> Batch:
+def _pack(parts: list[Part], highest_m: float) -> Batch:
     packed, indices, start = [], [], 0
     for part in parts:
         faces, source = own_vertices(part.faces, len(part.vertices))
@@ -94,7 +102,12 @@ def _pack(parts: list[Part]) -> Batch:
         indices.append(faces + start)
         start += len(vertices)
     matte = all(p.material.metallic == 0.0 and p.material.roughness >= MATTE_ROUGHNESS for p in parts)
-    return Batch(np.concatenate(packed), np.concatenate(indices).astype(np.uint32), _texture(parts[0]), matte)
+    vertices = np.concatenate(packed)
+    faces: NDArray[np.uint32] = np.concatenate(indices).astype(np.uint32)
+    upwards = vertices[faces[:, 2], _PLANE_Z] > 0.0
+    top = upwards & (vertices[faces, 2] > highest_m - SAME_LEVEL_M).all(axis=1)
+    faces = faces[np.argsort(~top, kind="stable")]
+    return Batch(vertices, faces, _texture(parts[0]), matte, int(np.count_nonzero(top)))
 
 
 def _vertex_columns(part: Part) -> NDArray[np.float32]:

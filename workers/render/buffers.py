@@ -18,7 +18,7 @@ from schemas.base import Array
 from schemas.shape import Shape
 from workers.render.batches import COLUMNS, Batch, pack_shape
 
-FLOAT_BYTES = 4
+FLOAT_BYTES = INDEX_BYTES = 4
 
 MAX_TEXTURE_PX = 2048
 """A larger texture is made smaller before it is uploaded: at most this many pixels wide and high."""
@@ -38,6 +38,8 @@ class Uploaded:
     buffers: tuple[int, int]
     texture: int | None
     index_count: int
+    top_count: int
+    """The first so many indices are of the shape's top (batches.py)."""
     matte: bool
     bytes: int
     holes: bool = False
@@ -208,6 +210,7 @@ def _upload(gl: ModuleType, batch: Batch) -> Uploaded:
         (vertex_buffer, index_buffer),
         texture,
         batch.indices.size,
+        3 * batch.top_faces,
         batch.matte,
         size,
         has_holes(batch.texture),

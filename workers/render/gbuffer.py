@@ -21,6 +21,7 @@ coordinates are image coordinates with pixel centres at +0.5. Both sides of ever
 transparent texels cut out) leaves depth and region alone: to labels every face is solid.
 """
 
+import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -31,14 +32,15 @@ from numpy.typing import NDArray
 from schemas.base import Pose
 from schemas.camera import Camera, Intrinsics
 from schemas.job import Render
-from schemas.scene import REGION_FLOOR, Appearance, GBuffer, Placed
+from schemas.scene import Appearance, GBuffer, Placed
 from workers.geometry.frames import invert
 from workers.render.batches import encode_srgb
-from workers.render.buffers import ShapeStore, TargetStore, Uploaded, UploadedShape
+from workers.render.buffers import INDEX_BYTES, ShapeStore, TargetStore, UploadedShape
 from workers.render.colour import ColourTarget
 from workers.render.context import open_context
 from workers.render.counting import PixelCounter
-from workers.render.programs import NEAR_M, Program, light_slots
+from workers.render.drawing import Draw, sort_draws
+from workers.render.programs import NEAR_M, Program
 from workers.render.scenelight import SceneLight
 from workers.render.shaders import Variant, label_sources
 from workers.render.smoothing import OFFSETS_PX, blend, edges, smooth
@@ -160,33 +162,25 @@ class Renderer:
         self.closed = True
 
     def _draw_things(self, things: Sequence[Placed], view: ViewOf, labels: bool) -> None:
-        """Draw into what is bound: the floor last, so that what things hide of it is not shaded."""
+        """Draw into what is bound."""
         ranks = {region: rank for rank, region in enumerate(sorted({thing.region_id for thing in things}))}
-        lights = light_slots(view.appearance)
-        by_variant: dict[Variant, list[tuple[Placed, UploadedShape, Uploaded]]] = {}
-        for thing in reversed(things):
-            ground = thing.region_id == REGION_FLOOR
-            shape = self._shapes.fetch(thing.shape)
-            for batch in shape.batches:
-                looks = (batch.texture is not None, batch.few_triangles, batch.matte, lights)
-                variant = Variant(*looks, view.raster, ground, labels, batch.holes and not labels)
-                by_variant.setdefault(variant, []).append((thing, shape, batch))
-        for variant, draws in by_variant.items():
+        top_is_level = self._lit().top_is_level if view.raster else None
+        for variant, draws in sort_draws(things, self._shapes.fetch, view.appearance, top_is_level, labels).items():
             program = self._program(variant)
             program.use()
             program.set_view(view.k)
             program.set_light(view.appearance, view.T_cam_world)
             if view.raster:
                 program.set_ambience(view.appearance, view.T_cam_world)
-            for thing, shape, batch in draws:
+            for draw in draws:
                 if view.raster:
-                    self._lit().bind(program, thing)
-                stand_back = STAND_BACK * ranks[thing.region_id]
+                    self._lit().bind(program, draw.thing)
+                stand_back = STAND_BACK * ranks[draw.thing.region_id]
                 ahead = FLOOR_AHEAD if variant.ground else -10.0 * stand_back
-                T_cam_shape = view.T_cam_world @ thing.T_world_shape
-                program.set_thing(T_cam_shape, thing.region_id, stand_back, ahead)
-                self._cull(shape, T_cam_shape, through_holes=not labels)
-                self._draw_batch(batch)
+                T_cam_shape = view.T_cam_world @ draw.thing.T_world_shape
+                program.set_thing(T_cam_shape, draw.thing.region_id, stand_back, ahead)
+                self._cull(draw.shape, T_cam_shape, through_holes=not labels)
+                self._draw(draw)
         self._gl.glDisable(self._gl.GL_CULL_FACE)
 
     def _refine(self, drawn: GBuffer, things: Sequence[Placed], view: ViewOf, samples: int) -> GBuffer:
@@ -245,12 +239,13 @@ class Renderer:
         cut = through_holes and any(batch.holes for batch in shape.batches)
         (gl.glEnable if shape.closed and whole and not cut else gl.glDisable)(gl.GL_CULL_FACE)
 
-    def _draw_batch(self, batch: Uploaded) -> None:
+    def _draw(self, draw: Draw) -> None:
         gl = self._gl
-        gl.glBindVertexArray(batch.vertex_array)
-        if batch.texture is not None:
-            gl.glBindTexture(gl.GL_TEXTURE_2D, batch.texture)
-        gl.glDrawElements(gl.GL_TRIANGLES, batch.index_count, gl.GL_UNSIGNED_INT, None)
+        gl.glBindVertexArray(draw.batch.vertex_array)
+        if draw.batch.texture is not None:
+            gl.glBindTexture(gl.GL_TEXTURE_2D, draw.batch.texture)
+        start = ctypes.c_void_p(INDEX_BYTES * draw.first)
+        gl.glDrawElements(gl.GL_TRIANGLES, draw.count, gl.GL_UNSIGNED_INT, start)
 
     def _read(self, k: Intrinsics) -> GBuffer:
         gl = self._gl

@@ -15,7 +15,7 @@ uniform mat4 level_from_shape;     // to (u, v, height above the level in units 
 uniform vec3 up;                   // the world's, in the optical frame
 uniform vec3 below;
 out vec3 v_level;
-#if !GROUND
+#if !LEVEL
 uniform mat4 shadow_from_shape;    // to (u, v, depth) of the shadow map
 uniform mat3 shadow_normal;        // inverse transpose of its linear part
 out vec3 v_shadow;
@@ -29,7 +29,7 @@ flat out vec3 v_below;
 
 void pass_light() {
     v_level = (level_from_shape * vec4(position, 1.0)).xyz;
-#if !GROUND
+#if !LEVEL
     v_shadow = (shadow_from_shape * vec4(position, 1.0)).xyz;
     // A face's plane n . p = d is one in the map too, where depth falls off by n_xy / n_z.
     vec3 n = shadow_normal * face_plane.xyz;
@@ -56,7 +56,7 @@ uniform vec3 below;
 #endif
 uniform sampler2D level_map;
 
-#if !GROUND
+#if !LEVEL
 in vec3 v_shadow;
 flat in vec2 v_slope;
 flat in vec2 v_aside;
@@ -65,10 +65,11 @@ uniform vec3 softness;             // radius of the filter in the shadow map; wh
 const vec2 RING[4] = vec2[4](vec2(0.92, 0.38), vec2(-0.38, 0.92), vec2(-0.92, -0.38), vec2(0.38, -0.92));
 
 // How much of the key light arrives. On the level it is in the map; elsewhere each tap compares with the face's own
-// plane, so that no face shades itself. A loop, because llvmpipe skips one that no fragment enters, and no branch.
-float key_share(float on_map) {
+// plane, so that no face shades itself. A loop, because llvmpipe skips one that no fragment enters, and no branch: it is
+// not entered on the level, nor by what is turned away from the light.
+float key_share(float on_map, float facing) {
     bool on_level = abs(v_level.z) < 0.01, inside = all(lessThan(abs(v_level.xy - 0.5), vec2(0.5)));
-    int taps = on_level ? (inside ? 0 : 1) : 4;
+    int taps = facing <= 0.0 ? 0 : on_level ? (inside ? 0 : 1) : 4;
     // The map's pixels hold the depth of their centres, up to a pixel away from where they are compared.
     float depth = v_shadow.z - softness.y - dot(abs(v_slope), vec2(softness.z));
     float sum = 0.0;
@@ -88,7 +89,7 @@ vec3 compress(vec3 c) {
 
 // Lambert, GGX's lobe as in the flat tier with Schlick's Fresnel, and a sky over a ground (hemispherical ambient).
 vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float roughness) {
-#if GROUND
+#if LEVEL
     vec4 level = textureLod(level_map, v_level.xy, 0.0);
     float open = level.r, lit = level.a;
 #else
@@ -96,7 +97,7 @@ vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float rou
     vec4 level = textureLod(level_map, v_level.xy + v_aside, 0.0);
     float open = mix(level.r, level.g, clamp(v_level.z / max(level.b, 0.004), 0.0, 1.0));
     open = v_level.z < -0.01 ? 1.0 : mix(open, 1.0, clamp(2.5 * (v_level.z - level.b), 0.0, 1.0));
-    float lit = key_share(level.a);
+    float lit = key_share(level.a, dot(normal, v_light_towards[0]));
 #endif
     vec3 diffuse = albedo * (1.0 - metallic);
     vec3 mirror = mix(vec3(0.04), albedo, metallic);

@@ -18,6 +18,12 @@ from workers.render.buffers import ShapeStore
 from workers.render.lighting import CAST_FRAGMENT, CAST_VERTEX
 from workers.render.programs import Program, ThingMaps
 
+UPRIGHT = 1.0 - 1e-9
+"""Cosine between two directions that are one."""
+
+SAME_LEVEL_M = 5e-4
+"""What lies this near to a level is lit as if it lay on it."""
+
 LEVEL_UNIT, SHADOW_UNIT = 1, 2
 """Texture units; unit 0 is the albedo's."""
 
@@ -60,6 +66,14 @@ class SceneLight:
         self._places.clear()
         self._baked = self._bake(things, appearance)
         self.bakes += 1
+
+    def top_is_level(self, thing: Placed) -> bool:
+        """Whether a thing's highest points, if its up is the world's, lie on the level that objects stand on."""
+        stand, T = self._baked.stand, thing.T_world_shape
+        if stand is None or T[2, 2] < UPRIGHT:
+            return False
+        top = T[2, 3] + float(max(part.vertices[:, 2].max() for part in thing.shape.parts))
+        return abs(top - float(stand.bounds[0, 2])) < SAME_LEVEL_M
 
     def bind(self, program: Program, thing: Placed) -> None:
         """The maps that a thing is lit with, for the program in use."""

@@ -25,6 +25,8 @@ class Variant(NamedTuple):
     """With shadows and occlusion (lighting.py)."""
     ground: bool = False
     """A floor: its depth in the test is the rasteriser's, so that what things hide of it is not shaded."""
+    level: bool = False
+    """All of it lies on the level of its map, which then says where the key light falls: for `raster` only."""
     labels: bool = True
     """False: colour alone, tested by the depth that the rasteriser interpolates, so that hidden fragments cost nothing."""
     cutout: bool = False

@@ -51,7 +51,19 @@ def test_a_face_without_area_has_no_plane():
         "p", frozen_array([[0, 0, 1], [1, 0, 1], [2, 0, 1], [0, 1, 1]]), frozen_array([[0, 1, 2], [0, 1, 3]], np.int32)
     )
     (batch,) = pack_shape(Shape((part,)))
-    np.testing.assert_allclose(batch.vertices[batch.indices[:, 2], -4:], [[0, 0, 0, 0], [0, 0, 1, 1]])
+    planes = batch.vertices[batch.indices[:, 2], -4:]
+    flat = ~planes.any(axis=1)
+    assert flat.sum() == 1 and (planes[~flat] == [0, 0, 1, 1]).all()
+
+
+def test_faces_of_the_top_come_first():
+    box = BODIES["box"]
+    (batch,) = pack_shape(Shape((part_of(box),)))
+    highest = batch.vertices[batch.indices, 2] == np.float32(box.vertices[:, 2].max())
+    assert batch.top_faces == 2
+    assert highest.all(axis=1).tolist() == [True] * 2 + [False] * 10
+    upside_down = Part("p", box.vertices, frozen_array(box.faces[:, ::-1], np.int32))
+    assert pack_shape(Shape((upside_down,)))[0].top_faces == 0, "a face seen from below only is no top"
 
 
 def test_parts_share_a_batch_where_they_share_a_texture_or_have_none():
