@@ -102,12 +102,11 @@ def _pack(parts: list[Part], highest_m: float) -> Batch:
         indices.append(faces + start)
         start += len(vertices)
     matte = all(p.material.metallic == 0.0 and p.material.roughness >= MATTE_ROUGHNESS for p in parts)
-    vertices = np.concatenate(packed)
-    faces: NDArray[np.uint32] = np.concatenate(indices).astype(np.uint32)
-    upwards = vertices[faces[:, 2], _PLANE_Z] > 0.0
-    top = upwards & (vertices[faces, 2] > highest_m - SAME_LEVEL_M).all(axis=1)
-    faces = faces[np.argsort(~top, kind="stable")]
-    return Batch(vertices, faces, _texture(parts[0]), matte, int(np.count_nonzero(top)))
+    vertices, corners = np.concatenate(packed), np.concatenate(indices).astype(np.uint32)
+    upwards = vertices[corners[:, 2], _PLANE_Z] > 0.0
+    top = upwards & (vertices[corners, 2] > highest_m - SAME_LEVEL_M).all(axis=1)
+    corners = corners[np.argsort(~top, kind="stable")]
+    return Batch(vertices, corners, _texture(parts[0]), matte, int(np.count_nonzero(top)))
 
 
 def _vertex_columns(part: Part) -> NDArray[np.float32]:
