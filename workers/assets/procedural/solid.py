@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import manifold3d  # type: ignore[import-not-found]
+import manifold3d
 import numpy as np
 from numpy.typing import NDArray
 

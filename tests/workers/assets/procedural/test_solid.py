@@ -2,7 +2,7 @@
 
 import math
 
-import manifold3d  # type: ignore[import-not-found]
+import manifold3d
 import numpy as np
 import pytest
 import trimesh
