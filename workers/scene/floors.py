@@ -48,7 +48,7 @@ class Covering:
 class Kind:
     """One kind of covering: how a pattern is drawn, how many the collection has, and colour and roughness of a floor."""
 
-    paint: Callable[[np.random.Generator], Plane]
+    paint: Callable[[np.random.Generator], Sequence[Plane]]
     patterns: int
     color: Callable[[np.random.Generator], NDArray[np.float64]]
     roughness: tuple[float, float]
@@ -67,34 +67,31 @@ def draw_covering(rng: np.random.Generator) -> Covering:
 def pattern_of(kind: int, number: int) -> Pattern:
     """Pattern `number` of a kind of `COVERINGS`; every call gives the same array."""
     rng = np.random.default_rng(np.random.SeedSequence(_SEED, spawn_key=(kind, number)))
-    shade = COVERINGS[kind].paint(rng)
-    white = float(shade.max())
-    eight_bit = np.rint(shade * np.float32(255.0 / white)).astype(np.uint8)
-    picture = np.asarray(eight_bit if shade.ndim == 3 else cv2.cvtColor(eight_bit, cv2.COLOR_GRAY2RGB), np.uint8)
+    planes = COVERINGS[kind].paint(rng)
+    white = max(float(plane.max()) for plane in planes)
+    shades = [np.rint(plane * np.float32(255.0 / white)).astype(np.uint8) for plane in planes]
+    picture = np.asarray(cv2.merge(shades if len(shades) == 3 else shades * 3), np.uint8)
     picture.setflags(write=False)
     return Pattern(picture, white)
 
 
-def _planks(rng: np.random.Generator) -> Plane:
-    """Boards of one width in rows, each row shifted, grain along them; some a little redder than others. [N, N, 3]."""
+def _planks(rng: np.random.Generator) -> Sequence[Plane]:
+    """Boards of one width in rows, each row shifted, grain along them; some a little redder than others: R, G, B."""
     rows, length = int(rng.integers(16, 29)), int(rng.integers(2, 4))
     row, across = _cells(rows)
     shift = rng.random(rows)
     tone = rng.uniform(0.82, 1.1, (rows, length, 1)) * (1.0 + rng.uniform(-0.03, 0.03, (rows, length, 1)) * _WARM)
     at = np.arange(TEXTURE_PX) * length / TEXTURE_PX + shift[:, None]
     whole = at.astype(np.int64)
-    boards = np.take_along_axis(tone, (whole % length)[..., None], axis=1)  # [rows, N, 3]
-    light = (
-        np.where((at - whole) * TEXTURE_PX / length < 1.0, 0.6, 1.0)[row]
-        * np.where(across * TEXTURE_PX / rows < 1.0, 0.6, 1.0)[:, None]
-    )
+    boards = [np.take_along_axis(tone[..., c], whole % length, axis=1) for c in range(3)]
+    ends = np.where((at - whole) * TEXTURE_PX / length < 1.0, 0.6, 1.0)
+    sides = np.where(across * TEXTURE_PX / rows < 1.0, 0.6, 1.0)[:, None]
+    gaps = ends.astype(np.float32)[row] * sides.astype(np.float32)
     grain = _noise(rng, 8, 128, 0.06) + _noise(rng, 32, 256, 0.04)
-    light = light.astype(np.float32)
-    planes = [(boards[..., c].astype(np.float32)[row] + grain) * light for c in range(3)]
-    return np.asarray(cv2.merge(planes), np.float32)
+    return [(board.astype(np.float32)[row] + grain) * gaps for board in boards]
 
 
-def _tiles(rng: np.random.Generator) -> Plane:
+def _tiles(rng: np.random.Generator) -> Sequence[Plane]:
     """Square tiles with joints, each a little different; at times two shades in turn."""
     count = int(rng.choice([6, 8, 10, 12, 16]))
     cell, at = _cells(count)
@@ -104,23 +101,23 @@ def _tiles(rng: np.random.Generator) -> Plane:
     joint = at * np.float32(TEXTURE_PX / count) < 1.5
     shade = tone[cell][:, cell] + _noise(rng, 16, 16, 0.05)
     shade[joint[:, None] | joint] = rng.uniform(0.6, 0.85)
-    return shade
+    return [shade]
 
 
-def _concrete(rng: np.random.Generator) -> Plane:
+def _concrete(rng: np.random.Generator) -> Sequence[Plane]:
     """Blotches of several sizes and fine grit."""
     blotch = _noise(rng, 4, 4, 0.03) + _noise(rng, 16, 16, 0.03) + _noise(rng, 64, 64, 0.03)
-    return np.float32(1.0) + blotch + _noise(rng, 256, 256, 0.04)
+    return [np.float32(1.0) + blotch + _noise(rng, 256, 256, 0.04)]
 
 
-def _carpet(rng: np.random.Generator) -> Plane:
+def _carpet(rng: np.random.Generator) -> Sequence[Plane]:
     """Fine pile, a little lighter and darker where it was trodden on."""
-    return np.float32(1.0) + _noise(rng, 256, 256, 0.08) + _noise(rng, 128, 128, 0.04) + _noise(rng, 8, 8, 0.03)
+    return [np.float32(1.0) + _noise(rng, 256, 256, 0.08) + _noise(rng, 128, 128, 0.04) + _noise(rng, 8, 8, 0.03)]
 
 
-def _plain(rng: np.random.Generator) -> Plane:
+def _plain(rng: np.random.Generator) -> Sequence[Plane]:
     """Linoleum or paint: nearly even."""
-    return np.float32(1.0) + _noise(rng, 8, 8, 0.02)
+    return [np.float32(1.0) + _noise(rng, 8, 8, 0.02)]
 
 
 def _of(*colors: Color) -> Callable[[np.random.Generator], NDArray[np.float64]]:
