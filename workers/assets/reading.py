@@ -13,7 +13,7 @@ from PIL import Image
 from trimesh.resolvers import Resolver
 
 from schemas.errors import MeshError
-from schemas.job import MeshLimits
+from schemas.sources import MeshLimits
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb")
 """What trimesh reads without further libraries."""

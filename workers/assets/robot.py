@@ -11,8 +11,8 @@ import trimesh
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
-from schemas.job import MeshLimits
 from schemas.shape import Material, Part, Shape
+from schemas.sources import MeshLimits
 from workers.assets.materials import DEFAULT
 from workers.assets.mesh import load_shape, transform_shape
 from workers.assets.reading import check_counts

@@ -4,8 +4,8 @@ from collections.abc import Collection
 from pathlib import Path
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job import MeshLimits, ShapeNetSource
 from schemas.shape import Asset
+from schemas.sources import MeshLimits, ShapeNetSource
 from workers.assets.mesh import load_shape
 from workers.assets.sources import (
     TABLE,

@@ -11,8 +11,8 @@ import numpy as np
 
 from schemas.base import Array, frozen_array
 from schemas.errors import MeshError
-from schemas.job import MeshLimits
 from schemas.shape import Asset, MassProperties, Shape
+from schemas.sources import MeshLimits
 from workers.assets.mass import mass_properties
 from workers.assets.mesh import transform_shape
 from workers.assets.reading import (

@@ -6,8 +6,9 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job import CATEGORIES, FolderSource, MeshLimits
+from schemas.job import CATEGORIES
 from schemas.shape import Asset
+from schemas.sources import FolderSource, MeshLimits
 from workers.assets.mesh import load_shape
 from workers.assets.robot import find_mesh, load_urdf, mesh_names, parse_urdf
 from workers.assets.sources import (

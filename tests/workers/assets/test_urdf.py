@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from schemas.errors import AssetSourceError
-from schemas.job import FolderSource, MeshLimits
+from schemas.sources import FolderSource, MeshLimits
 from tests.workers.assets.oracles import CUBE, write
 from workers.assets.sources import Weights
 from workers.assets.urdf import list_folder, load_folder_entry, locate_folder

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from schemas.job import CATEGORIES, ProceduralSource
+from schemas.job import CATEGORIES
+from schemas.sources import ProceduralSource
 from workers.assets.procedural.make import make_asset
 from workers.geometry.hull import convex_hull
 

@@ -179,13 +179,13 @@ def turns_about_z(x: Array, y: Array) -> Array:
     s = (t - near) / (1.0 + t * near)
     square = s * s
     series = np.zeros_like(s)
-    for power in (11, 9, 7, 5, 3, 1):
+    for power in (11.0, 9.0, 7.0, 5.0, 3.0, 1.0):
         series = 1.0 / power - square * series
     turn = (_EIGHTHS[step.astype(np.int64)] + s * series) / (2.0 * math.pi)
     turn = np.where(steep, 0.25 - turn, turn)
     turn = np.where(x < 0.0, 0.5 - turn, turn)
-    turned: Array = np.round(np.where(y < 0.0, 1.0 - turn, turn), TRIG_DIGITS)
-    return np.where(turned >= 1.0, 0.0, turned)
+    turned = np.round(np.where(y < 0.0, 1.0 - turn, turn), TRIG_DIGITS)
+    return np.where(turned >= 1.0, 0.0, turned).astype(np.float64)
 
 
 _EIGHTHS = np.array([round(math.atan(k / 8.0), 15) for k in range(9)])

@@ -6,8 +6,8 @@ from collections.abc import Callable
 import numpy as np
 
 from schemas.base import frozen_array
-from schemas.job import ProceduralSource
 from schemas.shape import Asset, Shape
+from schemas.sources import ProceduralSource
 from workers.assets.mass import solid_mass
 from workers.assets.procedural.bottle import make_bottle
 from workers.assets.procedural.bowl import make_bowl
