@@ -13,6 +13,7 @@ from workers.assets.sources import (
     Entry,
     Listing,
     Placement,
+    SourceShape,
     Weights,
     check_unchanged,
     found_in,
@@ -86,7 +87,7 @@ def load_shapenet(
     loaded = load_shape(mesh, limits, root=model)
     scale = settings.scale or (TABLE_SCALE if category == TABLE else OBJECT_SCALE)
     return placed_asset(
-        loaded.shape,
+        SourceShape(loaded.shape, loaded.notes),
         Placement(UP_AXES["y"], scale),
         entry=entry,
         category=category,

@@ -14,6 +14,7 @@ from workers.assets.sources import (
     Entry,
     Placement,
     SourceFile,
+    SourceShape,
     Weights,
     check_unchanged,
     found_in,
@@ -28,7 +29,7 @@ from workers.assets.sources import (
 def place(mesh, placement):
     entry = Entry("id", (SourceFile("a.obj", 1, "0" * 64),), "MIT")
     return placed_asset(
-        shape_of(mesh),
+        SourceShape(shape_of(mesh), ()),
         placement,
         entry=entry,
         category="mug",
