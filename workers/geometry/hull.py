@@ -14,6 +14,12 @@ leaves out points that stand out by less than 1e-7 of the cloud's size, which me
 FLAT_M = 1e-9
 """A cloud whose least singular value is below this lies in a plane."""
 
+MOST_VERTICES = 30_000
+"""Of a hull: PyBullet takes 131,072 at most, and looks at each of them in every step."""
+
+COARSER = 1e-5
+"""By how much of its size a hull with too many vertices is made coarser first; then by four times as much, and so on."""
+
 NO_AREA = 1e-12
 """A triangle whose area is below this share of the hull's size squared has no direction that can be trusted."""
 
@@ -21,14 +27,21 @@ NO_AREA = 1e-12
 def convex_hull(vertices: Array) -> Hull:
     """The hull of a vertex cloud [N, 3], metres; a flat cloud is thickened by joggling it (Qhull's QJ).
 
-    Exact to 1e-7 of the cloud's size; points may come more than once. Normals are those of triangles, so that a face of
-    the hull may have many, and are those of the triangles that have an area.
+    Exact to 1e-7 of the cloud's size, unless it has more than `MOST_VERTICES`: then as many as that are kept, and those
+    left out stand out by some 1e-4 of the size at most. Points may come more than once. Normals are those of triangles,
+    so that a face of the hull may have many, and are those of the triangles that have an area.
     """
     centred = vertices - vertices.mean(axis=0)
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred), 0.0))
     if spread[0] < THIN * spread[2]:
         return _thin_hull(vertices)
-    mesh = manifold3d.Manifold.hull_points(np.ascontiguousarray(vertices)).to_mesh64()
+    solid = manifold3d.Manifold.hull_points(np.ascontiguousarray(vertices))
+    step = COARSER * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    while solid.num_vert() > MOST_VERTICES:
+        solid, step = solid.simplify(step), 4.0 * step
+        if solid.num_vert() <= MOST_VERTICES:
+            solid = solid.hull()
+    mesh = solid.to_mesh64()
     points = np.array(mesh.vert_properties, dtype=np.float64)
     a, b, c = points[np.asarray(mesh.tri_verts, dtype=np.int64).T]
     ab, ac = b - a, c - a

@@ -7,7 +7,7 @@ from scipy.spatial import ConvexHull
 from schemas.job import CATEGORIES
 from schemas.sources import ProceduralSource
 from workers.assets.procedural.make import make_asset
-from workers.geometry.hull import convex_hull
+from workers.geometry.hull import MOST_VERTICES, convex_hull
 
 SOURCE = ProceduralSource(source="procedural")
 
@@ -53,3 +53,16 @@ def test_a_thin_sheet_keeps_its_thickness(thick):
     assert len(hull.vertices) >= 4
     assert np.ptp(hull.vertices[:, 2]) == pytest.approx(thick, rel=0.2, abs=1e-12)
     assert farthest_outside(points, hull) < 1e-9 + 1e-7 * thick
+
+
+def test_a_hull_with_too_many_vertices_is_made_coarser_by_little():
+    """PyBullet fails beyond 131,072. An ellipsoid, every point of which is on its hull."""
+    points = np.random.default_rng(2).normal(size=(150_000, 3))
+    points *= np.array([0.2, 0.1, 0.15]) / np.linalg.norm(points, axis=1)[:, None]
+    hull = convex_hull(points)
+    assert 1000 < len(hull.vertices) <= MOST_VERTICES
+    assert {tuple(p) for p in hull.vertices} <= {tuple(p) for p in points}
+    directions = np.random.default_rng(3).normal(size=(200, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    out = (points @ directions.T).max(axis=0) - (hull.vertices @ directions.T).max(axis=0)
+    assert 0.0 <= out.max() < 2e-4 * 0.54
