@@ -6,6 +6,7 @@ from scipy.spatial import ConvexHull
 
 from schemas.base import Array, frozen_array
 from schemas.shape import Hull
+from workers.geometry.manifold import hold_to_one_thread
 
 THIN = 1e-4
 """A cloud whose spread across its plane is below this share of its spread along it is left to Qhull: manifold3d's hull
@@ -35,6 +36,7 @@ def convex_hull(vertices: Array) -> Hull:
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred), 0.0))
     if spread[0] < THIN * spread[2]:
         return _thin_hull(vertices)
+    hold_to_one_thread()
     solid = manifold3d.Manifold.hull_points(np.ascontiguousarray(vertices))
     step = COARSER * float(np.linalg.norm(np.ptp(vertices, axis=0)))
     while solid.num_vert() > MOST_VERTICES:

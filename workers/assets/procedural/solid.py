@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
+from workers.geometry.manifold import hold_to_one_thread
 
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -189,6 +190,7 @@ def difference(solid: Solid, cutters: Sequence[Solid]) -> Solid:
 
 def _tagged(solids: Sequence[Solid]) -> list[manifold3d.Manifold]:
     """The solids in manifold3d, each face with its surface and a smooth number of its own solid's in its face id."""
+    hold_to_one_thread()
     manifolds = []
     first = 0
     for solid in solids:
