@@ -145,8 +145,9 @@ def union_at(solid: Solid, touched: Mask, apex: Array, others: Sequence[Solid], 
 
     What booleans cost grows with all faces that go in. So only these faces do, closed by fans from their border to
     `apex`, a point on their inner side that sees them all; between the fans and them the others must find what the
-    whole solid has there. The fans are taken off again and the rest of the solid put back. `beside`: solids that meet the others and not this one, and go in in the same step. Where
-    another solid reaches through the fans, the whole solid goes in: the same, but slower.
+    whole solid has there. The fans are taken off again and the rest of the solid put back. `beside`: solids that meet
+    the others and not this one, and go in in the same step. Where another solid reaches through the fans, the whole
+    solid goes in: the same, but slower.
     """
     core = solid.faces[touched]
     a, b = core.ravel(), core[:, [1, 2, 0]].ravel()
