@@ -115,6 +115,7 @@ SCHEMAS: dict[str, pa.Schema] = {
             ("T_source_to_object", _matrix, False),
             ("scale", _f64, False),
             ("split", _str, False),
+            ("notes", pa.list_(_str), True),
         ],
     ),
     "failures": _schema(

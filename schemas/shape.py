@@ -112,6 +112,7 @@ class Asset:
     `sha256` the digest of the source file, or of the generated arrays where there is none. `T_source_to_object` takes
     the source's coordinates, *after* multiplying them by `scale`, to the object frame. `shareable` says whether the
     cleaned mesh may be written into the dataset. `volume_m3` is None where the mesh is not watertight.
+    `notes` says what of the source was mended or left out, such as a texture that is missing.
     """
 
     instance_id: str
@@ -127,6 +128,7 @@ class Asset:
     watertight: bool
     volume_m3: float | None
     shareable: bool
+    notes: tuple[str, ...] = ()
 
     @property
     def extents_m(self) -> Array:

@@ -1,8 +1,8 @@
 """OUT/DATASET.md: what a dataset is, what made it, and whose shapes are in it."""
 
 from schemas.fingerprint import Fingerprint
-from schemas.job import ProceduralSource
 from schemas.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE
+from schemas.sources import ProceduralSource
 from services.jobrecord import JobRecord
 from services.merge import MergeResult
 from workers.assets.catalogue import Catalogue

@@ -205,4 +205,5 @@ def _asset(category: str, instance: str, shapes: bool) -> dict[str, object]:
         "T_source_to_object": matrix_of(len(instance)),
         "scale": 1.0,
         "split": "train",
+        "notes": [],
     }

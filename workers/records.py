@@ -212,6 +212,7 @@ def asset_row(asset: Asset, job: Job) -> Row:
         "T_source_to_object": matrix(asset.T_source_to_object),
         "scale": asset.scale,
         "split": split_of(asset.instance_id, job.assets.split),
+        "notes": list(asset.notes),
     }
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job import Assets, FolderSource, ProceduralSource, ShapeNetSource, SplitShares
 from schemas.shape import Asset
+from schemas.sources import Assets, FolderSource, ProceduralSource, ShapeNetSource, SplitShares
 from workers.assets.cache import AssetCache
 from workers.assets.procedural.make import VERSION, instance_id, make_asset
 from workers.assets.shapenet import list_shapenet, load_shapenet

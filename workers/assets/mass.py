@@ -28,8 +28,8 @@ def solid_mass(vertices: Array, faces: np.ndarray, density_kg_m3: float) -> Mass
     (Blow and Binstock, "How to find the inertia tensor of a solid body", 2004).
     """
     middle, corners = _corners(vertices, faces)
-    a, b, c = corners
-    det = (a * np.cross(b, c)).sum(axis=1)
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = corners
+    det = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
     mass = density_kg_m3 * float(det.sum()) / 6.0
     return _assemble(middle, corners, density_kg_m3 * det / 24.0, density_kg_m3 * det / 120.0, mass, solid=True)
 
@@ -43,28 +43,26 @@ def shell_mass(vertices: Array, faces: np.ndarray, shell_kg_m2: float) -> MassPr
     """
     middle, corners = _corners(vertices, faces)
     a, b, c = corners
-    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a, axis=0), axis=0)
     mass = shell_kg_m2 * float(area.sum())
     return _assemble(middle, corners, shell_kg_m2 * area / 3.0, shell_kg_m2 * area / 12.0, mass, solid=False)
 
 
-def _corners(vertices: Array, faces: np.ndarray) -> tuple[Array, tuple[Array, Array, Array]]:
-    """The bounding box's middle [3], and the corners of the faces measured from it, three [F, 3]."""
+def _corners(vertices: Array, faces: np.ndarray) -> tuple[Array, Array]:
+    """The bounding box's middle [3], and the faces' corners measured from it: [corner, axis, F]."""
     middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-    local = vertices - middle
-    return middle, (local[faces[:, 0]], local[faces[:, 1]], local[faces[:, 2]])
+    local = np.ascontiguousarray((vertices - middle).T)
+    return middle, np.stack([np.take(local, faces[:, k], axis=1) for k in range(3)])
 
 
-def _assemble(
-    middle: Array, corners: tuple[Array, Array, Array], first: Array, second: Array, mass: float, solid: bool
-) -> MassProperties:
+def _assemble(middle: Array, corners: Array, first: Array, second: Array, mass: float, solid: bool) -> MassProperties:
     """Mass properties from the weights [F] of s and of the outer products."""
     total = corners[0] + corners[1] + corners[2]
-    com = np.array([float((first * total[:, k]).sum()) for k in range(3)]) / mass
+    com = (first * total).sum(axis=1) / mass
+    vectors = np.stack([*corners, total], axis=1)  # [axis, vector, F]
+    weighted = second * vectors
     moments = np.empty((3, 3))
-    vectors = (*corners, total)
     for j, k in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
-        products = sum(vector[:, j] * vector[:, k] for vector in vectors)
-        moments[j, k] = moments[k, j] = float((second * products).sum()) - mass * com[j] * com[k]
+        moments[j, k] = moments[k, j] = float((weighted[j] * vectors[k]).sum()) - mass * com[j] * com[k]
     inertia = np.trace(moments) * np.eye(3) - moments
     return MassProperties(mass, frozen_array(middle + com), frozen_array(inertia), solid)

@@ -12,6 +12,7 @@ from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
 
 from schemas.base import Array
 from schemas.shape import Material
+from workers.assets.reading import plain_words
 
 BLACK = 0.02
 """A base colour darker than this under a texture is an exporter's leftover: the texture shows as it is."""
@@ -130,7 +131,7 @@ def _texture(image: Image.Image | None, notes: list[str]) -> NDArray[np.uint8] |
             alpha = "A" in image.getbands() or "transparency" in image.info
             pixels = np.array(image.convert("RGBA" if alpha else "RGB"), dtype=np.uint8)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
-        notes.append(f"a texture cannot be decoded ({error}): plain base colour used")
+        notes.append(f"a texture cannot be decoded ({plain_words(error)}): plain base colour used")
         return None
     pixels.setflags(write=False)
     return pixels

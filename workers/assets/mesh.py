@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
-from schemas.job import MeshLimits
 from schemas.shape import Part, Shape
+from schemas.sources import MeshLimits
 from workers.assets.materials import Look, look_of
 from workers.assets.reading import FolderResolver, check_counts, read_bytes, read_scene
 from workers.assets.topology import (

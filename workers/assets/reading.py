@@ -13,7 +13,7 @@ from PIL import Image
 from trimesh.resolvers import Resolver
 
 from schemas.errors import MeshError
-from schemas.job import MeshLimits
+from schemas.sources import MeshLimits
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb")
 """What trimesh reads without further libraries."""
@@ -24,6 +24,7 @@ LEAST_BYTES = 8
 _PICTURES = {b"\x89PNG\r\n\x1a\n": "PNG", b"\xff\xd8\xff": "JPEG"}
 _PLY_ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d+)", re.MULTILINE)
 _OBJ_COUNTED_BACK = re.compile(rb"^f[ \t][^\n]*-\d", re.MULTILINE)
+_ADDRESS = re.compile(r"\s*<[^<>]* at 0x[0-9a-fA-F]+>")
 _MTLLIB = re.compile(rb"mtllib[ \t]+([^\r\n]+)")
 
 
@@ -85,6 +86,11 @@ class FolderResolver(Resolver):
         return []
 
 
+def plain_words(error: Exception) -> str:
+    """Kind and message of an error without addresses in memory: what is said of a mesh goes into the dataset."""
+    return _ADDRESS.sub("", repr(error))
+
+
 def picture_fault(data: bytes, limits: MeshLimits) -> str | None:
     """Why these bytes may not be a texture, or None: a PNG or JPEG by its first bytes, of a size within the cap."""
     kind = next((kind for magic, kind in _PICTURES.items() if data.startswith(magic)), None)
@@ -96,7 +102,7 @@ def picture_fault(data: bytes, limits: MeshLimits) -> str | None:
             with Image.open(io.BytesIO(data), formats=(kind,)) as image:
                 largest = max(image.size)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
-        return f"cannot be opened ({error})"
+        return f"cannot be opened ({plain_words(error)})"
     return (
         f"has {largest} px, over max_texture_px = {limits.max_texture_px}" if largest > limits.max_texture_px else None
     )
@@ -133,7 +139,9 @@ def read_scene(path: Path, data: bytes, resolver: FolderResolver) -> trimesh.Sce
     except IndexError as error:
         raise MeshError("index_out_of_range", f"{path}: a face names a vertex that is not there ({error})") from error
     except Exception as error:
-        raise MeshError("unreadable", f"{path} is not a {kind[1:]} file that can be read: {error!r:.200}") from error
+        raise MeshError(
+            "unreadable", f"{path} is not a {kind[1:]} file that can be read: {plain_words(error):.200}"
+        ) from error
 
 
 def may_be_too_large(data: bytes, limits: MeshLimits) -> bool:
@@ -193,7 +201,9 @@ def _checked_glb(path: Path, data: bytes, resolver: FolderResolver) -> bytes:
         children = [int(child) for node in tree.get("nodes", []) for child in node.get("children", [])]
         faults = _picture_faults(tree, data[20 + length + 8 :], resolver.limits)
     except (struct.error, ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError) as error:
-        raise MeshError("unreadable", f"{path} is not a glb file that can be read: {error!r:.200}") from error
+        raise MeshError(
+            "unreadable", f"{path} is not a glb file that can be read: {plain_words(error):.200}"
+        ) from error
     if len(set(children)) != len(children):
         raise MeshError("unreadable", f"{path}: a node has two parents")
     if min(counts, default=0) < 0 or sum(counts) > len(data):

@@ -11,11 +11,12 @@ import trimesh
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
-from schemas.job import MeshLimits
 from schemas.shape import Material, Part, Shape
+from schemas.sources import MeshLimits
 from workers.assets.materials import DEFAULT
 from workers.assets.mesh import load_shape, transform_shape
 from workers.assets.reading import check_counts
+from workers.assets.sources import SourceShape
 from workers.geometry.frames import pose
 
 _DECLARATION = re.compile(rb"^\s*<\?xml[^>]*\?>")
@@ -63,14 +64,16 @@ def find_mesh(name: str, urdf: Path, root: Path) -> Path:
     raise MeshError("missing", f"{urdf} names the mesh {name!r}, which is not inside {root}")
 
 
-def load_urdf(path: Path, root: Path, limits: MeshLimits) -> Shape:
+def load_urdf(path: Path, root: Path, limits: MeshLimits) -> SourceShape:
     """All visuals of all links, joints at zero, in the frame of the first root link, metres; MeshError as load_shape."""
     robot = parse_urdf(path)
     colors = {m.get("name", ""): _color(path, m) for m in robot.iterfind("material")}
     parts: list[Part] = []
+    notes: list[str] = []
     for link, T_root_link in _link_poses(path, robot):
         for visual in link.iterfind("visual"):
-            shape = _visual(path, root, visual, limits)
+            shape, why = _visual(path, root, visual, limits)
+            notes += why
             material = visual.find("material")
             color = None if material is None else _color(path, material) or colors.get(material.get("name", ""))
             T = T_root_link @ _origin(path, visual)
@@ -78,7 +81,8 @@ def load_urdf(path: Path, root: Path, limits: MeshLimits) -> Shape:
             check_counts(path, sum(len(p.vertices) for p in parts), sum(len(p.faces) for p in parts), limits)
     if not parts:
         raise MeshError("no_faces", f"{path} has no visual geometry")
-    return Shape(tuple(replace(part, name=f"part{number}") for number, part in enumerate(parts)))
+    shape = Shape(tuple(replace(part, name=f"part{number}") for number, part in enumerate(parts)))
+    return SourceShape(shape, tuple(dict.fromkeys(notes)))
 
 
 def _painted(part: Part, color: tuple[float, ...] | None) -> Part:
@@ -114,16 +118,16 @@ def _link_poses(path: Path, robot: ElementTree.Element) -> list[tuple[ElementTre
     return placed
 
 
-def _visual(path: Path, root: Path, visual: ElementTree.Element, limits: MeshLimits) -> Shape:
-    """One visual's geometry in its own frame."""
+def _visual(path: Path, root: Path, visual: ElementTree.Element, limits: MeshLimits) -> tuple[Shape, tuple[str, ...]]:
+    """One visual's geometry in its own frame, and what of it was mended or left out."""
     for kind in visual.iterfind("geometry/*"):
         if kind.tag == "mesh":
             loaded = load_shape(find_mesh(kind.get("filename", ""), path, root), limits, root=root)
             scale = _numbers(path, kind.get("scale", "1 1 1"), 3)
             if 0.0 in scale:
                 raise MeshError("no_size", f"{path} scales a mesh by {scale}")
-            return transform_shape(loaded.shape, np.diag(scale), np.zeros(3))
-        return Shape((_primitive(path, kind),))
+            return transform_shape(loaded.shape, np.diag(scale), np.zeros(3)), loaded.notes
+        return Shape((_primitive(path, kind),)), ()
     raise MeshError("unreadable", f"{path} has a visual without geometry")
 
 

@@ -4,8 +4,8 @@ from collections.abc import Collection
 from pathlib import Path
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job import MeshLimits, ShapeNetSource
 from schemas.shape import Asset
+from schemas.sources import MeshLimits, ShapeNetSource
 from workers.assets.mesh import load_shape
 from workers.assets.sources import (
     TABLE,
@@ -13,6 +13,7 @@ from workers.assets.sources import (
     Entry,
     Listing,
     Placement,
+    SourceShape,
     Weights,
     check_unchanged,
     found_in,
@@ -86,7 +87,7 @@ def load_shapenet(
     loaded = load_shape(mesh, limits, root=model)
     scale = settings.scale or (TABLE_SCALE if category == TABLE else OBJECT_SCALE)
     return placed_asset(
-        loaded.shape,
+        SourceShape(loaded.shape, loaded.notes),
         Placement(UP_AXES["y"], scale),
         entry=entry,
         category=category,

@@ -11,8 +11,8 @@ import numpy as np
 
 from schemas.base import Array, frozen_array
 from schemas.errors import MeshError
-from schemas.job import MeshLimits
 from schemas.shape import Asset, MassProperties, Shape
+from schemas.sources import MeshLimits
 from workers.assets.mass import mass_properties
 from workers.assets.mesh import transform_shape
 from workers.assets.reading import (
@@ -77,6 +77,14 @@ class Placement:
     diagonal_m: float | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class SourceShape:
+    """A cleaned shape in its source's frame and units, and what of it was mended or left out."""
+
+    shape: Shape
+    notes: tuple[str, ...]
+
+
 def hashed(paths: Iterable[Path], root: Path) -> tuple[SourceFile, ...]:
     """The files with their sizes and digests, in the order given; reads every byte, at about 800 MB/s from cache."""
     files = []
@@ -131,10 +139,17 @@ def _names(pattern: re.Pattern[bytes], data: bytes) -> list[str]:
 
 
 def placed_asset(
-    shape: Shape, placement: Placement, *, entry: Entry, category: str, source: str, shareable: bool, weights: "Weights"
+    source_shape: SourceShape,
+    placement: Placement,
+    *,
+    entry: Entry,
+    category: str,
+    source: str,
+    shareable: bool,
+    weights: "Weights",
 ) -> Asset:
     """The asset of a cleaned shape in its source's frame: turned, scaled, centred on its bounding box, weighed."""
-    turned = transform_shape(shape, placement.axes, np.zeros(3))
+    turned = transform_shape(source_shape.shape, placement.axes, np.zeros(3))
     lower, upper = turned.bounds
     diagonal = float(np.linalg.norm(upper - lower))
     if diagonal == 0.0:
@@ -159,6 +174,7 @@ def placed_asset(
         watertight=mass.solid,
         volume_m3=volume(mass, weights.density_kg_m3),
         shareable=shareable,
+        notes=source_shape.notes,
     )
 
 

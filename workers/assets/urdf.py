@@ -6,8 +6,9 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job import CATEGORIES, FolderSource, MeshLimits
+from schemas.job import CATEGORIES
 from schemas.shape import Asset
+from schemas.sources import FolderSource, MeshLimits
 from workers.assets.mesh import load_shape
 from workers.assets.robot import find_mesh, load_urdf, mesh_names, parse_urdf
 from workers.assets.sources import (
@@ -17,6 +18,7 @@ from workers.assets.sources import (
     Entry,
     Listing,
     Placement,
+    SourceShape,
     Weights,
     check_unchanged,
     found_in,
@@ -129,11 +131,14 @@ def load_folder_entry(
     """One file, cleaned, z up, scaled; MeshError where it is refused or has changed."""
     check_unchanged(listing.folder, entry)
     path = listing.folder / entry.files[0].path
-    is_urdf = path.suffix.lower() == ".urdf"
-    shape = load_urdf(path, listing.folder, limits) if is_urdf else load_shape(path, limits, root=listing.folder).shape
+    if path.suffix.lower() == ".urdf":
+        found = load_urdf(path, listing.folder, limits)
+    else:
+        loaded = load_shape(path, limits, root=listing.folder)
+        found = SourceShape(loaded.shape, loaded.notes)
     diagonal = None if category == TABLE else settings.diagonal_m
     return placed_asset(
-        shape,
+        found,
         Placement(UP_AXES[settings.up], settings.scale, diagonal),
         entry=entry,
         category=category,

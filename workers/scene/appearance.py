@@ -8,7 +8,7 @@ from schemas.base import Array, frozen_array
 from schemas.job import Tier
 from schemas.scene import Appearance, Light
 from schemas.shape import Material, Part, Shape
-from workers.scene.floors import PERIOD_M, draw_covering
+from workers.scene.floors import draw_covering
 
 FLOOR_HALF_M = 30.0
 """Half the floor's side. The lowest ray of an input camera (0.7 rad less half the field of view) meets the floor some
@@ -22,22 +22,27 @@ def draw_look(rng: np.random.Generator, tier: Tier) -> tuple[Shape, Appearance]:
     """(the floor, the light and background) of a scene. The floor's geometry is the same whatever is drawn."""
     if tier == "flat":
         return _floor(_plain_material(rng)), _two_lights(rng)
-    picture, roughness = draw_covering(rng)
-    picture.setflags(write=False)
-    return _floor(Material((1.0, 1.0, 1.0, 1.0), 0.0, roughness, picture), rng), _studio(rng)
+    covering = draw_covering(rng)
+    material = Material((*covering.color, 1.0), 0.0, covering.roughness, covering.picture)
+    return _floor(material, _laid(rng, covering.period_m)), _studio(rng)
 
 
-def _floor(material: Material, rng: np.random.Generator | None = None) -> Shape:
-    """A level square at z = 0; its pattern is turned and shifted by chance."""
-    h = FLOOR_HALF_M
-    corners = frozen_array([[-h, -h, 0.0], [h, -h, 0.0], [h, h, 0.0], [-h, h, 0.0]])
-    faces = frozen_array([[0, 1, 2], [0, 2, 3]], np.int32)
-    uv = None
-    if rng is not None:
-        angle, shift = rng.uniform(-math.pi, math.pi), rng.random(2)
-        turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-        uv = frozen_array(corners[:, :2] @ turn.T / PERIOD_M + shift)
-    return Shape((Part("floor", corners, faces, material, uv=uv),))
+_CORNERS = frozen_array(
+    FLOOR_HALF_M * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+)
+_FACES = frozen_array([[0, 1, 2], [0, 2, 3]], np.int32)
+
+
+def _floor(material: Material, uv: Array | None = None) -> Shape:
+    """A level square at z = 0."""
+    return Shape((Part("floor", _CORNERS, _FACES, material, uv=uv),))
+
+
+def _laid(rng: np.random.Generator, period_m: float) -> Array:
+    """uv [4, 2] of the floor's corners: its pattern is turned and shifted by chance."""
+    angle, shift = rng.uniform(-math.pi, math.pi), rng.random(2)
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    return frozen_array(_CORNERS[:, :2] @ turn.T / period_m + shift)
 
 
 def _plain_material(rng: np.random.Generator) -> Material:

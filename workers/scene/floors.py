@@ -1,102 +1,169 @@
-"""Floor coverings, drawn from a seed: one square of a repeating pattern, [N, N, 3] uint8 sRGB.
+"""Floor coverings: a fixed collection of patterns, and what a scene makes of one of them.
 
-A pattern repeats after `PERIOD_M`: more than a camera of the default orbit sees of the floor in one direction nearby.
+A pattern is a square picture [N, N, 3] uint8 sRGB that repeats. It holds shades alone, its lightest about white: the
+scene's colour multiplies it (`Material.base_color`), and the scene lays it at its own scale, angle and offset. So a
+process makes each picture once, and may hand the same array to a renderer again and again.
 """
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Array
-
 TEXTURE_PX = 512
-PERIOD_M = 3.2
+PERIOD_M = (2.6, 4.2)
+"""After how many metres a pattern repeats: more than a camera of the default orbit sees of the floor nearby."""
 
-Picture = NDArray[np.uint8]
+Picture: TypeAlias = NDArray[np.uint8]
+Plane: TypeAlias = NDArray[np.float32]
+Color: TypeAlias = tuple[float, float, float]
 
-
-def draw_covering(rng: np.random.Generator) -> tuple[Picture, float]:
-    """(a picture [N, N, 3] of `PERIOD_M` of a floor, its roughness)."""
-    kind = COVERINGS[int(rng.integers(len(COVERINGS)))]
-    shade, roughness = kind(rng)
-    return np.rint(255.0 * np.clip(shade, 0.0, 1.0)).astype(np.uint8), roughness
-
-
-def _planks(rng: np.random.Generator) -> tuple[Array, float]:
-    """Boards of one width in rows, each row shifted, grain along them."""
-    rows = int(rng.integers(16, 29))
-    y = np.arange(TEXTURE_PX) * rows / TEXTURE_PX
-    row = y.astype(int)
-    shift, length = rng.random(rows), int(rng.integers(2, 4))
-    x = np.arange(TEXTURE_PX)[None, :] * length / TEXTURE_PX + shift[row][:, None]
-    board = (x.astype(int) % length) + length * row[:, None]
-    tone = rng.uniform(0.82, 1.1, rows * length)[board]
-    grain = _noise(rng, 8, 128) * 0.06 + _noise(rng, 32, 256) * 0.04
-    gap = np.minimum((y % 1.0)[:, None] * TEXTURE_PX / rows, (x % 1.0) * TEXTURE_PX / length) < 1.0
-    wood = _pick(rng, [(0.66, 0.5, 0.34), (0.5, 0.36, 0.24), (0.74, 0.63, 0.48), (0.36, 0.27, 0.2), (0.62, 0.58, 0.52)])
-    return wood * ((tone + grain) * np.where(gap, 0.6, 1.0))[..., None], float(rng.uniform(0.8, 0.9))
+_SEED = 48_271
+"""Of the collection, which is the same in every dataset."""
 
 
-def _tiles(rng: np.random.Generator) -> tuple[Array, float]:
-    """Square tiles with joints, each a little different; at times two colours in turn."""
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """A picture [N, N, 3] uint8 sRGB, read-only, and the shade that its white stands for: more than 1 where it is lit."""
+
+    picture: Picture
+    white: float
+
+
+@dataclass(frozen=True, eq=False)
+class Covering:
+    """A floor's surface: its picture, its colour (sRGB, multiplies the picture), roughness, and period in metres."""
+
+    picture: Picture
+    color: Color
+    roughness: float
+    period_m: float
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of covering: how a pattern is drawn, how many the collection has, and colour and roughness of a floor."""
+
+    paint: Callable[[np.random.Generator], Sequence[Plane]]
+    patterns: int
+    color: Callable[[np.random.Generator], NDArray[np.float64]]
+    roughness: tuple[float, float]
+
+
+def draw_covering(rng: np.random.Generator) -> Covering:
+    """One of the patterns in a colour of its kind."""
+    number = int(rng.integers(len(COVERINGS)))
+    kind = COVERINGS[number]
+    pattern = pattern_of(number, int(rng.integers(kind.patterns)))
+    r, g, b = (float(c) for c in np.clip(pattern.white * kind.color(rng), 0.0, 1.0))
+    return Covering(pattern.picture, (r, g, b), float(rng.uniform(*kind.roughness)), float(rng.uniform(*PERIOD_M)))
+
+
+@functools.cache  # bounded: `Kind.patterns` of each kind, 768 KiB a picture
+def pattern_of(kind: int, number: int) -> Pattern:
+    """Pattern `number` of a kind of `COVERINGS`; every call gives the same array."""
+    rng = np.random.default_rng(np.random.SeedSequence(_SEED, spawn_key=(kind, number)))
+    planes = COVERINGS[kind].paint(rng)
+    white = max(float(plane.max()) for plane in planes)
+    shades = [np.rint(plane * np.float32(255.0 / white)).astype(np.uint8) for plane in planes]
+    picture = np.asarray(cv2.merge(shades if len(shades) == 3 else shades * 3), np.uint8)
+    picture.setflags(write=False)
+    return Pattern(picture, white)
+
+
+def _planks(rng: np.random.Generator) -> Sequence[Plane]:
+    """Boards of one width in rows, each row shifted, grain along them; some a little redder than others: R, G, B."""
+    rows, length = int(rng.integers(16, 29)), int(rng.integers(2, 4))
+    row, across = _cells(rows)
+    shift = rng.random(rows)
+    tone = rng.uniform(0.82, 1.1, (rows, length, 1)) * (1.0 + rng.uniform(-0.03, 0.03, (rows, length, 1)) * _WARM)
+    at = np.arange(TEXTURE_PX) * length / TEXTURE_PX + shift[:, None]
+    whole = at.astype(np.int64)
+    boards = [np.take_along_axis(tone[..., c], whole % length, axis=1) for c in range(3)]
+    ends = np.where((at - whole) * TEXTURE_PX / length < 1.0, 0.6, 1.0)
+    sides = np.where(across * TEXTURE_PX / rows < 1.0, 0.6, 1.0)[:, None]
+    gaps = ends.astype(np.float32)[row] * sides.astype(np.float32)
+    grain = _noise(rng, 8, 128, 0.06) + _noise(rng, 32, 256, 0.04)
+    return [(board.astype(np.float32)[row] + grain) * gaps for board in boards]
+
+
+def _tiles(rng: np.random.Generator) -> Sequence[Plane]:
+    """Square tiles with joints, each a little different; at times two shades in turn."""
     count = int(rng.choice([6, 8, 10, 12, 16]))
-    at = np.arange(TEXTURE_PX) * count / TEXTURE_PX
-    cell = at.astype(int)
-    tone = rng.uniform(0.94, 1.04, (count, count))
+    cell, at = _cells(count)
+    tone = rng.uniform(0.94, 1.04, (count, count)).astype(np.float32)
     if rng.random() < 0.3:
-        tone *= np.where((np.arange(count)[:, None] + np.arange(count)) % 2, rng.uniform(0.55, 0.8), 1.0)
-    inside = (at % 1.0) * TEXTURE_PX / count >= 1.5
-    joint = inside[:, None] & inside[None, :]
-    stone = _noise(rng, 16, 16) * 0.05
-    clay = _pick(rng, [(0.78, 0.76, 0.72), (0.6, 0.6, 0.6), (0.66, 0.45, 0.36), (0.82, 0.8, 0.74), (0.42, 0.46, 0.5)])
-    level = np.where(joint, tone[cell][:, cell] + stone, rng.uniform(0.6, 0.85))
-    return clay * level[..., None], float(rng.uniform(0.8, 0.9))
+        tone *= np.where((np.arange(count)[:, None] + np.arange(count)) % 2, np.float32(rng.uniform(0.55, 0.8)), 1.0)
+    joint = at * np.float32(TEXTURE_PX / count) < 1.5
+    shade = tone[cell][:, cell] + _noise(rng, 16, 16, 0.05)
+    shade[joint[:, None] | joint] = rng.uniform(0.6, 0.85)
+    return [shade]
 
 
-def _concrete(rng: np.random.Generator) -> tuple[Array, float]:
+def _concrete(rng: np.random.Generator) -> Sequence[Plane]:
     """Blotches of several sizes and fine grit."""
-    blotch = _noise(rng, 4, 4) * 0.03 + _noise(rng, 12, 12) * 0.03 + _noise(rng, 64, 64) * 0.03
-    grey = rng.uniform(0.4, 0.7) * np.array([1.0, 1.0, 1.0]) + rng.uniform(-0.03, 0.03) * np.array([1.0, 0.0, -1.0])
-    return grey * (1.0 + blotch + _noise(rng, 256, 256) * 0.04)[..., None], 0.9
+    blotch = _noise(rng, 4, 4, 0.03) + _noise(rng, 16, 16, 0.03) + _noise(rng, 64, 64, 0.03)
+    return [np.float32(1.0) + blotch + _noise(rng, 256, 256, 0.04)]
 
 
-def _carpet(rng: np.random.Generator) -> tuple[Array, float]:
-    """Fine pile in a muted colour, a little lighter and darker where it was trodden on."""
-    pile = _noise(rng, 256, 256) * 0.1 + _noise(rng, 128, 128) * 0.05 + _noise(rng, 6, 6) * 0.04
-    return rng.uniform(0.25, 0.65, 3) * 0.6 * (1.0 + pile)[..., None] + 0.15, 1.0
+def _carpet(rng: np.random.Generator) -> Sequence[Plane]:
+    """Fine pile, a little lighter and darker where it was trodden on."""
+    return [np.float32(1.0) + _noise(rng, 256, 256, 0.08) + _noise(rng, 128, 128, 0.04) + _noise(rng, 8, 8, 0.03)]
 
 
-def _plain(rng: np.random.Generator) -> tuple[Array, float]:
-    """Linoleum or paint: nearly one colour."""
-    value, warmth = rng.uniform(0.35, 0.75), rng.uniform(-0.08, 0.08)
-    return np.array([value + warmth, value, value - warmth]) * (1.0 + _noise(rng, 8, 8) * 0.02)[..., None], 0.85
+def _plain(rng: np.random.Generator) -> Sequence[Plane]:
+    """Linoleum or paint: nearly even."""
+    return [np.float32(1.0) + _noise(rng, 8, 8, 0.02)]
 
 
-COVERINGS: tuple[Callable[[np.random.Generator], tuple[Array, float]], ...] = (
-    _planks,
-    _tiles,
-    _concrete,
-    _carpet,
-    _plain,
+def _of(*colors: Color) -> Callable[[np.random.Generator], NDArray[np.float64]]:
+    """One of the colours, a little lighter or darker, redder or bluer."""
+    return lambda rng: (
+        np.array(colors[int(rng.integers(len(colors)))])
+        * rng.uniform(0.88, 1.12)
+        * (1.0 + rng.uniform(-0.06, 0.06) * _WARM)
+    )
+
+
+def _grey(low: float, high: float, warmth: float) -> Callable[[np.random.Generator], NDArray[np.float64]]:
+    """A grey from `low` to `high`, redder or bluer by at most `warmth`."""
+    return lambda rng: rng.uniform(low, high) + rng.uniform(-warmth, warmth) * _WARM
+
+
+_WARM = np.array([1.0, 0.0, -1.0])
+_WOODS = ((0.66, 0.5, 0.34), (0.5, 0.36, 0.24), (0.74, 0.63, 0.48), (0.36, 0.27, 0.2), (0.62, 0.58, 0.52))
+_CLAYS = ((0.78, 0.76, 0.72), (0.6, 0.6, 0.6), (0.66, 0.45, 0.36), (0.82, 0.8, 0.74), (0.42, 0.46, 0.5))
+
+COVERINGS: Sequence[Kind] = (
+    Kind(_planks, 12, _of(*_WOODS), (0.8, 0.9)),
+    Kind(_tiles, 12, _of(*_CLAYS), (0.8, 0.9)),
+    Kind(_concrete, 6, _grey(0.4, 0.7, 0.03), (0.9, 0.9)),
+    Kind(_carpet, 6, lambda rng: rng.uniform(0.3, 0.54, 3), (1.0, 1.0)),
+    Kind(_plain, 4, _grey(0.35, 0.75, 0.08), (0.85, 0.85)),
 )
 
 
-def _pick(rng: np.random.Generator, colors: list[tuple[float, float, float]]) -> Array:
-    """[3]: one of the colours, slightly off."""
-    return np.array(colors[int(rng.integers(len(colors)))]) * rng.uniform(0.9, 1.1, 3)
+def _cells(count: int) -> tuple[NDArray[np.int64], Plane]:
+    """For each of N pixels in a row: which of `count` cells it lies in, and where in it, in [0, 1)."""
+    at = np.arange(TEXTURE_PX) * count / TEXTURE_PX
+    cell = at.astype(np.int64)
+    return cell, (at - cell).astype(np.float32)
 
 
-def _noise(rng: np.random.Generator, across: int, down: int) -> Array:
-    """[N, N] about within [-1, 1]: values on a lattice of across x down cells, smooth between, repeating."""
-    lattice = rng.uniform(-1.0, 1.0, (down, across))
-    return _stretch(_stretch(lattice).T).T
+def _noise(rng: np.random.Generator, across: int, down: int, size: float) -> Plane:
+    """[N, N] within about +- size: values on a lattice of across x down cells (powers of 2), smooth between, repeating."""
+    lattice = (rng.random((across, down), dtype=np.float32) * np.float32(2.0) - np.float32(1.0)) * np.float32(size)
+    return _stretch(np.ascontiguousarray(_stretch(lattice).T))
 
 
-def _stretch(lattice: Array) -> Array:
-    """Rows to TEXTURE_PX by smoothstep between neighbours, around the end to the first."""
-    at = np.arange(TEXTURE_PX) * len(lattice) / TEXTURE_PX
-    low = at.astype(int)
-    share = (at - low)[:, None]
-    share = share * share * (3.0 - 2.0 * share)
-    return lattice[low] * (1.0 - share) + lattice[(low + 1) % len(lattice)] * share
+def _stretch(lattice: Plane) -> Plane:
+    """Rows [C, K] to [N, K] by smoothstep between neighbours, around the end to the first; C divides N."""
+    count, width = lattice.shape
+    t = np.arange(TEXTURE_PX // count, dtype=np.float32) * np.float32(count / TEXTURE_PX)
+    share = (t * t * (np.float32(3.0) - np.float32(2.0) * t))[None, :, None]
+    step = np.roll(lattice, -1, axis=0) - lattice
+    return (lattice[:, None, :] + share * step[:, None, :]).reshape(TEXTURE_PX, width)

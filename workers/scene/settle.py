@@ -38,6 +38,9 @@ CALM_M_S = 0.05
 """A point of a resting object never moves faster than this, however briefly: it could not climb an eighth of a
 millimetre any more."""
 
+MOST_GROUND_VERTICES, MOST_GROUND_INDICES = 131_072, 524_288
+"""PyBullet's limits on one collision mesh; it fails beyond them without a word why."""
+
 RECHECK_S = 1.0
 """How long an object is watched when it is released again."""
 
@@ -56,8 +59,8 @@ class _Motion:
 def settle(start: ObjectStart, table: Table, physics: Physics) -> Settled:
     """Drop the object, wait until it rests, and remove what the simulator's margins left of gap and tilt.
 
-    Raises SettleError `not_at_rest`, `left_table` or `unsupported`. The result is a function of the arguments alone:
-    the world is made anew each time.
+    Raises SettleError `not_at_rest`, `left_table`, `unsupported` or `table_too_fine`. The result is a function of the
+    arguments alone: the world is made anew each time.
     """
     if start.placed:
         return _describe(start, table, _Motion(start.T_world_obj, 0.0, 0.0, True, True), "placed")
@@ -245,6 +248,12 @@ def _flat_ground(client: int, height_m: float) -> int:
 
 
 def _mesh_ground(client: int, mesh: Mesh) -> int:
+    if len(mesh.vertices) > MOST_GROUND_VERTICES or 3 * len(mesh.faces) > MOST_GROUND_INDICES:
+        raise SettleError(
+            "table_too_fine",
+            f"the table has {len(mesh.vertices)} vertices and {len(mesh.faces)} faces, and PyBullet takes "
+            f"{MOST_GROUND_VERTICES} and {MOST_GROUND_INDICES // 3}: use a coarser table, or lower assets.limits",
+        )
     shape = pybullet.createCollisionShape(
         pybullet.GEOM_MESH,
         vertices=mesh.vertices.tolist(),

@@ -9,8 +9,9 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.job import CATEGORIES, MeshLimits, ProceduralSource
+from schemas.job import CATEGORIES
 from schemas.shape import Material, Part, Shape
+from schemas.sources import MeshLimits, ProceduralSource
 from tests.shapes import asset_of
 from tests.workers.assets.oracles import welded, write
 from workers.assets.glb import asset_glb

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from schemas.errors import MeshError
-from schemas.job import MeshLimits
+from schemas.sources import MeshLimits
 from tests.workers.assets.oracles import CUBE, shape_of, welded, write
 from workers.assets.mesh import load_shape, transform_shape
 

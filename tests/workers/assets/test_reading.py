@@ -11,7 +11,7 @@ import trimesh
 from PIL import Image
 
 from schemas.errors import MeshError
-from schemas.job import MeshLimits
+from schemas.sources import MeshLimits
 from tests.workers.assets.oracles import CUBE, textured_cube, write
 from workers.assets.mesh import load_shape
 from workers.assets.reading import FolderResolver, check_counts, declared_counts, material_files, picture_fault

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from schemas.errors import MeshError
-from schemas.job import MeshLimits
+from schemas.sources import MeshLimits
 from tests.workers.assets.oracles import CUBE, welded, write
 from workers.assets.robot import find_mesh, load_urdf, parse_urdf
 
@@ -25,7 +25,7 @@ def link(inside):
 
 
 def load(path, **limits):
-    return load_urdf(path, path.parent, MeshLimits(**limits))
+    return load_urdf(path, path.parent, MeshLimits(**limits)).shape
 
 
 def refused(path, **limits):

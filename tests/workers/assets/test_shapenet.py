@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from schemas.errors import AssetSourceError
-from schemas.job import MeshLimits, ShapeNetSource
+from schemas.sources import MeshLimits, ShapeNetSource
 from tests.workers.assets.oracles import CUBE, write
 from workers.assets.shapenet import SYNSETS, list_shapenet, load_shapenet
 from workers.assets.sources import Weights

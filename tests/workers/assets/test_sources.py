@@ -7,13 +7,14 @@ import pytest
 import trimesh
 
 from schemas.errors import MeshError
-from schemas.job import MeshLimits
+from schemas.sources import MeshLimits
 from tests.workers.assets.oracles import CUBE, shape_of, welded, write
 from workers.assets.sources import (
     UP_AXES,
     Entry,
     Placement,
     SourceFile,
+    SourceShape,
     Weights,
     check_unchanged,
     found_in,
@@ -28,7 +29,7 @@ from workers.assets.sources import (
 def place(mesh, placement):
     entry = Entry("id", (SourceFile("a.obj", 1, "0" * 64),), "MIT")
     return placed_asset(
-        shape_of(mesh),
+        SourceShape(shape_of(mesh), ()),
         placement,
         entry=entry,
         category="mug",

@@ -3,13 +3,17 @@
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from schemas.errors import AssetSourceError
-from schemas.job import FolderSource, MeshLimits
-from tests.workers.assets.oracles import CUBE, write
+from schemas.job import Job
+from schemas.manifest import SCHEMAS
+from schemas.sources import FolderSource, MeshLimits
+from tests.workers.assets.oracles import CUBE, textured_cube, write
 from workers.assets.sources import Weights
 from workers.assets.urdf import list_folder, load_folder_entry, locate_folder
+from workers.records import asset_row
 
 LIMITS, WEIGHTS = MeshLimits(), Weights(600.0, 3.0)
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data" / "meshes"
@@ -113,3 +117,21 @@ def test_scanned_things_load_through_their_urdfs():
         assert asset.volume_m3 is not None
         assert 2e-5 < asset.volume_m3 < 3e-3
         assert entry.licence == "see LICENSE"
+
+
+URDF = '<robot name="r"><link name="l"><visual><geometry><mesh filename="cube.obj"/></geometry></visual></link></robot>'
+
+
+@pytest.mark.parametrize("name", ["cube.obj", "thing.urdf"])
+def test_what_was_left_out_of_a_mesh_is_told_by_its_row_in_the_assets_table(tmp_path, name):
+    textured_cube(tmp_path)
+    write(tmp_path / "skin.png", b"\x89PNG\r\n\x1a\n and no more")
+    write(tmp_path / "thing.urdf", URDF)
+    settings = source(category_map={name: "mug"})
+    listing = list_folder(settings, tmp_path, {"mug"}, LIMITS)
+    asset = load_folder_entry(settings, listing, listing.entries["mug"][0], "mug", LIMITS, WEIGHTS)
+    row = asset_row(asset, Job(name="t"))
+    table = pa.Table.from_pylist([row], schema=SCHEMAS["assets"])
+    (note,) = table["notes"][0].as_py()
+    assert note.startswith("skin.png cannot be opened") and note.endswith("plain base colour used")
+    assert " at 0x" not in note, "an address is another in every run"

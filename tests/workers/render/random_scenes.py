@@ -8,9 +8,10 @@ import trimesh
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.camera import Camera, Intrinsics
-from schemas.job import CATEGORIES, Assets
+from schemas.job import CATEGORIES
 from schemas.scene import Appearance, Light, Placed
 from schemas.shape import Material, Part, Shape
+from schemas.sources import Assets
 from workers.assets.catalogue import Catalogue, choose_object, choose_table, load_asset, open_catalogue
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, transform, uniform_rotation

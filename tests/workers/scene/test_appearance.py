@@ -10,7 +10,7 @@ from schemas.scene import Settled
 from tests.shapes import asset_of, box, table
 from workers.scene.appearance import draw_look
 from workers.scene.effects import Facts, write_receipt
-from workers.scene.floors import COVERINGS, TEXTURE_PX, draw_covering
+from workers.scene.floors import COVERINGS, PERIOD_M, TEXTURE_PX, draw_covering, pattern_of
 from workers.scene.plan import plan_scene
 from workers.scene.randomness import Stream, stream
 
@@ -35,8 +35,10 @@ def test_the_tier_changes_neither_poses_nor_cameras_nor_the_floors_geometry():
 
 def test_a_look_is_a_function_of_its_stream():
     (a, light), (b, same), (c, other) = look(3), look(3), look(4)
-    assert a.parts[0].material.texture.tobytes() == b.parts[0].material.texture.tobytes()
-    assert a.parts[0].material.texture.tobytes() != c.parts[0].material.texture.tobytes()
+    (here, again, elsewhere) = (floor.parts[0] for floor in (a, b, c))
+    assert here.material.texture is again.material.texture
+    assert here.material.base_color == again.material.base_color != elsewhere.material.base_color
+    assert here.uv.tobytes() == again.uv.tobytes() != elsewhere.uv.tobytes()
     assert light.ambient == same.ambient != other.ambient
     assert [one.color for one in light.lights] == [one.color for one in same.lights]
 
@@ -53,20 +55,44 @@ def test_scenes_are_neither_dark_nor_burnt_out():
     assert {len(look(scene)[1].lights) for scene in range(50)} == {1, 2, 3}
 
 
-@pytest.mark.parametrize("kind", COVERINGS)
+@pytest.mark.parametrize("kind", range(len(COVERINGS)))
 def test_a_covering_goes_on_where_it_ends(kind):
     """Across the seam neighbouring pixels differ no more than they do elsewhere."""
-    shade, roughness = kind(np.random.default_rng(7))
-    assert shade.shape == (TEXTURE_PX, TEXTURE_PX, 3) and 0.8 <= roughness <= 1.0
-    for axis in (0, 1):
-        steps = np.abs(np.diff(shade, axis=axis)).mean(axis=(1 - axis, 2))
-        seam = np.abs(np.take(shade, 0, axis) - np.take(shade, -1, axis)).mean()
-        assert seam <= steps.max() * 1.05
+    for number in range(COVERINGS[kind].patterns):
+        picture = pattern_of(kind, number).picture.astype(int)
+        assert picture.shape == (TEXTURE_PX, TEXTURE_PX, 3)
+        for axis in (0, 1):
+            steps = np.abs(np.diff(picture, axis=axis)).mean(axis=(1 - axis, 2))
+            seam = np.abs(np.take(picture, 0, axis) - np.take(picture, -1, axis)).mean()
+            assert seam <= steps.max() * 1.15, number
 
 
-def test_all_coverings_come_up():
-    means = {draw_covering(np.random.default_rng(seed))[1] for seed in range(60)}
-    assert len(means) > 10
+def test_patterns_are_made_once_and_no_two_are_alike():
+    """A renderer keeps what it uploaded by the array's identity, and a process keeps no more than the collection."""
+    every = [(kind, n) for kind in range(len(COVERINGS)) for n in range(COVERINGS[kind].patterns)]
+    pictures = [pattern_of(*which).picture for which in every]
+    assert all(pattern_of(*which).picture is picture for which, picture in zip(every, pictures, strict=True))
+    assert len({picture.tobytes() for picture in pictures}) == len(every)
+    assert not any(picture.flags.writeable for picture in pictures)
+    assert sum(picture.nbytes for picture in pictures) < 32 * 1024 * 1024
+    drawn = [draw_covering(np.random.default_rng(seed)) for seed in range(600)]
+    assert {id(one.picture) for one in drawn} == {id(picture) for picture in pictures}
+
+
+def test_a_pattern_leaves_the_floor_the_colour_that_its_kind_drew():
+    """White stands for the lightest shade: colour times the picture's mean is the colour times the mean shade."""
+    for kind, covering in enumerate(COVERINGS):
+        pattern = pattern_of(kind, 0)
+        shade = covering.paint(np.random.default_rng(np.random.SeedSequence(48_271, spawn_key=(kind, 0))))
+        assert pattern.picture.max() == 255
+        assert pattern.picture.mean() / 255.0 * pattern.white == pytest.approx(float(np.mean(shade)), abs=0.002)
+
+
+def test_floors_differ_in_colour_scale_and_angle():
+    drawn = [draw_covering(np.random.default_rng(seed)) for seed in range(200)]
+    assert len({one.color for one in drawn}) == len({one.period_m for one in drawn}) == 200
+    assert all(PERIOD_M[0] <= one.period_m <= PERIOD_M[1] and 0.8 <= one.roughness <= 1.0 for one in drawn)
+    assert all(0.1 < c <= 1.0 for one in drawn for c in one.color)
 
 
 @pytest.mark.parametrize("tier", ["flat", "raster"])

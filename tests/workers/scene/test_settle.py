@@ -129,3 +129,14 @@ def test_quaternions_agree_with_scipy(seed):
     assert abs(_quaternion(R) @ Rotation.from_matrix(R).as_quat()) == pytest.approx(1.0)
     half = Rotation.from_rotvec(math.pi * np.eye(3)[seed % 3]).as_matrix()
     assert Rotation.from_quat(_quaternion(half)).as_matrix() == pytest.approx(half, abs=1e-12)
+
+
+def test_a_table_finer_than_the_simulator_takes_is_a_failure_with_its_counts():
+    """PyBullet itself stops with `createCollisionShape failed`, which would end the worker."""
+    asset = asset_of(box(0.1, 0.08, 0.2))
+    many = np.tile(TABLE.mesh.vertices, (131_073 // len(TABLE.mesh.vertices) + 1, 1))
+    uneven = dataclasses.replace(TABLE.top, convex=False)
+    fine = dataclasses.replace(TABLE, mesh=Mesh(many, TABLE.mesh.faces), top=uneven)
+    with pytest.raises(SettleError, match="takes 131072 and 174762") as error:
+        settle(start_of(asset, translation(0.0, 0.0, TOP + 0.13)), fine, PHYSICS)
+    assert error.value.reason == "table_too_fine"

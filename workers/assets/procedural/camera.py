@@ -7,7 +7,7 @@ from workers.assets.procedural.curves import rounded
 from workers.assets.procedural.finish import Model, Surface
 from workers.assets.procedural.look import BLACK, Color, chance, mixed, near, pick, solid_color, steel, textured, vivid
 from workers.assets.procedural.paint import Picture, blend, noise
-from workers.assets.procedural.solid import Solid, lathe, loft, together, union
+from workers.assets.procedural.solid import Solid, lathe, loft, together, union_at
 from workers.assets.procedural.vessel import prism
 
 SKIN, SHELL, LENS, RING, GLASS, DIAL, DISPLAY, SHOE = 0, 1, 2, 3, 4, 5, 6, 7
@@ -24,12 +24,13 @@ def make_camera(rng: np.random.Generator) -> Model:
     depth = width * float(rng.uniform(*((0.34, 0.44), (0.24, 0.32), (0.2, 0.28))[kind]))
     size = width, depth, height
     on_hump, on_body = _finder(rng, size, kind)
-    # What stands on the body stands apart from all else on it, and is joined to it in one step.
-    on_body += [_lens(rng, size, kind), *_controls(rng, size)]
+    lens = _lens(rng, size, kind)
+    on_body += _controls(rng, size)
     if kind == 0 or chance(rng, 0.35):
         on_body.append(_grip(rng, size, kind))
-    layers = [_body(rng, size, kind), together(on_body)] + ([together(on_hump)] if on_hump else [])
-    return Model(union(layers), _surfaces(rng, size, kind))
+    # What stands on the body stands apart from all else on it, and is joined to it in one step.
+    layers = [_body(rng, size, kind)] + ([together(on_hump)] if on_hump else [])
+    return Model(_joined(lens, on_body, layers, depth), _surfaces(rng, size, kind))
 
 
 def _body(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> Solid:
@@ -90,6 +91,14 @@ def _lens(rng: np.random.Generator, size: tuple[float, float, float], kind: int)
     level = max(0.5 * height * float(rng.uniform(0.92, 1.06)), radius + 0.0015)
     level = min(level, height - 0.007 - radius)
     return barrel.placed(FORWARD, np.array([across, -0.5 * depth, level]))
+
+
+def _joined(lens: Solid, on_body: list[Solid], layers: list[Solid], depth: float) -> Solid:
+    """Everything as one. Of the lens only its first barrel, up to the first ring before the body, meets the body."""
+    along = lens.vertices[:, 1]
+    first = along[along < -0.5 * depth].max()
+    touched = (along >= first)[lens.faces].all(axis=1)
+    return union_at(lens, touched, np.array([lens.vertices[-1, 0], first, lens.vertices[-1, 2]]), layers, on_body)
 
 
 def _finder(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> tuple[list[Solid], list[Solid]]:

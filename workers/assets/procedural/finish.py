@@ -53,21 +53,26 @@ def cut_into_parts(solid: Solid, surfaces: Sequence[Surface], centre: Array, sca
     Points on a border between parts are the same doubles in both, so that the parts together are watertight.
     """
     vertices = (solid.vertices - centre) * scale
-    a, b, c = (vertices[solid.faces[:, k]] for k in range(3))
-    sides = (b - a, c - b, a - c)
-    across = np.cross(sides[0], -sides[2])
+    across, normals_at = _face_vectors(vertices, solid.faces)
     shaded, point = _dense(solid.smooth[:, None] * len(vertices) + solid.faces)
     point %= len(vertices)
-    normals = _shading_normals(shaded, across, sides, len(point))
+    normals = normals_at(shaded, len(point))
+    order = np.argsort(solid.surface, kind="stable")
+    stops = np.cumsum(np.bincount(solid.surface, minlength=len(surfaces)))
     parts = []
-    for number, surface in enumerate(surfaces):
-        chosen = np.flatnonzero(solid.surface == number)
-        if len(chosen):
+    for surface, start, stop in zip(surfaces, [0, *stops[:-1]], stops, strict=True):
+        if start < stop:
+            chosen = order[start:stop]
             corners = shaded[chosen]
-            variant, coordinates = _texture_variants(surface, solid.vertices, point[corners], across[chosen])
-            index, origin = _dense(corners * 3 + variant)
-            uv = None if coordinates is None else coordinates(point[origin // 3], origin % 3)
-            parts.append(_part(surface, vertices[point[origin // 3]], index, normals[origin // 3], uv))
+            variant, coordinates = _texture_variants(surface, solid.vertices, point[corners], across[:, chosen])
+            if coordinates is None:
+                index, origin = _dense(corners)
+                uv = None
+            else:
+                index, origin = _dense(corners * 3 + variant)
+                origin, which = np.divmod(origin, 3)
+                uv = coordinates(point[origin], which)
+            parts.append(_part(surface, vertices[point[origin]], index, normals[origin], uv))
     return Shape(tuple(parts), closed=True)
 
 
@@ -88,20 +93,29 @@ def _dense(keys: Indices) -> tuple[Indices, Indices]:
     return number[keys], np.flatnonzero(seen)
 
 
-def _shading_normals(corners: Indices, across: Array, sides: tuple[Array, Array, Array], count: int) -> Array:
-    """[count, 3] float64: for each point the unit mean of the normals of the faces [F, 3] around it.
+def _face_vectors(vertices: Array, faces: Indices) -> tuple[Array, Callable[[Indices, int], Array]]:
+    """Area vectors of the faces, twice their area long, axis by axis [3, F]; and what gives the shading normals.
 
-    A face counts by its area vector over the squares of the two sides that meet in the point, which is exact on
-    spheres and does not mind how a rectangle is cut in two (Max, "Weights for computing vertex normals from facet
-    normals", 1999).
+    The function takes the faces [F, 3] as numbers of `count` points, and gives [count, 3]: for each point the unit mean
+    of the normals of the faces around it. A face counts by its area vector over the squares of the two sides that meet
+    in the point, which is exact on spheres and does not mind how a rectangle is cut in two (Max, "Weights for computing
+    vertex normals from facet normals", 1999).
     """
-    square = [side[:, 0] ** 2 + side[:, 1] ** 2 + side[:, 2] ** 2 for side in sides]
-    pairs = np.stack([square[2] * square[0], square[0] * square[1], square[1] * square[2]], axis=1)
+    axes = np.ascontiguousarray(vertices.T)
+    a, b, c = (np.take(axes, faces[:, k], axis=1) for k in range(3))
+    (x, y, z), (u, v, w) = b - a, c - a
+    across = np.stack([y * w - z * v, z * u - x * w, x * v - y * u])
+    ab, bc, ca = (side[0] * side[0] + side[1] * side[1] + side[2] * side[2] for side in (b - a, c - b, a - c))
+    pairs = np.stack([ca * ab, ab * bc, bc * ca])
     weight = 1.0 / np.where(pairs == 0.0, 1.0, pairs)
-    flat = corners.ravel()
-    summed = np.stack([np.bincount(flat, (across[:, k : k + 1] * weight).ravel(), count) for k in range(3)], axis=1)
-    length = np.sqrt(summed[:, 0] ** 2 + summed[:, 1] ** 2 + summed[:, 2] ** 2)
-    return summed / np.where(length == 0.0, 1.0, length)[:, None]
+
+    def normals(corners: Indices, count: int) -> Array:
+        flat = np.ascontiguousarray(corners.T).ravel()
+        x, y, z = (np.bincount(flat, (weight * along).ravel(), count) for along in across)
+        length = np.sqrt(x * x + y * y + z * z)
+        return np.stack([x, y, z], axis=1) / np.where(length == 0.0, 1.0, length)[:, None]
+
+    return across, normals
 
 
 Coordinates = Callable[[Indices, Indices], Array]
@@ -111,7 +125,10 @@ Coordinates = Callable[[Indices, Indices], Array]
 def _texture_variants(
     surface: Surface, vertices: Array, faces: Indices, across: Array
 ) -> tuple[Indices, Coordinates | None]:
-    """Which variant [F, 3] of its points each face uses, and the texture coordinates of a point's variants."""
+    """Which variant [F, 3] of its points each face uses, and the texture coordinates of a point's variants.
+
+    across [3, F]: the faces' area vectors.
+    """
     if surface.wrap == "cylinder":
         turn = _turns(vertices, faces)
         beyond = turn[faces]
@@ -128,7 +145,7 @@ def _texture_variants(
             [(local[point] * axis).sum(axis=1) for axis in axes], axis=1
         )
     if surface.wrap == "grain":
-        axis = np.abs(across).argmax(axis=1)
+        axis = np.abs(across).argmax(axis=0)
         low = vertices.min(axis=0)
         sides = np.array(_SIDES[surface.grain])
         return np.repeat(axis[:, None], 3, axis=1), lambda point, variant: np.take_along_axis(
@@ -138,12 +155,38 @@ def _texture_variants(
 
 
 def _turns(vertices: Array, faces: Indices) -> Array:
-    """[V] float64: for the points that the faces name, the angle about the z axis in turns, in [0, 1).
-
-    Python's atan2, rounded, and not numpy's, which gives other bits with other vector instructions.
-    """
+    """[V] float64: for the points that the faces name, the angle about the z axis in turns, in [0, 1)."""
     turn = np.zeros(len(vertices))
-    used = np.unique(faces)
-    angles = [round(math.atan2(y, x) / (2.0 * math.pi), TRIG_DIGITS) for x, y in vertices[used, :2].tolist()]
-    turn[used] = [angle + 1.0 if angle < 0.0 else angle for angle in angles]
+    used = np.zeros(len(vertices), dtype=np.bool_)
+    used[faces] = True
+    turn[used] = turns_about_z(vertices[used, 0], vertices[used, 1])
     return turn
+
+
+def turns_about_z(x: Array, y: Array) -> Array:
+    """[N] float64: the angle of (x, y) in turns, in [0, 1), to `TRIG_DIGITS` digits; 0 at the origin.
+
+    By +, -, * and / alone, where numpy's atan2 gives other bits with other vector instructions: the tangent t in [0, 1]
+    of the angle to the nearest axis, less the nearest k/8, is small enough for a short series:
+    atan t = atan k/8 + atan s, s = (t - k/8) / (1 + t k/8).
+    """
+    wide, high = np.abs(x), np.abs(y)
+    steep = high > wide
+    long, short = np.where(steep, high, wide), np.where(steep, wide, high)
+    t = short / np.where(long == 0.0, 1.0, long)
+    step = np.rint(8.0 * t)
+    near = step / 8.0
+    s = (t - near) / (1.0 + t * near)
+    square = s * s
+    series = np.zeros_like(s)
+    for power in (11.0, 9.0, 7.0, 5.0, 3.0, 1.0):
+        series = 1.0 / power - square * series
+    turn = (_EIGHTHS[step.astype(np.int64)] + s * series) / (2.0 * math.pi)
+    turn = np.where(steep, 0.25 - turn, turn)
+    turn = np.where(x < 0.0, 0.5 - turn, turn)
+    turned = np.round(np.where(y < 0.0, 1.0 - turn, turn), TRIG_DIGITS)
+    return np.where(turned >= 1.0, 0.0, turned).astype(np.float64)
+
+
+_EIGHTHS = np.array([round(math.atan(k / 8.0), 15) for k in range(9)])
+"""[9] float64: the angles whose tangents are 0, 1/8, ... 1."""

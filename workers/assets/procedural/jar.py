@@ -21,8 +21,8 @@ from workers.assets.procedural.look import (
     textured,
 )
 from workers.assets.procedural.paint import Picture, band_height, bands, blank, dots, label, speckled, upright_stripes
-from workers.assets.procedural.solid import Solid, circle, lathe, union
-from workers.assets.procedural.vessel import BASE, INSIDE, OUTSIDE, Wall, bend_radius, rod, wall_around
+from workers.assets.procedural.solid import Solid, circle, lathe
+from workers.assets.procedural.vessel import BASE, INSIDE, OUTSIDE, Wall, bend_radius, rod, wall_around, with_handles
 
 EAR = 3
 SEGMENTS = 40
@@ -38,7 +38,7 @@ def make_jar(rng: np.random.Generator) -> Model:
     body = lathe(wall.profile, wall.surface, SEGMENTS, section)
     if glass or not chance(rng, 0.3):
         return Model(body, _surfaces(rng, wall, glass))
-    return Model(union([body, *_ears(rng, wall)]), _surfaces(rng, wall, glass))
+    return Model(with_handles(body, OUTSIDE, _ears(rng, wall)), _surfaces(rng, wall, glass))
 
 
 def _glass_jar(rng: np.random.Generator) -> Wall:

@@ -21,8 +21,8 @@ from workers.assets.procedural.look import (
     vivid,
 )
 from workers.assets.procedural.paint import Picture, band_height, bands, dots, label, speckled, upright_stripes
-from workers.assets.procedural.solid import Solid, lathe, union
-from workers.assets.procedural.vessel import BASE, INSIDE, OUTSIDE, Wall, bend_radius, rod, wall_around
+from workers.assets.procedural.solid import Solid, lathe
+from workers.assets.procedural.vessel import BASE, INSIDE, OUTSIDE, Wall, bend_radius, rod, wall_around, with_handles
 
 HANDLE = 3
 
@@ -30,7 +30,7 @@ HANDLE = 3
 def make_mug(rng: np.random.Generator) -> Model:
     """A mug: straight, tapered, bellied or bell-shaped, 55 to 115 mm high, glazed or enamelled."""
     wall = _body(rng)
-    solid = union([lathe(wall.profile, wall.surface, 40), _handle(rng, wall)])
+    solid = with_handles(lathe(wall.profile, wall.surface, 40), OUTSIDE, [_handle(rng, wall)])
     return Model(solid, _surfaces(rng, wall))
 
 

@@ -7,7 +7,10 @@ import numpy as np
 
 from schemas.base import Array
 from workers.assets.procedural.curves import half_turn_points, outwards, rounded_rectangles
-from workers.assets.procedural.solid import Indices, Solid, loft, smooth_runs
+from workers.assets.procedural.solid import Indices, Solid, loft, smooth_runs, union_at
+
+HANDLE_ROOM_M = 0.002
+"""Faces of a vessel this near a handle's bounding box are those that it may meet."""
 
 OUTSIDE, INSIDE, BASE = 0, 1, 2
 """Surface numbers of a vessel."""
@@ -113,6 +116,18 @@ def rod(path: Array, section: Array, surface: int, ends: tuple[Array, Array], sw
     caps = [np.array([path[k, 0], 0.0, path[k, 1]]) for k in (0, -1)]
     smooth = np.array([0, *[1] * (len(path) - 1), 2])
     return loft(rings, caps[0], caps[1], np.full(len(path) + 1, surface), smooth)
+
+
+def with_handles(body: Solid, outside: int, handles: Sequence[Solid]) -> Solid:
+    """A vessel about the z axis with handles that reach into its outside (a surface number) and through no wall."""
+    low, high = (body.vertices[body.faces].min(axis=1), body.vertices[body.faces].max(axis=1))
+    touched = np.zeros(len(body.faces), dtype=np.bool_)
+    for handle in handles:
+        start, stop = handle.vertices.min(axis=0) - HANDLE_ROOM_M, handle.vertices.max(axis=0) + HANDLE_ROOM_M
+        touched |= ((high >= start) & (low <= stop)).all(axis=1)
+    touched &= body.surface == outside
+    middle = 0.5 * float(low[touched, 2].min() + high[touched, 2].max())
+    return union_at(body, touched, np.array([0.0, 0.0, middle]), handles)
 
 
 def sides_apart(solid: Solid, surface: int, numbers: tuple[int, int, int, int]) -> Solid:

@@ -1,11 +1,13 @@
 """Cutting a solid into parts: nothing opens, normals and texture coordinates are where they belong."""
 
+import math
+
 import numpy as np
 import pytest
 
 from schemas.shape import Material
 from tests.workers.assets.oracles import welded
-from workers.assets.procedural.finish import Surface, cut_into_parts
+from workers.assets.procedural.finish import Surface, cut_into_parts, turns_about_z
 from workers.assets.procedural.solid import lathe, union
 from workers.assets.procedural.vessel import bevelled, prism
 
@@ -82,3 +84,14 @@ def test_arrays_are_read_only():
     part = cut_into_parts(cylinder(), named("none", "cylinder", "none"), np.zeros(3), 1.0).parts[1]
     for array in (part.vertices, part.faces, part.normals, part.uv):
         assert not array.flags.writeable
+
+
+def test_turns_are_the_angles_that_python_finds():
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.normal(size=(5000, 2)), [[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1]]])
+    points = np.concatenate([points, points * [1.0, 1e-9], points * [1e-9, 1.0], [[0.0, 0.0], [1.0, -1e-17]]])
+    turns = turns_about_z(points[:, 0], points[:, 1])
+    expected = np.array([math.atan2(y, x) / (2 * math.pi) % 1.0 for x, y in points.tolist()])
+    assert np.abs((turns - expected + 0.5) % 1.0 - 0.5).max() < 1.1e-14
+    assert turns.min() >= 0.0 and turns.max() < 1.0
+    assert turns[5000:5007].tolist() == [0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75]

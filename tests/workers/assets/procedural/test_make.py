@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.job import CATEGORIES, ProceduralSource
+from schemas.job import CATEGORIES
+from schemas.sources import ProceduralSource
 from tests.workers.assets.oracles import faulty_rays, support_margin, welded
 from workers.assets.procedural.make import FAMILIES, instance_id, make_asset, make_model, shape_digest
 

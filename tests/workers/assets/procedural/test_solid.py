@@ -2,13 +2,14 @@
 
 import math
 
-import manifold3d  # type: ignore[import-not-found]
+import manifold3d
 import numpy as np
 import pytest
 import trimesh
 
 from tests.workers.assets.oracles import faulty_rays
-from workers.assets.procedural.solid import Solid, circle, difference, lathe, smooth_runs, together, union
+from workers.assets.procedural import solid as solid_module
+from workers.assets.procedural.solid import Solid, circle, difference, lathe, smooth_runs, together, union, union_at
 
 
 def cylinder(radius=1.0, height=2.0, count=64, surface=0):
@@ -105,3 +106,42 @@ def test_manifold_agrees_that_a_lathe_is_a_manifold():
     solid = cylinder()
     mesh = manifold3d.Mesh64(vert_properties=solid.vertices, tri_verts=solid.faces.astype(np.uint64))
     assert manifold3d.Manifold(mesh).volume() == pytest.approx(mesh_of(solid).volume, rel=1e-12)
+
+
+def arm(reach: float) -> Solid:
+    """A rod along x out of the wall of a cylinder of radius 1, from x = 1 - reach to 2."""
+    axes = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    return cylinder(0.1, 1.0 + reach, 16, surface=2).placed(axes, np.array([1.0 - reach, 0.0, 1.0]))
+
+
+@pytest.mark.parametrize("reach", [0.05, 0.3, 1.5])
+def test_a_union_at_some_faces_is_the_union(reach):
+    """Where the arm stays within the fans, and where it goes through them and the whole solid has to go in."""
+    body = lathe(np.array([[0, 0], [1, 0], [1, 0.4], [1, 1.6], [1, 2], [0, 2]]), [1] * 5, 40)
+    near = (np.abs(body.vertices[:, 1]) < 0.3) & (body.vertices[:, 0] > 0.5)
+    touched = near[body.faces].all(axis=1)
+    assert 0 < touched.sum() < len(body.faces) / 4
+    whole, partly = union([body, arm(reach)]), union_at(body, touched, np.array([0.0, 0.0, 1.0]), [arm(reach)])
+    assert mesh_of(partly).is_watertight and mesh_of(partly).is_winding_consistent
+    assert mesh_of(partly).volume == pytest.approx(mesh_of(whole).volume, rel=1e-12)
+    for number in (1, 2):
+        areas = [mesh_of(one).area_faces[one.surface == number].sum() for one in (whole, partly)]
+        assert areas[1] == pytest.approx(areas[0], rel=1e-12)
+    assert set(partly.surface) == {1, 2}
+    assert len(np.unique(partly.faces)) == len(partly.vertices)
+    # The rest of the body shades with the faces that went in.
+    assert set(partly.smooth[partly.surface == 1]) == set(body.smooth)
+
+
+def test_a_union_at_some_faces_puts_only_those_in(monkeypatch):
+    body, sizes = lathe(np.array([[0, 0], [1, 0], [1, 0.4], [1, 1.6], [1, 2], [0, 2]]), [1] * 5, 40), []
+    tagged = solid_module._tagged
+    monkeypatch.setattr(
+        solid_module, "_tagged", lambda solids: (sizes.append([len(s.faces) for s in solids]), tagged(solids))[1]
+    )
+    touched = ((np.abs(body.vertices[:, 1]) < 0.3) & (body.vertices[:, 0] > 0.5))[body.faces].all(axis=1)
+    aside = cylinder(0.05, 0.5, 8, surface=3).moved(x=1.5, z=1.05)
+    both = union_at(body, touched, np.array([0.0, 0.0, 1.0]), [arm(0.1)], [aside])
+    assert len(sizes) == 1 and max(sizes[0]) < len(body.faces) / 2
+    assert set(both.surface) == {1, 2, 3}
+    assert mesh_of(both).body_count == 1

@@ -1,0 +1,117 @@
+"""The branch of the job file that says where objects and tables come from."""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from schemas.base import Frozen, NonNegativeInt, Positive, PositiveInt, Share
+
+
+class ProceduralSource(Frozen):
+    """The built-in shapes, made from a seed."""
+
+    source: Literal["procedural"]
+    """Which kind of source this is."""
+    weight: Positive = 1.0
+    """Share of this source among the sources that offer a scene's category."""
+    seed: NonNegativeInt = 0
+    """Seed of the shapes; instance n of a category is the same in every dataset with this seed."""
+    instances: PositiveInt = 1_000_000
+    """How many distinct instances of each category there are to choose from."""
+    size: Literal["article", "metric"] = "article"
+    """`article`: bounding-box diagonal `diagonal_m`; `metric`: the size such a thing really has. Tables are metric."""
+    diagonal_m: Positive = 0.25
+    """Bounding-box diagonal of every object where `size` is `article`."""
+
+
+class ShapeNetSource(Frozen):
+    """A folder with the user's own copy of ShapeNetCore, version 1 or 2."""
+
+    source: Literal["shapenet"]
+    """Which kind of source this is."""
+    weight: Positive = 1.0
+    """Share of this source among the sources that offer a scene's category."""
+    folder: str
+    """The folder that holds the synset folders (02876657, ...), relative to the job file."""
+    scale: Positive | None = None
+    """Multiplies the normalised units; default 0.25 for objects and 1.5 for tables, as in the article."""
+    licence: str = "ShapeNet terms of use: non-commercial research"
+    """What the `assets` table says of these shapes."""
+    copy_assets: bool = False
+    """Whether the cleaned shapes may be written into the dataset."""
+
+
+class FolderSource(Frozen):
+    """A folder of URDFs or meshes, with a map from file patterns to categories."""
+
+    source: Literal["urdf"]
+    """Which kind of source this is."""
+    weight: Positive = 1.0
+    """Share of this source among the sources that offer a scene's category."""
+    folder: str
+    """A folder relative to the job file, or `pybullet_data` for the meshes inside that package."""
+    category_map: dict[str, str] = Field(default_factory=dict)
+    """Category by file pattern (glob relative to `folder`); the first match wins. Empty: the map that is built in for
+    `pybullet_data`."""
+    up: Literal["x", "y", "z"] = "z"
+    """Which axis of the source points up."""
+    scale: Positive = 1.0
+    """Multiplies the source's coordinates: 0.001 for millimetres."""
+    diagonal_m: Positive | None = None
+    """Resize every object to this bounding-box diagonal; None keeps its own size."""
+    licence: str = "unknown"
+    """What the `assets` table says of these shapes."""
+    copy_assets: bool = False
+    """Whether the cleaned shapes may be written into the dataset."""
+
+
+Source = Annotated[ProceduralSource | ShapeNetSource | FolderSource, Field(discriminator="source")]
+
+
+class SplitShares(Frozen):
+    """Shares of instances (not of scenes) in train, val and test."""
+
+    train: Share = 0.8
+    """Share for training."""
+    val: Share = 0.1
+    """Share for validation."""
+    test: Share = 0.1
+    """Share for testing."""
+
+    @model_validator(mode="after")
+    def _sums_to_one(self) -> "SplitShares":
+        total = self.train + self.val + self.test
+        if not math.isclose(total, 1.0, abs_tol=1e-9):
+            raise ValueError(f"train + val + test is {total:g}, and must be 1")
+        return self
+
+
+class MeshLimits(Frozen):
+    """Caps on meshes from outside: one that is over a cap is skipped and counted."""
+
+    max_file_mb: Positive = 256.0
+    """Largest mesh file, MB."""
+    max_vertices: PositiveInt = 5_000_000
+    """Most vertices."""
+    max_faces: PositiveInt = 5_000_000
+    """Most faces."""
+    max_texture_px: PositiveInt = 8192
+    """Longest side of a texture, pixels."""
+
+
+class Assets(Frozen):
+    """Where objects and tables come from; sources are mixed by weight."""
+
+    objects: tuple[Source, ...] = Field(default=(ProceduralSource(source="procedural"),), min_length=1)
+    """Sources of objects."""
+    tables: tuple[Source, ...] = Field(default=(ProceduralSource(source="procedural"),), min_length=1)
+    """Sources of tables."""
+    split: SplitShares = SplitShares()
+    """Shares of instances in train, val and test."""
+    limits: MeshLimits = MeshLimits()
+    """Caps on meshes from outside."""
+    density_kg_m3: Positive = 600.0
+    """Of a watertight solid."""
+    shell_kg_m2: Positive = 3.0
+    """Surface density of a mesh that is not watertight, which is weighed as a thin shell."""

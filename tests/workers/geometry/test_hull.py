@@ -1,0 +1,68 @@
+"""Convex hulls, against Qhull and against what is known of a shape."""
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+
+from schemas.job import CATEGORIES
+from schemas.sources import ProceduralSource
+from workers.assets.procedural.make import make_asset
+from workers.geometry.hull import MOST_VERTICES, convex_hull
+
+SOURCE = ProceduralSource(source="procedural")
+
+
+def farthest_outside(points, hull):
+    """Metres that a point lies beyond the plane of a face of the hull, at most."""
+    support = (hull.vertices @ hull.normals.T).max(axis=0)
+    return float((points @ hull.normals.T - support).max())
+
+
+@pytest.mark.parametrize("category", [*CATEGORIES, "table"])
+def test_the_hull_of_a_shape_is_the_one_that_qhull_finds(category):
+    for index in range(5):
+        points = make_asset(category, SOURCE, index, 600.0).shape.vertices
+        hull, qhull = convex_hull(points), ConvexHull(points)
+        assert ConvexHull(hull.vertices).volume == pytest.approx(qhull.volume, rel=1e-12)
+        assert {tuple(p) for p in hull.vertices} <= {tuple(p) for p in points}
+        assert farthest_outside(points, hull) < 1e-7 * 0.25, "1e-7 of its size"
+        assert np.linalg.norm(hull.normals, axis=1) == pytest.approx(np.ones(len(hull.normals)))
+        # Every direction of a face is one that Qhull has, and the other way round.
+        agreement = hull.normals @ qhull.equations[:, :3].T
+        assert agreement.max(axis=1).min() > 1.0 - 1e-9
+        areas = np.linalg.norm(
+            np.cross(*(points[qhull.simplices[:, k]] - points[qhull.simplices[:, 0]] for k in (1, 2))), axis=1
+        )
+        assert agreement.max(axis=0)[areas > 1e-9].min() > 1.0 - 1e-9
+
+
+def test_points_that_come_often_and_points_within_change_nothing():
+    corners = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (0.0, 3.0)])
+    within = np.random.default_rng(0).uniform(0.1, 0.9, (500, 3))
+    hull = convex_hull(np.concatenate([within, corners, corners, within]))
+    assert {tuple(p) for p in hull.vertices} == {tuple(p) for p in corners}
+    assert {tuple(n) for n in np.round(hull.normals, 12) + 0.0} == {
+        tuple(sign * axis) for axis in np.eye(3) + 0.0 for sign in (1.0, -1.0)
+    }
+
+
+@pytest.mark.parametrize("thick", [0.0, 1e-8, 1e-6, 1e-5, 1e-3])
+def test_a_thin_sheet_keeps_its_thickness(thick):
+    points = np.random.default_rng(1).random((200, 3)) * [1.0, 1.0, thick]
+    hull = convex_hull(points)
+    assert len(hull.vertices) >= 4
+    assert np.ptp(hull.vertices[:, 2]) == pytest.approx(thick, rel=0.2, abs=1e-12)
+    assert farthest_outside(points, hull) < 1e-9 + 1e-7 * thick
+
+
+def test_a_hull_with_too_many_vertices_is_made_coarser_by_little():
+    """PyBullet fails beyond 131,072. An ellipsoid, every point of which is on its hull."""
+    points = np.random.default_rng(2).normal(size=(150_000, 3))
+    points *= np.array([0.2, 0.1, 0.15]) / np.linalg.norm(points, axis=1)[:, None]
+    hull = convex_hull(points)
+    assert 1000 < len(hull.vertices) <= MOST_VERTICES
+    assert {tuple(p) for p in hull.vertices} <= {tuple(p) for p in points}
+    directions = np.random.default_rng(3).normal(size=(200, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    out = (points @ directions.T).max(axis=0) - (hull.vertices @ directions.T).max(axis=0)
+    assert 0.0 <= out.max() < 2e-4 * 0.54
