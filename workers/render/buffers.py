@@ -5,23 +5,18 @@ Everything takes `gl`, the module that `open_context` loaded: nothing here loads
 
 import ctypes
 from collections import OrderedDict
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from types import ModuleType
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.shape import Shape
 from workers.render.batches import COLUMNS, Batch, pack_shape
+from workers.render.textures import Texture, TextureStore
 
 FLOAT_BYTES = INDEX_BYTES = 4
-
-MAX_TEXTURE_PX = 2048
-"""A larger texture is made smaller before it is uploaded: at most this many pixels wide and high."""
 
 FEW_TRIANGLES = 1000
 """Up to here a batch is drawn by the variant of the label pass that is fast for each pixel, above by the other."""
@@ -36,14 +31,18 @@ class Uploaded:
 
     vertex_array: int
     buffers: tuple[int, int]
-    texture: int | None
+    texture: Texture | None
     index_count: int
     top_count: int
     """The first so many indices are of the shape's top (batches.py)."""
     matte: bool
     bytes: int
-    holes: bool = False
-    """Its texture has texels that are cut out of colour."""
+    """Without its texture's."""
+
+    @property
+    def holes(self) -> bool:
+        """Its texture has texels that are cut out of colour."""
+        return self.texture is not None and self.texture.holes
 
     @property
     def few_triangles(self) -> bool:
@@ -54,8 +53,6 @@ class Uploaded:
         """Give the GPU's memory back."""
         gl.glDeleteVertexArrays(1, [self.vertex_array])
         gl.glDeleteBuffers(2, self.buffers)
-        if self.texture is not None:
-            gl.glDeleteTextures(1, [self.texture])
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +75,9 @@ class ShapeStore:
     A stored shape is held, so that no other object can take its id.
     """
 
-    def __init__(self, gl: ModuleType, max_shapes: int = 64, max_bytes: int = 256 * 2**20) -> None:
+    def __init__(self, gl: ModuleType, max_shapes: int = 64, max_bytes: int = 64 * 2**20) -> None:
         self._gl = gl
+        self.textures = TextureStore(gl)
         self._max_shapes, self._max_bytes = max_shapes, max_bytes
         self._stored: OrderedDict[int, tuple[Shape, UploadedShape]] = OrderedDict()
         self.bytes = 0
@@ -95,7 +93,7 @@ class ShapeStore:
         if shape in self:
             self._stored.move_to_end(id(shape))
             return self._stored[id(shape)][1]
-        batches = tuple(_upload(self._gl, batch) for batch in pack_shape(shape))
+        batches = tuple(_upload(self._gl, batch, self.textures) for batch in pack_shape(shape))
         corners = np.array(list(product(*shape.bounds.T)))
         uploaded = UploadedShape(batches, corners, shape.closed)
         self._stored[id(shape)] = (shape, uploaded)
@@ -104,19 +102,25 @@ class ShapeStore:
 
     def trim(self, in_use: int) -> None:
         """Free the longest unused until the bounds hold, but not the `in_use` shapes that were fetched last."""
-        while len(self._stored) > in_use and (len(self._stored) > self._max_shapes or self.bytes > self._max_bytes):
+        while len(self._stored) > in_use and not self._fit():
             self._drop_oldest()
+
+    def _fit(self) -> bool:
+        return len(self._stored) <= self._max_shapes and self.bytes <= self._max_bytes and self.textures.fit
 
     def clear(self) -> None:
         """Free everything."""
         while self._stored:
             self._drop_oldest()
+        self.textures.clear()
 
     def _drop_oldest(self) -> None:
         _, (_, uploaded) = self._stored.popitem(last=False)
         self.bytes -= uploaded.bytes
         for batch in uploaded.batches:
             batch.free(self._gl)
+            if batch.texture is not None:
+                self.textures.give_back(batch.texture)
 
 
 @dataclass(frozen=True)
@@ -188,7 +192,7 @@ class TargetStore:
         self._stored.clear()
 
 
-def _upload(gl: ModuleType, batch: Batch) -> Uploaded:
+def _upload(gl: ModuleType, batch: Batch, textures: TextureStore) -> Uploaded:
     vertex_array = int(gl.glGenVertexArrays(1))
     vertex_buffer, index_buffer = (int(name) for name in gl.glGenBuffers(2))
     gl.glBindVertexArray(vertex_array)
@@ -202,56 +206,7 @@ def _upload(gl: ModuleType, batch: Batch) -> Uploaded:
         gl.glEnableVertexAttribArray(location)
         offset += FLOAT_BYTES * size
     gl.glBindVertexArray(0)
-    levels = () if batch.texture is None else mip_levels(batch.texture)
-    texture = _upload_texture(gl, levels) if levels else None
-    size = batch.vertices.nbytes + batch.indices.nbytes + sum(level.nbytes for level in levels)
-    return Uploaded(
-        vertex_array,
-        (vertex_buffer, index_buffer),
-        texture,
-        batch.indices.size,
-        3 * batch.top_faces,
-        batch.matte,
-        size,
-        has_holes(batch.texture),
-    )
-
-
-def has_holes(texture: NDArray[np.uint8] | None) -> bool:
-    """Whether a texture [h, w, 3 or 4] has texels that are more transparent than not."""
-    return texture is not None and texture.shape[2] == 4 and bool((texture[..., 3] < 128).any())
-
-
-def mip_levels(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
-    """An image [h, w, 3 or 4] and its copies at half the size down to one pixel, [h', w', 4] uint8, area means.
-
-    The first is the image itself, or the largest that fits into `MAX_TEXTURE_PX`; row 0 is the lowest, OpenGL's.
-    """
-    level: NDArray = np.ascontiguousarray(image[::-1])
-    if level.shape[2] == 3:
-        level = cv2.cvtColor(level, cv2.COLOR_RGB2RGBA)
-    shrink = min(1.0, MAX_TEXTURE_PX / max(level.shape[:2]))
-    width, height = (max(1, round(shrink * level.shape[axis])) for axis in (1, 0))
-    levels = []
-    while True:
-        if level.shape[:2] != (height, width):
-            level = cv2.resize(level, (width, height), interpolation=cv2.INTER_AREA)
-        levels.append(level)
-        if width == height == 1:
-            return tuple(levels)
-        width, height = max(1, width // 2), max(1, height // 2)
-
-
-def _upload_texture(gl: ModuleType, levels: Sequence[NDArray[np.uint8]]) -> int:
-    """An sRGB texture, repeated, interpolated between its pixels; of its levels the nearest is read."""
-    texture = int(gl.glGenTextures(1))
-    gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
-    gl.glPixelStorei(gl.GL_UNPACK_ALIGNMENT, 1)
-    for i, level in enumerate(levels):
-        height, width = level.shape[:2]
-        form = (gl.GL_RGBA, gl.GL_UNSIGNED_BYTE, level)
-        gl.glTexImage2D(gl.GL_TEXTURE_2D, i, gl.GL_SRGB8_ALPHA8, width, height, 0, *form)
-    gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MIN_FILTER, gl.GL_LINEAR_MIPMAP_NEAREST)
-    gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MAG_FILTER, gl.GL_LINEAR)
-    gl.glBindTexture(gl.GL_TEXTURE_2D, 0)
-    return texture
+    texture = None if batch.texture is None else textures.take(batch.texture)
+    size = batch.vertices.nbytes + batch.indices.nbytes
+    buffers = (vertex_buffer, index_buffer)
+    return Uploaded(vertex_array, buffers, texture, batch.indices.size, 3 * batch.top_faces, batch.matte, size)

@@ -243,7 +243,7 @@ class Renderer:
         gl = self._gl
         gl.glBindVertexArray(draw.batch.vertex_array)
         if draw.batch.texture is not None:
-            gl.glBindTexture(gl.GL_TEXTURE_2D, draw.batch.texture)
+            gl.glBindTexture(gl.GL_TEXTURE_2D, draw.batch.texture.name)
         start = ctypes.c_void_p(INDEX_BYTES * draw.first)
         gl.glDrawElements(gl.GL_TRIANGLES, draw.count, gl.GL_UNSIGNED_INT, start)
 

@@ -1,0 +1,112 @@
+"""Textures on the GPU, by the identity of their pictures: floors and labels share them across scenes."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import ModuleType
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_TEXTURE_PX = 2048
+"""A larger texture is made smaller before it is uploaded: at most this many pixels wide and high."""
+
+
+@dataclass(eq=False)
+class Texture:
+    """A picture on the GPU, and how many batches draw with it. The picture is held, so that its id stays its own."""
+
+    picture: NDArray[np.uint8]
+    name: int
+    bytes: int
+    holes: bool
+    """Some texels are cut out of colour."""
+    uses: int = 0
+
+
+class TextureStore:
+    """Textures in use, and beside them the last that were, while they all fit into `max_bytes`."""
+
+    def __init__(self, gl: ModuleType, max_bytes: int = 48 * 2**20) -> None:
+        self._gl, self._max_bytes = gl, max_bytes
+        self._stored: OrderedDict[int, Texture] = OrderedDict()
+        self.bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._stored)
+
+    def take(self, picture: NDArray[np.uint8]) -> Texture:
+        """The texture of a picture [h, w, 3 or 4] uint8 sRGB, uploaded now if it is not there, with one use more."""
+        key = id(picture)
+        if key not in self._stored:
+            levels = mip_levels(picture)
+            size = sum(level.nbytes for level in levels)
+            self._stored[key] = Texture(picture, upload_texture(self._gl, levels), size, has_holes(picture))
+            self.bytes += size
+        texture = self._stored[key]
+        self._stored.move_to_end(key)
+        texture.uses += 1
+        return texture
+
+    def give_back(self, texture: Texture) -> None:
+        """One use less. Of those without any, the longest unused are freed until the rest fit."""
+        texture.uses -= 1
+        for key in [key for key, held in self._stored.items() if held.uses == 0]:
+            if self.fit:
+                return
+            self._free(self._stored.pop(key))
+
+    @property
+    def fit(self) -> bool:
+        """Whether all of them together are within the bound."""
+        return self.bytes <= self._max_bytes
+
+    def clear(self) -> None:
+        """Free everything; nothing may be in use."""
+        while self._stored:
+            self._free(self._stored.popitem()[1])
+
+    def _free(self, texture: Texture) -> None:
+        self._gl.glDeleteTextures(1, [texture.name])
+        self.bytes -= texture.bytes
+
+
+def has_holes(texture: NDArray[np.uint8] | None) -> bool:
+    """Whether a texture [h, w, 3 or 4] has texels that are more transparent than not."""
+    return texture is not None and texture.shape[2] == 4 and bool((texture[..., 3] < 128).any())
+
+
+def mip_levels(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
+    """An image [h, w, 3 or 4] and its copies at half the size down to one pixel, [h', w', 4] uint8, area means.
+
+    The first is the image itself, or the largest that fits into `MAX_TEXTURE_PX`; row 0 is the lowest, OpenGL's.
+    """
+    level: NDArray = np.ascontiguousarray(image[::-1])
+    if level.shape[2] == 3:
+        level = cv2.cvtColor(level, cv2.COLOR_RGB2RGBA)
+    shrink = min(1.0, MAX_TEXTURE_PX / max(level.shape[:2]))
+    width, height = (max(1, round(shrink * level.shape[axis])) for axis in (1, 0))
+    levels = []
+    while True:
+        if level.shape[:2] != (height, width):
+            level = cv2.resize(level, (width, height), interpolation=cv2.INTER_AREA)
+        levels.append(level)
+        if width == height == 1:
+            return tuple(levels)
+        width, height = max(1, width // 2), max(1, height // 2)
+
+
+def upload_texture(gl: ModuleType, levels: Sequence[NDArray[np.uint8]]) -> int:
+    """An sRGB texture, repeated, interpolated between its pixels; of its levels the nearest is read."""
+    texture = int(gl.glGenTextures(1))
+    gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
+    gl.glPixelStorei(gl.GL_UNPACK_ALIGNMENT, 1)
+    for i, level in enumerate(levels):
+        height, width = level.shape[:2]
+        form = (gl.GL_RGBA, gl.GL_UNSIGNED_BYTE, level)
+        gl.glTexImage2D(gl.GL_TEXTURE_2D, i, gl.GL_SRGB8_ALPHA8, width, height, 0, *form)
+    gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MIN_FILTER, gl.GL_LINEAR_MIPMAP_NEAREST)
+    gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MAG_FILTER, gl.GL_LINEAR)
+    gl.glBindTexture(gl.GL_TEXTURE_2D, 0)
+    return texture
