@@ -115,6 +115,27 @@ def test_a_texture_over_the_cap_is_refused(tmp_path):
     assert "over max_texture_px" in loaded.notes[0]
 
 
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_a_texture_whose_data_ends_early_leaves_the_base_colour_and_a_note(tmp_path, suffix):
+    """Its header is whole, so that it is found out only where it is decoded."""
+    stream = io.BytesIO()
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(stream, {"png": "PNG", "jpg": "JPEG"}[suffix])
+    (tmp_path / f"skin.{suffix}").write_bytes(stream.getvalue()[: len(stream.getvalue()) // 2])
+    loaded = load(textured_cube(tmp_path, picture=f"skin.{suffix}"))
+    assert loaded.shape.parts[0].material.texture is None
+    assert len(loaded.shape.faces) == 12
+    assert "cannot be decoded" in loaded.notes[0] and " at 0x" not in loaded.notes[0]
+
+
+def test_a_texture_as_large_as_the_cap_allows_comes_along(tmp_path):
+    side = MeshLimits().max_texture_px
+    Image.new("L", (side, 2), 99).save(tmp_path / "skin.png")
+    loaded = load(textured_cube(tmp_path))
+    assert loaded.shape.parts[0].material.texture.shape == (2, side, 3)
+    assert loaded.notes == ()
+
+
 def test_a_texture_outside_the_root_is_not_read(tmp_path):
     Image.fromarray(np.zeros((2, 2, 3), np.uint8)).save(tmp_path / "secret.png")
     path = textured_cube(tmp_path / "inner", picture="../secret.png")

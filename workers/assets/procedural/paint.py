@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,15 +35,18 @@ def _stretched(lattice: Plane, size: int) -> Plane:
     count = len(lattice)
     at = np.arange(size, dtype=np.float32) * np.float32(count / size)
     low = at.astype(np.int64)
-    t = (at - low.astype(np.float32))[:, None]
-    return lattice[low] * (1 - t) + lattice[(low + 1) % count] * t
+    step = np.take(np.roll(lattice, -1, axis=0) - lattice, low, axis=0)
+    step *= (at - low.astype(np.float32))[:, None]
+    step += np.take(lattice, low, axis=0)
+    return step
 
 
 def blend(a: Color, b: Color, share: Plane) -> Picture:
     """a where `share` [h, w] is 0, b where it is 1, in 64 steps."""
-    t = (np.arange(64) / 63.0)[:, None]
-    steps: Picture = np.round(255.0 * (np.array(a) * (1 - t) + np.array(b) * t)).astype(np.uint8)
-    return np.take(steps, np.clip(share * np.float32(63.0) + np.float32(0.5), 0, 63).astype(np.uint8), axis=0)
+    t = np.minimum(np.arange(256) / 63.0, 1.0)[:, None, None]
+    steps = np.round(255.0 * (np.array(a) * (1 - t) + np.array(b) * t)).astype(np.uint8)
+    level = np.clip(share * np.float32(63.0) + np.float32(0.5), 0, 63).astype(np.uint8)
+    return np.asarray(cv2.applyColorMap(level, steps), np.uint8)
 
 
 def wood(rng: np.random.Generator, light: Color, dark: Color, planks: int = 0, size: int = 256) -> Picture:
