@@ -72,6 +72,12 @@ def describe_sources(catalogue: Catalogue) -> list[str]:
                 lines.append(
                     f"{what}, weight {source.weight:g}: {source.source} folder {source.folder}, licence {source.licence}"
                 )
-    for folder, reasons in catalogue.skipped.items():
-        lines.append(f"left out of {folder}: {', '.join(f'{count} {reason}' for reason, count in reasons.items())}")
-    return lines
+    return lines + describe_left_out(catalogue)
+
+
+def describe_left_out(catalogue: Catalogue) -> list[str]:
+    """One line for each folder of which something was left out: how many, and why."""
+    return [
+        f"left out of {folder}: {', '.join(f'{count} {reason}' for reason, count in reasons.items())}"
+        for folder, reasons in catalogue.skipped.items()
+    ]

@@ -14,9 +14,8 @@ from schemas.scene import SceneOutput
 from services.jobrecord import JobRecord, require_job
 from services.stored import StoredRange, file_reader, find_scene
 from workers.assets.catalogue import open_catalogue
-from workers.context import WorkerContext, settings_digest
+from workers.context import WorkerContext, open_worker
 from workers.fingerprint import take_fingerprint
-from workers.render.gbuffer import shared_renderer
 from workers.scene_steps import Stopwatch
 from workers.shard import run_scene
 from workers.store.images import decode_png
@@ -63,7 +62,7 @@ def open_context(record: JobRecord) -> WorkerContext:
         raise MachineError(
             f"the asset folders of this job (from {record.folder}) do not hold what they held when it was run"
         )
-    return WorkerContext(record.job, catalogue, shared_renderer(), settings_digest(record.job, catalogue.digest))
+    return open_worker(record.job, catalogue)
 
 
 def _compare_files(store: Store, stored: StoredRange, output: SceneOutput, same_stack: bool) -> list[str]:

@@ -14,7 +14,7 @@ from schemas.layout import FINGERPRINT_FILE, JOB_FILE
 from schemas.report import ShardOrder
 from services.coordinator import Limits, Tally, run_spans
 from services.cores import usable_cores
-from services.datasetcard import describe_sources, write_card
+from services.datasetcard import describe_left_out, describe_sources, write_card
 from services.jobrecord import JobRecord, adopt, encode_job, record_job, refuse_foreign
 from services.lock import hold_lock
 from services.merge import MergeResult, merge, reopen
@@ -76,9 +76,8 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     """
     begun = time.monotonic()
     catalogue = open_catalogue(request.job.assets, request.job_folder, tuple(request.job.categories))
-    for folder, reasons in catalogue.skipped.items():
-        left_out = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
-        print(f"verso: left out of {folder}: {left_out}", file=sys.stderr)
+    for line in describe_left_out(catalogue):
+        print(f"verso: {line}", file=sys.stderr)
     store = open_store(request.out)
     refuse_foreign(store)
     store.prepare()

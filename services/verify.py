@@ -11,6 +11,7 @@ from schemas.layout import ASSETS, MANIFEST
 from services.jobrecord import require_job
 from services.merge import read_success
 from services.stored import Row, StoredRange, file_reader, iter_stored, read_image
+from workers.allocator import keep_freed_memory
 from workers.rederive import check_stored_pair
 from workers.store.store import Store
 
@@ -28,6 +29,7 @@ class Verdict:
 
 def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
     """Read everything back. Raises OutputError where the folder is no dataset."""
+    keep_freed_memory()
     record = require_job(store)
     verdict = Verdict()
     known: set[str] = set()

@@ -5,8 +5,9 @@ import json
 from dataclasses import dataclass
 
 from schemas.job import Job
+from workers.allocator import keep_freed_memory
 from workers.assets.catalogue import Catalogue
-from workers.render.gbuffer import Renderer
+from workers.render.gbuffer import Renderer, shared_renderer
 
 OUTSIDE_SETTINGS = {"name", "scenes", "first_scene", "run", "output", "verso"}
 """Keys of a job that do not change what a scene is."""
@@ -20,6 +21,12 @@ class WorkerContext:
     catalogue: Catalogue
     renderer: Renderer
     settings_digest: str
+
+
+def open_worker(job: Job, catalogue: Catalogue) -> WorkerContext:
+    """This process made ready to make the job's scenes: its allocator, its renderer."""
+    keep_freed_memory()
+    return WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
 
 
 def settings_digest(job: Job, catalogue_digest: str) -> str:

@@ -14,8 +14,8 @@ from schemas.scene import REGION_FIRST_OBJECT, ObjectLabel, View
 from workers.geometry.camera import image_coordinates
 from workers.geometry.frames import invert
 from workers.geometry.pixels import measure_regions
-from workers.scene.derive import agree_across, crop_box, derive_projected, projection_shares
-from workers.scene.views import front_distance, place_aligned_camera, place_mirror_camera, stored_depth_m
+from workers.scene.derive import compare_views, crop_box, derive_projected, projection_shares
+from workers.scene.views import object_distance, place_aligned_camera, place_mirror_camera
 
 SAME = 1e-12
 """Poses and distances that are computed again from the same doubles agree to rounding."""
@@ -178,8 +178,7 @@ def _check_cameras(job: Job, stored: Mapping[str, View], views: Mapping[str, Row
     """d_z from the input's stored depth; the aligned and mirror poses from it."""
     first, faults = stored["input"], []
     assert first.region is not None
-    depth_m = stored_depth_m(first.depth, job.images)
-    d_z = front_distance(depth_m, first.region >= REGION_FIRST_OBJECT, job.cameras.mirror)
+    d_z = object_distance(first.depth, first.region, job.images, job.cameras.mirror)
     poses = {
         "aligned": place_aligned_camera(first.camera, job.cameras.depth),
         "mirror": place_mirror_camera(first.camera, d_z, job.cameras.mirror),
@@ -208,7 +207,7 @@ def _check_projection(job: Job, stored: Mapping[str, View], views: Mapping[str, 
         np.array(shares), np.array([views["projected"][f"projected_{name}_share"] for name in ("filled", "hidden")])
     ):
         faults.append(f"{where}: the shares filled and hidden are {shares}, and not what views says")
-    agreement = agree_across(first, mirror, job.images, job.check.mirror_agreement_mm, REGION_FIRST_OBJECT)
+    agreement = compare_views(job, first, mirror)
     told = views["mirror"]["mirror_agreement"]
     found = None if agreement.median_mm is None else (agreement.median_mm, agreement.share)
     if (told is None) != (found is None) or (

@@ -7,12 +7,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from schemas.camera import Camera
-from schemas.job import Job
 from schemas.layout import input_pose_id
 from schemas.scene import (
-    REGION_FIRST_OBJECT,
     REGION_TABLE,
-    Agreement,
     GBuffer,
     ObjectLabel,
     Pair,
@@ -25,17 +22,16 @@ from workers.assets.catalogue import choose_object, choose_table, load_asset
 from workers.context import WorkerContext
 from workers.geometry.pixels import measure_regions
 from workers.scene.check import check_against_rays, check_pair, is_raycast_scene
-from workers.scene.derive import agree_across, derive_projected, label_region, projection_shares
+from workers.scene.derive import compare_views, derive_projected, label_region, projection_shares
 from workers.scene.plan import choose_category, plan_scene
 from workers.scene.randomness import Stream, stream
 from workers.scene.settle import recheck, settle
 from workers.scene.views import (
-    front_distance,
+    object_distance,
     place_aligned_camera,
     place_mirror_camera,
     pose_scene,
     quantise_depth,
-    stored_depth_m,
 )
 from workers.sensing import sense_view
 
@@ -132,8 +128,7 @@ def make_pair(scene: SceneView, camera: Camera, number: int) -> Pair:
     aligned_camera = place_aligned_camera(camera, job.cameras.depth)
     aligned = sense(scene, render_view(scene, "aligned", (parent, parent), aligned_camera), number)
     assert first.region is not None
-    depth_m = stored_depth_m(first.depth, job.images)
-    d_z_m = front_distance(depth_m, first.region >= REGION_FIRST_OBJECT, job.cameras.mirror)
+    d_z_m = object_distance(first.depth, first.region, job.images, job.cameras.mirror)
     mirror_camera = place_mirror_camera(camera, d_z_m, job.cameras.mirror)
     exact_mirror = render_view(scene, "mirror", (parent + 1, parent), mirror_camera)
     mirror = sense(scene, exact_mirror, number)
@@ -152,11 +147,6 @@ def sense(scene: SceneView, exact: View, number: int) -> View:
     """An exact view as the job's sensors store it."""
     with scene.watch.stage("sensor"):
         return sense_view(scene.context.job, exact, scene.plan.scene_id, number)
-
-
-def compare_views(job: Job, first: View, mirror: View) -> Agreement:
-    """How well an input and a mirror view agree."""
-    return agree_across(first, mirror, job.images, job.check.mirror_agreement_mm, REGION_FIRST_OBJECT)
 
 
 def render_view(scene: SceneView, role: str, ids: tuple[int, int], camera: Camera) -> View:

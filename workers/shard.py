@@ -18,9 +18,8 @@ from schemas.job import Job
 from schemas.layout import FINGERPRINT_FILE, staging_path
 from schemas.report import Blame, ShardOrder, ShardReport, SpanReport
 from schemas.scene import SceneOutput
-from workers.allocator import keep_freed_memory
 from workers.assets.catalogue import Catalogue
-from workers.context import WorkerContext, settings_digest
+from workers.context import WorkerContext, open_worker
 from workers.fingerprint import take_fingerprint
 from workers.records import failed_scene, record_scene, timing_row
 from workers.render.gbuffer import shared_renderer
@@ -45,8 +44,7 @@ class BlamedScene(SceneError):
 def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
     """Make and commit every range of the order. What a scene cannot be is a row; anything else propagates."""
     begun = time.perf_counter()
-    keep_freed_memory()
-    context = WorkerContext(order.job, catalogue, shared_renderer(), settings_digest(order.job, catalogue.digest))
+    context = open_worker(order.job, catalogue)
     fingerprint = _fingerprint()
     store = open_store(order.out)
     _join_stack(store, fingerprint, order)

@@ -6,7 +6,7 @@ from scipy.spatial import ConvexHull
 from schemas.base import Array, Pose
 from schemas.shape import Hull, Mesh
 from workers.geometry.frames import pose, rotation_between, transform
-from workers.geometry.heights import heights_at
+from workers.geometry.heights import Terrain, heights_at
 from workers.scene.support import inside_margin
 
 SAME_PLANE_M = 1e-6
@@ -66,7 +66,7 @@ def support_margin(contacts_xy: Array, com_xy: Array) -> float:
     return -float(np.linalg.norm(contacts_xy - com_xy, axis=1).min())
 
 
-def touching(hull: Hull, T_world_obj: Pose, support: Mesh) -> Array:
+def touching(hull: Hull, T_world_obj: Pose, support: Mesh | Terrain) -> Array:
     """[N, 2] float64: where vertices of the hull are within `CONTACT_M` of the mesh below them, world coordinates."""
     points = transform(T_world_obj, hull.vertices)
     points = points[points[:, 2] <= points[:, 2].min() + NEAR_LOWEST_M]

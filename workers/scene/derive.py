@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.camera import Camera
-from schemas.job import Images, Patch
-from schemas.scene import Agreement, ObjectLabel, View
+from schemas.job import Images, Job, Patch
+from schemas.scene import REGION_FIRST_OBJECT, Agreement, ObjectLabel, View
 from schemas.sensor import Distortion
 from workers.geometry.camera import image_coordinates, project
 from workers.geometry.distortion import distort
@@ -149,6 +149,11 @@ def agree_across(source: View, mirror: View, images: Images, bound_mm: float, fi
         points=len(of_object),
         scene_median_mm=float(np.median(difference_mm)) if len(difference_mm) >= FEWEST_POINTS else None,
     )
+
+
+def compare_views(job: Job, first: View, mirror: View) -> Agreement:
+    """How well an input and a mirror view agree, by the job's bound."""
+    return agree_across(first, mirror, job.images, job.check.mirror_agreement_mm, REGION_FIRST_OBJECT)
 
 
 def _sample_pixels(region: NDArray[np.uint8], first_object: int) -> NDArray[np.int64]:

@@ -1,35 +1,25 @@
-"""From release to rest. The one file that imports PyBullet, so that it can be replaced."""
+"""From release to rest: when an object rests, and what is made of the pose that the simulator stopped at."""
 
 import dataclasses
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import SettleError
 from schemas.job import Physics
-from schemas.scene import ObjectStart, Settled, Table, TableTop
+from schemas.scene import ObjectStart, Settled, Table
 from schemas.shape import MassProperties, Mesh
 from workers.geometry.frames import invert, pose, rotation_from_quaternion, transform, translation
-from workers.geometry.heights import heights_at, vertical_gap
+from workers.geometry.heights import Terrain, heights_at, survey, vertical_gap
+from workers.scene.bullet import Body, World, drop
 from workers.scene.contact import is_stable, snap_to_face, support_margin, touching
-from workers.scene.quiet import silence_c_stderr
-from workers.scene.support import inside_margin
+from workers.scene.watch import Motion, Watch, can_touch, stands_on_face, watch_edge, watch_tilt
 
-with silence_c_stderr():
-    import pybullet
-
-GRAVITY_M_S2 = 9.81
 SAMPLE_STEPS = 8
 """Speeds are read every so many steps: reading costs as much as stepping."""
-
-SLAB_HALF_M = (2.0, 2.0, 0.25)
-"""Half the sides of the box that stands for a flat top: larger and thicker than any table, so that nothing sinks
-through it; it stands in for the table only while the object stays over the true top."""
 
 LEFT_M = 0.05
 """An object whose table lies this far below the top has left it."""
@@ -38,16 +28,13 @@ CALM_M_S = 0.05
 """A point of a resting object never moves faster than this, however briefly: it could not climb an eighth of a
 millimetre any more."""
 
-MOST_GROUND_VERTICES, MOST_GROUND_INDICES = 131_072, 524_288
-"""PyBullet's limits on one collision mesh; it fails beyond them without a word why."""
-
 RECHECK_S = 1.0
 """How long an object is watched when it is released again."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """What a simulation ended with; `stayed` is False as soon as the object's footprint left the flat top."""
+    """What a simulation ended with; `stayed` is False as soon as its ground was no longer the right one."""
 
     T_world_obj: Pose
     speed_m_s: float
@@ -62,18 +49,19 @@ def settle(start: ObjectStart, table: Table, physics: Physics) -> Settled:
     Raises SettleError `not_at_rest`, `left_table`, `unsupported` or `table_too_fine`. The result is a function of the
     arguments alone: the world is made anew each time.
     """
+    ground = survey(table.mesh)
     if start.placed:
-        return _describe(start, table, _Motion(start.T_world_obj, 0.0, 0.0, True, True), "placed")
+        return _describe(start, ground, _Motion(start.T_world_obj, 0.0, 0.0, True, True), "placed")
     if table.top.convex:
-        motion = _settle_flat(start, table, physics)
+        motion = _settle_flat(start, table, ground, physics)
         if motion is not None:
-            return _describe(start, table, motion, "flat_top")
+            return _describe(start, ground, motion, "flat_top")
     motion = _simulate(start, table, physics, physics.max_settle_s, flat=False)
-    _require_rest(start, table, motion)
-    return _describe(start, table, _close_gap(start, table, motion), "mesh")
+    _require_rest(start, table, ground, motion)
+    return _describe(start, ground, _close_gap(start, ground, motion), "mesh")
 
 
-def _settle_flat(start: ObjectStart, table: Table, physics: Physics) -> _Motion | None:
+def _settle_flat(start: ObjectStart, table: Table, ground: Terrain, physics: Physics) -> _Motion | None:
     """Rest on the flat top alone; None where the footprint left it, so that the table's edges may have mattered.
 
     Rolling friction can hold an object within that lever arm of an edge of its hull, where in truth it would tip on.
@@ -85,14 +73,15 @@ def _settle_flat(start: ObjectStart, table: Table, physics: Physics) -> _Motion 
         motion = _simulate(start, table, physics, physics.max_settle_s, flat=True)
         if not motion.stayed:
             return None
-        _require_rest(start, table, motion)
+        _require_rest(start, table, ground, motion)
         seconds += motion.seconds
         T = snap_to_face(motion.T_world_obj, start.hull, start.asset.mass.com, physics.snap_rad)
+        snapped = T is not motion.T_world_obj  # onto a face with the centre of mass above it
         motion = _Motion(T, motion.speed_m_s, seconds, True, True)
-        if is_stable(T, start.hull, start.asset.mass.com):
+        if snapped or is_stable(T, start.hull, start.asset.mass.com):
             break
         start = dataclasses.replace(start, T_world_obj=T)
-    return _close_gap(start, table, motion)
+    return _close_gap(start, ground, motion)
 
 
 def recheck(start: ObjectStart, settled: Settled, table: Table, physics: Physics) -> float:
@@ -104,10 +93,9 @@ def recheck(start: ObjectStart, settled: Settled, table: Table, physics: Physics
     return float(np.linalg.norm(after - before, axis=1).max() * 1e3)
 
 
-def _require_rest(start: ObjectStart, table: Table, motion: _Motion) -> None:
+def _require_rest(start: ObjectStart, table: Table, ground: Terrain, motion: _Motion) -> None:
     com = transform(motion.T_world_obj, start.asset.mass.com[None, :])[0]
-    ground = heights_at(com[None, :2], table.mesh)[0]
-    if not ground >= table.top.height_m - LEFT_M:  # nan too
+    if not heights_at(com[None, :2], ground)[0] >= table.top.height_m - LEFT_M:  # nan too
         raise SettleError(
             "left_table",
             f"after {motion.seconds:.2f} s the centre of mass was at ({com[0]:.3f}, {com[1]:.3f}, {com[2]:.3f}) m, off the "
@@ -121,23 +109,23 @@ def _require_rest(start: ObjectStart, table: Table, motion: _Motion) -> None:
         )
 
 
-def _close_gap(start: ObjectStart, table: Table, motion: _Motion) -> _Motion:
+def _close_gap(start: ObjectStart, ground: Terrain, motion: _Motion) -> _Motion:
     """Move along z until the meshes just touch."""
-    lift = translation(0.0, 0.0, -_gap_m(start, motion.T_world_obj, table))
+    lift = translation(0.0, 0.0, -_gap_m(start, motion.T_world_obj, ground))
     return dataclasses.replace(motion, T_world_obj=lift @ motion.T_world_obj)
 
 
-def _gap_m(start: ObjectStart, T_world_obj: Pose, table: Table) -> float:
+def _gap_m(start: ObjectStart, T_world_obj: Pose, ground: Terrain) -> float:
     shape = start.asset.shape.mesh
-    return vertical_gap(Mesh(transform(T_world_obj, shape.vertices), shape.faces), table.mesh)
+    return vertical_gap(Mesh(transform(T_world_obj, shape.vertices), shape.faces), ground)
 
 
-def _describe(start: ObjectStart, table: Table, motion: _Motion, support: str) -> Settled:
+def _describe(start: ObjectStart, ground: Terrain, motion: _Motion, support: str) -> Settled:
     """The figures of a rest pose, measured between the meshes and not taken from the simulator."""
     T = motion.T_world_obj
-    gap_mm = _gap_m(start, T, table) * 1e3
+    gap_mm = _gap_m(start, T, ground) * 1e3
     com = transform(T, start.asset.mass.com[None, :])[0]
-    margin = support_margin(touching(start.hull, T, table.mesh), com[:2])
+    margin = support_margin(touching(start.hull, T, ground), com[:2])
     if support != "mesh" and not margin > 0.0:
         raise SettleError(
             "unsupported",
@@ -156,25 +144,36 @@ def _describe(start: ObjectStart, table: Table, motion: _Motion, support: str) -
 
 
 def _simulate(start: ObjectStart, table: Table, physics: Physics, seconds: float, flat: bool) -> _Motion:
-    T_obj_body, principal = _body_frame(start.asset.mass)
+    """Drop the object onto the flat top or the mesh; `stayed` is False where its footprint left the flat top.
+
+    What stands on a level plane touches it with few of its vertices as long as it does not tip, and Bullet's time goes
+    with their number. So it falls with these alone, and falls again with all of them should it tip.
+    """
+    T_obj_body, moments = _body_frame(start.asset.mass)
     vertices = transform(invert(T_obj_body), start.hull.vertices)
     reach = float(np.linalg.norm(vertices, axis=1).max())
-    with _world(physics) as client:
-        ground = _flat_ground(client, table.top.height_m) if flat else _mesh_ground(client, table.mesh)
-        shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices.tolist(), physicsClientId=client)
-        body = pybullet.createMultiBody(start.asset.mass.mass_kg, shape, physicsClientId=client)
-        pybullet.changeDynamics(body, -1, localInertiaDiagonal=principal.tolist(), physicsClientId=client)
-        for thing in (ground, body):
-            _set_surface(client, thing, physics)
-        _place(client, body, start.T_world_obj @ T_obj_body)
-        motion = _run(client, body, physics, seconds, (reach, table.top if flat else None))
-    return _Motion(
-        motion.T_world_obj @ invert(T_obj_body), motion.speed_m_s, motion.seconds, motion.rested, motion.stayed
-    )
+    T_world_body = start.T_world_obj @ T_obj_body
+
+    def fall(vertices: Array, watches: tuple[Watch, ...]) -> _Motion:
+        ground = table.top.height_m if flat else table.mesh
+        body = Body(start.asset.mass.mass_kg, moments, vertices)
+        with drop(body, T_world_body, ground, physics, SAMPLE_STEPS) as world:
+            motion = _run(world, physics, seconds, reach, watches)
+        return dataclasses.replace(motion, T_world_obj=motion.T_world_obj @ invert(T_obj_body))
+
+    if not flat:
+        return fall(vertices, ())
+    leaves = watch_edge(table.top.outline, reach)
+    down = -T_world_body[2, :3]
+    if stands_on_face(vertices, down):
+        motion = fall(vertices[can_touch(vertices, down)], (leaves, watch_tilt(T_world_body)))
+        if motion.stayed:
+            return motion
+    return fall(vertices, (leaves,))
 
 
-def _run(client: int, body: int, physics: Physics, seconds: float, watch: tuple[float, TableTop | None]) -> _Motion:
-    """Step until the object rests, the time is over, or the flat top is left.
+def _run(world: World, physics: Physics, seconds: float, reach: float, watches: tuple[Watch, ...]) -> _Motion:
+    """Step until the object rests, the time is over, or something that was watched for happens.
 
     It rests when, for the whole window, no point has gone further than the rest speed would take it, nor turned further
     than the rest spin would, and nothing moved faster than `CALM_M_S`. Displacement counts and not speed, because
@@ -183,105 +182,28 @@ def _run(client: int, body: int, physics: Physics, seconds: float, watch: tuple[
 
     The returned pose is the body frame's (centre of mass, principal axes).
     """
-    reach, top = watch
     steps, window = round(seconds * physics.step_hz), round(physics.rest.window_s * physics.step_hz)
     drift_m = physics.rest.speed_mm_s / 1e3 * physics.rest.window_s
     turn_rad = physics.rest.spin_rad_s * physics.rest.window_s
-    anchor, since, moved = _read_pose(client, body), 0, 0.0
+    anchor, since, moved = world.pose(), 0, 0.0
     for step in range(SAMPLE_STEPS, steps + SAMPLE_STEPS, SAMPLE_STEPS):
-        for _ in range(SAMPLE_STEPS):
-            pybullet.stepSimulation(physicsClientId=client)
-        v, w = (math.hypot(*x) for x in pybullet.getBaseVelocity(body, physicsClientId=client))
-        speed, now = v + w * reach, _read_pose(client, body)
-        if top is not None and inside_margin(now[0][None, :2], top.outline)[0] < reach:
-            return _Motion(_pose(*now), speed, step / physics.step_hz, False, False)
+        world.advance()
+        v, w = world.velocity()
+        speed, now = math.hypot(*v) + math.hypot(*w) * reach, world.pose()
+        if any(happens(now) for happens in watches):
+            return _Motion(_pose(now), speed, step / physics.step_hz, False, False)
         turned = _angle(anchor[1], now[1])
-        moved = float(np.linalg.norm(now[0] - anchor[0])) + turned * reach
+        moved = math.dist(anchor[0], now[0]) + turned * reach
         if speed > CALM_M_S or moved > drift_m or turned > turn_rad:
             anchor, since = now, step
         elif step - since >= window:
-            return _Motion(_pose(*now), moved * physics.step_hz / (step - since), step / physics.step_hz, True, True)
-    return _Motion(_pose(*now), speed, step / physics.step_hz, False, True)
+            return _Motion(_pose(now), moved * physics.step_hz / (step - since), step / physics.step_hz, True, True)
+    return _Motion(_pose(now), speed, step / physics.step_hz, False, True)
 
 
-def _read_pose(client: int, body: int) -> tuple[Array, Array]:
-    """Position [3] and quaternion [4], (x, y, z, w), of the body frame."""
-    position, quaternion = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
-    return np.array(position), np.array(quaternion)
-
-
-def _angle(a: Array, b: Array) -> float:
+def _angle(a: Sequence[float], b: Sequence[float]) -> float:
     """Angle, radians, of the turn between two unit quaternions; for small turns the chord is half the angle."""
-    return 4.0 * math.asin(min(1.0, 0.5 * min(float(np.linalg.norm(a - b)), float(np.linalg.norm(a + b)))))
-
-
-@contextmanager
-def _world(physics: Physics) -> Iterator[int]:
-    """An empty world, emptied again when the block ends. Bit-identical runs need deterministicOverlappingPairs.
-
-    One connection serves the whole process: a new one costs as much as a simulation, a reset a twentieth of that, and
-    both give the same bits, whatever was simulated before. Blocks do not nest.
-    """
-    client = _connection()
-    pybullet.setPhysicsEngineParameter(
-        fixedTimeStep=1.0 / physics.step_hz,
-        numSolverIterations=physics.solver_iterations,
-        deterministicOverlappingPairs=1,
-        physicsClientId=client,
-    )
-    pybullet.setGravity(0.0, 0.0, -GRAVITY_M_S2, physicsClientId=client)
-    try:
-        yield client
-    finally:
-        pybullet.resetSimulation(physicsClientId=client)
-
-
-@cache
-def _connection() -> int:
-    client: int = pybullet.connect(pybullet.DIRECT)
-    return client
-
-
-def _flat_ground(client: int, height_m: float) -> int:
-    shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=SLAB_HALF_M, physicsClientId=client)
-    return pybullet.createMultiBody(0, shape, basePosition=[0, 0, height_m - SLAB_HALF_M[2]], physicsClientId=client)
-
-
-def _mesh_ground(client: int, mesh: Mesh) -> int:
-    if len(mesh.vertices) > MOST_GROUND_VERTICES or 3 * len(mesh.faces) > MOST_GROUND_INDICES:
-        raise SettleError(
-            "table_too_fine",
-            f"the table has {len(mesh.vertices)} vertices and {len(mesh.faces)} faces, and PyBullet takes "
-            f"{MOST_GROUND_VERTICES} and {MOST_GROUND_INDICES // 3}: use a coarser table, or lower assets.limits",
-        )
-    shape = pybullet.createCollisionShape(
-        pybullet.GEOM_MESH,
-        vertices=mesh.vertices.tolist(),
-        indices=mesh.faces.ravel().tolist(),
-        flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
-        physicsClientId=client,
-    )
-    return pybullet.createMultiBody(0, shape, physicsClientId=client)
-
-
-def _set_surface(client: int, body: int, physics: Physics) -> None:
-    pybullet.changeDynamics(
-        body,
-        -1,
-        lateralFriction=physics.friction,
-        rollingFriction=physics.rolling_friction,
-        spinningFriction=physics.spinning_friction,
-        restitution=physics.restitution,
-        collisionMargin=physics.margin_mm / 1e3,
-        linearDamping=0.0,
-        angularDamping=0.0,
-        physicsClientId=client,
-    )
-
-
-def _place(client: int, body: int, T: Pose) -> None:
-    quaternion = _quaternion(T[:3, :3])
-    pybullet.resetBasePositionAndOrientation(body, T[:3, 3].tolist(), quaternion.tolist(), physicsClientId=client)
+    return 4.0 * math.asin(min(1.0, 0.5 * min(math.dist(a, b), math.dist(a, [-c for c in b]))))
 
 
 def _body_frame(mass: MassProperties) -> tuple[Pose, Array]:
@@ -292,20 +214,6 @@ def _body_frame(mass: MassProperties) -> tuple[Pose, Array]:
     return pose(axes, mass.com), moments
 
 
-def _pose(position: Array, quaternion: Array) -> Pose:
-    return pose(rotation_from_quaternion(quaternion), position)
-
-
-def _quaternion(R: Array) -> Array:
-    """(x, y, z, w) of a rotation [3, 3], by the largest of the four components (Shepperd 1978)."""
-    trace = float(np.trace(R))
-    squares = np.array([R[0, 0], R[1, 1], R[2, 2], trace])
-    k = int(np.argmax(squares))
-    q = np.empty(4)
-    if k == 3:
-        q[:] = [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1.0 + trace]
-    else:
-        i, j, m = k, (k + 1) % 3, (k + 2) % 3
-        q[i] = 1.0 + 2.0 * R[i, i] - trace
-        q[j], q[m], q[3] = R[i, j] + R[j, i], R[i, m] + R[m, i], R[m, j] - R[j, m]
-    return q / np.linalg.norm(q)
+def _pose(motion: Motion) -> Pose:
+    position, quaternion = motion
+    return pose(rotation_from_quaternion(np.array(quaternion)), np.array(position))

@@ -7,7 +7,7 @@ from schemas.base import Array, frozen_array
 from schemas.camera import Camera
 from schemas.errors import ViewError
 from schemas.job import DepthCamera, Images, Mirror
-from schemas.scene import REGION_FLOOR, REGION_TABLE, Placed, PosedScene, ScenePlan, Settled
+from schemas.scene import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE, Placed, PosedScene, ScenePlan, Settled
 from workers.geometry.frames import UP, translation
 from workers.geometry.mirror import mirror_pose
 from workers.geometry.pixels import round_depth
@@ -40,7 +40,12 @@ def place_aligned_camera(camera: Camera, depth_camera: DepthCamera) -> Camera:
     return Camera(camera.intrinsics, frozen_array(camera.T_world_cam @ translation(*depth_camera.offset_m)))
 
 
-def front_distance(depth_m: Array, object_pixels: NDArray[np.bool_], mirror: Mirror) -> float:
+def object_distance(depth: NDArray[np.uint16], region: NDArray[np.uint8], images: Images, mirror: Mirror) -> float:
+    """`front_distance` of the object in a stored view; of its depth only the object's pixels are turned to metres."""
+    return front_distance(stored_depth_m(depth[region >= REGION_FIRST_OBJECT], images), np.True_, mirror)
+
+
+def front_distance(depth_m: Array, object_pixels: NDArray[np.bool_] | np.bool_, mirror: Mirror) -> float:
     """d_z: distance to the object's front surface along the optical axis, metres, from its stored depth.
 
     A low percentile by default, because the single nearest pixel is noisy. Raises ViewError where the object has no

@@ -100,9 +100,9 @@ class Attempt:
         tables = {table: table_of_rows(table, output.rows.get(table, ())) for table in TABLES}
         if unknown := output.rows.keys() - tables.keys():
             raise ValueError(f"scene {output.scene_id} has rows for unknown tables: {', '.join(sorted(unknown))}")
-        outcome = outcome_of(output.scene_id, tables)
+        outcome = outcome_of(output)
         entries = {path: FileEntry(path=path, bytes=len(data), sha256=_sha256(data)) for path, data in output.files}
-        check_files(output, tables["views"], entries)
+        check_files(output, entries)
         for path in self._files.keys() & entries.keys():
             if self._files[path] != entries[path]:
                 raise ValueError(f"{path} was written twice with different bytes")
@@ -112,7 +112,7 @@ class Attempt:
         for table, rows in tables.items():
             self._rows[table].append(rows)
         self._scenes[output.scene_id] = SceneMark(
-            scene_id=output.scene_id, outcome=outcome, digest=scene_digest(tables)
+            scene_id=output.scene_id, outcome=outcome, digest=scene_digest(output.rows)
         )
 
     def commit(self) -> CommitResult:

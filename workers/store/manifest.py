@@ -3,8 +3,8 @@
 import io
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from schemas.errors import CorruptError
@@ -28,13 +28,16 @@ def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
         if row.keys() != names:
             wrong = sorted(names.symmetric_difference(row.keys()))
             raise ValueError(f"{table}: a row has other columns than the schema: {', '.join(wrong)}")
-    try:
-        result = pa.Table.from_pylist(list(rows), schema=schema).combine_chunks()
-    except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError) as error:
-        raise ValueError(f"{table}: {error}") from error
-    for field, column in zip(schema, result.columns, strict=True):
-        _check_values(f"{table}.{field.name}", field, column.combine_chunks())
-    return result
+    arrays = []
+    for field in schema:
+        where = f"{table}.{field.name}"
+        try:
+            array = pa.array([row[field.name] for row in rows], field.type)
+        except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError) as error:
+            raise ValueError(f"{where}: {error}") from error
+        _check_values(where, field, array)
+        arrays.append(array)
+    return pa.Table.from_arrays(arrays, schema=schema)
 
 
 def sorted_rows(table: str, rows: pa.Table) -> pa.Table:
@@ -93,11 +96,12 @@ def _check_values(where: str, field: pa.Field, array: pa.Array) -> None:
         raise ValueError(f"{where} is missing in {array.null_count} of {len(array)} rows")
     kind = field.type
     if pa.types.is_floating(kind):
-        if not pc.all(pc.is_finite(pc.fill_null(array, 0.0)), min_count=0).as_py():
-            raise ValueError(f"{where} is not finite: {pc.filter(array, pc.invert(pc.is_finite(array)))[0]}")
+        values = array.drop_null().to_numpy()
+        if not np.isfinite(values).all():
+            raise ValueError(f"{where} is not finite: {values[~np.isfinite(values)][0]}")
     elif pa.types.is_struct(kind):
+        present = array.drop_null()
         for i in range(kind.num_fields):
-            present = array.filter(array.is_valid())
             _check_values(f"{where}.{kind.field(i).name}", kind.field(i), present.field(i))
     elif pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
         _check_values(where, kind.value_field, array.flatten())

@@ -16,7 +16,7 @@ from workers.geometry.frames import angle_between, pose, rotation_about, transfo
 from workers.geometry.heights import vertical_gap
 from workers.geometry.hull import convex_hull
 from workers.scene.plan import plan_scene
-from workers.scene.settle import _body_frame, _quaternion, recheck, settle
+from workers.scene.settle import _body_frame, recheck, settle
 from workers.scene.support import place_table
 
 PHYSICS = Job(name="t").physics
@@ -119,16 +119,6 @@ def test_principal_axes_are_a_rotation_that_makes_the_inertia_diagonal():
     R = T[:3, :3]
     assert np.linalg.det(R) == pytest.approx(1.0)
     assert R.T @ mass.inertia @ R == pytest.approx(np.diag(moments), abs=1e-12)
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_quaternions_agree_with_scipy(seed):
-    from scipy.spatial.transform import Rotation
-
-    R = Rotation.random(random_state=seed).as_matrix()
-    assert abs(_quaternion(R) @ Rotation.from_matrix(R).as_quat()) == pytest.approx(1.0)
-    half = Rotation.from_rotvec(math.pi * np.eye(3)[seed % 3]).as_matrix()
-    assert Rotation.from_quat(_quaternion(half)).as_matrix() == pytest.approx(half, abs=1e-12)
 
 
 def test_a_table_finer_than_the_simulator_takes_is_a_failure_with_its_counts():

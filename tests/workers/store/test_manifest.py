@@ -37,9 +37,9 @@ def test_numpy_values_are_taken_as_plain_ones():
         ("scenes", {"settle_s": None}, "scenes.settle_s is missing in 1 of 1 rows"),
         ("scenes", {"settle_s": float("nan")}, "scenes.settle_s is not finite: nan"),
         ("scenes", {"T_world_obj": [float("inf")] * 16}, "scenes.T_world_obj is not finite: inf"),
-        ("scenes", {"T_world_obj": [0.0] * 15}, "scenes: .*16"),
-        ("scenes", {"scene_id": "three"}, "scenes: .*three"),
-        ("scenes", {"scene_id": 2**63}, "scenes: "),
+        ("scenes", {"T_world_obj": [0.0] * 15}, "scenes.T_world_obj: .*16"),
+        ("scenes", {"scene_id": "three"}, "scenes.scene_id: .*three"),
+        ("scenes", {"scene_id": 2**63}, "scenes.scene_id: "),
         ("views", {"files": [{"path": None, "bytes": 1, "sha256": ""}]}, "views.files.path is missing"),
         (
             "views",

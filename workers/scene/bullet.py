@@ -1,0 +1,213 @@
+"""One rigid body falling onto a ground, in PyBullet. The one file that imports PyBullet, so that it can be replaced."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array, Pose
+from schemas.errors import SettleError
+from schemas.job import Physics
+from schemas.shape import Mesh
+from workers.scene.quiet import silence_c_stderr
+from workers.scene.watch import Motion
+
+with silence_c_stderr():
+    import pybullet
+
+GRAVITY_M_S2 = 9.81
+
+SLAB_HALF_M = (2.0, 2.0, 0.25)
+"""Half the sides of the box that stands for level ground: larger and thicker than any table, so that nothing sinks
+through it. Bullet's plane is twice as fast and worse: it gives one contact a step, so that a box which lands on an edge
+turns about the vertical by ten times as much as on the box."""
+
+MOST_GROUND_VERTICES, MOST_GROUND_INDICES = 131_072, 524_288
+"""PyBullet's limits on one collision mesh; it fails beyond them without a word why."""
+
+WORLDS_BEFORE_RESET = 32
+"""What is removed from a simulation leaves some kilobytes behind, which only a reset frees; a reset costs as much as
+fifty milliseconds of simulated time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A convex body about its centre of mass and along its principal axes: vertices [N, 3] m, moments [3] kg m^2."""
+
+    mass_kg: float
+    moments: Array
+    vertices: Array
+
+
+@dataclass(frozen=True)
+class World:
+    """A ground and a body on it, `steps` steps of the simulation at a time."""
+
+    client: int
+    body: int
+
+    def advance(self) -> None:
+        """The steps that the world was opened for."""
+        pybullet.stepSimulation(physicsClientId=self.client)
+
+    def pose(self) -> Motion:
+        """Where the body is."""
+        position, quaternion = pybullet.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
+        return position, quaternion
+
+    def velocity(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Velocity, m/s, of the centre of mass, and angular velocity, rad/s."""
+        v, w = pybullet.getBaseVelocity(self.body, physicsClientId=self.client)
+        return v, w
+
+
+@contextmanager
+def drop(body: Body, T_world_body: Pose, ground: float | Mesh, physics: Physics, steps: int) -> Iterator[World]:
+    """A world with nothing but the body and the ground: level at a height in metres, or a mesh.
+
+    Bit-identical runs need deterministicOverlappingPairs. One connection serves the whole process: a new one costs as
+    much as a simulation. What was simulated before leaves no trace in the bits: two bodies are one pair, so that no
+    order of pairs, contacts or islands can differ. Blocks do not nest.
+    """
+    client = _connection()
+    pybullet.setPhysicsEngineParameter(
+        fixedTimeStep=steps / physics.step_hz,
+        numSubSteps=steps,
+        numSolverIterations=physics.solver_iterations,
+        deterministicOverlappingPairs=1,
+        physicsClientId=client,
+    )
+    pybullet.setGravity(0.0, 0.0, -GRAVITY_M_S2, physicsClientId=client)
+    things: list[int] = []
+    try:
+        things.append(_add_mesh(client, ground) if isinstance(ground, Mesh) else _add_slab(client, ground))
+        things.append(_add_body(client, body))
+        for thing in things:
+            _set_surface(client, thing, physics)
+        _place(client, things[1], T_world_body)
+        yield World(client, things[1])
+    finally:
+        _clear(client, things)
+
+
+@dataclass
+class _Use:
+    """How many worlds a connection has seen since it was reset."""
+
+    worlds: int = 0
+
+
+@dataclass(frozen=True)
+class _Numbers:
+    """Python objects that are handed to PyBullet again and again.
+
+    PyBullet 3.2.7 takes a reference to each list of vertices or indices, and to each of their items, and never gives it
+    back (190 bytes a vertex). So it is given the same objects each time, with other contents.
+    """
+
+    points: list[list[float]] = field(default_factory=list)
+    integers: list[int] = field(default_factory=list)
+    vertex_list: list[list[float]] = field(default_factory=list)
+    index_list: list[int] = field(default_factory=list)
+
+    def vertices(self, points: Array) -> list[list[float]]:
+        """[N, 3] as lists, valid until the next call."""
+        self.points.extend([0.0, 0.0, 0.0] for _ in range(len(points) - len(self.points)))
+        for mine, point in zip(self.points, points.tolist(), strict=False):
+            mine[:] = point
+        self.vertex_list[:] = self.points[: len(points)]
+        return self.vertex_list
+
+    def indices(self, values: NDArray[np.integer]) -> list[int]:
+        """[N] non-negative integers as a list, valid until the next call."""
+        self.integers.extend(range(len(self.integers), int(values.max()) + 1))
+        self.index_list[:] = [self.integers[value] for value in values.tolist()]
+        return self.index_list
+
+
+_NUMBERS = _Numbers()
+_USE = _Use()
+
+
+@cache
+def _connection() -> int:
+    client: int = pybullet.connect(pybullet.DIRECT)
+    return client
+
+
+def _clear(client: int, things: list[int]) -> None:
+    _USE.worlds += 1
+    if _USE.worlds >= WORLDS_BEFORE_RESET or len(things) < 2:
+        pybullet.resetSimulation(physicsClientId=client)
+        _USE.worlds = 0
+        return
+    for thing in reversed(things):
+        pybullet.removeBody(thing, physicsClientId=client)
+
+
+def _add_slab(client: int, height_m: float) -> int:
+    shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=SLAB_HALF_M, physicsClientId=client)
+    return pybullet.createMultiBody(0, shape, basePosition=[0, 0, height_m - SLAB_HALF_M[2]], physicsClientId=client)
+
+
+def _add_mesh(client: int, mesh: Mesh) -> int:
+    if len(mesh.vertices) > MOST_GROUND_VERTICES or 3 * len(mesh.faces) > MOST_GROUND_INDICES:
+        raise SettleError(
+            "table_too_fine",
+            f"the table has {len(mesh.vertices)} vertices and {len(mesh.faces)} faces, and PyBullet takes "
+            f"{MOST_GROUND_VERTICES} and {MOST_GROUND_INDICES // 3}: use a coarser table, or lower assets.limits",
+        )
+    shape = pybullet.createCollisionShape(
+        pybullet.GEOM_MESH,
+        vertices=_NUMBERS.vertices(mesh.vertices),
+        indices=_NUMBERS.indices(mesh.faces.ravel()),
+        flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
+        physicsClientId=client,
+    )
+    return pybullet.createMultiBody(0, shape, physicsClientId=client)
+
+
+def _add_body(client: int, body: Body) -> int:
+    vertices = _NUMBERS.vertices(body.vertices)
+    shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client)
+    thing: int = pybullet.createMultiBody(body.mass_kg, shape, physicsClientId=client)
+    pybullet.changeDynamics(thing, -1, localInertiaDiagonal=body.moments.tolist(), physicsClientId=client)
+    return thing
+
+
+def _set_surface(client: int, thing: int, physics: Physics) -> None:
+    pybullet.changeDynamics(
+        thing,
+        -1,
+        lateralFriction=physics.friction,
+        rollingFriction=physics.rolling_friction,
+        spinningFriction=physics.spinning_friction,
+        restitution=physics.restitution,
+        collisionMargin=physics.margin_mm / 1e3,
+        linearDamping=0.0,
+        angularDamping=0.0,
+        physicsClientId=client,
+    )
+
+
+def _place(client: int, thing: int, T: Pose) -> None:
+    quaternion = quaternion_of(T[:3, :3])
+    pybullet.resetBasePositionAndOrientation(thing, T[:3, 3].tolist(), quaternion.tolist(), physicsClientId=client)
+
+
+def quaternion_of(R: Array) -> Array:
+    """(x, y, z, w) of a rotation [3, 3], by the largest of the four components (Shepperd 1978)."""
+    trace = float(np.trace(R))
+    squares = np.array([R[0, 0], R[1, 1], R[2, 2], trace])
+    k = int(np.argmax(squares))
+    q = np.empty(4)
+    if k == 3:
+        q[:] = [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1.0 + trace]
+    else:
+        i, j, m = k, (k + 1) % 3, (k + 2) % 3
+        q[i] = 1.0 + 2.0 * R[i, i] - trace
+        q[j], q[m], q[3] = R[i, j] + R[j, i], R[i, m] + R[m, i], R[m, j] - R[j, m]
+    return q / np.linalg.norm(q)
