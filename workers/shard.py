@@ -23,6 +23,7 @@ from workers.assets.catalogue import Catalogue
 from workers.context import WorkerContext, settings_digest
 from workers.fingerprint import take_fingerprint
 from workers.records import failed_scene, record_scene, timing_row
+from workers.render.context import require_device
 from workers.render.gbuffer import shared_renderer
 from workers.scene.plan import choose_category
 from workers.scene_steps import Stopwatch, make_scene
@@ -46,7 +47,9 @@ def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
     """Make and commit every range of the order. What a scene cannot be is a row; anything else propagates."""
     begun = time.perf_counter()
     keep_freed_memory()
-    context = WorkerContext(order.job, catalogue, shared_renderer(), settings_digest(order.job, catalogue.digest))
+    renderer = shared_renderer()
+    require_device(renderer.name, order.job.run.device)
+    context = WorkerContext(order.job, catalogue, renderer, settings_digest(order.job, catalogue.digest))
     fingerprint = _fingerprint()
     store = open_store(order.out)
     _join_stack(store, fingerprint, order)
