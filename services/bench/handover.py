@@ -12,6 +12,7 @@ from schemas.shape import Asset, Mesh, Shape
 from workers.assets.glb import asset_glb
 from workers.records import image_boxes
 from workers.scene_steps import Scene
+from workers.store.images import encode_png
 
 URDF = """<robot name="{name}"><link name="base">
 <inertial><origin xyz="{com}"/><mass value="{mass}"/>
@@ -33,7 +34,10 @@ def hand_over(scene: Scene, job: Job, folder: Path) -> Path:
     described = {
         "T_world_table": _matrix(table.T_world_table),
         "T_world_obj": _matrix(start.T_world_obj),
-        "floor": _floor(scene.posed.things[0]),
+        "floor": _floor(scene.posed.things[0], folder),
+        "lights": [
+            {"towards": light.direction.tolist(), "color": list(light.color)} for light in scene.posed.appearance.lights
+        ],
         "intrinsics": {key: getattr(sensor, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
         "depth_units_per_m": job.images.depth_units_per_m,
         "pairs": [_pair(pair, job) for pair in scene.pairs],
@@ -58,13 +62,21 @@ def _matrix(T: Pose) -> list[list[float]]:
     return np.asarray(T).tolist()
 
 
-def _floor(placed: Placed) -> dict[str, object]:
+def _floor(placed: Placed, folder: Path) -> dict[str, object]:
+    """Its geometry, its mean colour, and where it has a texture that as `floor.png`, with coordinates."""
     shape: Shape = placed.shape
-    return {
+    part = shape.parts[0]
+    described: dict[str, object] = {
         "vertices": shape.vertices.tolist(),
         "faces": shape.faces.tolist(),
-        "color": list(shape.parts[0].material.base_color),
+        "color": list(part.material.base_color),
+        "roughness": part.material.roughness,
     }
+    if part.material.texture is None or part.uv is None:
+        return described
+    picture = part.material.texture[..., :3]
+    (folder / "floor.png").write_bytes(encode_png(np.ascontiguousarray(picture)))
+    return described | {"uv": part.uv.tolist(), "color": [*(picture.mean(axis=(0, 1)) / 255.0).tolist(), 1.0]}
 
 
 def _obj(mesh: Mesh) -> str:
