@@ -10,8 +10,8 @@ from typing import Any
 
 from schemas.errors import InputError
 from schemas.job import Job
-from services.bench.machine import other_systems
 from services.bench.measure import bench_folder, measure
+from services.bench.others import other_systems
 from services.bench.report import describe, summarise
 from services.jobfile import load_job, set_key, validate_job
 from workers.store.mounts import file_system_of

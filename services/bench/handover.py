@@ -34,6 +34,7 @@ def hand_over(scene: Scene, job: Job, folder: Path) -> Path:
     described = {
         "T_world_table": _matrix(table.T_world_table),
         "T_world_obj": _matrix(start.T_world_obj),
+        "object": _body(start.asset),
         "floor": _floor(scene.posed.things[0], folder),
         "lights": [
             {"towards": light.direction.tolist(), "color": list(light.color)} for light in scene.posed.appearance.lights
@@ -77,6 +78,12 @@ def _floor(placed: Placed, folder: Path) -> dict[str, object]:
     picture = part.material.texture[..., :3]
     (folder / "floor.png").write_bytes(encode_png(np.ascontiguousarray(picture)))
     return described | {"uv": part.uv.tolist(), "color": [*(picture.mean(axis=(0, 1)) / 255.0).tolist(), 1.0]}
+
+
+def _body(asset: Asset) -> dict[str, object]:
+    """Mass, centre of mass and principal moments of the object, in its frame."""
+    mass = asset.mass
+    return {"mass_kg": mass.mass_kg, "com": mass.com.tolist(), "inertia": np.diag(mass.inertia).tolist()}
 
 
 def _obj(mesh: Mesh) -> str:
