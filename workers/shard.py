@@ -45,7 +45,7 @@ class BlamedScene(SceneError):
 
 def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
     """Make and commit every range of the order. What a scene cannot be is a row; anything else propagates."""
-    begun = time.perf_counter()
+    begun, cpu = time.perf_counter(), time.process_time()
     keep_freed_memory()
     renderer = shared_renderer()
     require_device(renderer.name, order.job.run.device)
@@ -60,6 +60,7 @@ def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
         spans=reports,
         seconds=total.seconds,
         wall_s=time.perf_counter() - begun,
+        cpu_s=time.process_time() - cpu,
         fingerprint=fingerprint,
         host=socket.gethostname(),
         pid=os.getpid(),

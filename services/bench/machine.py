@@ -61,6 +61,12 @@ def resident_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
+def peak_resident_mb(status: Path = Path("/proc/self/status")) -> float:
+    """The most memory that this process ever held, MB. Not `ru_maxrss`, which a child inherits from its parent."""
+    line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+    return int(line.split()[1]) * 1024 / 1e6
+
+
 def _processor(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
     try:
         lines = cpuinfo.read_text().splitlines()

@@ -115,20 +115,34 @@ def _spread(spread: dict[str, float]) -> str:
 def _describe_memory(memory: dict[str, Any] | None) -> list[str]:
     if memory is None:
         return []
+    settled, scenes = memory["settled_after"], memory["scenes"]
     return [
-        f"memory                  {memory['settled_mb']:.0f} MB after {memory['settled_after']} scenes, "
-        f"{memory['last_mb']:.0f} MB after {memory['scenes']} ({memory['grown']:+.1%}), at most "
-        f"{memory['peak_mb']:.0f} MB; time for a scene "
-        f"{memory['slowed']:+.1%}"
+        "",
+        f"one worker over {scenes} scenes",
+        f"  memory                 {memory['settled_mb']:.0f} MB after {settled}, {memory['last_mb']:.0f} MB at the end: "
+        f"{memory['grown']:+.1%}; at most {memory['peak_mb']:.0f} MB",
+        f"  processor for a scene  {memory['first_ms']:.1f} ms in the first {settled}, {memory['last_ms']:.1f} ms in the "
+        f"last: {memory['last_to_first']:.3f} times",
     ]
 
 
 def _describe_scaling(scaling: dict[str, Any] | None) -> list[str]:
     if scaling is None:
         return []
-    share = Spread(**scaling["ray_share"])
+    share, share_one = Spread(**scaling["ray_share"]), Spread(**scaling["ray_share_one"])
+    lines = [
+        "",
+        f"{scaling['workers']} at once against one     {'as many scenes':24} {'processor for a scene':24} scenes/s",
+    ]
+    for name, gain in (("through Ray", scaling["ray"]), ("plain processes", scaling["bare"])):
+        lines.append(
+            f"  {name:22} {_spread(gain['speedup']):24} {_spread(gain['inflation']):24} "
+            f"{gain['one_scenes_per_s']:.2f} and {gain['all_scenes_per_s']:.2f}, {gain['scenes']} scenes"
+        )
     return [
-        f"{scaling['workers']} workers against one   {_spread(scaling['speedup'])} ({scaling['one_scenes_per_s']:.2f} and "
-        f"{scaling['all_scenes_per_s']:.2f} scenes/s, {scaling['scenes']} scenes)",
-        f"Ray's share             {share.median:.1%} [{share.least:.1%} to {share.most:.1%}] with shards of {scaling['shard']}",
+        *lines,
+        f"  Ray gives {scaling['share_of_bare']:.1%} of what plain processes gain",
+        f"  Ray's share of time    {share_one.median:.1%} [{share_one.least:.1%} to {share_one.most:.1%}] with one worker, "
+        f"{share.median:.1%} [{share.least:.1%} to {share.most:.1%}] with {scaling['workers']}, their uneven end included; "
+        f"shards of {scaling['shard']}",
     ]

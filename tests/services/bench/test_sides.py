@@ -14,7 +14,6 @@ from services.bench.encoders import choose_encoders, encoders, kind_of
 from services.bench.floor import committed_files, images_of, run_floor, write_durably
 from services.bench.handover import hand_over
 from services.bench.machine import pinned
-from services.bench.memory import describe
 from services.bench.side_process import side_process
 from services.bench.stages import open_workbench
 from services.cli import main
@@ -188,13 +187,6 @@ def test_cores_are_given_back_also_after_an_error():
     with pytest.raises(KeyError):
         fail()
     assert os.sched_getaffinity(0) == before
-
-
-def test_memory_is_compared_after_it_settled():
-    samples = [(100.0 + n, 0.1) for n in range(10)] + [(110.0, 0.1)] * 90
-    told = describe(samples, 1600)
-    assert (told.settled_after, told.settled_mb, told.peak_mb) == (160, 109.0, 110.0)
-    assert told.grown == 110.0 / 109.0 - 1.0 and told.slowed == 0.0
 
 
 def test_bench_prints_one_object_last_and_leaves_nothing(tmp_path, capsys):
