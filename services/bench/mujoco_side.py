@@ -77,6 +77,7 @@ class Simulator:
     """What stays from one scene to the next: the module."""
 
     def __init__(self) -> None:
+        os.environ["MUJOCO_GL"] = "egl"  # noqa: TID251 - read at import, there is no other way to say it
         self._mujoco: Any = importlib.import_module("mujoco")
 
     def make(

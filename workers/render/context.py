@@ -13,7 +13,7 @@ REMEDY = (
     "`verso doctor` says what else is missing"
 )
 
-SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swr ", "swiftshader", "lavapipe")
+SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swr ", "swiftshader", "lavapipe", "basic render")
 """What GL_RENDERER holds, in lower case, where OpenGL runs on the CPU."""
 
 NO_GPU = (
