@@ -31,7 +31,8 @@ def main(options: argparse.Namespace) -> int:
             "scaling": _scaling(options, job, job_folder, folder),
             "other_systems": other_systems(),
         }
-    print("\n".join(describe(figures)))
+        # Before the folder goes: thousands of files take a while where the disk is busy.
+        print("\n".join(describe(figures)), flush=True)
     if options.json:
         print(json.dumps(figures))
     return 0

@@ -18,8 +18,8 @@ from services.bench.ratios import Lap
 from services.bench.side_process import SideProcess, side_process
 from services.bench.stages import Workbench, open_workbench
 
-WARM_UP = 2
-"""Scenes before the clock: shaders are made and caches filled."""
+WARM_UP = 8
+"""Scenes before the clock: shaders are made, of which pyrender has one for each number of lights, and caches filled."""
 
 
 @dataclass(frozen=True)

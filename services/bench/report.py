@@ -72,7 +72,7 @@ def describe(figures: dict[str, Any]) -> list[str]:
         f"{figures['core']}, {figures['bytes_per_scene'] / 1e3:.0f} kB a scene on {figures['file_system']}",
         "start-up   "
         + ", ".join(f"{name} {s:.1f} s" for name, s in figures["startup_s"].items())
-        + "; not counted below",
+        + ", the first scenes included; not counted below",
         "",
         *_table("ours", figures["ours"]),
         *_table("floor: bare passes, fastest encoder, durable writes", figures["floor"]),
