@@ -24,6 +24,11 @@ from schemas.sources import Assets
 
 Tier = Literal["flat", "raster"]
 Category = Literal["bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box"]
+Focal = Annotated[float, Field(ge=1e-3, le=1e6)]
+Principal = Annotated[float, Field(ge=-1e6, le=1e6)]
+Reach = Annotated[float, Field(gt=0, le=1e3)]
+Offset = Annotated[float, Field(ge=-1e3, le=1e3)]
+"""Far beyond any camera, and what its numbers can be without overflow in float32 on the GPU."""
 CATEGORIES: tuple[Category, ...] = ("bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box")
 
 
@@ -83,7 +88,7 @@ class Orbit(Frozen):
     """Angle of the optical axis below the horizontal."""
     yaw_rad: Interval = Range(-math.pi, math.pi)
     """Direction from the table to the camera."""
-    radius_m: Positive = 2.5
+    radius_m: Reach = 2.5
     """Distance from the centre of the table top."""
 
 
@@ -94,27 +99,27 @@ class Sensor(Frozen):
     """Pixels."""
     height: Annotated[int, Field(ge=1, le=4096)] = 480
     """Pixels."""
-    fx: Positive = 525.0
+    fx: Focal = 525.0
     """Focal length, pixels."""
-    fy: Positive = 525.0
+    fy: Focal = 525.0
     """Focal length, pixels."""
-    cx: float = 320.0
+    cx: Principal = 320.0
     """Principal point, pixels from the left edge."""
-    cy: float = 240.0
+    cy: Principal = 240.0
     """Principal point, pixels from the upper edge."""
 
 
 class DepthCamera(Frozen):
     """The depth camera's place in the RGB camera's optical axes, metres; same rotation [A]."""
 
-    offset_m: tuple[float, float, float] = (-0.051, 0.001, -0.001)
+    offset_m: tuple[Offset, Offset, Offset] = (-0.051, 0.001, -0.001)
     """Translation in the RGB camera's optical axes."""
 
 
 class Mirror(Frozen):
     """The camera on the other side [A, C]."""
 
-    T_z_m: Positive = 1.3
+    T_z_m: Reach = 1.3
     """Distance of the mirror camera from the point that it looks at."""
     front: Literal["percentile", "median", "nearest"] = "percentile"
     """How d_z, the distance to the object's front surface, is read from the object's stored input depth."""
@@ -230,6 +235,8 @@ class Run(Frozen):
     """Tries of a range whose worker dies, before the scene it died in is recorded as an environmental failure."""
     scene_timeout_s: Positive = 120.0
     """A worker that takes longer over one scene is killed."""
+    device: Literal["any", "gpu"] = "any"
+    """What may draw: `gpu` refuses workers on which OpenGL runs in software, on the CPU."""
     fingerprint: Literal["strict", "record"] = "strict"
     """`strict` refuses workers whose stack makes other bytes; `record` allows them and stores which made what."""
 

@@ -52,6 +52,8 @@ class ShardReport(Frozen):
     spans: tuple[SpanReport, ...]
     seconds: dict[str, float]
     wall_s: float
+    cpu_s: float
+    """Of the processor, in this process."""
     fingerprint: Fingerprint
     host: str
     pid: int

@@ -157,7 +157,9 @@ def _add_bench(commands: "argparse._SubParsersAction") -> None:
         "--folder", type=Path, metavar="DIR", default=Path("data"), help="on the disk to measure (default: data)"
     )
     bench.add_argument("--memory", type=_count, metavar="N", help="also watch one worker's memory over N scenes")
-    bench.add_argument("--workers", type=_count, metavar="N", help="also compare N workers with one, through Ray")
+    bench.add_argument(
+        "--workers", type=_count, metavar="N", help="also compare N workers with one, beside N plain processes"
+    )
     bench.add_argument(
         "--scaling-scenes", type=_count, metavar="N", default=512, help="how many scenes that comparison makes"
     )

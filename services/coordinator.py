@@ -46,6 +46,7 @@ class Tally:
     conflicts: list[str] = field(default_factory=list)
     shards: int = 0
     shard_wall_s: float = 0.0
+    shard_cpu_s: float = 0.0
 
     @property
     def done(self) -> int:
@@ -56,6 +57,7 @@ class Tally:
         """Count one shard's report in."""
         self.shards += 1
         self.shard_wall_s += report.wall_s
+        self.shard_cpu_s += report.cpu_s
         self.seconds.update(report.seconds)
         for span in report.spans:
             if span.conflict:

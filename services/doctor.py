@@ -88,12 +88,13 @@ def _ray() -> Finding:
 
 def _renderer() -> Finding:
     try:
+        from workers.render.context import is_software
         from workers.render.gbuffer import shared_renderer
 
         name = shared_renderer().name
     except MachineError as error:
         return Finding("GL", False, "no off-screen OpenGL", str(error))
-    kind = "software, on the CPU" if "llvmpipe" in name or "softpipe" in name else "hardware"
+    kind = "software, on the CPU" if is_software(name) else "hardware"
     return Finding("GL", True, f"{name} ({kind})")
 
 

@@ -22,6 +22,7 @@ from workers.assets.catalogue import Catalogue
 from workers.context import WorkerContext, open_worker
 from workers.fingerprint import take_fingerprint
 from workers.records import failed_scene, record_scene, timing_row
+from workers.render.context import require_device
 from workers.render.gbuffer import shared_renderer
 from workers.scene.plan import choose_category
 from workers.scene_steps import Stopwatch, make_scene
@@ -43,8 +44,9 @@ class BlamedScene(SceneError):
 
 def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
     """Make and commit every range of the order. What a scene cannot be is a row; anything else propagates."""
-    begun = time.perf_counter()
+    begun, cpu = time.perf_counter(), time.process_time()
     context = open_worker(order.job, catalogue)
+    require_device(context.renderer.name, order.job.run.device)
     fingerprint = _fingerprint()
     store = open_store(order.out)
     _join_stack(store, fingerprint, order)
@@ -55,6 +57,7 @@ def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
         spans=reports,
         seconds=total.seconds,
         wall_s=time.perf_counter() - begun,
+        cpu_s=time.process_time() - cpu,
         fingerprint=fingerprint,
         host=socket.gethostname(),
         pid=os.getpid(),

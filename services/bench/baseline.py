@@ -1,8 +1,12 @@
 """The script that people write today: stock PyBullet, stock pyrender, plain numpy, `cv2.imwrite`.
 
 Run as a process of its own (`python -m services.bench.baseline`), because stock pyrender ends EGL for its whole process
-when it is done. It reads one line of JSON for each scene, `{"scene": FILE, "out": FOLDER}`, makes the scene's images,
-and answers with one line of seconds by stage. It uses none of our code.
+when it is done. It reads one line of JSON for each scene, `{"scene": FILE, "out": FOLDER, "look": LOOK}`, makes the
+scene's images, and answers with one line of seconds by stage. It uses none of our code.
+
+It has two looks. `plain` is what such scripts do: a floor of one colour, one light, no shadows. `same` is what one has to
+write to get images such as the raster tier's: the floor's texture, each of the scene's distant lights, and pyrender's
+own shadows of them. Everything else is as pyrender comes.
 """
 
 import json
@@ -22,6 +26,7 @@ import pybullet  # noqa: E402
 import pyrender  # noqa: E402
 import trimesh  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
+from PIL import Image  # noqa: E402
 
 STEP_HZ, SECONDS = 240, 3.0
 OPTICAL_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -31,10 +36,18 @@ FLOOR = 1
 Images = dict[str, NDArray]
 
 
-def load(description: dict[str, Any], folder: Path) -> dict[str, Any]:
+def load(description: dict[str, Any], folder: Path, look: str) -> dict[str, Any]:
     """The meshes of a scene as pyrender wants them."""
-    floor: Any = trimesh.Trimesh(description["floor"]["vertices"], description["floor"]["faces"], process=False)
-    floor.visual.face_colors = [round(255 * c) for c in description["floor"]["color"]]
+    given = description["floor"]
+    floor: Any = trimesh.Trimesh(given["vertices"], given["faces"], process=False)
+    if look == "same":
+        picture = Image.open(folder / "floor.png")
+        picture.load()
+        surface = {"baseColorTexture": picture, "metallicFactor": 0.0, "roughnessFactor": given["roughness"]}
+        material = trimesh.visual.material.PBRMaterial(**surface)
+        floor.visual = trimesh.visual.TextureVisuals(uv=np.array(given["uv"]), material=material)
+    else:
+        floor.visual.face_colors = [round(255 * c) for c in given["color"]]
     loaded: dict[str, Any] = {name: trimesh.load(folder / f"{name}.glb") for name in ("table", "object")}
     meshes = {name: scene.dump() for name, scene in loaded.items()}
     return {**meshes, "floor": [floor]}
@@ -64,7 +77,9 @@ def _load_urdf(path: Path, T: NDArray, fixed: bool = False) -> int:
     return body
 
 
-def build(description: dict[str, Any], meshes: dict[str, Any], T_world_obj: NDArray) -> tuple[Any, dict[Any, Any]]:
+def build(
+    description: dict[str, Any], meshes: dict[str, Any], T_world_obj: NDArray, look: str
+) -> tuple[Any, dict[Any, Any]]:
     """The pyrender scene, and the colour of each node in a segmentation pass."""
     scene = pyrender.Scene(ambient_light=[0.3, 0.3, 0.3], bg_color=[0.8, 0.85, 0.9])
     poses = {"floor": np.eye(4), "table": np.array(description["T_world_table"]), "object": T_world_obj}
@@ -72,17 +87,23 @@ def build(description: dict[str, Any], meshes: dict[str, Any], T_world_obj: NDAr
     for region, name in ((FLOOR, "floor"), (TABLE, "table"), (OBJECT, "object")):
         mesh = pyrender.Mesh.from_trimesh(meshes[name], smooth=False)
         colors[scene.add(mesh, pose=poses[name])] = (region, region, region)
-    light = np.eye(4)
-    light[:3, :3] = trimesh.transformations.euler_matrix(0.6, 0.3, 0.0)[:3, :3]
-    scene.add(pyrender.DirectionalLight(intensity=3.0), pose=light)
+    if look == "same":
+        for light in description["lights"]:
+            lamp = pyrender.DirectionalLight(color=np.array(light["color"]), intensity=np.pi)
+            scene.add(lamp, pose=trimesh.geometry.align_vectors([0.0, 0.0, 1.0], light["towards"]))
+    else:
+        scene.add(pyrender.DirectionalLight(intensity=3.0), pose=trimesh.transformations.euler_matrix(0.6, 0.3, 0.0))
     return scene, colors
 
 
-def render(scene: Any, colors: dict, renderer: Any, k: dict[str, float], T_world_cam: NDArray) -> Images:
+def render(
+    scene: Any, colors: dict, renderer: Any, k: dict[str, float], T_world_cam: NDArray, look: str = "plain"
+) -> Images:
     """Colour, depth and segmentation from one camera."""
+    flags = pyrender.RenderFlags.SHADOWS_DIRECTIONAL if look == "same" else pyrender.RenderFlags.NONE
     camera = pyrender.IntrinsicsCamera(k["fx"], k["fy"], k["cx"], k["cy"], znear=0.05, zfar=100.0)
     node = scene.add(camera, pose=T_world_cam @ OPTICAL_TO_OPENGL)
-    rgb, depth = renderer.render(scene)
+    rgb, depth = renderer.render(scene, flags=flags)
     region, _ = renderer.render(scene, flags=pyrender.RenderFlags.SEG, seg_node_map=colors)
     scene.remove_node(node)
     return {"rgb": rgb, "depth": depth, "region": np.ascontiguousarray(region[..., 0])}
@@ -133,21 +154,22 @@ class Script:
         pybullet.connect(pybullet.DIRECT)
         self._renderer: Any = None
 
-    def make(self, description: dict[str, Any], meshes: dict[str, Any], folder: Path, out: Path) -> dict[str, float]:
+    def make(self, description: dict[str, Any], meshes: dict[str, Any], asked: dict[str, str]) -> dict[str, float]:
         """One scene's images; seconds by stage."""
+        folder, out, look = Path(asked["scene"]).parent, Path(asked["out"]), asked["look"]
         seconds: dict[str, float] = {}
         k = description["intrinsics"]
         if self._renderer is None:
             self._renderer = pyrender.OffscreenRenderer(k["width"], k["height"])
         T_world_obj = _timed(seconds, "physics", lambda: simulate(description, folder))
-        scene, colors = _timed(seconds, "scene", lambda: build(description, meshes, T_world_obj))
+        scene, colors = _timed(seconds, "scene", lambda: build(description, meshes, T_world_obj, look))
         for pair in description["pairs"]:
             cameras = {role: np.array(T) for role, T in pair["cameras"].items()}
             views = _timed(
                 seconds,
                 "render",
                 lambda cameras=cameras: {  # type: ignore[misc]
-                    role: render(scene, colors, self._renderer, k, T) for role, T in cameras.items()
+                    role: render(scene, colors, self._renderer, k, T, look) for role, T in cameras.items()
                 },
             )
             T_mirror_input = np.linalg.inv(cameras["mirror"]) @ cameras["input"]
@@ -183,9 +205,9 @@ def main() -> None:
         asked = json.loads(line)
         path, before = Path(asked["scene"]), time.perf_counter()
         description = json.loads(path.read_text())
-        meshes = load(description, path.parent)
+        meshes = load(description, path.parent, asked["look"])
         wall, cpu = time.perf_counter(), time.process_time()
-        stages = script.make(description, meshes, path.parent, Path(asked["out"]))
+        stages = script.make(description, meshes, asked)
         answer = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu, "stages_s": stages}
         answer["load_s"] = wall - before
         print(json.dumps(answer), file=answers)

@@ -10,8 +10,8 @@ from typing import Any
 
 from schemas.errors import InputError
 from schemas.job import Job
-from services.bench.machine import other_systems
 from services.bench.measure import bench_folder, measure
+from services.bench.others import other_systems
 from services.bench.report import describe, summarise
 from services.jobfile import load_job, set_key, validate_job
 from workers.store.mounts import file_system_of
@@ -31,7 +31,8 @@ def main(options: argparse.Namespace) -> int:
             "scaling": _scaling(options, job, job_folder, folder),
             "other_systems": other_systems(),
         }
-    print("\n".join(describe(figures)))
+        # Before the folder goes: thousands of files take a while where the disk is busy.
+        print("\n".join(describe(figures)), flush=True)
     if options.json:
         print(json.dumps(figures))
     return 0

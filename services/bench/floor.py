@@ -1,88 +1,18 @@
 """The least that a machine can do for the same files: bare draws, the fastest encoder, and a durable write."""
 
-import importlib
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import cv2
-import numpy as np
-
 from schemas.commit import CommitRecord
+from services.bench.encoders import Encoder, kind_of
 from services.bench.ratios import Lap
-from workers.render.gbuffer import Renderer
+from workers.render.gbuffer import FLAT, Renderer
 from workers.scene_steps import Scene
 from workers.store.durable import sync_folder, sync_tree
 from workers.store.images import Pixels, decode_png
-
-Encoder = Callable[[Pixels], bytes]
-
-NO_LARGER = 2.0
-"""An encoder that is fast because it hardly compresses is no floor: it may make at most this many times our bytes."""
-
-STRATEGIES = {
-    "huffman": cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
-    "rle": cv2.IMWRITE_PNG_STRATEGY_RLE,
-    "deflate": cv2.IMWRITE_PNG_STRATEGY_DEFAULT,
-}
-FILTERS = {"none": cv2.IMWRITE_PNG_FILTER_NONE, "sub": cv2.IMWRITE_PNG_FILTER_SUB, "up": cv2.IMWRITE_PNG_FILTER_UP}
-REPEATS = 3
-
-
-def encoders() -> dict[str, Encoder]:
-    """Every lossless PNG encoder at hand, by name."""
-    found: dict[str, Encoder] = {}
-    for strategy, number in STRATEGIES.items():
-        for row_filter, filter_number in FILTERS.items():
-            settings = [
-                *(cv2.IMWRITE_PNG_COMPRESSION, 1),
-                *(cv2.IMWRITE_PNG_STRATEGY, number),
-                *(cv2.IMWRITE_PNG_FILTER, filter_number),
-            ]
-            found[f"cv2 {strategy} {row_filter}"] = _opencv(settings)
-    try:
-        codecs = importlib.import_module("imagecodecs")
-    except ImportError:
-        return found
-    return found | {"imagecodecs png 1": lambda pixels: bytes(codecs.png_encode(pixels, level=1))}
-
-
-def _opencv(settings: list[int]) -> Encoder:
-    def encode(pixels: Pixels) -> bytes:
-        bgr = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
-        return bytes(cv2.imencode(".png", bgr, settings)[1].data)
-
-    return encode
-
-
-def kind_of(pixels: Pixels) -> str:
-    """`rgb`, `uint16` or `uint8`."""
-    return "rgb" if pixels.ndim == 3 else str(pixels.dtype)
-
-
-def choose_encoders(images: Sequence[tuple[Pixels, int]]) -> dict[str, tuple[str, Encoder]]:
-    """Name and function of the fastest encoder for each kind of image, measured on `images` and the bytes of each now."""
-    chosen = {}
-    for kind in sorted({kind_of(pixels) for pixels, _ in images}):
-        own = [(pixels, size) for pixels, size in images if kind_of(pixels) == kind]
-        allowed = NO_LARGER * sum(size for _, size in own)
-        timed = []
-        for name, encode in encoders().items():
-            took = min(_seconds(encode, own) for _ in range(REPEATS))
-            if sum(len(encode(pixels)) for pixels, _ in own) <= allowed:
-                timed.append((took, name, encode))
-        _, name, encode = min(timed, key=lambda one: one[0])
-        chosen[kind] = (name, encode)
-    return chosen
-
-
-def _seconds(encode: Encoder, images: Sequence[tuple[Pixels, int]]) -> float:
-    begun = time.perf_counter()
-    for pixels, _ in images:
-        encode(pixels)
-    return time.perf_counter() - begun
 
 
 def committed_files(root: Path, record: CommitRecord) -> dict[str, bytes]:
@@ -102,22 +32,39 @@ def run_floor(
     chosen: Mapping[str, tuple[str, Encoder]],
     folder: Path,
 ) -> Lap:
-    """Draw every view, encode every image, write every byte so that it survives a loss of power. `folder` is new."""
+    """Draw every view, encode every image, write every byte so that it survives a loss of power. `folder` is new.
+
+    `apart_s` of the lap: a first draw of each scene, which uploads its shapes.
+    """
+    upload, draw, draw_cpu = _draw(renderer, scenes)
     images = images_of(files)
-    marks, cpu = [time.perf_counter()], time.process_time()
-    for scene in scenes:
-        for pair in scene.pairs:
-            for view in pair.views[:3]:
-                renderer.draw(scene.posed.things, scene.posed.appearance, view.camera)
-    marks.append(time.perf_counter())
+    begun, cpu = time.perf_counter(), time.process_time()
     for pixels, _ in images:
         chosen[kind_of(pixels)][1](pixels)
-    marks.append(time.perf_counter())
+    encoded = time.perf_counter()
     write_durably(files, folder)
-    marks.append(time.perf_counter())
-    draw, encode, write = np.diff(marks).tolist()
-    stages = {"draw": draw, "encode": encode, "write": write}
-    return Lap(len(scenes), marks[-1] - marks[0], time.process_time() - cpu, stages)
+    written = time.perf_counter()
+    stages = {"draw": draw, "encode": encoded - begun, "write": written - encoded}
+    return Lap(len(scenes), sum(stages.values()), draw_cpu + time.process_time() - cpu, stages, upload)
+
+
+def _draw(renderer: Renderer, scenes: Sequence[Scene]) -> tuple[float, float, float]:
+    """Seconds apart, in which every scene's shapes reach the GPU, then of the clock and of the processor for bare passes.
+
+    A bare pass: colour without shadows, depth and region of everything, read back; flat's, whatever the job's tier.
+    """
+    upload, wall, cpu = 0.0, 0.0, 0.0
+    for scene in scenes:
+        views = [view.camera for pair in scene.pairs for view in pair.views if view.role != "projected"]
+        things, appearance = scene.posed.things, scene.posed.appearance
+        begun = time.perf_counter()
+        renderer.draw(things, appearance, views[0], FLAT)
+        drawn, drawn_cpu = time.perf_counter(), time.process_time()
+        for camera in views:
+            renderer.draw(things, appearance, camera, FLAT)
+        upload, wall = upload + drawn - begun, wall + time.perf_counter() - drawn
+        cpu += time.process_time() - drawn_cpu
+    return upload, wall, cpu
 
 
 def write_durably(files: Mapping[str, bytes], folder: Path) -> int:

@@ -11,7 +11,9 @@ from schemas.scene import Pair, Placed
 from schemas.shape import Asset, Mesh, Shape
 from workers.assets.glb import asset_glb
 from workers.records import image_boxes
+from workers.render.batches import SRGB_STEPS, decode_srgb, encode_srgb
 from workers.scene_steps import Scene
+from workers.store.images import encode_png
 
 URDF = """<robot name="{name}"><link name="base">
 <inertial><origin xyz="{com}"/><mass value="{mass}"/>
@@ -33,7 +35,11 @@ def hand_over(scene: Scene, job: Job, folder: Path) -> Path:
     described = {
         "T_world_table": _matrix(table.T_world_table),
         "T_world_obj": _matrix(start.T_world_obj),
-        "floor": _floor(scene.posed.things[0]),
+        "object": _body(start.asset),
+        "floor": _floor(scene.posed.things[0], folder),
+        "lights": [
+            {"towards": light.direction.tolist(), "color": list(light.color)} for light in scene.posed.appearance.lights
+        ],
         "intrinsics": {key: getattr(sensor, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
         "depth_units_per_m": job.images.depth_units_per_m,
         "pairs": [_pair(pair, job) for pair in scene.pairs],
@@ -58,13 +64,28 @@ def _matrix(T: Pose) -> list[list[float]]:
     return np.asarray(T).tolist()
 
 
-def _floor(placed: Placed) -> dict[str, object]:
+def _floor(placed: Placed, folder: Path) -> dict[str, object]:
+    """Its geometry, its mean colour, and where it has a texture that as `floor.png`, with coordinates."""
     shape: Shape = placed.shape
-    return {
+    part = shape.parts[0]
+    described: dict[str, object] = {
         "vertices": shape.vertices.tolist(),
         "faces": shape.faces.tolist(),
-        "color": list(shape.parts[0].material.base_color),
+        "color": list(part.material.base_color),
+        "roughness": part.material.roughness,
     }
+    if part.material.texture is None or part.uv is None:
+        return described
+    tint = decode_srgb(np.array(part.material.base_color[:3]))
+    picture = np.rint(255.0 * encode_srgb(SRGB_STEPS[part.material.texture[..., :3]] * tint)).astype(np.uint8)
+    (folder / "floor.png").write_bytes(encode_png(np.ascontiguousarray(picture)))
+    return described | {"uv": part.uv.tolist(), "color": [*(picture.mean(axis=(0, 1)) / 255.0).tolist(), 1.0]}
+
+
+def _body(asset: Asset) -> dict[str, object]:
+    """Mass, centre of mass and principal moments of the object, in its frame."""
+    mass = asset.mass
+    return {"mass_kg": mass.mass_kg, "com": mass.com.tolist(), "inertia": np.diag(mass.inertia).tolist()}
 
 
 def _obj(mesh: Mesh) -> str:

@@ -5,12 +5,11 @@ import os
 import platform
 import time
 from collections.abc import Iterator
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from services.bench.others import installed
+
 LIBRARIES = ("numpy", "opencv-contrib-python-headless", "pybullet", "pyrender", "pyarrow", "trimesh", "PyOpenGL", "ray")
-OTHER_SYSTEMS = {"Blender Cycles": "bpy", "MuJoCo": "mujoco"}
-"""Systems whose rows could stand beside ours, and the package of each."""
 
 
 @contextlib.contextmanager
@@ -30,19 +29,24 @@ def describe_machine(renderer: str) -> dict[str, object]:
     return {
         "cores": os.cpu_count(),
         "usable_cores": len(os.sched_getaffinity(0)),
+        "threads_per_core": threads_per_core(),
         "cpu": _processor(),
         "memory_gib": round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30, 1),
         "gl_renderer": renderer,
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.release()}",
         "load_1min": os.getloadavg()[0],
-        "versions": {name: found for name in LIBRARIES if (found := _version(name)) is not None},
+        "versions": {name: found for name in LIBRARIES if (found := installed(name)) is not None},
     }
 
 
-def other_systems() -> dict[str, str]:
-    """Version by name of the other systems that are installed, `not installed` for the rest. Nothing is imported."""
-    return {name: _version(package) or "not installed" for name, package in OTHER_SYSTEMS.items()}
+def threads_per_core(topology: Path = Path("/sys/devices/system/cpu/cpu0/topology/thread_siblings_list")) -> int | None:
+    """How many logical cores share a physical one, as far as this machine tells: those gain less than 2 times together."""
+    try:
+        parts = [part.split("-") for part in topology.read_text().strip().split(",")]
+    except OSError:
+        return None
+    return sum(int(part[-1]) - int(part[0]) + 1 for part in parts)
 
 
 def process_age_s() -> float:
@@ -57,16 +61,15 @@ def resident_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
+def peak_resident_mb(status: Path = Path("/proc/self/status")) -> float:
+    """The most memory that this process ever held, MB. Not `ru_maxrss`, which a child inherits from its parent."""
+    line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+    return int(line.split()[1]) * 1024 / 1e6
+
+
 def _processor(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
     try:
         lines = cpuinfo.read_text().splitlines()
     except OSError:
         return "unknown"
     return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown")
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None

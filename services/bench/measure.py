@@ -1,23 +1,25 @@
-"""The benchmark's rounds: ours, the floor and the straightforward script, in turn, on one core."""
+"""The benchmark's rounds: ours, the floor, the straightforward script and other systems, in turn, on one core."""
 
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from schemas.commit import Span
-from schemas.errors import OutputError
+from schemas.errors import MachineError, OutputError
 from schemas.job import Job
-from services.bench.floor import Encoder, choose_encoders, clear, committed_files, images_of, run_floor
+from services.bench.encoders import Encoder, choose_encoders
+from services.bench.floor import clear, committed_files, images_of, run_floor
 from services.bench.handover import hand_over
 from services.bench.machine import describe_machine, pinned, process_age_s
+from services.bench.others import Side, sides_of
 from services.bench.ratios import Lap
-from services.bench.script_process import ScriptProcess, script_process
+from services.bench.side_process import SideProcess, side_process
 from services.bench.stages import Workbench, open_workbench
 
-WARM_UP = 2
-"""Scenes before the clock: shaders are made and caches filled."""
+WARM_UP = 8
+"""Scenes before the clock: shaders are made, of which pyrender has one for each number of lights, and caches filled."""
 
 
 @dataclass(frozen=True)
@@ -26,20 +28,23 @@ class Round:
 
     ours: Lap
     floor: Lap
-    script: Lap
+    others: Mapping[str, Lap]
+    """By name of the side."""
     bytes: int
 
 
 @dataclass(frozen=True)
 class Measured:
-    """All rounds, and seconds from the start of each process to the end of its first scenes."""
+    """All rounds, and seconds from the start of each process to the end of its first scenes, by side."""
 
     machine: dict[str, object]
     core: int
     rounds: tuple[Round, ...]
     encoders: dict[str, str]
-    startup_ours_s: float
-    startup_script_s: float
+    sides: tuple[Side, ...]
+    startup_s: Mapping[str, float]
+    left_out: Mapping[str, str]
+    """Optional sides that are installed and could not run, and why."""
 
 
 @contextmanager
@@ -56,36 +61,71 @@ def bench_folder(parent: Path) -> Iterator[Path]:
 
 def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
     """Ranges of the job's size until `scenes` are made, each by all sides in turn."""
-    with pinned() as core:
+    with pinned() as core, ExitStack() as processes:
         bench = open_workbench(job, job_folder, folder / "ours")
         warm = bench.next_span(WARM_UP)
         bench.run(warm)
-        startup_ours_s = process_age_s()
+        startup_s = {"ours": process_age_s()}
         encoders = choose_encoders(images_of(committed_files(bench.store.root, bench.record(warm))))
-        with script_process() as (script, startup_script_s):
-            sides = _Sides(bench, script, encoders, folder)
-            startup_script_s += sides.script(warm).wall_s
-            rounds = tuple(sides.round(bench.next_span(count)) for count in _counts(scenes, job.run.range_size))
-    machine = describe_machine(bench.context.renderer.name)
-    names = {kind: name for kind, (name, _) in encoders.items()}
-    return Measured(machine, core, rounds, names, startup_ours_s, startup_script_s)
+        sides = _Sides(bench, encoders, folder, processes)
+        given = sides.give(warm)
+        for side in sides_of(job):
+            startup_s[side.name] = sides.open(side, given)
+        clear(sides.given_folder(warm))
+        rounds = tuple(sides.round(bench.next_span(count)) for count in _counts(scenes, job.run.range_size))
+    return Measured(
+        describe_machine(bench.context.renderer.name),
+        core,
+        rounds,
+        {kind: name for kind, (name, _) in encoders.items()},
+        tuple(sides.opened),
+        startup_s,
+        sides.left_out,
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """Everything that is compared."""
+    """Everything that is compared, and the processes of those that are not us: one for each module."""
 
     bench: Workbench
-    process: ScriptProcess
     encoders: dict[str, tuple[str, Encoder]]
     folder: Path
+    running: ExitStack
+    processes: dict[str, SideProcess] = field(default_factory=dict)
+    opened: list[Side] = field(default_factory=list)
+    left_out: dict[str, str] = field(default_factory=dict)
+
+    def open(self, side: Side, given: list[Path]) -> float:
+        """Start a side and let it make these scenes; the seconds that took.
+
+        Raises MachineError where the script cannot run; an optional side that cannot is left out, saying why.
+        """
+        took = 0.0
+        try:
+            if side.module not in self.processes:
+                self.processes[side.module], took = self.running.enter_context(side_process(side.module))
+            lap = self.processes[side.module].run(given, self.folder / side.name, side.asked)
+        except MachineError as error:
+            if side.package is None:
+                raise
+            self.left_out[side.title] = str(error)
+            return took
+        self.opened.append(side)
+        return took + lap.wall_s + lap.apart_s
 
     def round(self, span: Span) -> Round:
-        """Ours, the floor, the script: what one hands to the next is made between their clocks."""
+        """Ours, the floor, the others: what one hands to the next is made between their clocks."""
         ours = self.bench.run(span)
         files = committed_files(self.bench.store.root, self.bench.record(span))
         floor = self.floor(span, files)
-        return Round(ours, floor, self.script(span), sum(map(len, files.values())))
+        given = self.give(span)
+        others = {
+            side.name: self.processes[side.module].run(given, self.folder / side.name, side.asked)
+            for side in self.opened
+        }
+        clear(self.given_folder(span))
+        return Round(ours, floor, others, sum(map(len, files.values())))
 
     def floor(self, span: Span, files: dict[str, bytes]) -> Lap:
         """The least for the scenes of a span."""
@@ -94,16 +134,14 @@ class _Sides:
         clear(out)
         return lap
 
-    def script(self, span: Span) -> Lap:
-        """The same scenes by the script."""
-        given, out = self.folder / f"given{span.start}", self.folder / "script"
-        scenes = [
-            hand_over(scene, self.bench.context.job, given / str(scene.plan.scene_id))
-            for scene in self.bench.scenes(span)
-        ]
-        lap = self.process.run(scenes, out)
-        clear(given)
-        return lap
+    def give(self, span: Span) -> list[Path]:
+        """The same scenes as files for the others."""
+        folder, job = self.given_folder(span), self.bench.context.job
+        return [hand_over(scene, job, folder / str(scene.plan.scene_id)) for scene in self.bench.scenes(span)]
+
+    def given_folder(self, span: Span) -> Path:
+        """Where they lie."""
+        return self.folder / f"given{span.start}"
 
 
 def _counts(scenes: int, size: int) -> list[int]:

@@ -1,14 +1,16 @@
 """Memory and speed of one worker over many scenes, in a process of its own."""
 
 import multiprocessing
-import time
+from bisect import bisect_left
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
+from statistics import median
 
 from schemas.job import Job
-from services.bench.machine import resident_mb
-from services.bench.ratios import growth
+from services.bench.machine import peak_resident_mb, resident_mb
+from services.bench.ratios import by_processor, growth
 from services.bench.stages import open_workbench
 
 SETTLED = 200
@@ -16,11 +18,21 @@ SETTLED = 200
 
 
 @dataclass(frozen=True)
+class Sample:
+    """One range: its scenes, MB held after it, seconds of the processor for a scene of it."""
+
+    scenes: int
+    mb: float
+    cpu_s: float
+
+
+@dataclass(frozen=True)
 class Memory:
     """Resident memory, MB, and pace over the scenes.
 
-    grown: of the memory since it settled; slowed: of the time for a scene from the first `settled_after` to as many at
-    the end; shares, 0.05 being 5 % more.
+    grown: of the memory since it settled, 0.05 being 5 % more. peak_mb: the most that the process ever held. first_ms and
+    last_ms: of the processor for a scene in the first `settled_after` scenes and in as many at the end, medians over
+    ranges, which neighbours on the machine disturb little; last_to_first: their ratio.
     """
 
     scenes: int
@@ -29,38 +41,44 @@ class Memory:
     last_mb: float
     peak_mb: float
     grown: float
-    slowed: float
+    first_ms: float
+    last_ms: float
+    last_to_first: float
 
 
 def measure_memory(job: Job, job_folder: Path, folder: Path, scenes: int) -> Memory:
     """Make so many scenes in one fresh worker."""
     fresh = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=fresh) as pool:
-        samples = pool.submit(sample_memory, job, job_folder, folder, scenes).result()
-    return describe(samples, scenes)
+        samples, peak = pool.submit(sample_memory, job, job_folder, folder, scenes).result()
+    return describe(samples, peak)
 
 
-def sample_memory(job: Job, job_folder: Path, folder: Path, scenes: int) -> list[tuple[float, float]]:
-    """(resident MB, seconds per scene) after each range."""
+def sample_memory(job: Job, job_folder: Path, folder: Path, scenes: int) -> tuple[list[Sample], float]:
+    """What each range left, and the most MB that this process ever held."""
     bench = open_workbench(job, job_folder, folder)
-    samples = []
-    while bench.next_scene < job.first_scene + scenes:
-        begun = time.perf_counter()
-        lap = bench.run(bench.next_span(job.run.range_size))
-        samples.append((resident_mb(), (time.perf_counter() - begun) / lap.scenes))
-    return samples
+    stop, samples = job.first_scene + scenes, []
+    while bench.next_scene < stop:
+        span = bench.next_span(min(job.run.range_size, stop - bench.next_scene))
+        lap = bench.run(span)
+        samples.append(Sample(len(span.scene_ids), resident_mb(), by_processor(lap)))
+    return samples, peak_resident_mb()
 
 
-def describe(samples: list[tuple[float, float]], scenes: int) -> Memory:
+def describe(samples: list[Sample], peak_mb: float) -> Memory:
     """The figures of a run; with fewer than ten times `SETTLED` scenes, the first tenth counts as settling."""
-    settled = max(1, len(samples) * min(SETTLED, scenes // 10 or 1) // scenes)
-    megabytes, paces = [mb for mb, _ in samples], [pace for _, pace in samples]
+    scenes = list(accumulate(sample.scenes for sample in samples))
+    settled = bisect_left(scenes, min(SETTLED, scenes[-1] // 10 or 1))
+    window = settled + 1
+    megabytes, paces = [sample.mb for sample in samples], [sample.cpu_s for sample in samples]
     return Memory(
-        scenes=scenes,
-        settled_after=scenes * settled // len(samples),
-        settled_mb=megabytes[settled - 1],
+        scenes=scenes[-1],
+        settled_after=scenes[settled],
+        settled_mb=megabytes[settled],
         last_mb=megabytes[-1],
-        peak_mb=max(megabytes),
-        grown=megabytes[-1] / megabytes[settled - 1] - 1.0,
-        slowed=growth(paces, settled),
+        peak_mb=max(peak_mb, *megabytes),
+        grown=megabytes[-1] / megabytes[settled] - 1.0,
+        first_ms=median(paces[:window]) * 1e3,
+        last_ms=median(paces[-window:]) * 1e3,
+        last_to_first=1.0 + growth(paces, window),
     )

@@ -6,12 +6,13 @@ from statistics import mean, median
 from typing import Any
 
 from services.bench.measure import Measured
+from services.bench.others import Side
 from services.bench.ratios import Lap, Spread, by_processor, slope_ratio, stage_table, with_loading
 
 
 def summarise(measured: Measured) -> dict[str, Any]:
     """The figures of the rounds: plain numbers, milliseconds per scene, ratios of slopes."""
-    ours, floor, script = ([getattr(one, side) for one in measured.rounds] for side in ("ours", "floor", "script"))
+    ours, floor = [one.ours for one in measured.rounds], [one.floor for one in measured.rounds]
     scenes = sum(lap.scenes for lap in ours)
     return {
         "machine": measured.machine,
@@ -19,16 +20,31 @@ def summarise(measured: Measured) -> dict[str, Any]:
         "scenes": scenes,
         "rounds": len(ours),
         "bytes_per_scene": sum(one.bytes for one in measured.rounds) / scenes,
-        "startup_s": {"ours": measured.startup_ours_s, "script": measured.startup_script_s},
+        "startup_s": dict(measured.startup_s),
         "ours": _side(ours),
-        "script": _side(script) | {"load_ms": median(lap.apart_s / lap.scenes for lap in script) * 1e3},
-        "floor": _side(floor) | {"encoders": measured.encoders},
-        "ratio": asdict(slope_ratio(script, ours)),
-        "ratio_cpu": asdict(slope_ratio(script, ours, by_processor)),
-        "ratio_with_loading": asdict(slope_ratio(script, ours, with_loading)),
+        "floor": _side(floor) | {"encoders": measured.encoders, "upload_ms": _apart(floor)},
         "times_floor": asdict(slope_ratio(ours, floor)),
         "times_floor_cpu": asdict(slope_ratio(ours, floor, by_processor)),
+        "others": {side.name: _other(side, measured, ours) for side in measured.sides},
+        "left_out": dict(measured.left_out),
     }
+
+
+def _other(side: Side, measured: Measured, ours: Sequence[Lap]) -> dict[str, Any]:
+    """One of the other systems; a ratio is how many times as many scenes we make in the same time."""
+    laps = [one.others[side.name] for one in measured.rounds]
+    return _side(laps) | {
+        "title": side.title,
+        "makes": side.makes,
+        "load_ms": _apart(laps),
+        "ratio": asdict(slope_ratio(laps, ours)),
+        "ratio_cpu": asdict(slope_ratio(laps, ours, by_processor)),
+        "ratio_with_loading": asdict(slope_ratio(laps, ours, with_loading)),
+    }
+
+
+def _apart(laps: Sequence[Lap]) -> float:
+    return median(lap.apart_s / lap.scenes for lap in laps) * 1e3
 
 
 def _side(laps: Sequence[Lap]) -> dict[str, Any]:
@@ -43,38 +59,53 @@ def _side(laps: Sequence[Lap]) -> dict[str, Any]:
 def describe(figures: dict[str, Any]) -> list[str]:
     """The same for a reader, one line each."""
     machine = figures["machine"]
-    start = figures["startup_s"]
+    others: dict[str, dict[str, Any]] = figures["others"]
+    threads = machine["threads_per_core"]
     lines = [
-        f"machine    {machine['usable_cores']} of {machine['cores']} cores, {machine['cpu']}, load {machine['load_1min']:.1f}",
+        f"machine    {machine['usable_cores']} of {machine['cores']} cores"
+        + (f" ({threads} thread{'s' * (threads > 1)} each)" if threads else "")
+        + f", {machine['cpu']}, load {machine['load_1min']:.1f}",
         f"           {machine['gl_renderer']}",
         f"           Python {machine['python']}, " + ", ".join(f"{k} {v}" for k, v in machine["versions"].items()),
         f"command    {figures['command']}",
         f"measured   {figures['scenes']} scenes in {figures['rounds']} rounds, each side in turn on core "
         f"{figures['core']}, {figures['bytes_per_scene'] / 1e3:.0f} kB a scene on {figures['file_system']}",
-        f"start-up   ours {start['ours']:.1f} s, script {start['script']:.1f} s, not counted below",
+        "start-up   "
+        + ", ".join(f"{name} {s:.1f} s" for name, s in figures["startup_s"].items())
+        + ", the first scenes included; not counted below",
         "",
+        *_table("ours", figures["ours"]),
+        *_table("floor: bare passes, fastest encoder, durable writes", figures["floor"]),
+        f"  before its clock each scene's shapes go to the GPU: {figures['floor']['upload_ms']:.1f} ms a scene",
+        f"  encoders: {', '.join(f'{kind} {name}' for kind, name in figures['floor']['encoders'].items())}",
     ]
-    for name, what in (("ours", "ours"), ("script", "straightforward script"), ("floor", "floor")):
-        lines += _table(what, figures[name])
+    for other in others.values():
+        lines += _table(f"{other['title']} ({other['makes']})", other)
+        lines.append(f"  before its clock it reads its files: {other['load_ms']:.1f} ms a scene")
+    lines += ["", f"{'as many scenes as':24} {'by the clock':24} {'by processor time':24} its reading counted"]
     lines += [
-        f"  before its clock the script loads its meshes: {figures['script']['load_ms']:.1f} ms a scene",
-        f"  the floor's encoders: {', '.join(f'{kind} {name}' for kind, name in figures['floor']['encoders'].items())}",
-        "",
-        f"against the script      {_spread(figures['ratio'])} as many scenes (of processor time "
-        f"{_spread(figures['ratio_cpu'])}; its loading counted {_spread(figures['ratio_with_loading'])})",
-        f"against the floor       {_spread(figures['times_floor'])} its time (of processor time "
-        f"{_spread(figures['times_floor_cpu'])})",
+        f"  {other['title']:22} {_spread(other['ratio']):24} {_spread(other['ratio_cpu']):24} "
+        f"{_spread(other['ratio_with_loading'])}"
+        for other in others.values()
     ]
+    floor = f"{_spread(figures['times_floor']):24} {_spread(figures['times_floor_cpu'])}"
+    lines += [f"{'as long as the floor':24} {floor}"]
     lines += _describe_memory(figures["memory"]) + _describe_scaling(figures["scaling"])
-    return lines + [f"{name:23} {found}" for name, found in figures["other_systems"].items()]
+    return lines + [
+        f"{name:24} {figures['left_out'].get(name, found)}" for name, found in figures["other_systems"].items()
+    ]
 
 
 def _table(what: str, side: dict[str, Any]) -> list[str]:
     total = side["ms_per_scene"]
-    head = f"{what:28} {total:8.1f} ms a scene, {1e3 / total:.2f} scenes/s ({side['cpu_ms_per_scene']:.1f} ms of processor)"
+    cost = f"{total:.1f} ms a scene, {1e3 / total:.2f} scenes/s ({side['cpu_ms_per_scene']:.1f} ms of processor)"
     stages = sorted(side["stages_ms"].items(), key=lambda stage: (stage[0] == "rest", -stage[1]))
     means = side["stages_mean_ms"]
-    return [head, *(f"  {name:26} {ms:8.2f} ms {ms / total:6.1%}, mean {means[name]:.2f} ms" for name, ms in stages)]
+    return [
+        what,
+        f"  {cost}",
+        *(f"    {name:22} {ms:8.2f} ms {ms / total:6.1%}, mean {means[name]:.2f} ms" for name, ms in stages),
+    ]
 
 
 def _spread(spread: dict[str, float]) -> str:
@@ -84,20 +115,34 @@ def _spread(spread: dict[str, float]) -> str:
 def _describe_memory(memory: dict[str, Any] | None) -> list[str]:
     if memory is None:
         return []
+    settled, scenes = memory["settled_after"], memory["scenes"]
     return [
-        f"memory                  {memory['settled_mb']:.0f} MB after {memory['settled_after']} scenes, "
-        f"{memory['last_mb']:.0f} MB after {memory['scenes']} ({memory['grown']:+.1%}), at most "
-        f"{memory['peak_mb']:.0f} MB; time for a scene "
-        f"{memory['slowed']:+.1%}"
+        "",
+        f"one worker over {scenes} scenes",
+        f"  memory                 {memory['settled_mb']:.0f} MB after {settled}, {memory['last_mb']:.0f} MB at the end: "
+        f"{memory['grown']:+.1%}; at most {memory['peak_mb']:.0f} MB",
+        f"  processor for a scene  {memory['first_ms']:.1f} ms in the first {settled}, {memory['last_ms']:.1f} ms in the "
+        f"last: {memory['last_to_first']:.3f} times",
     ]
 
 
 def _describe_scaling(scaling: dict[str, Any] | None) -> list[str]:
     if scaling is None:
         return []
-    share = Spread(**scaling["ray_share"])
+    share, share_one = Spread(**scaling["ray_share"]), Spread(**scaling["ray_share_one"])
+    lines = [
+        "",
+        f"{scaling['workers']} at once against one     {'as many scenes':24} {'processor for a scene':24} scenes/s",
+    ]
+    for name, gain in (("through Ray", scaling["ray"]), ("plain processes", scaling["bare"])):
+        lines.append(
+            f"  {name:22} {_spread(gain['speedup']):24} {_spread(gain['inflation']):24} "
+            f"{gain['one_scenes_per_s']:.2f} and {gain['all_scenes_per_s']:.2f}, {gain['scenes']} scenes"
+        )
     return [
-        f"{scaling['workers']} workers against one   {_spread(scaling['speedup'])} ({scaling['one_scenes_per_s']:.2f} and "
-        f"{scaling['all_scenes_per_s']:.2f} scenes/s, {scaling['scenes']} scenes)",
-        f"Ray's share             {share.median:.1%} [{share.least:.1%} to {share.most:.1%}] with shards of {scaling['shard']}",
+        *lines,
+        f"  Ray gives {scaling['share_of_bare']:.1%} of what plain processes gain",
+        f"  Ray's share of time    {share_one.median:.1%} [{share_one.least:.1%} to {share_one.most:.1%}] with one worker, "
+        f"{share.median:.1%} [{share.least:.1%} to {share.most:.1%}] with {scaling['workers']}, their uneven end included; "
+        f"shards of {scaling['shard']}",
     ]

@@ -1,70 +1,130 @@
-"""Several workers against one, through the real coordinator."""
+"""Several workers against one, through the real coordinator, and beside it several plain processes against one."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 from schemas.commit import Span
 from schemas.job import Job
-from services.bench.ratios import Spread, idle_share
+from services.bench.bare import bare_processes
+from services.bench.ratios import Lap, Spread, by_processor, idle_share
 from services.bench.stages import bench_order
 from services.coordinator import Limits, Tally, run_spans
 from services.ray_cluster import PREFETCH, private_ray
 from services.run import USUAL_SHARD, group_shards
-from workers.assets.catalogue import open_catalogue
+from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.store.local import LocalStore
 
 
 @dataclass(frozen=True)
-class Scaling:
-    """`speedup`: how many times one worker's pace `workers` have; `ray_share`: of the slots' time, what no shard used."""
+class Gain:
+    """What several at once gain over one, over rounds.
 
-    workers: int
+    speedup: how many times one's pace; inflation: how many times the processor time that a scene takes alone, which is
+    what they cost one another by sharing caches, memory and clock, and no time that anybody waits.
+    """
+
     scenes: int
-    shard: int
     one_scenes_per_s: float
     all_scenes_per_s: float
     speedup: Spread
+    inflation: Spread
+
+    @classmethod
+    def of(cls, one: Sequence[Lap], several: Sequence[Lap]) -> "Gain":
+        """From laps of one and of all, in pairs; a lap's wall is from the first scene's begin to the last one's end."""
+        pairs = list(zip(one, several, strict=True))
+        return cls(
+            scenes=several[0].scenes,
+            one_scenes_per_s=Spread.of([lap.scenes / lap.wall_s for lap in one]).median,
+            all_scenes_per_s=Spread.of([lap.scenes / lap.wall_s for lap in several]).median,
+            speedup=Spread.of([a.slope_s / b.slope_s for a, b in pairs]),
+            inflation=Spread.of([by_processor(b) / by_processor(a) for a, b in pairs]),
+        )
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """`ray`: workers through the coordinator; `bare`: plain processes, each on a core of its own.
+
+    ray_share: of the slots' time, what no shard used while all worked, the uneven end of the last shards included;
+    ray_share_one: the same with one worker, which has no such end. share_of_bare: the one speed-up over the other.
+    """
+
+    workers: int
+    shard: int
+    ray: Gain
+    bare: Gain
     ray_share: Spread
+    ray_share_one: Spread
+    share_of_bare: float
 
 
 def measure_scaling(
-    job: Job, job_folder: Path, folder: Path, workers: int, scenes: int, rounds: int = 2, shard: int = USUAL_SHARD
+    job: Job, job_folder: Path, folder: Path, workers: int, scenes: int, rounds: int = 3, shard: int = USUAL_SHARD
 ) -> Scaling:
-    """One worker, all workers, one, all ...; each time the same scenes into a new folder, on workers that are warm."""
+    """One worker, all workers, one process, all processes, and again; always the same scenes, into new folders.
+
+    Everything is warm before: Ray's start, imports, the OpenGL context and its shaders are in no figure.
+    """
     catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
-    one, all_of_them, shares = [], [], []
-
-    def make(name: str, slots: int, count: int, shard_size: int) -> tuple[float, float]:
-        """(seconds, seconds in shards)."""
-        out = folder / name
-        LocalStore(out).prepare()
-        size, first = job.run.range_size, job.first_scene
-        spans = [Span(start=s, stop=s + size) for s in range(first, first + count, size)]
-        tally = Tally(asked=count)
-        limits = Limits(PREFETCH * slots if slots == workers else slots, 1, count)
-        begun = time.perf_counter()
-        run_spans((bench_order(job, out), catalogue), group_shards(spans, shard_size), limits, _quiet, tally)
-        return time.perf_counter() - begun, tally.shard_wall_s
-
-    with private_ray(workers):
-        make("warm", workers, 4 * workers * job.run.range_size, job.run.range_size)
+    drive = _RayDrive(job, catalogue, folder, workers)
+    ray: dict[int, list[tuple[Lap, float]]] = {1: [], workers: []}
+    bare: dict[int, list[Lap]] = {1: [], workers: []}
+    each = max(1, scenes // workers)
+    with ExitStack() as running:
+        running.enter_context(private_ray(workers))
+        processes = running.enter_context(bare_processes(job, job_folder, folder, workers))
+        drive.run("warm", workers, 4 * workers * job.run.range_size, job.run.range_size)
         for number in range(rounds):
-            seconds, _ = make(f"one{number}", 1, scenes, shard)
-            one.append(seconds)
-            seconds, inside = make(f"all{number}", workers, scenes, shard)
-            all_of_them.append(seconds)
-            shares.append(idle_share(inside, workers, seconds))
+            for count in (1, workers):
+                ray[count].append(drive.run(f"{number}-{count}", count, scenes, shard))
+            for count in (1, workers):
+                laps = processes.run(count, job.first_scene, job.first_scene + each)
+                bare[count].append(_together(laps))
+    gain = Gain.of(*([lap for lap, _ in ray[count]] for count in (1, workers)))
+    reference = Gain.of(bare[1], bare[workers])
     return Scaling(
         workers=workers,
-        scenes=scenes,
         shard=shard,
-        one_scenes_per_s=scenes / min(one),
-        all_scenes_per_s=scenes / min(all_of_them),
-        speedup=Spread.of([a / b for a, b in zip(one, all_of_them, strict=True)]),
-        ray_share=Spread.of(shares),
+        ray=gain,
+        bare=reference,
+        ray_share=Spread.of([idle for _, idle in ray[workers]]),
+        ray_share_one=Spread.of([idle for _, idle in ray[1]]),
+        share_of_bare=gain.speedup.median / reference.speedup.median,
     )
+
+
+def _together(laps: Sequence[Lap]) -> Lap:
+    """One lap of processes that began together: until the last has ended."""
+    return Lap(sum(lap.scenes for lap in laps), max(lap.wall_s for lap in laps), sum(lap.cpu_s for lap in laps), {})
+
+
+@dataclass(frozen=True)
+class _RayDrive:
+    """Runs of the coordinator on a Ray that is there."""
+
+    job: Job
+    catalogue: Catalogue
+    folder: Path
+    workers: int
+
+    def run(self, name: str, slots: int, count: int, shard_size: int) -> tuple[Lap, float]:
+        """A lap of so many scenes, and the share of the slots' time in which no shard ran."""
+        out, size, first = self.folder / name, self.job.run.range_size, self.job.first_scene
+        LocalStore(out).prepare()
+        spans = [Span(start=s, stop=min(s + size, first + count)) for s in range(first, first + count, size)]
+        tally = Tally(asked=count)
+        # A shard that waits could be started by the other slot: one at a time where one is to work.
+        limits = Limits(PREFETCH * slots if slots == self.workers else slots, 1, count)
+        begun = time.perf_counter()
+        work = (bench_order(self.job, out), self.catalogue)
+        run_spans(work, group_shards(spans, shard_size), limits, _quiet, tally)
+        seconds = time.perf_counter() - begun
+        idle = idle_share(tally.shard_wall_s, slots, seconds)
+        return Lap(tally.made, seconds, tally.shard_cpu_s, {}), idle
 
 
 _quiet: Callable[[Tally], None] = lambda tally: None  # noqa: E731

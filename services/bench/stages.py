@@ -12,6 +12,7 @@ from services.bench.ratios import Lap
 from workers.allocator import keep_freed_memory
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.context import WorkerContext, settings_digest
+from workers.render.context import require_device
 from workers.render.gbuffer import shared_renderer
 from workers.scene_steps import Scene, Stopwatch, make_scene
 from workers.shard import run_span
@@ -85,4 +86,6 @@ def bench_order(job: Job, out: Path) -> ShardOrder:
 
 def _context(job: Job, catalogue: Catalogue) -> WorkerContext:
     keep_freed_memory()
-    return WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
+    renderer = shared_renderer()
+    require_device(renderer.name, job.run.device)
+    return WorkerContext(job, catalogue, renderer, settings_digest(job, catalogue.digest))

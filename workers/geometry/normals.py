@@ -18,6 +18,8 @@ def facing_cosine(
     four neighbours have depth and belong to one region.
     """
     height, width = depth_m.shape
+    if min(height, width) < 3:
+        return np.full(len(pixels), np.nan)  # no pixel has four neighbours
     rows, columns = np.divmod(pixels, width)
     inner = (rows > 0) & (rows < height - 1) & (columns > 0) & (columns < width - 1)
     at = np.where(inner, pixels, width + 1)
@@ -46,6 +48,8 @@ def is_smooth(
     a plane does not explain, and must stay below `bound_m` along rows and along columns.
     """
     height, width = depth_m.shape
+    if min(height, width) < 3:
+        return np.zeros(len(pixels), bool)
     rows, columns = np.divmod(pixels, width)
     inner = (rows > 0) & (rows < height - 1) & (columns > 0) & (columns < width - 1)
     at = np.where(inner, pixels, width + 1)

@@ -91,6 +91,8 @@ def sample_inverse_depth(
     and region 0. On a plane 1/z is linear in the image, so this is exact there. Returns [N] float64 and [N] uint8.
     """
     height, width = depth_m.shape
+    if min(height, width) < 2:
+        return np.zeros(len(u)), np.zeros(len(u), np.uint8)  # no point has four pixels about it
     x, y = u - 0.5, v - 0.5
     column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     inside = (column >= 0) & (column < width - 1) & (row >= 0) & (row < height - 1)

@@ -1,8 +1,9 @@
 """The process's one OpenGL context: off-screen, through EGL, opened with pyrender's platform."""
 
 import importlib
+import socket
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 from schemas.errors import MachineError
 
@@ -11,6 +12,27 @@ REMEDY = (
     "apt-get install -y libgl1 libegl1 libgl1-mesa-dri libglu1-mesa. "
     "`verso doctor` says what else is missing"
 )
+
+SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swr ", "swiftshader", "lavapipe", "basic render")
+"""What GL_RENDERER holds, in lower case, where OpenGL runs on the CPU."""
+
+NO_GPU = (
+    "install the GPU's driver with its EGL library (NVIDIA: libnvidia-gl; in a container run with --gpus all and "
+    "NVIDIA_DRIVER_CAPABILITIES=all) and see that `verso doctor` names the GPU, or set run.device: any"
+)
+
+
+def is_software(name: str) -> bool:
+    """Whether a GL_RENDERER is one that draws on the CPU."""
+    return any(word in f"{name.lower()} " for word in SOFTWARE)
+
+
+def require_device(name: str, device: Literal["any", "gpu"]) -> None:
+    """Raises MachineError where a GPU is asked for and the GL_RENDERER called `name` is software."""
+    if device == "gpu" and is_software(name):
+        raise MachineError(
+            f"run.device is gpu, and OpenGL fell back to software on {socket.gethostname()} ({name}): {NO_GPU}"
+        )
 
 
 def open_context() -> tuple[ModuleType, Any]:
@@ -26,5 +48,7 @@ def open_context() -> tuple[ModuleType, Any]:
         gl = importlib.import_module("OpenGL.GL")
         gl.glGetString(gl.GL_RENDERER).decode()
     except Exception as error:  # a missing library shows as ImportError, AttributeError, TypeError, EGLError or assert
-        raise MachineError(f"no OpenGL context could be opened ({type(error).__name__}: {error}): {REMEDY}") from error
+        # pyrender takes the first of EGL's devices.
+        found = "EGL has no device" if isinstance(error, IndexError) else f"{type(error).__name__}: {error}"
+        raise MachineError(f"no OpenGL context could be opened ({found}): {REMEDY}") from error
     return gl, platform

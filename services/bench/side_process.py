@@ -1,4 +1,4 @@
-"""The straightforward script as a process beside us: one line to it for each scene, one line back."""
+"""Another system as a process beside us: one line to it for each scene, one line back."""
 
 import contextlib
 import json
@@ -6,7 +6,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -16,25 +16,25 @@ from services.bench.ratios import Lap
 ROOT = Path(__file__).resolve().parents[2]
 
 
-class ScriptProcess:
-    """A running script. It inherits our core and our environment, and never shares our OpenGL context."""
+class SideProcess:
+    """A running module. It inherits our core and our environment, and never shares our OpenGL context."""
 
-    def __init__(self, process: subprocess.Popen[str], errors: IO[str]) -> None:
-        self._process, self._errors = process, errors
+    def __init__(self, module: str, process: subprocess.Popen[str], errors: IO[str]) -> None:
+        self._module, self._process, self._errors = module, process, errors
 
-    def run(self, scenes: Sequence[Path], out: Path) -> Lap:
+    def run(self, scenes: Sequence[Path], out: Path, asked: Mapping[str, str]) -> Lap:
         """Make these scenes, one after another, into one folder."""
         wall, cpu, load = 0.0, 0.0, 0.0
         stages: dict[str, float] = {}
         for scene in scenes:
-            answer = self.ask({"scene": str(scene), "out": str(out)})
+            answer = self.ask({"scene": str(scene), "out": str(out), **asked})
             wall, cpu, load = wall + answer["wall_s"], cpu + answer["cpu_s"], load + answer["load_s"]
             for stage, seconds in answer["stages_s"].items():
                 stages[stage] = stages.get(stage, 0.0) + seconds
         return Lap(len(scenes), wall, cpu, stages, load)
 
-    def ask(self, question: dict[str, str] | None = None) -> dict[str, Any]:
-        """The next answer. Raises MachineError with the script's last words where it died."""
+    def ask(self, question: Mapping[str, str] | None = None) -> dict[str, Any]:
+        """The next answer. Raises MachineError with the process's last words where it died."""
         assert self._process.stdin is not None and self._process.stdout is not None
         line = ""
         with contextlib.suppress(BrokenPipeError):
@@ -45,19 +45,19 @@ class ScriptProcess:
         if not line:
             self._process.wait()
             self._errors.seek(0)
-            last = self._errors.read().strip().splitlines()[-5:]
-            raise MachineError(f"the straightforward script ended ({self._process.returncode}): {' | '.join(last)}")
+            last = " | ".join(self._errors.read().strip().splitlines()[-5:])
+            raise MachineError(f"{self._module} ended ({self._process.returncode}): {last}")
         answer: dict[str, Any] = json.loads(line)
         return answer
 
 
 @contextlib.contextmanager
-def script_process() -> Iterator[tuple[ScriptProcess, float]]:
-    """The script, ready for its first scene, and the seconds that took."""
+def side_process(module: str) -> Iterator[tuple[SideProcess, float]]:
+    """The module as a process, ready for its first scene, and the seconds that took. Raises MachineError."""
     begun = time.perf_counter()
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
-            [sys.executable, "-W", "ignore", "-m", "services.bench.baseline"],
+            [sys.executable, "-W", "ignore", "-m", module],
             cwd=ROOT,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -65,9 +65,9 @@ def script_process() -> Iterator[tuple[ScriptProcess, float]]:
             text=True,
         )
         try:
-            script = ScriptProcess(process, errors)
-            script.ask()
-            yield script, time.perf_counter() - begun
+            side = SideProcess(module, process, errors)
+            side.ask()
+            yield side, time.perf_counter() - begun
         finally:
             process.kill()
             process.communicate()

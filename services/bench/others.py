@@ -1,0 +1,75 @@
+"""The other systems that make the scenes beside us. A new one is a module that answers lines, and a row in `SIDES`.
+
+Such a module is a process of its own. It says `{"ready": true}`, then reads one line of JSON for each scene (`scene`: the
+`scene.json` that handover.py wrote beside its meshes; `out`: a folder; and what its row says in `asked`) and answers
+with one line: `wall_s`, `cpu_s`, `stages_s` by stage, and `load_s`, the seconds before its clock in which it read files.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+
+from schemas.job import Job
+
+
+@dataclass(frozen=True)
+class Side:
+    """One row: its name in JSON and on paper, what it makes, the module that answers, and the wheel that it needs."""
+
+    name: str
+    title: str
+    makes: str
+    module: str
+    asked: Mapping[str, str] = field(default_factory=dict)
+    package: str | None = None
+    only_raster: bool = False
+    """Whether its images are comparable with the raster tier's alone."""
+
+
+SIDES = (
+    Side(
+        "script_plain",
+        "the script, plain look",
+        "same files; RGB with a floor of one colour, one light, no shadows",
+        "services.bench.baseline",
+        {"look": "plain"},
+    ),
+    Side(
+        "script_same_look",
+        "the script, same look",
+        "same files; RGB with the floor's texture, the scene's lights and pyrender's shadows",
+        "services.bench.baseline",
+        {"look": "same"},
+        only_raster=True,
+    ),
+    Side(
+        "mujoco",
+        "MuJoCo",
+        "physics and 3 views in memory; no textures, no projection, no patches, no files",
+        "services.bench.mujoco_side",
+        package="mujoco",
+    ),
+)
+
+ELSEWHERE = {"Blender Cycles": "bpy"}
+"""Systems without a row here, and the package of each."""
+
+
+def sides_of(job: Job) -> list[Side]:
+    """The rows that can be filled for a job on this machine."""
+    comparable = [side for side in SIDES if job.render.tier == "raster" or not side.only_raster]
+    return [side for side in comparable if side.package is None or installed(side.package)]
+
+
+def other_systems() -> dict[str, str]:
+    """Version by name of the optional systems that are installed, `not installed` for the rest. Nothing is imported."""
+    packages = {side.title: side.package for side in SIDES if side.package is not None} | ELSEWHERE
+    return {title: installed(package) or "not installed" for title, package in packages.items()}
+
+
+def installed(package: str) -> str | None:
+    """Version of a package, None where it is not there."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
