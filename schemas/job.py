@@ -21,7 +21,7 @@ from schemas.base import (
 )
 from schemas.sensor import SensorEffects
 
-Tier = Literal["flat", "raster"]
+Tier = Literal["flat", "raster", "pathtraced"]
 Category = Literal["bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box"]
 CATEGORIES: tuple[Category, ...] = ("bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box")
 
@@ -300,10 +300,15 @@ class Render(Frozen):
 
     tier: Tier = "raster"
     """raster: textured floors, a key light with soft shadows, contact shadows, transparent texels cut out, smooth edges;
-    flat: albedo and light from two directions, in less than half the time. Depth and masks are the same in both."""
+    flat: albedo and light from two directions, in less than half the time; pathtraced: global illumination, glass and
+    metal by Mitsuba, in seconds an image (`./verso extra pathtraced` installs it). Depth and masks are the same in all."""
     samples: Literal[1, 4] = 1
     """Of colour in a pixel that shows an edge, for tier raster: 1 smooths edges by their neighbours, 4 draws them at three
     more points, which takes twice as long. Labels are the pixel centre's either way."""
+    path_samples: Annotated[int, Field(ge=1, le=65_536)] = 16
+    """Paths through each pixel, for tier pathtraced: time grows with them, noise falls with their root."""
+    path_bounces: Annotated[int, Field(ge=1, le=64)] = 8
+    """How often a path may be scattered or cross glass, for tier pathtraced."""
 
 
 class Check(Frozen):
