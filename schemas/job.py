@@ -306,7 +306,8 @@ class Render(Frozen):
     """Of colour in a pixel that shows an edge, for tier raster: 1 smooths edges by their neighbours, 4 draws them at three
     more points, which takes twice as long. Labels are the pixel centre's either way."""
     path_samples: Annotated[int, Field(ge=1, le=65_536)] = 16
-    """Paths through each pixel, for tier pathtraced: time grows with them, noise falls with their root."""
+    """Paths through each pixel, for tier pathtraced: time grows with them. They fill a grid of nearly equal
+    sides, and are rounded up where they do not: 16 is 4 x 4, 13 becomes 15."""
     path_bounces: Annotated[int, Field(ge=1, le=64)] = 8
     """How often a path may be scattered or cross glass, for tier pathtraced."""
 

@@ -1,7 +1,11 @@
 """An `Appearance` as Mitsuba's lights: the same directions and strengths as in the raster tier.
 
-The key light is a disc as wide as a lamp of `LAMP_RAD`, far away; the sky, its other lights as soft lamps, and what
-comes from below the horizon are one picture around the scene.
+**The key light** is `LAMPS` distant lights spread evenly over a lamp of `LAMP_RAD`: its shadows are as soft as a disc's, but
+no path ever runs into it. A disc a thousand times as bright as the sky, met by chance after a mirror, leaves white specks
+that hundreds of samples do not average out. What mirrors would show of it is a glow in the sky, which has `GLOW` of its
+light.
+
+**The sky,** the other lights as soft lamps, and what comes from below the horizon are one picture around the scene.
 """
 
 import math
@@ -14,8 +18,11 @@ from schemas.base import Array
 from schemas.scene import Appearance, Light
 from workers.render.baking import LAMP_RAD
 
-FAR_M = 100.0
-"""Of the key light: over a table its direction changes by half a degree."""
+LAMPS = 32
+"""The shadow of a table top has an edge of 4 cm on the floor, or eight pixels: no step of it shows."""
+
+GLOW, GLOW_RAD = 0.08, 0.08
+"""Share of the key light that comes from a glow about it, and its standard deviation."""
 
 SKY_PX = (128, 64)
 """Width and height of the picture around the scene; it holds nothing sharp."""
@@ -31,34 +38,36 @@ It grows with the sine of the elevation: then HORIZON + 2/3 (ZENITH - HORIZON) m
 
 
 def lights_of(mi: ModuleType, appearance: Appearance) -> dict[str, Any]:
-    """Mitsuba's emitters by name."""
-    key = {"key": _disc(mi, appearance.lights[0])} if appearance.lights else {}
-    return key | {"sky": _surroundings(mi, appearance)}
+    """Mitsuba's emitters by name. Half of the samples go to the key light, half to the sky."""
+    lamps = _lamps(appearance.lights[0]) if appearance.lights else []
+    return {f"key-{n}": lamp for n, lamp in enumerate(lamps)} | {"sky": _surroundings(mi, appearance)}
 
 
-def _disc(mi: ModuleType, light: Light) -> dict[str, Any]:
-    """Its radiance L makes a surface that faces it as bright as a distant light of `color`: L sin^2(half its angle)."""
-    half = 0.5 * LAMP_RAD
-    place = mi.ScalarTransform4f().look_at(
-        origin=(FAR_M * light.direction).tolist(), target=[0.0, 0.0, 0.0], up=_aside(light.direction)
-    )
-    radiance = [c / math.sin(half) ** 2 for c in light.color]
-    return {
-        "type": "disk",
-        "to_world": place.scale(FAR_M * math.tan(half)),
-        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
-    }
+def _lamps(light: Light) -> list[dict[str, Any]]:
+    """A distant light of `color` gives a surface that faces it an irradiance of pi times `color`."""
+    irradiance = [math.pi * (1.0 - GLOW) * c / LAMPS for c in light.color]
+    shine: dict[str, Any] = {"type": "directional", "irradiance": {"type": "rgb", "value": irradiance}}
+    return [shine | {"direction": (-towards).tolist()} for towards in lamp_directions(light.direction)]
 
 
-def _aside(direction: Array) -> list[float]:
-    return [0.0, 1.0, 0.0] if abs(direction[1]) < 0.9 else [1.0, 0.0, 0.0]
+def lamp_directions(direction: Array) -> Array:
+    """[LAMPS, 3] unit: evenly over a disc of `LAMP_RAD` about a direction, in a sunflower's spiral (Vogel 1979)."""
+    x = np.cross([0.0, 1.0, 0.0] if abs(direction[1]) < 0.9 else [1.0, 0.0, 0.0], direction)
+    x /= np.linalg.norm(x)
+    y = np.cross(direction, x)
+    number = np.arange(LAMPS)
+    radius = math.tan(0.5 * LAMP_RAD) * np.sqrt((number + 0.5) / LAMPS)
+    turn = number * math.pi * (3.0 - math.sqrt(5.0))
+    spread = direction + (radius * np.cos(turn))[:, None] * x + (radius * np.sin(turn))[:, None] * y
+    return np.asarray(spread / np.linalg.norm(spread, axis=1, keepdims=True), np.float64)
 
 
 def _surroundings(mi: ModuleType, appearance: Appearance) -> dict[str, Any]:
     picture = sky_picture(appearance)
     # Mitsuba's picture has y up and looks along z in its middle; ours z up and x in its middle.
     turn = mi.ScalarTransform4f(np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]))
-    return {"type": "envmap", "bitmap": mi.Bitmap(picture.astype(np.float32)), "to_world": turn}
+    around = {"type": "envmap", "bitmap": mi.Bitmap(picture.astype(np.float32)), "to_world": turn}
+    return around | {"sampling_weight": float(LAMPS) if appearance.lights else 1.0}
 
 
 def sky_picture(appearance: Appearance) -> Array:
@@ -69,12 +78,12 @@ def sky_picture(appearance: Appearance) -> Array:
     picture = np.where(sine > 0.0, sky, np.array(appearance.below))
     cosine = np.sqrt(1.0 - sine**2)
     cell_sr = cosine * (2.0 * math.pi / SKY_PX[0]) * (math.pi / SKY_PX[1])
-    for light in appearance.lights[1:]:
+    for number, light in enumerate(appearance.lights):
+        share, width = (1.0, FILL_RAD) if number else (GLOW, GLOW_RAD)
         towards = directions @ light.direction
-        lobe = np.exp((towards - 1.0) / FILL_RAD**2)[..., None]
-        lobe = np.where(sine > 0.0, lobe, 0.0)
+        lobe = np.where(sine > 0.0, np.exp((towards - 1.0) / width**2)[..., None], 0.0)
         received = (lobe * np.maximum(towards, 0.0)[..., None] * cell_sr).sum()
-        picture = picture + np.array(light.color) * (math.pi / received) * lobe
+        picture = picture + share * np.array(light.color) * (math.pi / received) * lobe
     return np.asarray(picture, np.float64)
 
 

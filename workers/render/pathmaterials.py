@@ -82,12 +82,14 @@ def _opaque(material: Material, color: Any) -> Bsdf:
 def _glass(mi: ModuleType, part: Part, body: Bsdf) -> Bsdf:
     """A sheet that light crosses straight on, tinted, and that mirrors some: it neither bends light nor turns black.
 
-    Every surface of a vessel counts as one such sheet, be it a solid's outline or one of a wall's two sides. Light that
+    A vessel's outline is one such sheet, as if it were empty; so is a wall, whose other side says `ior` 1. Light that
     crosses straight on is found by the lamps' samples too, so that shadows of glass are tinted and free of fireflies.
     """
     material = part.material
+    if material.ior == 1.0:
+        return {"type": "null"}
     tint = decode_srgb(np.array(material.base_color[:3])) ** GLASS_PALENESS
-    sheet = {"type": "thindielectric", "int_ior": 1.5, "specular_transmittance": _rgb(tint)}
+    sheet = {"type": "thindielectric", "int_ior": material.ior, "specular_transmittance": _rgb(tint)}
     if material.transmission_map is not None and part.uv is not None:
         weight: Any = _picture(mi, 1.0 - material.transmission * material.transmission_map.astype(np.float32) / 255.0)
     elif material.transmission >= 1.0:

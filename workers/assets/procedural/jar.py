@@ -138,7 +138,7 @@ def _surfaces(rng: np.random.Generator, wall: Wall, glass: bool) -> tuple[Surfac
     if glass:
         tint = near(rng, pick(rng, ((0.74, 0.83, 0.83), (0.66, 0.76, 0.74), (0.32, 0.2, 0.1))), 0.04)
         inside = base = clear_glass(tint, float(rng.uniform(0.08, 0.2)))
-        outside = inside
+        outside, inside = inside, replace(inside, ior=1.0)
         if chance(rng, 0.6):
             outside = _on_glass(rng, tint, band_height(0.0, high, float(wall.outer[:, 0].max())))
             wrapped = True

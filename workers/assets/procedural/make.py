@@ -95,7 +95,7 @@ def shape_digest(shape: Shape) -> str:
             material.transmission_map,
         )
         shapes = [None if array is None else array.shape for array in arrays]
-        looks = (material.base_color, material.metallic, material.roughness, material.transmission)
+        looks = (material.base_color, material.metallic, material.roughness, material.transmission, material.ior)
         digest.update(repr((part.name, *looks, shapes)).encode())
         for array in arrays:
             if array is not None:
