@@ -22,7 +22,7 @@ from services.bench.ratios import Lap
 from workers.geometry.frames import transform
 from workers.render.baking import LAMP_RAD
 from workers.render.batches import decode_srgb
-from workers.render.pathlights import sky_picture
+from workers.render.pathlights import GLOW, SKY_PX, sky_directions, sky_picture
 from workers.render.pathmaterials import GLASS_PALENESS
 from workers.render.tiers import shared_tracer
 
@@ -32,11 +32,11 @@ SCRIPT = Path(__file__).with_name("cycles_script.py")
 def hand_over(posed: PosedScene, cameras: Sequence[Camera], render: Render, folder: Path) -> Path:
     """Write what the script is to render, once, outside any clock. Returns the path of its description."""
     folder.mkdir(parents=True)
-    parts = []
+    parts: list[dict[str, Any]] = []
     for thing in posed.things:
         for part in thing.shape.parts:
             name = f"{len(parts)}.npz"
-            np.savez(folder / name, **_arrays(part, thing.T_world_shape))  # type: ignore[arg-type]
+            np.savez(folder / name, **_arrays(part, thing.T_world_shape))
             parts.append(_part(part, name))
     np.save(folder / "sky.npy", _blenders_sky(posed))
     keys = posed.appearance.lights[:1]
@@ -45,7 +45,7 @@ def hand_over(posed: PosedScene, cameras: Sequence[Camera], render: Render, fold
         "suns": [
             {
                 "angle_rad": LAMP_RAD,
-                "irradiance": [np.pi * c for c in light.color],
+                "irradiance": [np.pi * (1.0 - GLOW) * c for c in light.color],
                 "T_world_light": _facing(light.direction).tolist(),
             }
             for light in keys
@@ -85,9 +85,9 @@ def _part(part: Part, arrays: str) -> dict[str, Any]:
 
 
 def _blenders_sky(posed: PosedScene) -> Array:
-    """Our picture turned to how Blender wraps one: its middle looks along x, and further right is clockwise from above."""
-    picture = sky_picture(posed.appearance)
-    return np.asarray(picture.astype(np.float32))
+    """The sky in Blender's projection, which has the same columns as ours, and rows that are centred."""
+    directions = sky_directions((np.arange(SKY_PX[1]) + 0.5) / SKY_PX[1])
+    return np.asarray(sky_picture(posed.appearance, directions).astype(np.float32))
 
 
 def _facing(towards: Array) -> Array:

@@ -10,15 +10,16 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
-import bpy  # type: ignore[import-not-found]
+import bpy
 import numpy as np
-from mathutils import Matrix  # type: ignore[import-not-found]
+from mathutils import Matrix
 
 OPTICAL_TO_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def build(described, folder):
+def build(described: dict[str, Any], folder: Path) -> Any:
     """Everything but the camera."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
@@ -38,7 +39,7 @@ def build(described, folder):
     return scene
 
 
-def add_part(scene, part, arrays):
+def add_part(scene: Any, part: dict[str, Any], arrays: Any) -> None:
     """One mesh with its material."""
     mesh = bpy.data.meshes.new(part["name"])
     faces = arrays["faces"]
@@ -59,7 +60,7 @@ def add_part(scene, part, arrays):
     scene.collection.objects.link(bpy.data.objects.new(part["name"], mesh))
 
 
-def make_material(part, arrays):
+def make_material(part: dict[str, Any], arrays: Any) -> Any:
     """Principled, or where it transmits a clear sheet that mirrors by Fresnel."""
     material = bpy.data.materials.new(part["name"])
     material.use_nodes = True
@@ -73,12 +74,13 @@ def make_material(part, arrays):
         picture.image = image_of("texture", arrays["texture"], False)
         links.new(picture.outputs["Color"], body.inputs["Base Color"])
     if part["tint"] is not None:
-        links.new(sheet(nodes, links, part, arrays, body), nodes["Material Output"].inputs["Surface"])
+        links.new(sheet(material.node_tree, part, arrays, body), nodes["Material Output"].inputs["Surface"])
     return material
 
 
-def sheet(nodes, links, part, arrays, body):
+def sheet(tree: Any, part: dict[str, Any], arrays: Any, body: Any) -> Any:
     """The output of a thin sheet of glass, and of the body where its map says so."""
+    nodes, links = tree.nodes, tree.links
     clear, mirror = nodes.new("ShaderNodeBsdfTransparent"), nodes.new("ShaderNodeBsdfGlossy")
     clear.inputs["Color"].default_value = (*part["tint"], 1.0)
     mirror.inputs["Roughness"].default_value = 0.0
@@ -96,7 +98,7 @@ def sheet(nodes, links, part, arrays, body):
     return both.outputs["Shader"]
 
 
-def image_of(name, pixels, raw):
+def image_of(name: str, pixels: Any, raw: bool) -> Any:
     """Pixels [h, w, 3], row 0 at the top: uint8 sRGB, or float32 linear where `raw`."""
     height, width = pixels.shape[:2]
     image = bpy.data.images.new(name, width, height, float_buffer=raw)
@@ -109,7 +111,7 @@ def image_of(name, pixels, raw):
     return image
 
 
-def add_sky(scene, picture):
+def add_sky(scene: Any, picture: Any) -> None:
     """A picture [h, w, 3] of linear radiance around the scene, in Blender's own projection."""
     world = bpy.data.worlds.new("sky")
     world.use_nodes = True
@@ -120,7 +122,7 @@ def add_sky(scene, picture):
     links.new(around.outputs["Color"], nodes["Background"].inputs["Color"])
 
 
-def settings(scene, described):
+def settings(scene: Any, described: dict[str, Any]) -> None:
     """Cycles on one thread, every sample taken, nothing smoothed afterwards; the rest as it comes."""
     k = described["intrinsics"]
     scene.render.engine = "CYCLES"
@@ -137,7 +139,7 @@ def settings(scene, described):
     scene.view_settings.view_transform = "Standard"
 
 
-def look(scene, described, T_world_cam):
+def look(scene: Any, described: dict[str, Any], T_world_cam: list[list[float]]) -> None:
     """The camera at one pose."""
     k = described["intrinsics"]
     data = bpy.data.cameras.new("camera")
@@ -152,7 +154,7 @@ def look(scene, described, T_world_cam):
     scene.camera = placed
 
 
-def render(described, folder, samples, out):
+def render(described: dict[str, Any], folder: Path, samples: int, out: str | None) -> tuple[float, float]:
     """(seconds by the clock, seconds of the processor) for all views, building the scene included."""
     wall, cpu = time.perf_counter(), time.process_time()
     scene = build(described, folder)
@@ -165,7 +167,7 @@ def render(described, folder, samples, out):
     return time.perf_counter() - wall, time.process_time() - cpu
 
 
-def main():
+def main() -> None:
     """Answer one line with one line until there are no more. Blender talks on standard output, so that is moved."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)

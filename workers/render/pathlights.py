@@ -21,7 +21,7 @@ from workers.render.baking import LAMP_RAD
 LAMPS = 32
 """The shadow of a table top has an edge of 4 cm on the floor, or eight pixels: no step of it shows."""
 
-GLOW, GLOW_RAD = 0.08, 0.08
+GLOW, GLOW_RAD = 0.04, 0.15
 """Share of the key light that comes from a glow about it, and its standard deviation."""
 
 SKY_PX = (128, 64)
@@ -63,38 +63,35 @@ def lamp_directions(direction: Array) -> Array:
 
 
 def _surroundings(mi: ModuleType, appearance: Appearance) -> dict[str, Any]:
-    picture = sky_picture(appearance)
-    # Mitsuba's picture has y up and looks along z in its middle; ours z up and x in its middle.
+    picture = sky_picture(appearance, sky_directions(np.arange(SKY_PX[1]) / (SKY_PX[1] - 1.0)))
+    # Mitsuba's picture has y up and -z at its left edge; ours has z up and -x there.
     turn = mi.ScalarTransform4f(np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]))
     around = {"type": "envmap", "bitmap": mi.Bitmap(picture.astype(np.float32)), "to_world": turn}
     return around | {"sampling_weight": float(LAMPS) if appearance.lights else 1.0}
 
 
-def sky_picture(appearance: Appearance) -> Array:
-    """[H, W, 3] linear radiance by direction: row 0 is the zenith, see `sky_directions`."""
-    directions = sky_directions()
+def sky_picture(appearance: Appearance, directions: Array) -> Array:
+    """[H, W, 3] linear radiance from each of the directions [H, W, 3], which go around the whole sphere in even steps."""
     sine = directions[..., 2:]
     sky = np.array(appearance.ambient) * (HORIZON + (ZENITH - HORIZON) * sine)
     picture = np.where(sine > 0.0, sky, np.array(appearance.below))
-    cosine = np.sqrt(1.0 - sine**2)
-    cell_sr = cosine * (2.0 * math.pi / SKY_PX[0]) * (math.pi / SKY_PX[1])
+    level = np.sqrt(1.0 - sine**2)
+    cell_sr = level * (4.0 * math.pi / level.sum())
     for number, light in enumerate(appearance.lights):
         share, width = (1.0, FILL_RAD) if number else (GLOW, GLOW_RAD)
         towards = directions @ light.direction
-        lobe = np.where(sine > 0.0, np.exp((towards - 1.0) / width**2)[..., None], 0.0)
+        own_side = (sine > 0.0) == (light.direction[2] > 0.0)
+        lobe = np.where(own_side, np.exp((towards - 1.0) / width**2)[..., None], 0.0)
         received = (lobe * np.maximum(towards, 0.0)[..., None] * cell_sr).sum()
         picture = picture + share * np.array(light.color) * (math.pi / received) * lobe
     return np.asarray(picture, np.float64)
 
 
-def sky_directions() -> Array:
-    """[H, W, 3] unit, world: where each cell of the picture looks."""
-    width, height = SKY_PX
-    turn = 2.0 * math.pi * (np.arange(width) + 0.5) / width
-    fall = math.pi * (np.arange(height) + 0.5) / height
-    directions = np.empty((height, width, 3))
-    # x, y, z = z', x', y' of Mitsuba's (sin turn sin fall, cos fall, -cos turn sin fall).
-    directions[..., 0] = -np.cos(turn) * np.sin(fall)[:, None]
-    directions[..., 1] = np.sin(turn) * np.sin(fall)[:, None]
-    directions[..., 2] = np.cos(fall)[:, None]
-    return directions
+def sky_directions(fall: Array) -> Array:
+    """[H, W, 3] unit, world: where each cell of a picture looks whose rows lie `fall` [H] of the way from zenith to nadir.
+
+    Mitsuba's first row is the zenith itself and its last the nadir; columns are centred.
+    """
+    turn = 2.0 * math.pi * (np.arange(SKY_PX[0]) + 0.5) / SKY_PX[0]
+    level, up = np.sin(math.pi * fall)[:, None], np.cos(math.pi * fall)[:, None]
+    return np.stack([-np.cos(turn) * level, np.sin(turn) * level, np.broadcast_to(up, (len(fall), len(turn)))], axis=2)

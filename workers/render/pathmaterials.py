@@ -23,6 +23,9 @@ green (0.03 of the light, opaque) lets a quarter through two walls, as wine bott
 LEAST_WIDTH = 0.02
 """Of a lobe: a mirror any sharper is noise at the samples that one can afford."""
 
+LEAST_METAL_WIDTH = 0.12
+"""The same of metal, whose sharper reflections of the key light would leave more specks on whatever is near."""
+
 HOLE = 0.5
 """Texels more transparent than this are holes, as in the raster tier."""
 
@@ -67,7 +70,8 @@ def bsdf_of(mi: ModuleType, part: Part) -> Bsdf:
 
 def _opaque(material: Material, color: Any) -> Bsdf:
     width = max(material.roughness**2, LEAST_WIDTH)
-    metal = {"type": "roughconductor", "material": "none", "alpha": width, "specular_reflectance": color}
+    metal: Bsdf = {"type": "roughconductor", "material": "none", "specular_reflectance": color}
+    metal["alpha"] = max(width, LEAST_METAL_WIDTH)
     if material.metallic >= 1.0:
         return _both_sides(metal)
     if material.roughness >= MATTE_ROUGHNESS:

@@ -42,6 +42,9 @@ NEAR_M = 0.05
 ROULETTE_DEPTH = 5
 """Bounces after which paths end by chance, the sooner the less they carry."""
 
+SPECK = 1.4
+"""Cycles bounds what a sample may add, which Mitsuba cannot; texture at the size of a pixel stays below this."""
+
 REMEDY = "`./verso extra pathtraced` installs it (mitsuba==3.9.1), or set render.tier to raster or flat"
 
 
@@ -86,7 +89,7 @@ class Tracer:
     ) -> NDArray[np.uint8]:
         """[H, W, 3] uint8 sRGB, the same bytes for the same arguments; `seed` below 2**32."""
         light = self.radiance(things, appearance, camera, render, seed)
-        return encode(compress(light))
+        return encode(compress(without_specks(light)))
 
     def radiance(
         self, things: Sequence[Placed], appearance: Appearance, camera: Camera, render: Render, seed: int
@@ -110,15 +113,15 @@ class Tracer:
         return average(light, camera.intrinsics)
 
     def build(self, things: Sequence[Placed], appearance: Appearance) -> Built:
-        """The scene in Mitsuba; each mesh's id begins with its region's number and a slash."""
+        """The scene in Mitsuba; a mesh's id is region-REGION-THING-PART."""
         if self._built is not None and _same(self._built, things, appearance):
             return self._built
         tree: dict[str, Any] = {"type": "scene", **lights_of(self._mi, appearance)}
         for number, thing in enumerate(things):
             for piece, part in enumerate(thing.shape.parts):
-                name = f"{thing.region_id}-{number}-{piece}"
+                name = f"region-{thing.region_id}-{number}-{piece}"
                 if len(part.faces):
-                    tree[f"thing-{name}"] = make_mesh(self._mi, part, thing.T_world_shape, name)
+                    tree[name] = make_mesh(self._mi, part, thing.T_world_shape, name)
         clear = any(lets_through(part.material) for thing in things for part in thing.shape.parts)
         self._built = Built(self._mi.load_dict(tree), clear, tuple(things), appearance)
         return self._built
@@ -147,6 +150,25 @@ class Tracer:
                 "sampler": {"type": "multijitter"},
             }
         )
+
+
+def without_specks(light: Array) -> Array:
+    """Pixels brighter than `SPECK` times the second brightest of their eight neighbours, brought down to that.
+
+    A path that by chance finds the key light in a mirror leaves such a pixel; lines, edges and spots of three stay.
+    """
+    level = light @ np.array([0.2126, 0.7152, 0.0722])
+    height, width = level.shape
+    around = np.pad(level, 1, mode="reflect" if min(height, width) > 1 else "edge")
+    first, second = np.zeros_like(level), np.zeros_like(level)
+    for v, u in ((v, u) for v in range(3) for u in range(3) if (v, u) != (1, 1)):
+        other = around[v : v + height, u : u + width]
+        np.maximum(second, np.minimum(first, other), out=second)
+        np.maximum(first, other, out=first)
+    too_bright = level > SPECK * second
+    result = light.copy()
+    result[too_bright] *= (second[too_bright] / level[too_bright])[:, None]
+    return result
 
 
 def compress(light: Array) -> Array:
