@@ -143,9 +143,11 @@ class CyclesProcess:
 def cycles_process(python: str = sys.executable) -> Iterator[CyclesProcess]:
     """The script, ready for its first scene. Raises MachineError where that interpreter has no bpy that loads."""
     with tempfile.TemporaryFile("w+") as errors:
-        process = subprocess.Popen(
-            [python, "-I", str(SCRIPT)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True
-        )
+        pipe, command = subprocess.PIPE, [python, "-I", str(SCRIPT)]
+        try:
+            process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=errors, text=True)
+        except OSError as error:
+            raise MachineError(f"{python} cannot be run: {error}") from error
         try:
             yield CyclesProcess(process, errors)
         finally:

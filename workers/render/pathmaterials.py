@@ -16,9 +16,9 @@ from workers.render.batches import MATTE_ROUGHNESS, SRGB_STEPS, decode_srgb
 
 Bsdf = dict[str, Any]
 
-GLASS_PALENESS = 0.2
-"""Light keeps this power of the colour that glass shows as an opaque body at each surface that it crosses: a bottle of
-green (0.03 of the light, opaque) lets a quarter through two walls, as wine bottles do."""
+GLASS_PALENESS = 0.3
+"""Light keeps this power of the colour that glass shows as an opaque body at each sheet that it crosses: a bottle of
+green (0.03 of the light, opaque) lets an eighth through two walls, as wine bottles do."""
 
 LEAST_WIDTH = 0.02
 """Of a lobe: a mirror any sharper is noise at the samples that one can afford."""
