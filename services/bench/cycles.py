@@ -23,7 +23,7 @@ from workers.geometry.frames import transform
 from workers.render.baking import LAMP_RAD
 from workers.render.batches import decode_srgb
 from workers.render.pathlights import GLOW, SKY_PX, sky_directions, sky_picture
-from workers.render.pathmaterials import GLASS_PALENESS
+from workers.render.pathmaterials import tint_of
 from workers.render.tiers import shared_tracer
 
 SCRIPT = Path(__file__).with_name("cycles_script.py")
@@ -79,7 +79,7 @@ def _arrays(part: Part, T_world_shape: Array) -> dict[str, Any]:
 def _part(part: Part, arrays: str) -> dict[str, Any]:
     material = part.material
     color = decode_srgb(np.array(material.base_color[:3]))
-    tint = (color**GLASS_PALENESS).tolist() if material.transmission > 0.0 else None
+    tint = tint_of(part).tolist() if material.transmission > 0.0 else None
     look = {"color": color.tolist(), "tint": tint, "metallic": material.metallic, "roughness": material.roughness}
     return {"name": part.name, "arrays": arrays, **look}
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Pose
+from schemas.base import Array, Pose
 from schemas.shape import Material, Part
 from workers.geometry.frames import transform
 from workers.render.batches import MATTE_ROUGHNESS, SRGB_STEPS, decode_srgb
@@ -92,8 +92,7 @@ def _glass(mi: ModuleType, part: Part, body: Bsdf) -> Bsdf:
     material = part.material
     if material.ior == 1.0:
         return {"type": "null"}
-    tint = decode_srgb(np.array(material.base_color[:3])) ** GLASS_PALENESS
-    sheet = {"type": "thindielectric", "int_ior": material.ior, "specular_transmittance": _rgb(tint)}
+    sheet = {"type": "thindielectric", "int_ior": material.ior, "specular_transmittance": _rgb(tint_of(part))}
     if material.transmission_map is not None and part.uv is not None:
         weight: Any = _picture(mi, 1.0 - material.transmission * material.transmission_map.astype(np.float32) / 255.0)
     elif material.transmission >= 1.0:
@@ -101,6 +100,18 @@ def _glass(mi: ModuleType, part: Part, body: Bsdf) -> Bsdf:
     else:
         weight = 1.0 - material.transmission
     return {"type": "blendbsdf", "weight": weight, "first": sheet, "second": body}
+
+
+def tint_of(part: Part) -> Array:
+    """[3] share of linear light that crosses a sheet of glass: of a textured one, by the mean of what lets most through."""
+    material, texture = part.material, _texture(part)
+    color = decode_srgb(np.array(material.base_color[:3]))
+    if texture is not None:
+        clear = np.ones(texture.shape[:2], np.bool_)
+        if material.transmission_map is not None and material.transmission_map.shape == texture.shape[:2]:
+            clear = material.transmission_map == material.transmission_map.max()
+        color = color * SRGB_STEPS[texture[..., :3][clear]].mean(axis=0)
+    return np.asarray(color**GLASS_PALENESS, np.float64)
 
 
 def _both_sides(bsdf: Bsdf) -> Bsdf:
