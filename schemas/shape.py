@@ -30,12 +30,18 @@ class Material:
 
     `base_color` is sRGB with straight alpha, each in [0, 1]; it multiplies the texture and the vertex colours.
     `texture` is [h, w, 3 or 4] uint8 sRGB, row 0 at the top; uv (0, 0) is its lower left corner (OpenGL, trimesh).
+    `transmission` is the share of what is not mirrored that crosses the surface as through glass, for the path-traced tier
+    alone; `transmission_map` [h, w] uint8 multiplies it, and `ior` is the index of refraction. A surface that transmits is a
+    thin sheet there; an `ior` of 1 lets all light pass, as on the second side of a wall whose first stands for both.
     """
 
     base_color: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
     metallic: float = 0.0
     roughness: float = 0.6
     texture: NDArray[np.uint8] | None = None
+    transmission: float = 0.0
+    transmission_map: NDArray[np.uint8] | None = None
+    ior: float = 1.5
 
 
 @dataclass(frozen=True, eq=False)

@@ -166,6 +166,13 @@ def _add_bench(commands: "argparse._SubParsersAction") -> None:
     bench.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes", help="change a key of the job"
     )
+    bench.add_argument(
+        "--pathtraced",
+        nargs="?",
+        const=sys.executable,
+        metavar="PYTHON",
+        help="time the path-traced tier instead, beside Blender's Cycles where PYTHON (default: this one) has bpy",
+    )
     bench.set_defaults(handler="services.bench.command:main")
 
 

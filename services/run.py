@@ -22,6 +22,7 @@ from services.progress import ProgressLine, event_log, log_event
 from services.ranges import committed_ranges, list_commits, plan_ranges, plan_retries
 from services.ray_cluster import Slots, cluster_ray, private_ray
 from workers.assets.catalogue import Catalogue, open_catalogue
+from workers.render.tiers import require_tier
 from workers.store.local import LocalStore
 from workers.store.opening import open_store
 from workers.store.store import Store
@@ -59,6 +60,7 @@ class RunResult:
 def describe_plan(request: RunRequest) -> list[str]:
     """What a run would do, without doing any of it."""
     job = request.job
+    require_tier(job.render)
     catalogue = open_catalogue(job.assets, request.job_folder, tuple(job.categories))
     lines = [
         f"job {job.name}: scenes {job.first_scene} to {job.stop_scene - 1}, {job.pairs_per_scene} pair(s) each, seed {job.seed}",
@@ -75,6 +77,7 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     `cluster` is entered if there is something to make; by default it is what the request asks for.
     """
     begun = time.monotonic()
+    require_tier(request.job.render)
     catalogue = open_catalogue(request.job.assets, request.job_folder, tuple(request.job.categories))
     for line in describe_left_out(catalogue):
         print(f"verso: {line}", file=sys.stderr)

@@ -5,11 +5,13 @@ import shutil
 import signal
 import subprocess
 import time
+import tomllib
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+LOCKS = ("requirements.lock", "requirements-pathtraced.lock", "requirements-dev.lock")
 
 # Answers the launcher's probe, makes a `.venv` that links back to itself, and logs every call of pip.
 # Files named after what should go wrong, in the folder $FAULTS, make it go wrong.
@@ -49,7 +51,7 @@ class Checkout:
         for made in (self.root, self.faults, self.bin):
             made.mkdir()
         shutil.copy(ROOT / "verso", self.root)
-        for name in ("requirements.lock", "requirements-dev.lock", "pyproject.toml"):
+        for name in (*LOCKS, "pyproject.toml"):
             (self.root / name).write_text(f"contents of {name}\n")
         for name, script in FAKES.items():
             (self.bin / name).write_text(script)
@@ -152,6 +154,28 @@ def test_a_changed_development_lock_matters_to_tests_alone(checkout):
     assert checkout.calls() == [locked("requirements-dev.lock", checkout.root)]
 
 
+def test_the_extra_is_installed_once_and_starts_no_command(checkout):
+    code, out, err = checkout.run("extra", "pathtraced")
+    assert (code, out) == (0, "")
+    assert "pathtraced is installed" in err
+    base = ["venv", locked("requirements.lock", checkout.root), project(checkout.root)]
+    assert checkout.calls() == [*base, locked("requirements-pathtraced.lock", checkout.root)]
+    assert checkout.run("extra", "pathtraced")[0] == 0
+    checkout.run("--version")
+    assert checkout.calls() == []
+    (checkout.root / "requirements-pathtraced.lock").write_text("something else\n")
+    checkout.run("extra", "pathtraced")
+    assert checkout.calls() == [locked("requirements-pathtraced.lock", checkout.root)]
+
+
+@pytest.mark.parametrize("words", [("extra",), ("extra", "gpu"), ("extra", "pathtraced", "please")])
+def test_an_extra_that_there_is_not_is_refused_before_anything_is_made(checkout, words):
+    code, out, err = checkout.run(*words)
+    assert (code, out) == (2, "")
+    assert "./verso extra pathtraced" in err
+    assert not checkout.venv.exists()
+
+
 # ------------------------------------------------------------------------------------------------ what goes wrong
 
 
@@ -195,6 +219,13 @@ def test_test_tools_half_installed_are_installed_over(checkout):
     kill_while_pip_hangs(checkout, "test")
     assert checkout.run("test")[0] == 0
     assert checkout.calls() == [locked("requirements-dev.lock", checkout.root, "--force-reinstall")]
+
+
+def test_an_extra_half_installed_is_installed_over(checkout):
+    checkout.run("--version")
+    kill_while_pip_hangs(checkout, "extra", "pathtraced")
+    assert checkout.run("extra", "pathtraced")[0] == 0
+    assert checkout.calls() == [locked("requirements-pathtraced.lock", checkout.root, "--force-reinstall")]
 
 
 def test_pip_failing_stops_with_its_reason_and_nothing_is_started(checkout):
@@ -282,7 +313,7 @@ def test_without_a_package_that_python_needs_it_stops(checkout, obstacle):
 # ------------------------------------------------------------------------------------------------ the lock files
 
 
-@pytest.mark.parametrize("lock", ["requirements.lock", "requirements-dev.lock"])
+@pytest.mark.parametrize("lock", LOCKS)
 def test_the_locks_pin_everything_by_hash_and_name_no_index(lock):
     lines = (ROOT / lock).read_text().splitlines()
     pins = [line for line in lines if not line.startswith(" ")]
@@ -291,11 +322,21 @@ def test_the_locks_pin_everything_by_hash_and_name_no_index(lock):
     assert not any("://" in line for line in lines)
 
 
-def test_both_locks_agree_on_what_they_share():
-    runtime, development = (
-        dict(line.rstrip(" \\").split("==") for line in (ROOT / lock).read_text().splitlines() if "==" in line)
-        for lock in ("requirements.lock", "requirements-dev.lock")
-    )
+def pins(lock: str) -> dict[str, str]:
+    lines = (ROOT / lock).read_text().splitlines()
+    return dict(line.rstrip(" \\").split("==") for line in lines if "==" in line)
+
+
+def test_the_locks_agree_on_what_they_share():
+    runtime, extra, development = (pins(lock) for lock in LOCKS)
     shared = runtime.keys() & development.keys()
     assert shared
     assert {name: runtime[name] for name in shared} == {name: development[name] for name in shared}
+    assert extra and extra.items() <= development.items()
+    assert not extra.keys() & runtime.keys()
+
+
+def test_the_extra_is_pinned_alike_wherever_it_is_named():
+    tree = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    asked = tree["project"]["optional-dependencies"]["pathtraced"]
+    assert asked == tree["dependency-groups"]["pathtraced"] == [f"mitsuba=={pins(LOCKS[1])['mitsuba']}"]

@@ -53,7 +53,7 @@ def test_what_the_rules_allow_passes(tmp_path):
         "services/coordinator.py": "ray",
         "services/jobs.py": "ray.job_submission",
         "services/cli.py": "services.coordinator",
-        "workers/scene/settle.py": "pybullet",
+        "workers/scene/bullet.py": "pybullet",
         "workers/render/gbuffer.py": "OpenGL.GL",
         "workers/scene/views.py": "workers.geometry.thing",
         "workers/store/paths.py": "schemas.thing",

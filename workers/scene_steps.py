@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from schemas.camera import Camera
+from schemas.camera import ROLES, Camera, Role
 from schemas.layout import input_pose_id
 from schemas.scene import (
     REGION_TABLE,
@@ -21,6 +21,7 @@ from schemas.scene import (
 from workers.assets.catalogue import choose_object, choose_table, load_asset
 from workers.context import WorkerContext
 from workers.geometry.pixels import measure_regions
+from workers.render.tiers import draw_view
 from workers.scene.check import check_against_rays, check_pair, is_raycast_scene
 from workers.scene.derive import compare_views, derive_projected, label_region, projection_shares
 from workers.scene.plan import choose_category, plan_scene
@@ -149,18 +150,19 @@ def sense(scene: SceneView, exact: View, number: int) -> View:
         return sense_view(scene.context.job, exact, scene.plan.scene_id, number)
 
 
-def render_view(scene: SceneView, role: str, ids: tuple[int, int], camera: Camera) -> View:
+def render_view(scene: SceneView, role: Role, ids: tuple[int, int], camera: Camera) -> View:
     """One rendered view: exact images in their stored encodings, and labels of the table and of every object."""
     job, renderer = scene.context.job, scene.context.renderer
     with scene.watch.stage("render"):
-        buffer = renderer.draw(scene.posed.things, scene.posed.appearance, camera, job.render)
+        paths = stream(job.seed, scene.plan.scene_id, Stream.PATHS, *ids, ROLES.index(role))
+        buffer = draw_view(renderer, scene.posed.things, scene.posed.appearance, camera, job.render, paths)
     if scene.raycast_checked:
         with scene.watch.stage("raycast"):
             check_against_rays(scene.posed, camera, buffer, job.images.depth_range_m)
     with scene.watch.stage("labels"):
         labels = label_view(scene, camera, buffer)
         depth = quantise_depth(buffer.depth_m, job.images)
-    return View(role, *ids, camera, buffer.rgb, depth, buffer.region, labels)  # type: ignore[arg-type]
+    return View(role, *ids, camera, buffer.rgb, depth, buffer.region, labels)
 
 
 def label_view(scene: SceneView, camera: Camera, buffer: GBuffer) -> tuple[ObjectLabel, ...]:

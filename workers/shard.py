@@ -24,6 +24,7 @@ from workers.fingerprint import take_fingerprint
 from workers.records import failed_scene, record_scene, timing_row
 from workers.render.context import require_device
 from workers.render.gbuffer import shared_renderer
+from workers.render.tiers import require_tier
 from workers.scene.plan import choose_category
 from workers.scene_steps import Stopwatch, make_scene
 from workers.store.attempt import Attempt, begin_attempt
@@ -45,6 +46,7 @@ class BlamedScene(SceneError):
 def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
     """Make and commit every range of the order. What a scene cannot be is a row; anything else propagates."""
     begun, cpu = time.perf_counter(), time.process_time()
+    require_tier(order.job.render)
     context = open_worker(order.job, catalogue)
     require_device(context.renderer.name, order.job.run.device)
     fingerprint = _fingerprint()

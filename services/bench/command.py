@@ -13,6 +13,7 @@ from schemas.job import Job
 from services.bench.measure import bench_folder, measure
 from services.bench.others import other_systems
 from services.bench.report import describe, summarise
+from services.bench.traced import measure_traced
 from services.jobfile import load_job, set_key, validate_job
 from workers.store.mounts import file_system_of
 
@@ -21,6 +22,8 @@ def main(options: argparse.Namespace) -> int:
     """Measure what the options ask for; 0, or an error where a side cannot be run at all."""
     job, job_folder = _job(options)
     with bench_folder(options.folder) as folder:
+        if options.pathtraced is not None:
+            return measure_traced(options, job, job_folder, folder)
         figures = {
             "ok": True,
             "command": shlex.join(["verso", *sys.argv[1:]]),

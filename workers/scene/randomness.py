@@ -19,6 +19,7 @@ class Stream(IntEnum):
     SENSOR_DEPTH = 8
     SENSOR_RGB = 9
     SENSOR_EXPOSURE = 10
+    PATHS = 11
 
 
 def stream(seed: int, scene_id: int, name: Stream, *within: int) -> np.random.Generator:

@@ -10,6 +10,7 @@ from workers.assets.procedural.finish import Model, Surface
 from workers.assets.procedural.look import (
     Color,
     chance,
+    clear_glass,
     glass_color,
     mixed,
     near,
@@ -173,12 +174,12 @@ def _surfaces(rng: np.random.Generator, kind: Kind, corners: Array, surface: Arr
 
 def _body_material(rng: np.random.Generator, kind: Kind) -> Material:
     if kind.look == "glass":
-        return solid_color(glass_color(rng), float(rng.uniform(0.08, 0.18)))
+        return clear_glass(glass_color(rng), float(rng.uniform(0.08, 0.18)))
     if kind.look == "clear":
         tint = pick(
             rng, ((0.72, 0.82, 0.85), (0.6, 0.74, 0.82), (0.66, 0.8, 0.66), (0.28, 0.12, 0.06), (0.78, 0.5, 0.16))
         )
-        return solid_color(near(rng, tint, 0.04), float(rng.uniform(0.1, 0.25)))
+        return clear_glass(near(rng, tint, 0.04), float(rng.uniform(0.1, 0.25)))
     if kind.look == "metal":
         return steel(rng) if chance(rng, 0.3) else solid_color(near(rng, vivid(rng)), float(rng.uniform(0.35, 0.65)))
     return plastic(rng)

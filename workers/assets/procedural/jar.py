@@ -1,5 +1,7 @@
 """Pure: open jars: preserving jars, pots, vases, urns with two ears."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from schemas.base import Array
@@ -11,6 +13,7 @@ from workers.assets.procedural.look import (
     WHITE,
     Color,
     chance,
+    clear_glass,
     glaze_color,
     ink_on,
     mixed,
@@ -20,7 +23,7 @@ from workers.assets.procedural.look import (
     solid_color,
     textured,
 )
-from workers.assets.procedural.paint import Picture, band_height, bands, blank, dots, label, speckled, upright_stripes
+from workers.assets.procedural.paint import band_height, bands, blank, dots, label, speckled, upright_stripes
 from workers.assets.procedural.solid import Solid, circle, lathe
 from workers.assets.procedural.vessel import BASE, INSIDE, OUTSIDE, Wall, bend_radius, rod, wall_around, with_handles
 
@@ -134,13 +137,11 @@ def _surfaces(rng: np.random.Generator, wall: Wall, glass: bool) -> tuple[Surfac
     wrapped = False
     if glass:
         tint = near(rng, pick(rng, ((0.74, 0.83, 0.83), (0.66, 0.76, 0.74), (0.32, 0.2, 0.1))), 0.04)
-        inside = base = solid_color(tint, float(rng.uniform(0.08, 0.2)))
-        outside = inside
+        inside = base = clear_glass(tint, float(rng.uniform(0.08, 0.2)))
+        outside, inside = inside, replace(inside, ior=1.0)
         if chance(rng, 0.6):
-            outside, wrapped = (
-                textured(_on_glass(rng, tint, band_height(0.0, high, float(wall.outer[:, 0].max()))), 0.35),
-                True,
-            )
+            outside = _on_glass(rng, tint, band_height(0.0, high, float(wall.outer[:, 0].max())))
+            wrapped = True
     else:
         outside, inside, base, wrapped = _pottery(rng, band_height(0.0, high, float(wall.outer[:, 0].max())))
     ground: Color = inside.base_color[:3]
@@ -153,14 +154,17 @@ def _surfaces(rng: np.random.Generator, wall: Wall, glass: bool) -> tuple[Surfac
     return tuple(table[number] for number in sorted(table))
 
 
-def _on_glass(rng: np.random.Generator, tint: Color, rows: int) -> Picture:
-    """A paper label around the middle of a glass."""
+def _on_glass(rng: np.random.Generator, tint: Color, rows: int) -> Material:
+    """A glass with a paper label around its middle."""
     paper = pale(rng) if chance(rng, 0.6) else (0.92, 0.9, 0.84)
     printed = label(rng, paper, height=rows // 2)
     picture = blank(rows, 256, tint)
     top = int(0.36 * rows)
     picture[top : top + len(printed)] = printed
-    return picture
+    clear = np.full(picture.shape[:2], 255, np.uint8)
+    clear[top : top + len(printed)] = 0
+    clear.setflags(write=False)
+    return replace(textured(picture, 0.35), transmission=1.0, transmission_map=clear)
 
 
 def _pottery(rng: np.random.Generator, rows: int) -> tuple[Material, Material, Material, bool]:

@@ -2,6 +2,7 @@
 
 import colorsys
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -105,6 +106,11 @@ def ink_on(rng: np.random.Generator, paper: Color) -> Color:
 def solid_color(color: Color, roughness: float, metallic: float = 0.0) -> Material:
     """A material of one colour."""
     return Material((color[0], color[1], color[2], 1.0), metallic=metallic, roughness=float(roughness))
+
+
+def clear_glass(color: Color, roughness: float) -> Material:
+    """Glass or clear plastic, which most renderers draw as an opaque body of this colour."""
+    return replace(solid_color(color, roughness), transmission=1.0)
 
 
 def textured(picture: NDArray[np.uint8], roughness: float, metallic: float = 0.0) -> Material:

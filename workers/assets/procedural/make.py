@@ -85,9 +85,18 @@ def shape_digest(shape: Shape) -> str:
     digest = hashlib.sha256()
     for part in shape.parts:
         material = part.material
-        arrays = (part.vertices, part.faces, part.normals, part.uv, part.colors, material.texture)
+        arrays = (
+            part.vertices,
+            part.faces,
+            part.normals,
+            part.uv,
+            part.colors,
+            material.texture,
+            material.transmission_map,
+        )
         shapes = [None if array is None else array.shape for array in arrays]
-        digest.update(repr((part.name, material.base_color, material.metallic, material.roughness, shapes)).encode())
+        looks = (material.base_color, material.metallic, material.roughness, material.transmission, material.ior)
+        digest.update(repr((part.name, *looks, shapes)).encode())
         for array in arrays:
             if array is not None:
                 digest.update(np.ascontiguousarray(array).data)

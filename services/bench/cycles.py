@@ -1,0 +1,155 @@
+"""The path-traced tier beside Blender's Cycles: the same meshes, materials, lights, cameras and samples, in turn."""
+
+import contextlib
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from schemas.base import Array
+from schemas.camera import Camera
+from schemas.errors import MachineError
+from schemas.job import Render
+from schemas.scene import PosedScene
+from schemas.shape import Part
+from services.bench.ratios import Lap
+from workers.geometry.frames import transform
+from workers.render.baking import LAMP_RAD
+from workers.render.batches import decode_srgb
+from workers.render.pathlights import GLOW, SKY_PX, sky_directions, sky_picture
+from workers.render.pathmaterials import tint_of
+from workers.render.tiers import shared_tracer
+
+SCRIPT = Path(__file__).with_name("cycles_script.py")
+
+
+def hand_over(posed: PosedScene, cameras: Sequence[Camera], render: Render, folder: Path) -> Path:
+    """Write what the script is to render, once, outside any clock. Returns the path of its description."""
+    folder.mkdir(parents=True)
+    parts: list[dict[str, Any]] = []
+    for thing in posed.things:
+        for part in thing.shape.parts:
+            name = f"{len(parts)}.npz"
+            np.savez(folder / name, **_arrays(part, thing.T_world_shape))
+            parts.append(_part(part, name))
+    np.save(folder / "sky.npy", _blenders_sky(posed))
+    keys = posed.appearance.lights[:1]
+    described = {
+        "parts": parts,
+        "suns": [
+            {
+                "angle_rad": LAMP_RAD,
+                "irradiance": [np.pi * (1.0 - GLOW) * c for c in light.color],
+                "T_world_light": _facing(light.direction).tolist(),
+            }
+            for light in keys
+        ],
+        "sky": "sky.npy",
+        "intrinsics": cameras[0].intrinsics.model_dump(),
+        "cameras": [camera.T_world_cam.tolist() for camera in cameras],
+        "bounces": render.path_bounces,
+    }
+    path = folder / "scene.json"
+    path.write_text(json.dumps(described))
+    return path
+
+
+def _arrays(part: Part, T_world_shape: Array) -> dict[str, Any]:
+    arrays: dict[str, Any] = {
+        "vertices": transform(T_world_shape, part.vertices).astype(np.float32),
+        "faces": part.faces.astype(np.int32),
+    }
+    if part.normals is not None:
+        arrays["normals"] = part.normals @ T_world_shape[:3, :3].T
+    if part.uv is not None:
+        arrays["uv"] = part.uv.astype(np.float32)
+        if part.material.texture is not None:
+            arrays["texture"] = part.material.texture[..., :3]
+        if part.material.transmission_map is not None:
+            arrays["opaque"] = 1.0 - part.material.transmission_map.astype(np.float32) / 255.0
+    return arrays
+
+
+def _part(part: Part, arrays: str) -> dict[str, Any]:
+    material = part.material
+    color = decode_srgb(np.array(material.base_color[:3]))
+    tint = tint_of(part).tolist() if material.transmission > 0.0 else None
+    look = {"color": color.tolist(), "tint": tint, "metallic": material.metallic, "roughness": material.roughness}
+    return {"name": part.name, "arrays": arrays, **look}
+
+
+def _blenders_sky(posed: PosedScene) -> Array:
+    """The sky in Blender's projection, which has the same columns as ours, and rows that are centred."""
+    directions = sky_directions((np.arange(SKY_PX[1]) + 0.5) / SKY_PX[1])
+    return np.asarray(sky_picture(posed.appearance, directions).astype(np.float32))
+
+
+def _facing(towards: Array) -> Array:
+    """[4, 4]: a lamp that shines along its -z, from the direction `towards`."""
+    x = np.cross([0.0, 1.0, 0.0] if abs(towards[1]) < 0.9 else [1.0, 0.0, 0.0], towards)
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(towards, x), towards], axis=1)
+    return T
+
+
+def trace_lap(posed: PosedScene, cameras: Sequence[Camera], render: Render) -> Lap:
+    """Our side: the scene built anew, and every view traced."""
+    tracer = shared_tracer()
+    tracer.forget()
+    wall, cpu = time.perf_counter(), time.process_time()
+    for camera in cameras:
+        tracer.trace(posed.things, posed.appearance, camera, render, 0)
+    return Lap(len(cameras), time.perf_counter() - wall, time.process_time() - cpu, {})
+
+
+class CyclesProcess:
+    """A running script under an interpreter that has bpy; it inherits our core."""
+
+    def __init__(self, process: subprocess.Popen[str], errors: IO[str]) -> None:
+        self._process, self._errors = process, errors
+        self.version: str = self._answer()["version"]
+
+    def lap(self, scene: Path, views: int, samples: int, out: Path | None = None) -> Lap:
+        """Every view of a scene with these samples, building it included; `out`: where its pictures are left."""
+        question = {"scene": str(scene), "samples": [samples], "out": None if out is None else str(out)}
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.write(json.dumps(question) + "\n")
+            self._process.stdin.flush()
+        wall_s, cpu_s = self._answer()["seconds"][str(samples)]
+        return Lap(views, wall_s, cpu_s, {})
+
+    def _answer(self) -> dict[str, Any]:
+        """The next answer. Raises MachineError with the script's last words where it died."""
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            self._process.wait()
+            self._errors.seek(0)
+            last = " | ".join(self._errors.read().strip().splitlines()[-5:])
+            raise MachineError(f"Blender's script ended ({self._process.returncode}): {last}")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+
+@contextlib.contextmanager
+def cycles_process(python: str = sys.executable) -> Iterator[CyclesProcess]:
+    """The script, ready for its first scene. Raises MachineError where that interpreter has no bpy that loads."""
+    with tempfile.TemporaryFile("w+") as errors:
+        pipe, command = subprocess.PIPE, [python, "-I", str(SCRIPT)]
+        try:
+            process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=errors, text=True)
+        except OSError as error:
+            raise MachineError(f"{python} cannot be run: {error}") from error
+        try:
+            yield CyclesProcess(process, errors)
+        finally:
+            process.kill()
+            process.communicate()

@@ -1,0 +1,44 @@
+"""Where a view's colour comes from: the label pass itself, or paths traced beside it. Labels are the same in all tiers."""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+
+from schemas.camera import Camera
+from schemas.job import Render
+from schemas.scene import Appearance, GBuffer, Placed
+from workers.render.gbuffer import FLAT, Renderer
+from workers.render.pathtrace import Tracer, require_mitsuba
+
+SEEDS = 2**32
+"""As many as Mitsuba's samplers tell apart."""
+
+
+def require_tier(render: Render) -> None:
+    """Raises InputError, with the remedy, where what the tier needs is not installed."""
+    if render.tier == "pathtraced":
+        require_mitsuba()
+
+
+def draw_view(
+    renderer: Renderer,
+    things: Sequence[Placed],
+    appearance: Appearance,
+    camera: Camera,
+    render: Render,
+    rng: np.random.Generator,
+) -> GBuffer:
+    """What one camera sees, in the tier that the job asks for; `rng` seeds the paths."""
+    if render.tier != "pathtraced":
+        return renderer.draw(things, appearance, camera, render)
+    labels = renderer.draw(things, appearance, camera, FLAT)
+    rgb = shared_tracer().trace(things, appearance, camera, render, int(rng.integers(SEEDS)))
+    rgb.setflags(write=False)
+    return GBuffer(rgb, labels.depth_m, labels.region)
+
+
+@cache
+def shared_tracer() -> Tracer:
+    """This process's tracer, made at the first call."""
+    return Tracer()
