@@ -39,7 +39,7 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
         assets = [scene.plan.table.asset, *(start.asset for start in scene.plan.objects)]
         for asset in assets:
             if asset.shareable:
-                files.append((asset_path(asset.category, asset.instance_id), asset_glb(asset)))
+                files.append((asset_path(asset.category, asset.instance_id), asset_glb(asset, encode_png)))
     rows = {
         "scenes": [scene_row(context, scene)],
         "views": views,

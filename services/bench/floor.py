@@ -1,7 +1,6 @@
 """The least that a machine can do for the same files: bare draws, the fastest encoder, and a durable write."""
 
 import os
-import shutil
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -84,8 +83,3 @@ def write_durably(files: Mapping[str, bytes], folder: Path) -> int:
     os.rename(staging, folder)
     sync_folder(folder.parent)
     return written
-
-
-def clear(folder: Path) -> None:
-    """Remove what a round left."""
-    shutil.rmtree(folder, ignore_errors=True)

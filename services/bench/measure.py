@@ -10,7 +10,7 @@ from schemas.commit import Span
 from schemas.errors import MachineError, OutputError
 from schemas.job import Job
 from services.bench.encoders import Encoder, choose_encoders
-from services.bench.floor import clear, committed_files, images_of, run_floor
+from services.bench.floor import committed_files, images_of, run_floor
 from services.bench.handover import hand_over
 from services.bench.machine import describe_machine, pinned, process_age_s
 from services.bench.others import Side, sides_of
@@ -60,7 +60,10 @@ def bench_folder(parent: Path) -> Iterator[Path]:
 
 
 def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
-    """Ranges of the job's size until `scenes` are made, each by all sides in turn."""
+    """Ranges of the job's size until `scenes` are made, each by all sides in turn.
+
+    Nothing is deleted in between: for seconds afterwards ext4 searches what was deleted whenever a file is made.
+    """
     with pinned() as core, ExitStack() as processes:
         bench = open_workbench(job, job_folder, folder / "ours")
         warm = bench.next_span(WARM_UP)
@@ -71,7 +74,6 @@ def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
         given = sides.give(warm)
         for side in sides_of(job):
             startup_s[side.name] = sides.open(side, given)
-        clear(sides.given_folder(warm))
         rounds = tuple(sides.round(bench.next_span(count)) for count in _counts(scenes, job.run.range_size))
     return Measured(
         describe_machine(bench.context.renderer.name),
@@ -124,15 +126,12 @@ class _Sides:
             side.name: self.processes[side.module].run(given, self.folder / side.name, side.asked)
             for side in self.opened
         }
-        clear(self.given_folder(span))
         return Round(ours, floor, others, sum(map(len, files.values())))
 
     def floor(self, span: Span, files: dict[str, bytes]) -> Lap:
         """The least for the scenes of a span."""
         out = self.folder / f"floor{span.start}"
-        lap = run_floor(self.bench.context.renderer, self.bench.scenes(span), files, self.encoders, out)
-        clear(out)
-        return lap
+        return run_floor(self.bench.context.renderer, self.bench.scenes(span), files, self.encoders, out)
 
     def give(self, span: Span) -> list[Path]:
         """The same scenes as files for the others."""

@@ -8,6 +8,7 @@ compresses pictures as it likes cannot promise bytes; the tests read it back wit
 import io
 import json
 import struct
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -22,11 +23,22 @@ _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 PNG_LEVEL = 1
 """Pictures are small and often written: more effort saves a third of their size and costs four times the time."""
 
+EncodePicture = Callable[[NDArray[np.uint8]], bytes]
+"""A PNG of [h, w, 3 or 4] uint8."""
+
+
+def encode_with_pillow(pixels: NDArray[np.uint8]) -> bytes:
+    """The PNG of a picture with or without alpha."""
+    stream = io.BytesIO()
+    Image.fromarray(np.asarray(pixels)).save(stream, "PNG", compress_level=PNG_LEVEL)
+    return stream.getvalue()
+
 
 class _Writer:
     """Collects buffer views, accessors and pictures in the order in which they come."""
 
-    def __init__(self) -> None:
+    def __init__(self, encode_opaque: EncodePicture) -> None:
+        self._encode_opaque = encode_opaque
         self.binary = bytearray()
         self.views: list[dict[str, Any]] = []
         self.accessors: list[dict[str, Any]] = []
@@ -52,16 +64,18 @@ class _Writer:
     def picture(self, pixels: NDArray[np.uint8]) -> int:
         """The number of a texture [h, w, 3 or 4]; parts that share the array share the texture."""
         if id(pixels) not in self._pictures:
-            stream = io.BytesIO()
-            Image.fromarray(np.asarray(pixels)).save(stream, "PNG", compress_level=PNG_LEVEL)
+            png = self._encode_opaque(pixels) if pixels.shape[2] == 3 else encode_with_pillow(pixels)
             self._pictures[id(pixels)] = len(self.images)
-            self.images.append({"bufferView": self.view(stream.getvalue()), "mimeType": "image/png"})
+            self.images.append({"bufferView": self.view(png), "mimeType": "image/png"})
         return self._pictures[id(pixels)]
 
 
-def asset_glb(asset: Asset) -> bytes:
-    """The asset's shape with its materials: positions and normals float32, one primitive for each part."""
-    writer = _Writer()
+def asset_glb(asset: Asset, encode_opaque: EncodePicture = encode_with_pillow) -> bytes:
+    """The asset's shape with its materials: positions and normals float32, one primitive for each part.
+
+    `encode_opaque` makes the PNGs of pictures without alpha.
+    """
+    writer = _Writer(encode_opaque)
     materials = [_material(writer, part, asset.watertight) for part in asset.shape.parts]
     primitives = [_primitive(writer, part, number) for number, part in enumerate(asset.shape.parts)]
     tree: dict[str, Any] = {

@@ -189,7 +189,7 @@ void main() {
     vec3 albedo = v_albedo_roughness.rgb;
 #if TEXTURED
     vec4 texel = texture(albedo_map, v_uv);
-    albedo *= texel.rgb;
+    albedo *= texel.rgb * texel.rgb;
 #if CUTOUT && !LABELS
     if (texel.a < HOLE) discard;
 #endif

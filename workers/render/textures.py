@@ -9,8 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from workers.render.batches import SRGB_STEPS
+
 MAX_TEXTURE_PX = 2048
 """A larger texture is made smaller before it is uploaded: at most this many pixels wide and high."""
+
+
+_ROOTS = np.stack([np.rint(255.0 * np.sqrt(SRGB_STEPS))] * 3 + [np.arange(256.0)], axis=-1).astype(np.uint8)[:, None, :]
+"""[256, 1, 4] uint8: the root of linear light of each sRGB code, in 255ths; alpha as it is."""
 
 
 @dataclass(eq=False)
@@ -78,34 +84,36 @@ def has_holes(texture: NDArray[np.uint8] | None) -> bool:
 
 
 def mip_levels(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
-    """An image [h, w, 3 or 4] and its copies at half the size down to one pixel, [h', w', 4] uint8, area means.
+    """A picture [h, w, 3 or 4] sRGB and its copies at half the size down to one pixel, [h', w', 4] uint8, area means.
 
-    The first is the image itself, or the largest that fits into `MAX_TEXTURE_PX`; row 0 is the lowest, OpenGL's.
+    Colours are roots of linear light, which a shader squares: half the time of decoding sRGB for each texel. The first is
+    the picture itself, or the largest that fits into `MAX_TEXTURE_PX`; row 0 is the lowest, OpenGL's.
     """
     level: NDArray = np.ascontiguousarray(image[::-1])
     if level.shape[2] == 3:
         level = cv2.cvtColor(level, cv2.COLOR_RGB2RGBA)
+    level = np.asarray(cv2.LUT(level, _ROOTS), np.uint8)
     shrink = min(1.0, MAX_TEXTURE_PX / max(level.shape[:2]))
     width, height = (max(1, round(shrink * level.shape[axis])) for axis in (1, 0))
-    levels = []
+    levels: list[NDArray[np.uint8]] = []
     while True:
         if level.shape[:2] != (height, width):
             level = cv2.resize(level, (width, height), interpolation=cv2.INTER_AREA)
-        levels.append(level)
+        levels.append(np.asarray(level, np.uint8))
         if width == height == 1:
             return tuple(levels)
         width, height = max(1, width // 2), max(1, height // 2)
 
 
 def upload_texture(gl: ModuleType, levels: Sequence[NDArray[np.uint8]]) -> int:
-    """An sRGB texture, repeated, interpolated between its pixels; of its levels the nearest is read."""
+    """A texture, repeated, interpolated between its pixels; of its levels the nearest is read."""
     texture = int(gl.glGenTextures(1))
     gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
     gl.glPixelStorei(gl.GL_UNPACK_ALIGNMENT, 1)
     for i, level in enumerate(levels):
         height, width = level.shape[:2]
         form = (gl.GL_RGBA, gl.GL_UNSIGNED_BYTE, level)
-        gl.glTexImage2D(gl.GL_TEXTURE_2D, i, gl.GL_SRGB8_ALPHA8, width, height, 0, *form)
+        gl.glTexImage2D(gl.GL_TEXTURE_2D, i, gl.GL_RGBA8, width, height, 0, *form)
     gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MIN_FILTER, gl.GL_LINEAR_MIPMAP_NEAREST)
     gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MAG_FILTER, gl.GL_LINEAR)
     gl.glBindTexture(gl.GL_TEXTURE_2D, 0)
