@@ -103,7 +103,7 @@ def _stack() -> Finding:
         from workers.fingerprint import take_fingerprint
         from workers.render.gbuffer import shared_renderer
 
-        stack = take_fingerprint(shared_renderer())
+        stack = take_fingerprint(shared_renderer(), "raster")
     except VersoError as error:
         return Finding("fingerprint", False, "the canary scene could not be made", str(error))
     return Finding(

@@ -47,7 +47,7 @@ def replay_scene(store: Store, scene_id: int) -> Replay:
     record, stored = require_job(store), find_scene(store, scene_id)
     context = open_context(record)
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
-    same_stack = take_fingerprint(context.renderer) == theirs
+    same_stack = take_fingerprint(context.renderer, context.job.render.tier) == theirs
     output = run_scene(context, scene_id, Stopwatch())
     differences = _compare_files(store, stored, output, same_stack)
     if same_stack:

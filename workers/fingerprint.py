@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from schemas.fingerprint import Fingerprint
-from schemas.job import Job
+from schemas.job import Job, Tier
 from workers.assets.catalogue import open_catalogue
 from workers.context import WorkerContext, settings_digest
 from workers.records import record_scene
@@ -22,7 +22,10 @@ CANARY_SCENE = 3
 
 LIBRARIES = (
     "embreex",
+    "isal",
+    "llvmlite",
     "manifold3d",
+    "numba",
     "numpy",
     "opencv-contrib-python-headless",
     "pillow",
@@ -33,16 +36,22 @@ LIBRARIES = (
 )
 """What has a hand in the bytes."""
 
+TIER_LIBRARIES: dict[Tier, tuple[str, ...]] = {"pathtraced": ("mitsuba", "drjit")}
+"""What has a hand in the bytes of one tier alone, which the canary scene is not drawn in."""
+
 SOURCE_PACKAGES = ("schemas", "workers")
 """What of the project has a hand in the bytes: not the services that drive it."""
 
 
-def take_fingerprint(renderer: Renderer) -> Fingerprint:
-    """The fingerprint of this process's stack. Takes about a second, most of it Python's and GL's first use."""
+def take_fingerprint(renderer: Renderer, tier: Tier) -> Fingerprint:
+    """The fingerprint of this process's stack, as far as a tier's bytes depend on it.
+
+    Takes about a second, most of it Python's and GL's first use.
+    """
     return Fingerprint(
         canary=canary_digest(renderer),
         code=code_digest(),
-        libraries={name: version(name) for name in LIBRARIES},
+        libraries={name: version(name) for name in (*LIBRARIES, *TIER_LIBRARIES.get(tier, ()))},
         simd=numpy_simd(),
         renderer=renderer.name,
     )

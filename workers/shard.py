@@ -14,7 +14,7 @@ from typing import IO
 from schemas.commit import Span
 from schemas.errors import FingerprintError, SceneError
 from schemas.fingerprint import Fingerprint
-from schemas.job import Job
+from schemas.job import Job, Tier
 from schemas.layout import FINGERPRINT_FILE, staging_path
 from schemas.report import Blame, ShardOrder, ShardReport, SpanReport
 from schemas.scene import SceneOutput
@@ -49,7 +49,7 @@ def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
     require_tier(order.job.render)
     context = open_worker(order.job, catalogue)
     require_device(context.renderer.name, order.job.run.device)
-    fingerprint = _fingerprint()
+    fingerprint = _fingerprint(order.job.render.tier)
     store = open_store(order.out)
     _join_stack(store, fingerprint, order)
     order = order.model_copy(update={"terms": order.terms.model_copy(update={"fingerprint": fingerprint.digest})})
@@ -115,8 +115,8 @@ def run_scene(context: WorkerContext, scene_id: int, total: Stopwatch) -> SceneO
 
 
 @cache
-def _fingerprint() -> Fingerprint:
-    return take_fingerprint(shared_renderer())
+def _fingerprint(tier: Tier) -> Fingerprint:
+    return take_fingerprint(shared_renderer(), tier)
 
 
 def _join_stack(store: Store, mine: Fingerprint, order: ShardOrder) -> None:
