@@ -1,64 +1,107 @@
-"""Which way the surface in a depth image faces."""
+"""Which way the surface in a depth image faces, and whether it is one surface."""
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.camera import Camera
-from workers.geometry.camera import unproject
+from workers.geometry.loops import compiled
+
+Depth = NDArray[np.floating] | NDArray[np.uint16]
+"""[H, W] z along the optical axis, in units of which there are `units_per_m`; 0 where there is none."""
 
 
 def facing_cosine(
-    depth_m: Array, region: NDArray[np.uint8], pixels: NDArray[np.int64], camera: Camera, viewpoint: Array
+    depth: Depth,
+    region: NDArray[np.uint8],
+    pixels: NDArray[np.int64],
+    camera: Camera,
+    viewpoint: Array,
+    units_per_m: float = 1.0,
 ) -> Array:
     """Cosine between the surface's normal and the direction to `viewpoint` (world), at some pixels; nan where unknown.
 
-    depth_m [H, W] metres, 0 for none; pixels [N] flat indices; returns [N] float64. The normal comes from central
-    differences of the unprojected depth, on the side of the camera that took it; it is known where the pixel and its
-    four neighbours have depth and belong to one region.
+    pixels [N] flat indices; returns [N] float64. The normal comes from central differences of the unprojected depth, on
+    the side of the camera that took it; it is known where the pixel and its four neighbours have depth and belong to one
+    region.
     """
-    height, width = depth_m.shape
-    if min(height, width) < 3:
-        return np.full(len(pixels), np.nan)  # no pixel has four neighbours
-    rows, columns = np.divmod(pixels, width)
-    inner = (rows > 0) & (rows < height - 1) & (columns > 0) & (columns < width - 1)
-    at = np.where(inner, pixels, width + 1)
-    flat, ids = depth_m.ravel(), region.ravel()
-    known = inner & (flat[at] > 0.0)
-    points = []
-    for step in (1, -1, width, -width):
-        known &= (ids[at + step] == ids[at]) & (flat[at + step] > 0.0)
-        points.append(unproject(*np.divmod(at + step, width), flat[at + step], camera.intrinsics))
-    # x runs right and y down, so that y across x points towards the camera.
-    normal = np.cross(points[2] - points[3], points[0] - points[1])
-    here = unproject(*np.divmod(at, width), flat[at], camera.intrinsics)
-    towards = camera.T_world_cam[:3, :3].T @ (viewpoint - camera.position) - here
-    length = np.linalg.norm(normal, axis=1) * np.linalg.norm(towards, axis=1)
+    k = camera.intrinsics
+    eye = camera.T_world_cam[:3, :3].T @ (viewpoint - camera.position)
     cosine = np.full(len(pixels), np.nan)
-    np.divide((normal * towards).sum(axis=1), length, out=cosine, where=known & (length > 0.0))
+    _facing_cosine(depth, units_per_m, region, pixels, (k.cx, k.cy, k.fx, k.fy), eye, cosine)
     return cosine
 
 
+@compiled
+def _facing_cosine(
+    depth: Depth,
+    units_per_m: float,
+    region: NDArray[np.uint8],
+    pixels: NDArray[np.int64],
+    k: tuple[float, float, float, float],
+    eye: Array,
+    cosine: Array,
+) -> None:
+    """k: cx, cy, fx, fy. In the camera's frame x runs right and y down, so that y across x points towards the camera."""
+    height, width = depth.shape
+    points = np.empty((5, 3))
+    for n in range(len(pixels)):
+        row, column = pixels[n] // width, pixels[n] % width
+        if row == 0 or column == 0 or row == height - 1 or column == width - 1:
+            continue
+        known = True
+        for i, (dy, dx) in enumerate(((0, 0), (0, 1), (0, -1), (1, 0), (-1, 0))):
+            z = depth[row + dy, column + dx] / units_per_m
+            known = known and z > 0.0 and region[row + dy, column + dx] == region[row, column]
+            points[i, 0] = (column + dx + 0.5 - k[0]) / k[2] * z
+            points[i, 1] = (row + dy + 0.5 - k[1]) / k[3] * z
+            points[i, 2] = z
+        if not known:
+            continue
+        a, b = points[3] - points[4], points[1] - points[2]
+        normal = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+        towards = eye - points[0]
+        along = normal[0] * towards[0] + normal[1] * towards[1] + normal[2] * towards[2]
+        length2 = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
+        away2 = towards[0] * towards[0] + towards[1] * towards[1] + towards[2] * towards[2]
+        if length2 > 0.0 and away2 > 0.0:
+            cosine[n] = along / (math.sqrt(length2) * math.sqrt(away2))
+
+
 def is_smooth(
-    depth_m: Array, region: NDArray[np.uint8], pixels: NDArray[np.int64], bound_m: float
+    depth: Depth, region: NDArray[np.uint8], pixels: NDArray[np.int64], bound_m: float, units_per_m: float = 1.0
 ) -> NDArray[np.bool_]:
     """[N] bool: whether a pixel (flat index) and its four neighbours see one smooth surface of one region.
 
     On a plane 1/z is linear in the image; what its second differences leave, times z squared, is the step in depth that
     a plane does not explain, and must stay below `bound_m` along rows and along columns.
     """
-    height, width = depth_m.shape
-    if min(height, width) < 3:
-        return np.zeros(len(pixels), bool)
-    rows, columns = np.divmod(pixels, width)
-    inner = (rows > 0) & (rows < height - 1) & (columns > 0) & (columns < width - 1)
-    at = np.where(inner, pixels, width + 1)
-    flat, ids = depth_m.ravel(), region.ravel()
-    smooth = inner & (flat[at] > 0.0)
-    z = np.where(smooth, flat[at], 1.0)
-    for step in (1, width):
-        a, b = flat[at + step], flat[at - step]
-        smooth &= (a > 0.0) & (b > 0.0) & (ids[at + step] == ids[at]) & (ids[at - step] == ids[at])
-        bend = 1.0 / np.where(a > 0.0, a, 1.0) + 1.0 / np.where(b > 0.0, b, 1.0) - 2.0 / z
-        smooth &= np.abs(bend) * z * z < bound_m
+    smooth = np.zeros(len(pixels), np.bool_)
+    if min(depth.shape) < 3:
+        return smooth  # no pixel has four neighbours
+    _is_smooth(depth, units_per_m, region, pixels, bound_m, smooth)
     return smooth
+
+
+@compiled
+def _is_smooth(
+    depth: Depth,
+    units_per_m: float,
+    region: NDArray[np.uint8],
+    pixels: NDArray[np.int64],
+    bound_m: float,
+    smooth: NDArray[np.bool_],
+) -> None:
+    height, width = depth.shape
+    for n in range(len(pixels)):
+        row, column = pixels[n] // width, pixels[n] % width
+        z = depth[row, column] / units_per_m
+        good = 0 < row < height - 1 and 0 < column < width - 1 and z > 0.0
+        for dy, dx in ((0, 1), (1, 0)):
+            if good:
+                a, b = depth[row + dy, column + dx] / units_per_m, depth[row - dy, column - dx] / units_per_m
+                alike = region[row + dy, column + dx] == region[row, column] == region[row - dy, column - dx]
+                good = alike and a > 0.0 and b > 0.0 and abs(1.0 / a + 1.0 / b - 2.0 / z) * z * z < bound_m
+        smooth[n] = good

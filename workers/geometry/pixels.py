@@ -30,7 +30,7 @@ def _round_depth(depth_m: NDArray, low_m: float, high_m: float, units_per_m: flo
         units[i] = np.uint16(np.rint(z * units_per_m)) if low_m < z < high_m else np.uint16(0)
 
 
-def take_colours(rgb: NDArray[np.uint8], source: NDArray[np.int64]) -> NDArray[np.uint8]:
+def take_colours(rgb: NDArray[np.uint8], source: NDArray[np.integer]) -> NDArray[np.uint8]:
     """[H, W, 3] uint8: at each pixel the colour of the pixel of `rgb` whose flat index `source` [H, W] holds; -1 is black."""
     taken = np.zeros((*source.shape, 3), np.uint8)
     _take_colours(np.ascontiguousarray(rgb).reshape(-1, 3), source.reshape(-1), taken.reshape(-1, 3))
@@ -38,7 +38,7 @@ def take_colours(rgb: NDArray[np.uint8], source: NDArray[np.int64]) -> NDArray[n
 
 
 @compiled
-def _take_colours(rgb: NDArray[np.uint8], source: NDArray[np.int64], taken: NDArray[np.uint8]) -> None:
+def _take_colours(rgb: NDArray[np.uint8], source: NDArray[np.integer], taken: NDArray[np.uint8]) -> None:
     for i in range(len(source)):
         if source[i] >= 0:
             for channel in range(3):
@@ -49,7 +49,9 @@ def measure_regions(region: NDArray[np.uint8]) -> list[Extent]:
     """The extent of each of the 256 region ids in a mask [H, W]."""
     counts, boxes = np.zeros(256, np.int64), np.zeros((256, 4), np.int64)
     boxes[:, :2] = max(region.shape)
-    _measure_regions(region, counts, boxes)
+    whole = np.ascontiguousarray(region)
+    words = whole.view(np.uint64) if region.shape[1] % 8 == 0 else np.empty((len(region), 0), np.uint64)
+    _measure_regions(whole, words, counts, boxes)
     return [
         Extent(count, (x, y, right - x, bottom - y)) if count else Extent(0, (0, 0, 0, 0))
         for count, (x, y, right, bottom) in zip(counts.tolist(), boxes.tolist(), strict=True)
@@ -57,16 +59,25 @@ def measure_regions(region: NDArray[np.uint8]) -> list[Extent]:
 
 
 @compiled
-def _measure_regions(region: NDArray[np.uint8], counts: NDArray[np.int64], boxes: NDArray[np.int64]) -> None:
-    """Runs of one id along a row are counted at once; boxes are left, top, right and bottom, the last two excluded."""
+def _measure_regions(
+    region: NDArray[np.uint8], words: NDArray[np.uint64], counts: NDArray[np.int64], boxes: NDArray[np.int64]
+) -> None:
+    """Runs of one id along a row are counted at once; boxes are left, top, right and bottom, the last two excluded.
+
+    `words` are the same pixels eight at a time, or none.
+    """
     height, width = region.shape
     for row in range(height):
         first = 0
         while first < width:
             region_id = region[row, first]
             stop = first + 1
+            eight = np.uint64(region_id) * np.uint64(0x0101010101010101)
             while stop < width and region[row, stop] == region_id:
-                stop += 1
+                if stop % 8 == 0 and stop // 8 < words.shape[1] and words[row, stop // 8] == eight:
+                    stop += 8
+                else:
+                    stop += 1
             counts[region_id] += stop - first
             boxes[region_id, 0] = min(boxes[region_id, 0], first)
             boxes[region_id, 1] = min(boxes[region_id, 1], row)

@@ -10,62 +10,69 @@ from schemas.camera import Camera, Intrinsics
 from workers.geometry.camera import unproject
 from workers.geometry.frames import invert, transform
 from workers.geometry.loops import compiled
+from workers.geometry.normals import Depth
 
 
 @dataclass(frozen=True, eq=False)
 class Projected:
     """What a cloud looks like from another camera.
 
-    depth_m [H, W] float64, z, 0 in holes; source [H, W] int64, the flat index of the source pixel, -1 in holes.
+    depth_m [H, W] float64, z, 0 in holes; source [H, W] int32, the flat index of the source pixel, -1 in holes.
     """
 
     depth_m: Array
-    source: NDArray[np.int64]
+    source: NDArray[np.int32]
 
 
-def carry_pixels(depth_m: Array, pixels: NDArray[np.int64], source: Camera, target: Camera) -> Array:
+def carry_pixels(
+    depth: Depth, pixels: NDArray[np.int64], source: Camera, target: Camera, units_per_m: float = 1.0
+) -> Array:
     """[N, 3] float64: points in the target's frame of the source's pixels (flat indices [N]).
 
-    depth_m [H, W] float64 is z along the source's axis.
+    depth [H, W] is z along the source's axis.
     """
-    rows, columns = np.divmod(pixels, depth_m.shape[1])
-    points = unproject(rows, columns, depth_m.ravel()[pixels], source.intrinsics)
+    rows, columns = np.divmod(pixels, depth.shape[1])
+    z = depth.ravel()[pixels].astype(np.float64) / units_per_m
+    points = unproject(rows, columns, z, source.intrinsics)
     return transform(invert(target.T_world_cam) @ source.T_world_cam, points)
 
 
-def forward_project(depth_m: Array, source: Camera, target: Camera, splat: int = 1) -> Projected:
+def forward_project(
+    depth: Depth, source: Camera, target: Camera, splat: int = 1, units_per_m: float = 1.0
+) -> Projected:
     """Carry a depth image into another camera.
 
     The target pixel is the floor of (u, v); nearest z wins, ties to the lowest source index; holes stay 0
     (dataset.md "Projection"). With `splat` n > 1 each point fills a square of n x n pixels.
     """
     m = target.intrinsics
-    depth, index = np.zeros((m.height, m.width)), np.full((m.height, m.width), -1, np.int64)
+    carried, index = np.zeros((m.height, m.width)), np.full((m.height, m.width), -1, np.int32)
     T = invert(target.T_world_cam) @ source.T_world_cam
     k = source.intrinsics
-    _carry(depth_m, (k.cx, k.cy, k.fx, k.fy), T, (m.cx, m.cy, m.fx, m.fy), splat // 2, depth, index)
-    return Projected(depth, index)
+    _carry(depth, units_per_m, (k.cx, k.cy, k.fx, k.fy), T, (m.cx, m.cy, m.fx, m.fy), splat // 2, carried, index)
+    return Projected(carried, index)
 
 
 @compiled
 def _carry(
-    depth_m: Array,
+    depth: Depth,
+    units_per_m: float,
     k: tuple[float, float, float, float],
     T_target_source: Array,
     m: tuple[float, float, float, float],
     reach: int,
-    depth: Array,
-    index: NDArray[np.int64],
+    carried: Array,
+    index: NDArray[np.int32],
 ) -> None:
-    """Fill depth and index; k and m: cx, cy, fx, fy of source and target. Sums in the order of `carry_pixels`."""
-    height, width = depth.shape
+    """Fill carried and index; k and m: cx, cy, fx, fy of source and target. Sums in the order of `carry_pixels`."""
+    height, width = carried.shape
     T = T_target_source
-    for i in range(depth_m.shape[0]):
+    for i in range(depth.shape[0]):
         ray_y = (i + 0.5 - k[1]) / k[3]
-        for j in range(depth_m.shape[1]):
-            z = depth_m[i, j]
-            if not z > 0.0:
+        for j in range(depth.shape[1]):
+            if not depth[i, j] > 0:
                 continue
+            z = depth[i, j] / units_per_m
             x, y = (j + 0.5 - k[0]) / k[2] * z, ray_y * z
             Z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
             if not Z > 0.0:
@@ -77,34 +84,50 @@ def _carry(
             column, row = int(np.floor(u)), int(np.floor(v))
             for at_row in range(max(row - reach, 0), min(row + reach + 1, height)):
                 for at in range(max(column - reach, 0), min(column + reach + 1, width)):
-                    if index[at_row, at] < 0 or depth[at_row, at] > Z:
-                        depth[at_row, at] = Z
-                        index[at_row, at] = i * depth_m.shape[1] + j
+                    if index[at_row, at] < 0 or carried[at_row, at] > Z:
+                        carried[at_row, at] = Z
+                        index[at_row, at] = i * depth.shape[1] + j
 
 
 def sample_inverse_depth(
-    depth_m: Array, region: NDArray[np.uint8], u: Array, v: Array
+    depth: Depth, region: NDArray[np.uint8], u: Array, v: Array, units_per_m: float = 1.0
 ) -> tuple[Array, NDArray[np.uint8]]:
     """Depth at image coordinates (u, v), interpolated bilinearly in 1/z, and the region there.
 
     Only where the four pixels about the point lie in the image, have depth and share one region; elsewhere depth is 0
-    and region 0. On a plane 1/z is linear in the image, so this is exact there. Returns [N] float64 and [N] uint8.
+    and region 0. On a plane 1/z is linear in the image, so this is exact there. Returns [N] float64 metres and [N] uint8.
     """
-    height, width = depth_m.shape
-    if min(height, width) < 2:
-        return np.zeros(len(u)), np.zeros(len(u), np.uint8)  # no point has four pixels about it
-    x, y = u - 0.5, v - 0.5
-    column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    inside = (column >= 0) & (column < width - 1) & (row >= 0) & (row < height - 1)
-    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
-    fx, fy = x - column, y - row
-    corners = [(row, column), (row, column + 1), (row + 1, column), (row + 1, column + 1)]
-    depths = np.stack([depth_m[c] for c in corners])
-    regions = np.stack([region[c] for c in corners])
-    good = inside & (depths > 0.0).all(axis=0) & (regions == regions[0]).all(axis=0)
-    weights = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
-    inverse = (weights / np.where(depths > 0.0, depths, 1.0)).sum(axis=0)
-    return np.where(good, 1.0 / np.where(good, inverse, 1.0), 0.0), np.where(good, regions[0], 0).astype(np.uint8)
+    sampled, regions = np.zeros(len(u)), np.zeros(len(u), np.uint8)
+    _sample(depth, units_per_m, region, u, v, sampled, regions)
+    return sampled, regions
+
+
+@compiled
+def _sample(
+    depth: Depth,
+    units_per_m: float,
+    region: NDArray[np.uint8],
+    u: Array,
+    v: Array,
+    sampled: Array,
+    regions: NDArray[np.uint8],
+) -> None:
+    height, width = depth.shape
+    for n in range(len(u)):
+        x, y = u[n] - 0.5, v[n] - 0.5
+        if not (0.0 <= x < width - 1 and 0.0 <= y < height - 1):
+            continue
+        column, row = int(np.floor(x)), int(np.floor(y))
+        inverse, good = 0.0, True
+        for dy in range(2):
+            for dx in range(2):
+                z = depth[row + dy, column + dx] / units_per_m
+                good = good and z > 0.0 and region[row + dy, column + dx] == region[row, column]
+                share = abs(1 - dx - (x - column)) * abs(1 - dy - (y - row))
+                if z > 0.0:
+                    inverse += share / z
+        if good:
+            sampled[n], regions[n] = 1.0 / inverse, region[row, column]
 
 
 def in_frame(u: Array, v: Array, intrinsics: Intrinsics) -> NDArray[np.bool_]:

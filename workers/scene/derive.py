@@ -16,7 +16,7 @@ from workers.geometry.frames import invert
 from workers.geometry.normals import facing_cosine, is_smooth
 from workers.geometry.pixels import Extent, count_filled, take_colours
 from workers.geometry.project import Projected, carry_pixels, forward_project, in_frame, sample_inverse_depth
-from workers.scene.views import quantise_depth, stored_depth_m
+from workers.scene.views import quantise_depth
 
 FEWEST_POINTS = 50
 """With fewer co-visible pixels an agreement is not worth a figure."""
@@ -49,7 +49,7 @@ def derive_projected(
     return take_colours(source.rgb, projected.source), quantise_depth(projected.depth_m, images)
 
 
-def colours_of(source: View, pixels: NDArray[np.int64], lens: Distortion | None) -> NDArray[np.uint8]:
+def colours_of(source: View, pixels: NDArray[np.integer], lens: Distortion | None) -> NDArray[np.uint8]:
     """[N, 3] uint8: stored colours of depth pixels (flat indices).
 
     Behind a lens a depth pixel's colour is that of the RGB pixel that its centre is drawn in, black outside the picture.
@@ -67,15 +67,13 @@ def colours_of(source: View, pixels: NDArray[np.int64], lens: Distortion | None)
 
 def carry_depth(source: View, target: Camera, images: Images) -> Projected:
     """The stored input cloud in another camera, with the job's splat and hidden-point removal."""
-    depth_m = stored_depth_m(source.depth, images)
+    depth, units = source.depth, images.depth_units_per_m
     if images.projection.hidden_point_removal and source.region is not None:
         # A point whose surface faces away from the new camera is the back of something nearer to it.
-        everywhere = np.arange(depth_m.size)
-        facing = facing_cosine(depth_m, source.region, everywhere, source.camera, target.position).reshape(
-            depth_m.shape
-        )
-        depth_m = np.where(np.nan_to_num(facing, nan=-1.0) > 0.0, depth_m, 0.0)
-    return forward_project(depth_m, source.camera, target, images.projection.splat)
+        everywhere = np.arange(depth.size)
+        facing = facing_cosine(depth, source.region, everywhere, source.camera, target.position, units)
+        depth = np.where(np.nan_to_num(facing, nan=-1.0).reshape(depth.shape) > 0.0, depth, np.uint16(0))
+    return forward_project(depth, source.camera, target, images.projection.splat, units)
 
 
 def projection_shares(projected: NDArray[np.uint16], mirror: NDArray[np.uint16], images: Images) -> tuple[float, float]:
@@ -124,20 +122,19 @@ def agree_across(source: View, mirror: View, images: Images, bound_mm: float, fi
     Every pixel of an object is compared, and of the rest one in `SCENE_STRIDE` squared.
     """
     assert source.region is not None and mirror.region is not None
-    depth_m = stored_depth_m(source.depth, images)
+    units = images.depth_units_per_m
     pixels = _sample_pixels(source.region, first_object)
-    facing = facing_cosine(depth_m, source.region, pixels, source.camera, mirror.camera.position)
-    both_sides = (np.nan_to_num(facing, nan=-1.0) > FACING) & is_smooth(depth_m, source.region, pixels, SMOOTH_INPUT_M)
-    index = pixels[both_sides]
-    points = carry_pixels(depth_m, index, source.camera, mirror.camera)
+    facing = facing_cosine(source.depth, source.region, pixels, source.camera, mirror.camera.position, units)
+    smooth = is_smooth(source.depth, source.region, pixels, SMOOTH_INPUT_M, units)
+    index = pixels[(np.nan_to_num(facing, nan=-1.0) > FACING) & smooth]
+    points = carry_pixels(source.depth, index, source.camera, mirror.camera, units)
     keep = points[:, 2] > 0.0
     points, index = points[keep], index[keep]
     u, v = project(points, mirror.camera.intrinsics)
     inside = in_frame(u, v, mirror.camera.intrinsics)
     points, index, u, v = points[inside], index[inside], u[inside], v[inside]
-    mirror_m = stored_depth_m(mirror.depth, images)
-    seen, region = sample_inverse_depth(mirror_m, mirror.region, u, v)
-    seen = np.where(_smooth_around(mirror_m, mirror.region, u, v), seen, 0.0)
+    seen, region = sample_inverse_depth(mirror.depth, mirror.region, u, v, units)
+    seen = np.where(_smooth_around(mirror.depth, mirror.region, u, v, units), seen, 0.0)
     own = source.region.ravel()[index]
     both = (seen > 0.0) & (region == own) & (points[:, 2] < seen + HIDDEN_M)
     difference_mm = np.abs(points[both, 2] - seen[both]) * 1e3
@@ -163,12 +160,14 @@ def _sample_pixels(region: NDArray[np.uint8], first_object: int) -> NDArray[np.i
     return np.flatnonzero(chosen)
 
 
-def _smooth_around(depth_m: Array, region: NDArray[np.uint8], u: Array, v: Array) -> NDArray[np.bool_]:
+def _smooth_around(
+    depth: NDArray[np.uint16], region: NDArray[np.uint8], u: Array, v: Array, units_per_m: float
+) -> NDArray[np.bool_]:
     """[N] bool: whether the four pixels about each image coordinate see one smooth surface."""
-    height, width = depth_m.shape
+    height, width = depth.shape
     column = np.clip(np.floor(u - 0.5).astype(np.int64), 0, width - 2)
     row = np.clip(np.floor(v - 0.5).astype(np.int64), 0, height - 2)
     smooth = np.ones(len(u), bool)
     for step in (0, 1, width, width + 1):
-        smooth &= is_smooth(depth_m, region, row * width + column + step, SMOOTH_MIRROR_M)
+        smooth &= is_smooth(depth, region, row * width + column + step, SMOOTH_MIRROR_M, units_per_m)
     return smooth

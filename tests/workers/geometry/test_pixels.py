@@ -10,10 +10,13 @@ from workers.geometry.loops import compiled
 from workers.geometry.pixels import Extent, count_filled, measure_regions, round_depth, take_colours
 
 
-def test_every_region_is_counted_and_boxed():
+@pytest.mark.parametrize("width", [70, 72])
+def test_every_region_is_counted_and_boxed(width):
+    """Also where eight pixels make a word."""
     rng = np.random.default_rng(1)
-    region = rng.integers(0, 6, (50, 70)).astype(np.uint8)
+    region = rng.integers(0, 6, (50, width)).astype(np.uint8)
     region[:, 40:] = 2
+    region[20, 40:] = 3
     region[4:9, 3:30] = 255
     extents = measure_regions(region)
     assert len(extents) == 256
