@@ -3,7 +3,7 @@
 python -m services.sheet OUT FILE.jpg [SCENES [CATEGORY]]
 """
 
-import sys
+import argparse
 from collections.abc import Callable
 from pathlib import Path
 
@@ -126,7 +126,17 @@ def _paint_regions(region: NDArray) -> Picture:
     return painted
 
 
+def main() -> None:
+    """Draw what the command line asks for."""
+    parser = argparse.ArgumentParser(prog="python -m services.sheet", description=__doc__.splitlines()[0])
+    parser.add_argument("out", metavar="OUT", help="a dataset's folder")
+    parser.add_argument("file", metavar="FILE.jpg", type=Path, help="the picture to write")
+    parser.add_argument("scenes", metavar="SCENES", type=int, nargs="?", default=1, help="scenes of each category")
+    parser.add_argument("category", metavar="CATEGORY", nargs="?", help="only this one")
+    options = parser.parse_args()
+    sheet = draw_sheet(open_store(options.out), options.scenes, options.category)
+    Image.fromarray(sheet).save(options.file, quality=88)
+
+
 if __name__ == "__main__":
-    scenes = int(sys.argv[3]) if len(sys.argv) > 3 else 1
-    sheet = draw_sheet(open_store(sys.argv[1]), scenes, sys.argv[4] if len(sys.argv) > 4 else None)
-    Image.fromarray(sheet).save(Path(sys.argv[2]), quality=88)
+    main()

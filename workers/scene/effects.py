@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from schemas.job import Job
+from schemas.job import Job, Tier
 from schemas.scene import ScenePlan, Settled
 from schemas.sensor import SensorEffects
 
@@ -60,8 +60,9 @@ def _sensor(name: str) -> Callable[[Facts], str | None]:
     return lambda facts: f"sensor.{name} is off" if getattr(facts.job.sensor, name) is None else None
 
 
-def _raster(facts: Facts) -> str | None:
-    return "render.tier is flat" if facts.job.render.tier == "flat" else None
+def _tier(*tiers: Tier) -> Callable[[Facts], str | None]:
+    """An effect of colour that belongs to these tiers."""
+    return lambda facts: None if facts.job.render.tier in tiers else f"render.tier is {facts.job.render.tier}"
 
 
 EFFECTS: tuple[Effect, ...] = (
@@ -74,9 +75,11 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("hidden_point_removal", _hidden_points),
     Effect("raycast_check", _raycast),
     Effect("release_again", _raycast),
-    Effect("shadows", _raster),
-    Effect("ambient_occlusion", _raster),
-    Effect("antialiasing", _raster),
+    Effect("shadows", _tier("raster", "pathtraced")),
+    Effect("ambient_occlusion", _tier("raster")),
+    Effect("antialiasing", _tier("raster", "pathtraced")),
+    Effect("global_illumination", _tier("pathtraced")),
+    Effect("glass", _tier("pathtraced")),
     *(Effect(f"sensor_{name}", _sensor(name)) for name in SensorEffects.model_fields),
 )
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from schemas.job import Job
+from schemas.job import Job, Render
 from schemas.scene import Settled
 from tests.shapes import asset_of, box, table
 from workers.scene.appearance import draw_look
@@ -95,12 +95,20 @@ def test_floors_differ_in_colour_scale_and_angle():
     assert all(0.1 < c <= 1.0 for one in drawn for c in one.color)
 
 
-@pytest.mark.parametrize("tier", ["flat", "raster"])
-def test_the_receipt_says_which_effects_of_light_ran(tier):
+@pytest.mark.parametrize(
+    ("tier", "expected"),
+    [
+        ("flat", set()),
+        ("raster", {"shadows", "ambient_occlusion", "antialiasing"}),
+        ("pathtraced", {"shadows", "antialiasing", "global_illumination", "glass"}),
+    ],
+)
+def test_the_receipt_says_which_effects_of_light_ran(tier, expected):
     rest = Settled(np.eye(4), 0.0, 0.0, 1.0, 0.0, 0.1, "flat_top")
-    ran, skipped = write_receipt(Facts(JOBS[tier], plan_scene(JOBS[tier], 0, TABLE, BOX), (rest,), False))
-    names = {"shadows", "ambient_occlusion", "antialiasing"}
-    assert (names <= set(ran)) == (tier == "raster")
-    reasons = {one["effect"]: one["why"] for one in skipped}
-    assert (names <= set(reasons)) == (tier == "flat")
-    assert all(reasons[name] == "render.tier is flat" for name in names & set(reasons))
+    job = JOBS["raster"].model_copy(update={"render": Render(tier=tier)})
+    ran, skipped = write_receipt(Facts(job, plan_scene(JOBS["raster"], 0, TABLE, BOX), (rest,), False))
+    names = {"shadows", "ambient_occlusion", "antialiasing", "global_illumination", "glass"}
+    assert names & set(ran) == expected
+    assert {one["effect"]: one["why"] for one in skipped if one["effect"] in names} == dict.fromkeys(
+        names - expected, f"render.tier is {tier}"
+    )
