@@ -9,8 +9,8 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 OWN_PAGES_BYTES = 32 * 2**20
 """Larger blocks still come from the kernel and go back to it: an image of 4096 x 4096 in float64 does."""
 
-KEPT_BYTES = 128 * 2**20
-"""At most this much that is free at the end of the heap stays: about twice what a scene of 640 x 480 images needs."""
+KEPT_BYTES = 64 * 2**20
+"""At most this much that is free at the end of the heap stays: about what a scene of 640 x 480 images needs."""
 
 
 def keep_freed_memory() -> None:

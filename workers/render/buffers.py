@@ -75,7 +75,7 @@ class ShapeStore:
     A stored shape is held, so that no other object can take its id.
     """
 
-    def __init__(self, gl: ModuleType, max_shapes: int = 64, max_bytes: int = 64 * 2**20) -> None:
+    def __init__(self, gl: ModuleType, max_shapes: int = 16, max_bytes: int = 64 * 2**20) -> None:
         self._gl = gl
         self.textures = TextureStore(gl)
         self._max_shapes, self._max_bytes = max_shapes, max_bytes

@@ -39,7 +39,8 @@ def sort_draws(
         shape, ground = fetch(thing.shape), thing.region_id == REGION_FLOOR
         split = top_is_level is not None and top_is_level(thing)
         for batch in shape.batches:
-            looks = (batch.texture is not None, batch.few_triangles, batch.matte, lights, raster)
+            # Only a floor is large enough for what a program without highlights saves; each program takes megabytes.
+            looks = (batch.texture is not None, batch.few_triangles, batch.matte and ground, lights, raster)
             for first, count, level in _ranges(batch, split, raster and ground):
                 variant = Variant(*looks, ground, level, labels, batch.holes and not labels)
                 by_variant.setdefault(variant, []).append(Draw(thing, shape, batch, first, count))

@@ -111,10 +111,14 @@ class Program:
 
 
 def light_slots(appearance: Appearance) -> int:
-    """How many lights the program must have: at least one. Raises ValueError above `MAX_LIGHTS`."""
-    if len(appearance.lights) > MAX_LIGHTS:
-        raise ValueError(f"{len(appearance.lights)} lights: the renderer takes at most {MAX_LIGHTS}")
-    return max(1, len(appearance.lights))
+    """How many lights the program must have: one, three or `MAX_LIGHTS`, unused ones dark.
+
+    Each number of lights has programs of its own, which take some megabytes each. Raises ValueError above `MAX_LIGHTS`.
+    """
+    for slots in (1, 3, MAX_LIGHTS):
+        if len(appearance.lights) <= slots:
+            return slots
+    raise ValueError(f"{len(appearance.lights)} lights: the renderer takes at most {MAX_LIGHTS}")
 
 
 def clip_from_cam(k: Intrinsics) -> Pose:

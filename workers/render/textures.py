@@ -34,7 +34,7 @@ class Texture:
 class TextureStore:
     """Textures in use, and beside them the last that were, while they all fit into `max_bytes`."""
 
-    def __init__(self, gl: ModuleType, max_bytes: int = 48 * 2**20) -> None:
+    def __init__(self, gl: ModuleType, max_bytes: int = 32 * 2**20) -> None:
         self._gl, self._max_bytes = gl, max_bytes
         self._stored: OrderedDict[int, Texture] = OrderedDict()
         self.bytes = 0
