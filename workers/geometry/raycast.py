@@ -30,6 +30,10 @@ GRAZING = 1e-6
 """Cosine of incidence below which a plane no longer says where the ray meets the triangle; Embree's distance then does."""
 
 
+RAYS_AT_ONCE = 65_536
+"""Of a view: some ten megabytes of what is in between, where a whole image of 640 x 480 took a hundred."""
+
+
 @dataclass(frozen=True, eq=False)
 class Hits:
     """Where rays first meet a surface.
@@ -58,7 +62,10 @@ def cast_view(things: Sequence[Placed], camera: Camera) -> tuple[Array, NDArray[
     for thing in _ascending(things):
         mesh = _in_camera(thing, camera)
         pixels = _pixels_in_reach(mesh.vertices, camera)
-        _keep_nearer(best, pixels, *_cast(mesh, NEAR_M * rays[pixels], rays[pixels]), thing.region_id, offset=NEAR_M)
+        caster = _Caster(mesh)
+        for first in range(0, len(pixels), RAYS_AT_ONCE):
+            some = pixels[first : first + RAYS_AT_ONCE]
+            _keep_nearer(best, some, *caster.cast(NEAR_M * rays[some], rays[some]), thing.region_id, offset=NEAR_M)
     depth = np.where(np.isinf(best.distance), 0.0, best.distance)
     shape = (intrinsics.height, intrinsics.width)
     return depth.reshape(shape), best.region.reshape(shape), best.incidence_cos.reshape(shape)
@@ -73,7 +80,7 @@ def first_hit(things: Sequence[Placed], origins: Array, directions: Array) -> Hi
     everything = np.arange(len(origins))
     for thing in _ascending(things):
         mesh = _Mesh(transform(thing.T_world_shape, thing.shape.vertices), thing.shape.faces)
-        _keep_nearer(best, everything, *_cast(mesh, origins, directions), thing.region_id)
+        _keep_nearer(best, everything, *_Caster(mesh).cast(origins, directions), thing.region_id)
     return best
 
 
@@ -131,25 +138,33 @@ def _pixels_in_reach(vertices: Array, camera: Camera) -> NDArray[np.int64]:
     return (np.arange(top, bottom)[:, None] * k.width + np.arange(left, right)).ravel()
 
 
-def _cast(mesh: _Mesh, origins: Array, directions: Array) -> tuple[Array, Array]:
-    """(distance, incidence_cos), each [N] float64: distance inf and cosine 0 where the ray meets nothing."""
-    distance, cosine = np.full(len(origins), np.inf), np.zeros(len(origins))
-    if not len(origins) or not len(mesh.faces):
-        return distance, cosine  # Embree does not take empty scenes
-    scene = EmbreeScene(robust=True)
-    geometry = TriangleMesh(scene, mesh.vertices.astype(np.float32), np.ascontiguousarray(mesh.faces, dtype=np.int32))
-    found = scene.run(origins.astype(np.float32), directions.astype(np.float32), output=1)
-    del geometry
-    hit = np.flatnonzero(found["primID"] >= 0)
-    normals, offsets = _planes(mesh)
-    face, o, d = found["primID"][hit], origins[hit], directions[hit]
-    n = normals[face]
-    towards = np.einsum("ij,ij->i", n, d)
-    cosine[hit] = np.abs(towards) / np.sqrt(np.einsum("ij,ij->i", d, d))
-    steep = cosine[hit] > GRAZING
-    exact = (offsets[face] - np.einsum("ij,ij->i", n, o)) / np.where(steep, towards, 1.0)
-    distance[hit] = np.where(steep, exact, found["tfar"][hit].astype(np.float64))
-    return distance, cosine
+class _Caster:
+    """A mesh in Embree's tree."""
+
+    def __init__(self, mesh: _Mesh) -> None:
+        self._empty = not len(mesh.faces)  # Embree does not take empty scenes
+        if self._empty:
+            return
+        self._scene = EmbreeScene(robust=True)
+        faces = np.ascontiguousarray(mesh.faces, dtype=np.int32)
+        self._geometry = TriangleMesh(self._scene, mesh.vertices.astype(np.float32), faces)
+        self._normals, self._offsets = _planes(mesh)
+
+    def cast(self, origins: Array, directions: Array) -> tuple[Array, Array]:
+        """(distance, incidence_cos), each [N] float64: distance inf and cosine 0 where the ray meets nothing."""
+        distance, cosine = np.full(len(origins), np.inf), np.zeros(len(origins))
+        if self._empty or not len(origins):
+            return distance, cosine
+        found = self._scene.run(origins.astype(np.float32), directions.astype(np.float32), output=1)
+        hit = np.flatnonzero(found["primID"] >= 0)
+        face, o, d = found["primID"][hit], origins[hit], directions[hit]
+        n = self._normals[face]
+        towards = np.einsum("ij,ij->i", n, d)
+        cosine[hit] = np.abs(towards) / np.sqrt(np.einsum("ij,ij->i", d, d))
+        steep = cosine[hit] > GRAZING
+        exact = (self._offsets[face] - np.einsum("ij,ij->i", n, o)) / np.where(steep, towards, 1.0)
+        distance[hit] = np.where(steep, exact, found["tfar"][hit].astype(np.float64))
+        return distance, cosine
 
 
 def _planes(mesh: _Mesh) -> tuple[Array, Array]:
