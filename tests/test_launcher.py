@@ -168,6 +168,23 @@ def test_the_extra_is_installed_once_and_starts_no_command(checkout):
     assert checkout.calls() == [locked("requirements-pathtraced.lock", checkout.root)]
 
 
+def test_the_extra_brings_the_library_that_its_package_lacks(checkout):
+    checkout.run("--version")
+    checkout.calls()
+    checkout.fault("no-libatomic1")
+    code, _, err = checkout.run("extra", "pathtraced")
+    assert code == 0 and "installing Debian packages: libatomic1" in err
+    assert checkout.calls()[0] == "apt-get -y --no-install-recommends libatomic1"
+
+
+def test_the_extra_says_what_an_administrator_has_to_install(checkout):
+    checkout.run("--version")
+    for name in ("no-libatomic1", "not-root"):
+        checkout.fault(name)
+    code, _, err = checkout.run("extra", "pathtraced")
+    assert code == 0 and "apt-get install libatomic1" in err
+
+
 @pytest.mark.parametrize("words", [("extra",), ("extra", "gpu"), ("extra", "pathtraced", "please")])
 def test_an_extra_that_there_is_not_is_refused_before_anything_is_made(checkout, words):
     code, out, err = checkout.run(*words)

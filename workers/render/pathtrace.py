@@ -13,6 +13,7 @@ samples, noise on floor and table is a tenth of what independent ones leave, for
 holes straight on, so that both throw tinted shadows.
 """
 
+import ctypes
 import importlib
 import importlib.util
 import math
@@ -45,13 +46,23 @@ ROULETTE_DEPTH = 5
 SPECK = 1.4
 """Cycles bounds what a sample may add, which Mitsuba cannot; texture at the size of a pixel stays below this."""
 
+SYSTEM_LIBRARY = "libatomic.so.1"
+"""Of the compiler's run time; Mitsuba's wheel does not bring it, and small images of Debian lack it."""
+
 REMEDY = "`./verso extra pathtraced` installs it (mitsuba==3.9.1), or set render.tier to raster or flat"
 
 
 def require_mitsuba() -> None:
-    """Raises InputError, with the remedy, where Mitsuba is not installed. Imports nothing."""
+    """Raises InputError, with the remedy, where Mitsuba or the system's library that it loads is not there."""
     if importlib.util.find_spec("mitsuba") is None:
         raise InputError(f"render.tier is pathtraced, and Mitsuba is not installed: {REMEDY}")
+    try:
+        ctypes.CDLL(SYSTEM_LIBRARY)
+    except OSError as error:
+        remedy = "on Debian or Ubuntu: apt-get install -y libatomic1"
+        raise InputError(
+            f"render.tier is pathtraced, and Mitsuba needs {SYSTEM_LIBRARY} ({error}): {remedy}"
+        ) from error
 
 
 def load_mitsuba() -> ModuleType:
