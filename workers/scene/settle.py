@@ -95,7 +95,8 @@ def recheck(start: ObjectStart, settled: Settled, table: Table, physics: Physics
 
 def _require_rest(start: ObjectStart, table: Table, ground: Terrain, motion: _Motion) -> None:
     com = transform(motion.T_world_obj, start.asset.mass.com[None, :])[0]
-    if not heights_at(com[None, :2], ground)[0] >= table.top.height_m - LEFT_M:  # nan too
+    over_top = heights_at(com[None, :2], ground)[0] >= table.top.height_m - LEFT_M  # nan compares false
+    if not over_top and not (motion.rested and _bridges(start, table, ground, motion)):
         raise SettleError(
             "left_table",
             f"after {motion.seconds:.2f} s the centre of mass was at ({com[0]:.3f}, {com[1]:.3f}, {com[2]:.3f}) m, off the "
@@ -107,6 +108,16 @@ def _require_rest(start: ObjectStart, table: Table, ground: Terrain, motion: _Mo
             f"still moving at {motion.speed_m_s * 1e3:.2f} mm/s after {motion.seconds:.1f} s: raise physics.max_settle_s "
             "or physics.rolling_friction",
         )
+
+
+def _bridges(start: ObjectStart, table: Table, ground: Terrain, motion: _Motion) -> bool:
+    """Whether it rests on the top on all sides of a hole that its centre of mass is over."""
+    if not np.isfinite(_gap_m(start, motion.T_world_obj, ground)):
+        return False
+    T = _close_gap(start, ground, motion).T_world_obj
+    com = transform(T, start.asset.mass.com[None, :])[0]
+    high = com[2] >= table.top.height_m - LEFT_M
+    return bool(high and support_margin(touching(start.hull, T, ground), com[:2]) > 0.0)
 
 
 def _close_gap(start: ObjectStart, ground: Terrain, motion: _Motion) -> _Motion:
