@@ -60,7 +60,7 @@ def at(T: Pose, intrinsics: Intrinsics = VGA) -> Camera:
     return Camera(intrinsics, frozen_array(T))
 
 
-def looking(position: Array, target: Array = MIDDLE) -> Pose:
+def looking(position: Array | list[float], target: Array = MIDDLE) -> Pose:
     return look_at(np.asarray(position, np.float64), target)
 
 

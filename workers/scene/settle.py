@@ -15,7 +15,7 @@ from schemas.shape import MassProperties, Mesh
 from workers.geometry.frames import invert, pose, rotation_from_quaternion, transform, translation
 from workers.geometry.heights import Terrain, heights_at, survey, vertical_gap
 from workers.scene.bullet import Body, World, drop
-from workers.scene.contact import is_stable, snap_to_face, support_margin, touching
+from workers.scene.contact import snap_to_face, support_margin, tip_onto_face, touching
 from workers.scene.watch import Motion, Watch, can_touch, stands_on_face, watch_edge, watch_tilt
 
 SAMPLE_STEPS = 8
@@ -65,7 +65,8 @@ def _settle_flat(start: ObjectStart, table: Table, ground: Terrain, physics: Phy
     """Rest on the flat top alone; None where the footprint left it, so that the table's edges may have mattered.
 
     Rolling friction can hold an object within that lever arm of an edge of its hull, where in truth it would tip on.
-    Such a pose has no face below the centre of mass, and is let go once more without rolling friction.
+    Such a pose has no face below the centre of mass. It is tipped on by geometry, because thin rods that are let go on
+    an edge gain speed in Bullet; where the next face is far, it is let go once more without rolling friction.
     """
     seconds = 0.0
     for friction in (physics.rolling_friction, 0.0):
@@ -77,8 +78,9 @@ def _settle_flat(start: ObjectStart, table: Table, ground: Terrain, physics: Phy
         seconds += motion.seconds
         T = snap_to_face(motion.T_world_obj, start.hull, start.asset.mass.com, physics.snap_rad)
         snapped = T is not motion.T_world_obj  # onto a face with the centre of mass above it
-        motion = _Motion(T, motion.speed_m_s, seconds, True, True)
-        if snapped or is_stable(T, start.hull, start.asset.mass.com):
+        tipped = T if snapped else tip_onto_face(T, start.hull, start.asset.mass.com)
+        motion = _Motion(T if tipped is None else tipped, motion.speed_m_s, seconds, True, True)
+        if tipped is not None:
             break
         start = dataclasses.replace(start, T_world_obj=T)
     return _close_gap(start, ground, motion)
