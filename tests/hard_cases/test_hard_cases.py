@@ -60,10 +60,12 @@ def judge(case: Case, made: Drop | None, end: Settled | SceneError) -> tuple[str
             "" if figure <= case.measure.bound else f"{figure:.4g} where {case.measure.bound:g} is the bound"
         )
         return case.measure.what, figure, case.measure.bound, wrong
-    if end.reason == "left_table" and case.outcome in (FALL, EITHER):
+    if end.reason == "left_table":
         assert made is not None
         height = fallen_mm(made, end)
-        return "height at the end, mm", height, FALLEN_MM, "" if height <= FALLEN_MM else f"only at {height:.0f} mm"
+        wrong = "" if case.outcome in (FALL, EITHER) else str(end)
+        wrong = wrong or ("" if height <= FALLEN_MM else f"only at {height:.0f} mm")
+        return "height at the end, mm", height, None if case.outcome == SETTLE else FALLEN_MM, wrong
     return "reason", None, None, "" if case.outcome == f"must refuse: {end.reason}" else str(end)
 
 
