@@ -5,7 +5,7 @@ from scipy.spatial import ConvexHull
 
 from schemas.base import Array, Pose
 from schemas.shape import Hull, Mesh
-from workers.geometry.frames import pose, rotation_between, transform
+from workers.geometry.frames import pose, rotation_about, rotation_between, transform
 from workers.geometry.heights import Terrain, heights_at
 from workers.scene.support import inside_margin
 
@@ -17,6 +17,12 @@ CONTACT_M = 5e-5
 
 NEAR_LOWEST_M = 0.02
 """Only vertices this near the lowest one can touch a support that is level to within a few degrees."""
+
+FARTHEST_TIP_RAD = 0.2
+"""As `watch.TIPPED_RAD`: so far a thing may tip by geometry alone, without a simulation."""
+
+MOST_TIPS = 16
+"""Corner, edge, face, and at the end of a rod once more: beyond that the shape is round."""
 
 DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -41,9 +47,51 @@ def snap_to_face(T_world_obj: Pose, hull: Hull, com: Array, snap_rad: float) -> 
     return T_world_obj
 
 
-def is_stable(T_world_obj: Pose, hull: Hull, com: Array) -> bool:
-    """Whether the centre of mass stands over the hull's lowest face (on a level plane, at any height)."""
-    return _stands(transform(T_world_obj, hull.vertices), transform(T_world_obj, com[None, :])[0])
+def tip_onto_face(T_world_obj: Pose, hull: Hull, com: Array) -> Pose | None:
+    """Turn the object over its lowest edges and corners, as it would tip on a level plane, until it stands on a face.
+
+    For what friction holds between two faces, as no face can: it is turned about the nearest point of its contacts,
+    away from them, until the next vertex touches; its centre of mass only sinks. None where that is further than
+    `FARTHEST_TIP_RAD` in all, because there it falls and does not tip. The height is left to the caller.
+    """
+    T, turned = T_world_obj, 0.0
+    for _ in range(MOST_TIPS):
+        points, centre = transform(T, hull.vertices), transform(T, com[None, :])[0]
+        low = points[points[:, 2] <= points[:, 2].min() + SAME_PLANE_M]
+        if support_margin(low[:, :2], centre[:2]) > 0.0:
+            return T
+        pivot = _nearest_of_hull(low, centre)
+        away = centre[:2] - pivot[:2]
+        if float(np.linalg.norm(away)) < SAME_PLANE_M:  # on a ridge, in balance: it may go either way
+            away = _across(low)
+        away = away / np.linalg.norm(away)
+        ahead, height = (points[:, :2] - pivot[:2]) @ away, points[:, 2] - pivot[2]
+        angle = np.arctan2(height, ahead)[(ahead > SAME_PLANE_M) & (height > SAME_PLANE_M)]
+        turned += float(angle.min(initial=np.pi))
+        if turned > FARTHEST_TIP_RAD:
+            return None
+        R = rotation_about(np.array([-away[1], away[0], 0.0]), float(angle.min()))
+        T = pose(R @ T[:3, :3], R @ (T[:3, 3] - pivot) + pivot)
+    return None
+
+
+def _nearest_of_hull(low: Array, centre: Array) -> Array:
+    """[3]: the point nearest below `centre` of the segment or polygon that the points [N, 3] of one level span."""
+    best = low[np.argmin(np.linalg.norm(low[:, :2] - centre[:2], axis=1))]
+    for k, a in enumerate(low):
+        along = low[k + 1 :] - a
+        length2 = np.maximum((along[:, :2] ** 2).sum(axis=1), 1e-300)
+        share = np.clip(((centre - a)[:2] * along[:, :2]).sum(axis=1) / length2, 0.0, 1.0)
+        for foot in a + share[:, None] * along:
+            if np.linalg.norm(foot[:2] - centre[:2]) < np.linalg.norm(best[:2] - centre[:2]):
+                best = foot
+    return best
+
+
+def _across(low: Array) -> Array:
+    """[2]: level, at right angles to the longest line between points [N, 3]; along x where there is one point."""
+    far = low[np.argmax(np.linalg.norm(low - low[0], axis=1))] - low[0]
+    return np.array([-far[1], far[0]]) if len(low) > 1 else np.array([1.0, 0.0])
 
 
 def _stands(points: Array, com: Array) -> bool:

@@ -15,7 +15,7 @@ from schemas.shape import MassProperties, Mesh
 from workers.geometry.frames import invert, pose, rotation_from_quaternion, transform, translation
 from workers.geometry.heights import Terrain, heights_at, survey, vertical_gap
 from workers.scene.bullet import Body, World, drop
-from workers.scene.contact import is_stable, snap_to_face, support_margin, touching
+from workers.scene.contact import snap_to_face, support_margin, tip_onto_face, touching
 from workers.scene.watch import Motion, Watch, can_touch, stands_on_face, watch_edge, watch_tilt
 
 SAMPLE_STEPS = 8
@@ -65,7 +65,8 @@ def _settle_flat(start: ObjectStart, table: Table, ground: Terrain, physics: Phy
     """Rest on the flat top alone; None where the footprint left it, so that the table's edges may have mattered.
 
     Rolling friction can hold an object within that lever arm of an edge of its hull, where in truth it would tip on.
-    Such a pose has no face below the centre of mass, and is let go once more without rolling friction.
+    Such a pose has no face below the centre of mass. It is tipped on by geometry, because thin rods that are let go on
+    an edge gain speed in Bullet; where the next face is far, it is let go once more without rolling friction.
     """
     seconds = 0.0
     for friction in (physics.rolling_friction, 0.0):
@@ -77,8 +78,9 @@ def _settle_flat(start: ObjectStart, table: Table, ground: Terrain, physics: Phy
         seconds += motion.seconds
         T = snap_to_face(motion.T_world_obj, start.hull, start.asset.mass.com, physics.snap_rad)
         snapped = T is not motion.T_world_obj  # onto a face with the centre of mass above it
-        motion = _Motion(T, motion.speed_m_s, seconds, True, True)
-        if snapped or is_stable(T, start.hull, start.asset.mass.com):
+        tipped = T if snapped else tip_onto_face(T, start.hull, start.asset.mass.com)
+        motion = _Motion(T if tipped is None else tipped, motion.speed_m_s, seconds, True, True)
+        if tipped is not None:
             break
         start = dataclasses.replace(start, T_world_obj=T)
     return _close_gap(start, ground, motion)
@@ -95,7 +97,8 @@ def recheck(start: ObjectStart, settled: Settled, table: Table, physics: Physics
 
 def _require_rest(start: ObjectStart, table: Table, ground: Terrain, motion: _Motion) -> None:
     com = transform(motion.T_world_obj, start.asset.mass.com[None, :])[0]
-    if not heights_at(com[None, :2], ground)[0] >= table.top.height_m - LEFT_M:  # nan too
+    over_top = heights_at(com[None, :2], ground)[0] >= table.top.height_m - LEFT_M  # nan compares false
+    if not over_top and not (motion.rested and _bridges(start, table, ground, motion)):
         raise SettleError(
             "left_table",
             f"after {motion.seconds:.2f} s the centre of mass was at ({com[0]:.3f}, {com[1]:.3f}, {com[2]:.3f}) m, off the "
@@ -107,6 +110,16 @@ def _require_rest(start: ObjectStart, table: Table, ground: Terrain, motion: _Mo
             f"still moving at {motion.speed_m_s * 1e3:.2f} mm/s after {motion.seconds:.1f} s: raise physics.max_settle_s "
             "or physics.rolling_friction",
         )
+
+
+def _bridges(start: ObjectStart, table: Table, ground: Terrain, motion: _Motion) -> bool:
+    """Whether it rests on the top on all sides of a hole that its centre of mass is over."""
+    if not np.isfinite(_gap_m(start, motion.T_world_obj, ground)):
+        return False
+    T = _close_gap(start, ground, motion).T_world_obj
+    com = transform(T, start.asset.mass.com[None, :])[0]
+    high = com[2] >= table.top.height_m - LEFT_M
+    return bool(high and support_margin(touching(start.hull, T, ground), com[:2]) > 0.0)
 
 
 def _close_gap(start: ObjectStart, ground: Terrain, motion: _Motion) -> _Motion:

@@ -50,7 +50,9 @@ def _describe(points: Array, area_m2: float, highest_m: float) -> TableTop:
         hull = ConvexHull(points[:, :2])
     except QhullError as error:
         raise StartError("no_table_top", "the table's level faces have no area: leave this table out") from error
-    convex = area_m2 >= CONVEX_SHARE * hull.volume and highest_m <= height + SAME_LEVEL_M
+    # A face that leans within `LEVEL` is no level: nothing may be dropped on a level plane at its highest point.
+    even = height - float(points[:, 2].min()) <= SAME_LEVEL_M
+    convex = even and area_m2 >= CONVEX_SHARE * hull.volume and highest_m <= height + SAME_LEVEL_M
     middle = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
     return TableTop(height, frozen_array(middle), frozen_array(points[hull.vertices, :2]), bool(convex))
 

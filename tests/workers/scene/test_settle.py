@@ -11,7 +11,7 @@ from schemas.errors import SettleError
 from schemas.job import Job
 from schemas.scene import ObjectStart
 from schemas.shape import Mesh
-from tests.shapes import asset_of, box, table
+from tests.shapes import asset_of, box, shape_of, table
 from workers.geometry.frames import angle_between, pose, rotation_about, transform, translation
 from workers.geometry.heights import vertical_gap
 from workers.geometry.hull import convex_hull
@@ -94,6 +94,24 @@ def test_an_object_over_the_edge_is_dropped_on_the_real_mesh_and_falls_where_it_
     with pytest.raises(SettleError) as caught:
         settle(start_of(asset, translation(0.7 + 0.01, 0.0, TOP + 0.055)), TABLE, PHYSICS)
     assert caught.value.reason == "left_table"
+
+
+@pytest.mark.parametrize(("side", "stays"), [(0.1, True), (0.065, True), (0.055, False)])
+def test_an_object_over_a_hole_rests_on_its_rim_if_it_is_larger(side, stays):
+    sides = [box(0.67, 1.4, 0.03, (x, 0, 0.7)) for x in (-0.365, 0.365)] + [
+        box(0.06, 0.67, 0.03, (0, y, 0.7)) for y in (-0.365, 0.365)
+    ]
+    holed = place_table(dataclasses.replace(table(), shape=shape_of(*sides)))
+    top = holed.top.height_m
+    start = start_of(asset_of(box(side, side, 0.05)), translation(0.0, 0.0, top + 0.03))
+    if stays:
+        rest = settle(start, holed, PHYSICS)
+        assert rest.T_world_obj[:3, 3] == pytest.approx([0.0, 0.0, top + 0.025], abs=1e-5)
+        assert rest.support_margin_mm > 1e3 * (side - 0.001) / 2
+    else:
+        with pytest.raises(SettleError) as caught:
+            settle(start, holed, PHYSICS)
+        assert caught.value.reason == "left_table"
 
 
 def test_an_object_that_does_not_rest_in_time_says_how_fast_it_still_is():

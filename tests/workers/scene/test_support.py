@@ -32,6 +32,13 @@ def test_a_table_that_is_wound_inside_out_has_the_same_top():
     assert find_table_top(shape_of(inside_out)).height_m == pytest.approx(0.05)
 
 
+@pytest.mark.parametrize(("degrees", "level"), [(0.0, True), (0.003, True), (1.0, False), (2.5, False)])
+def test_a_face_that_leans_by_more_than_a_tenth_of_a_millimetre_is_no_level_to_drop_things_on(degrees, level):
+    slope = box(1, 1, 0.1)
+    slope.apply_transform(trimesh.transformations.rotation_matrix(np.radians(degrees), [0, 1, 0]))
+    assert find_table_top(shape_of(slope)).convex == level
+
+
 def test_a_table_without_a_level_face_is_refused():
     slope = box(1, 1, 0.1)
     slope.apply_transform(trimesh.transformations.rotation_matrix(0.3, [1, 0.2, 0]))

@@ -1,0 +1,25 @@
+"""One row of the table of hard cases."""
+
+from dataclasses import dataclass, field
+
+from tests.hard_cases.drops import Make
+from tests.hard_cases.measures import Measure
+
+SETTLE, FALL, EITHER = "must settle", "must fall", "either"
+
+
+def refuse(reason: str) -> str:
+    """Must be refused with this reason."""
+    return f"must refuse: {reason}"
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One row; `physics` are settings other than the defaults."""
+
+    name: str
+    outcome: str
+    measure: Measure
+    make: Make
+    physics: dict[str, float] = field(default_factory=dict)
+    miss: str = ""
