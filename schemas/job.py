@@ -72,7 +72,7 @@ class Physics(Frozen):
     friction: NonNegative = 0.7
     """Of each body; contact friction is the product of the two."""
     rolling_friction: NonNegative = 0.0005
-    """Lever arms, metres: the torque against rolling is this times the contact force."""
+    """Of each body, metres: Bullet's torque against rolling is twice this, times `friction`, times the contact force."""
     spinning_friction: NonNegative = 0.0005
     """The same against spinning about the contact's normal."""
     restitution: Share = 0.0

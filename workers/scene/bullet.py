@@ -1,6 +1,6 @@
 """One rigid body falling onto a ground, in PyBullet. The one file that imports PyBullet, so that it can be replaced."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -62,6 +62,14 @@ class World:
         """Velocity, m/s, of the centre of mass, and angular velocity, rad/s."""
         v, w = pybullet.getBaseVelocity(self.body, physicsClientId=self.client)
         return v, w
+
+    def push(self, velocity: Sequence[float], spin: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+        """Give the centre of mass a velocity, m/s, and the body an angular velocity, rad/s, in world coordinates."""
+        pybullet.resetBaseVelocity(self.body, list(velocity), list(spin), physicsClientId=self.client)
+
+    def pull(self, gravity: Sequence[float]) -> None:
+        """Another gravity, m/s^2, in this world alone: a level ground in it is a slope."""
+        pybullet.setGravity(*gravity, physicsClientId=self.client)
 
 
 @contextmanager

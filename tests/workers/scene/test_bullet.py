@@ -82,6 +82,19 @@ def test_an_error_inside_a_world_does_not_harm_the_next():
     assert fall(body, T) == first
 
 
+def test_a_push_and_another_gravity_end_with_their_world():
+    T = pose(np.eye(3), np.array([0, 0, 3.0]))
+    body = body_of(box(0.1, 0.08, 0.2))
+    first = fall(body, T)
+    with drop(body, T, 0.0, PHYSICS, STEPS) as world:
+        world.push((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
+        world.pull((0.0, 0.0, 0.0))
+        assert world.velocity() == ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
+        world.advance()
+        assert world.pose()[0] == pytest.approx(np.array([1.0, 2.0, 3.0]) * STEPS / PHYSICS.step_hz + T[:3, 3])
+    assert fall(body, T) == first
+
+
 def test_worlds_come_and_go_without_their_memory_staying():
     run = [sys.executable, "-c", GROWTH]
     kilobytes = float(subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()[-1])

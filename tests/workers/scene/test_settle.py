@@ -11,11 +11,13 @@ from schemas.errors import SettleError
 from schemas.job import Job
 from schemas.scene import ObjectStart
 from schemas.shape import Mesh
+from schemas.sources import ProceduralSource
 from tests.shapes import asset_of, box, shape_of, table
+from workers.assets.procedural.make import make_asset
 from workers.geometry.frames import angle_between, pose, rotation_about, transform, translation
 from workers.geometry.heights import vertical_gap
 from workers.geometry.hull import convex_hull
-from workers.scene.plan import plan_scene
+from workers.scene.plan import draw_start, plan_scene
 from workers.scene.settle import _body_frame, recheck, settle
 from workers.scene.support import place_table
 
@@ -65,6 +67,17 @@ def test_tumbled_cylinders_rest_on_a_face_with_their_centre_above_it_and_do_not_
     assert rest.hover_gap_mm < 1e-9
     assert rest.support_margin_mm > 1.0
     assert recheck(plan.objects[0], rest, plan.table, PHYSICS) < 0.2
+
+
+@pytest.mark.parametrize("scene_id", [5, 11, 18, 23])
+def test_a_bottle_that_rolling_friction_held_on_an_edge_rolls_onto_a_face_and_not_for_ever(scene_id):
+    asset = make_asset("bottle", ProceduralSource(source="procedural"), 822319, 600.0)
+    job = Job.model_validate({"name": "t", "seed": 2024, "start": {"pose": "tumbled"}})
+    start = draw_start(job, scene_id, asset, TABLE)
+    rest = settle(start, TABLE, PHYSICS)
+    assert rest.support == "flat_top"
+    assert rest.support_margin_mm > 0.0
+    assert recheck(start, rest, TABLE, PHYSICS) < 0.2
 
 
 def test_the_same_start_gives_the_same_bits():

@@ -1,0 +1,42 @@
+"""A ball that rolls on level ground, against the torque of rolling friction."""
+
+import pytest
+
+from tests.physics.room import PHYSICS, RATES_HZ, G, advance, at, ball_body, ball_physics
+from workers.scene.bullet import drop
+
+RADIUS_M = 0.05
+ARM_M = 2 * PHYSICS.rolling_friction * PHYSICS.friction
+"""Bullet's lever arm, metres: over both bodies, rolling friction times the other's friction."""
+
+
+def speeds(rate_hz: int, seconds: float, first_m_s: float, spin_rad_s: float, **changes) -> tuple[float, float]:
+    """Speed, m/s, and spin, rad/s, about the axis across, after so long on the ground."""
+    settings = ball_physics(RADIUS_M, step_hz=rate_hz, **changes)
+    with drop(ball_body(RADIUS_M), at(0, RADIUS_M), 0.0, settings, 1) as world:
+        advance(world, rate_hz // 4)
+        world.push((first_m_s, 0, 0), (0, spin_rad_s, 0))
+        advance(world, round(rate_hz * seconds))
+        v, w = world.velocity()
+        return v[0], w[1]
+
+
+def test_a_rolling_ball_slows_down_by_its_rolling_friction(record_figure):
+    """a = arm g / (R (1 + 2 / 5)): no error in the step at all, because the torque is constant."""
+    exact = 1.0 - 2.0 * ARM_M * G / (RADIUS_M * 1.4)
+    errors = [speeds(rate, 2.0, 1.0, 1.0 / RADIUS_M)[0] - exact for rate in RATES_HZ]
+    record_figure("rolling: error of the speed after 2 s, m/s", "passed", max(map(abs, errors)), 1e-9)
+    assert max(map(abs, errors)) < 1e-9
+
+
+def test_a_ball_without_rolling_friction_rolls_for_ever(record_figure):
+    error = speeds(960, 4.0, 1.0, 1.0 / RADIUS_M, rolling_friction=0.0)[0] - 1.0
+    record_figure("rolling without friction: error of the speed after 4 s, m/s", "passed", error, 1e-9)
+    assert abs(error) < 1e-9
+
+
+def test_a_ball_that_is_pushed_without_spin_slides_until_it_rolls_at_five_sevenths(record_figure):
+    v, w = speeds(960, 1.0, 1.0, 0.0, rolling_friction=0.0)
+    record_figure("from sliding to rolling: error of the speed, m/s", "passed", v - 5 / 7, 1e-9)
+    assert v == pytest.approx(5 / 7, abs=1e-9)  # angular momentum about the contact stays, whatever the step
+    assert w * RADIUS_M == pytest.approx(v, abs=1e-9)
