@@ -124,7 +124,6 @@ def drop_many(asset: Asset, settings: Physics, first: int, drops: int) -> Array:
     return counts
 
 
-@pytest.mark.parametrize("name", ["box", "hull"])
 def is_stable(T_world_obj, hull, com) -> bool:
     """Whether the centre of mass stands over the hull's lowest face."""
     points = transform(T_world_obj, hull.vertices)
@@ -132,6 +131,7 @@ def is_stable(T_world_obj, hull, com) -> bool:
     return support_margin(face[:, :2], transform(T_world_obj, com[None, :])[0, :2]) > 0.0
 
 
+@pytest.mark.parametrize("name", ["box", "hull"])
 def test_predicted_shares_belong_to_faces_that_the_body_can_stand_on_and_add_up_to_one(name):
     asset = body(name)
     hull = convex_hull(asset.shape.vertices)
