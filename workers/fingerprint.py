@@ -22,7 +22,6 @@ CANARY_SCENE = 3
 
 LIBRARIES = (
     "embreex",
-    "isal",
     "llvmlite",
     "manifold3d",
     "numba",
@@ -33,6 +32,7 @@ LIBRARIES = (
     "pyrender",
     "scipy",
     "trimesh",
+    "zlib-ng",
 )
 """What has a hand in the bytes."""
 
