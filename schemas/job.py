@@ -60,15 +60,17 @@ class Physics(Frozen):
     """PyBullet's settings."""
 
     step_hz: Annotated[int, Field(ge=30, le=20_000)] = 960
-    """Steps a second."""
+    """Steps a second where all moves slowly; up to 16 times as many where it does not."""
+    way_mm: Positive = 0.1
+    """How far the fastest point may go in a step; more in falls from above 50 mm, less for what is thinner than 2 mm."""
     solver_iterations: Annotated[int, Field(ge=1, le=10_000)] = 100
     """Iterations of the contact solver in each step."""
     max_settle_s: Positive = 8.0
     """Simulated time after which an object that still moves is a failure."""
     rest: Rest = Rest()
     """When an object counts as resting."""
-    margin_mm: NonNegative = 0.1
-    """Collision margin of mesh shapes."""
+    margin_mm: Annotated[float, Field(ge=0.02)] = 0.1
+    """Collision margin of an object, which its collision shape is smaller by; less where it is thinner than four margins."""
     friction: NonNegative = 0.7
     """Of each body; contact friction is the product of the two."""
     rolling_friction: NonNegative = 0.0005

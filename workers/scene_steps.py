@@ -104,7 +104,7 @@ def recheck_objects(context: WorkerContext, plan: ScenePlan, settled: tuple[Sett
     """Every object released again where it rests, with how far it moved."""
     physics = context.job.physics
     return tuple(
-        dataclasses.replace(rest, recheck_move_mm=recheck(start, rest, plan.table, physics))
+        dataclasses.replace(rest, recheck_move_mm=recheck(start, rest, plan.table, physics)[0])
         for start, rest in zip(plan.objects, settled, strict=True)
     )
 

@@ -24,23 +24,19 @@ def physics(**changes) -> Physics:
     return Physics.model_validate({**PHYSICS.model_dump(), **changes})
 
 
-def margin_m(settings: Physics) -> float:
-    return settings.margin_mm / 1e3
+MARGIN_M = 1e-4
+"""Of boxes here: their faces stand so far from the ground."""
 
 
 def box_body(x: float, y: float, z: float, mass_kg: float = 1.0) -> Body:
     """A solid box of these sides, metres."""
     corners = np.array([[i, j, k] for i in (-x, x) for j in (-y, y) for k in (-z, z)]) / 2
-    return Body(mass_kg, np.array([y * y + z * z, x * x + z * z, x * x + y * y]) * mass_kg / 12, corners)
+    return Body(mass_kg, np.array([y * y + z * z, x * x + z * z, x * x + y * y]) * mass_kg / 12, (corners,), MARGIN_M)
 
 
 def ball_body(radius_m: float, mass_kg: float = 1.0) -> Body:
-    """A solid ball, to be dropped with `ball_physics`: Bullet's hull of one point, with the radius as its margin."""
-    return Body(mass_kg, np.full(3, 0.4 * mass_kg * radius_m**2), np.zeros((1, 3)))
-
-
-def ball_physics(radius_m: float, **changes) -> Physics:
-    return physics(margin_mm=radius_m * 1e3, **changes)
+    """A solid ball: Bullet's hull of one point, with the radius as its margin."""
+    return Body(mass_kg, np.full(3, 0.4 * mass_kg * radius_m**2), (np.zeros((1, 3)),), radius_m)
 
 
 def at(x: float, z: float, lean_rad: float = 0.0) -> Pose:

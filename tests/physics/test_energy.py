@@ -3,22 +3,26 @@
 import functools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import pybullet
 import pytest
 
 from schemas.base import Array
 from schemas.job import Job
+from schemas.scene import ObjectStart
 from schemas.shape import Asset
 from schemas.sources import ProceduralSource
 from tests.physics.room import G, physics
 from tests.shapes import asset_of, box, table
 from workers.assets.procedural.make import make_asset
-from workers.geometry.frames import invert, rotation_from_quaternion, transform
-from workers.geometry.hull import convex_hull
-from workers.scene.bullet import Body, drop
+from workers.geometry.frames import rotation_from_quaternion
+from workers.scene import bullet
+from workers.scene.bullet import World
+from workers.scene.fall import body_frame
 from workers.scene.plan import draw_start
-from workers.scene.settle import _body_frame
+from workers.scene.settle import settle
 from workers.scene.support import place_table
 
 TABLE = place_table(table())
@@ -48,47 +52,59 @@ class Rise:
 
 
 @functools.cache
-def worst_rise(category: str, start: str, seed: int, rate_hz: int) -> Rise:
+def worst_rise(category: str, start: str, seed: int, refine: int = 1) -> Rise:
     asset = asset_for(category, seed)
     job = Job.model_validate({"name": "t", "seed": seed, "start": {"pose": start}})
-    energy = energies(asset, draw_start(job, seed, asset, TABLE).T_world_obj, rate_hz)
-    rise = float((energy - np.minimum.accumulate(energy)).max())
-    weight = asset.mass.mass_kg * G
-    return Rise(rise / max(SHARE * (energy[0] - energy[-1]), LIFT_M * weight), rise / weight)
+    weight, rises = asset.mass.mass_kg * G, []
+    for energy in energies(draw_start(job, seed, asset, TABLE), refine):
+        rise = float((energy - np.minimum.accumulate(energy)).max())
+        rises.append(Rise(rise / max(SHARE * (energy[0] - energy[-1]), LIFT_M * weight), rise / weight))
+    return max(rises, key=lambda rise: rise.over_bound)
 
 
-def energies(asset: Asset, T_world_obj: Array, rate_hz: int) -> Array:
-    """[steps] joules: kinetic and potential energy after every step, from the release on.
+def energies(start: ObjectStart, refine: int) -> list[Array]:
+    """[steps] joules: kinetic and potential energy after every step of each fall of a settling as it is in production.
 
     In the air semi-implicit Euler only loses energy, g^2 h / 2 a second and kilogram, so that no rise is its own.
     """
-    T_obj_body, moments = _body_frame(asset.mass)
-    vertices = convex_hull(asset.shape.vertices).vertices
-    body = Body(asset.mass.mass_kg, moments, transform(invert(T_obj_body), vertices))
-    found = []
-    with drop(body, T_world_obj @ T_obj_body, TABLE.top.height_m, physics(step_hz=rate_hz), 1) as world:
-        for _ in range(round(WATCHED_S * rate_hz)):
-            (x, quaternion), (v, w) = world.pose(), world.velocity()
-            spin = rotation_from_quaternion(np.array(quaternion)).T @ np.array(w)
-            found.append(body.mass_kg * (np.dot(v, v) / 2 + G * x[2]) + float(moments @ (spin * spin)) / 2)
-            world.advance()
-    return np.array(found)
+    mass, falls = start.asset.mass, list[list[float]]()
+    _, moments = body_frame(mass)
+
+    class Watched(World):
+        """Steps one at a time, and looks at the energy after each."""
+
+        def advance(self) -> None:
+            for _ in range(self.steps):
+                pybullet.stepSimulation(physicsClientId=self.client)
+                (x, quaternion), (v, w) = self.pose(), self.velocity()
+                spin = rotation_from_quaternion(np.array(quaternion)).T @ np.array(w)
+                falls[-1].append(mass.mass_kg * (np.dot(v, v) / 2 + G * x[2]) + float(moments @ (spin * spin)) / 2)
+
+        def pace(self, step_hz: float, repair: float = bullet.REPAIR) -> None:
+            pybullet.setPhysicsEngineParameter(
+                fixedTimeStep=1.0 / step_hz, numSubSteps=0, contactERP=repair, physicsClientId=self.client
+            )
+
+    def begin(*of: Any) -> World:
+        falls.append([])
+        return Watched(*of)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bullet, "World", begin)
+        settle(start, TABLE, physics(step_hz=960 * refine, way_mm=0.1 / refine))
+    return [np.array(energy) for energy in falls]
 
 
-@pytest.mark.xfail(
-    reason="at 960 Hz 73 of these 160 drops rise further, by up to 0.42 mm of height and 7.7 times the bound: Bullet "
-    "closes a fifth of what bodies overlap in each step (contactERP), and they keep the speed that it gives them",
-)
 @pytest.mark.parametrize("start", STARTS)
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_energy_never_rises_above_its_running_minimum(category, start, record_figure):
-    rises = [worst_rise(category, start, seed, 960) for seed in range(SEEDS)]
+    rises = [worst_rise(category, start, seed) for seed in range(SEEDS)]
     missed = sum(rise.over_bound > 1.0 for rise in rises)
-    record_figure(f"energy, {category} {start}: drops that rise too far", "missed", missed, 0)
+    record_figure(f"energy, {category} {start}: drops that rise too far", "passed", missed, 0)
     record_figure(
-        f"energy, {category} {start}: worst rise over its bound", "missed", max(r.over_bound for r in rises), 1
+        f"energy, {category} {start}: worst rise over its bound", "passed", max(r.over_bound for r in rises), 1
     )
-    record_figure(f"energy, {category} {start}: worst rise, um", "missed", max(r.lift_m for r in rises) * 1e6)
+    record_figure(f"energy, {category} {start}: worst rise, um", "passed", max(r.lift_m for r in rises) * 1e6)
     assert missed == 0
 
 
@@ -98,8 +114,7 @@ def test_energy_never_rises_above_its_running_minimum(category, start, record_fi
 def test_what_energy_rises_by_shrinks_with_the_step(category, start, record_figure):
     """A step goes too deep by a step's way at most: the first order, 0.8 of which twenty drops show."""
     coarse, fine = (
-        float(np.mean([worst_rise(category, start, seed, rate).lift_m for seed in range(SEEDS)]))
-        for rate in (960, 3840)
+        float(np.mean([worst_rise(category, start, seed, refine).lift_m for seed in range(SEEDS)])) for refine in (1, 4)
     )
     found = math.log(coarse / fine, 4)
     record_figure(f"energy, {category} {start}: order of the mean rise in the step", "passed", found, 0.8)

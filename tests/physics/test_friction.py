@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from tests.physics.room import PHYSICS, G, advance, at, box_body, margin_m, order, physics, slope
+from tests.physics.room import MARGIN_M, PHYSICS, G, advance, at, box_body, order, physics, slope
 from workers.scene.bullet import drop
 
 MU = PHYSICS.friction**2
@@ -17,7 +17,7 @@ FLAT = box_body(0.2, 0.2, 0.01)
 def slid(rate_hz: int, speed_m_s: float) -> float:
     """Metres that the box slides on level ground when it is pushed, after it has come to rest."""
     settings = physics(step_hz=rate_hz)
-    with drop(FLAT, at(0, 0.005 + margin_m(settings)), 0.0, settings, 1) as world:
+    with drop(FLAT, at(0, 0.005 + MARGIN_M), 0.0, settings, 1) as world:
         advance(world, rate_hz)
         before = world.pose()[0][0]
         world.push((speed_m_s, 0.0, 0.0))
@@ -28,7 +28,7 @@ def slid(rate_hz: int, speed_m_s: float) -> float:
 def speed_on_slope(rate_hz: int, angle_rad: float, heading_rad: float) -> float:
     """Speed, m/s, that the box has half a second after the level ground under it became a slope."""
     settings = physics(step_hz=rate_hz)
-    with drop(FLAT, at(0, 0.005 + margin_m(settings)), 0.0, settings, 1) as world:
+    with drop(FLAT, at(0, 0.005 + MARGIN_M), 0.0, settings, 1) as world:
         advance(world, rate_hz)
         world.pull(slope(angle_rad, heading_rad))
         advance(world, rate_hz // 2)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.physics.room import PHYSICS, RATES_HZ, G, advance, at, ball_body, ball_physics
+from tests.physics.room import PHYSICS, RATES_HZ, G, advance, at, ball_body, physics
 from workers.scene.bullet import drop
 
 RADIUS_M = 0.05
@@ -12,7 +12,7 @@ ARM_M = 2 * PHYSICS.rolling_friction * PHYSICS.friction
 
 def speeds(rate_hz: int, seconds: float, first_m_s: float, spin_rad_s: float, **changes) -> tuple[float, float]:
     """Speed, m/s, and spin, rad/s, about the axis across, after so long on the ground."""
-    settings = ball_physics(RADIUS_M, step_hz=rate_hz, **changes)
+    settings = physics(step_hz=rate_hz, **changes)
     with drop(ball_body(RADIUS_M), at(0, RADIUS_M), 0.0, settings, 1) as world:
         advance(world, rate_hz // 4)
         world.push((first_m_s, 0, 0), (0, spin_rad_s, 0))

@@ -1,5 +1,6 @@
 """A box over one of its edges: the slope on which it tips, and how it rocks."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -7,11 +8,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from schemas.job import Physics
-from tests.physics.room import G, advance, at, box_body, lean, margin_m, order, physics, slope
+from tests.physics.room import G, advance, at, box_body, lean, order, physics, slope
 from workers.scene.bullet import drop
 
 WIDTH_M, HEIGHT_M = 0.06, 0.2
-BOX = box_body(WIDTH_M, 0.1, HEIGHT_M)
+MARGIN_M = 1e-6
+BOX = dataclasses.replace(box_body(WIDTH_M, 0.1, HEIGHT_M), margin_m=MARGIN_M)
 TIPPING_RAD = math.atan(WIDTH_M / HEIGHT_M)
 ARM_M = math.hypot(WIDTH_M, HEIGHT_M) / 2
 RATE2 = G * ARM_M / ((WIDTH_M**2 + HEIGHT_M**2) / 12 + ARM_M**2)
@@ -21,12 +23,11 @@ RATES_HZ = (480, 960, 1920, 3840)
 TIPPED_RAD = 0.1
 
 
-def hard(rate_hz: int, margin_mm: float = 1e-3, rolling_friction: float = 0.0) -> Physics:
+def hard(rate_hz: int, rolling_friction: float = 0.0) -> Physics:
     """Friction that holds the edge where it is, sharp edges, and no torque against rolling over them."""
     return physics(
         step_hz=rate_hz,
         friction=1.0,
-        margin_mm=margin_mm,
         rolling_friction=rolling_friction,
         spinning_friction=0.0,
     )
@@ -37,7 +38,7 @@ def tips(settings: Physics, nearly_rad: float, angle_rad: float) -> bool:
 
     From level ground at once, the jolt alone would tip it a few tenths of a degree too early.
     """
-    with drop(BOX, at(0, HEIGHT_M / 2 + margin_m(settings)), 0.0, settings, 1) as world:
+    with drop(BOX, at(0, HEIGHT_M / 2 + MARGIN_M), 0.0, settings, 1) as world:
         advance(world, settings.step_hz // 4)
         world.pull(slope(nearly_rad))
         advance(world, settings.step_hz // 2)
@@ -62,7 +63,7 @@ def first_quarter(settings: Physics, lean_rad: float) -> float:
     """Seconds from rest on one edge, leaning by `lean_rad`, to upright; between steps by a straight line."""
     x, z = WIDTH_M / 2, HEIGHT_M / 2
     c, s = math.cos(lean_rad), math.sin(lean_rad)
-    over = at(z * s - x * c, z * c + x * s + margin_m(settings), lean_rad)  # the edge at +x lies on the y axis
+    over = at(z * s - x * c, z * c + x * s + MARGIN_M, lean_rad)  # the edge at +x lies on the y axis
     before = lean_rad
     with drop(BOX, over, 0.0, settings, 1) as world:
         for step in range(settings.step_hz):

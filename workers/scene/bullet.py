@@ -1,9 +1,11 @@
-"""One rigid body falling onto a ground, in PyBullet. The one file that imports PyBullet, so that it can be replaced."""
+"""Rigid bodies falling onto a ground, in PyBullet. The one file that imports PyBullet, so that it can be replaced."""
 
+import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,19 @@ turns about the vertical by ten times as much as on the box."""
 MOST_GROUND_VERTICES, MOST_GROUND_INDICES = 131_072, 524_288
 """PyBullet's limits on one collision mesh; it fails beyond them without a word why."""
 
+SLOP_M = 1e-5
+"""How deep bodies overlap at rest: Bullet leaves as much where it is."""
+
+REPAIR = 0.05
+"""Share of what overlaps further that is pushed apart in a step. What is pushed keeps the speed, which is that share of the
+depth over the step: with 0.2 things that roll over edges gain energy, with 0.4 boxes are thrown up."""
+
+BOUNCE_REPAIR = 0.005
+"""The same while things bounce, which they do from where they overlap by a step's way: it throws them up by so much less."""
+
+NO_THRESHOLD = 1e18
+"""Bullet's own: contacts count as soon as they are foreseen."""
+
 WORLDS_BEFORE_RESET = 32
 """What is removed from a simulation leaves some kilobytes behind, which only a reset frees; a reset costs as much as
 fifty milliseconds of simulated time."""
@@ -35,70 +50,119 @@ fifty milliseconds of simulated time."""
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A convex body about its centre of mass and along its principal axes: vertices [N, 3] m, moments [3] kg m^2."""
+    """A rigid body about its centre of mass and along its principal axes.
+
+    moments [3] kg m^2; parts: the vertices [N, 3], metres, of convex bodies, each with a margin of `margin_m` about it. One
+    part may be a single point, which makes a ball of the margin. `rolls` is False where friction against rolling and
+    spinning is left out. `damping` is Bullet's, of speed and spin: nothing is damped that falls.
+    """
 
     mass_kg: float
     moments: Array
-    vertices: Array
+    parts: tuple[Array, ...]
+    margin_m: float
+    rolls: bool = True
+    damping: float = 0.0
 
 
 @dataclass(frozen=True)
 class World:
-    """A ground and a body on it, `steps` steps of the simulation at a time."""
+    """A ground and bodies on it, `steps` steps of the simulation at a time; bodies are told by their number."""
 
     client: int
-    body: int
+    ground: int
+    bodies: tuple[int, ...]
+    steps: int
 
     def advance(self) -> None:
         """The steps that the world was opened for."""
         pybullet.stepSimulation(physicsClientId=self.client)
 
-    def pose(self) -> Motion:
-        """Where the body is."""
-        position, quaternion = pybullet.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
+    def pace(self, step_hz: float, repair: float = REPAIR) -> None:
+        """Go on at so many steps a second; in each, this share of what bodies overlap is pushed apart."""
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=self.steps / step_hz,
+            numSubSteps=self.steps,
+            contactERP=repair,
+            physicsClientId=self.client,
+        )
+
+    def pose(self, body: int = 0) -> Motion:
+        """Where a body is."""
+        position, quaternion = pybullet.getBasePositionAndOrientation(self.bodies[body], physicsClientId=self.client)
         return position, quaternion
 
-    def velocity(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    def velocity(self, body: int = 0) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
         """Velocity, m/s, of the centre of mass, and angular velocity, rad/s."""
-        v, w = pybullet.getBaseVelocity(self.body, physicsClientId=self.client)
+        v, w = pybullet.getBaseVelocity(self.bodies[body], physicsClientId=self.client)
         return v, w
 
-    def push(self, velocity: Sequence[float], spin: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
-        """Give the centre of mass a velocity, m/s, and the body an angular velocity, rad/s, in world coordinates."""
-        pybullet.resetBaseVelocity(self.body, list(velocity), list(spin), physicsClientId=self.client)
+    def push(self, velocity: Sequence[float], spin: Sequence[float] = (0.0, 0.0, 0.0), body: int = 0) -> None:
+        """Give a centre of mass a velocity, m/s, and the body an angular velocity, rad/s, in world coordinates."""
+        pybullet.resetBaseVelocity(self.bodies[body], list(velocity), list(spin), physicsClientId=self.client)
 
     def pull(self, gravity: Sequence[float]) -> None:
         """Another gravity, m/s^2, in this world alone: a level ground in it is a slope."""
         pybullet.setGravity(*gravity, physicsClientId=self.client)
 
+    def bounce(self, restitution: float) -> None:
+        """Give ground and bodies this restitution from now on; a contact's is the product of its two.
+
+        Bullet solves contacts before they close, and takes speed away in portions that are too slow to bounce: with steps
+        shorter than its contact distance over the speed nothing bounces. So what bounces waits until it overlaps.
+        """
+        for thing in (self.ground, *self.bodies):
+            pybullet.changeDynamics(
+                thing,
+                -1,
+                restitution=restitution,
+                contactProcessingThreshold=0.0 if restitution > 0.0 else NO_THRESHOLD,
+                physicsClientId=self.client,
+            )
+
 
 @contextmanager
-def drop(body: Body, T_world_body: Pose, ground: float | Mesh, physics: Physics, steps: int) -> Iterator[World]:
-    """A world with nothing but the body and the ground: level at a height in metres, or a mesh.
+def open_world(
+    placed: Sequence[tuple[Body, Pose]], ground: float | Mesh, physics: Physics, steps: int
+) -> Iterator[World]:
+    """A world with nothing but the bodies, each at its `T_world_body`, and the ground.
+
+    Which is level at a height in metres, or a mesh, which then has no margin.
 
     Bit-identical runs need deterministicOverlappingPairs. One connection serves the whole process: a new one costs as
     much as a simulation. What was simulated before leaves no trace in the bits: two bodies are one pair, so that no
-    order of pairs, contacts or islands can differ. Blocks do not nest.
+    order of pairs, contacts or islands can differ, and for more bodies all is reset first. Blocks do not nest.
     """
     client = _connection()
+    if len(placed) > 1:
+        _reset(client)
     pybullet.setPhysicsEngineParameter(
-        fixedTimeStep=steps / physics.step_hz,
-        numSubSteps=steps,
-        numSolverIterations=physics.solver_iterations,
-        deterministicOverlappingPairs=1,
-        physicsClientId=client,
+        numSolverIterations=physics.solver_iterations, deterministicOverlappingPairs=1, physicsClientId=client
     )
     pybullet.setGravity(0.0, 0.0, -GRAVITY_M_S2, physicsClientId=client)
     things: list[int] = []
     try:
         things.append(_add_mesh(client, ground) if isinstance(ground, Mesh) else _add_slab(client, ground))
-        things.append(_add_body(client, body))
-        for thing in things:
-            _set_surface(client, thing, physics)
-        _place(client, things[1], T_world_body)
-        yield World(client, things[1])
+        _set_surface(client, things[0], physics, Body(0.0, np.zeros(3), (), 0.0, rolls=False))
+        for body, T_world_body in placed:
+            things.append(_add_body(client, body))
+            _set_surface(client, things[-1], physics, body)
+            _place(client, things[-1], T_world_body)
+        world = World(client, things[0], tuple(things[1:]), steps)
+        world.pace(physics.step_hz)
+        if physics.restitution > 0.0:
+            world.bounce(physics.restitution)
+            world.pace(physics.step_hz, BOUNCE_REPAIR)
+        yield world
     finally:
-        _clear(client, things)
+        _clear(client, things, 1 + len(placed))
+
+
+def drop(
+    body: Body, T_world_body: Pose, ground: float | Mesh, physics: Physics, steps: int
+) -> AbstractContextManager[World]:
+    """A world with one body."""
+    return open_world([(body, T_world_body)], ground, physics, steps)
 
 
 @dataclass
@@ -146,11 +210,15 @@ def _connection() -> int:
     return client
 
 
-def _clear(client: int, things: list[int]) -> None:
+def _reset(client: int) -> None:
+    pybullet.resetSimulation(physicsClientId=client)
+    _USE.worlds = 0
+
+
+def _clear(client: int, things: list[int], whole: int) -> None:
     _USE.worlds += 1
-    if _USE.worlds >= WORLDS_BEFORE_RESET or len(things) < 2:
-        pybullet.resetSimulation(physicsClientId=client)
-        _USE.worlds = 0
+    if _USE.worlds >= WORLDS_BEFORE_RESET or len(things) < whole:
+        _reset(client)
         return
     for thing in reversed(things):
         pybullet.removeBody(thing, physicsClientId=client)
@@ -179,24 +247,44 @@ def _add_mesh(client: int, mesh: Mesh) -> int:
 
 
 def _add_body(client: int, body: Body) -> int:
-    vertices = _NUMBERS.vertices(body.vertices)
-    shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client)
+    if len(body.parts) == 1:
+        vertices = _NUMBERS.vertices(body.parts[0])
+        shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client)
+    else:
+        shape = _compound(client, body.parts)
     thing: int = pybullet.createMultiBody(body.mass_kg, shape, physicsClientId=client)
     pybullet.changeDynamics(thing, -1, localInertiaDiagonal=body.moments.tolist(), physicsClientId=client)
     return thing
 
 
-def _set_surface(client: int, thing: int, physics: Physics) -> None:
+def _compound(client: int, parts: Sequence[Array]) -> int:
+    """One collision shape of many convex parts, which PyBullet takes from a file alone: the objects of an OBJ."""
+    lines, first = [], 1
+    for number, vertices in enumerate(parts):
+        lines.append(f"o part{number}")
+        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
+        lines += [f"f {first} {first + k} {first + k + 1}" for k in range(1, len(vertices) - 1)]
+        first += len(vertices)
+    with tempfile.TemporaryDirectory(prefix="verso-parts-") as folder:
+        path = Path(folder, "parts.obj")
+        path.write_text("\n".join(lines), encoding="ascii")
+        shape: int = pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path), physicsClientId=client)
+    return shape
+
+
+def _set_surface(client: int, thing: int, physics: Physics, body: Body) -> None:
+    # The arm of a contact is the sum over both of one's rolling friction times the other's friction: the ground's part is
+    # given to the bodies, so that it is gone where a body has none.
     pybullet.changeDynamics(
         thing,
         -1,
         lateralFriction=physics.friction,
-        rollingFriction=physics.rolling_friction,
-        spinningFriction=physics.spinning_friction,
-        restitution=physics.restitution,
-        collisionMargin=physics.margin_mm / 1e3,
-        linearDamping=0.0,
-        angularDamping=0.0,
+        rollingFriction=2.0 * physics.rolling_friction if body.rolls else 0.0,
+        spinningFriction=2.0 * physics.spinning_friction if body.rolls else 0.0,
+        restitution=0.0,
+        collisionMargin=body.margin_m,
+        linearDamping=body.damping,
+        angularDamping=body.damping,
         physicsClientId=client,
     )
 

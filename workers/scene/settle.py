@@ -2,107 +2,166 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from schemas.base import Array, Pose, frozen_array
+from schemas.base import Pose, frozen_array
 from schemas.errors import SettleError
 from schemas.job import Physics
-from schemas.scene import ObjectStart, Settled, Table
-from schemas.shape import MassProperties, Mesh
-from workers.geometry.frames import invert, pose, rotation_from_quaternion, transform, translation
+from schemas.scene import ObjectStart, ScenePlan, Settled, Table
+from schemas.shape import Mesh
+from workers.geometry.frames import transform, translation
 from workers.geometry.heights import Terrain, heights_at, survey, vertical_gap
-from workers.scene.bullet import Body, World, drop
+from workers.geometry.inset import least_width_m
 from workers.scene.contact import snap_to_face, support_margin, tip_onto_face, touching
-from workers.scene.watch import Motion, Watch, can_touch, stands_on_face, watch_edge, watch_tilt
-
-SAMPLE_STEPS = 8
-"""Speeds are read every so many steps: reading costs as much as stepping."""
+from workers.scene.dynamics import called_for
+from workers.scene.effect import EffectPlan
+from workers.scene.fall import FINEST, Fall, Faller, Pace, fall, make_faller
+from workers.scene.support import support_height
+from workers.scene.watch import can_touch, stands_on_face, watch_edge, watch_gone, watch_tilt
 
 LEFT_M = 0.05
 """An object whose table lies this far below the top has left it."""
 
-CALM_M_S = 0.05
-"""A point of a resting object never moves faster than this, however briefly: it could not climb an eighth of a
-millimetre any more."""
-
 LESS_ROLLING_FRICTION = (1.0, 0.1, 0.01, 0.0)
 """Shares of the rolling friction that an object is dropped with, each where the one before left it on an edge."""
+
+DAMPING = 0.9
+"""Of what is let go again with less rolling friction: it loses nine tenths of its speed in a second."""
 
 RECHECK_S = 1.0
 """How long an object is watched when it is released again."""
 
+DROP_SHARE = 0.002
+"""Of the height that things fall: how far a point may go in a step onto level ground, if that is more than
+`physics.way_mm`. What it sinks in by is then within the thousandth of the fall's energy that may come back."""
+
+THIN_SHARE = 0.05
+"""Of the thinnest object: how far a point may go in a step."""
+
+LEFT_TOP = "its footprint left the table's flat top"
+
 
 @dataclass(frozen=True, eq=False)
-class _Motion:
-    """What a simulation ended with; `stayed` is False as soon as its ground was no longer the right one."""
+class Rest:
+    """Every object of a scene at rest, and the effects that the plan had left out and that were called for after all."""
 
-    T_world_obj: Pose
-    speed_m_s: float
-    seconds: float
-    rested: bool
-    stayed: bool
+    settled: tuple[Settled, ...]
+    called: Mapping[str, str] = field(default_factory=dict)
 
 
-def settle(start: ObjectStart, table: Table, physics: Physics) -> Settled:
-    """Drop the object, wait until it rests, and remove what the simulator's margins left of gap and tilt.
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """One object to be dropped: where it starts, on what, and with which effects."""
+
+    start: ObjectStart
+    table: Table
+    ground: Terrain
+    physics: Physics
+    ran: Collection[str]
+    damping: float = 0.0
+
+
+def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan) -> Rest:
+    """Drop the scene's objects, wait until they rest, and remove what the simulator left of gap and tilt.
 
     Raises SettleError `not_at_rest`, `left_table`, `unsupported` or `table_too_fine`. The result is a function of the
     arguments alone: the world is made anew each time.
     """
-    ground = survey(table.mesh)
-    if start.placed:
-        return _describe(start, ground, _Motion(start.T_world_obj, 0.0, 0.0, True, True), "placed")
-    if table.top.convex:
-        motion = _settle_flat(start, table, ground, physics)
+    settled = tuple(settle(start, plan.table, physics, effects.ran) for start in plan.objects)
+    left = any(rest.support == "mesh" for rest in settled) and not effects.runs("table_mesh")
+    return Rest(settled, {"table_mesh": LEFT_TOP} if left else {})
+
+
+def settle(start: ObjectStart, table: Table, physics: Physics, ran: Collection[str] | None = None) -> Settled:
+    """One object on its own, with the effects that are named, or else those that it calls for. Raises SettleError."""
+    ran = called_for((start,), table, physics) if ran is None else ran
+    task = _Task(start, table, survey(table.mesh), physics, ran)
+    if "dynamics" not in ran:
+        return _describe(task, Fall((start.T_world_obj,), 0.0, 0.0, True), "placed")
+    if "table_mesh" not in ran:
+        motion = _settle_flat(task)
         if motion is not None:
-            return _describe(start, ground, motion, "flat_top")
-    motion = _simulate(start, table, physics, physics.max_settle_s, flat=False)
-    _require_rest(start, table, ground, motion)
-    return _describe(start, ground, _close_gap(start, ground, motion), "mesh")
+            return _describe(task, motion, "flat_top")
+    motion = _simulate(task, physics.max_settle_s, flat=False)
+    _require_rest(task, motion)
+    return _describe(task, _close_gap(task, motion), "mesh")
 
 
-def _settle_flat(start: ObjectStart, table: Table, ground: Terrain, physics: Physics) -> _Motion | None:
+def _settle_flat(task: _Task) -> Fall | None:
     """Rest on the flat top alone; None where the footprint left it, so that the table's edges may have mattered.
 
     Rolling friction can hold an object within that lever arm of an edge of its hull, where in truth it would tip on.
     Such a pose has no face below the centre of mass. It is tipped on by geometry, because thin rods that are let go on
-    an edge gain speed in Bullet; where the next face is far, it is let go once more with less rolling friction. With none
-    at all a bottle on its side may roll for ever: what little Bullet adds in energy at each edge, nothing takes away.
+    an edge gain speed in Bullet; where the next face is far, it is let go once more with less rolling friction. Then it is
+    damped, because what little Bullet adds in energy at each edge of a bottle on its side, nothing else takes away.
     """
-    seconds = 0.0
-    for share in LESS_ROLLING_FRICTION:
+    seconds, physics, asset = 0.0, task.physics, task.start.asset
+    shares = LESS_ROLLING_FRICTION if "rolling_friction" in task.ran else LESS_ROLLING_FRICTION[:1]
+    for share in shares:
         less = physics.model_copy(update={"rolling_friction": share * physics.rolling_friction})
-        motion = _simulate(start, table, less, physics.max_settle_s, flat=True)
-        if not motion.stayed:
+        damping = 0.0 if share == 1.0 else DAMPING
+        motion = _simulate(dataclasses.replace(task, physics=less, damping=damping), physics.max_settle_s, flat=True)
+        if motion.happened is not None:
             return None
-        _require_rest(start, table, ground, motion)
+        _require_rest(task, motion)
         seconds += motion.seconds
-        T = snap_to_face(motion.T_world_obj, start.hull, start.asset.mass.com, physics.snap_rad)
-        snapped = T is not motion.T_world_obj  # onto a face with the centre of mass above it
-        tipped = T if snapped else tip_onto_face(T, start.hull, start.asset.mass.com)
-        motion = _Motion(T if tipped is None else tipped, motion.speed_m_s, seconds, True, True)
+        stopped = motion.poses[0]
+        T = snap_to_face(stopped, task.start.hull, asset.mass.com, physics.snap_rad)
+        snapped = T is not stopped  # onto a face with the centre of mass above it
+        tipped = T if snapped else tip_onto_face(T, task.start.hull, asset.mass.com)
+        motion = Fall((T if tipped is None else tipped,), motion.speed_m_s, seconds, True)
         if tipped is not None:
             break
-        start = dataclasses.replace(start, T_world_obj=T)
-    return _close_gap(start, ground, motion)
+        task = dataclasses.replace(task, start=dataclasses.replace(task.start, T_world_obj=T))
+    return _close_gap(task, motion)
 
 
-def recheck(start: ObjectStart, settled: Settled, table: Table, physics: Physics) -> float:
-    """How far the object's farthest point moves, in millimetres, when it is released again where it rests."""
+def recheck(start: ObjectStart, settled: Settled, table: Table, physics: Physics) -> tuple[float, float]:
+    """How far the farthest point moves, mm, and the object turns, degrees, when it is released again where it rests.
+
+    For `RECHECK_S`, in the finest steps, on the ground that it came to rest on. Nothing is corrected afterwards.
+    """
+    ran = called_for((start,), table, physics) | {"dynamics"}
     again = dataclasses.replace(start, T_world_obj=settled.T_world_obj, placed=False)
-    motion = _simulate(again, table, physics, RECHECK_S, flat=settled.support != "mesh")
-    before = transform(settled.T_world_obj, start.hull.vertices)
-    after = transform(motion.T_world_obj, start.hull.vertices)
-    return float(np.linalg.norm(after - before, axis=1).max() * 1e3)
+    fine = physics.model_copy(update={"step_hz": FINEST * physics.step_hz, "max_settle_s": RECHECK_S})
+    task = _Task(again, table, survey(table.mesh), fine, ran)
+    after = _simulate(task, RECHECK_S, flat=settled.support != "mesh", whole=True).poses[0]
+    return moved_by(start, settled.T_world_obj, after)
 
 
-def _require_rest(start: ObjectStart, table: Table, ground: Terrain, motion: _Motion) -> None:
-    com = transform(motion.T_world_obj, start.asset.mass.com[None, :])[0]
-    over_top = heights_at(com[None, :2], ground)[0] >= table.top.height_m - LEFT_M  # nan compares false
-    if not over_top and not (motion.rested and _bridges(start, table, ground, motion)):
+def release_again(
+    plan: ScenePlan, settled: Sequence[Settled], physics: Physics, effects: EffectPlan, seconds: float
+) -> tuple[Pose, ...]:
+    """Where the objects are, `T_world_obj` [4, 4] each, that long after they were released where they rest.
+
+    With the effects that the plan names, in the finest steps; nothing is corrected afterwards.
+    """
+    fine = physics.model_copy(update={"step_hz": FINEST * physics.step_hz, "max_settle_s": seconds})
+    flat = not effects.runs("table_mesh")
+    ended = []
+    for start, rest in zip(plan.objects, settled, strict=True):
+        again = dataclasses.replace(start, T_world_obj=rest.T_world_obj, placed=False)
+        task = _Task(again, plan.table, survey(plan.table.mesh), fine, effects.ran)
+        ended.append(_simulate(task, seconds, flat, whole=True).poses[0])
+    return tuple(ended)
+
+
+def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, float]:
+    """Between two poses of an object: how far its farthest point went, mm, and by how much it turned, degrees."""
+    way = transform(before, start.hull.vertices) - transform(after, start.hull.vertices)
+    turned = float(np.linalg.norm(before[:3, :3] - after[:3, :3])) / math.sqrt(8.0)  # the sine of half the angle
+    return float(np.linalg.norm(way, axis=1).max() * 1e3), math.degrees(2.0 * math.asin(min(1.0, turned)))
+
+
+def _require_rest(task: _Task, motion: Fall) -> None:
+    table = task.table
+    com = transform(motion.poses[0], task.start.asset.mass.com[None, :])[0]
+    over_top = heights_at(com[None, :2], task.ground)[0] >= table.top.height_m - LEFT_M  # nan compares false
+    high = com[2] >= table.top.height_m - LEFT_M
+    if not (over_top and high) and not (motion.rested and _bridges(task, motion)):
         raise SettleError(
             "left_table",
             f"after {motion.seconds:.2f} s the centre of mass was at ({com[0]:.3f}, {com[1]:.3f}, {com[2]:.3f}) m, off the "
@@ -116,33 +175,33 @@ def _require_rest(start: ObjectStart, table: Table, ground: Terrain, motion: _Mo
         )
 
 
-def _bridges(start: ObjectStart, table: Table, ground: Terrain, motion: _Motion) -> bool:
+def _bridges(task: _Task, motion: Fall) -> bool:
     """Whether it rests on the top on all sides of a hole that its centre of mass is over."""
-    if not np.isfinite(_gap_m(start, motion.T_world_obj, ground)):
+    if not np.isfinite(_gap_m(task, motion.poses[0])):
         return False
-    T = _close_gap(start, ground, motion).T_world_obj
-    com = transform(T, start.asset.mass.com[None, :])[0]
-    high = com[2] >= table.top.height_m - LEFT_M
-    return bool(high and support_margin(touching(start.hull, T, ground), com[:2]) > 0.0)
+    T = _close_gap(task, motion).poses[0]
+    com = transform(T, task.start.asset.mass.com[None, :])[0]
+    high = com[2] >= task.table.top.height_m - LEFT_M
+    return bool(high and support_margin(touching(task.start.hull, T, task.ground), com[:2]) > 0.0)
 
 
-def _close_gap(start: ObjectStart, ground: Terrain, motion: _Motion) -> _Motion:
+def _close_gap(task: _Task, motion: Fall) -> Fall:
     """Move along z until the meshes just touch."""
-    lift = translation(0.0, 0.0, -_gap_m(start, motion.T_world_obj, ground))
-    return dataclasses.replace(motion, T_world_obj=lift @ motion.T_world_obj)
+    lift = translation(0.0, 0.0, -_gap_m(task, motion.poses[0]))
+    return dataclasses.replace(motion, poses=(lift @ motion.poses[0],))
 
 
-def _gap_m(start: ObjectStart, T_world_obj: Pose, ground: Terrain) -> float:
-    shape = start.asset.shape.mesh
-    return vertical_gap(Mesh(transform(T_world_obj, shape.vertices), shape.faces), ground)
+def _gap_m(task: _Task, T_world_obj: Pose) -> float:
+    shape = task.start.asset.shape.mesh
+    return vertical_gap(Mesh(transform(T_world_obj, shape.vertices), shape.faces), task.ground)
 
 
-def _describe(start: ObjectStart, ground: Terrain, motion: _Motion, support: str) -> Settled:
+def _describe(task: _Task, motion: Fall, support: str) -> Settled:
     """The figures of a rest pose, measured between the meshes and not taken from the simulator."""
-    T = motion.T_world_obj
-    gap_mm = _gap_m(start, T, ground) * 1e3
+    T, start = motion.poses[0], task.start
+    gap_mm = _gap_m(task, T) * 1e3
     com = transform(T, start.asset.mass.com[None, :])[0]
-    margin = support_margin(touching(start.hull, T, ground), com[:2])
+    margin = support_margin(touching(start.hull, T, task.ground), com[:2])
     if support != "mesh" and not margin > 0.0:
         raise SettleError(
             "unsupported",
@@ -160,77 +219,41 @@ def _describe(start: ObjectStart, ground: Terrain, motion: _Motion, support: str
     )
 
 
-def _simulate(start: ObjectStart, table: Table, physics: Physics, seconds: float, flat: bool) -> _Motion:
-    """Drop the object onto the flat top or the mesh; `stayed` is False where its footprint left the flat top.
+def _simulate(task: _Task, seconds: float, flat: bool, whole: bool = False) -> Fall:
+    """Drop the object onto the flat top or the mesh; a watch happens where its footprint leaves the flat top.
 
     What stands on a level plane touches it with few of its vertices as long as it does not tip, and Bullet's time goes
-    with their number. So it falls with these alone, and falls again with all of them should it tip.
+    with their number. So it falls with these alone, and falls again with all of them should it tip; with all at once
+    where `whole`.
     """
-    T_obj_body, moments = _body_frame(start.asset.mass)
-    vertices = transform(invert(T_obj_body), start.hull.vertices)
-    reach = float(np.linalg.norm(vertices, axis=1).max())
-    T_world_body = start.T_world_obj @ T_obj_body
+    start, table = task.start, task.table
+    faller = make_faller(start, task.physics, "rolling_friction" in task.ran, task.damping)
+    points = transform(start.T_world_obj, start.hull.vertices)
+    below = table.top.height_m if flat else support_height(points[:, :2], table.mesh)
+    free = max(0.0, float(points[:, 2].min()) - below) if math.isfinite(below) else 0.0
+    pace = _pace(task, free if flat else 0.0)
+    ground = table.top.height_m if flat else table.mesh
+    gone = watch_gone(float(table.mesh.vertices[:, 2].min()) - faller.reach_m)
 
-    def fall(vertices: Array, watches: tuple[Watch, ...]) -> _Motion:
-        ground = table.top.height_m if flat else table.mesh
-        body = Body(start.asset.mass.mass_kg, moments, vertices)
-        with drop(body, T_world_body, ground, physics, SAMPLE_STEPS) as world:
-            motion = _run(world, physics, seconds, reach, watches)
-        return dataclasses.replace(motion, T_world_obj=motion.T_world_obj @ invert(T_obj_body))
+    def drop(faller: Faller, *watches) -> Fall:  # type: ignore[no-untyped-def]
+        return fall([faller], [start.T_world_obj], ground, task.physics, pace, seconds, free, watches)
 
     if not flat:
-        return fall(vertices, ())
-    leaves = watch_edge(table.top.outline, reach)
-    down = -T_world_body[2, :3]
-    if stands_on_face(vertices, down):
-        motion = fall(vertices[can_touch(vertices, down)], (leaves, watch_tilt(T_world_body)))
-        if motion.stayed:
+        return drop(faller, gone)
+    leaves = watch_edge(table.top.outline, faller.reach_m)
+    T_world_body = start.T_world_obj @ faller.T_obj_body
+    down, vertices = -T_world_body[2, :3], faller.body.parts[0]
+    if not whole and stands_on_face(vertices, down):
+        motion = drop(faller.only(vertices[can_touch(vertices, down)]), leaves, watch_tilt(T_world_body))
+        if motion.happened != 1:
             return motion
-    return fall(vertices, (leaves,))
+    return drop(faller, leaves)
 
 
-def _run(world: World, physics: Physics, seconds: float, reach: float, watches: tuple[Watch, ...]) -> _Motion:
-    """Step until the object rests, the time is over, or something that was watched for happens.
-
-    It rests when, for the whole window, no point has gone further than the rest speed would take it, nor turned further
-    than the rest spin would, and nothing moved faster than `CALM_M_S`. Displacement counts and not speed, because
-    Bullet's contact points flicker between the many vertices of a round rim, and an object that stands still for all
-    purposes may rattle by micrometres at some millimetres a second for ever.
-
-    The returned pose is the body frame's (centre of mass, principal axes).
-    """
-    steps, window = round(seconds * physics.step_hz), round(physics.rest.window_s * physics.step_hz)
-    drift_m = physics.rest.speed_mm_s / 1e3 * physics.rest.window_s
-    turn_rad = physics.rest.spin_rad_s * physics.rest.window_s
-    anchor, since, moved = world.pose(), 0, 0.0
-    for step in range(SAMPLE_STEPS, steps + SAMPLE_STEPS, SAMPLE_STEPS):
-        world.advance()
-        v, w = world.velocity()
-        speed, now = math.hypot(*v) + math.hypot(*w) * reach, world.pose()
-        if any(happens(now) for happens in watches):
-            return _Motion(_pose(now), speed, step / physics.step_hz, False, False)
-        turned = _angle(anchor[1], now[1])
-        moved = math.dist(anchor[0], now[0]) + turned * reach
-        if speed > CALM_M_S or moved > drift_m or turned > turn_rad:
-            anchor, since = now, step
-        elif step - since >= window:
-            return _Motion(_pose(now), moved * physics.step_hz / (step - since), step / physics.step_hz, True, True)
-    return _Motion(_pose(now), speed, step / physics.step_hz, False, True)
-
-
-def _angle(a: Sequence[float], b: Sequence[float]) -> float:
-    """Angle, radians, of the turn between two unit quaternions; for small turns the chord is half the angle."""
-    return 4.0 * math.asin(min(1.0, 0.5 * min(math.dist(a, b), math.dist(a, [-c for c in b]))))
-
-
-def _body_frame(mass: MassProperties) -> tuple[Pose, Array]:
-    """Centre of mass and principal axes: `T_obj_body` [4, 4], and the principal moments [3] kg m^2."""
-    moments, axes = np.linalg.eigh(mass.inertia)
-    if np.linalg.det(axes) < 0:
-        axes = axes * np.array([1.0, 1.0, -1.0])
-    return pose(axes, mass.com), moments
-
-
-def _pose(motion: Motion) -> Pose:
-    position, quaternion = motion
-    return pose(rotation_from_quaternion(np.array(quaternion)), np.array(position))
+def _pace(task: _Task, drop_m: float) -> Pace:
+    """Steps from the scene's own scales: how far it falls, and how thin the object is."""
+    physics = task.physics
+    if "fine_step" not in task.ran:
+        return Pace(physics.step_hz, math.inf)
+    way_m = max(physics.way_mm / 1e3, DROP_SHARE * drop_m)
+    return Pace(physics.step_hz, min(way_m, THIN_SHARE * least_width_m(task.start.hull)))

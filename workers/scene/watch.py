@@ -48,6 +48,15 @@ def watch_edge(outline: Array, reach: float) -> Watch:
     return leaves
 
 
+def watch_gone(below_m: float) -> Watch:
+    """Whether a body's centre of mass is lower than `below_m`, world z: below everything that it could land on."""
+
+    def gone(motion: Motion) -> bool:
+        return motion[0][2] < below_m
+
+    return gone
+
+
 def watch_tilt(T_world_body: Pose) -> Watch:
     """Whether the body leans by more than `TIPPED_RAD` from how it began."""
     a, b, c = T_world_body[2, :3].tolist()

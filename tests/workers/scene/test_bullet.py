@@ -28,7 +28,7 @@ def anonymous_kb():
     return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("RssAnon"))
 
 points = np.random.default_rng(0).standard_normal((400, 3))
-body = Body(1.0, np.ones(3) * 1e-3, 0.1 * points / np.linalg.norm(points, axis=1)[:, None])
+body = Body(1.0, np.ones(3) * 1e-3, (0.1 * points / np.linalg.norm(points, axis=1)[:, None],), 1e-4)
 square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 plate = Mesh(np.tile(square, (100, 1)), np.arange(400)[:, None] // 4 * 4 + np.array([[0, 1, 2], [0, 2, 3]]).repeat(200, 0))
 T = np.eye(4)
@@ -43,7 +43,7 @@ print((sizes[512] - sizes[256]) / 256)
 
 
 def body_of(shape) -> Body:
-    return Body(0.4, np.array([1.5e-3, 1.6e-3, 5e-4]), np.asarray(shape.vertices))
+    return Body(0.4, np.array([1.5e-3, 1.6e-3, 5e-4]), (np.asarray(shape.vertices),), 1e-4)
 
 
 def fall(body: Body, T, advances: int = 60):

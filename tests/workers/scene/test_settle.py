@@ -17,8 +17,9 @@ from workers.assets.procedural.make import make_asset
 from workers.geometry.frames import angle_between, pose, rotation_about, transform, translation
 from workers.geometry.heights import vertical_gap
 from workers.geometry.hull import convex_hull
+from workers.scene.fall import body_frame
 from workers.scene.plan import draw_start, plan_scene
-from workers.scene.settle import _body_frame, recheck, settle
+from workers.scene.settle import recheck, settle
 from workers.scene.support import place_table
 
 PHYSICS = Job(name="t").physics
@@ -66,7 +67,7 @@ def test_tumbled_cylinders_rest_on_a_face_with_their_centre_above_it_and_do_not_
     assert rest.penetration_mm < 1e-9
     assert rest.hover_gap_mm < 1e-9
     assert rest.support_margin_mm > 1.0
-    assert recheck(plan.objects[0], rest, plan.table, PHYSICS) < 0.2
+    assert recheck(plan.objects[0], rest, plan.table, PHYSICS)[0] < 0.1
 
 
 @pytest.mark.parametrize("scene_id", [5, 11, 18, 23])
@@ -77,7 +78,7 @@ def test_a_bottle_that_rolling_friction_held_on_an_edge_rolls_onto_a_face_and_no
     rest = settle(start, TABLE, PHYSICS)
     assert rest.support == "flat_top"
     assert rest.support_margin_mm > 0.0
-    assert recheck(start, rest, TABLE, PHYSICS) < 0.2
+    assert recheck(start, rest, TABLE, PHYSICS)[0] < 0.1
 
 
 def test_the_same_start_gives_the_same_bits():
@@ -91,10 +92,10 @@ def test_the_same_start_gives_the_same_bits():
 def test_an_object_whose_frame_is_far_from_its_centre_of_mass_falls_the_same_way():
     here = asset_of(box(0.1, 0.08, 0.2))
     shifted = asset_of(box(0.1, 0.08, 0.2, (0.3, -0.2, 0.1)))
-    R = rotation_about(np.array([0, 1.0, 0]), 0.3)
-    a = settle(start_of(here, pose(R, np.array([0, 0, TOP + 0.2]))), TABLE, PHYSICS)
+    R = rotation_about(np.array([0, 1.0, 0]), 0.05)
+    a = settle(start_of(here, pose(R, np.array([0, 0, TOP + 0.12]))), TABLE, PHYSICS)
     offset = translation(-0.3, 0.2, -0.1)
-    b = settle(start_of(shifted, pose(R, np.array([0, 0, TOP + 0.2])) @ offset), TABLE, PHYSICS)
+    b = settle(start_of(shifted, pose(R, np.array([0, 0, TOP + 0.12])) @ offset), TABLE, PHYSICS)
     # Two roundings of one drop that bounces on an edge differ by some tenths of a milliradian, and not by decimetres.
     assert b.T_world_obj @ np.linalg.inv(offset) == pytest.approx(a.T_world_obj, abs=2e-3)
 
@@ -119,7 +120,7 @@ def test_an_object_over_a_hole_rests_on_its_rim_if_it_is_larger(side, stays):
     start = start_of(asset_of(box(side, side, 0.05)), translation(0.0, 0.0, top + 0.03))
     if stays:
         rest = settle(start, holed, PHYSICS)
-        assert rest.T_world_obj[:3, 3] == pytest.approx([0.0, 0.0, top + 0.025], abs=1e-5)
+        assert rest.T_world_obj[:3, 3] == pytest.approx([0.0, 0.0, top + 0.025], abs=2e-5)
         assert rest.support_margin_mm > 1e3 * (side - 0.001) / 2
     else:
         with pytest.raises(SettleError) as caught:
@@ -146,7 +147,7 @@ def test_a_placed_object_is_not_simulated_and_not_moved():
 
 def test_principal_axes_are_a_rotation_that_makes_the_inertia_diagonal():
     mass = asset_of(box(0.1, 0.02, 0.05), box(0.03, 0.2, 0.01, (0.05, 0.1, 0.02))).mass
-    T, moments = _body_frame(mass)
+    T, moments = body_frame(mass)
     R = T[:3, :3]
     assert np.linalg.det(R) == pytest.approx(1.0)
     assert R.T @ mass.inertia @ R == pytest.approx(np.diag(moments), abs=1e-12)
