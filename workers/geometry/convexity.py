@@ -1,0 +1,76 @@
+"""How far a surface is from convex, and the pieces that it falls into. Pure."""
+
+import manifold3d
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from schemas.base import Array
+from schemas.shape import Mesh
+from workers.geometry.manifold import hold_to_one_thread
+from workers.geometry.nearest import nearest_on_mesh
+
+
+def weld(mesh: Mesh) -> Mesh:
+    """The same triangles with one vertex at each place, each once, without those that have two corners at one place."""
+    vertices, inverse = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces = inverse.reshape(-1)[mesh.faces].astype(np.int32)
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return Mesh(vertices, faces[np.sort(first)])
+
+
+def components(mesh: Mesh) -> list[Mesh]:
+    """The pieces of a welded mesh that share no vertex, in the order of their first vertex; loose vertices are left out."""
+    ends = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    count = len(mesh.vertices)
+    links = coo_matrix((np.ones(len(ends), dtype=np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    label = connected_components(links, directed=False)[1]
+    used, first = np.unique(label[mesh.faces[:, 0]], return_index=True)
+    return [_piece(mesh, mesh.faces[label[mesh.faces[:, 0]] == one]) for one in used[np.argsort(first, kind="stable")]]
+
+
+def _piece(mesh: Mesh, faces: NDArray[np.int32]) -> Mesh:
+    kept, inverse = np.unique(faces, return_inverse=True)
+    return Mesh(mesh.vertices[kept], inverse.reshape(-1, 3).astype(np.int32))
+
+
+def concavity_m(mesh: Mesh) -> float:
+    """How deep below its hull the surface lies, metres: the largest distance from the hull to the mesh.
+
+    Looked for at the middle of each triangle of the hull and of each of its edges: a dent is wider than it is deep, or
+    deeper than what is found. The other way, from the mesh to the hull, a thin wall would count by its thickness only.
+    """
+    hull = manifold3d.Manifold.hull_points(np.ascontiguousarray(mesh.vertices))
+    if hull.is_empty():  # flat
+        return 0.0
+    a, b, c = triangle_corners(triangles_of(hull))
+    points = np.concatenate([(a + b + c) / 3, (a + b) / 2, (b + c) / 2, (c + a) / 2])
+    found, _ = nearest_on_mesh(points, mesh)
+    return float(np.linalg.norm(found - points, axis=1).max())
+
+
+def triangle_corners(mesh: Mesh) -> tuple[Array, Array, Array]:
+    """Of every triangle, [F, 3] each."""
+    return mesh.vertices[mesh.faces[:, 0]], mesh.vertices[mesh.faces[:, 1]], mesh.vertices[mesh.faces[:, 2]]
+
+
+def solid_of(mesh: Mesh) -> manifold3d.Manifold | None:
+    """The body that a welded mesh encloses, wound outwards; None where it is not closed, or not a manifold."""
+    hold_to_one_thread()
+    for faces in (mesh.faces, mesh.faces[:, ::-1]):
+        solid = manifold3d.Manifold(
+            manifold3d.Mesh64(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(faces.astype(np.uint64)))
+        )
+        if solid.status() != manifold3d.Error.NoError:
+            return None
+        if solid.volume() > 0.0:
+            return solid
+    return None
+
+
+def triangles_of(solid: manifold3d.Manifold) -> Mesh:
+    """Its surface as a mesh."""
+    mesh = solid.to_mesh64()
+    return Mesh(np.array(mesh.vert_properties, dtype=np.float64)[:, :3], np.array(mesh.tri_verts, dtype=np.int32))
