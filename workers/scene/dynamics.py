@@ -1,13 +1,18 @@
 """The effects of physics: which of them the scene calls for, from its shapes and scales alone. Pure."""
 
+import itertools
+import math
 from collections.abc import Callable, Sequence
 
+import manifold3d
 import numpy as np
 
 from schemas.job import Physics
 from schemas.scene import ObjectStart, Table
 from schemas.shape import Hull
+from workers.geometry.decompose import CONVEX_SHARE
 from workers.geometry.frames import transform
+from workers.geometry.manifold import hold_to_one_thread
 from workers.scene.effect import Effect, Facts
 from workers.scene.support import inside_margin
 
@@ -16,6 +21,9 @@ ROUND_FACES = 20
 
 SAME_PLANE = 1e-6
 """Normals whose coordinates differ by less are of one plane."""
+
+LEAST_ROOM_M = 0.01
+"""Objects whose rooms are narrower than this are simulated together at once."""
 
 AT_REST = "placed in a statically stable pose"
 
@@ -35,24 +43,62 @@ def starts_over_top(start: ObjectStart, table: Table) -> bool:
     return bool(inside_margin(points, table.top.outline).min() > 0.0)
 
 
-def _dynamics(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
-    return AT_REST if all(start.placed for start in starts) else None
+def is_convex(start: ObjectStart) -> bool:
+    """Whether the object fills its hull; what encloses no body does not."""
+    volume = start.asset.volume_m3
+    if volume is None:
+        return False
+    hold_to_one_thread()
+    hull = manifold3d.Manifold.hull_points(np.ascontiguousarray(start.hull.vertices))
+    return volume >= CONVEX_SHARE * hull.volume()
+
+
+def rooms_m(starts: Sequence[ObjectStart]) -> list[float]:
+    """How far each object's centre of mass may go sideways without any two having to meet; negative where they may."""
+    middles = [transform(start.T_world_obj, start.asset.mass.com[None, :])[0, :2] for start in starts]
+    reaches = [float(np.linalg.norm(start.hull.vertices - start.asset.mass.com, axis=1).max()) for start in starts]
+    rooms = [math.inf] * len(starts)
+    for i, j in itertools.combinations(range(len(starts)), 2):
+        room = (float(np.linalg.norm(middles[i] - middles[j])) - reaches[i] - reaches[j]) / 2
+        rooms[i], rooms[j] = min(rooms[i], room), min(rooms[j], room)
+    return rooms
+
+
+def _resting(predicate: Predicate) -> Predicate:
+    """An effect of motion: not called for where nothing moves."""
+
+    def skipped(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
+        return AT_REST if all(start.placed for start in starts) else predicate(starts, table, physics)
+
+    return skipped
+
+
+def _always(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
+    return None
+
+
+def _over_top(starts: Sequence[ObjectStart], table: Table) -> bool:
+    return all(starts_over_top(start, table) for start in starts)
 
 
 def _table_mesh(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
-    if all(start.placed for start in starts):
-        return AT_REST
-    over = all(starts_over_top(start, table) for start in starts)
-    return "all starts over the table's convex flat top, and nothing left it" if over else None
+    return "all starts over the table's convex flat top, and nothing left it" if _over_top(starts, table) else None
 
 
-def _fine_step(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
-    return AT_REST if all(start.placed for start in starts) else None
+def _object_contacts(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
+    if len(starts) == 1:
+        return "there is one object"
+    return "no two objects came near one another" if min(rooms_m(starts)) > LEAST_ROOM_M else None
+
+
+def _decomposition(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
+    alone = _object_contacts(starts, table, physics) is not None
+    if alone and _over_top(starts, table):
+        return "over a flat top an object touches with its hull alone"
+    return "every object is convex" if all(is_convex(start) for start in starts) else None
 
 
 def _rolling(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
-    if all(start.placed for start in starts):
-        return AT_REST
     return None if any(is_round(start.hull) for start in starts) else "nothing here is round"
 
 
@@ -61,16 +107,20 @@ def _restitution(starts: Sequence[ObjectStart], table: Table, physics: Physics) 
 
 
 PREDICATES: dict[str, Predicate] = {
-    "dynamics": _dynamics,
-    "table_mesh": _table_mesh,
-    "fine_step": _fine_step,
-    "rolling_friction": _rolling,
-    "restitution": _restitution,
+    "dynamics": _resting(_always),
+    "table_mesh": _resting(_table_mesh),
+    "object_contacts": _resting(_object_contacts),
+    "decomposition": _resting(_decomposition),
+    "fine_step": _resting(_always),
+    "rolling_friction": _resting(_rolling),
+    "restitution": _resting(_restitution),
 }
 
 _COSTS = {
     "dynamics": "milliseconds a scene",
     "table_mesh": "the simulation takes several times as long",
+    "object_contacts": "all objects are simulated at once, until the last rests",
+    "decomposition": "seconds for each new shape, and tens of parts for one hull",
     "fine_step": "up to 16 times as many steps while things move fast",
     "rolling_friction": "three rows more for each pair in contact",
     "restitution": "the fall is simulated for longer",

@@ -7,20 +7,22 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from schemas.base import Pose, frozen_array
+from schemas.base import Array, Pose, frozen_array
 from schemas.errors import SettleError
 from schemas.job import Physics
 from schemas.scene import ObjectStart, ScenePlan, Settled, Table
 from schemas.shape import Mesh
+from workers.geometry.decompose import convex_parts
 from workers.geometry.frames import transform, translation
 from workers.geometry.heights import Terrain, heights_at, survey, vertical_gap
 from workers.geometry.inset import least_width_m
 from workers.scene.contact import snap_to_face, support_margin, tip_onto_face, touching
-from workers.scene.dynamics import called_for
+from workers.scene.dynamics import called_for, is_convex, rooms_m
 from workers.scene.effect import EffectPlan
 from workers.scene.fall import FINEST, Fall, Faller, Pace, fall, make_faller
 from workers.scene.support import support_height
-from workers.scene.watch import can_touch, stands_on_face, watch_edge, watch_gone, watch_tilt
+from workers.scene.together import settle_together
+from workers.scene.watch import Watch, can_touch, stands_on_face, watch_edge, watch_gone, watch_room, watch_tilt
 
 LEFT_M = 0.05
 """An object whose table lies this far below the top has left it."""
@@ -41,7 +43,12 @@ DROP_SHARE = 0.002
 THIN_SHARE = 0.05
 """Of the thinnest object: how far a point may go in a step."""
 
-LEFT_TOP = "its footprint left the table's flat top"
+LEFT_TOP = "a footprint left the table's flat top"
+LEFT_ROOM = "an object left the room that it had to itself"
+
+
+class _LeftRoomError(Exception):
+    """An object came where it may meet another."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +68,7 @@ class _Task:
     ground: Terrain
     physics: Physics
     ran: Collection[str]
+    room_m: float = math.inf
     damping: float = 0.0
 
 
@@ -70,16 +78,45 @@ def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan) -> Rest
     Raises SettleError `not_at_rest`, `left_table`, `unsupported` or `table_too_fine`. The result is a function of the
     arguments alone: the world is made anew each time.
     """
-    settled = tuple(settle(start, plan.table, physics, effects.ran) for start in plan.objects)
-    left = any(rest.support == "mesh" for rest in settled) and not effects.runs("table_mesh")
-    return Rest(settled, {"table_mesh": LEFT_TOP} if left else {})
+    starts, table, called = plan.objects, plan.table, dict[str, str]()
+    if len(starts) == 1:
+        settled: tuple[Settled, ...] = (settle(starts[0], table, physics, effects.ran),)
+    elif effects.runs("object_contacts"):
+        settled = settle_together(starts, table, physics, effects.ran)
+    else:
+        try:
+            rooms = rooms_m(starts)
+            settled = tuple(
+                settle(start, table, physics, effects.ran, room) for start, room in zip(starts, rooms, strict=True)
+            )
+        except _LeftRoomError:
+            called["object_contacts"] = LEFT_ROOM
+            ran = (*effects.ran, "object_contacts")
+            if not all(is_convex(start) for start in starts):
+                called["decomposition"] = LEFT_ROOM
+                ran = (*ran, "decomposition")
+            settled = settle_together(starts, table, physics, ran)
+    if any(rest.support == "mesh" for rest in settled):
+        called["table_mesh"] = LEFT_TOP
+        if not all(is_convex(start) for start in starts):
+            called["decomposition"] = LEFT_TOP
+    return Rest(settled, {name: why for name, why in called.items() if not effects.runs(name)})
 
 
-def settle(start: ObjectStart, table: Table, physics: Physics, ran: Collection[str] | None = None) -> Settled:
-    """One object on its own, with the effects that are named, or else those that it calls for. Raises SettleError."""
+def settle(
+    start: ObjectStart,
+    table: Table,
+    physics: Physics,
+    ran: Collection[str] | None = None,
+    room_m: float = math.inf,
+) -> Settled:
+    """One object on its own, with the effects that are named, or else those that it calls for. Raises SettleError.
+
+    Its centre of mass may go `room_m` sideways.
+    """
     ran = called_for((start,), table, physics) if ran is None else ran
-    task = _Task(start, table, survey(table.mesh), physics, ran)
-    if "dynamics" not in ran:
+    task = _Task(start, table, survey(table.mesh), physics, ran, room_m)
+    if start.placed and "dynamics" not in ran:
         return _describe(task, Fall((start.T_world_obj,), 0.0, 0.0, True), "placed")
     if "table_mesh" not in ran:
         motion = _settle_flat(task)
@@ -128,7 +165,7 @@ def recheck(start: ObjectStart, settled: Settled, table: Table, physics: Physics
     again = dataclasses.replace(start, T_world_obj=settled.T_world_obj, placed=False)
     fine = physics.model_copy(update={"step_hz": FINEST * physics.step_hz, "max_settle_s": RECHECK_S})
     task = _Task(again, table, survey(table.mesh), fine, ran)
-    after = _simulate(task, RECHECK_S, flat=settled.support != "mesh", whole=True).poses[0]
+    after = _simulate(task, RECHECK_S, flat=settled.support != "mesh").poses[0]
     return moved_by(start, settled.T_world_obj, after)
 
 
@@ -145,7 +182,7 @@ def release_again(
     for start, rest in zip(plan.objects, settled, strict=True):
         again = dataclasses.replace(start, T_world_obj=rest.T_world_obj, placed=False)
         task = _Task(again, plan.table, survey(plan.table.mesh), fine, effects.ran)
-        ended.append(_simulate(task, seconds, flat, whole=True).poses[0])
+        ended.append(_simulate(task, seconds, flat).poses[0])
     return tuple(ended)
 
 
@@ -219,35 +256,43 @@ def _describe(task: _Task, motion: Fall, support: str) -> Settled:
     )
 
 
-def _simulate(task: _Task, seconds: float, flat: bool, whole: bool = False) -> Fall:
+def _simulate(task: _Task, seconds: float, flat: bool) -> Fall:
     """Drop the object onto the flat top or the mesh; a watch happens where its footprint leaves the flat top.
 
     What stands on a level plane touches it with few of its vertices as long as it does not tip, and Bullet's time goes
-    with their number. So it falls with these alone, and falls again with all of them should it tip; with all at once
-    where `whole`.
+    with their number. So it falls with these alone, and falls again with all of them should it tip. On the mesh it falls as
+    its convex parts.
     """
     start, table = task.start, task.table
-    faller = make_faller(start, task.physics, "rolling_friction" in task.ran, task.damping)
+    cut: Sequence[Array] = ()
+    if not flat and not is_convex(start):
+        parts = convex_parts(start.asset.shape.mesh, start.asset.sha256)
+        cut = parts if len(parts) > 1 else ()
+    faller = make_faller(start, task.physics, "rolling_friction" in task.ran, task.damping, cut)
     points = transform(start.T_world_obj, start.hull.vertices)
     below = table.top.height_m if flat else support_height(points[:, :2], table.mesh)
     free = max(0.0, float(points[:, 2].min()) - below) if math.isfinite(below) else 0.0
     pace = _pace(task, free if flat else 0.0)
     ground = table.top.height_m if flat else table.mesh
-    gone = watch_gone(float(table.mesh.vertices[:, 2].min()) - faller.reach_m)
-
-    def drop(faller: Faller, *watches) -> Fall:  # type: ignore[no-untyped-def]
-        return fall([faller], [start.T_world_obj], ground, task.physics, pace, seconds, free, watches)
-
-    if not flat:
-        return drop(faller, gone)
-    leaves = watch_edge(table.top.outline, faller.reach_m)
     T_world_body = start.T_world_obj @ faller.T_obj_body
-    down, vertices = -T_world_body[2, :3], faller.body.parts[0]
-    if not whole and stands_on_face(vertices, down):
-        motion = drop(faller.only(vertices[can_touch(vertices, down)]), leaves, watch_tilt(T_world_body))
-        if motion.happened != 1:
+    gone = watch_gone(float(table.mesh.vertices[:, 2].min()) - faller.reach_m)
+    leaves = watch_edge(table.top.outline, faller.reach_m) if flat else gone
+    strays = watch_room(T_world_body[:2, 3], task.room_m)
+
+    def drop(faller: Faller, *more: Watch) -> Fall:
+        watches = (leaves, strays, *more)
+        motion = fall([faller], [start.T_world_obj], ground, task.physics, pace, seconds, free, watches)
+        if motion.happened == 1:
+            raise _LeftRoomError
+        return motion
+
+    down = -T_world_body[2, :3]
+    if flat and stands_on_face(faller.body.parts[0], down):
+        vertices = faller.body.parts[0]
+        motion = drop(faller.only(vertices[can_touch(vertices, down)]), watch_tilt(T_world_body))
+        if motion.happened != 2:
             return motion
-    return drop(faller, leaves)
+    return drop(faller)
 
 
 def _pace(task: _Task, drop_m: float) -> Pace:

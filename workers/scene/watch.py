@@ -48,6 +48,16 @@ def watch_edge(outline: Array, reach: float) -> Watch:
     return leaves
 
 
+def watch_room(middle: Array, room_m: float) -> Watch:
+    """Whether a body's centre of mass is further than `room_m` from the vertical line through `middle` [2]."""
+    x, y = float(middle[0]), float(middle[1])
+
+    def strays(motion: Motion) -> bool:
+        return math.hypot(motion[0][0] - x, motion[0][1] - y) > room_m
+
+    return strays
+
+
 def watch_gone(below_m: float) -> Watch:
     """Whether a body's centre of mass is lower than `below_m`, world z: below everything that it could land on."""
 
