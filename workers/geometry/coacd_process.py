@@ -18,7 +18,7 @@ MISSING = 3
 def main(folder: Path) -> int:
     """Exit code."""
     allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(allowed)})  # OpenMP counts the cores when it is loaded: one thread, one order of sums
+    os.sched_setaffinity(0, {min(allowed)})  # OpenMP counts them when it is loaded: a worker has one core
     try:
         import coacd  # type: ignore[import-untyped]
     except ImportError:

@@ -13,9 +13,12 @@ from workers.geometry.nearest import nearest_on_mesh
 
 
 def weld(mesh: Mesh) -> Mesh:
-    """The same triangles with one vertex at each place, each once, without those that have two corners at one place."""
-    vertices, inverse = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    faces = inverse.reshape(-1)[mesh.faces].astype(np.int32)
+    """The same triangles, each once, with one vertex at each place and none loose; none has two corners at one place."""
+    used = np.unique(mesh.faces)
+    vertices, inverse = np.unique(mesh.vertices[used], axis=0, return_inverse=True)
+    place = np.zeros(len(mesh.vertices), dtype=np.int32)
+    place[used] = inverse.reshape(-1)
+    faces = place[mesh.faces]
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     return Mesh(vertices, faces[np.sort(first)])

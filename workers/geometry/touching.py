@@ -59,17 +59,31 @@ def touching_points(upper: Mesh, lower: Mesh, within_m: float) -> tuple[Array, A
 
 
 def _sides(upper: Mesh, lower: Mesh, within_m: float) -> tuple[_Side, _Side] | None:
-    welded = [weld(upper), weld(lower)]
-    if not all(len(mesh.faces) for mesh in welded):
+    if not (len(upper.faces) and len(lower.faces)):
         return None
-    low = np.max([mesh.vertices.min(axis=0) for mesh in welded], axis=0) - within_m
-    high = np.min([mesh.vertices.max(axis=0) for mesh in welded], axis=0) + within_m
-    sides = [_side(mesh, low, high) for mesh in welded]
-    return (sides[0], sides[1]) if sides[0] is not None and sides[1] is not None else None
+    low = np.maximum(upper.vertices.min(axis=0), lower.vertices.min(axis=0)) - within_m
+    high = np.minimum(upper.vertices.max(axis=0), lower.vertices.max(axis=0)) + within_m
+    above, below = _side(upper, low, high), _side(lower, low, high)
+    return (above, below) if above is not None and below is not None else None
+
+
+def _cut(mesh: Mesh, low: Array, high: Array) -> Mesh | None:
+    """The triangles that reach into a box, and all that have a corner in common with one of them, welded."""
+    corners = mesh.vertices[mesh.faces]
+    least, most = corners.min(axis=1), corners.max(axis=1)
+    near = ((least <= high) & (most >= low)).all(axis=1)
+    if not near.any():
+        return None
+    low, high = least[near].min(axis=0), most[near].max(axis=0)
+    return weld(Mesh(mesh.vertices, mesh.faces[((least <= high) & (most >= low)).all(axis=1)]))
 
 
 def _side(mesh: Mesh, low: Array, high: Array) -> _Side | None:
-    """The parts of a welded mesh that reach into a box; None where there are none."""
+    """The parts of a mesh that reach into a box; None where there are none."""
+    cut = _cut(mesh, low, high)
+    if cut is None:
+        return None
+    mesh = cut
     corners = mesh.vertices[mesh.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     doubled = np.linalg.norm(across, axis=1)

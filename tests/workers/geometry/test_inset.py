@@ -110,9 +110,9 @@ def test_a_tetrahedron_does_not_vanish():
 
 
 def test_where_the_middle_of_the_vertices_is_no_place_to_stand_the_largest_ball_says_where():
-    """Nearly all vertices of a long wedge lie on its blade."""
+    """Nearly all vertices of a long wedge lie on its curved blade."""
     along = np.linspace(0.0, 1.0, 200)
-    blade = np.column_stack([1e-6 * np.sin(np.pi * along), np.zeros(200), along])
+    blade = np.column_stack([1e-3 * np.sin(np.pi * along), np.zeros(200), along])
     base = np.array([[-0.1, y, z] for y in (-0.05, 0.05) for z in (0.0, 1.0)])
     hull = convex_hull(np.concatenate([blade, base]))
     smaller = inset_hull(hull, 5e-3)
