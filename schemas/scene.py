@@ -10,6 +10,9 @@ from schemas.base import Array, Pose
 from schemas.camera import Camera, Role
 from schemas.shape import Asset, Hull, Mesh, Shape
 
+SupportedBy = Literal["flat_top", "mesh", "placed"]
+"""What an object was dropped on: the table's flat top alone, its whole mesh, or nothing, where it was set down at rest."""
+
 REGION_NOTHING = 0
 REGION_FLOOR = 1
 REGION_TABLE = 2
@@ -98,20 +101,22 @@ class Settled:
     """One object at rest, with how well it rests.
 
     penetration_mm and hover_gap_mm are measured between the meshes after the correction; support_margin_mm is how far
-    the centre of mass projects inside the hull of the contact points; residual_speed_mm_s is the speed at which the
-    object's farthest point drifted over the last window, before the correction; recheck_move_mm is how far it moved when released
-    again (None where it was not re-released). `support` tells what it was dropped on: its table's flat top alone, the
-    table's whole mesh, or nothing, where it was set down at rest.
+    the centre of mass projects inside the hull of the contact points; equilibrium_residual is the share of its weight that
+    contact forces cannot balance (0 on level ground with a margin above 0); residual_speed_mm_s is the speed at which the
+    object's farthest point drifted over the last window, before the correction; recheck_move_mm and
+    recheck_turn_deg are how far it moved and turned when released again (None where it was not re-released).
     """
 
     T_world_obj: Pose
     penetration_mm: float
     hover_gap_mm: float
     support_margin_mm: float
+    equilibrium_residual: float
     residual_speed_mm_s: float
     settle_s: float
-    support: Literal["flat_top", "mesh", "placed"]
+    support: SupportedBy
     recheck_move_mm: float | None = None
+    recheck_turn_deg: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

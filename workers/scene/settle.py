@@ -10,16 +10,16 @@ import numpy as np
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import SettleError
 from schemas.job import Physics
-from schemas.scene import ObjectStart, ScenePlan, Settled, Table
-from schemas.shape import Mesh
+from schemas.scene import ObjectStart, ScenePlan, Settled, SupportedBy, Table
 from workers.geometry.decompose import convex_parts
-from workers.geometry.frames import transform, translation
-from workers.geometry.heights import Terrain, heights_at, survey, vertical_gap
+from workers.geometry.frames import transform
+from workers.geometry.heights import heights_at
 from workers.geometry.inset import least_width_m
 from workers.scene.contact import snap_to_face, support_margin, tip_onto_face, touching
 from workers.scene.dynamics import called_for, is_convex, rooms_m
 from workers.scene.effect import EffectPlan
 from workers.scene.fall import FINEST, Fall, Faller, Pace, fall, make_faller
+from workers.scene.landing import Ground, gap_m, ground_of, support_of, touch_down
 from workers.scene.support import support_height
 from workers.scene.together import settle_together
 from workers.scene.watch import Watch, can_touch, stands_on_face, watch_edge, watch_gone, watch_room, watch_tilt
@@ -35,6 +35,10 @@ DAMPING = 0.9
 
 RECHECK_S = 1.0
 """How long an object is watched when it is released again."""
+
+UNBALANCED = 0.05
+"""Share of its weight, and of weight times size, that contacts may fail to balance: what their positions, known to
+`CONTACT_M`, leave open."""
 
 DROP_SHARE = 0.002
 """Of the height that things fall: how far a point may go in a step onto level ground, if that is more than
@@ -64,8 +68,7 @@ class _Task:
     """One object to be dropped: where it starts, on what, and with which effects."""
 
     start: ObjectStart
-    table: Table
-    ground: Terrain
+    ground: Ground
     physics: Physics
     ran: Collection[str]
     room_m: float = math.inf
@@ -115,7 +118,7 @@ def settle(
     Its centre of mass may go `room_m` sideways.
     """
     ran = called_for((start,), table, physics) if ran is None else ran
-    task = _Task(start, table, survey(table.mesh), physics, ran, room_m)
+    task = _Task(start, ground_of(table), physics, ran, room_m)
     if start.placed and "dynamics" not in ran:
         return _describe(task, Fall((start.T_world_obj,), 0.0, 0.0, True), "placed")
     if "table_mesh" not in ran:
@@ -124,7 +127,7 @@ def settle(
             return _describe(task, motion, "flat_top")
     motion = _simulate(task, physics.max_settle_s, flat=False)
     _require_rest(task, motion)
-    return _describe(task, _close_gap(task, motion), "mesh")
+    return _describe(task, motion, "mesh")
 
 
 def _settle_flat(task: _Task) -> Fall | None:
@@ -153,7 +156,7 @@ def _settle_flat(task: _Task) -> Fall | None:
         if tipped is not None:
             break
         task = dataclasses.replace(task, start=dataclasses.replace(task.start, T_world_obj=T))
-    return _close_gap(task, motion)
+    return motion
 
 
 def recheck(start: ObjectStart, settled: Settled, table: Table, physics: Physics) -> tuple[float, float]:
@@ -164,7 +167,7 @@ def recheck(start: ObjectStart, settled: Settled, table: Table, physics: Physics
     ran = called_for((start,), table, physics) | {"dynamics"}
     again = dataclasses.replace(start, T_world_obj=settled.T_world_obj, placed=False)
     fine = physics.model_copy(update={"step_hz": FINEST * physics.step_hz, "max_settle_s": RECHECK_S})
-    task = _Task(again, table, survey(table.mesh), fine, ran)
+    task = _Task(again, ground_of(table), fine, ran)
     after = _simulate(task, RECHECK_S, flat=settled.support != "mesh").poses[0]
     return moved_by(start, settled.T_world_obj, after)
 
@@ -181,7 +184,7 @@ def release_again(
     ended = []
     for start, rest in zip(plan.objects, settled, strict=True):
         again = dataclasses.replace(start, T_world_obj=rest.T_world_obj, placed=False)
-        task = _Task(again, plan.table, survey(plan.table.mesh), fine, effects.ran)
+        task = _Task(again, ground_of(plan.table), fine, effects.ran)
         ended.append(_simulate(task, seconds, flat).poses[0])
     return tuple(ended)
 
@@ -194,11 +197,11 @@ def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, floa
 
 
 def _require_rest(task: _Task, motion: Fall) -> None:
-    table = task.table
-    com = transform(motion.poses[0], task.start.asset.mass.com[None, :])[0]
-    over_top = heights_at(com[None, :2], task.ground)[0] >= table.top.height_m - LEFT_M  # nan compares false
+    table, start = task.ground.table, task.start
+    com = transform(motion.poses[0], start.asset.mass.com[None, :])[0]
+    over_top = heights_at(com[None, :2], task.ground.terrain)[0] >= table.top.height_m - LEFT_M  # nan compares false
     high = com[2] >= table.top.height_m - LEFT_M
-    if not (over_top and high) and not (motion.rested and _bridges(task, motion)):
+    if not (over_top and high) and not (motion.rested and _is_held(task, motion)):
         raise SettleError(
             "left_table",
             f"after {motion.seconds:.2f} s the centre of mass was at ({com[0]:.3f}, {com[1]:.3f}, {com[2]:.3f}) m, off the "
@@ -212,47 +215,38 @@ def _require_rest(task: _Task, motion: Fall) -> None:
         )
 
 
-def _bridges(task: _Task, motion: Fall) -> bool:
-    """Whether it rests on the top on all sides of a hole that its centre of mass is over."""
-    if not np.isfinite(_gap_m(task, motion.poses[0])):
-        return False
-    T = _close_gap(task, motion).poses[0]
-    com = transform(T, task.start.asset.mass.com[None, :])[0]
-    high = com[2] >= task.table.top.height_m - LEFT_M
-    return bool(high and support_margin(touching(task.start.hull, T, task.ground), com[:2]) > 0.0)
+def _is_held(task: _Task, motion: Fall) -> bool:
+    """Whether the top holds it though its centre of mass is not over the top: over a hole, or hung on an edge."""
+    T = touch_down(task.start, motion.poses[0], task.ground)
+    support = support_of(task.start, T, task.ground, task.physics.friction**2)
+    return support.residual <= UNBALANCED and support.highest_m >= task.ground.table.top.height_m - LEFT_M
 
 
-def _close_gap(task: _Task, motion: Fall) -> Fall:
-    """Move along z until the meshes just touch."""
-    lift = translation(0.0, 0.0, -_gap_m(task, motion.poses[0]))
-    return dataclasses.replace(motion, poses=(lift @ motion.poses[0],))
-
-
-def _gap_m(task: _Task, T_world_obj: Pose) -> float:
-    shape = task.start.asset.shape.mesh
-    return vertical_gap(Mesh(transform(T_world_obj, shape.vertices), shape.faces), task.ground)
-
-
-def _describe(task: _Task, motion: Fall, support: str) -> Settled:
+def _describe(task: _Task, motion: Fall, support: SupportedBy) -> Settled:
     """The figures of a rest pose, measured between the meshes and not taken from the simulator."""
-    T, start = motion.poses[0], task.start
-    gap_mm = _gap_m(task, T) * 1e3
+    start = task.start
+    T = motion.poses[0] if support == "placed" else touch_down(start, motion.poses[0], task.ground)
+    gap_mm = gap_m(start, T, task.ground) * 1e3
     com = transform(T, start.asset.mass.com[None, :])[0]
-    margin = support_margin(touching(start.hull, T, task.ground), com[:2])
-    if support != "mesh" and not margin > 0.0:
+    margin, residual = support_margin(touching(start.hull, T, task.ground.terrain), com[:2]), 0.0
+    if support == "mesh":
+        held = support_of(start, T, task.ground, task.physics.friction**2)
+        margin, residual = held.margin_m, held.residual
+    if residual > UNBALANCED or (support != "mesh" and not margin > 0.0):
         raise SettleError(
             "unsupported",
-            f"it came to rest with its centre of mass {-margin * 1e3:.2f} mm outside the hull of its contacts: "
-            "raise physics.snap_rad or lower physics.rest.speed_mm_s",
+            f"it came to rest with its centre of mass {-margin * 1e3:.2f} mm outside the hull of its contacts, which leave "
+            f"{residual:.0%} of its weight without balance: raise physics.snap_rad or lower physics.rest.speed_mm_s",
         )
     return Settled(
         T_world_obj=frozen_array(T),
         penetration_mm=max(0.0, -gap_mm),
         hover_gap_mm=max(0.0, gap_mm),
         support_margin_mm=margin * 1e3,
+        equilibrium_residual=residual,
         residual_speed_mm_s=motion.speed_m_s * 1e3,
         settle_s=motion.seconds,
-        support=support,  # type: ignore[arg-type]
+        support=support,
     )
 
 
@@ -263,7 +257,7 @@ def _simulate(task: _Task, seconds: float, flat: bool) -> Fall:
     with their number. So it falls with these alone, and falls again with all of them should it tip. On the mesh it falls as
     its convex parts.
     """
-    start, table = task.start, task.table
+    start, table = task.start, task.ground.table
     cut: Sequence[Array] = ()
     if not flat and not is_convex(start):
         parts = convex_parts(start.asset.shape.mesh, start.asset.sha256)

@@ -1,34 +1,30 @@
 """Several objects that fall together, onto the table and onto one another."""
 
+import itertools
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 
-import manifold3d
 import numpy as np
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import SettleError
 from schemas.job import Physics
-from schemas.scene import ObjectStart, Settled, Table
+from schemas.scene import ObjectStart, Settled, SupportedBy, Table
 from schemas.shape import Mesh
-from workers.geometry.convexity import solid_of, triangles_of, weld
 from workers.geometry.decompose import convex_parts
 from workers.geometry.frames import transform
-from workers.geometry.heights import Terrain, survey, vertical_gap
-from workers.geometry.hull import convex_hull
+from workers.geometry.heights import survey
 from workers.geometry.inset import least_width_m
-from workers.geometry.manifold import hold_to_one_thread
+from workers.scene.clearance import clearances
 from workers.scene.contact import CONTACT_M
-from workers.scene.equilibrium import contact_points, support_margin_m
+from workers.scene.equilibrium import FIXED, Contact, Weight, contact_points, equilibrium_residual, support_margin_m
 from workers.scene.fall import Fall, Faller, Pace, fall, make_faller
+from workers.scene.landing import HELD_FROM, placed_mesh
 from workers.scene.support import support_height
 from workers.scene.watch import Watch, watch_edge, watch_gone
 
 LEFT_M = 0.05
 """An object whose centre of mass is this far below the table's top has left it."""
-
-NEAR_M = 0.02
-"""How far from an object the next one is looked for."""
 
 DROP_SHARE = 0.002
 """Of the height that the highest object may fall: how far a point may go in a step, if that is more than
@@ -36,9 +32,6 @@ DROP_SHARE = 0.002
 
 THIN_SHARE = 0.05
 """Of the thinnest object: how far a point may go in a step at most."""
-
-FROM_BELOW = 0.3
-"""A contact holds an object up where its normal's part along z is more than this."""
 
 
 def settle_together(
@@ -57,7 +50,7 @@ def settle_together(
         flat = False
         motion = release(fallers, [start.T_world_obj for start in starts], starts, table, physics, ran, flat)
     _require_rest(starts, table, motion)
-    return _describe(starts, table, motion, "flat_top" if flat else "mesh")
+    return _describe(starts, table, motion, physics, "flat_top" if flat else "mesh")
 
 
 def _faller(start: ObjectStart, physics: Physics, ran: Collection[str]) -> Faller:
@@ -122,73 +115,48 @@ def _require_rest(starts: Sequence[ObjectStart], table: Table, motion: Fall) -> 
         )
 
 
-def _describe(starts: Sequence[ObjectStart], table: Table, motion: Fall, support: str) -> tuple[Settled, ...]:
+def _describe(
+    starts: Sequence[ObjectStart], table: Table, motion: Fall, physics: Physics, support: SupportedBy
+) -> tuple[Settled, ...]:
     """The figures of every rest pose, measured between the meshes and not taken from the simulator."""
-    meshes = [
-        Mesh(transform(T, start.asset.shape.vertices), start.asset.shape.faces)
-        for start, T in zip(starts, motion.poses, strict=True)
+    meshes = [placed_mesh(start, T) for start, T in zip(starts, motion.poses, strict=True)]
+    coms = [transform(T, start.asset.mass.com[None, :])[0] for start, T in zip(starts, motion.poses, strict=True)]
+    gaps, contacts = clearances(meshes, survey(table.mesh)), _contacts(meshes, table)
+    weights = [
+        Weight(start.asset.mass.mass_kg, com, float(np.ptp(mesh.vertices, axis=0).max()))
+        for start, com, mesh in zip(starts, coms, meshes, strict=True)
     ]
-    ground = survey(table.mesh)
-    gaps = clearances(meshes, ground)
-    settled = []
-    for k, (start, T) in enumerate(zip(starts, motion.poses, strict=True)):
-        com = transform(T, start.asset.mass.com[None, :])[0]
-        settled.append(
-            Settled(
-                T_world_obj=frozen_array(T),
-                penetration_mm=max(0.0, -gaps[k][0]) * 1e3,
-                hover_gap_mm=max(0.0, gaps[k][0]) * 1e3,
-                support_margin_mm=1e3 * _margin_m(k, meshes, ground, com),
-                residual_speed_mm_s=motion.speed_m_s * 1e3,
-                settle_s=motion.seconds,
-                support=support,  # type: ignore[arg-type]
-            )
+    residuals = equilibrium_residual(weights, contacts, physics.friction**2)
+    return tuple(
+        Settled(
+            T_world_obj=frozen_array(motion.poses[k]),
+            penetration_mm=max(0.0, -gaps[k]) * 1e3,
+            hover_gap_mm=max(0.0, gaps[k]) * 1e3,
+            support_margin_mm=1e3 * _margin_m(k, contacts, weights[k]),
+            equilibrium_residual=float(residuals[k]),
+            residual_speed_mm_s=motion.speed_m_s * 1e3,
+            settle_s=motion.seconds,
+            support=support,
         )
-    return tuple(settled)
+        for k in range(len(starts))
+    )
 
 
-def clearances(meshes: Sequence[Mesh], ground: Terrain) -> list[tuple[float, int]]:
-    """Of each mesh (world coordinates): metres to what is nearest, negative where they overlap, and what that is.
-
-    The number of another mesh, or -1 for the ground. Overlaps count before gaps. Between two meshes the least distance,
-    or minus the least width of what they share; a mesh that encloses no body stands there as its hull.
-    """
-    hold_to_one_thread()
-    solids = [_solid(mesh) for mesh in meshes]
-    boxes = [(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) for mesh in meshes]
-    found = [(vertical_gap(mesh, ground), -1) for mesh in meshes]
-    for i, j in _pairs(len(meshes)):
-        if (boxes[i][0] > boxes[j][1] + NEAR_M).any() or (boxes[j][0] > boxes[i][1] + NEAR_M).any():
-            continue
-        gap = _between(solids[i], solids[j])
-        for a, b in ((i, j), (j, i)):
-            found[a] = min(found[a], (gap, b))
+def _contacts(meshes: Sequence[Mesh], table: Table) -> list[Contact]:
+    """Of every mesh with the table, and of every two that come near one another."""
+    found = [Contact(k, FIXED, *contact_points(mesh, table.mesh, CONTACT_M)) for k, mesh in enumerate(meshes)]
+    boxes = [(mesh.vertices.min(axis=0) - CONTACT_M, mesh.vertices.max(axis=0) + CONTACT_M) for mesh in meshes]
+    for i, j in itertools.combinations(range(len(meshes)), 2):
+        if (boxes[i][0] <= boxes[j][1]).all() and (boxes[j][0] <= boxes[i][1]).all():
+            found.append(Contact(i, j, *contact_points(meshes[i], meshes[j], CONTACT_M)))
     return found
 
 
-def _pairs(count: int) -> Iterable[tuple[int, int]]:
-    return ((i, j) for i in range(count) for j in range(i + 1, count))
-
-
-def _solid(mesh: Mesh) -> manifold3d.Manifold:
-    solid = solid_of(weld(mesh))
-    return manifold3d.Manifold.hull_points(np.ascontiguousarray(mesh.vertices)) if solid is None else solid
-
-
-def _between(a: manifold3d.Manifold, b: manifold3d.Manifold) -> float:
-    shared = a ^ b
-    if shared.is_empty() or shared.volume() <= 0.0:
-        return float(a.min_gap(b, NEAR_M))
-    return -max(least_width_m(convex_hull(triangles_of(piece).vertices)) for piece in shared.decompose())
-
-
-def _margin_m(number: int, meshes: Sequence[Mesh], ground: Terrain, com: Array) -> float:
-    """How far the centre of mass projects inside the hull of the contacts that hold the object up; minus its reach if none."""
-    mesh = meshes[number]
-    low, high = mesh.vertices.min(axis=0) - CONTACT_M, mesh.vertices.max(axis=0) + CONTACT_M
-    points = [contact_points(mesh, ground, CONTACT_M)]
-    for k, other in enumerate(meshes):
-        if k != number and (other.vertices.max(axis=0) >= low).all() and (other.vertices.min(axis=0) <= high).all():
-            points.append(contact_points(mesh, other, CONTACT_M))
-    held = np.concatenate([at[normals[:, 2] > FROM_BELOW] for at, normals in points])
-    return support_margin_m(held, com) if len(held) else -float(np.linalg.norm(mesh.vertices - com, axis=1).max())
+def _margin_m(number: int, contacts: Sequence[Contact], weight: Weight) -> float:
+    """How far the centre of mass projects inside the hull of the contacts that hold the object up; minus its size if none."""
+    held = [np.empty((0, 3))]
+    for contact in contacts:
+        sign = 1.0 if contact.upper == number else -1.0 if contact.lower == number else 0.0
+        held.append(contact.points[sign * contact.normals[:, 2] > HELD_FROM])
+    points = np.concatenate(held)
+    return support_margin_m(points, weight.com) if len(points) else -weight.size_m

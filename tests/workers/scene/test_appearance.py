@@ -104,7 +104,7 @@ def test_floors_differ_in_colour_scale_and_angle():
     ],
 )
 def test_the_receipt_says_which_effects_of_light_ran(tier, expected):
-    rest = Settled(np.eye(4), 0.0, 0.0, 1.0, 0.0, 0.1, "flat_top")
+    rest = Settled(np.eye(4), 0.0, 0.0, 1.0, 0.0, 0.0, 0.1, "flat_top")
     job = JOBS["raster"].model_copy(update={"render": Render(tier=tier)})
     ran, skipped = write_receipt(Facts(job, plan_scene(JOBS["raster"], 0, TABLE, BOX), (rest,), False))
     names = {"shadows", "ambient_occlusion", "antialiasing", "global_illumination", "glass"}
