@@ -21,6 +21,7 @@ CANARY = Job(name="canary", seed=7, scenes=1)
 CANARY_SCENE = 3
 
 LIBRARIES = (
+    "coacd",
     "embreex",
     "llvmlite",
     "manifold3d",

@@ -20,6 +20,8 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
@@ -59,8 +61,10 @@ OPEN = {"preprocess_mode": "on", "preprocess_resolution": 40}
 
 CLOSED = {"preprocess_mode": "off"}
 
-METHOD = f"coacd 1.0.14, {json.dumps([OPTIONS, OPEN, CLOSED, SIMPLER, MOST_PIECES, SHALLOW_M, CONVEX_SHARE])}, 1"
-"""What parts depend on beside the mesh and the threshold; the last number counts changes of this file."""
+LIBRARIES = ("coacd", "manifold3d", "numpy", "scipy")
+"""With other versions of these a mesh may have other parts."""
+
+NOT_INSTALLED = "the package `{}` is not installed, or cannot be loaded: set Verso up again with `./verso test`"
 
 LONGEST_S = 300
 """On some broken meshes CoACD never ends; the slowest that did end took a tenth of this."""
@@ -94,9 +98,19 @@ def decompose(mesh: Mesh, digest: str, threshold: float = THRESHOLD, folder: Pat
     why answers may be kept in memory and in `folder` (None: nowhere). Raises MachineError where CoACD is missing or was
     killed from outside, MeshError `no_convex_parts` where it does not end.
     """
-    key = key_of(METHOD, repr(threshold), digest, mesh.vertices.tobytes(), mesh.faces.tobytes())
+    key = key_of(_method(), repr(threshold), digest, mesh.vertices.tobytes(), mesh.faces.tobytes())
     way, clouds = _CACHE.get(key, folder, lambda: _decompose(mesh, threshold))
     return Parts(clouds, way)  # type: ignore[arg-type]
+
+
+@cache
+def _method() -> str:
+    """What parts depend on beside the mesh and the threshold: this folder's files, and the versions of libraries."""
+    files = sorted(Path(__file__).parent.glob("*.py"))
+    try:
+        return key_of(*(file.read_bytes() for file in files), *(version(name) for name in LIBRARIES))
+    except PackageNotFoundError as error:
+        raise MachineError(NOT_INSTALLED.format(error.name)) from error
 
 
 def _decompose(mesh: Mesh, threshold: float) -> tuple[Way, tuple[Array, ...]]:
@@ -140,7 +154,7 @@ def _run(mesh: Mesh, options: dict[str, object]) -> list[Array]:
             detail = f"CoACD found no convex parts in {LONGEST_S} s: make the mesh simpler or mend it"
             raise MeshError("no_convex_parts", detail) from error
         if done.returncode == MISSING:
-            raise MachineError("the package `coacd` is not installed: set Verso up again with `./verso test`")
+            raise MachineError(NOT_INSTALLED.format("coacd"))
         if done.returncode in (-2, -9, -15):
             raise MachineError("CoACD was killed from outside, perhaps for want of memory: use fewer workers")
         if done.returncode != 0:
