@@ -31,6 +31,10 @@ ROUND_TO = 8
 """Decimals of a collision shape's vertices, metres. Where more than three lie in a plane but for the last bits, Bullet's own
 hull leaves out some that are in it: things then sank into the ground by 20 micrometres."""
 
+TOUCHDOWN_S = 0.005
+"""So long, from `SKIPPED_TO_M` above the ground, steps are the shortest: what lands flat then stops at once, and no later
+step would mend how deep it went."""
+
 SKIPPED_TO_M = 2e-4
 """The fall through the air is not simulated until the lowest point is this near the ground."""
 
@@ -61,8 +65,10 @@ class Pace:
     slowest_hz: float
     way_m: float
 
-    def rate(self, speed_m_s: float) -> float:
-        """Steps a second for the farthest and fastest point's speed: `slowest_hz` times a power of two."""
+    def rate(self, speed_m_s: float, time_s: float = math.inf) -> float:
+        """Steps a second for the fastest point's speed: `slowest_hz` times a power of two, the highest at touchdown."""
+        if math.isfinite(self.way_m) and time_s < TOUCHDOWN_S:
+            return FINEST * self.slowest_hz
         rate = self.slowest_hz
         while speed_m_s > rate * self.way_m and rate < FINEST * self.slowest_hz:
             rate *= 2.0
@@ -170,7 +176,7 @@ def _run(
     time, rate, bounces = 0.0, physics.step_hz * 1.0, physics.restitution > 0.0
     speeds = _speeds(world, fallers)
     while True:
-        wanted = pace.rate(max(speeds))
+        wanted = pace.rate(max(speeds), time)
         if bounces and max(speeds) < BOUNCES_M_S:
             world.bounce(0.0)
             bounces, rate = False, 0.0
