@@ -75,6 +75,8 @@ def _check_depth(region_id: int, error_mm: NDArray[np.float64]) -> None:
 def check_pair(pair: Pair, check: Check) -> None:
     """Hold a pair's two views, as they were before the sensors' effects, against each other. Raises LabelError."""
     agreement = pair.exact_agreement
+    if agreement is None:  # there is no second view
+        return
     for what, median in (("the object", agreement.median_mm), ("the scene", agreement.scene_median_mm)):
         if median is not None and median > check.mirror_agreement_mm:
             raise LabelError(
