@@ -27,7 +27,8 @@ def rank_regions(things: Sequence[Placed], corners: Sequence[Array]) -> dict[int
     if not regions:
         return {}
     low, high = (np.array([boxes[region][k] for region in regions]) for k in (0, 1))
-    meets = ((low[:, None] < high[None] + NEAR_M) & (low[None] < high[:, None] + NEAR_M)).all(axis=2)
+    before = (low[:, None] < high[None] + NEAR_M).all(axis=2)
+    meets = np.logical_and(before, before.T)
     ranks = np.zeros(len(regions), np.int64)
     for number in range(1, len(regions)):
         below = ranks[:number][meets[number, :number]]
