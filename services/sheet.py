@@ -48,6 +48,9 @@ MORE_COLORS = np.array(
 DEPTH_STRETCH = (2.0, 98.0)
 """Percentiles of a depth image that are drawn as its nearest and its farthest colour."""
 
+MOST_PATCHES = 4
+"""Objects whose patches are drawn."""
+
 Picture = NDArray[np.uint8]
 
 
@@ -98,7 +101,7 @@ def _cells(read: Callable[[str], bytes], stored: StoredRange, scene: Row) -> lis
         cells.append(cell("segment", number, _paint_regions))
     cells.append(cell("RGBprojected", e))
     regions = [body["region_id"] for body in scene["bodies"] or [{"region_id": REGION_FIRST_OBJECT}]]
-    indices = [patch_index(region, len(regions)) for region in regions]
+    indices = [patch_index(region, len(regions)) for region in regions[:MOST_PATCHES]]
     patches = [patch_path(category, "RGB", number, index) for index in indices for number in (e, e + 1)]
     cells.append(_stack([read_image(read, path) for path in patches if path in listed]))
     return cells

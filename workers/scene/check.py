@@ -12,7 +12,7 @@ from schemas.camera import Camera
 from schemas.errors import LabelError
 from schemas.job import Check, Job
 from schemas.scene import REGION_FIRST_OBJECT, GBuffer, Pair, PosedScene
-from workers.geometry.raycast import cast_view, edge_distance_px
+from workers.geometry.raycast import cast_view, edge_distance_px, first_hit
 from workers.scene.randomness import Stream, stream
 
 EDGE_PX = 1.0 / 64.0
@@ -25,6 +25,10 @@ OBJECT_P99_MM = 0.05
 
 ONE_SURFACE_MM = 0.02
 """Where two things touch or cut through one another no edge marks the line, and surfaces this near are both the answer."""
+
+TOUCHING_MM = 0.1
+"""Half a unit of stored depth. Of two surfaces nearer than this, where they touch or cut through one another, the renderer
+may show either: things stand back from one another by some micrometres for each step of their order."""
 
 STEEPEST_COS = math.cos(math.radians(80.0))
 """Beyond 80 degrees of incidence a thousandth of a pixel moves depth by more than the bound."""
@@ -46,8 +50,10 @@ def check_against_rays(scene: PosedScene, camera: Camera, buffer: GBuffer, depth
     rows, columns = np.nonzero((region != buffer.region) & (error_mm > ONE_SURFACE_MM))
     if len(rows):
         away = edge_distance_px(scene.things, camera, np.stack([rows, columns], axis=1))
-        worst = int(np.argmax(away))
-        if away[worst] > EDGE_PX:
+        wrong = away > EDGE_PX
+        wrong[wrong] = ~_cut_through(scene, camera, buffer, rows[wrong], columns[wrong])
+        worst = int(np.argmax(np.where(wrong, away, -1.0)))
+        if wrong[worst]:
             at = rows[worst], columns[worst]
             raise LabelError(
                 "mask_disagrees",
@@ -60,6 +66,30 @@ def check_against_rays(scene: PosedScene, camera: Camera, buffer: GBuffer, depth
         pixels = np.argwhere(same & (region == region_id))
         to_edge = partial(edge_distance_px, scene.things, camera)
         _check_depth(int(region_id), error_mm[tuple(pixels.T)], pixels, to_edge)
+
+
+def _cut_through(
+    scene: PosedScene, camera: Camera, buffer: GBuffer, rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """[N] bool: whether a pixel's ray meets the thing that the mask names within `TOUCHING_MM` of what it meets first.
+
+    Measured along the normal of the more slanted of the two: along the ray two such surfaces may be far apart. The mask's
+    own depth must be that of the thing it names.
+    """
+    k, R = camera.intrinsics, camera.T_world_cam[:3, :3]
+    rays = np.stack([(columns + 0.5 - k.cx) / k.fx, (rows + 0.5 - k.cy) / k.fy, np.ones(len(rows))], axis=1) @ R.T
+    origins = np.broadcast_to(camera.position, rays.shape)
+    nearest, touching = first_hit(scene.things, origins, rays), np.zeros(len(rows), bool)
+    named, drawn = buffer.region[rows, columns], buffer.depth_m[rows, columns].astype(np.float64)
+    for thing in scene.things:
+        own = np.flatnonzero(named == thing.region_id)
+        alone = first_hit([thing], origins[own], rays[own])
+        met = np.isfinite(alone.distance) & np.isfinite(nearest.distance[own])
+        own, z, cosine = own[met], alone.distance[met], alone.incidence_cos[met]
+        slant = np.minimum(cosine, nearest.incidence_cos[own]) * np.linalg.norm(rays[own], axis=1)
+        faithful = np.abs(drawn[own] - z) * 1e3 * slant < ONE_SURFACE_MM
+        touching[own] = (np.abs(z - nearest.distance[own]) * 1e3 * slant < TOUCHING_MM) & faithful
+    return touching
 
 
 def _check_depth(
