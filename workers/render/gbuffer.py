@@ -98,6 +98,7 @@ class Renderer:
         """What OpenGL calls the device: tells a GPU from software."""
         self.closed = False
         self._shapes = ShapeStore(gl)
+        self._in_use = 0  # by the scene drawn last, whose other views come next
         self._targets = TargetStore(gl)
         self._programs: dict[Variant, Program] = {}
         self._scene_light: SceneLight | None = None
@@ -127,7 +128,8 @@ class Renderer:
         drawn = self._read(camera.intrinsics)
         if raster:
             drawn = self._refine(drawn, things, view, render.samples)
-        self._shapes.trim(in_use=len(things))
+        self._in_use = len(things)
+        self._shapes.trim(self._in_use)
         for image in (drawn.rgb, drawn.depth_m, drawn.region):
             image.setflags(write=False)
         return drawn
@@ -146,7 +148,7 @@ class Renderer:
         self._cull(shape, T_cam_shape)
         count = sum(self._counter.count(shape, tile) for tile in tiles(thing.shape, T_cam_shape, camera.intrinsics))
         self._gl.glDisable(self._gl.GL_CULL_FACE)
-        self._shapes.trim(in_use=1)
+        self._shapes.trim(max(1, self._in_use))
         return count
 
     def close(self) -> None:
