@@ -4,7 +4,6 @@ import contextlib
 import json
 import re
 import shutil
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ import trimesh
 
 import services.verify
 from services.jobfile import validate_job
-from services.merge import merge
 from services.query import query
 from services.ray_cluster import Slots, private_ray
 from services.replay import replay_scene
@@ -262,20 +260,22 @@ def test_a_mask_with_two_objects_swapped_is_found(made, tmp_path):
 
 
 @pytest.mark.ray
-def test_workers_shards_and_ranges_do_not_change_the_dataset(tmp_path):
+def test_workers_shards_ranges_and_an_extension_do_not_change_the_dataset(tmp_path):
     changes = {"objects_per_scene": [2, 4], "scenes": 8}
-    digests = set()
+
+    def run(name: str, slots: int, **more: Any) -> str:
+        job = validate_job(overlaid(SMALL, {**changes, **more}), "test")
+        request = RunRequest(job, Path(), str(tmp_path / name))
+        return run_job(request, contextlib.nullcontext(Slots(slots, slots))).merged.digest
+
     with private_ray(2):
-        for number, (slots, run) in enumerate(
-            [(1, {"shard_size": 8, "range_size": 8}), (2, {"shard_size": 1, "range_size": 2}), (2, {"range_size": 4})]
-        ):
-            job = validate_job(overlaid(SMALL, {**changes, "run": run}), "test")
-            request = RunRequest(job, Path(), str(tmp_path / str(number)))
-            digests.add(run_job(request, contextlib.nullcontext(Slots(slots, slots))).merged.digest)
-    assert len(digests) == 1
-    store, digest = make_dataset(tmp_path / "plain", **changes)
-    assert merge(store, 0, 8).digest == digest
-    success = json.loads((tmp_path / "0" / "_SUCCESS").read_text())
-    assert success["scenes"]["made"] + success["scenes"]["intrinsic"] == 8
-    ids = [row["scene_id"] for row in rows(LocalStore(tmp_path / "0"), "select scene_id from scenes order by 1")]
-    assert all(a < b for a, b in pairwise(ids))
+        digests = {
+            run("whole", 1, run={"shard_size": 8, "range_size": 8}),
+            run("split", 2, run={"shard_size": 1, "range_size": 2}),
+        }
+        assert run("grown", 2, scenes=3, run={"range_size": 2}) not in digests
+        digests.add(run("grown", 2, run={"range_size": 4}))
+    plain = make_dataset(tmp_path / "plain", **changes)
+    assert digests == {plain[1]}
+    success = json.loads((tmp_path / "grown" / "_SUCCESS").read_text())
+    assert success["scenes"] == {"made": 8, "intrinsic": 0, "environmental": 0}
