@@ -17,7 +17,7 @@ SEEDS = 2**32
 
 def require_tier(render: Render) -> None:
     """Raises InputError, with the remedy, where what the tier needs is not installed."""
-    if render.tier == "pathtraced":
+    if render.tier == "pathtraced" and render.rgb:
         require_mitsuba()
 
 
@@ -29,7 +29,9 @@ def draw_view(
     render: Render,
     rng: np.random.Generator,
 ) -> GBuffer:
-    """What one camera sees, in the tier that the job asks for; `rng` seeds the paths."""
+    """What one camera sees, in the tier that the job asks for; `rng` seeds the paths. Without RGB, colour means nothing."""
+    if not render.rgb:
+        return renderer.draw(things, appearance, camera, FLAT)
     if render.tier != "pathtraced":
         return renderer.draw(things, appearance, camera, render)
     labels = renderer.draw(things, appearance, camera, FLAT)

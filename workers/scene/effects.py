@@ -26,12 +26,17 @@ class Effect:
     skipped_because: Callable[[Facts], str | None]
 
 
-def _always(_: Facts) -> None:
-    return None
+def _asked(key: str, switch: Callable[[Job], bool]) -> Callable[[Facts], str | None]:
+    """An effect that runs unless its switch is off."""
+    return lambda facts: None if switch(facts.job) else f"{key} is false"
+
+
+_projection = _asked("images.projection.enabled", lambda job: job.images.projection.enabled)
 
 
 def _dynamics(facts: Facts) -> str | None:
-    return "placed in a statically stable pose" if facts.settled[0].support == "placed" else None
+    all_placed = all(rest.support == "placed" for rest in facts.settled)
+    return "placed in a statically stable pose" if all_placed else None
 
 
 def _table_mesh(facts: Facts) -> str | None:
@@ -39,14 +44,19 @@ def _table_mesh(facts: Facts) -> str | None:
         "placed": "placed in a statically stable pose",
         "flat_top": "the whole motion stayed over the table's convex flat top",
     }
-    return reasons.get(facts.settled[0].support)
+    supports = {rest.support for rest in facts.settled}
+    return None if "mesh" in supports else reasons["flat_top" if "flat_top" in supports else "placed"]
 
 
 def _splat(facts: Facts) -> str | None:
+    if (why := _projection(facts)) is not None:
+        return why
     return "images.projection.splat is 1" if facts.job.images.projection.splat == 1 else None
 
 
 def _hidden_points(facts: Facts) -> str | None:
+    if (why := _projection(facts)) is not None:
+        return why
     asked = facts.job.images.projection.hidden_point_removal
     return None if asked else "images.projection.hidden_point_removal is off"
 
@@ -62,15 +72,22 @@ def _sensor(name: str) -> Callable[[Facts], str | None]:
 
 def _tier(*tiers: Tier) -> Callable[[Facts], str | None]:
     """An effect of colour that belongs to these tiers."""
-    return lambda facts: None if facts.job.render.tier in tiers else f"render.tier is {facts.job.render.tier}"
+
+    def skipped_because(facts: Facts) -> str | None:
+        if not facts.job.render.rgb:
+            return "render.rgb is false"
+        return None if facts.job.render.tier in tiers else f"render.tier is {facts.job.render.tier}"
+
+    return skipped_because
 
 
 EFFECTS: tuple[Effect, ...] = (
     Effect("dynamics", _dynamics),
     Effect("table_mesh_collision", _table_mesh),
-    Effect("depth_camera", _always),
-    Effect("mirror", _always),
-    Effect("projection", _always),
+    Effect("depth_camera", _asked("cameras.depth.enabled", lambda job: job.cameras.depth.enabled)),
+    Effect("mirror", _asked("cameras.mirror.enabled", lambda job: job.cameras.mirror.enabled)),
+    Effect("projection", _projection),
+    Effect("rgb", _asked("render.rgb", lambda job: job.render.rgb)),
     Effect("splat", _splat),
     Effect("hidden_point_removal", _hidden_points),
     Effect("raycast_check", _raycast),

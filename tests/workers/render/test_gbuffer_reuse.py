@@ -61,6 +61,17 @@ def test_shapes_and_framebuffers_on_the_gpu_are_bounded(renderer):
     assert sum(target.bytes for target in renderer._targets._stored.values()) <= 64 * 2**20
 
 
+def test_the_shapes_of_a_scene_stay_on_the_gpu_between_its_views_however_many(renderer):
+    shapes = [shape_of(trimesh.creation.icosphere(1, 0.1)) for _ in range(22)]
+    things = [Placed(k, shape, translation(0.3 * k - 3.0, 0, 6)) for k, shape in enumerate(shapes, start=1)]
+    renderer.draw(things, APPEARANCE, camera())
+    for thing in things:
+        renderer.count_pixels(thing, camera())
+    assert all(shape in renderer._shapes for shape in shapes)
+    renderer.draw(things[:1], APPEARANCE, camera())
+    assert len(renderer._shapes) <= 16
+
+
 def test_memory_stays_flat_over_scenes_with_new_meshes(renderer, record_figure):
     """300 scenes, each with a new 5,000-face object and a new texture; the first 100 fill the stores."""
     texture = np.zeros((256, 256, 3), np.uint8)

@@ -9,7 +9,14 @@ import pytest
 
 from schemas.camera import Camera
 from schemas.scene import Placed
-from tests.workers.render.random_scenes import APPEARANCE, VGA, orbit_and_mirror, procedural_things, random_things
+from tests.workers.render.random_scenes import (
+    APPEARANCE,
+    VGA,
+    five_procedural_things,
+    orbit_and_mirror,
+    procedural_things,
+    random_things,
+)
 from workers.geometry.raycast import cast_view, edge_distance_px
 from workers.render.gbuffer import Renderer
 
@@ -98,16 +105,19 @@ def hold(record_figure: Callable, kind: str, worst: dict[str, float], scenes: in
     assert not missed
 
 
-@pytest.mark.parametrize(
-    ("kind", "make"), [("rods, bowls and boxes", random_things), ("built-in shapes", procedural_things)]
-)
+KINDS: list[tuple[str, Scenes]] = [
+    ("rods, bowls and boxes", random_things),
+    ("built-in shapes", procedural_things),
+    ("five built-in shapes", five_procedural_things),
+]
+
+
+@pytest.mark.parametrize(("kind", "make"), KINDS)
 def test_labels_agree_with_rays_in_every_region(renderer, record_figure, kind, make):
     hold(record_figure, kind, score(renderer, make, range(1000, 1006)), 6)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "make"), [("rods, bowls and boxes", random_things), ("built-in shapes", procedural_things)]
-)
+@pytest.mark.parametrize(("kind", "make"), KINDS)
 def test_labels_agree_with_rays_in_every_region_of_two_hundred_scenes(renderer, record_figure, kind, make):
     hold(record_figure, kind, score(renderer, make, range(200)), 200)

@@ -1,5 +1,7 @@
 """What follows from rendered views, on views whose depth is known in closed form."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -120,6 +122,11 @@ def test_a_patch_is_centred_on_the_object_and_left_out_where_it_would_leave_the_
     assert crop_box(label(97, 60), HERE, patch) is None
     assert crop_box(label(80, 73), HERE, patch) is None
     assert crop_box(label(-1, -1), HERE, patch) is None
+
+
+def test_an_object_that_the_view_does_not_see_has_no_patch():
+    hidden = dataclasses.replace(label(80, 60), pixels=0)
+    assert crop_box(hidden, HERE, Patch(width=128, height=96)) is None
 
 
 def test_a_label_counts_boxes_and_shares_its_own_pixels():

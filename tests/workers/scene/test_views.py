@@ -9,6 +9,7 @@ from schemas.job import Job
 from workers.geometry.camera import orbit_pose
 from workers.scene.views import (
     front_distance,
+    object_distance,
     place_aligned_camera,
     place_mirror_camera,
     quantise_depth,
@@ -64,3 +65,16 @@ def test_the_mirror_camera_keeps_the_intrinsics():
     assert mirror.intrinsics == CAMERA.intrinsics
     pivot = CAMERA.position + 2.2 * CAMERA.T_world_cam[:3, 2]
     assert np.linalg.norm(mirror.position - pivot) == pytest.approx(1.3)
+
+
+def test_d_z_is_read_from_all_objects_and_from_whichever_is_seen():
+    """The first object is hidden, the second stands at 2 m, the third at 3 m."""
+    images = JOB.images.model_copy(update={"depth_units_per_m": 5000.0})
+    region = np.full((10, 10), 1, np.uint8)
+    region[2:4], region[6:8] = 4, 5
+    depth = np.where(region == 4, 10_000, np.where(region == 5, 15_000, 5_000)).astype(np.uint16)
+    assert object_distance(depth, region, images, JOB.cameras.mirror) == pytest.approx(2.0)
+    region[region == 4] = 2
+    assert object_distance(depth, region, images, JOB.cameras.mirror) == pytest.approx(3.0)
+    with pytest.raises(ViewError, match="no depth pixel"):
+        object_distance(depth, np.minimum(region, 2), images, JOB.cameras.mirror)
