@@ -101,23 +101,28 @@ def test_the_plan_chooses_rightly_on_two_hundred_random_scenes():
     assert idle["floor"] <= left_out["floor"] and idle["table"] <= left_out["table"], (idle, left_out)
 
 
-@pytest.mark.parametrize(
-    "scenes", [pytest.param(range(8), id="8"), pytest.param(range(SCENES), id="200", marks=pytest.mark.slow)]
-)
-def test_forcing_what_a_random_scene_left_out_changes_no_byte(scenes, record_figure):
-    made, forced = 0, Counter[str]()
-    for number in scenes:
+@pytest.mark.parametrize("wanted", [pytest.param(8, id="8"), pytest.param(SCENES, id="200", marks=pytest.mark.slow)])
+def test_forcing_what_a_random_scene_left_out_changes_no_byte(wanted, record_figure):
+    made, forced, changed = 0, Counter[str](), []
+    for number in range(4 * wanted):
         setting = random_setting(number)
         try:
             plain = make(setting)
         except SceneError:
             continue
-        made += 1
-        for name in names_of_kind("no_op") & plain.scene.effects.skipped.keys():
+        for name in sorted(names_of_kind("no_op") & plain.scene.effects.skipped.keys()):
             again = make(setting, forced=name)
-            assert plain.files == again.files, f"scene {number}, {name}"
-            assert plain.rows == again.rows, f"scene {number}, {name}"
             forced[name] += 1
-    record_figure(f"no-ops forced in {made} random scenes: {forced.total()}", "must be the same bytes", 0.0, 0.0)
-    assert made >= len(scenes) // 4
-    assert forced.total() >= made
+            if (plain.files, plain.rows) != (again.files, again.rows):
+                changed.append((number, name))
+        made += 1
+        if made == wanted:
+            break
+    told = ", ".join(f"{name} {count}" for name, count in sorted(forced.items()))
+    record_figure(
+        f"no-ops forced in {made} random scenes ({told}): scenes changed", "none may", float(len(changed)), 0.0
+    )
+    assert changed == []
+    assert made == wanted
+    assert forced.total() >= 2 * made
+    assert wanted < SCENES or all(forced[name] >= 5 for name in NO_OPS)
