@@ -73,6 +73,8 @@ def test_forcing_a_no_op_where_nothing_calls_for_it_changes_no_byte(name):
     assert plain.rows == forced.rows
     assert not plain.scene.effects.runs(name)
     assert forced.scene.effects.runs(name)
+    if name in CHECKS_ONLY:
+        assert name in forced.watch.effects and name not in plain.watch.effects
 
 
 @pytest.mark.parametrize(
