@@ -145,7 +145,7 @@ def with_holes(plan: ScenePlan) -> ScenePlan:
 
     start = plan.objects[0]
     pierced = replace(start, asset=replace(start.asset, shape=_of_parts(start.asset.shape, pierce)))
-    return replace(plan, objects=(pierced,))
+    return replace(plan, objects=(pierced, *plan.objects[1:]))
 
 
 def _of_parts(shape: Shape, change: Callable[[Part], Part]) -> Shape:

@@ -59,13 +59,13 @@ def _require_forcible(forced: frozenset[str]) -> None:
 
 
 def _switch(key: str) -> Reason:
-    """An effect that a key of the job switches on and off; on while the job has no such key."""
+    """An effect that a key of the job switches on and off; on while a job has no such key."""
 
     def why(facts: Facts) -> str | None:
         branch: Any = facts.job
         for name in key.split("."):
             branch = getattr(branch, name, True)
-        return None if branch else f"{key} is off"
+        return None if branch else f"{key} is false"
 
     return why
 
@@ -77,6 +77,11 @@ def _first_of(*reasons: Reason) -> Reason:
 
 def _splat(facts: Facts) -> str | None:
     return "images.projection.splat is 1" if facts.job.images.projection.splat == 1 else None
+
+
+def _hidden_points(facts: Facts) -> str | None:
+    asked = facts.job.images.projection.hidden_point_removal
+    return None if asked else "images.projection.hidden_point_removal is off"
 
 
 def _samples(facts: Facts) -> str | None:
@@ -179,7 +184,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         "hidden_point_removal",
         "asked",
-        _first_of(_PROJECTION, _switch("images.projection.hidden_point_removal")),
+        _first_of(_PROJECTION, _hidden_points),
         "normals of the input's cloud",
         "projection",
     ),
@@ -198,7 +203,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("release_again", "asked", _raycast, "a second of simulation", "recheck"),
     Effect("floor", "no_op", _floor, "a draw in each view", "render"),
     Effect("table", "no_op", _table, "a draw in each view", "render"),
-    Effect("textures", "no_op", _textures, "a look-up for each fragment", "render"),
+    Effect("textures", "no_op", _first_of(_RGB, _textures), "a look-up for each fragment", "render"),
     Effect(
         "transparency",
         "no_op",
@@ -209,6 +214,8 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         "light_maps", "no_op", _first_of(_RGB, _tier("raster")), "maps of shadow and openness, once a scene", "render"
     ),
-    Effect("exact_agreement", "no_op", _exact_agreement, "the two views compared once more", "check"),
+    Effect(
+        "exact_agreement", "no_op", _first_of(_MIRROR, _exact_agreement), "the two views compared once more", "check"
+    ),
 )
 """Every effect there is. A receipt names them in this order."""
