@@ -26,6 +26,13 @@ class Range(NamedTuple):
     high: float
 
 
+class Counts(NamedTuple):
+    """Whole numbers from `low` to `high`, both included."""
+
+    low: int
+    high: int
+
+
 def _ordered(value: Range) -> Range:
     if not value.low <= value.high:
         raise ValueError(f"the range [{value.low}, {value.high}] is empty: write the smaller number first")

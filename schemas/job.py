@@ -21,6 +21,7 @@ from schemas.base import (
 )
 from schemas.sensor import SensorEffects
 from schemas.sources import Assets
+from schemas.start import ONE_OBJECT, ObjectCount, Start
 
 Tier = Literal["flat", "raster", "pathtraced"]
 Category = Literal["bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box"]
@@ -30,19 +31,6 @@ Reach = Annotated[float, Field(gt=0, le=1e3)]
 Offset = Annotated[float, Field(ge=-1e3, le=1e3)]
 """Far beyond any camera, and what its numbers can be without overflow in float32 on the GPU."""
 CATEGORIES: tuple[Category, ...] = ("bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box")
-
-
-class Start(Frozen):
-    """How an object begins."""
-
-    pose: Literal["upright", "tumbled", "placed"] = "upright"
-    """upright: uniform yaw; tumbled: uniform rotation; placed: set down at rest, no drop unless it would tip."""
-    offset_m: Interval = Range(-0.25, 0.25)
-    """Along x and along y from the centre of the table top."""
-    clearance_m: Interval = Range(0.005, 0.05)
-    """Height of the lowest point above the table at the start of a drop."""
-    max_redraws: NonNegativeInt = 20
-    """How often a position with no table under the centre of mass is drawn again."""
 
 
 class Rest(Frozen):
@@ -112,6 +100,8 @@ class Sensor(Frozen):
 class DepthCamera(Frozen):
     """The depth camera's place in the RGB camera's optical axes, metres; same rotation [A]."""
 
+    enabled: bool = True
+    """Whether there are aligned views."""
     offset_m: tuple[Offset, Offset, Offset] = (-0.051, 0.001, -0.001)
     """Translation in the RGB camera's optical axes."""
 
@@ -119,6 +109,8 @@ class DepthCamera(Frozen):
 class Mirror(Frozen):
     """The camera on the other side [A, C]."""
 
+    enabled: bool = True
+    """Whether there are mirror views; without them camPoses.csv has one row a pair, with an even id."""
     T_z_m: Reach = 1.3
     """Distance of the mirror camera from the point that it looks at."""
     front: Literal["percentile", "median", "nearest"] = "percentile"
@@ -152,6 +144,8 @@ class Patch(Frozen):
 class Projection(Frozen):
     """How the input cloud is carried into the mirror view."""
 
+    enabled: bool = True
+    """Whether there are projected images; they need `cameras.mirror.enabled`."""
     splat: Annotated[int, Field(ge=1, le=15)] = 1
     """Side of the square of pixels that each point fills; odd."""
     hidden_point_removal: bool = False
@@ -195,6 +189,8 @@ class Images(Frozen):
 class Render(Frozen):
     """RGB."""
 
+    rgb: bool = True
+    """Whether there are RGB images; without them no colour is worked out."""
     tier: Tier = "raster"
     """raster: textured floors, a key light with soft shadows, contact shadows, transparent texels cut out, smooth edges;
     flat: albedo and light from two directions, in less than half the time; pathtraced: global illumination, glass and
@@ -262,6 +258,8 @@ class Job(Frozen):
     """Id of the first scene."""
     pairs_per_scene: Annotated[int, Field(ge=1, le=1000)] = 1
     """Input and mirror poses of each scene."""
+    objects_per_scene: ObjectCount = ONE_OBJECT
+    """How many objects lie on the table; a range is drawn from, each number alike. The scene's category is the first's."""
     categories: dict[Category, Positive] = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)
     """Weights; a list of names means equal weights."""
     assets: Assets = Assets()
@@ -293,6 +291,20 @@ class Job(Frozen):
                 raise ValueError(f"{value} names a category twice")
             return dict.fromkeys(value, 1.0)
         return value
+
+    @model_validator(mode="after")
+    def _agrees(self) -> "Job":
+        if self.images.projection.enabled and not self.cameras.mirror.enabled:
+            raise ValueError(
+                "images.projection.enabled is true and cameras.mirror.enabled is false: what is projected is what the "
+                "mirror camera would see; set images.projection.enabled: false too"
+            )
+        if self.sensor.changes_rgb and not self.render.rgb:
+            raise ValueError(
+                "render.rgb is false and sensor asks for an effect on RGB: leave out sensor.distortion, sensor.rgb_noise "
+                "and sensor.exposure"
+            )
+        return self
 
     @property
     def stop_scene(self) -> int:

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from schemas.camera import Role
+from schemas.camera import ROLES, Role
+from schemas.job import Job
+from schemas.scene import REGION_FIRST_OBJECT
 
 JOB_FILE = "job.yaml"
 README_FILE = "DATASET.md"
@@ -52,7 +54,27 @@ IMAGES: tuple[Image, ...] = (
     Image("RGBprojected", "projected", "rgb"),
     Image("depthProjected", "projected", "depth"),
 )
-"""(a)-(k) of the article's figure 1; each also has a patch, (l)-(u)."""
+"""(a)-(k) of the article's figure 1; each also has a patch of every object, (l)-(u)."""
+
+
+def stored_roles(job: Job) -> tuple[Role, ...]:
+    """The views of each pair that the job asks for, in the order of `ROLES`."""
+    off = {
+        "aligned": not job.cameras.depth.enabled,
+        "mirror": not job.cameras.mirror.enabled,
+        "projected": not job.images.projection.enabled,
+    }
+    return tuple(role for role in ROLES if not off.get(role, False))
+
+
+def stored_images(role: Role, job: Job) -> tuple[Image, ...]:
+    """The images of one view that the job asks for."""
+    return tuple(image for image in IMAGES if image.role == role and (image.pixels != "rgb" or job.render.rgb))
+
+
+def patch_index(region_id: int, objects: int) -> int | None:
+    """Which object a patch's name tells: k for region 3 + k, None in a scene that has one object only."""
+    return None if objects == 1 else region_id - REGION_FIRST_OBJECT
 
 
 def input_pose_id(scene_id: int, pair: int, pairs_per_scene: int) -> int:

@@ -1,5 +1,8 @@
 """The Arrow schemas of the six manifest tables, and which of their columns are a function of job and seed."""
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import pyarrow as pa
 
 SCHEMA_VERSION = 1
@@ -15,6 +18,23 @@ _file = pa.struct(
     [pa.field("path", pa.string(), False), pa.field("bytes", pa.int64(), False), pa.field("sha256", pa.string(), False)]
 )
 _skip = pa.struct([pa.field("effect", pa.string(), False), pa.field("why", pa.string(), False)])
+_body = pa.struct(
+    [
+        pa.field("region_id", pa.int64(), False),
+        pa.field("category", pa.string(), False),
+        pa.field("instance_id", pa.string(), False),
+        pa.field("source", pa.string(), False),
+        pa.field("object_scale", pa.float64(), False),
+        pa.field("T_world_obj", _matrix, False),
+        pa.field("redraws", pa.int64(), False),
+        pa.field("penetration_mm", pa.float64(), False),
+        pa.field("hover_gap_mm", pa.float64(), False),
+        pa.field("support_margin_mm", pa.float64(), False),
+        pa.field("residual_speed_mm_s", pa.float64(), False),
+        pa.field("recheck_move_mm", pa.float64(), True),
+    ]
+)
+"""One object of a scene. The columns beside are the first object's, and of the figures the worst of all objects."""
 _agreement = pa.struct([pa.field("median_mm", pa.float64(), False), pa.field("share", pa.float64(), False)])
 """Input depth carried into the mirror view against mirror depth: median difference, and share within the bound."""
 _seconds = pa.struct([pa.field("name", pa.string(), False), pa.field("seconds", pa.float64(), False)])
@@ -51,6 +71,7 @@ SCHEMAS: dict[str, pa.Schema] = {
             ("settle_s", _f64, False),
             ("raycast_checked", _bool, False),
             ("settings_digest", _str, False),
+            ("bodies", pa.list_(_body), True),
         ],
     ),
     "views": _schema(
@@ -98,6 +119,7 @@ SCHEMAS: dict[str, pa.Schema] = {
             ("bbox_xywh", pa.list_(pa.field("item", _i64, nullable=False), 4), False),
             ("pixels", _i64, False),
             ("visible_fraction", _f64, False),
+            ("patch_object_fraction", _f64, True),
         ],
     ),
     "assets": _schema(
@@ -151,3 +173,14 @@ SORT_KEYS: dict[str, tuple[str, ...]] = {
     "timings": ("scene_id",),
 }
 """Each table's key: no two rows share it, and merged rows are in this order."""
+
+
+def worst_rest(bodies: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
+    """The columns of `scenes` that are the worst of its bodies': the most of each, and of the support margin the least."""
+    most = ("penetration_mm", "hover_gap_mm", "residual_speed_mm_s")
+    moves = [body["recheck_move_mm"] for body in bodies if body["recheck_move_mm"] is not None]
+    return {
+        **{name: max(body[name] for body in bodies) for name in most},
+        "support_margin_mm": min(body["support_margin_mm"] for body in bodies),
+        "recheck_move_mm": max(moves, default=None),
+    }

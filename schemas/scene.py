@@ -167,15 +167,16 @@ class ObjectLabel:
 class View:
     """One camera's images as they are stored, and its labels (none for a projected view).
 
-    rgb [H, W, 3] uint8; depth [H, W] uint16 in units of `Images.depth_units_per_m`; region [H, W] uint8, or None where
-    the images were projected and not rendered. `pose_id` is the view's own; `parent_id` the input pose's.
+    rgb [H, W, 3] uint8, or None where the job asks for no colour; depth [H, W] uint16 in units of
+    `Images.depth_units_per_m`; region [H, W] uint8, or None where the images were projected and not rendered. `pose_id` is
+    the view's own; `parent_id` the input pose's.
     """
 
     role: Role
     pose_id: int
     parent_id: int
     camera: Camera
-    rgb: NDArray[np.uint8]
+    rgb: NDArray[np.uint8] | None
     depth: NDArray[np.uint16]
     region: NDArray[np.uint8] | None
     labels: tuple[ObjectLabel, ...]
@@ -197,7 +198,7 @@ class Agreement:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """An input pose and its mirror pose with all their views.
+    """An input pose and its mirror pose with all their views; None is what the job has switched off.
 
     filled_share: of the mirror image's pixels, those that the projection fills; hidden_share: of the filled ones,
     those that show a surface behind what the mirror camera sees. `agreement` is of the stored images;
@@ -206,18 +207,18 @@ class Pair:
 
     d_z_m: float
     input: View
-    aligned: View
-    mirror: View
-    projected: View
-    agreement: Agreement
-    exact_agreement: Agreement
-    filled_share: float
-    hidden_share: float
+    aligned: View | None
+    mirror: View | None = None
+    projected: View | None = None
+    agreement: Agreement | None = None
+    exact_agreement: Agreement | None = None
+    filled_share: float | None = None
+    hidden_share: float | None = None
 
     @property
-    def views(self) -> tuple[View, View, View, View]:
-        """All four, in the order of `ROLES`."""
-        return self.input, self.aligned, self.mirror, self.projected
+    def views(self) -> tuple[View, ...]:
+        """Those that there are, in the order of `ROLES`."""
+        return tuple(view for view in (self.input, self.aligned, self.mirror, self.projected) if view is not None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,8 @@
 """OUT/DATASET.md: what a dataset is, what made it, and whose shapes are in it."""
 
+from schemas.base import Counts
 from schemas.fingerprint import Fingerprint
-from schemas.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE
+from schemas.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE, stored_roles
 from schemas.sources import ProceduralSource
 from services.jobrecord import JobRecord
 from services.merge import MergeResult
@@ -35,6 +36,8 @@ other side sees. Made by Verso; the layout and the geometry follow {ARTICLE}.
 |---|---|
 | scenes | {job.first_scene} to {job.stop_scene - 1}: {counts} |
 | pairs in each scene | {job.pairs_per_scene} |
+| objects in each scene | {_count(job.objects_per_scene)} |
+| views of each pair | {", ".join(stored_roles(job))}{"" if job.render.rgb else "; without RGB"} |
 | seed | {job.seed} |
 | dataset digest | `{merged.digest}` |
 | job digest | `{record.digest}` (the job is in `{JOB_FILE}`) |
@@ -55,10 +58,15 @@ Every shape, with its licence and its split by instance, is a row of the `assets
 ## Reading it
 
 `pyarrow.dataset.dataset("manifest/views", partitioning="hive")` has a row for each camera and the names and checksums of
-its images. Depth is 16-bit PNG, z along the optical axis, {job.images.depth_units_per_m:g} units a metre, 0 where there is none.
+its images, `manifest/objects` one for each thing that it may see; `bodies` in `manifest/scenes` says where each object lies.
+Depth is 16-bit PNG, z along the optical axis, {job.images.depth_units_per_m:g} units a metre, 0 where there is none.
 Masks are 8-bit PNG: 0 nothing, 1 floor, 2 table, 3 and up objects. Poses are camera to world, optical frame (x right,
 y down, z forward), metres.
 """
+
+
+def _count(count: Counts) -> str:
+    return str(count.low) if count.low == count.high else f"{count.low} to {count.high}"
 
 
 def describe_sources(catalogue: Catalogue) -> list[str]:

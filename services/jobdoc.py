@@ -10,8 +10,9 @@ from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from schemas.base import Range
+from schemas.base import Counts, Range
 from schemas.job import Job
+from schemas.start import MOST_OBJECTS
 
 HEADER = """\
 # Keys of a job file
@@ -80,6 +81,8 @@ def _name(annotation: Any) -> str:
         return "map"
     if annotation is Range:
         return "[low, high]"
+    if annotation is Counts:
+        return f"whole number or [low, high], from 1 to {MOST_OBJECTS}"
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return "map"
     return {int: "whole number", float: "number", bool: "`true` or `false`", str: "text"}[annotation]
@@ -93,6 +96,8 @@ def _default(field: FieldInfo) -> str:
         return "below"
     if isinstance(value, Range):
         return f"`[{value.low:.6g}, {value.high:.6g}]`"
+    if isinstance(value, Counts):
+        return f"`{value.low}`" if value.low == value.high else f"`{list(value)}`"
     if isinstance(value, tuple):
         return "one `procedural` source" if isinstance(value[0], BaseModel) else f"`{list(value)}`"
     if isinstance(value, dict):

@@ -1,5 +1,6 @@
 """`verso scene`: the posed geometry of one stored scene as one GLB."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -8,11 +9,13 @@ from PIL import Image
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+from schemas.base import Pose
 from schemas.errors import InputError
-from schemas.shape import Part
+from schemas.scene import ScenePlan
+from schemas.shape import Part, Shape
 from services.jobrecord import require_job
 from services.replay import open_context
-from services.stored import find_scene
+from services.stored import Row, find_scene
 from workers.scene_steps import plan_with_assets
 from workers.store.store import Store
 
@@ -29,12 +32,11 @@ def export_scene(store: Store, scene_id: int, target: Path) -> int:
         reason = next((f["reason"] for f in stored.rows["failures"] if f["scene_id"] == scene_id), "unknown")
         raise InputError(f"scene {scene_id} was not made ({reason}): it has no geometry")
     plan = plan_with_assets(open_context(record), scene_id)
-    thing = plan.objects[0].asset
     scene = trimesh.Scene()
     for name, shape, T in (
         ("floor", plan.floor, np.eye(4)),
         (f"table {plan.table.asset.instance_id}", plan.table.asset.shape, np.reshape(row["T_world_table"], (4, 4))),
-        (f"{thing.category} {thing.instance_id}", thing.shape, np.reshape(row["T_world_obj"], (4, 4))),
+        *_objects(plan, row),
     ):
         for number, part in enumerate(shape.parts):
             label = f"{name}/{number}-{part.name}"
@@ -43,6 +45,15 @@ def export_scene(store: Store, scene_id: int, target: Path) -> int:
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_bytes(data)
     return len(data)
+
+
+def _objects(plan: ScenePlan, row: Row) -> Iterator[tuple[str, Shape, Pose]]:
+    """Name, shape and pose of every object; of several, names end in their region ids, as two may be of one instance."""
+    bodies = row["bodies"] or [{"T_world_obj": row["T_world_obj"]}]
+    for start, body in zip(plan.objects, bodies, strict=True):
+        region = f" {start.region_id}" if len(bodies) > 1 else ""
+        name = f"{start.asset.category} {start.asset.instance_id}{region}"
+        yield name, start.asset.shape, np.reshape(body["T_world_obj"], (4, 4))
 
 
 def _mesh(part: Part) -> trimesh.Trimesh:

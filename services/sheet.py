@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from schemas.layout import Content, image_path, patch_path
+from schemas.layout import Content, image_path, patch_index, patch_path
+from schemas.scene import REGION_FIRST_OBJECT
 from services.stored import Row, StoredRange, file_reader, iter_stored, read_image
 from workers.store.opening import open_store
 from workers.store.store import Store
@@ -36,7 +37,13 @@ COLUMNS = (
 )
 
 REGION_COLORS = np.array([[255, 255, 255], [205, 205, 205], [160, 120, 80], [230, 70, 40]], np.uint8)
-"""Nothing, floor, table, object."""
+"""Nothing, floor, table, first object."""
+
+MORE_COLORS = np.array(
+    [[45, 110, 200], [60, 160, 70], [240, 180, 30], [140, 70, 170], [30, 170, 180], [220, 110, 170], [110, 90, 40]],
+    np.uint8,
+)
+"""Further objects, in turn."""
 
 DEPTH_STRETCH = (2.0, 98.0)
 """Percentiles of a depth image that are drawn as its nearest and its farthest colour."""
@@ -80,18 +87,26 @@ def _cells(read: Callable[[str], bytes], stored: StoredRange, scene: Row) -> lis
     e, category = min(row["parent_id"] for row in views), scene["category"]
     listed = {file["path"] for row in views for file in row["files"]}
 
-    def image(content: Content, number: int) -> NDArray:
-        return read_image(read, image_path(category, content, number))
+    def cell(content: Content, number: int, paint: Callable[[NDArray], NDArray] = np.asarray) -> Picture:
+        path = image_path(category, content, number)
+        return _fit(paint(read_image(read, path))) if path in listed else _empty()
 
     cells = []
     for number in (e, e + 1):
-        cells.append(_fit(image("RGB", number)))
-        cells.append(_fit(_paint_depth(image("depth", number))))
-        cells.append(_fit(_paint_regions(image("segment", number))))
-    cells.append(_fit(image("RGBprojected", e)))
-    patches = [patch_path(category, "RGB", number) for number in (e, e + 1)]
+        cells.append(cell("RGB", number))
+        cells.append(cell("depth", number, _paint_depth))
+        cells.append(cell("segment", number, _paint_regions))
+    cells.append(cell("RGBprojected", e))
+    regions = [body["region_id"] for body in scene["bodies"] or [{"region_id": REGION_FIRST_OBJECT}]]
+    indices = [patch_index(region, len(regions)) for region in regions]
+    patches = [patch_path(category, "RGB", number, index) for index in indices for number in (e, e + 1)]
     cells.append(_stack([read_image(read, path) for path in patches if path in listed]))
     return cells
+
+
+def _empty() -> Picture:
+    """Where there is no image."""
+    return np.full((CELL[1], CELL[0], 3), 245, np.uint8)
 
 
 def _fit(picture: NDArray) -> Picture:
@@ -99,12 +114,17 @@ def _fit(picture: NDArray) -> Picture:
 
 
 def _stack(patches: list[NDArray]) -> Picture:
-    """Patches one over the other, pixel for pixel, in the middle of a cell."""
-    cell = np.full((CELL[1], CELL[0], 3), 245, np.uint8)
+    """Patches pixel for pixel, two one over the other in the middle of a cell; more of them side by side, made smaller."""
+    cell = _empty()
+    columns = (len(patches) + 1) // 2
     for number, patch in enumerate(patches):
-        height, width = min(patch.shape[0], CELL[1] // 2), min(patch.shape[1], CELL[0])
-        left = (CELL[0] - width) // 2
-        cell[number * height : (number + 1) * height, left : left + width] = patch[:height, :width]
+        share = CELL[0] // columns
+        size = (
+            min(share, patch.shape[1]),
+            min(CELL[1] // 2, patch.shape[0] * min(share, patch.shape[1]) // patch.shape[1]),
+        )
+        top, left = (number % 2) * size[1], (number // 2) * share + (share - size[0]) // 2
+        cell[top : top + size[1], left : left + size[0]] = cv2.resize(patch, size, interpolation=cv2.INTER_AREA)
     return cell
 
 
@@ -122,7 +142,8 @@ def _paint_depth(depth: NDArray) -> Picture:
 
 
 def _paint_regions(region: NDArray) -> Picture:
-    painted: Picture = REGION_COLORS[np.minimum(region, len(REGION_COLORS) - 1)]
+    further = np.resize(MORE_COLORS, (256 - len(REGION_COLORS), 3))
+    painted: Picture = np.concatenate([REGION_COLORS, further])[region]
     return painted
 
 

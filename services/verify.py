@@ -4,15 +4,14 @@ import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from schemas.camera import ROLES
 from schemas.errors import CorruptError
 from schemas.job import Job
-from schemas.layout import ASSETS, MANIFEST
+from schemas.layout import ASSETS, MANIFEST, stored_roles
 from services.jobrecord import require_job
 from services.merge import read_success
 from services.stored import Row, StoredRange, file_reader, iter_stored, read_image
 from workers.allocator import keep_freed_memory
-from workers.rederive import check_stored_pair
+from workers.rederive import check_stored_pair, check_stored_scene
 from workers.store.store import Store
 
 
@@ -76,6 +75,7 @@ def _check_scenes(store: Store, stored: StoredRange, job: Job, verdict: Verdict)
         verdict.faults.append(f"scenes {stored.start} to {stored.stop - 1}: some are missing, or both made and failed")
     verdict.scenes += len(made) + len(failed)
     for scene_id, scene in made.items():
+        verdict.faults += check_stored_scene(scene)
         views = [row for row in stored.rows["views"] if row["scene_id"] == scene_id]
         objects = [row for row in stored.rows["objects"] if row["scene_id"] == scene_id]
         for parent in sorted({row["parent_id"] for row in views}):
@@ -86,8 +86,9 @@ def _check_scenes(store: Store, stored: StoredRange, job: Job, verdict: Verdict)
 
 def _check_pair(job: Job, read: Callable[[str], bytes], rows: tuple[Row, dict[str, Row], list[Row]]) -> list[str]:
     scene, pair, objects = rows
-    if set(pair) != set(ROLES):
-        return [f"scene {scene['scene_id']}: has views {sorted(pair)}, and must have {sorted(ROLES)}"]
+    roles = stored_roles(job)
+    if set(pair) != set(roles):
+        return [f"scene {scene['scene_id']}: has views {sorted(pair)}, and must have {sorted(roles)}"]
     own = {row["pose_id"] for row in pair.values()}
     try:
         return check_stored_pair(

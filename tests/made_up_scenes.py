@@ -140,6 +140,25 @@ def _scene(scene_id: int, category: str, instance: str, table: str) -> dict[str,
         "settle_s": 0.7,
         "raycast_checked": scene_id % 2 == 0,
         "settings_digest": "d" * 64,
+        "bodies": [_body(scene_id, region, category, instance) for region in (3, 4)],
+    }
+
+
+def _body(scene_id: int, region: int, category: str, instance: str) -> dict[str, object]:
+    """The first object is that of the scene's own columns."""
+    return {
+        "region_id": region,
+        "category": category,
+        "instance_id": instance,
+        "source": "procedural",
+        "object_scale": 0.25,
+        "T_world_obj": matrix_of(scene_id, 1 if region == 3 else region),
+        "redraws": scene_id % 3,
+        "penetration_mm": 0.01,
+        "hover_gap_mm": -0.0,
+        "support_margin_mm": 12.5,
+        "residual_speed_mm_s": 0.1,
+        "recheck_move_mm": None if scene_id % 2 else 0.02,
     }
 
 
@@ -188,6 +207,7 @@ def _object(view: dict, region: int, category: str, instance: str) -> dict[str, 
         "bbox_xywh": [1, 2, 3, 4],
         "pixels": 500,
         "visible_fraction": 0.9,
+        "patch_object_fraction": None if region == 2 else 0.3,
     }
 
 

@@ -62,7 +62,7 @@ def differences_mm(pair: Pair, scene: PosedScene, object_only: bool) -> tuple[np
     The ratio is by how much more a step of the input's depth counts along the mirror's ray.
     """
     first, mirror = pair.input, pair.mirror
-    assert first.region is not None and mirror.region is not None
+    assert mirror is not None and first.region is not None and mirror.region is not None
     k, R, eye = first.camera.intrinsics, mirror.camera.T_world_cam[:3, :3], mirror.camera.T_world_cam[:3, 3]
     step = 1 if object_only else 7
     rows, columns = (

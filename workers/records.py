@@ -1,29 +1,26 @@
 """What is written of a scene: encoded files, and one row or more in each manifest table. Pure."""
 
 import hashlib
-from collections.abc import Iterator
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from schemas.base import Pose
 from schemas.camera import Camera
 from schemas.errors import SceneError
-from schemas.job import Job, Patch
-from schemas.layout import IMAGES, PixelKind, asset_path, file_pose_id, image_path, patch_path
-from schemas.scene import REGION_FIRST_OBJECT, ObjectLabel, Pair, SceneOutput, View
+from schemas.job import Job
+from schemas.layout import asset_path
+from schemas.manifest import worst_rest
+from schemas.scene import REGION_FIRST_OBJECT, ObjectStart, Pair, SceneOutput, Settled, View
 from schemas.shape import Asset
 from workers.assets.catalogue import split_of
 from workers.assets.glb import asset_glb
 from workers.context import WorkerContext
 from workers.geometry.camera import inclination, yaw
-from workers.scene.derive import crop_box
+from workers.pictures import Files, encode_view, object_labels, patch_object_fraction
 from workers.scene.effects import write_receipt
 from workers.scene_steps import Scene, Stopwatch
 from workers.store.images import encode_png
 
-Row = dict[str, object]
-Files = list[tuple[str, bytes]]
+Row = dict[str, Any]
 
 
 def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> SceneOutput:
@@ -36,57 +33,21 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
                 own = encode_view(view, pair, context.job)
                 files += own
                 views.append(view_row(scene, pair, view, own, context.job))
-        assets = [scene.plan.table.asset, *(start.asset for start in scene.plan.objects)]
+        every = (scene.plan.table.asset, *(start.asset for start in scene.plan.objects))
+        assets = list({asset.instance_id: asset for asset in every}.values())
         for asset in assets:
             if asset.shareable:
                 files.append((asset_path(asset.category, asset.instance_id), asset_glb(asset, encode_png)))
     rows = {
         "scenes": [scene_row(context, scene)],
         "views": views,
-        "objects": [row for pair in scene.pairs for view in pair.views for row in object_rows(scene, view)],
+        "objects": [
+            row for pair in scene.pairs for view in pair.views for row in object_rows(scene, view, context.job)
+        ],
         "assets": [asset_row(asset, context.job) for asset in assets],
         "failures": [],
     }
     return SceneOutput(scene.plan.scene_id, tuple(files), rows)
-
-
-def encode_view(view: View, pair: Pair, job: Job) -> Files:
-    """The view's images and their patches as PNG, by path."""
-    files: Files = []
-    for path, kind, box in image_boxes(view, pair, job):
-        pixels = _pixels(view, kind)
-        part = pixels if box is None else np.ascontiguousarray(pixels[box])
-        files.append((path, encode_png(part, job.images.png_level)))
-    return files
-
-
-def image_boxes(view: View, pair: Pair, job: Job) -> Iterator[tuple[str, PixelKind, tuple[slice, slice] | None]]:
-    """Path, kind of pixels and crop (rows, columns; None for all) of each image of the view and of its patches."""
-    category = pair.input.labels[-1].category
-    number = file_pose_id(view.role, view.parent_id)
-    objects = _object_labels(view, pair)
-    for image in IMAGES:
-        if image.role != view.role:
-            continue
-        yield image_path(category, image.content, number), image.pixels, None
-        for label in objects:
-            box = crop_box(label, view.camera, job.images.patch)
-            if box is not None:
-                index = None if len(objects) == 1 else label.region_id - REGION_FIRST_OBJECT
-                yield patch_path(category, image.content, number, index), image.pixels, box
-
-
-def _pixels(view: View, kind: PixelKind) -> NDArray:
-    images: dict[str, NDArray | None] = {"rgb": view.rgb, "depth": view.depth, "region": view.region}
-    pixels = images[kind]
-    assert pixels is not None
-    return pixels
-
-
-def _object_labels(view: View, pair: Pair) -> list[ObjectLabel]:
-    """Labels of the objects alone; a projected view is seen by the mirror camera and has its labels."""
-    labels = pair.mirror.labels if view.role == "projected" else view.labels
-    return [label for label in labels if label.region_id >= REGION_FIRST_OBJECT]
 
 
 def matrix(T: Pose) -> list[float]:
@@ -95,9 +56,10 @@ def matrix(T: Pose) -> list[float]:
 
 
 def scene_row(context: WorkerContext, scene: Scene) -> Row:
-    """The row of `scenes`."""
+    """The row of `scenes`: its own columns are the first object's, and of the figures the worst of all objects."""
     start, rest = scene.plan.objects[0], scene.settled[0]
     ran, skipped = write_receipt(scene.effects, scene.called)
+    bodies = [body_row(start, rest) for start, rest in zip(scene.plan.objects, scene.settled, strict=True)]
     return {
         "scene_id": scene.plan.scene_id,
         "category": scene.plan.category,
@@ -111,20 +73,35 @@ def scene_row(context: WorkerContext, scene: Scene) -> Row:
         "redraws": start.redraws,
         "effects": ran,
         "skipped": skipped,
+        **worst_rest(bodies),
+        "settle_s": max(rest.settle_s for rest in scene.settled),
+        "raycast_checked": scene.raycast_checked,
+        "settings_digest": context.settings_digest,
+        "bodies": bodies,
+    }
+
+
+def body_row(start: ObjectStart, rest: Settled) -> Row:
+    """One object of a scene, an item of `scenes.bodies`."""
+    return {
+        "region_id": start.region_id,
+        "category": start.asset.category,
+        "instance_id": start.asset.instance_id,
+        "source": start.asset.source,
+        "object_scale": start.asset.scale,
+        "T_world_obj": matrix(rest.T_world_obj),
+        "redraws": start.redraws,
         "penetration_mm": rest.penetration_mm,
         "hover_gap_mm": rest.hover_gap_mm,
         "support_margin_mm": rest.support_margin_mm,
         "residual_speed_mm_s": rest.residual_speed_mm_s,
         "recheck_move_mm": rest.recheck_move_mm,
-        "settle_s": rest.settle_s,
-        "raycast_checked": scene.raycast_checked,
-        "settings_digest": context.settings_digest,
     }
 
 
 def view_row(scene: Scene, pair: Pair, view: View, files: Files, job: Job) -> Row:
     """The row of `views`, key (pose_id, role)."""
-    labels = _object_labels(view, pair)
+    labels = object_labels(view, pair)
     projected = view.role == "projected"
     agreement = pair.agreement if view.role == "mirror" else None
     return {
@@ -150,14 +127,6 @@ def view_row(scene: Scene, pair: Pair, view: View, files: Files, job: Job) -> Ro
     }
 
 
-def patch_object_fraction(view: View, label: ObjectLabel, patch: Patch) -> float | None:
-    """Share of an object's patch that is the object; None where the patch was left out."""
-    box = crop_box(label, view.camera, patch)
-    if box is None or view.region is None:
-        return None
-    return float((view.region[box] == label.region_id).mean())
-
-
 def camera_columns(camera: Camera) -> Row:
     """The columns that describe a camera, in both pixel conventions."""
     k = camera.intrinsics
@@ -176,7 +145,7 @@ def camera_columns(camera: Camera) -> Row:
     }
 
 
-def object_rows(scene: Scene, view: View) -> list[Row]:
+def object_rows(scene: Scene, view: View, job: Job) -> list[Row]:
     """The rows of `objects`, key (pose_id, role, region_id); the table has one too."""
     return [
         {
@@ -192,6 +161,9 @@ def object_rows(scene: Scene, view: View) -> list[Row]:
             "bbox_xywh": list(label.bbox_xywh),
             "pixels": label.pixels,
             "visible_fraction": label.visible_fraction,
+            "patch_object_fraction": None
+            if label.region_id < REGION_FIRST_OBJECT
+            else patch_object_fraction(view, label, job.images.patch),
         }
         for label in view.labels
     ]

@@ -1,7 +1,6 @@
 """Labels derived again from what is stored: the images, the rows and the job, and nothing of the renderer."""
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,46 +8,72 @@ from numpy.typing import NDArray
 from schemas.base import Array, frozen_array
 from schemas.camera import Camera, Intrinsics, Role
 from schemas.job import Job
-from schemas.layout import IMAGES, file_pose_id, image_path, patch_path
-from schemas.scene import REGION_FIRST_OBJECT, ObjectLabel, View
+from schemas.layout import file_pose_id, image_path, stored_images
+from schemas.manifest import worst_rest
+from schemas.scene import REGION_FIRST_OBJECT, REGION_TABLE, ObjectLabel, View
 from workers.geometry.camera import image_coordinates
 from workers.geometry.frames import invert
 from workers.geometry.pixels import measure_regions
-from workers.scene.derive import compare_views, crop_box, derive_projected, projection_shares
+from workers.pictures import patch_object_fraction
+from workers.rederive_patches import ReadImage, Row, check_patches
+from workers.scene.derive import compare_views, derive_projected, projection_shares
 from workers.scene.views import object_distance, place_aligned_camera, place_mirror_camera
 
 SAME = 1e-12
 """Poses and distances that are computed again from the same doubles agree to rounding."""
 
-Row = Mapping[str, Any]
-ReadImage = Callable[[str], NDArray]
+FIRST_OBJECT = ("category", "instance_id", "source", "object_scale", "T_world_obj", "redraws")
+"""Columns of `scenes` that are those of its first body."""
+
 DTYPES = {"rgb": np.uint8, "depth": np.uint16, "region": np.uint8}
+
+
+def check_stored_scene(scene: Row) -> list[str]:
+    """What a scene's own columns say that its bodies do not; nothing where it was stored before there were bodies."""
+    bodies = scene["bodies"]
+    if bodies is None:
+        return []
+    expected = {name: bodies[0][name] for name in FIRST_OBJECT} | worst_rest(bodies)
+    where = f"scene {scene['scene_id']}"
+    faults = [
+        f"{where}: {name} is {scene[name]}, its bodies give {value}"
+        for name, value in expected.items()
+        if scene[name] != value
+    ]
+    regions = [body["region_id"] for body in bodies]
+    if regions != list(range(REGION_FIRST_OBJECT, REGION_FIRST_OBJECT + len(bodies))):
+        faults.append(f"{where}: its bodies have the regions {regions}")
+    return faults
 
 
 def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], scene: Row, read: ReadImage) -> list[str]:
     """Everything of one pair that does not follow from the rest of it, a sentence each; empty where all does.
 
-    `views` holds the pair's four rows by role, `objects` its rows of that table, `read` returns an image by its path.
+    `views` holds the pair's rows by role, `objects` its rows of that table, `read` returns an image by its path.
     """
     faults: list[str] = []
-    loaded = {role: _load(row, read, faults) for role, row in views.items()}
+    loaded = {role: _load(row, job, read, faults) for role, row in views.items()}
     if faults:
         return faults
     stored = {role: _view(row, loaded[role], _labels(objects, row)) for role, row in views.items()}
     for role, view in stored.items():
         if role != "projected":
             faults += _check_labels(view, scene)
+            faults += _check_patch_shares(job, view, scene, objects)
             faults += _check_images(view)
-        faults += _check_patches(view, stored, job, read, views[role])
-    return faults + _check_cameras(job, stored, views) + _check_projection(job, stored, views)
+        faults += check_patches(view, stored["mirror" if role == "projected" else role], job, read, views[role])
+    faults += _check_cameras(job, stored, views)
+    if "mirror" in stored:
+        faults += _check_agreement(job, stored, views)
+    if "projected" in stored:
+        faults += _check_projection(job, stored, views)
+    return faults
 
 
-def _load(row: Row, read: ReadImage, faults: list[str]) -> dict[str, NDArray]:
+def _load(row: Row, job: Job, read: ReadImage, faults: list[str]) -> dict[str, NDArray]:
     """A view's images by kind of pixel, with their sizes and types checked."""
     images: dict[str, NDArray] = {}
-    for image in IMAGES:
-        if image.role != row["role"]:
-            continue
+    for image in stored_images(row["role"], job):
         path = image_path(row["category"], image.content, file_pose_id(row["role"], row["parent_id"]))
         pixels = read(path)
         shape = (row["height"], row["width"], 3)[: 3 if image.pixels == "rgb" else 2]
@@ -93,7 +118,7 @@ def _view(row: Row, images: Mapping[str, NDArray], labels: tuple[ObjectLabel, ..
         row["pose_id"],
         row["parent_id"],
         camera_of(row),
-        images["rgb"],
+        images.get("rgb"),
         images["depth"],
         images.get("region"),
         labels,
@@ -104,14 +129,19 @@ def _differs(a: Array, b: Array) -> bool:
     return bool(np.abs(np.asarray(a) - np.asarray(b)).max() > SAME)
 
 
+def _world_poses(scene: Row) -> dict[int, list[float]]:
+    """Where the table and every object stand, by region id."""
+    bodies = scene["bodies"] or [{"region_id": REGION_FIRST_OBJECT, "T_world_obj": scene["T_world_obj"]}]
+    return {REGION_TABLE: scene["T_world_table"], **{body["region_id"]: body["T_world_obj"] for body in bodies}}
+
+
 def _check_labels(view: View, scene: Row) -> list[str]:
     """Rows of `objects` against the mask and the poses."""
     assert view.region is not None
     where, faults = f"pose {view.pose_id} ({view.role})", []
-    worlds = {
-        label.region_id: scene["T_world_obj" if label.region_id >= REGION_FIRST_OBJECT else "T_world_table"]
-        for label in view.labels
-    }
+    worlds = _world_poses(scene)
+    if {label.region_id for label in view.labels} != set(worlds):
+        return [f"{where}: objects has the regions {[label.region_id for label in view.labels]}, scenes {list(worlds)}"]
     extents = measure_regions(view.region)
     for label in view.labels:
         pixels, box = extents[label.region_id]
@@ -129,6 +159,27 @@ def _check_labels(view: View, scene: Row) -> list[str]:
     return faults
 
 
+def _check_patch_shares(job: Job, view: View, scene: Row, objects: list[Row]) -> list[str]:
+    """How much of its patch each object fills; nothing where it was stored before there was such a column."""
+    if scene["bodies"] is None:
+        return []
+    shares = {
+        row["region_id"]: row["patch_object_fraction"]
+        for row in objects
+        if (row["pose_id"], row["role"]) == (view.pose_id, view.role)
+    }
+    found = {
+        label.region_id: patch_object_fraction(view, label, job.images.patch)
+        for label in view.labels
+        if label.region_id >= REGION_FIRST_OBJECT
+    }
+    return [
+        f"pose {view.pose_id} ({view.role}), region {region}: fills {share} of its patch, objects says {shares[region]}"
+        for region, share in found.items()
+        if share != shares[region]
+    ]
+
+
 def _check_images(view: View) -> list[str]:
     """Masks against depth, and against the regions that objects names."""
     assert view.region is not None
@@ -144,36 +195,6 @@ def _check_images(view: View) -> list[str]:
     return faults
 
 
-def _check_patches(view: View, stored: Mapping[str, View], job: Job, read: ReadImage, row: Row) -> list[str]:
-    """Patches are crops of the images, and are there exactly where the crop stays inside."""
-    labels = [
-        label
-        for label in (stored["mirror"] if view.role == "projected" else view).labels
-        if label.region_id >= REGION_FIRST_OBJECT
-    ]
-    pixels: dict[str, NDArray | None] = {"rgb": view.rgb, "depth": view.depth, "region": view.region}
-    listed = {file["path"] for file in row["files"]}
-    faults, expected = [], set()
-    for image in (image for image in IMAGES if image.role == view.role):
-        number = file_pose_id(view.role, view.parent_id)
-        expected.add(image_path(row["category"], image.content, number))
-        for label in labels:
-            box = crop_box(label, view.camera, job.images.patch)
-            index = None if len(labels) == 1 else label.region_id - REGION_FIRST_OBJECT
-            path = patch_path(row["category"], image.content, number, index)
-            if box is None:
-                continue
-            expected.add(path)
-            full = pixels[image.pixels]
-            if path in listed and full is not None and not np.array_equal(read(path), full[box]):
-                faults.append(f"{path}: is not the crop of its image")
-    if expected != listed:
-        faults.append(
-            f"pose {view.pose_id} ({view.role}): files {sorted(expected ^ listed)} should be there, or should not"
-        )
-    return faults
-
-
 def _check_cameras(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> list[str]:
     """d_z from the input's stored depth; the aligned and mirror poses from it."""
     first, faults = stored["input"], []
@@ -185,7 +206,7 @@ def _check_cameras(job: Job, stored: Mapping[str, View], views: Mapping[str, Row
     }
     poses["projected"] = poses["mirror"]
     for role, camera in poses.items():
-        if _differs(camera.T_world_cam, stored[role].camera.T_world_cam):
+        if role in stored and _differs(camera.T_world_cam, stored[role].camera.T_world_cam):
             faults.append(
                 f"pose {stored[role].pose_id} ({role}): T_world_cam does not follow from the input pose and d_z"
             )
@@ -195,23 +216,30 @@ def _check_cameras(job: Job, stored: Mapping[str, View], views: Mapping[str, Row
     return faults
 
 
+def _check_agreement(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> list[str]:
+    """The agreement of the two views."""
+    mirror = stored["mirror"]
+    agreement = compare_views(job, stored["input"], mirror)
+    told = views["mirror"]["mirror_agreement"]
+    found = None if agreement.median_mm is None else (agreement.median_mm, agreement.share)
+    if (told is None) != (found is None) or (
+        found and _differs(np.array(found), np.array([told["median_mm"], told["share"]]))
+    ):
+        return [f"pose {mirror.pose_id} (mirror): the two views agree to {found}, views says {told}"]
+    return []
+
+
 def _check_projection(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> list[str]:
-    """The projected images to the byte, and the agreement of the two views."""
+    """The projected images to the byte, and their shares."""
     first, mirror, projected = stored["input"], stored["mirror"], stored["projected"]
     where, faults = f"pose {projected.pose_id} (projected)", []
     rgb, depth = derive_projected(first, mirror.camera, job.images, job.sensor.distortion)
-    if not np.array_equal(rgb, projected.rgb) or not np.array_equal(depth, projected.depth):
+    same_rgb = rgb is None or (projected.rgb is not None and np.array_equal(rgb, projected.rgb))
+    if not same_rgb or not np.array_equal(depth, projected.depth):
         faults.append(f"{where}: the stored input depth projects to other images")
     shares = projection_shares(depth, mirror.depth, job.images)
     if _differs(
         np.array(shares), np.array([views["projected"][f"projected_{name}_share"] for name in ("filled", "hidden")])
     ):
         faults.append(f"{where}: the shares filled and hidden are {shares}, and not what views says")
-    agreement = compare_views(job, first, mirror)
-    told = views["mirror"]["mirror_agreement"]
-    found = None if agreement.median_mm is None else (agreement.median_mm, agreement.share)
-    if (told is None) != (found is None) or (
-        found and _differs(np.array(found), np.array([told["median_mm"], told["share"]]))
-    ):
-        faults.append(f"pose {mirror.pose_id} (mirror): the two views agree to {found}, views says {told}")
     return faults

@@ -27,8 +27,8 @@ from workers.scene.check import check_against_rays, check_pair, is_raycast_scene
 from workers.scene.derive import compare_views, derive_projected, label_region, projection_shares
 from workers.scene.effect import EffectPlan, Facts
 from workers.scene.effects import called_for, plan_effects
-from workers.scene.plan import choose_category, plan_scene
-from workers.scene.randomness import Stream, stream
+from workers.scene.plan import choose_category, count_objects, plan_scene
+from workers.scene.randomness import Stream, of_object, stream
 from workers.scene.settle import recheck, settle
 from workers.scene.views import (
     object_distance,
@@ -111,12 +111,14 @@ def make_scene(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Scene
 
 
 def plan_with_assets(context: WorkerContext, scene_id: int) -> ScenePlan:
-    """Draw category, object and table, load them, and draw everything else."""
+    """Draw table, categories and objects, load them, and draw everything else."""
     job, catalogue = context.job, context.catalogue
-    category = choose_category(job, scene_id)
-    asset = load_asset(catalogue, choose_object(catalogue, category, stream(job.seed, scene_id, Stream.OBJECT)))
+    assets = []
+    for number in range(count_objects(job, scene_id)):
+        rng = stream(job.seed, scene_id, Stream.OBJECT, *of_object(number))
+        assets.append(load_asset(catalogue, choose_object(catalogue, choose_category(job, scene_id, number), rng)))
     table = load_asset(catalogue, choose_table(catalogue, stream(job.seed, scene_id, Stream.TABLE)))
-    return plan_scene(job, scene_id, table, asset)
+    return plan_scene(job, scene_id, table, *assets)
 
 
 def settle_objects(
@@ -153,29 +155,35 @@ class SceneView:
 
 
 def make_pair(scene: SceneView, camera: Camera, number: int) -> Pair:
-    """All four views of one pair. Raises ViewError where the input camera sees no object."""
+    """The views of one pair that the job asks for. Raises ViewError where the input camera sees no object."""
     job, watch = scene.context.job, scene.watch
     parent = input_pose_id(scene.plan.scene_id, number, job.pairs_per_scene)
     exact_first = render_view(scene, "input", (parent, parent), camera)
     first = sense(scene, exact_first, number)
-    with watch.effect("depth_camera"):
-        aligned_camera = place_aligned_camera(camera, job.cameras.depth)
-        aligned = sense(scene, render_view(scene, "aligned", (parent, parent), aligned_camera), number)
+    aligned: View | None = None
+    if scene.effects.runs("depth_camera"):
+        with watch.effect("depth_camera"):
+            aligned_camera = place_aligned_camera(camera, job.cameras.depth)
+            aligned = sense(scene, render_view(scene, "aligned", (parent, parent), aligned_camera), number)
     assert first.region is not None
     d_z_m = object_distance(first.depth, first.region, job.images, job.cameras.mirror)
+    if not scene.effects.runs("mirror"):
+        return Pair(d_z_m, first, aligned)
     mirror_camera = place_mirror_camera(camera, d_z_m, job.cameras.mirror)
     with watch.effect("mirror"):
         exact_mirror = render_view(scene, "mirror", (parent + 1, parent), mirror_camera)
         mirror = sense(scene, exact_mirror, number)
-    with watch.stage("projection", "projection"):
-        rgb, depth = derive_projected(first, mirror.camera, job.images, job.sensor.distortion)
-        filled, hidden = projection_shares(depth, mirror.depth, job.images)
     with watch.stage("check"):
         agreement = compare_views(job, first, mirror)
     exact_agreement = agreement
     if scene.effects.runs("exact_agreement"):
         with watch.stage("check", "exact_agreement"):
             exact_agreement = compare_views(job, exact_first, exact_mirror)
+    if not scene.effects.runs("projection"):
+        return Pair(d_z_m, first, aligned, mirror, None, agreement, exact_agreement)
+    with watch.stage("projection", "projection"):
+        rgb, depth = derive_projected(first, mirror.camera, job.images, job.sensor.distortion)
+        filled, hidden = projection_shares(depth, mirror.depth, job.images)
     projected = View("projected", parent, parent, mirror.camera, rgb, depth, None, ())
     return Pair(d_z_m, first, aligned, mirror, projected, agreement, exact_agreement, filled, hidden)
 
@@ -201,7 +209,7 @@ def render_view(scene: SceneView, role: Role, ids: tuple[int, int], camera: Came
     with scene.watch.stage("labels"):
         labels = label_view(scene, camera, buffer)
         depth = quantise_depth(buffer.depth_m, job.images)
-    return View(role, *ids, camera, buffer.rgb, depth, buffer.region, labels)
+    return View(role, *ids, camera, buffer.rgb if job.render.rgb else None, depth, buffer.region, labels)
 
 
 def label_view(scene: SceneView, camera: Camera, buffer: GBuffer) -> tuple[ObjectLabel, ...]:

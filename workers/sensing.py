@@ -19,7 +19,7 @@ def sense_view(job: Job, view: View, scene_id: int, pair: int) -> View:
     assert view.region is not None
     own = (pair, ROLES.index(view.role))
     rgb, depth = view.rgb, view.depth
-    if job.sensor.changes_rgb:
+    if rgb is not None and job.sensor.changes_rgb:
         exposure = stream(job.seed, scene_id, Stream.SENSOR_EXPOSURE, *own)
         noise = stream(job.seed, scene_id, Stream.SENSOR_RGB, *own)
         rgb = sense_rgb(rgb, view.camera.intrinsics, job.sensor, exposure, noise)

@@ -10,6 +10,7 @@ from typing import Any
 
 from schemas.errors import InputError
 from schemas.job import Job
+from schemas.start import ONE_OBJECT
 from services.bench.measure import bench_folder, measure
 from services.bench.others import other_systems
 from services.bench.report import describe, summarise
@@ -52,7 +53,22 @@ def _job(options: argparse.Namespace) -> tuple[Job, Path]:
         job, folder = load_job(options.job, options.changes), options.job.parent
     if job.output.layout != "files":
         raise InputError(f"output.layout is {job.output.layout!r}: the benchmark compares files, leave it at 'files'")
+    refuse_unmatched(job)
     return job, folder
+
+
+def refuse_unmatched(job: Job) -> None:
+    """Raises InputError for a job whose scenes the straightforward script does not make."""
+    if job.objects_per_scene != ONE_OBJECT:
+        raise InputError("objects_per_scene is not 1: the benchmark compares scenes of one object, leave it at 1")
+    switches = {
+        "cameras.depth.enabled": job.cameras.depth.enabled,
+        "cameras.mirror.enabled": job.cameras.mirror.enabled,
+        "images.projection.enabled": job.images.projection.enabled,
+        "render.rgb": job.render.rgb,
+    }
+    if off := [name for name, on in switches.items() if not on]:
+        raise InputError(f"{', '.join(off)} is off: the benchmark compares whole pairs, leave it on")
 
 
 def _memory(options: argparse.Namespace, job: Job, job_folder: Path, folder: Path) -> dict[str, Any] | None:

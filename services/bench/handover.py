@@ -10,7 +10,7 @@ from schemas.job import Job
 from schemas.scene import Pair, Placed
 from schemas.shape import Asset, Mesh, Shape
 from workers.assets.glb import asset_glb
-from workers.records import image_boxes
+from workers.pictures import image_boxes
 from workers.render.batches import SRGB_STEPS, decode_srgb, encode_srgb
 from workers.scene_steps import Scene
 from workers.store.images import encode_png

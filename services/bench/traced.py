@@ -72,7 +72,7 @@ def first_scenes(job: Job, job_folder: Path, count: int) -> list[Scene]:
 def measure_scene(scene: Scene, folder: Path, cycles: CyclesProcess | None) -> dict[str, Lap]:
     """Laps over the scene's three rendered views by side and samples, such as `ours 16`; its building is in each."""
     pair = scene.pairs[0]
-    cameras = [view.camera for view in (pair.input, pair.aligned, pair.mirror)]
+    cameras = [view.camera for view in pair.views if view.role != "projected"]
     laps = {}
     handed = None if cycles is None else hand_over(scene.posed, cameras, Render(), folder)
     for samples in SAMPLES:

@@ -34,7 +34,13 @@ NOISY = {
 FLAT, RASTER = {"render": {"tier": "flat"}}, {"render": {"tier": "raster"}}
 TRACED = {"render": {"tier": "pathtraced", "path_samples": 1}, "categories": ["jar"]}
 
+WITHOUT_MIRROR = {"cameras": {"mirror": {"enabled": False}}, "images": {"projection": {"enabled": False}}}
+
 ASKED: dict[str, Case] = {
+    "depth_camera": _asked({}, {"cameras": {"depth": {"enabled": False}}}, "cameras.depth.enabled is false"),
+    "mirror": _asked({}, WITHOUT_MIRROR, "cameras.mirror.enabled is false"),
+    "projection": _asked({}, {"images": {"projection": {"enabled": False}}}, "images.projection.enabled is false"),
+    "rgb": _asked({}, {"render": {"rgb": False}}, "render.rgb is false"),
     "splat": _asked({"images": {"projection": {"splat": 3}}}, {}, "images.projection.splat is 1"),
     "hidden_point_removal": _asked(
         {"images": {"projection": {"hidden_point_removal": True}}},
@@ -54,14 +60,6 @@ ASKED: dict[str, Case] = {
     "raycast_check": _asked({"check": {"raycast_share": 1.0}}, {}, "not in the share check.raycast_share"),
     "release_again": _asked({"check": {"raycast_share": 1.0}}, {}, "not in the share check.raycast_share"),
 }
-
-NO_SWITCH_YET: dict[str, str] = {
-    "depth_camera": "cameras.depth.enabled",
-    "mirror": "cameras.mirror.enabled",
-    "projection": "images.projection.enabled",
-    "rgb": "render.rgb",
-}
-"""Asked effects that no job can ask to leave out: as soon as one can, they get a case each in `ASKED`."""
 
 NO_OPS: dict[str, Case] = {
     "floor": Case(Setting({}), Setting(ABOVE_THE_HORIZON), "outside of every view"),

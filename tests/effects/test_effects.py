@@ -1,12 +1,10 @@
 """Every effect on a scene that needs it and on one that does not: the plan, what leaving out breaks, what forcing changes."""
 
 import importlib.util
-from typing import Any
 
 import pytest
 
-from schemas.errors import InputError
-from tests.effects.cases import ASKED, NO_OPS, NO_SWITCH_YET, Case
+from tests.effects.cases import ASKED, NO_OPS, Case
 from tests.effects.physics_cases import PHYSICS
 from tests.effects.scenes import Setting, facts_of, make
 from workers.scene.effects import EFFECTS, names_of_kind, plan_effects, write_receipt
@@ -19,10 +17,10 @@ CHECKS_ONLY = {"exact_agreement"}
 
 def test_every_effect_has_its_three_tests():
     """A new entry of the table needs a case, which every test below takes up."""
-    assert {effect.name for effect in EFFECTS} == CASES.keys() | NO_SWITCH_YET.keys()
+    assert {effect.name for effect in EFFECTS} == CASES.keys()
     assert names_of_kind("no_op") == NO_OPS.keys()
     assert names_of_kind("approximation") == PHYSICS.keys()
-    assert names_of_kind("asked") == ASKED.keys() | NO_SWITCH_YET.keys()
+    assert names_of_kind("asked") == ASKED.keys()
     assert len(EFFECTS) == len({effect.name for effect in EFFECTS})
     assert all(effect.cost and effect.stage for effect in EFFECTS)
 
@@ -33,16 +31,6 @@ def test_the_plan_runs_it_where_the_scene_needs_it_and_says_why_not_elsewhere(na
     assert needs.runs(name) and name not in needs.skipped
     assert not spares.runs(name)
     assert spares.skipped[name] == CASES[name].why
-
-
-@pytest.mark.parametrize("name", NO_SWITCH_YET)
-def test_what_no_job_can_switch_off_runs_always(name):
-    assert plan_effects(facts_of(Setting({}))).runs(name)
-    branch: Any = False
-    for key in reversed(NO_SWITCH_YET[name].split(".")):
-        branch = {key: branch}
-    with pytest.raises(InputError):
-        assert Setting(branch).job
 
 
 @pytest.mark.parametrize("name", ASKED)

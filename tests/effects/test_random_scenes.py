@@ -32,7 +32,7 @@ def random_setting(number: int) -> Setting:
     cy = above_horizon if rng.random() < 0.4 else height / 2
     changes: dict[str, Any] = {
         "categories": [str(rng.choice(CATEGORIES))],
-        "render": {"tier": str(rng.choice(["flat", "raster"]))},
+        "render": {"tier": str(rng.choice(["flat", "raster"])), "rgb": bool(rng.random() < 0.8)},
         "sensor": {"depth_noise": {}} if rng.random() < 0.2 else {},
         "start": {"pose": str(rng.choice(["upright", "tumbled", "placed"]))},
         "cameras": {
@@ -74,9 +74,9 @@ def called_for(facts: Facts) -> set[str]:
     wanted = {
         "floor": may_be_seen(floor, facts),
         "table": may_be_seen(table, facts),
-        "textures": any(picture is not None for picture in pictures),
-        "transparency": bool(clear) and job.render.tier == "raster",
-        "light_maps": job.render.tier == "raster",
+        "textures": any(picture is not None for picture in pictures) and job.render.rgb,
+        "transparency": bool(clear) and job.render.tier == "raster" and job.render.rgb,
+        "light_maps": job.render.tier == "raster" and job.render.rgb,
         "exact_agreement": job.sensor.depth_noise is not None,
     }
     return {name for name, wants in wanted.items() if wants}

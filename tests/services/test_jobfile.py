@@ -47,6 +47,12 @@ def test_every_example_is_a_job(path):
         ("name: a\nassets: {split: {train: 0.5}}", ["assets.split", "0.7"]),
         ("name: a\nimages: {depth_units_per_m: 10000}", ["images", "80000", "65535"]),
         ("name: a\nimages: {projection: {splat: 4}}", ["images.projection.splat", "4", "even"]),
+        ("name: a\nobjects_per_scene: 21", ["objects_per_scene", "21", "from 1 to 20"]),
+        ("name: a\nobjects_per_scene: 0", ["objects_per_scene", "0", "from 1 to 20"]),
+        ("name: a\nobjects_per_scene: [2, 1]", ["objects_per_scene", "[2, 1]", "empty"]),
+        ("name: a\nobjects_per_scene: [1, 2.5]", ["objects_per_scene", "2.5", "[low, high]"]),
+        ("name: a\nobjects_per_scene: true", ["objects_per_scene", "True", "whole number"]),
+        ("name: a\nobjects_per_scene: many", ["objects_per_scene", "'many'", "whole number"]),
         ("name: a/b", ["name", "a/b"]),
         ("name: a\nverso: 2", ["verso", "2", "newer"]),
         ("name: a\nseed: 1\nseed: 2", ["line 3", "'seed'", "twice"]),
@@ -102,3 +108,14 @@ def test_a_job_with_all_defaults_is_the_articles():
     assert (job.images.patch.width, job.images.patch.height, job.images.depth_units_per_m) == (128, 96, 5000)
     assert job.start.offset_m == (-0.25, 0.25)
     assert len(job.categories) == 8
+
+
+@pytest.mark.parametrize(
+    ("text", "ends", "told"), [("3", (3, 3), 3), ("[1, 5]", (1, 5), [1, 5]), ("[4, 4]", (4, 4), 4)]
+)
+def test_a_count_of_objects_is_a_number_or_a_range_and_is_written_as_it_was(tmp_path, text, ends, told):
+    job = load_job(write(tmp_path, f"name: a\nobjects_per_scene: {text}"))
+    assert job.objects_per_scene == ends
+    dumped = job.model_dump(mode="json")
+    assert dumped["objects_per_scene"] == told
+    assert Job.model_validate(dumped) == job

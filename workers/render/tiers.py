@@ -18,7 +18,7 @@ SEEDS = 2**32
 
 def require_tier(render: Render) -> None:
     """Raises InputError, with the remedy, where what the tier needs is not installed."""
-    if render.tier == "pathtraced":
+    if render.tier == "pathtraced" and render.rgb:
         require_mitsuba()
 
 
@@ -31,7 +31,12 @@ def draw_view(
     rng: np.random.Generator,
     passes: Passes = AS_CALLED_FOR,
 ) -> GBuffer:
-    """What one camera sees, in the tier that the job asks for; `rng` seeds the paths, `passes` are of the label pass."""
+    """What one camera sees, in the tier that the job asks for; `rng` seeds the paths, `passes` are of the label pass.
+
+    Without RGB, colour means nothing.
+    """
+    if not render.rgb:
+        return renderer.draw(things, appearance, camera, FLAT, passes)
     if render.tier != "pathtraced":
         return renderer.draw(things, appearance, camera, render, passes)
     labels = renderer.draw(things, appearance, camera, FLAT, passes)

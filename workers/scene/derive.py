@@ -38,9 +38,14 @@ SCENE_STRIDE = 8
 
 def derive_projected(
     source: View, mirror: Camera, images: Images, lens: Distortion | None = None
-) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
-    """RGB [H, W, 3] uint8 and depth [H, W] uint16 of the stored input cloud seen from the mirror camera; holes 0."""
+) -> tuple[NDArray[np.uint8] | None, NDArray[np.uint16]]:
+    """RGB [H, W, 3] uint8 and depth [H, W] uint16 of the stored input cloud seen from the mirror camera; holes 0.
+
+    RGB is None where the source has none.
+    """
     projected = carry_depth(source, mirror, images)
+    if source.rgb is None:
+        return None, quantise_depth(projected.depth_m, images)
     if lens is not None:
         rgb = np.zeros((*projected.depth_m.shape, 3), np.uint8)
         seen = projected.source >= 0
@@ -54,6 +59,7 @@ def colours_of(source: View, pixels: NDArray[np.integer], lens: Distortion | Non
 
     Behind a lens a depth pixel's colour is that of the RGB pixel that its centre is drawn in, black outside the picture.
     """
+    assert source.rgb is not None
     if lens is None:
         return source.rgb.reshape(-1, 3)[pixels]
     k = source.camera.intrinsics
@@ -83,8 +89,11 @@ def projection_shares(projected: NDArray[np.uint16], mirror: NDArray[np.uint16],
 
 
 def crop_box(label: ObjectLabel, camera: Camera, patch: Patch) -> tuple[slice, slice] | None:
-    """(rows, columns) of the crop centred on the object's image coordinates; None where it would leave the image."""
-    if label.u < 0:
+    """(rows, columns) of the crop centred on the object's image coordinates.
+
+    None where it would leave the image, and where the view does not see the object.
+    """
+    if label.u < 0 or label.pixels == 0:
         return None
     left, top = label.u - patch.width // 2, label.v - patch.height // 2
     right, bottom = left + patch.width, top + patch.height

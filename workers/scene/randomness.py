@@ -20,6 +20,7 @@ class Stream(IntEnum):
     SENSOR_RGB = 9
     SENSOR_EXPOSURE = 10
     PATHS = 11
+    COUNT = 12
 
 
 def stream(seed: int, scene_id: int, name: Stream, *within: int) -> np.random.Generator:
@@ -28,3 +29,8 @@ def stream(seed: int, scene_id: int, name: Stream, *within: int) -> np.random.Ge
     `within` names a part of a step that must not depend on how many parts there are: (pair, role) for a view's noise.
     """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(scene_id, int(name), *within)))
+
+
+def of_object(number: int) -> tuple[int, ...]:
+    """What `within` is for an object by its number: the first object's streams are those of a scene that has only one."""
+    return (number,) if number else ()

@@ -75,10 +75,17 @@ def decode_table(table: str, data: bytes, name: str) -> pa.Table:
 
 
 def conform(table: str, rows: pa.Table, name: str) -> pa.Table:
-    """Rows with exactly today's schema of `table`. Raises CorruptError where a column cannot be had."""
+    """Rows with exactly today's schema of `table`. Raises CorruptError where a column cannot be had.
+
+    A schema only ever grows: rows that lack a column and have one that is unknown have a name that was damaged.
+    """
     schema = SCHEMAS[table]
     if rows.schema.equals(schema):
         return rows.cast(schema)  # Parquet has other names inside lists
+    missing = [column for column in schema.names if column not in rows.column_names]
+    foreign = [column for column in rows.column_names if column not in schema.names]
+    if missing and foreign:
+        raise CorruptError(f"{name} lacks the column {missing[0]} of the table {table}, and has {foreign[0]!r}")
     columns = []
     for field in schema:
         if field.name in rows.column_names:
