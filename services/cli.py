@@ -115,6 +115,12 @@ def _add_reading(commands: "argparse._SubParsersAction") -> None:
         commands, "verify", "read every file back and derive the labels again", "verso verify data/tabletop"
     )
     verify.add_argument("out", metavar="OUT")
+    verify.add_argument(
+        "--audit",
+        type=_count,
+        metavar="N",
+        help="also make N scenes again with the effects that were left out, to prove that they did not matter",
+    )
     verify.set_defaults(handler="services.commands:verify")
     query = _command(
         commands,

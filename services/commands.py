@@ -12,6 +12,7 @@ from schemas.layout import JOB_FILE
 from services.jobfile import load_job
 
 if TYPE_CHECKING:
+    from services.audit import Audit
     from workers.store.store import Store
 
 
@@ -110,8 +111,27 @@ def verify(options: argparse.Namespace) -> int:
         f"{options.out}: {verdict.files} files ({verdict.bytes / 1e6:.1f} MB), {verdict.scenes} scenes, labels of "
         f"{verdict.pairs} pairs derived again: {len(verdict.faults) or 'nothing'} off"
     )
-    _answer(options, {"ok": not verdict.faults, **dataclasses.asdict(verdict)})
-    return 1 if verdict.faults else 0
+    answer, faults = dataclasses.asdict(verdict), list(verdict.faults)
+    if options.audit:
+        found = _audit(options, store)
+        faults += found.faults
+        answer["audit"] = dataclasses.asdict(found)
+    _answer(options, {"ok": not faults, **answer})
+    return 1 if faults else 0
+
+
+def _audit(options: argparse.Namespace, store: "Store") -> "Audit":
+    from services.audit import audit
+    from services.audit_words import describe_audit
+    from services.progress import ProgressLine
+
+    line = ProgressLine(options.audit, "audit")
+    try:
+        found = audit(store, options.audit, lambda now: line.show(now.scenes, len(now.faults)))
+    finally:
+        line.close()
+    print("\n".join(describe_audit(found)))
+    return found
 
 
 def query(options: argparse.Namespace) -> int:

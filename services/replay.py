@@ -49,9 +49,9 @@ def replay_scene(store: Store, scene_id: int) -> Replay:
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
     same_stack = take_fingerprint(context.renderer, context.job.render.tier) == theirs
     output = run_scene(context, scene_id, Stopwatch())
-    differences = _compare_files(store, stored, output, same_stack)
+    differences = compare_files(store, stored, output, same_stack)
     if same_stack:
-        differences += _compare_rows(stored, output)
+        differences += compare_rows(stored, output)
     return Replay(same_stack, len(output.files) + (len(DETERMINISTIC_TABLES) if same_stack else 0), tuple(differences))
 
 
@@ -65,7 +65,8 @@ def open_context(record: JobRecord) -> WorkerContext:
     return open_worker(record.job, catalogue)
 
 
-def _compare_files(store: Store, stored: StoredRange, output: SceneOutput, same_stack: bool) -> list[str]:
+def compare_files(store: Store, stored: StoredRange, output: SceneOutput, same_stack: bool) -> list[str]:
+    """How a scene's images, made now, differ from the stored ones: a sentence each."""
     scene_files = {
         file["path"]: file["sha256"]
         for view in stored.rows["views"]
@@ -105,7 +106,8 @@ def _compare_pixels(before: bytes, now: bytes) -> _PixelDifference:
     )
 
 
-def _compare_rows(stored: StoredRange, output: SceneOutput) -> list[str]:
+def compare_rows(stored: StoredRange, output: SceneOutput, but: frozenset[str] = frozenset()) -> list[str]:
+    """How a scene's rows, made now, differ from the stored ones, `but` for these columns: a sentence each."""
     differences = []
     for table in DETERMINISTIC_TABLES:
         made = output.rows.get(table, [])
@@ -115,6 +117,7 @@ def _compare_rows(stored: StoredRange, output: SceneOutput) -> list[str]:
         else:
             before = [row for row in stored.rows[table] if row["scene_id"] == output.scene_id]
         now = table_of_rows(table, made).to_pylist()
+        before, now = ([{k: v for k, v in row.items() if k not in but} for row in rows] for rows in (before, now))
         if sorted(map(repr, before)) != sorted(map(repr, now)):
             columns = sorted(
                 {key for a, b in zip(before, now, strict=False) for key in a if repr(a[key]) != repr(b.get(key))}

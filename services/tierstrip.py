@@ -14,6 +14,8 @@ from workers.assets.catalogue import open_catalogue
 from workers.context import WorkerContext, settings_digest
 from workers.render.gbuffer import shared_renderer
 from workers.render.tiers import draw_view
+from workers.scene.effect import Facts
+from workers.scene.effects import plan_effects
 from workers.scene.views import front_distance, place_mirror_camera, pose_scene
 from workers.scene_steps import plan_with_assets, settle_objects
 
@@ -47,7 +49,7 @@ def _posed(job: Job, number: int) -> tuple[PosedScene, Camera]:
     catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
     context = WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
     plan = plan_with_assets(context, number)
-    posed = pose_scene(plan, settle_objects(context, plan))
+    posed = pose_scene(plan, settle_objects(context, plan, plan_effects(Facts(job, plan, False)))[0])
     seen = shared_renderer().draw(posed.things, posed.appearance, plan.input_cameras[0])
     d_z_m = front_distance(seen.depth_m.astype(np.float64), seen.region >= REGION_FIRST_OBJECT, job.cameras.mirror)
     mirror = place_mirror_camera(plan.input_cameras[0], d_z_m, job.cameras.mirror)

@@ -21,6 +21,8 @@ class WorkerContext:
     catalogue: Catalogue
     renderer: Renderer
     settings_digest: str
+    forced: frozenset[str] = frozenset()
+    """Effects that run also where a scene does not call for them: no switches of the job. For the audit."""
 
 
 def open_worker(job: Job, catalogue: Catalogue) -> WorkerContext:

@@ -16,7 +16,7 @@ from workers.assets.glb import asset_glb
 from workers.context import WorkerContext
 from workers.geometry.camera import inclination, yaw
 from workers.pictures import Files, encode_view, object_labels, patch_object_fraction
-from workers.scene.effects import Facts, write_receipt
+from workers.scene.effects import write_receipt
 from workers.scene_steps import Scene, Stopwatch
 from workers.store.images import encode_png
 
@@ -58,7 +58,7 @@ def matrix(T: Pose) -> list[float]:
 def scene_row(context: WorkerContext, scene: Scene) -> Row:
     """The row of `scenes`: its own columns are the first object's, and of the figures the worst of all objects."""
     start, rest = scene.plan.objects[0], scene.settled[0]
-    ran, skipped = write_receipt(Facts(context.job, scene.plan, scene.settled, scene.raycast_checked))
+    ran, skipped = write_receipt(scene.effects, scene.called)
     bodies = [body_row(start, rest) for start, rest in zip(scene.plan.objects, scene.settled, strict=True)]
     return {
         "scene_id": scene.plan.scene_id,
@@ -204,11 +204,13 @@ def failed_scene(scene_id: int, category: str, error: SceneError, attempts: int 
 
 def timing_row(scene_id: int, category: str, watch: Stopwatch) -> Row:
     """The row of `timings`: the only one that is not a function of job and seed."""
-    stages = [{"name": name, "seconds": seconds} for name, seconds in watch.seconds.items()]
+    stages, effects = (
+        [{"name": name, "seconds": seconds} for name, seconds in one.items()] for one in (watch.seconds, watch.effects)
+    )
     return {
         "scene_id": scene_id,
         "category": category,
         "stages": stages,
-        "effects": [],
+        "effects": effects,
         "total_s": sum(watch.seconds.values()),
     }

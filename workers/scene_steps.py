@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -21,9 +21,12 @@ from schemas.scene import (
 from workers.assets.catalogue import choose_object, choose_table, load_asset
 from workers.context import WorkerContext
 from workers.geometry.pixels import measure_regions
+from workers.render.passes import Passes
 from workers.render.tiers import draw_view
 from workers.scene.check import check_against_rays, check_pair, is_raycast_scene
 from workers.scene.derive import compare_views, derive_projected, label_region, projection_shares
+from workers.scene.effect import EffectPlan, Facts
+from workers.scene.effects import called_for, plan_effects
 from workers.scene.plan import choose_category, count_objects, plan_scene
 from workers.scene.randomness import Stream, of_object, stream
 from workers.scene.settle import recheck, settle
@@ -46,22 +49,41 @@ class Scene:
     posed: PosedScene
     pairs: tuple[Pair, ...]
     raycast_checked: bool
+    effects: EffectPlan
+    called: Mapping[str, str]
+    """Effects that the plan left out and that ran after all, and why."""
 
 
 @dataclass(frozen=True)
 class Stopwatch:
-    """Seconds by stage; a stage that runs twice adds up."""
+    """Seconds by stage, and by effect where an effect has a time of its own; what runs twice adds up.
+
+    Stages follow one another and sum up to the scene; an effect's time lies within those of stages.
+    """
 
     seconds: dict[str, float] = field(default_factory=dict)
+    effects: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Adds the time that the block takes to the stage's."""
+    def stage(self, name: str, effect: str | None = None) -> Iterator[None]:
+        """Adds the time that the block takes to the stage's, and to the effect's that it is the work of."""
         begun = time.perf_counter()
         try:
             yield
         finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
+            took = time.perf_counter() - begun
+            self.seconds[name] = self.seconds.get(name, 0.0) + took
+            if effect is not None:
+                self.effects[effect] = self.effects.get(effect, 0.0) + took
+
+    @contextmanager
+    def effect(self, name: str) -> Iterator[None]:
+        """Adds the time that the block, which has stages of its own, takes to the effect's."""
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.effects[name] = self.effects.get(name, 0.0) + time.perf_counter() - begun
 
 
 def make_scene(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Scene:
@@ -70,20 +92,22 @@ def make_scene(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Scene
     with watch.stage("assets"):
         plan = plan_with_assets(context, scene_id)
     checked = is_raycast_scene(job, scene_id)
-    with watch.stage("physics"):
-        settled = settle_objects(context, plan)
-    if checked:
-        with watch.stage("recheck"):
+    with watch.stage("plan"):
+        effects = plan_effects(Facts(job, plan, checked), context.forced)
+    with watch.stage("physics", "dynamics" if effects.runs("dynamics") else None):
+        settled, called = settle_objects(context, plan, effects)
+    if effects.runs("release_again"):
+        with watch.stage("recheck", "release_again"):
             settled = recheck_objects(context, plan, settled)
     posed = pose_scene(plan, settled)
-    pairs = tuple(
-        make_pair(SceneView(context, plan, posed, checked, watch), camera, number)
-        for number, camera in enumerate(plan.input_cameras)
-    )
+    view = SceneView(context, plan, posed, effects, watch)
+    with watch.stage("render", "light_maps" if effects.runs("light_maps") else None):
+        context.renderer.prepare_light(posed.things, posed.appearance, job.render, view.passes)
+    pairs = tuple(make_pair(view, camera, number) for number, camera in enumerate(plan.input_cameras))
     with watch.stage("check"):
         for pair in pairs:
             check_pair(pair, job.check)
-    return Scene(plan, settled, posed, pairs, checked)
+    return Scene(plan, settled, posed, pairs, checked, effects, called)
 
 
 def plan_with_assets(context: WorkerContext, scene_id: int) -> ScenePlan:
@@ -97,9 +121,12 @@ def plan_with_assets(context: WorkerContext, scene_id: int) -> ScenePlan:
     return plan_scene(job, scene_id, table, *assets)
 
 
-def settle_objects(context: WorkerContext, plan: ScenePlan) -> tuple[Settled, ...]:
-    """Every object at rest."""
-    return tuple(settle(start, plan.table, context.job.physics) for start in plan.objects)
+def settle_objects(
+    context: WorkerContext, plan: ScenePlan, effects: EffectPlan
+) -> tuple[tuple[Settled, ...], Mapping[str, str]]:
+    """(every object at rest, effects that the plan had left out and that settling called for)."""
+    settled = tuple(settle(start, plan.table, context.job.physics) for start in plan.objects)
+    return settled, called_for(effects, [rest.support for rest in settled])
 
 
 def recheck_objects(context: WorkerContext, plan: ScenePlan, settled: tuple[Settled, ...]) -> tuple[Settled, ...]:
@@ -118,8 +145,13 @@ class SceneView:
     context: WorkerContext
     plan: ScenePlan
     posed: PosedScene
-    raycast_checked: bool
+    effects: EffectPlan
     watch: Stopwatch
+
+    @property
+    def passes(self) -> Passes:
+        """What the renderer leaves out and what it is forced to draw."""
+        return Passes(frozenset(self.effects.skipped), self.effects.forced)
 
 
 def make_pair(scene: SceneView, camera: Camera, number: int) -> Pair:
@@ -129,23 +161,27 @@ def make_pair(scene: SceneView, camera: Camera, number: int) -> Pair:
     exact_first = render_view(scene, "input", (parent, parent), camera)
     first = sense(scene, exact_first, number)
     aligned: View | None = None
-    if job.cameras.depth.enabled:
-        aligned_camera = place_aligned_camera(camera, job.cameras.depth)
-        aligned = sense(scene, render_view(scene, "aligned", (parent, parent), aligned_camera), number)
+    if scene.effects.runs("depth_camera"):
+        with watch.effect("depth_camera"):
+            aligned_camera = place_aligned_camera(camera, job.cameras.depth)
+            aligned = sense(scene, render_view(scene, "aligned", (parent, parent), aligned_camera), number)
     assert first.region is not None
     d_z_m = object_distance(first.depth, first.region, job.images, job.cameras.mirror)
-    if not job.cameras.mirror.enabled:
+    if not scene.effects.runs("mirror"):
         return Pair(d_z_m, first, aligned)
     mirror_camera = place_mirror_camera(camera, d_z_m, job.cameras.mirror)
-    exact_mirror = render_view(scene, "mirror", (parent + 1, parent), mirror_camera)
-    mirror = sense(scene, exact_mirror, number)
+    with watch.effect("mirror"):
+        exact_mirror = render_view(scene, "mirror", (parent + 1, parent), mirror_camera)
+        mirror = sense(scene, exact_mirror, number)
     with watch.stage("check"):
         agreement = compare_views(job, first, mirror)
-        noisy = job.sensor.depth_noise is not None
-        exact_agreement = compare_views(job, exact_first, exact_mirror) if noisy else agreement
-    if not job.images.projection.enabled:
+    exact_agreement = agreement
+    if scene.effects.runs("exact_agreement"):
+        with watch.stage("check", "exact_agreement"):
+            exact_agreement = compare_views(job, exact_first, exact_mirror)
+    if not scene.effects.runs("projection"):
         return Pair(d_z_m, first, aligned, mirror, None, agreement, exact_agreement)
-    with watch.stage("projection"):
+    with watch.stage("projection", "projection"):
         rgb, depth = derive_projected(first, mirror.camera, job.images, job.sensor.distortion)
         filled, hidden = projection_shares(depth, mirror.depth, job.images)
     projected = View("projected", parent, parent, mirror.camera, rgb, depth, None, ())
@@ -154,7 +190,8 @@ def make_pair(scene: SceneView, camera: Camera, number: int) -> Pair:
 
 def sense(scene: SceneView, exact: View, number: int) -> View:
     """An exact view as the job's sensors store it."""
-    with scene.watch.stage("sensor"):
+    on = [name for name in scene.effects.ran if name.startswith("sensor_")]
+    with scene.watch.stage("sensor", on[0] if len(on) == 1 else None):
         return sense_view(scene.context.job, exact, scene.plan.scene_id, number)
 
 
@@ -163,9 +200,11 @@ def render_view(scene: SceneView, role: Role, ids: tuple[int, int], camera: Came
     job, renderer = scene.context.job, scene.context.renderer
     with scene.watch.stage("render"):
         paths = stream(job.seed, scene.plan.scene_id, Stream.PATHS, *ids, ROLES.index(role))
-        buffer = draw_view(renderer, scene.posed.things, scene.posed.appearance, camera, job.render, paths)
-    if scene.raycast_checked:
-        with scene.watch.stage("raycast"):
+        buffer = draw_view(
+            renderer, scene.posed.things, scene.posed.appearance, camera, job.render, paths, scene.passes
+        )
+    if scene.effects.runs("raycast_check"):
+        with scene.watch.stage("raycast", "raycast_check"):
             check_against_rays(scene.posed, camera, buffer, job.images.depth_range_m)
     with scene.watch.stage("labels"):
         labels = label_view(scene, camera, buffer)

@@ -1,13 +1,43 @@
 """Which part of which thing is drawn by which program: pure."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from schemas.scene import REGION_FLOOR, Appearance, Placed
+from schemas.base import Pose
+from schemas.camera import Intrinsics
+from schemas.scene import REGION_FLOOR, REGION_TABLE, Appearance, Placed
 from schemas.shape import Shape
 from workers.render.buffers import Uploaded, UploadedShape
+from workers.render.passes import AS_CALLED_FOR, Passes
 from workers.render.programs import light_slots
 from workers.render.shaders import Variant
+
+NAMES = {REGION_FLOOR: "floor", REGION_TABLE: "table"}
+"""Effects that are the drawing of a thing; objects are always drawn."""
+
+
+@dataclass(frozen=True)
+class Aim:
+    """What a pass over the things is for: labels with colour, or colour alone, then with clear texels `cut` out or not."""
+
+    labels: bool
+    cut: bool = False
+    passes: Passes = AS_CALLED_FOR
+
+
+@dataclass(frozen=True, eq=False)
+class ViewOf:
+    """What a pass over the things of a scene draws them with."""
+
+    appearance: Appearance
+    k: Intrinsics
+    T_cam_world: Pose
+    raster: bool
+    passes: Passes = AS_CALLED_FOR
+
+    def moved(self, x: float, y: float) -> "ViewOf":
+        """The view that at a pixel's centre sees what this one sees (x, y) pixels beside it."""
+        return replace(self, k=self.k.model_copy(update={"cx": self.k.cx - x, "cy": self.k.cy - y}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +56,7 @@ def sort_draws(
     fetch: Callable[[Shape], UploadedShape],
     appearance: Appearance,
     top_is_level: Callable[[Placed], bool] | None,
-    labels: bool,
+    aim: Aim,
 ) -> dict[Variant, list[Draw]]:
     """Draws by program, the floor's last, so that what things hide of it is not shaded.
 
@@ -36,13 +66,17 @@ def sort_draws(
     lights, raster = light_slots(appearance), top_is_level is not None
     by_variant: dict[Variant, list[Draw]] = {}
     for thing in reversed(things):
+        if not aim.passes.draw(NAMES.get(thing.region_id, "object")):
+            continue
         shape, ground = fetch(thing.shape), thing.region_id == REGION_FLOOR
         split = top_is_level is not None and top_is_level(thing)
         for batch in shape.batches:
             # Only a floor is large enough for what a program without highlights saves; each program takes megabytes.
-            looks = (batch.texture is not None, batch.few_triangles, batch.matte and ground, lights, raster)
+            textured = aim.passes.draw("textures", batch.texture is not None)
+            cutout = aim.cut and textured and aim.passes.draw("transparency", batch.holes)
+            looks = (textured, batch.few_triangles, batch.matte and ground, lights, raster)
             for first, count, level in _ranges(batch, split, raster and ground):
-                variant = Variant(*looks, ground, level, labels, batch.holes and not labels)
+                variant = Variant(*looks, ground, level, aim.labels, cutout)
                 by_variant.setdefault(variant, []).append(Draw(thing, shape, batch, first, count))
     return by_variant
 

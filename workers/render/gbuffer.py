@@ -23,7 +23,6 @@ transparent texels cut out) leaves depth and region alone: to labels every face 
 
 import ctypes
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -39,8 +38,9 @@ from workers.render.buffers import INDEX_BYTES, ShapeStore, TargetStore, Uploade
 from workers.render.colour import ColourTarget
 from workers.render.context import open_context
 from workers.render.counting import PixelCounter
-from workers.render.drawing import Draw, sort_draws
+from workers.render.drawing import Aim, Draw, ViewOf, sort_draws
 from workers.render.order import rank_regions
+from workers.render.passes import AS_CALLED_FOR, Passes
 from workers.render.programs import NEAR_M, Program
 from workers.render.scenelight import SceneLight
 from workers.render.shaders import Variant, label_sources
@@ -71,20 +71,6 @@ def shared_renderer() -> "Renderer":
     return _shared
 
 
-@dataclass(frozen=True, eq=False)
-class ViewOf:
-    """What a pass over the things of a scene draws them with."""
-
-    appearance: Appearance
-    k: Intrinsics
-    T_cam_world: Pose
-    raster: bool
-
-    def moved(self, x: float, y: float) -> "ViewOf":
-        """The view that at a pixel's centre sees what this one sees (x, y) pixels beside it."""
-        return replace(self, k=self.k.model_copy(update={"cx": self.k.cx - x, "cy": self.k.cy - y}))
-
-
 class Renderer:
     """Draws scenes; keeps on the GPU the shapes and framebuffers that were used lately.
 
@@ -112,27 +98,43 @@ class Renderer:
         gl.glProvokingVertex(gl.GL_LAST_VERTEX_CONVENTION)
         gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
 
-    def draw(self, things: Sequence[Placed], appearance: Appearance, camera: Camera, render: Render = FLAT) -> GBuffer:
+    def draw(
+        self,
+        things: Sequence[Placed],
+        appearance: Appearance,
+        camera: Camera,
+        render: Render = FLAT,
+        passes: Passes = AS_CALLED_FOR,
+    ) -> GBuffer:
         """What the camera sees at the centre of every pixel; region and depth are 0 where nothing is hit.
 
-        Depth and region do not depend on `render`. Faces nearer than 0.05 m along the optical axis are not seen. Raises
+        Depth and region do not depend on `render`, and nothing on `passes` as long as those that are left out are not
+        called for. Faces nearer than 0.05 m along the optical axis are not seen. Raises
         ValueError above six lights.
         """
-        self._platform.make_current()
-        raster = render.tier == "raster"
-        if raster:
-            self._lit().prepare(things, appearance)
-        view = ViewOf(appearance, camera.intrinsics, invert(camera.T_world_cam), raster)
+        self.prepare_light(things, appearance, render, passes)
+        view = ViewOf(appearance, camera.intrinsics, invert(camera.T_world_cam), render.tier == "raster", passes)
         self._clear(camera.intrinsics, appearance)
-        self._draw_things(things, view, labels=True)
+        self._draw_things(things, view, Aim(labels=True, passes=passes))
         drawn = self._read(camera.intrinsics)
-        if raster:
+        if view.raster:
             drawn = self._refine(drawn, things, view, render.samples)
         self._in_use = len(things)
         self._shapes.trim(self._in_use)
         for image in (drawn.rgb, drawn.depth_m, drawn.region):
             image.setflags(write=False)
         return drawn
+
+    def prepare_light(
+        self, things: Sequence[Placed], appearance: Appearance, render: Render, passes: Passes = AS_CALLED_FOR
+    ) -> None:
+        """Make the maps of a scene's light, which all of its views share, unless they are there or nothing asks for them."""
+        self._platform.make_current()
+        raster = render.tier == "raster"
+        if passes.draw("light_maps", raster):
+            self._lit().prepare(things, appearance)
+        elif raster:
+            self._lit().prepare((), appearance)
 
     def count_pixels(self, thing: Placed, camera: Camera) -> int:
         """Pixels that a thing alone would cover, also outside the image, with nothing in front of it.
@@ -164,11 +166,11 @@ class Renderer:
         self._platform.delete_context()
         self.closed = True
 
-    def _draw_things(self, things: Sequence[Placed], view: ViewOf, labels: bool) -> None:
+    def _draw_things(self, things: Sequence[Placed], view: ViewOf, aim: Aim) -> None:
         """Draw into what is bound."""
         ranks = rank_regions(things, [self._shapes.fetch(thing.shape).corners for thing in things])
         top_is_level = self._lit().top_is_level if view.raster else None
-        for variant, draws in sort_draws(things, self._shapes.fetch, view.appearance, top_is_level, labels).items():
+        for variant, draws in sort_draws(things, self._shapes.fetch, view.appearance, top_is_level, aim).items():
             program = self._program(variant)
             program.use()
             program.set_view(view.k)
@@ -182,33 +184,49 @@ class Renderer:
                 ahead = FLOOR_AHEAD if variant.ground else -10.0 * stand_back
                 T_cam_shape = view.T_cam_world @ draw.thing.T_world_shape
                 program.set_thing(T_cam_shape, draw.thing.region_id, stand_back, ahead)
-                self._cull(draw.shape, T_cam_shape, through_holes=not labels)
-                self._draw(draw)
+                self._cull(draw.shape, T_cam_shape, through_holes=not aim.labels)
+                self._draw(draw, variant.textured)
         self._gl.glDisable(self._gl.GL_CULL_FACE)
 
     def _refine(self, drawn: GBuffer, things: Sequence[Placed], view: ViewOf, samples: int) -> GBuffer:
         """The same with holes cut out of colour and its edges made smooth."""
-        rgb = drawn.rgb
-        if any(batch.holes for thing in things for batch in self._shapes.fetch(thing.shape).batches):
-            rgb = cv2.cvtColor(self._draw_colour(things, view, None), cv2.COLOR_RGBA2RGB)  # type: ignore[assignment]
-            self._colour().release()
+        rgb, cut = drawn.rgb, self._cuts_out(things, view)
+        if cut:
+            self._cut_out(rgb, things, view)
         mask = edges(rgb, drawn.region)
         if samples == 1:
             smooth(rgb, mask)
         else:
             self._colour().select(mask, view.k)
-            moved = [self._draw_colour(things, view.moved(*offset), mask) for offset in OFFSETS_PX]
+            moved = [self._draw_colour(things, view.moved(*offset), mask, cut) for offset in OFFSETS_PX]
             self._colour().release()
             blend(rgb, moved, mask)
         return GBuffer(rgb, drawn.depth_m, drawn.region)
 
-    def _draw_colour(self, things: Sequence[Placed], view: ViewOf, mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+    def _cuts_out(self, things: Sequence[Placed], view: ViewOf) -> bool:
+        holes = any(batch.holes for thing in things for batch in self._shapes.fetch(thing.shape).batches)
+        return view.passes.draw("transparency", holes)
+
+    def _cut_out(self, rgb: NDArray[np.uint8], things: Sequence[Placed], view: ViewOf) -> None:
+        """Put into `rgb` [H, W, 3] what is seen through clear texels: where two pictures differ, cut out and not.
+
+        Only there, because colour alone is tested by another depth than labels are, and so may show another of two faces
+        that meet.
+        """
+        whole, cut = (self._draw_colour(things, view, None, cut) for cut in (False, True))
+        self._colour().release()
+        seen_through = (whole != cut).any(axis=2)
+        rgb[seen_through] = cut[seen_through, :3]
+
+    def _draw_colour(
+        self, things: Sequence[Placed], view: ViewOf, mask: NDArray[np.uint8] | None, cut: bool
+    ) -> NDArray[np.uint8]:
         """[H, W, 4] uint8 sRGB; where there is a mask, it was selected before."""
         target = self._colour()
         if mask is None:
             target.select(None, view.k)
         target.clear(view.appearance)
-        self._draw_things(things, view, labels=False)
+        self._draw_things(things, view, Aim(labels=False, cut=cut, passes=view.passes))
         return target.read()
 
     def _lit(self) -> SceneLight:
@@ -242,11 +260,12 @@ class Renderer:
         cut = through_holes and any(batch.holes for batch in shape.batches)
         (gl.glEnable if shape.closed and whole and not cut else gl.glDisable)(gl.GL_CULL_FACE)
 
-    def _draw(self, draw: Draw) -> None:
+    def _draw(self, draw: Draw, textured: bool) -> None:
         gl = self._gl
         gl.glBindVertexArray(draw.batch.vertex_array)
-        if draw.batch.texture is not None:
-            gl.glBindTexture(gl.GL_TEXTURE_2D, draw.batch.texture.name)
+        if textured:
+            own = draw.batch.texture
+            gl.glBindTexture(gl.GL_TEXTURE_2D, self._shapes.textures.white if own is None else own.name)
         start = ctypes.c_void_p(INDEX_BYTES * draw.first)
         gl.glDrawElements(gl.GL_TRIANGLES, draw.count, gl.GL_UNSIGNED_INT, start)
 

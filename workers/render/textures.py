@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from workers.geometry.texels import has_holes
 from workers.render.batches import SRGB_STEPS
 
 MAX_TEXTURE_PX = 2048
@@ -38,6 +39,14 @@ class TextureStore:
         self._gl, self._max_bytes = gl, max_bytes
         self._stored: OrderedDict[int, Texture] = OrderedDict()
         self.bytes = 0
+        self._white: int | None = None
+
+    @property
+    def white(self) -> int:
+        """A texture that multiplies by one everywhere, for what has none of its own."""
+        if self._white is None:
+            self._white = upload_texture(self._gl, mip_levels(np.full((1, 1, 3), 255, np.uint8)))
+        return self._white
 
     def __len__(self) -> int:
         return len(self._stored)
@@ -72,15 +81,13 @@ class TextureStore:
         """Free everything; nothing may be in use."""
         while self._stored:
             self._free(self._stored.popitem()[1])
+        if self._white is not None:
+            self._gl.glDeleteTextures(1, [self._white])
+            self._white = None
 
     def _free(self, texture: Texture) -> None:
         self._gl.glDeleteTextures(1, [texture.name])
         self.bytes -= texture.bytes
-
-
-def has_holes(texture: NDArray[np.uint8] | None) -> bool:
-    """Whether a texture [h, w, 3 or 4] has texels that are more transparent than not."""
-    return texture is not None and texture.shape[2] == 4 and bool((texture[..., 3] < 128).any())
 
 
 def mip_levels(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:

@@ -9,6 +9,7 @@ from schemas.camera import Camera
 from schemas.job import Render
 from schemas.scene import Appearance, GBuffer, Placed
 from workers.render.gbuffer import FLAT, Renderer
+from workers.render.passes import AS_CALLED_FOR, Passes
 from workers.render.pathtrace import Tracer, require_mitsuba
 
 SEEDS = 2**32
@@ -28,13 +29,17 @@ def draw_view(
     camera: Camera,
     render: Render,
     rng: np.random.Generator,
+    passes: Passes = AS_CALLED_FOR,
 ) -> GBuffer:
-    """What one camera sees, in the tier that the job asks for; `rng` seeds the paths. Without RGB, colour means nothing."""
+    """What one camera sees, in the tier that the job asks for; `rng` seeds the paths, `passes` are of the label pass.
+
+    Without RGB, colour means nothing.
+    """
     if not render.rgb:
-        return renderer.draw(things, appearance, camera, FLAT)
+        return renderer.draw(things, appearance, camera, FLAT, passes)
     if render.tier != "pathtraced":
-        return renderer.draw(things, appearance, camera, render)
-    labels = renderer.draw(things, appearance, camera, FLAT)
+        return renderer.draw(things, appearance, camera, render, passes)
+    labels = renderer.draw(things, appearance, camera, FLAT, passes)
     rgb = shared_tracer().trace(things, appearance, camera, render, int(rng.integers(SEEDS)))
     rgb.setflags(write=False)
     return GBuffer(rgb, labels.depth_m, labels.region)

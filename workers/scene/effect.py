@@ -37,10 +37,14 @@ class Effect:
 
 @dataclass(frozen=True, eq=False)
 class EffectPlan:
-    """The effects that are to run, and why each of the others is not, in the table's order."""
+    """The effects that are to run, and why each of the others is not, in the table's order.
+
+    `forced` are those that run everywhere, also in views and on things that do not call for them.
+    """
 
     ran: tuple[str, ...]
     skipped: Mapping[str, str]
+    forced: frozenset[str] = frozenset()
 
     def runs(self, name: str) -> bool:
         """Whether the effect is to run."""

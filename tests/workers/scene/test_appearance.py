@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from schemas.job import Job, Render
-from schemas.scene import Settled
 from tests.shapes import asset_of, box, table
 from workers.scene.appearance import draw_look
-from workers.scene.effects import Facts, write_receipt
+from workers.scene.effect import Facts
+from workers.scene.effects import plan_effects, write_receipt
 from workers.scene.floors import COVERINGS, PERIOD_M, TEXTURE_PX, draw_covering, pattern_of
 from workers.scene.plan import plan_scene
 from workers.scene.randomness import Stream, stream
@@ -104,9 +104,8 @@ def test_floors_differ_in_colour_scale_and_angle():
     ],
 )
 def test_the_receipt_says_which_effects_of_light_ran(tier, expected):
-    rest = Settled(np.eye(4), 0.0, 0.0, 1.0, 0.0, 0.0, 0.1, "flat_top")
     job = JOBS["raster"].model_copy(update={"render": Render(tier=tier)})
-    ran, skipped = write_receipt(Facts(job, plan_scene(JOBS["raster"], 0, TABLE, BOX), (rest,), False))
+    ran, skipped = write_receipt(plan_effects(Facts(job, plan_scene(JOBS["raster"], 0, TABLE, BOX), False)))
     names = {"shadows", "ambient_occlusion", "antialiasing", "global_illumination", "glass"}
     assert names & set(ran) == expected
     assert {one["effect"]: one["why"] for one in skipped if one["effect"] in names} == dict.fromkeys(

@@ -1,0 +1,71 @@
+"""Two scenes for each effect: one that needs it and one that does not. An entry of `EFFECTS` without its case fails.
+
+Effects of physics have theirs in physics_cases.py.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from tests.effects.scenes import ABOVE_THE_HORIZON, Setting, with_holes, without_textures
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """`needs` calls for the effect; `spares` does not, and `why` is the plan's reason."""
+
+    needs: Setting
+    spares: Setting
+    why: str
+
+
+def _asked(on: Mapping[str, Any], off: Mapping[str, Any], why: str) -> Case:
+    return Case(Setting(on), Setting(off), why)
+
+
+def _sensor(name: str, **branch: Any) -> Case:
+    return _asked({"sensor": {name: branch}}, {}, f"sensor.{name} is off")
+
+
+NOISY = {
+    "sensor": {"depth_noise": {}},
+    "cameras": {"sensor": {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 320.0, "cy": 240.0}},
+}
+FLAT, RASTER = {"render": {"tier": "flat"}}, {"render": {"tier": "raster"}}
+TRACED = {"render": {"tier": "pathtraced", "path_samples": 1}, "categories": ["jar"]}
+
+WITHOUT_MIRROR = {"cameras": {"mirror": {"enabled": False}}, "images": {"projection": {"enabled": False}}}
+
+ASKED: dict[str, Case] = {
+    "depth_camera": _asked({}, {"cameras": {"depth": {"enabled": False}}}, "cameras.depth.enabled is false"),
+    "mirror": _asked({}, WITHOUT_MIRROR, "cameras.mirror.enabled is false"),
+    "projection": _asked({}, {"images": {"projection": {"enabled": False}}}, "images.projection.enabled is false"),
+    "rgb": _asked({}, {"render": {"rgb": False}}, "render.rgb is false"),
+    "splat": _asked({"images": {"projection": {"splat": 3}}}, {}, "images.projection.splat is 1"),
+    "hidden_point_removal": _asked(
+        {"images": {"projection": {"hidden_point_removal": True}}},
+        {},
+        "images.projection.hidden_point_removal is off",
+    ),
+    "shadows": _asked(RASTER, FLAT, "render.tier is flat"),
+    "ambient_occlusion": _asked(RASTER, FLAT, "render.tier is flat"),
+    "antialiasing": _asked(RASTER, FLAT, "render.tier is flat"),
+    "samples": _asked({"render": {"samples": 4}}, {}, "render.samples is 1"),
+    "global_illumination": _asked(TRACED, {**TRACED, **RASTER}, "render.tier is raster"),
+    "glass": _asked(TRACED, {**TRACED, **RASTER}, "render.tier is raster"),
+    "sensor_depth_noise": _sensor("depth_noise"),
+    "sensor_distortion": _sensor("distortion", k1=-0.1),
+    "sensor_rgb_noise": _sensor("rgb_noise"),
+    "sensor_exposure": _sensor("exposure", stops=[1.0, 1.0]),
+    "raycast_check": _asked({"check": {"raycast_share": 1.0}}, {}, "not in the share check.raycast_share"),
+    "release_again": _asked({"check": {"raycast_share": 1.0}}, {}, "not in the share check.raycast_share"),
+}
+
+NO_OPS: dict[str, Case] = {
+    "floor": Case(Setting({}), Setting(ABOVE_THE_HORIZON), "outside of every view"),
+    "table": Case(Setting({}), Setting(ABOVE_THE_HORIZON), "outside of every view"),
+    "textures": Case(Setting({}), Setting({}, without_textures), "no surface has a texture"),
+    "transparency": Case(Setting({}, with_holes), Setting({}), "no texture has clear texels"),
+    "light_maps": Case(Setting(RASTER), Setting(FLAT), "render.tier is flat"),
+    "exact_agreement": Case(Setting(NOISY), Setting({}), "stored depth is exact: sensor.depth_noise is off"),
+}

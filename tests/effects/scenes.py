@@ -1,0 +1,160 @@
+"""Scenes to try effects on: a job's changes, and what is done to the scene that is drawn."""
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+
+import workers.scene_steps
+from schemas.job import Category, Job
+from schemas.scene import ScenePlan
+from schemas.shape import Part, Shape
+from services.jobfile import validate_job
+from workers.assets.catalogue import Catalogue, open_catalogue
+from workers.context import WorkerContext, settings_digest
+from workers.records import record_scene
+from workers.render.gbuffer import shared_renderer
+from workers.scene.check import is_raycast_scene
+from workers.scene.effect import EffectPlan, Facts
+from workers.scene.effects import plan_effects
+from workers.scene_steps import Scene, Stopwatch, make_scene, plan_with_assets
+
+SMALL: dict[str, Any] = {
+    "name": "effects",
+    "seed": 11,
+    "categories": ["can"],
+    "cameras": {"sensor": {"width": 160, "height": 120, "fx": 131.25, "fy": 131.25, "cx": 80.0, "cy": 60.0}},
+    "images": {"patch": {"width": 32, "height": 24}},
+    "check": {"raycast_share": 0.0, "mirror_agreement_mm": 5.0},
+}
+
+ABOVE_THE_HORIZON: dict[str, Any] = {
+    "categories": ["bottle"],
+    "cameras": {
+        "orbit": {"inclination_rad": [0.04, 0.04]},
+        "sensor": {"fx": 400.0, "fy": 400.0, "cy": 140.0},
+    },
+    "images": {"depth_range_m": [0.2, 3.0]},
+}
+"""A camera 10 cm above the table's top whose picture begins above the horizon: it sees bottles, neither table nor floor."""
+
+RECEIPT = {"effects", "skipped", "settings_digest"}
+
+Edit = Callable[[ScenePlan], ScenePlan]
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """A scene: what differs from `SMALL`, and what is done to what was drawn."""
+
+    changes: Mapping[str, Any]
+    edit: Edit = lambda plan: plan
+    scene_id: int = 0
+
+    @property
+    def job(self) -> Job:
+        return validate_job(merged(SMALL, self.changes), "a test")
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """What came of it: SHA-256 by path, rows without the receipt, and the scene."""
+
+    files: dict[str, str]
+    rows: dict[str, list[dict[str, object]]]
+    scene: Scene
+    watch: Stopwatch
+
+
+def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The branches of a job, with those of the changes laid over."""
+    both = {**base, **changes}
+    return {
+        key: merged(base[key], changes[key])
+        if isinstance(base.get(key), dict) and isinstance(changes.get(key), dict)
+        else value
+        for key, value in both.items()
+    }
+
+
+@cache
+def _catalogue(categories: tuple[Category, ...]) -> Catalogue:
+    return open_catalogue(Job(name="c").assets, Path(), categories)
+
+
+def context_of(job: Job, forced: frozenset[str] = frozenset()) -> WorkerContext:
+    catalogue = _catalogue(tuple(job.categories))
+    return WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest), forced)
+
+
+def facts_of(setting: Setting) -> Facts:
+    """What the plan of effects is made from."""
+    job = setting.job
+    plan = setting.edit(plan_with_assets(context_of(job), setting.scene_id))
+    return Facts(job, plan, is_raycast_scene(job, setting.scene_id))
+
+
+def make(setting: Setting, forced: str | None = None, left_out: str | None = None) -> Made:
+    """The scene made, with one effect forced, or left out although it may be called for. Raises SceneError."""
+    context = context_of(setting.job, frozenset({forced} if forced else ()))
+
+    def draw(context: WorkerContext, scene_id: int) -> ScenePlan:
+        return setting.edit(plan_with_assets(context, scene_id))
+
+    def leave_out(facts: Facts, forced: frozenset[str]) -> EffectPlan:
+        plan = plan_effects(facts, forced)
+        if left_out is None:
+            return plan
+        ran = tuple(name for name in plan.ran if name != left_out)
+        return EffectPlan(ran, {**plan.skipped, left_out: "left out by a test"}, forced)
+
+    watch = Stopwatch()
+    with (
+        mock.patch.object(workers.scene_steps, "plan_with_assets", draw),
+        mock.patch.object(workers.scene_steps, "plan_effects", leave_out),
+    ):
+        scene = make_scene(context, setting.scene_id, watch)
+    output = record_scene(context, scene, watch)
+    rows = {
+        table: [{key: value for key, value in row.items() if key not in RECEIPT} for row in some]
+        for table, some in output.rows.items()
+    }
+    return Made({path: hashlib.sha256(data).hexdigest() for path, data in output.files}, rows, scene, watch)
+
+
+def without_textures(plan: ScenePlan) -> ScenePlan:
+    """Every surface in its own colour."""
+    return _each_part(plan, lambda part: replace(part, material=replace(part.material, texture=None)))
+
+
+def with_holes(plan: ScenePlan) -> ScenePlan:
+    """The upper half of each of the objects' textures is clear."""
+
+    def pierce(part: Part) -> Part:
+        texture = part.material.texture
+        if texture is None:
+            return part
+        alpha = np.full((*texture.shape[:2], 1), 255, np.uint8)
+        alpha[: len(alpha) // 2] = 0
+        return replace(part, material=replace(part.material, texture=np.dstack([texture[..., :3], alpha])))
+
+    start = plan.objects[0]
+    pierced = replace(start, asset=replace(start.asset, shape=_of_parts(start.asset.shape, pierce)))
+    return replace(plan, objects=(pierced, *plan.objects[1:]))
+
+
+def _of_parts(shape: Shape, change: Callable[[Part], Part]) -> Shape:
+    return replace(shape, parts=tuple(change(part) for part in shape.parts))
+
+
+def _each_part(plan: ScenePlan, change: Callable[[Part], Part]) -> ScenePlan:
+    table = replace(plan.table, asset=replace(plan.table.asset, shape=_of_parts(plan.table.asset.shape, change)))
+    objects = tuple(
+        replace(start, asset=replace(start.asset, shape=_of_parts(start.asset.shape, change))) for start in plan.objects
+    )
+    return replace(plan, floor=_of_parts(plan.floor, change), table=table, objects=objects)

@@ -1,0 +1,128 @@
+"""The plan's choices on random scenes: cameras, tiers, textures and shapes of all kinds."""
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from schemas.camera import Camera
+from schemas.errors import SceneError
+from schemas.job import CATEGORIES
+from schemas.scene import REGION_FLOOR, REGION_TABLE, Placed
+from tests.effects.cases import NO_OPS
+from tests.effects.scenes import Setting, facts_of, make, with_holes, without_textures
+from workers.geometry.raycast import cast_view
+from workers.scene.effect import Facts
+from workers.scene.effects import EFFECTS, names_of_kind, plan_effects
+from workers.scene.views import place_aligned_camera, place_mirror_camera
+
+SCENES = 200
+EDITS = (lambda plan: plan, lambda plan: plan, with_holes, without_textures)
+
+
+def random_setting(number: int) -> Setting:
+    """Cameras from level to straight down, near and far, wide and narrow, their pictures shifted; every tier but the slow."""
+    rng = np.random.default_rng((7, number))
+    width, height = 80, 60
+    f = float(rng.uniform(40.0, 400.0))
+    tilt = float(rng.choice([rng.uniform(0.0, 0.1), rng.uniform(0.1, 1.5)]))
+    above_horizon = height + rng.uniform(-3.0, 20.0) + f * np.tan(tilt)
+    cy = above_horizon if rng.random() < 0.4 else height / 2
+    changes: dict[str, Any] = {
+        "categories": [str(rng.choice(CATEGORIES))],
+        "render": {"tier": str(rng.choice(["flat", "raster"])), "rgb": bool(rng.random() < 0.8)},
+        "sensor": {"depth_noise": {}} if rng.random() < 0.2 else {},
+        "start": {"pose": str(rng.choice(["upright", "tumbled", "placed"]))},
+        "cameras": {
+            "orbit": {"inclination_rad": [tilt, tilt], "radius_m": float(rng.uniform(0.8, 4.0))},
+            "sensor": {"width": width, "height": height, "fx": f, "fy": f, "cx": width / 2, "cy": float(cy)},
+        },
+        "images": {"depth_range_m": [0.2, float(rng.uniform(1.0, 6.0))]},
+        "check": {"mirror_agreement_mm": 50.0},
+    }
+    return Setting(changes, EDITS[int(rng.integers(len(EDITS)))], number)
+
+
+def cameras_of(facts: Facts) -> Iterator[Camera]:
+    """The input camera, the one beside it, and mirror cameras from objects at seven distances."""
+    first, job = facts.plan.input_cameras[0], facts.job
+    yield first
+    yield place_aligned_camera(first, job.cameras.depth)
+    for d_z_m in np.linspace(*job.images.depth_range_m, 7):
+        yield place_mirror_camera(first, float(d_z_m), job.cameras.mirror)
+
+
+def may_be_seen(thing: Placed, facts: Facts) -> bool:
+    """By rays: whether the thing, alone, is in any of its scene's pictures."""
+    return any((cast_view([thing], camera)[1] > 0).any() for camera in cameras_of(facts))
+
+
+def called_for(facts: Facts) -> set[str]:
+    """The no-ops that a scene needs, each found in another way than the plan finds it."""
+    plan, job = facts.plan, facts.job
+    floor, table = (
+        Placed(REGION_FLOOR, plan.floor, np.eye(4)),
+        Placed(REGION_TABLE, plan.table.asset.shape, plan.table.T_world_table),
+    )
+    shapes = (plan.floor, plan.table.asset.shape, plan.objects[0].asset.shape)
+    pictures = [p.material.texture for shape in shapes for p in shape.parts if p.uv is not None]
+    clear = [
+        picture for picture in pictures if picture is not None and picture.shape[2] == 4 and picture[..., 3].min() < 128
+    ]
+    wanted = {
+        "floor": may_be_seen(floor, facts),
+        "table": may_be_seen(table, facts),
+        "textures": any(picture is not None for picture in pictures) and job.render.rgb,
+        "transparency": bool(clear) and job.render.tier == "raster" and job.render.rgb,
+        "light_maps": job.render.tier == "raster" and job.render.rgb,
+        "exact_agreement": job.sensor.depth_noise is not None,
+    }
+    return {name for name, wants in wanted.items() if wants}
+
+
+def test_the_plan_chooses_rightly_on_two_hundred_random_scenes():
+    """Nothing that a scene needs is left out, and what none needs is, but for a few whose pictures pass close by."""
+    left_out, idle = Counter[str](), Counter[str]()
+    for number in range(SCENES):
+        try:
+            facts = facts_of(random_setting(number))
+        except SceneError:
+            continue
+        plan, wanted = plan_effects(facts), called_for(facts)
+        assert {*plan.ran, *plan.skipped} == {effect.name for effect in EFFECTS}
+        for name in names_of_kind("no_op"):
+            assert plan.runs(name) or name not in wanted, f"scene {number} needs {name}"
+            left_out[name] += not plan.runs(name)
+            idle[name] += plan.runs(name) and name not in wanted
+    assert all(left_out[name] >= 8 for name in NO_OPS), left_out
+    assert all(idle[name] == 0 for name in NO_OPS if name not in ("floor", "table"))
+    assert idle["floor"] <= left_out["floor"] and idle["table"] <= left_out["table"], (idle, left_out)
+
+
+@pytest.mark.parametrize("wanted", [pytest.param(8, id="8"), pytest.param(SCENES, id="200", marks=pytest.mark.slow)])
+def test_forcing_what_a_random_scene_left_out_changes_no_byte(wanted, record_figure):
+    made, forced, changed = 0, Counter[str](), []
+    for number in range(4 * wanted):
+        setting = random_setting(number)
+        try:
+            plain = make(setting)
+        except SceneError:
+            continue
+        for name in sorted(names_of_kind("no_op") & plain.scene.effects.skipped.keys()):
+            again = make(setting, forced=name)
+            forced[name] += 1
+            if (plain.files, plain.rows) != (again.files, again.rows):
+                changed.append((number, name))
+        made += 1
+        if made == wanted:
+            break
+    told = ", ".join(f"{name} {count}" for name, count in sorted(forced.items()))
+    record_figure(
+        f"no-ops forced in {made} random scenes ({told}): scenes changed", "none may", float(len(changed)), 0.0
+    )
+    assert changed == []
+    assert made == wanted
+    assert forced.total() >= 2 * made
+    assert wanted < SCENES or all(forced[name] >= 5 for name in NO_OPS)
