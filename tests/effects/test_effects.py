@@ -7,7 +7,9 @@ import pytest
 from tests.effects.cases import ASKED, NO_OPS, Case
 from tests.effects.physics_cases import PHYSICS
 from tests.effects.scenes import Setting, facts_of, make
+from workers.records import timing_row
 from workers.scene.effects import EFFECTS, names_of_kind, plan_effects, write_receipt
+from workers.scene_steps import Stopwatch
 
 CASES: dict[str, Case] = {**PHYSICS, **ASKED, **NO_OPS}
 
@@ -93,6 +95,21 @@ def test_every_effect_that_ran_is_timed_within_a_stage_that_was_timed():
             "exact_agreement", "sensor_depth_noise"} == set(made.watch.effects)  # fmt: skip
     assert all(seconds > 0.0 for seconds in made.watch.effects.values())
     assert sum(made.watch.effects.values()) < 2.0 * sum(made.watch.seconds.values())
+
+
+def test_the_manifest_has_the_seconds_of_each_effect_and_they_add_nothing_to_the_scenes():
+    watch = Stopwatch()
+    with watch.effect("mirror"):
+        for _ in range(2):
+            with watch.stage("render"):
+                pass
+        with watch.stage("recheck", "release_again"):
+            pass
+    row: Any = timing_row(3, "mug", watch)
+    assert {one["name"]: one["seconds"] for one in row["effects"]} == watch.effects
+    assert set(watch.effects) == {"mirror", "release_again"}
+    assert watch.effects["mirror"] >= watch.effects["release_again"] == watch.seconds["recheck"]
+    assert row["total_s"] == watch.seconds["render"] + watch.seconds["recheck"]
 
 
 def test_an_effect_that_did_not_run_has_no_time():

@@ -66,7 +66,8 @@ def sort_draws(
     lights, raster = light_slots(appearance), top_is_level is not None
     by_variant: dict[Variant, list[Draw]] = {}
     for thing in reversed(things):
-        if not aim.passes.draw(NAMES.get(thing.region_id, "object")):
+        name = NAMES.get(thing.region_id)
+        if name is not None and not aim.passes.draw(name):
             continue
         shape, ground = fetch(thing.shape), thing.region_id == REGION_FLOOR
         split = top_is_level is not None and top_is_level(thing)

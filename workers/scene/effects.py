@@ -204,6 +204,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("floor", "no_op", _floor, "a draw in each view", "render"),
     Effect("table", "no_op", _table, "a draw in each view", "render"),
     Effect("textures", "no_op", _first_of(_RGB, _textures), "a look-up for each fragment", "render"),
+    # In tier flat there is nothing to force: it has no such pass. The path tracer has it in its materials.
     Effect(
         "transparency",
         "no_op",
