@@ -32,6 +32,8 @@ _body = pa.struct(
         pa.field("support_margin_mm", pa.float64(), False),
         pa.field("residual_speed_mm_s", pa.float64(), False),
         pa.field("recheck_move_mm", pa.float64(), True),
+        pa.field("recheck_turn_deg", pa.float64(), True),
+        pa.field("equilibrium_residual", pa.float64(), False),
     ]
 )
 """One object of a scene. The columns beside are the first object's, and of the figures the worst of all objects."""
@@ -68,6 +70,8 @@ SCHEMAS: dict[str, pa.Schema] = {
             ("support_margin_mm", _f64, False),
             ("residual_speed_mm_s", _f64, False),
             ("recheck_move_mm", _f64, True),
+            ("recheck_turn_deg", _f64, True),
+            ("equilibrium_residual", _f64, False),
             ("settle_s", _f64, False),
             ("raycast_checked", _bool, False),
             ("settings_digest", _str, False),
@@ -177,10 +181,10 @@ SORT_KEYS: dict[str, tuple[str, ...]] = {
 
 def worst_rest(bodies: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
     """The columns of `scenes` that are the worst of its bodies': the most of each, and of the support margin the least."""
-    most = ("penetration_mm", "hover_gap_mm", "residual_speed_mm_s")
-    moves = [body["recheck_move_mm"] for body in bodies if body["recheck_move_mm"] is not None]
+    most = ("penetration_mm", "hover_gap_mm", "residual_speed_mm_s", "equilibrium_residual")
+    again = ("recheck_move_mm", "recheck_turn_deg")
     return {
         **{name: max(body[name] for body in bodies) for name in most},
+        **{name: max((body[name] for body in bodies if body[name] is not None), default=None) for name in again},
         "support_margin_mm": min(body["support_margin_mm"] for body in bodies),
-        "recheck_move_mm": max(moves, default=None),
     }

@@ -18,7 +18,7 @@ from workers.geometry.raycast import NEAR_M, edge_distance_px
 from workers.render.gbuffer import Renderer
 from workers.scene.effect import Facts
 from workers.scene.effects import names_of_kind, plan_effects
-from workers.scene.release import release_again
+from workers.scene.settle import release_again
 from workers.scene_steps import Scene
 
 RELEASE_S = 1.0

@@ -16,8 +16,9 @@ from workers.render.gbuffer import shared_renderer
 from workers.render.tiers import draw_view
 from workers.scene.effect import Facts
 from workers.scene.effects import plan_effects
+from workers.scene.settle import settle_scene
 from workers.scene.views import front_distance, place_mirror_camera, pose_scene
-from workers.scene_steps import plan_with_assets, settle_objects
+from workers.scene_steps import plan_with_assets
 
 TIERS = ("flat", "raster", "pathtraced")
 CELL, ZOOM, MARGIN, HEADING = (400, 300), 2.2, 4, 24
@@ -49,7 +50,8 @@ def _posed(job: Job, number: int) -> tuple[PosedScene, Camera]:
     catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
     context = WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
     plan = plan_with_assets(context, number)
-    posed = pose_scene(plan, settle_objects(context, plan, plan_effects(Facts(job, plan, False)))[0])
+    rest = settle_scene(plan, job.physics, plan_effects(Facts(job, plan, False)))
+    posed = pose_scene(plan, rest.settled)
     seen = shared_renderer().draw(posed.things, posed.appearance, plan.input_cameras[0])
     d_z_m = front_distance(seen.depth_m.astype(np.float64), seen.region >= REGION_FIRST_OBJECT, job.cameras.mirror)
     mirror = place_mirror_camera(plan.input_cameras[0], d_z_m, job.cameras.mirror)

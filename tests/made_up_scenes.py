@@ -137,6 +137,8 @@ def _scene(scene_id: int, category: str, instance: str, table: str) -> dict[str,
         "support_margin_mm": 12.5,
         "residual_speed_mm_s": 0.1,
         "recheck_move_mm": None if scene_id % 2 else 0.02,
+        "recheck_turn_deg": None if scene_id % 2 else 0.01,
+        "equilibrium_residual": 0.001,
         "settle_s": 0.7,
         "raycast_checked": scene_id % 2 == 0,
         "settings_digest": "d" * 64,
@@ -159,6 +161,8 @@ def _body(scene_id: int, region: int, category: str, instance: str) -> dict[str,
         "support_margin_mm": 12.5,
         "residual_speed_mm_s": 0.1,
         "recheck_move_mm": None if scene_id % 2 else 0.02,
+        "recheck_turn_deg": None if scene_id % 2 else 0.01,
+        "equilibrium_residual": 0.001,
     }
 
 

@@ -96,6 +96,8 @@ def body_row(start: ObjectStart, rest: Settled) -> Row:
         "support_margin_mm": rest.support_margin_mm,
         "residual_speed_mm_s": rest.residual_speed_mm_s,
         "recheck_move_mm": rest.recheck_move_mm,
+        "recheck_turn_deg": rest.recheck_turn_deg,
+        "equilibrium_residual": rest.equilibrium_residual,
     }
 
 

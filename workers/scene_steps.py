@@ -1,6 +1,5 @@
 """One scene from its id to what is written: the list of steps, readable in one glance."""
 
-import dataclasses
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -26,10 +25,10 @@ from workers.render.tiers import draw_view
 from workers.scene.check import check_against_rays, check_pair, is_raycast_scene
 from workers.scene.derive import compare_views, derive_projected, label_region, projection_shares
 from workers.scene.effect import EffectPlan, Facts
-from workers.scene.effects import called_for, plan_effects
+from workers.scene.effects import plan_effects
 from workers.scene.plan import choose_category, count_objects, plan_scene
 from workers.scene.randomness import Stream, of_object, stream
-from workers.scene.settle import recheck, settle
+from workers.scene.settle import recheck_scene, settle_scene
 from workers.scene.views import (
     object_distance,
     place_aligned_camera,
@@ -95,11 +94,11 @@ def make_scene(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Scene
     with watch.stage("plan"):
         effects = plan_effects(Facts(job, plan, checked), context.forced)
     with watch.stage("physics", "dynamics" if effects.runs("dynamics") else None):
-        settled, called = settle_objects(context, plan, effects)
+        rest = settle_scene(plan, job.physics, effects)
     if effects.runs("release_again"):
         with watch.stage("recheck", "release_again"):
-            settled = recheck_objects(context, plan, settled)
-    posed = pose_scene(plan, settled)
+            rest = recheck_scene(plan, rest, job.physics, effects)
+    posed = pose_scene(plan, rest.settled)
     view = SceneView(context, plan, posed, effects, watch)
     with watch.stage("render", "light_maps" if effects.runs("light_maps") else None):
         context.renderer.prepare_light(posed.things, posed.appearance, job.render, view.passes)
@@ -107,7 +106,7 @@ def make_scene(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Scene
     with watch.stage("check"):
         for pair in pairs:
             check_pair(pair, job.check)
-    return Scene(plan, settled, posed, pairs, checked, effects, called)
+    return Scene(plan, rest.settled, posed, pairs, checked, effects, rest.called)
 
 
 def plan_with_assets(context: WorkerContext, scene_id: int) -> ScenePlan:
@@ -119,23 +118,6 @@ def plan_with_assets(context: WorkerContext, scene_id: int) -> ScenePlan:
         assets.append(load_asset(catalogue, choose_object(catalogue, choose_category(job, scene_id, number), rng)))
     table = load_asset(catalogue, choose_table(catalogue, stream(job.seed, scene_id, Stream.TABLE)))
     return plan_scene(job, scene_id, table, *assets)
-
-
-def settle_objects(
-    context: WorkerContext, plan: ScenePlan, effects: EffectPlan
-) -> tuple[tuple[Settled, ...], Mapping[str, str]]:
-    """(every object at rest, effects that the plan had left out and that settling called for)."""
-    settled = tuple(settle(start, plan.table, context.job.physics) for start in plan.objects)
-    return settled, called_for(effects, [rest.support for rest in settled])
-
-
-def recheck_objects(context: WorkerContext, plan: ScenePlan, settled: tuple[Settled, ...]) -> tuple[Settled, ...]:
-    """Every object released again where it rests, with how far it moved."""
-    physics = context.job.physics
-    return tuple(
-        dataclasses.replace(rest, recheck_move_mm=recheck(start, rest, plan.table, physics)[0])
-        for start, rest in zip(plan.objects, settled, strict=True)
-    )
 
 
 @dataclass(frozen=True, eq=False)

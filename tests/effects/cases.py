@@ -40,6 +40,7 @@ ASKED: dict[str, Case] = {
     "depth_camera": _asked({}, {"cameras": {"depth": {"enabled": False}}}, "cameras.depth.enabled is false"),
     "mirror": _asked({}, WITHOUT_MIRROR, "cameras.mirror.enabled is false"),
     "projection": _asked({}, {"images": {"projection": {"enabled": False}}}, "images.projection.enabled is false"),
+    "restitution": _asked({"physics": {"restitution": 0.8}}, {}, "physics.restitution is 0"),
     "rgb": _asked({}, {"render": {"rgb": False}}, "render.rgb is false"),
     "splat": _asked({"images": {"projection": {"splat": 3}}}, {}, "images.projection.splat is 1"),
     "hidden_point_removal": _asked(

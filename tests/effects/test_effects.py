@@ -1,6 +1,7 @@
 """Every effect on a scene that needs it and on one that does not: the plan, what leaving out breaks, what forcing changes."""
 
 import importlib.util
+from typing import Any
 
 import pytest
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import manifold3d
 import numpy as np
 
+from schemas.base import Array
 from schemas.job import Physics
 from schemas.scene import ObjectStart, Table
 from schemas.shape import Hull
@@ -16,11 +17,18 @@ from workers.geometry.manifold import hold_to_one_thread
 from workers.scene.effect import Effect, Facts
 from workers.scene.support import inside_margin
 
-ROUND_FACES = 20
-"""A hull with this many planes or more may roll over them; a box has 6."""
+NEIGHBOUR_RAD = math.radians(30.0)
+"""Planes of a hull whose normals are this near belong to one stretch of its surface."""
 
-SAME_PLANE = 1e-6
-"""Normals whose coordinates differ by less are of one plane."""
+ROUND_SHARE = 0.03
+"""A stretch on which the centre of mass is as high to within this share, over what it rests on, is round: a prism of 13
+sides or more. The height over the faces of a box grows by a sixth within 10 degrees."""
+
+SAME_PLANE_RAD = 0.02
+"""Normals this near are of one plane: a hull's faces are triangles, known to rounding."""
+
+CELL = 0.04
+"""Of normals in one cell of this size one is looked at."""
 
 LEAST_ROOM_M = 0.01
 """Objects whose rooms are narrower than this are simulated together at once."""
@@ -30,9 +38,19 @@ AT_REST = "placed in a statically stable pose"
 Predicate = Callable[[Sequence[ObjectStart], Table, Physics], str | None]
 
 
-def is_round(hull: Hull) -> bool:
-    """Whether so many planes bound the hull that it may roll from one to the next."""
-    return len(np.unique(np.round(hull.normals / SAME_PLANE).astype(np.int64), axis=0)) >= ROUND_FACES
+def is_round(hull: Hull, com: Array) -> bool:
+    """Whether the object may rest on a stretch of its hull over which it rolls.
+
+    com [3], object frame. Where the object rests, its centre of mass is lower above the plane than above all neighbours;
+    on a round stretch it is hardly lower than above some of them.
+    """
+    cells = np.round(hull.normals / CELL).astype(np.int64) @ np.array([10_000, 100, 1])
+    normals = hull.normals[np.unique(cells, return_index=True)[1]]
+    height = (hull.vertices @ normals.T).max(axis=0) - normals @ com
+    cosine = normals @ normals.T
+    near = (cosine > math.cos(NEIGHBOUR_RAD)) & (cosine < math.cos(SAME_PLANE_RAD))
+    lowest = np.where(near, height, np.inf).min(axis=1)  # of the neighbours
+    return bool(((height <= lowest) & (lowest <= height * (1.0 + ROUND_SHARE))).any())
 
 
 def starts_over_top(start: ObjectStart, table: Table) -> bool:
@@ -99,7 +117,7 @@ def _decomposition(starts: Sequence[ObjectStart], table: Table, physics: Physics
 
 
 def _rolling(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
-    return None if any(is_round(start.hull) for start in starts) else "nothing here is round"
+    return None if any(is_round(start.hull, start.asset.mass.com) for start in starts) else "nothing here is round"
 
 
 def _restitution(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:

@@ -5,7 +5,7 @@ effect, add an entry with its kind, predicate, cost and stage, let the step that
 its three tests (tests/effects/): a scene that needs it, one that does not, and the plan's choice on both.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from schemas.sensor import SensorEffects
 from schemas.shape import Part
 from workers.geometry.sight import outside_views
 from workers.geometry.texels import has_holes
+from workers.scene.dynamics import PHYSICS_EFFECTS
 from workers.scene.effect import Effect, EffectPlan, Facts
 from workers.scene.views import place_aligned_camera, place_mirror_camera
 
@@ -59,12 +60,12 @@ def _require_forcible(forced: frozenset[str]) -> None:
 
 
 def _switch(key: str) -> Reason:
-    """An effect that a key of the job switches on and off; on while a job has no such key."""
+    """An effect that a key of the job switches on and off."""
 
     def why(facts: Facts) -> str | None:
         branch: Any = facts.job
         for name in key.split("."):
-            branch = getattr(branch, name, True)
+            branch = getattr(branch, name)
         return None if branch else f"{key} is false"
 
     return why
@@ -149,30 +150,6 @@ def _views(job: Job, plan: ScenePlan) -> Iterator[tuple[Camera, ...]]:
 
 def _exact_agreement(facts: Facts) -> str | None:
     return "stored depth is exact: sensor.depth_noise is off" if facts.job.sensor.depth_noise is None else None
-
-
-# ------------------------------------------------------------------------------------------- approximations
-
-
-def _dynamics(facts: Facts) -> str | None:
-    placed = all(start.placed for start in facts.plan.objects)
-    return "placed in a statically stable pose" if placed else None
-
-
-def _table_mesh(facts: Facts) -> str | None:
-    return "the table's top is level and convex" if facts.plan.table.top.convex else None
-
-
-PHYSICS_EFFECTS: tuple[Effect, ...] = (
-    Effect("dynamics", "approximation", _dynamics, "a simulated drop, most of the time of physics", "physics"),
-    Effect("table_mesh", "approximation", _first_of(_dynamics, _table_mesh), "contacts with every triangle", "physics"),
-)
-
-
-def called_for(plan: EffectPlan, supports: Iterable[str]) -> Mapping[str, str]:
-    """Effects that the plan had left out, and that what the objects were dropped on says ran after all."""
-    late = {"table_mesh": "an object left the table's flat top"} if "mesh" in supports else {}
-    return {name: why for name, why in late.items() if not plan.runs(name)}
 
 
 EFFECTS: tuple[Effect, ...] = (

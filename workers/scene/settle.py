@@ -21,7 +21,7 @@ from workers.scene.effect import EffectPlan
 from workers.scene.fall import FINEST, Fall, Faller, Pace, fall, make_faller
 from workers.scene.landing import Ground, gap_m, ground_of, support_of, touch_down
 from workers.scene.support import support_height
-from workers.scene.together import settle_together
+from workers.scene.together import release_together, settle_together
 from workers.scene.watch import Watch, can_touch, stands_on_face, watch_edge, watch_gone, watch_room, watch_tilt
 
 LEFT_M = 0.05
@@ -119,7 +119,7 @@ def settle(
     """
     ran = called_for((start,), table, physics) if ran is None else ran
     task = _Task(start, ground_of(table), physics, ran, room_m)
-    if start.placed and "dynamics" not in ran:
+    if "dynamics" not in ran:
         return _describe(task, Fall((start.T_world_obj,), 0.0, 0.0, True), "placed")
     if "table_mesh" not in ran:
         motion = _settle_flat(task)
@@ -164,12 +164,19 @@ def recheck(start: ObjectStart, settled: Settled, table: Table, physics: Physics
 
     For `RECHECK_S`, in the finest steps, on the ground that it came to rest on. Nothing is corrected afterwards.
     """
-    ran = called_for((start,), table, physics) | {"dynamics"}
-    again = dataclasses.replace(start, T_world_obj=settled.T_world_obj, placed=False)
-    fine = physics.model_copy(update={"step_hz": FINEST * physics.step_hz, "max_settle_s": RECHECK_S})
-    task = _Task(again, ground_of(table), fine, ran)
-    after = _simulate(task, RECHECK_S, flat=settled.support != "mesh").poses[0]
-    return moved_by(start, settled.T_world_obj, after)
+    ran = called_for((start,), table, physics)
+    return moved_by(start, settled.T_world_obj, _let_go(start, settled, table, physics, ran, RECHECK_S))
+
+
+def recheck_scene(plan: ScenePlan, rest: Rest, physics: Physics, effects: EffectPlan) -> Rest:
+    """The same, with how far every object moved and turned when all were released again."""
+    called = EffectPlan((*effects.ran, *rest.called), effects.skipped)
+    poses = release_again(plan, rest.settled, physics, called, RECHECK_S)
+    settled = []
+    for start, before, after in zip(plan.objects, rest.settled, poses, strict=True):
+        moved, turned = moved_by(start, before.T_world_obj, after)
+        settled.append(dataclasses.replace(before, recheck_move_mm=moved, recheck_turn_deg=turned))
+    return dataclasses.replace(rest, settled=tuple(settled))
 
 
 def release_again(
@@ -179,14 +186,27 @@ def release_again(
 
     With the effects that the plan names, in the finest steps; nothing is corrected afterwards.
     """
-    fine = physics.model_copy(update={"step_hz": FINEST * physics.step_hz, "max_settle_s": seconds})
-    flat = not effects.runs("table_mesh")
-    ended = []
-    for start, rest in zip(plan.objects, settled, strict=True):
-        again = dataclasses.replace(start, T_world_obj=rest.T_world_obj, placed=False)
-        task = _Task(again, ground_of(plan.table), fine, effects.ran)
-        ended.append(_simulate(task, seconds, flat).poses[0])
-    return tuple(ended)
+    if len(plan.objects) > 1 and effects.runs("object_contacts"):
+        flat = not effects.runs("table_mesh") and all(rest.support != "mesh" for rest in settled)
+        poses = [rest.T_world_obj for rest in settled]
+        return release_together(plan.objects, poses, plan.table, finest(physics, seconds), effects.ran, flat).poses
+    return tuple(
+        _let_go(start, rest, plan.table, physics, effects.ran, seconds)
+        for start, rest in zip(plan.objects, settled, strict=True)
+    )
+
+
+def finest(physics: Physics, seconds: float) -> Physics:
+    """The same physics in the finest steps, for so long."""
+    return physics.model_copy(update={"step_hz": FINEST * physics.step_hz, "max_settle_s": seconds})
+
+
+def _let_go(
+    start: ObjectStart, rest: Settled, table: Table, physics: Physics, ran: Collection[str], seconds: float
+) -> Pose:
+    again = dataclasses.replace(start, T_world_obj=rest.T_world_obj, placed=False)
+    task = _Task(again, ground_of(table), finest(physics, seconds), ran)
+    return _simulate(task, seconds, rest.support != "mesh" and "table_mesh" not in ran).poses[0]
 
 
 def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, float]:

@@ -43,12 +43,12 @@ def settle_together(
     another are not moved after the simulation: what is measured of gaps is the simulation's. Raises SettleError
     `not_at_rest`, `left_table` or `table_too_fine`.
     """
-    fallers = [_faller(start, physics, ran) for start in starts]
     flat = "table_mesh" not in ran and table.top.convex
-    motion = release(fallers, [start.T_world_obj for start in starts], starts, table, physics, ran, flat)
+    poses = [start.T_world_obj for start in starts]
+    motion = release_together(starts, poses, table, physics, ran, flat)
     if flat and motion.happened is not None:
         flat = False
-        motion = release(fallers, [start.T_world_obj for start in starts], starts, table, physics, ran, flat)
+        motion = release_together(starts, poses, table, physics, ran, flat)
     _require_rest(starts, table, motion)
     return _describe(starts, table, motion, physics, "flat_top" if flat else "mesh")
 
@@ -61,10 +61,9 @@ def _faller(start: ObjectStart, physics: Physics, ran: Collection[str]) -> Falle
     return make_faller(start, physics, "rolling_friction" in ran, cut=cut)
 
 
-def release(
-    fallers: Sequence[Faller],
-    poses: Sequence[Pose],
+def release_together(
     starts: Sequence[ObjectStart],
+    poses: Sequence[Pose],
     table: Table,
     physics: Physics,
     ran: Collection[str],
@@ -75,6 +74,7 @@ def release(
     The solver goes from contact to contact: what one iteration carries down a stack is one object, and by a share that
     shrinks with the ratio of the masses. So there are more for more objects; it stops where they change nothing.
     """
+    fallers = [_faller(start, physics, ran) for start in starts]
     hulls = [transform(T, start.hull.vertices) for T, start in zip(poses, starts, strict=True)]
     free = min(_free_m(points, table, flat) for points in hulls)
     top = table.top.height_m
