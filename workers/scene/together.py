@@ -80,7 +80,7 @@ def release_together(
     top = table.top.height_m
     drop = max(float(points[:, 2].min()) for points in hulls) - top
     thinnest = min(least_width_m(start.hull) for start in starts)
-    way = max(physics.way_mm / 1e3, DROP_SHARE * drop if flat else 0.0)
+    way = max(physics.way_mm / 1e3, DROP_SHARE * drop)
     pace = Pace(physics.step_hz, min(way, THIN_SHARE * thinnest) if "fine_step" in ran else math.inf)
     reach = max(faller.reach_m for faller in fallers)
     lowest = float(table.mesh.vertices[:, 2].min())
