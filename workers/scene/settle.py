@@ -166,8 +166,7 @@ def recheck(start: ObjectStart, settled: Settled, table: Table, physics: Physics
     """
     ran = called_for((start,), table, physics) | {"dynamics"}
     again = dataclasses.replace(start, T_world_obj=settled.T_world_obj, placed=False)
-    fine = physics.model_copy(update={"step_hz": FINEST * physics.step_hz, "max_settle_s": RECHECK_S})
-    task = _Task(again, ground_of(table), fine, ran)
+    task = _Task(again, ground_of(table), _watching(physics, RECHECK_S), ran)
     after = _simulate(task, RECHECK_S, flat=settled.support != "mesh").poses[0]
     return moved_by(start, settled.T_world_obj, after)
 
@@ -179,7 +178,7 @@ def release_again(
 
     With the effects that the plan names, in the finest steps; nothing is corrected afterwards.
     """
-    fine = physics.model_copy(update={"step_hz": FINEST * physics.step_hz, "max_settle_s": seconds})
+    fine = _watching(physics, seconds)
     flat = not effects.runs("table_mesh")
     ended = []
     for start, rest in zip(plan.objects, settled, strict=True):
@@ -187,6 +186,12 @@ def release_again(
         task = _Task(again, ground_of(plan.table), fine, effects.ran)
         ended.append(_simulate(task, seconds, flat).poses[0])
     return tuple(ended)
+
+
+def _watching(physics: Physics, seconds: float) -> Physics:
+    """The finest steps, and nothing rests before the time is over."""
+    rest = physics.rest.model_copy(update={"window_s": 2.0 * seconds})
+    return physics.model_copy(update={"step_hz": FINEST * physics.step_hz, "max_settle_s": seconds, "rest": rest})
 
 
 def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, float]:
