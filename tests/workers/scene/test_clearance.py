@@ -56,7 +56,10 @@ def test_no_two_tilted_boxes_are_apart_where_no_axis_separates_them_nor_the_othe
     a, b = (mesh_of(CUBE, pose(R, at)) for R, at in zip(turns, places, strict=True))
     axes = [*turns[0].T, *turns[1].T, *(np.cross(u, v) for u, v in itertools.product(turns[0].T, turns[1].T))]
     apart = [
-        max(float((b.vertices @ n).min() - (a.vertices @ n).max()), float((a.vertices @ n).min() - (b.vertices @ n).max()))
+        max(
+            float((b.vertices @ n).min() - (a.vertices @ n).max()),
+            float((a.vertices @ n).min() - (b.vertices @ n).max()),
+        )
         for n in (axis / np.linalg.norm(axis) for axis in axes)
     ]
     found = between(solid(a), solid(b))
@@ -87,6 +90,6 @@ def test_each_object_is_told_of_what_is_nearest_to_it_the_ground_or_another():
 
 def test_what_encloses_no_body_stands_for_its_hull():
     walls = CUBE.faces[CUBE.face_normals[:, 2] < 0.5]  # an open box
-    open_box = Mesh(np.asarray(CUBE.vertices) + [0, 0, 0.05], np.asarray(walls, dtype=np.int32))
+    open_box = Mesh(np.asarray(CUBE.vertices) + np.array([0, 0, 0.05]), np.asarray(walls, dtype=np.int32))
     inside = mesh_of(box(0.01, 0.01, 0.01, (0, 0, 0.09)))
     assert clearances([open_box, inside], GROUND)[1] == pytest.approx(-0.01, abs=1e-9)

@@ -31,7 +31,9 @@ def table_of(*meshes) -> Table:
 
 def sloping() -> Table:
     """A slab that falls towards +x by `SLOPE_RAD`, its upper side through the world's z axis at its middle's height."""
-    return table_of(box(1.4, 1.4, 0.03, (0, 0, -0.015)).apply_transform(pose(rotation_about(Y, SLOPE_RAD), np.zeros(3))))
+    return table_of(
+        box(1.4, 1.4, 0.03, (0, 0, -0.015)).apply_transform(pose(rotation_about(Y, SLOPE_RAD), np.zeros(3)))
+    )
 
 
 CUBE = start_of(asset_of(box(0.1, 0.1, 0.1)))
