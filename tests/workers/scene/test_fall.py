@@ -133,6 +133,8 @@ def test_a_thin_part_makes_the_margin_of_all_smaller():
     cut = [np.asarray(box(0.2, 0.1, 0.1, (0, 0, 0.05)).vertices), np.asarray(thin.vertices)]
     faller = make_faller(start, PHYSICS, rolls=False, cut=cut)
     assert faller.body.margin_m == pytest.approx(0.0002 / 4 + SLOP_M)
+    thick = transform(faller.T_obj_body, faller.body.parts[0])  # made smaller by as little as the thin one
+    assert thick.min(axis=0) == pytest.approx(np.array([-0.1, -0.05, 0.0]) + 0.0002 / 4, abs=2e-8)
 
 
 def test_a_watch_ends_the_fall_and_says_which_it_was():
