@@ -15,11 +15,16 @@ def refuse(reason: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One row; `physics` are settings other than the defaults."""
+    """One row; `physics` are settings other than the defaults, `spin` is the angular velocity at release, rad/s.
+
+    `miss` says why the case itself is not met, `moves` why the object moves when it is let go again.
+    """
 
     name: str
     outcome: str
     measure: Measure
     make: Make
     physics: dict[str, float] = field(default_factory=dict)
+    spin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     miss: str = ""
+    moves: str = ""

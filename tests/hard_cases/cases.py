@@ -11,7 +11,6 @@ from tests.hard_cases.bodies import (
     ball,
     built_in,
     cube,
-    globe,
     laptop_angles,
     laptop_leaning,
     mug_handle_over_edge,
@@ -36,15 +35,13 @@ from tests.hard_cases.drops import (
 )
 from tests.hard_cases.measures import Z, flat, gap, height, leaning, shift, tilt
 from tests.hard_cases.mesh_cases import OUTSIDE
+from tests.hard_cases.rolling_cases import ONE_POINT, ROLLING, SMOOTH, SPINS
 from tests.shapes import asset_of, box
 
 
 def plate() -> partial:
     return partial(asset_of, box(0.2, 0.2, 0.0005))
 
-
-SMOOTH = {"friction": 0.0, "rolling_friction": 0.0, "spinning_friction": 0.0}
-NO_ROLLING = {"rolling_friction": 0.0}
 
 THIN_AND_SMALL = (
     Case("cube on a top 1 mm thick", SETTLE, gap(), lambda: drop(cube(), level(0.001), 0.03)),
@@ -122,57 +119,6 @@ TIPPING = (
     ),
 )
 
-ROLLING = (
-    Case("can lying", SETTLE, gap(), lambda: drop(built_in("can"), level(), R=turn(X, 90) @ turn(Z, 1))),
-    Case(
-        "can balanced on a ridge between two of its sides",
-        SETTLE,
-        gap(),
-        lambda: drop(rod(0.033, 0.12), level(), R=turn(X, 90)),
-    ),
-    Case(
-        "can lying, axis 5 mm inside the edge",
-        SETTLE,
-        gap(),
-        lambda: drop(rod(0.033, 0.12), level(), 0.001, turn(X, 90), (EDGE_M - 0.005, 0.0)),
-    ),
-    Case(
-        "can lying, axis 2 mm outside the edge",
-        FALL,
-        gap(),
-        lambda: drop(rod(0.033, 0.12), level(), 0.001, turn(X, 90), (EDGE_M + 0.002, 0.0)),
-    ),
-    Case(
-        "can of 360 sides rolls off a slope of 2 degrees",
-        FALL,
-        gap(),
-        lambda: drop(rod(0.033, 0.12, 360), slope(2.0), 0.001, turn(X, 90), (0.3, 0.0)),
-    ),
-    Case("ball on a level, friction", SETTLE, shift(20.0), lambda: drop(ball(0.04), level())),
-    Case("ball on a level, no friction", SETTLE, shift(1.0), lambda: drop(ball(0.04), level()), SMOOTH),
-    Case(
-        "ball on a slope of 1 degree, friction",
-        FALL,
-        gap(),
-        lambda: drop(globe(0.04), slope(1.0), 0.001, turn(X, 90), (0.55, 0.0)),
-        NO_ROLLING,
-    ),
-    Case(
-        "ball on a slope of 1 degree, no friction",
-        FALL,
-        gap(),
-        lambda: drop(ball(0.04), slope(1.0), 0.001, xy=(0.4, 0.0)),
-        SMOOTH,
-    ),
-    Case(
-        "ball on a slope of 1 degree, rolling friction of 5 mm",
-        SETTLE,
-        shift(20.0),
-        lambda: drop(ball(0.04), slope(1.0), 0.001),
-        {"rolling_friction": 0.005},
-    ),
-)
-
 EDGES = (
     Case("cube over the edge by 49 %", SETTLE, tilt(0.1), lambda: over_edge(0.49)),
     Case("cube over the edge by 50 %", EITHER, gap(), lambda: over_edge(0.50)),
@@ -239,18 +185,24 @@ SURFACES = (
         "cube from 100 mm, restitution 0.9", SETTLE, flat(0.1), lambda: drop(cube(), level(), 0.1), {"restitution": 0.9}
     ),
     Case(
-        "ball from 100 mm, restitution 0.9", SETTLE, gap(), lambda: drop(ball(0.04), level(), 0.1), {"restitution": 0.9}
+        "ball from 100 mm, restitution 0.9",
+        SETTLE,
+        gap(),
+        lambda: drop(ball(0.04, 3), level(), 0.1),
+        {"restitution": 0.9},
     ),
 )
 
-ONE_HULL = "a moving object is the convex hull of its mesh: nothing goes through a handle"
-
-MISSES = {
-    "mug hung by its handle on a peg at the edge": ONE_HULL,
-}
+MISSES = dict.fromkeys(("can spun upright at 200 rad/s", "can spun lying at 50 rad/s"), ONE_POINT)
 """Cases that the program does not meet yet, and why."""
 
+MOVES = {
+    "mug hung by its handle on a peg at the edge": "convex parts stand 2 mm out of the handle's inner side: once it is set "
+    "down on the peg they overlap it, and throw the mug off",
+}
+"""Cases whose object moves by more than 0.1 mm or 0.1 degrees in the second after it is let go again, and why."""
+
 CASES = tuple(
-    dataclasses.replace(case, miss=MISSES.get(case.name, ""))
-    for case in (*THIN_AND_SMALL, *HIGH, *VESSELS, *TIPPING, *ROLLING, *EDGES, *TABLES, *SURFACES, *OUTSIDE)
+    dataclasses.replace(case, miss=MISSES.get(case.name, ""), moves=MOVES.get(case.name, ""))
+    for case in (*THIN_AND_SMALL, *HIGH, *VESSELS, *TIPPING, *ROLLING, *EDGES, *TABLES, *SURFACES, *SPINS, *OUTSIDE)
 )

@@ -88,7 +88,7 @@ def ring(thick_m: float = 0.03) -> Table:
 
 def with_raised_ring() -> Table:
     """A level table that carries a ring of 100 mm across, 5 mm high."""
-    hoop = trimesh.creation.annulus(r_min=0.046, r_max=0.05, height=0.005, sections=48)
+    hoop = trimesh.creation.annulus(r_min=0.046, r_max=0.05, height=0.005, sections=24)
     hoop.apply_translation((0, 0, 0.7025))
     return table_of(box(1.4, 1.4, 0.03, (0, 0, 0.685)), hoop)
 

@@ -8,10 +8,9 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.scene import Settled
-from schemas.shape import Mesh
 from tests.hard_cases.drops import Drop
 from workers.geometry.frames import transform
-from workers.geometry.heights import vertical_gap
+from workers.scene.landing import gap_m, ground_of
 
 Z = np.array([0.0, 0.0, 1.0])
 
@@ -27,8 +26,7 @@ class Measure:
 
 def gap_mm(case: Drop, rest: Settled) -> float:
     """Penetration or gap, whichever there is."""
-    shape = case.start.asset.shape.mesh
-    return abs(vertical_gap(Mesh(transform(rest.T_world_obj, shape.vertices), shape.faces), case.table.mesh)) * 1e3
+    return abs(gap_m(case.start, rest.T_world_obj, ground_of(case.table))) * 1e3
 
 
 def gap(bound_mm: float = 0.1) -> Measure:

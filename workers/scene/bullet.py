@@ -43,6 +43,9 @@ BOUNCE_REPAIR = 0.005
 NO_THRESHOLD = 1e18
 """Bullet's own: contacts count as soon as they are foreseen."""
 
+FASTEST = 1e4
+"""m/s and rad/s: what moves faster is held to it. Bullet's own is 100, and what is small spins faster where it lands."""
+
 WORLDS_BEFORE_RESET = 32
 """What is removed from a simulation leaves some kilobytes behind, which only a reset frees; a reset costs as much as
 fifty milliseconds of simulated time."""
@@ -285,6 +288,7 @@ def _set_surface(client: int, thing: int, physics: Physics, body: Body) -> None:
         collisionMargin=body.margin_m,
         linearDamping=body.damping,
         angularDamping=body.damping,
+        maxJointVelocity=FASTEST,
         physicsClientId=client,
     )
 

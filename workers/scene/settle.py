@@ -189,23 +189,24 @@ def release_again(
     if len(plan.objects) > 1 and effects.runs("object_contacts"):
         flat = not effects.runs("table_mesh") and all(rest.support != "mesh" for rest in settled)
         poses = [rest.T_world_obj for rest in settled]
-        return release_together(plan.objects, poses, plan.table, finest(physics, seconds), effects.ran, flat).poses
+        return release_together(plan.objects, poses, plan.table, watching(physics, seconds), effects.ran, flat).poses
     return tuple(
         _let_go(start, rest, plan.table, physics, effects.ran, seconds)
         for start, rest in zip(plan.objects, settled, strict=True)
     )
 
 
-def finest(physics: Physics, seconds: float) -> Physics:
-    """The same physics in the finest steps, for so long."""
-    return physics.model_copy(update={"step_hz": FINEST * physics.step_hz, "max_settle_s": seconds})
+def watching(physics: Physics, seconds: float) -> Physics:
+    """The same physics in the finest steps, in which nothing counts as resting before the time is over."""
+    rest = physics.rest.model_copy(update={"window_s": 2.0 * seconds})
+    return physics.model_copy(update={"step_hz": FINEST * physics.step_hz, "max_settle_s": seconds, "rest": rest})
 
 
 def _let_go(
     start: ObjectStart, rest: Settled, table: Table, physics: Physics, ran: Collection[str], seconds: float
 ) -> Pose:
     again = dataclasses.replace(start, T_world_obj=rest.T_world_obj, placed=False)
-    task = _Task(again, ground_of(table), finest(physics, seconds), ran)
+    task = _Task(again, ground_of(table), watching(physics, seconds), ran)
     return _simulate(task, seconds, rest.support != "mesh" and "table_mesh" not in ran).poses[0]
 
 

@@ -17,9 +17,10 @@ from workers.assets.procedural.make import make_asset
 from workers.geometry.frames import angle_between, pose, rotation_about, transform, translation
 from workers.geometry.heights import vertical_gap
 from workers.geometry.hull import convex_hull
-from workers.scene.fall import body_frame
+from workers.scene.effect import EffectPlan
+from workers.scene.fall import body_frame, fall
 from workers.scene.plan import draw_start, plan_scene
-from workers.scene.settle import recheck, settle
+from workers.scene.settle import RECHECK_S, recheck, release_again, settle
 from workers.scene.support import place_table
 
 PHYSICS = Job(name="t").physics
@@ -79,6 +80,22 @@ def test_a_bottle_that_rolling_friction_held_on_an_edge_rolls_onto_a_face_and_no
     assert rest.support == "flat_top"
     assert rest.support_margin_mm > 0.0
     assert recheck(start, rest, TABLE, PHYSICS)[0] < 0.1
+
+
+def test_what_is_let_go_again_is_watched_to_the_end_however_still_it_stands(monkeypatch):
+    start, watched = start_of(asset_of(box(0.1, 0.08, 0.2)), translation(0.0, 0.0, TOP + 0.11)), []
+    rest = settle(start, TABLE, PHYSICS)
+
+    def told(*arguments):
+        watched.append(fall(*arguments))
+        return watched[-1]
+
+    monkeypatch.setattr("workers.scene.settle.fall", told)
+    recheck(start, rest, TABLE, PHYSICS)
+    plan = plan_scene(Job(name="t"), 0, table(), start.asset)
+    plan = dataclasses.replace(plan, objects=(start,), table=TABLE)
+    release_again(plan, [rest], PHYSICS, EffectPlan(("dynamics", "fine_step"), {}), 0.5)
+    assert [each.seconds for each in watched] == pytest.approx([RECHECK_S, 0.5], abs=1e-3)
 
 
 def test_the_same_start_gives_the_same_bits():

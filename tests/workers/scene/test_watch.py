@@ -16,6 +16,8 @@ from workers.scene.watch import (
     can_touch,
     stands_on_face,
     watch_edge,
+    watch_gone,
+    watch_room,
     watch_tilt,
 )
 
@@ -74,3 +76,17 @@ def test_an_edge_is_near_where_the_nearest_one_is_within_reach():
     rng = np.random.default_rng(0)
     for x, y in rng.uniform([-0.6, -0.4], [1.0, 0.4], (500, 2)):
         assert near(at(x, y)) == (min(x + 0.5, 0.9 - x, y + 0.3, 0.3 - y) < 0.1)
+
+
+def test_a_room_is_a_circle_about_where_the_body_began_however_high_it_is():
+    strays = watch_room(np.array([0.3, -0.2]), 0.05)
+    for way in (0.0, 1.0, 2.5, 4.0):
+        for far, expected in ((0.0, False), (0.0499, False), (0.0501, True), (3.0, True)):
+            x, y = 0.3 + far * math.cos(way), -0.2 + far * math.sin(way)
+            assert strays(((x, y, 7.0 * way), at(0, 0)[1])) == expected
+    assert not watch_room(np.zeros(2), math.inf)(at(1e9, 1e9))
+
+
+def test_what_is_gone_is_below_everything_that_it_could_land_on():
+    gone = watch_gone(-0.1)
+    assert [gone(((5.0, 5.0, z), at(0, 0)[1])) for z in (0.0, -0.0999, -0.1001, -9.0)] == [False, False, True, True]
