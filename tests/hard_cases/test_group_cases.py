@@ -21,8 +21,7 @@ from workers.scene.dynamics import called_for
 from workers.scene.effect import EffectPlan
 from workers.scene.plan import plan_scene
 from workers.scene.settle import UNBALANCED, moved_by, settle_scene
-from workers.scene.together import _faller as faller_of
-from workers.scene.together import release
+from workers.scene.together import release_together
 
 PHYSICS = Job(name="t").physics
 FINEST, WATCHED_S = 16, 1.0
@@ -81,8 +80,7 @@ def let_go_again(case: GroupCase, rest: Sequence[Settled]) -> tuple[float, float
     settings, ran = PHYSICS.model_copy(update=fine), called_for(group.starts, group.table, PHYSICS)
     poses = [each.T_world_obj for each in rest]
     flat = rest[0].support == "flat_top"
-    fallers = [faller_of(start, settings, ran) for start in group.starts]
-    after = release(fallers, poses, group.starts, group.table, settings, ran, flat)
+    after = release_together(group.starts, poses, group.table, settings, ran, flat)
     assert after.seconds >= WATCHED_S
     moved = [moved_by(*each) for each in zip(group.starts, poses, after.poses, strict=True)]
     return max(mm for mm, _ in moved), max(deg for _, deg in moved)
