@@ -15,6 +15,10 @@ SAME_PLANE_M = 1e-6
 CONTACT_M = 5e-5
 """A vertex that is nearer to the support than this counts as touching it."""
 
+STEADY_M = 2e-4
+"""An object whose centre of mass is nearer than this to the edge of the face that it stands on may rock to the next one in a
+simulator, whose edges are rounded by its margin of half as much."""
+
 NEAR_LOWEST_M = 0.02
 """Only vertices this near the lowest one can touch a support that is level to within a few degrees."""
 
@@ -32,47 +36,69 @@ def snap_to_face(T_world_obj: Pose, hull: Hull, com: Array, snap_rad: float) -> 
 
     A simulator stops with the lowest vertices some tenths of a millimetre apart, because its collision shapes have
     margins. On a level plane a rest pose has a face of the hull in the plane with the centre of mass above it, so the
-    nearest such face is the pose that was meant. Returns the pose unchanged where no such face is near (the object
-    leans on an edge of the table, say). The height is left to the caller.
+    nearest such face is the pose that was meant: the nearest that is steady, or the steadiest. Returns the pose unchanged
+    where no such face is near (the object leans on an edge of the table, say). The height is left to the caller.
     """
     R = T_world_obj[:3, :3]
     tilt = np.arccos(np.clip(hull.normals @ (R.T @ DOWN), -1.0, 1.0))
     near = np.flatnonzero(tilt <= snap_rad)
+    best, most = None, 0.0
     for index in near[np.argsort(tilt[near], kind="stable")]:
-        normal = hull.normals[index]
-        turn = rotation_between(R @ normal, DOWN) @ R
-        if _stands(hull.vertices @ turn.T, turn @ com):
-            com_world = R @ com + T_world_obj[:3, 3]
-            return pose(turn, com_world - turn @ com)
-    return T_world_obj
+        turn = rotation_between(R @ hull.normals[index], DOWN) @ R
+        margin = face_margin(hull.vertices @ turn.T, turn @ com)
+        if margin > most:
+            best, most = turn, margin
+        if most > STEADY_M:
+            break
+    return T_world_obj if best is None else pose(best, R @ com + T_world_obj[:3, 3] - best @ com)
 
 
 def tip_onto_face(T_world_obj: Pose, hull: Hull, com: Array) -> Pose | None:
     """Turn the object over its lowest edges and corners, as it would tip on a level plane, until it stands on a face.
 
     For what friction holds between two faces, as no face can: it is turned about the nearest point of its contacts,
-    away from them, until the next vertex touches; its centre of mass only sinks. None where that is further than
-    `FARTHEST_TIP_RAD` in all, because there it falls and does not tip. The height is left to the caller.
+    away from them, until the next vertex touches; its centre of mass only sinks. A face that is not steady is tipped
+    over too, by its nearest edge: the centre of mass rises by less than a micrometre. Returns the first steady pose, else
+    the steadiest; None where there is none within `FARTHEST_TIP_RAD` in all, because further it falls and does not tip.
+    The height is left to the caller.
     """
     T, turned = T_world_obj, 0.0
+    best, most = None, 0.0
     for _ in range(MOST_TIPS):
         points, centre = transform(T, hull.vertices), transform(T, com[None, :])[0]
         low = points[points[:, 2] <= points[:, 2].min() + SAME_PLANE_M]
-        if support_margin(low[:, :2], centre[:2]) > 0.0:
-            return T
-        pivot = _nearest_of_hull(low, centre)
-        away = centre[:2] - pivot[:2]
-        if float(np.linalg.norm(away)) < SAME_PLANE_M:  # on a ridge, in balance: it may go either way
-            away = _across(low)
-        away = away / np.linalg.norm(away)
+        margin = support_margin(low[:, :2], centre[:2])
+        if margin > most:
+            best, most = T, margin
+        if margin > STEADY_M:
+            break
+        pivot, away = _way_to_tip(low, centre, margin)
         ahead, height = (points[:, :2] - pivot[:2]) @ away, points[:, 2] - pivot[2]
         angle = np.arctan2(height, ahead)[(ahead > SAME_PLANE_M) & (height > SAME_PLANE_M)]
         turned += float(angle.min(initial=np.pi))
         if turned > FARTHEST_TIP_RAD:
-            return None
+            break
         R = rotation_about(np.array([-away[1], away[0], 0.0]), float(angle.min()))
         T = pose(R @ T[:3, :3], R @ (T[:3, 3] - pivot) + pivot)
-    return None
+    return best
+
+
+def _way_to_tip(low: Array, centre: Array, margin: float) -> tuple[Array, Array]:
+    """(point [3] to turn about, level unit direction [2] to turn to) of a body whose lowest vertices are `low` [N, 3]."""
+    if margin > 0.0:  # over the nearest edge of the face that it stands on
+        corners = low[ConvexHull(low[:, :2]).vertices]
+        along = np.roll(corners, -1, axis=0) - corners
+        normal = np.stack([along[:, 1], -along[:, 0]], axis=1)  # outwards: the corners go round counter-clockwise
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        distance = ((corners - centre)[:, :2] * normal).sum(axis=1)
+        nearest = int(np.argmin(distance))
+        pivot = np.array([*(centre[:2] + distance[nearest] * normal[nearest]), low[:, 2].min()])
+        return pivot, normal[nearest]
+    pivot = _nearest_of_hull(low, centre)
+    away = centre[:2] - pivot[:2]
+    if float(np.linalg.norm(away)) < SAME_PLANE_M:  # on a ridge, in balance: it may go either way
+        away = _across(low)
+    return pivot, away / np.linalg.norm(away)
 
 
 def _nearest_of_hull(low: Array, centre: Array) -> Array:
@@ -94,9 +120,10 @@ def _across(low: Array) -> Array:
     return np.array([-far[1], far[0]]) if len(low) > 1 else np.array([1.0, 0.0])
 
 
-def _stands(points: Array, com: Array) -> bool:
+def face_margin(points: Array, com: Array) -> float:
+    """Metres that the centre of mass [3] lies inside the lowest face of a hull's vertices [N, 3]; negative outside."""
     face = points[points[:, 2] <= points[:, 2].min() + SAME_PLANE_M]
-    return support_margin(face[:, :2], com[:2]) > 0.0
+    return support_margin(face[:, :2], com[:2])
 
 
 def support_margin(contacts_xy: Array, com_xy: Array) -> float:

@@ -150,8 +150,7 @@ def _settle_flat(task: _Task) -> Fall | None:
         seconds += motion.seconds
         stopped = motion.poses[0]
         T = snap_to_face(stopped, task.start.hull, asset.mass.com, physics.snap_rad)
-        snapped = T is not stopped  # onto a face with the centre of mass above it
-        tipped = T if snapped else tip_onto_face(T, task.start.hull, asset.mass.com)
+        tipped = tip_onto_face(T, task.start.hull, asset.mass.com)
         motion = Fall((T if tipped is None else tipped,), motion.speed_m_s, seconds, True)
         if tipped is not None:
             break
