@@ -53,7 +53,7 @@ class Physics(Frozen):
     """How far the fastest point may go in a step; more in falls from above 35 mm, less for what is thinner than 2 mm."""
     solver_iterations: Annotated[int, Field(ge=1, le=10_000)] = 100
     """Iterations of the contact solver in each step."""
-    max_settle_s: Positive = 8.0
+    max_settle_s: Positive = 20.0
     """Simulated time after which an object that still moves is a failure."""
     rest: Rest = Rest()
     """When an object counts as resting."""

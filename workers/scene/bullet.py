@@ -148,7 +148,7 @@ def open_world(
         things.append(_add_mesh(client, ground) if isinstance(ground, Mesh) else _add_slab(client, ground))
         _set_surface(client, things[0], physics, Body(0.0, np.zeros(3), (), 0.0, rolls=False))
         for body, T_world_body in placed:
-            things.append(_add_body(client, body))
+            things.append(_add_body(client, body, T_world_body))
             _set_surface(client, things[-1], physics, body)
             _place(client, things[-1], T_world_body)
         world = World(client, things[0], tuple(things[1:]), steps)
@@ -249,18 +249,29 @@ def _add_mesh(client: int, mesh: Mesh) -> int:
     return pybullet.createMultiBody(0, shape, physicsClientId=client)
 
 
-def _add_body(client: int, body: Body) -> int:
+def _add_body(client: int, body: Body, T_world_body: Pose) -> int:
+    """The body, its shape given to Bullet in the world's axes.
+
+    Bullet's hulls are made on a grid of a ten-thousandth of their size along each axis, some 20 micrometres, on which only
+    the outermost vertices are where they belong. Those are, in the world's axes, the ones that the body stands on.
+    """
+    R = T_world_body[:3, :3]
+    back = quaternion_of(R.T).tolist()
     if len(body.parts) == 1:
-        vertices = _NUMBERS.vertices(body.parts[0])
-        shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client)
+        shape = pybullet.createCollisionShape(
+            pybullet.GEOM_MESH,
+            vertices=_NUMBERS.vertices(body.parts[0] @ R.T),
+            collisionFrameOrientation=back,
+            physicsClientId=client,
+        )
     else:
-        shape = _compound(client, body.parts)
+        shape = _compound(client, [part @ R.T for part in body.parts], back)
     thing: int = pybullet.createMultiBody(body.mass_kg, shape, physicsClientId=client)
     pybullet.changeDynamics(thing, -1, localInertiaDiagonal=body.moments.tolist(), physicsClientId=client)
     return thing
 
 
-def _compound(client: int, parts: Sequence[Array]) -> int:
+def _compound(client: int, parts: Sequence[Array], orientation: list[float]) -> int:
     """One collision shape of many convex parts, which PyBullet takes from a file alone: the objects of an OBJ."""
     lines, first = [], 1
     for number, vertices in enumerate(parts):
@@ -271,7 +282,9 @@ def _compound(client: int, parts: Sequence[Array]) -> int:
     with tempfile.TemporaryDirectory(prefix="verso-parts-") as folder:
         path = Path(folder, "parts.obj")
         path.write_text("\n".join(lines), encoding="ascii")
-        shape: int = pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path), physicsClientId=client)
+        shape: int = pybullet.createCollisionShape(
+            pybullet.GEOM_MESH, fileName=str(path), collisionFrameOrientation=orientation, physicsClientId=client
+        )
     return shape
 
 
