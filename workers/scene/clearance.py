@@ -47,6 +47,13 @@ def between(a: manifold3d.Manifold, b: manifold3d.Manifold) -> float:
     return -max(least_width_m(convex_hull(triangles_of(piece).vertices)) for piece in pieces)
 
 
+def overlap_m(a: Mesh, b: Mesh) -> float:
+    """Metres that two meshes (world coordinates) reach into one another at most; 0 where they do not."""
+    apart = (a.vertices.min(axis=0) > b.vertices.max(axis=0)) | (b.vertices.min(axis=0) > a.vertices.max(axis=0))
+    return 0.0 if apart.any() else max(0.0, -between(_solid(a), _solid(b)))
+
+
 def _solid(mesh: Mesh) -> manifold3d.Manifold:
+    hold_to_one_thread()
     solid = solid_of(weld(mesh))
     return manifold3d.Manifold.hull_points(np.ascontiguousarray(mesh.vertices)) if solid is None else solid

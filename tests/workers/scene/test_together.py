@@ -108,6 +108,18 @@ def test_one_that_falls_off_the_table_is_named_by_its_region():
     assert caught.value.reason == "left_table"
 
 
+@pytest.mark.parametrize(("deep_m", "refused"), [(0.059, True), (0.002, True), (5e-5, False), (-1e-4, False)])
+def test_objects_that_begin_inside_one_another_are_refused_and_not_thrown_apart(deep_m, refused):
+    starts = [start_of(CUBE, 0, 0, 0.031), dataclasses.replace(start_of(CUBE, 0.06 - deep_m, 0.0, 0.031), region_id=4)]
+    if refused:
+        with pytest.raises(SettleError, match=f"regions 3 and 4 begin {deep_m * 1e3:.2f} mm") as caught:
+            settle_together(starts, TABLE, PHYSICS, ALL)
+        assert caught.value.reason == "objects_overlap"
+    else:
+        rest = settle_together(starts, TABLE, PHYSICS, ALL)
+        assert rest[1].T_world_obj[0, 3] == pytest.approx(0.06 - deep_m, abs=1e-3)
+
+
 def test_what_does_not_rest_in_time_says_so():
     hurried = PHYSICS.model_copy(update={"max_settle_s": 0.1})
     with pytest.raises(SettleError) as caught:
