@@ -143,7 +143,7 @@ def test_a_hook_hangs_where_its_centre_of_mass_is_over_the_top_and_not_where_it_
 def test_what_only_touches_a_side_is_not_held_up_by_it():
     """The force mu n up and n sideways that is nearest to the weight leaves 1 / sqrt(1 + mu^2) of it."""
     support = held(CUBE, translation(0.75, 0.0, TOP - 0.02))
-    assert support.residual == pytest.approx(1.0 / math.sqrt(1.0 + FRICTION**2), rel=1e-6)
+    assert support.residual == pytest.approx(1.0 / math.sqrt(1.0 + FRICTION**2), rel=1e-3)
     assert support.margin_m == pytest.approx(-0.1)
     assert support.highest_m == pytest.approx(TOP, abs=1e-6)  # though there are contacts
 
