@@ -93,6 +93,15 @@ def test_an_overlap_is_the_depth_and_nothing_where_two_bodies_only_touch_or_are_
         assert overlap_m(mesh_of(CUBE), mesh_of(box(0.1, 0.1, 0.1, (0, way, 0)))) == pytest.approx(expected, abs=1e-9)
 
 
+def test_what_touches_the_side_of_a_wall_is_as_deep_in_it_as_it_reaches_and_not_as_the_wall_is_high():
+    walled = survey(
+        mesh_of(trimesh.util.concatenate([box(2.0, 2.0, 0.1, (0, 0, -0.05)), box(0.02, 1.0, 0.3, (0.06, 0, 0.1))]))
+    )
+    for way in (1e-6, 3e-5, 4e-4):
+        assert clearances([mesh_of(box(0.1, 0.1, 0.1, (way, 0, 0.05)))], walled)[0] == pytest.approx(-way, abs=2e-7)
+    assert clearances([mesh_of(box(0.1, 0.1, 0.1, (-1e-6, 0, 0.051)))], walled)[0] == pytest.approx(0.001, abs=1e-9)
+
+
 def test_what_encloses_no_body_stands_for_its_hull():
     walls = CUBE.faces[CUBE.face_normals[:, 2] < 0.5]  # an open box
     open_box = Mesh(np.asarray(CUBE.vertices) + np.array([0, 0, 0.05]), np.asarray(walls, dtype=np.int32))

@@ -107,6 +107,17 @@ def test_what_is_hooked_to_nothing_is_left_where_it_is():
     assert np.array_equal(touch_down(HOOK, T, LEVEL), T)
 
 
+@pytest.mark.parametrize("deep_m", [1e-6, 3e-5])
+def test_what_touches_a_wall_is_not_lifted_onto_it(deep_m):
+    walled = ground_of(table_of(box(1.4, 1.4, 0.03, (0, 0, -0.015)), box(0.02, 1.4, 0.15, (0.69, 0, 0.075))))
+    T = translation(0.68 - 0.05 + deep_m, 0.0, walled.table.top.height_m + 0.05)
+    assert gap_m(CUBE, T, walled) == pytest.approx(-deep_m, abs=2e-7)
+    lifted = translation(0.0, 0.0, 0.002) @ T
+    for begun in (T, lifted):
+        assert touch_down(CUBE, begun, walled) == pytest.approx(T, abs=1e-9)
+    assert support_of(CUBE, T, walled, FRICTION).residual < 1e-6
+
+
 def held(start: ObjectStart, T: np.ndarray, ground: Ground = LEVEL):
     return support_of(start, T, ground, FRICTION)
 
