@@ -204,6 +204,8 @@ MISSES = dict.fromkeys(("can spun upright at 200 rad/s", "can spun lying at 50 r
 """Cases that the program does not meet yet, and why."""
 
 MOVES = {
+    "cube leaning against the wall of a tray": "it slips by 0.26 mm and 0.25 degrees: the correction lifts it off its edge by "
+    "26 um, and leaves it 30 um in the wall",
     "mug hung by its handle on a peg at the edge": "convex parts stand 2 mm out of the handle's inner side: once it is set "
     "down on the peg they overlap it, and throw the mug off",
 }
