@@ -99,6 +99,7 @@ SWAYS = (
 SWAYS += "more than in longer ones: the solver's error of each step adds up"
 
 MOVES = {
+    "pile of twenty boxes": "one that leans slips by 0.6 mm and 0.7 degrees, more slowly than the 1 mm/s that counts as moving",
     "stack of ten cubes": SWAYS,
     "stack of ten cubes, each turned by 7 degrees": SWAYS,
     "row of six dominoes, the first leaning 14 of 8.9 degrees": "they slip on one another by 0.1 degrees within half a "
