@@ -89,8 +89,6 @@ ROWS = (
 )
 
 MISSES = {
-    "two cubes in one place": "they are thrown apart at 24 m/s: what overlaps is pushed by a share of the depth in each step, "
-    "and steps get shorter as things get faster",
     "ball in a bowl": "convex parts stand out of the bowl's inner side by up to 4 mm, and the ball lies on them",
 }
 """Cases that the program does not meet, and why."""
@@ -101,6 +99,7 @@ SWAYS = (
 SWAYS += "more than in longer ones: the solver's error of each step adds up"
 
 MOVES = {
+    "pile of twenty boxes": "one that leans slips by 0.6 mm and 0.7 degrees, more slowly than the 1 mm/s that counts as moving",
     "stack of ten cubes": SWAYS,
     "stack of ten cubes, each turned by 7 degrees": SWAYS,
     "row of six dominoes, the first leaning 14 of 8.9 degrees": "they slip on one another by 0.1 degrees within half a "

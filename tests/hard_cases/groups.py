@@ -11,7 +11,7 @@ from schemas.base import Array, frozen_array
 from schemas.scene import ObjectStart, Table
 from schemas.shape import Asset
 from tests.hard_cases.bodies import ball, built_in, cube
-from tests.hard_cases.drops import Y, level, table_of, turn
+from tests.hard_cases.drops import Drop, Y, level, table_of, turn
 from tests.shapes import asset_of, box
 from workers.geometry.frames import pose, uniform_rotation
 from workers.geometry.hull import convex_hull
@@ -78,6 +78,12 @@ def tray() -> Table:
     walls = [box(0.02, 0.34, 0.15, (x, 0, 0.075)) for x in (-0.16, 0.16)]
     walls += [box(0.34, 0.02, 0.15, (0, y, 0.075)) for y in (-0.16, 0.16)]
     return table_of(box(0.34, 0.34, 0.03, (0, 0, -0.015)), *walls)
+
+
+def leaning_on_a_wall() -> Drop:
+    """A cube of 50 mm in a tray, on an edge and against a wall: 20 degrees from upright, 70 from the wall."""
+    table = tray()
+    return Drop(put(cube(SMALL_M), table, 0.003, (0.118, 0.0), turn(Y, -20.0)), table)
 
 
 def pile(count: int) -> Group:

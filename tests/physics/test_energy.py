@@ -2,6 +2,8 @@
 
 import functools
 import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,20 +12,24 @@ import pybullet
 import pytest
 
 from schemas.base import Array
+from schemas.errors import SettleError
 from schemas.job import Job
-from schemas.scene import ObjectStart
 from schemas.shape import Asset
 from schemas.sources import ProceduralSource
+from tests.hard_cases.bodies import cube
+from tests.hard_cases.groups import dominoes, pile, stack
 from tests.physics.room import G, physics
 from tests.shapes import asset_of, box, table
 from workers.assets.procedural.make import make_asset
 from workers.geometry.frames import rotation_from_quaternion
 from workers.scene import bullet
 from workers.scene.bullet import World
+from workers.scene.dynamics import called_for
 from workers.scene.fall import body_frame
 from workers.scene.plan import draw_start
 from workers.scene.settle import settle
 from workers.scene.support import place_table
+from workers.scene.together import settle_together
 
 TABLE = place_table(table())
 SEEDS = 20
@@ -51,24 +57,39 @@ class Rise:
     lift_m: float
 
 
-@functools.cache
-def worst_rise(category: str, start: str, seed: int, refine: int = 1) -> Rise:
-    asset = asset_for(category, seed)
-    job = Job.model_validate({"name": "t", "seed": seed, "start": {"pose": start}})
-    weight, rises = asset.mass.mass_kg * G, []
-    for energy in energies(draw_start(job, seed, asset, TABLE), refine):
+def worst_of(falls: Iterable[Array], weight: float) -> Rise:
+    """Of each simulation's energies [steps], joules, of things of this weight, newtons."""
+    rises = []
+    for energy in falls:
         rise = float((energy - np.minimum.accumulate(energy)).max())
         rises.append(Rise(rise / max(SHARE * (energy[0] - energy[-1]), LIFT_M * weight), rise / weight))
     return max(rises, key=lambda rise: rise.over_bound)
 
 
-def energies(start: ObjectStart, refine: int) -> list[Array]:
-    """[steps] joules: kinetic and potential energy after every step of each fall of a settling as it is in production.
+@functools.cache
+def worst_rise(category: str, start: str, seed: int, refine: int = 1) -> Rise:
+    asset = asset_for(category, seed)
+    job = Job.model_validate({"name": "t", "seed": seed, "start": {"pose": start}})
+    drawn = draw_start(job, seed, asset, TABLE)
+    with watched([asset]) as falls:
+        settle(drawn, TABLE, physics(step_hz=960 * refine, way_mm=0.1 / refine))
+    return worst_of(falls(), asset.mass.mass_kg * G)
 
-    In the air semi-implicit Euler only loses energy, g^2 h / 2 a second and kilogram, so that no rise is its own.
+
+@contextmanager
+def watched(assets: Sequence[Asset], spin: Sequence[float] = (0.0, 0.0, 0.0)) -> Iterator[Callable[[], list[Array]]]:
+    """Within the block production settles these objects; then [steps] joules in all after every step of each simulation.
+
+    Kinetic and potential energy. In the air semi-implicit Euler only loses energy, g^2 h / 2 a second and kilogram, so that
+    no rise is its own. `spin` is what they are let go with, rad/s.
     """
-    mass, falls = start.asset.mass, list[list[float]]()
-    _, moments = body_frame(mass)
+    falls = list[list[float]]()
+    moments = [body_frame(asset.mass)[1] for asset in assets]
+
+    def energy(world: World, body: int) -> float:
+        (x, quaternion), (v, w) = world.pose(body), world.velocity(body)
+        spins = rotation_from_quaternion(np.array(quaternion)).T @ np.array(w)
+        return assets[body].mass.mass_kg * (np.dot(v, v) / 2 + G * x[2]) + float(moments[body] @ (spins * spins)) / 2
 
     class Watched(World):
         """Steps one at a time, and looks at the energy after each."""
@@ -76,14 +97,15 @@ def energies(start: ObjectStart, refine: int) -> list[Array]:
         def advance(self) -> None:
             for _ in range(self.steps):
                 pybullet.stepSimulation(physicsClientId=self.client)
-                (x, quaternion), (v, w) = self.pose(), self.velocity()
-                spin = rotation_from_quaternion(np.array(quaternion)).T @ np.array(w)
-                falls[-1].append(mass.mass_kg * (np.dot(v, v) / 2 + G * x[2]) + float(moments @ (spin * spin)) / 2)
+                falls[-1].append(sum(energy(self, body) for body in range(len(self.bodies))))
 
         def pace(self, step_hz: float, repair: float = bullet.REPAIR) -> None:
             pybullet.setPhysicsEngineParameter(
                 fixedTimeStep=1.0 / step_hz, numSubSteps=0, contactERP=repair, physicsClientId=self.client
             )
+
+        def push(self, velocity: Sequence[float], _: Any = None, body: int = 0) -> None:
+            super().push(velocity, spin, body)
 
     def begin(*of: Any) -> World:
         falls.append([])
@@ -91,8 +113,7 @@ def energies(start: ObjectStart, refine: int) -> list[Array]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bullet, "World", begin)
-        settle(start, TABLE, physics(step_hz=960 * refine, way_mm=0.1 / refine))
-    return [np.array(energy) for energy in falls]
+        yield lambda: [np.array(energies) for energies in falls]
 
 
 @pytest.mark.parametrize("start", STARTS)
@@ -106,6 +127,54 @@ def test_energy_never_rises_above_its_running_minimum(category, start, record_fi
     )
     record_figure(f"energy, {category} {start}: worst rise, um", "passed", max(r.lift_m for r in rises) * 1e6)
     assert missed == 0
+
+
+GROUPS = {
+    "pile of six": lambda: pile(6),
+    "stack of five": lambda: stack(*[cube(0.05)] * 5),
+    "six dominoes": lambda: dominoes(6, 14.0),
+}
+
+
+@pytest.mark.parametrize("make", GROUPS.values(), ids=GROUPS)
+def test_the_energy_of_all_that_falls_together_never_rises_above_its_running_minimum(make, request, record_figure):
+    group = make()
+    assets = [start.asset for start in group.starts]
+    settings = physics()
+    with watched(assets) as falls:
+        settle_together(group.starts, group.table, settings, called_for(group.starts, group.table, settings))
+    rise = worst_of(falls(), sum(asset.mass.mass_kg for asset in assets) * G)
+    name = f"energy, {request.node.callspec.id}"
+    record_figure(f"{name}: worst rise over its bound", "passed", rise.over_bound, 1)
+    record_figure(f"{name}: worst rise, um", "passed", rise.lift_m * 1e6)
+    assert rise.over_bound <= 1.0
+
+
+TOO_FAST = pytest.mark.xfail(
+    reason="steps are at most 16 times shorter: at 20 m/s a point goes 1.3 mm in one and sinks in as deep",
+    raises=AssertionError,
+)
+SPINS = [
+    (0.0, 0.0, 50.0),
+    (30.0, 40.0, 0.0),
+    pytest.param((0.0, 0.0, 200.0), marks=TOO_FAST),
+    pytest.param((0.0, 160.0, 120.0), marks=TOO_FAST),
+]
+"""Angular velocities, rad/s."""
+
+
+@pytest.mark.parametrize("spin", SPINS)
+@pytest.mark.parametrize("category", ["box", "can"])
+def test_what_spins_when_it_is_let_go_gains_no_energy(category, spin, record_figure):
+    """The energy that is set free is the spin's too."""
+    asset = asset_for(category, 0)
+    start = draw_start(Job(name="t"), 0, asset, TABLE)
+    with watched([asset], spin) as falls, suppress(SettleError):  # some leave the table, and some spin for too long
+        settle(start, TABLE, physics(max_settle_s=1.0))
+    rise = worst_of(falls(), asset.mass.mass_kg * G)
+    outcome = "known miss" if max(spin) > 100.0 else "passed"
+    record_figure(f"energy, {category} spun by {spin} rad/s: worst rise over its bound", outcome, rise.over_bound, 1)
+    assert rise.over_bound <= 1.0
 
 
 @pytest.mark.slow

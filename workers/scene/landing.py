@@ -9,8 +9,8 @@ from schemas.scene import ObjectStart, Table
 from schemas.shape import Mesh
 from workers.geometry.convexity import solid_of, weld
 from workers.geometry.frames import transform, translation
-from workers.geometry.heights import Terrain, survey, vertical_gap
-from workers.scene.clearance import between
+from workers.geometry.heights import Terrain, survey
+from workers.scene.clearance import above_ground, between, ground_gap_m
 from workers.scene.contact import CONTACT_M
 from workers.scene.equilibrium import FIXED, Contact, Weight, contact_points, equilibrium_residual, support_margin_m
 
@@ -65,12 +65,12 @@ def placed_mesh(start: ObjectStart, T_world_obj: Pose) -> Mesh:
 def gap_m(start: ObjectStart, T_world_obj: Pose, ground: Ground) -> float:
     """Metres between object and table, negative where they overlap; inf where neither is above the other.
 
-    Along z for what stands on the table, where that is exact. For what may be hooked to it the least distance, or minus
-    the least width of what both share, where both enclose bodies.
+    Along z for what stands on the table, where that is exact but for edges that cross. For what may be hooked to it the
+    least distance, or minus the least width of what both share, where both enclose bodies.
     """
     mesh = placed_mesh(start, T_world_obj)
     if not _hooked(mesh, ground):
-        return vertical_gap(mesh, ground.terrain)
+        return ground_gap_m(mesh, ground.terrain)
     solids = solid_of(weld(mesh)), solid_of(weld(ground.table.mesh))
     if solids[0] is not None and solids[1] is not None:
         return between(solids[0], solids[1])
@@ -78,10 +78,13 @@ def gap_m(start: ObjectStart, T_world_obj: Pose, ground: Ground) -> float:
 
 
 def touch_down(start: ObjectStart, T_world_obj: Pose, ground: Ground) -> Pose:
-    """The pose moved along z until the meshes just touch; what may be hooked to the table is only lowered."""
+    """The pose moved along z until the meshes just touch.
+
+    What may be hooked to the table is only lowered.
+    """
     mesh = placed_mesh(start, T_world_obj)
     if not _hooked(mesh, ground):
-        return translation(0.0, 0.0, -vertical_gap(mesh, ground.terrain)) @ T_world_obj
+        return translation(0.0, 0.0, -above_ground(mesh, ground.terrain)[0]) @ T_world_obj
     T = T_world_obj
     for _ in range(MOST_STEPS):
         distance = _distance_m(placed_mesh(start, T), ground)

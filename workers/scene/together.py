@@ -1,5 +1,6 @@
 """Several objects that fall together, onto the table and onto one another."""
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Collection, Sequence
@@ -15,7 +16,7 @@ from workers.geometry.decompose import convex_parts
 from workers.geometry.frames import transform
 from workers.geometry.heights import survey
 from workers.geometry.inset import least_width_m
-from workers.scene.clearance import clearances
+from workers.scene.clearance import clearances, overlap_m
 from workers.scene.contact import CONTACT_M
 from workers.scene.equilibrium import FIXED, Contact, Weight, contact_points, equilibrium_residual, support_margin_m
 from workers.scene.fall import Fall, Faller, Pace, fall, make_faller
@@ -33,6 +34,10 @@ DROP_SHARE = 0.002
 THIN_SHARE = 0.05
 """Of the thinnest object: how far a point may go in a step at most."""
 
+MOST_OVERLAP_M = 1e-4
+"""How far objects may begin inside one another. What overlaps is pushed apart by a share of its depth in each step, which a
+depth of centimetres turns into tens of metres a second."""
+
 
 def settle_together(
     starts: Sequence[ObjectStart], table: Table, physics: Physics, ran: Collection[str]
@@ -41,8 +46,9 @@ def settle_together(
 
     What is not convex falls as its convex parts where `decomposition` ran, else as its hull. Objects that lie on one
     another are not moved after the simulation: what is measured of gaps is the simulation's. Raises SettleError
-    `not_at_rest`, `left_table` or `table_too_fine`.
+    `objects_overlap`, `not_at_rest`, `left_table` or `table_too_fine`.
     """
+    _require_apart(starts)
     flat = "table_mesh" not in ran and table.top.convex
     poses = [start.T_world_obj for start in starts]
     motion = release_together(starts, poses, table, physics, ran, flat)
@@ -50,7 +56,23 @@ def settle_together(
         flat = False
         motion = release_together(starts, poses, table, physics, ran, flat)
     _require_rest(starts, table, motion)
+    # Once more from there: their shapes are then given to Bullet as they lie, to the micrometre.
+    again = release_together(starts, motion.poses, table, physics, ran, flat)
+    _require_rest(starts, table, again)
+    motion = dataclasses.replace(again, seconds=motion.seconds)
     return _describe(starts, table, motion, physics, "flat_top" if flat else "mesh")
+
+
+def _require_apart(starts: Sequence[ObjectStart]) -> None:
+    meshes = [placed_mesh(start, start.T_world_obj) for start in starts]
+    for i, j in itertools.combinations(range(len(starts)), 2):
+        deep = overlap_m(meshes[i], meshes[j])
+        if deep > MOST_OVERLAP_M:
+            raise SettleError(
+                "objects_overlap",
+                f"regions {starts[i].region_id} and {starts[j].region_id} begin {deep * 1e3:.2f} mm inside one another: let "
+                "them go apart, or one above the other",
+            )
 
 
 def _faller(start: ObjectStart, physics: Physics, ran: Collection[str]) -> Faller:

@@ -12,7 +12,7 @@ from tests.shapes import box
 from workers.geometry.convexity import solid_of, weld
 from workers.geometry.frames import pose, rotation_about, transform, uniform_rotation
 from workers.geometry.heights import survey
-from workers.scene.clearance import NEAR_M, between, clearances
+from workers.scene.clearance import NEAR_M, between, clearances, overlap_m
 
 
 def mesh_of(body, T=None) -> Mesh:
@@ -86,6 +86,20 @@ def test_each_object_is_told_of_what_is_nearest_to_it_the_ground_or_another():
         mesh_of(box(0.1, 0.1, 0.1, (-0.5, 0, 0.3))),  # alone in the air
     ]
     assert clearances(meshes, GROUND) == pytest.approx([0.001, -0.001, -0.001, -0.0005, 0.25], abs=1e-9)
+
+
+def test_an_overlap_is_the_depth_and_nothing_where_two_bodies_only_touch_or_are_apart():
+    for way, expected in ((0.098, 0.002), (0.1, 0.0), (0.11, 0.0), (3.0, 0.0)):
+        assert overlap_m(mesh_of(CUBE), mesh_of(box(0.1, 0.1, 0.1, (0, way, 0)))) == pytest.approx(expected, abs=1e-9)
+
+
+def test_what_touches_the_side_of_a_wall_is_as_deep_in_it_as_it_reaches_and_not_as_the_wall_is_high():
+    walled = survey(
+        mesh_of(trimesh.util.concatenate([box(2.0, 2.0, 0.1, (0, 0, -0.05)), box(0.02, 1.0, 0.3, (0.06, 0, 0.1))]))
+    )
+    for way in (1e-6, 3e-5, 4e-4):
+        assert clearances([mesh_of(box(0.1, 0.1, 0.1, (way, 0, 0.05)))], walled)[0] == pytest.approx(-way, abs=2e-7)
+    assert clearances([mesh_of(box(0.1, 0.1, 0.1, (-1e-6, 0, 0.051)))], walled)[0] == pytest.approx(0.001, abs=1e-9)
 
 
 def test_what_encloses_no_body_stands_for_its_hull():

@@ -107,6 +107,17 @@ def test_what_is_hooked_to_nothing_is_left_where_it_is():
     assert np.array_equal(touch_down(HOOK, T, LEVEL), T)
 
 
+@pytest.mark.parametrize("deep_m", [1e-6, 3e-5])
+def test_what_touches_a_wall_is_not_lifted_onto_it(deep_m):
+    walled = ground_of(table_of(box(1.4, 1.4, 0.03, (0, 0, -0.015)), box(0.02, 1.4, 0.15, (0.69, 0, 0.075))))
+    T = translation(0.68 - 0.05 + deep_m, 0.0, walled.table.top.height_m + 0.05)
+    assert gap_m(CUBE, T, walled) == pytest.approx(-deep_m, abs=2e-7)
+    lifted = translation(0.0, 0.0, 0.002) @ T
+    for begun in (T, lifted):
+        assert touch_down(CUBE, begun, walled) == pytest.approx(T, abs=1e-9)
+    assert support_of(CUBE, T, walled, FRICTION).residual < 1e-6
+
+
 def held(start: ObjectStart, T: np.ndarray, ground: Ground = LEVEL):
     return support_of(start, T, ground, FRICTION)
 
@@ -138,6 +149,14 @@ def test_a_hook_hangs_where_its_centre_of_mass_is_over_the_top_and_not_where_it_
     assert held(HOOK, hangs).residual < 1e-6
     assert held(HOOK, falls).margin_m == pytest.approx(0.005 + centre, abs=1e-6)
     assert held(HOOK, falls).residual > 0.05
+
+
+def test_what_only_touches_a_side_is_not_held_up_by_it():
+    """The force mu n up and n sideways that is nearest to the weight leaves 1 / sqrt(1 + mu^2) of it."""
+    support = held(CUBE, translation(0.75, 0.0, TOP - 0.02))
+    assert support.residual == pytest.approx(1.0 / math.sqrt(1.0 + FRICTION**2), rel=1e-3)
+    assert support.margin_m == pytest.approx(-0.1)
+    assert support.highest_m == pytest.approx(TOP, abs=1e-6)  # though there are contacts
 
 
 def test_nothing_is_held_in_the_air():

@@ -15,6 +15,7 @@ from workers.geometry.frames import pose, rotation_about, translation
 from workers.geometry.hull import convex_hull
 from workers.scene.dynamics import called_for
 from workers.scene.effect import EffectPlan
+from workers.scene.fall import fall
 from workers.scene.plan import plan_scene
 from workers.scene.settle import LEFT_ROOM, LEFT_TOP, Rest, settle, settle_scene
 from workers.scene.support import place_table
@@ -106,6 +107,34 @@ def test_one_that_falls_off_the_table_is_named_by_its_region():
     with pytest.raises(SettleError, match="region 4") as caught:
         settle_together(starts, TABLE, PHYSICS, (*ALL, "table_mesh"))
     assert caught.value.reason == "left_table"
+
+
+@pytest.mark.parametrize(("deep_m", "refused"), [(0.059, True), (0.002, True), (5e-5, False), (-1e-4, False)])
+def test_objects_that_begin_inside_one_another_are_refused_and_not_thrown_apart(deep_m, refused):
+    starts = [start_of(CUBE, 0, 0, 0.031), dataclasses.replace(start_of(CUBE, 0.06 - deep_m, 0.0, 0.031), region_id=4)]
+    if refused:
+        with pytest.raises(SettleError, match=f"regions 3 and 4 begin {deep_m * 1e3:.2f} mm") as caught:
+            settle_together(starts, TABLE, PHYSICS, ALL)
+        assert caught.value.reason == "objects_overlap"
+    else:
+        rest = settle_together(starts, TABLE, PHYSICS, ALL)
+        assert rest[1].T_world_obj[0, 3] == pytest.approx(0.06 - deep_m, abs=1e-3)
+
+
+@pytest.mark.parametrize(("height_m", "side_m", "way_m"), [(0.02, 0.06, 1e-4), (0.3, 0.06, 6e-4), (0.3, 0.006, 3e-4)])
+def test_steps_are_as_fine_as_the_highest_fall_and_the_thinnest_object_ask(height_m, side_m, way_m, monkeypatch):
+    """0.1 mm, or 0.002 of the fall if that is more, or 0.05 of the thinnest if that is less."""
+    seen = []
+
+    def told(*arguments):
+        seen.append(arguments[4])
+        return fall(*arguments)
+
+    monkeypatch.setattr("workers.scene.together.fall", told)
+    small = asset_of(box(side_m, side_m, side_m))
+    starts = [start_of(CUBE, 0, 0, 0.031), start_of(small, 0.2, 0.0, height_m + side_m / 2)]
+    settle_together(starts, TABLE, PHYSICS, ALL)
+    assert [(pace.slowest_hz, pytest.approx(pace.way_m)) for pace in seen] == [(PHYSICS.step_hz, way_m)]
 
 
 def test_what_does_not_rest_in_time_says_so():
