@@ -40,6 +40,10 @@ depth over the step: with 0.2 things that roll over edges gain energy, with 0.4 
 BOUNCE_REPAIR = 0.005
 """The same while things bounce, which they do from where they overlap by a step's way: it throws them up by so much less."""
 
+ROUND_TO = 8
+"""Decimals of a collision shape's vertices, metres. Where more than three lie in a plane but for the last bits, Bullet's own
+hull leaves out some that are in it."""
+
 NO_THRESHOLD = 1e18
 """Bullet's own: contacts count as soon as they are foreseen."""
 
@@ -148,7 +152,7 @@ def open_world(
         things.append(_add_mesh(client, ground) if isinstance(ground, Mesh) else _add_slab(client, ground))
         _set_surface(client, things[0], physics, Body(0.0, np.zeros(3), (), 0.0, rolls=False))
         for body, T_world_body in placed:
-            things.append(_add_body(client, body, T_world_body))
+            things.append(_add_body(client, body, T_world_body[:3, :3] if len(placed) == 1 else None))
             _set_surface(client, things[-1], physics, body)
             _place(client, things[-1], T_world_body)
         world = World(client, things[0], tuple(things[1:]), steps)
@@ -249,23 +253,27 @@ def _add_mesh(client: int, mesh: Mesh) -> int:
     return pybullet.createMultiBody(0, shape, physicsClientId=client)
 
 
-def _add_body(client: int, body: Body, T_world_body: Pose) -> int:
-    """The body, its shape given to Bullet in the world's axes.
+def _add_body(client: int, body: Body, R_world_body: Array | None) -> int:
+    """The body, its shape given to Bullet in the world's axes where `R_world_body` [3, 3] says how these lie.
 
     Bullet's hulls are made on a grid of a ten-thousandth of their size along each axis, some 20 micrometres, on which only
-    the outermost vertices are where they belong. Those are, in the world's axes, the ones that the body stands on.
+    the outermost vertices are where they belong. Those are, in the world's axes, the ones that the body stands on. But a
+    shape with axes of its own is a compound to Bullet, and compounds do not stay as well on one another.
     """
-    R = T_world_body[:3, :3]
-    back = quaternion_of(R.T).tolist()
-    if len(body.parts) == 1:
+    parts = [np.round(part if R_world_body is None else part @ R_world_body.T, ROUND_TO) for part in body.parts]
+    orientation = [0.0, 0.0, 0.0, 1.0] if R_world_body is None else quaternion_of(R_world_body.T).tolist()
+    if len(parts) > 1:
+        shape = _compound(client, parts, orientation)
+    elif R_world_body is None:
+        vertices = _NUMBERS.vertices(parts[0])
+        shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client)
+    else:
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_MESH,
-            vertices=_NUMBERS.vertices(body.parts[0] @ R.T),
-            collisionFrameOrientation=back,
+            vertices=_NUMBERS.vertices(parts[0]),
+            collisionFrameOrientation=orientation,
             physicsClientId=client,
         )
-    else:
-        shape = _compound(client, [part @ R.T for part in body.parts], back)
     thing: int = pybullet.createMultiBody(body.mass_kg, shape, physicsClientId=client)
     pybullet.changeDynamics(thing, -1, localInertiaDiagonal=body.moments.tolist(), physicsClientId=client)
     return thing

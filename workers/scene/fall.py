@@ -27,10 +27,6 @@ millimetre any more."""
 FINEST = 16
 """A step is this many times shorter than the longest at most."""
 
-ROUND_TO = 8
-"""Decimals of a collision shape's vertices, metres. Where more than three lie in a plane but for the last bits, Bullet's own
-hull leaves out some that are in it: things then sank into the ground by 20 micrometres."""
-
 TOUCHDOWN_S = 0.005
 """So long, from `SKIPPED_TO_M` above the ground, steps are the shortest: what lands flat then stops at once, and no later
 step would mend how deep it went."""
@@ -106,7 +102,7 @@ def make_faller(
     shapes, margin = [each.vertices for each in smaller], min(each.inset_m for each in smaller) + SLOP_M
     to_body = invert(T_obj_body)
     reach = float(np.linalg.norm(transform(to_body, start.hull.vertices), axis=1).max())
-    parts = tuple(np.round(transform(to_body, each), ROUND_TO) for each in shapes)
+    parts = tuple(transform(to_body, each) for each in shapes)
     body = Body(start.asset.mass.mass_kg, moments, parts, margin, rolls, damping)
     return Faller(body, T_obj_body, reach)
 

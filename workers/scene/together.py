@@ -1,6 +1,5 @@
 """Several objects that fall together, onto the table and onto one another."""
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Collection, Sequence
@@ -56,10 +55,6 @@ def settle_together(
         flat = False
         motion = release_together(starts, poses, table, physics, ran, flat)
     _require_rest(starts, table, motion)
-    # Once more from there: their shapes are then given to Bullet as they lie, to the micrometre.
-    again = release_together(starts, motion.poses, table, physics, ran, flat)
-    _require_rest(starts, table, again)
-    motion = dataclasses.replace(again, seconds=motion.seconds)
     return _describe(starts, table, motion, physics, "flat_top" if flat else "mesh")
 
 
