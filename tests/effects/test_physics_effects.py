@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import trimesh
 
 from schemas.errors import SettleError
 from schemas.scene import ObjectStart
@@ -14,6 +15,7 @@ from tests.effects.scenes import Setting, facts_of
 from tests.hard_cases.bodies import built_in, cube, mug_on_peg, over_edge, rod
 from tests.hard_cases.drops import EDGE_M, X, Y, drop, level, lowered, ring, turn
 from tests.hard_cases.measures import Z
+from tests.shapes import asset_of
 from workers.geometry.frames import transform
 from workers.geometry.heights import survey
 from workers.scene.clearance import clearances
@@ -205,3 +207,21 @@ def test_all_approximations_at_once_leave_a_default_scene_where_it_is():
     for number in range(3):
         facts = facts_of(Setting({"categories": ["mug", "box", "bottle"]}, scene_id=number))
         assert is_still(moved_when_forced(facts, *names))
+
+
+@pytest.mark.xfail(strict=True, reason="Bullet throws up some convex bodies that rest on a table's mesh")
+def test_the_hull_of_a_laptop_at_rest_stays_on_the_tables_mesh():
+    """As one convex body, by the plan that every convex body on a mesh has: it comes to lie half a metre away."""
+    facts = facts_of(Setting({"categories": ["laptop"], "start": {"pose": "tumbled"}}, scene_id=1))
+    (start,) = facts.plan.objects
+    whole = asset_of(trimesh.convex.convex_hull(start.asset.shape.vertices))
+    hull = replace(start, asset=replace(whole, mass=start.asset.mass))
+    facts = replace(facts, plan=replace(facts.plan, objects=(hull,)))
+    assert moved_when_forced(facts, "table_mesh")[0] <= 1.0
+
+
+@pytest.mark.xfail(strict=True, reason="as one hull on the mesh it rocks beyond the bound; not yet known why")
+def test_a_jar_on_its_side_stays_under_the_tables_mesh_within_the_bounds():
+    """As its hull it turns by 0.06 degrees; as its convex parts by 0.009."""
+    facts = facts_with(drop(built_in("jar"), level(), R=turn(X, 90)))
+    assert is_still(moved_when_forced(facts, "table_mesh"))
