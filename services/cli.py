@@ -179,6 +179,12 @@ def _add_bench(commands: "argparse._SubParsersAction") -> None:
         metavar="PYTHON",
         help="time the path-traced tier instead, beside Blender's Cycles where PYTHON (default: this one) has bpy",
     )
+    bench.add_argument(
+        "--effects",
+        type=_count,
+        metavar="N",
+        help="time settling instead: N scenes by their plan of effects, and with every effect of physics forced",
+    )
     bench.set_defaults(handler="services.bench.command:main")
 
 

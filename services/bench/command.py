@@ -11,6 +11,7 @@ from typing import Any
 from schemas.errors import InputError
 from schemas.job import Job
 from schemas.start import ONE_OBJECT
+from services.bench.effects import measure_effects
 from services.bench.measure import bench_folder, measure
 from services.bench.others import other_systems
 from services.bench.report import describe, summarise
@@ -22,6 +23,9 @@ from workers.store.mounts import file_system_of
 def main(options: argparse.Namespace) -> int:
     """Measure what the options ask for; 0, or an error where a side cannot be run at all."""
     job, job_folder = _job(options)
+    if options.effects is not None:
+        return measure_effects(options, job, job_folder)
+    refuse_unmatched(job)
     with bench_folder(options.folder) as folder:
         if options.pathtraced is not None:
             return measure_traced(options, job, job_folder, folder)
@@ -43,7 +47,7 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _job(options: argparse.Namespace) -> tuple[Job, Path]:
-    """The job to measure, and where its relative folders are resolved from. Raises InputError for tars."""
+    """The job to measure, and where its relative folders are resolved from."""
     if options.job is None:
         tree: dict[str, Any] = {"name": "bench"}
         for change in options.changes:
@@ -51,14 +55,13 @@ def _job(options: argparse.Namespace) -> tuple[Job, Path]:
         job, folder = validate_job(tree, "the default job"), Path()
     else:
         job, folder = load_job(options.job, options.changes), options.job.parent
-    if job.output.layout != "files":
-        raise InputError(f"output.layout is {job.output.layout!r}: the benchmark compares files, leave it at 'files'")
-    refuse_unmatched(job)
     return job, folder
 
 
 def refuse_unmatched(job: Job) -> None:
-    """Raises InputError for a job whose scenes the straightforward script does not make."""
+    """Raises InputError for a job whose scenes the straightforward script does not make, or that is stored in tars."""
+    if job.output.layout != "files":
+        raise InputError(f"output.layout is {job.output.layout!r}: the benchmark compares files, leave it at 'files'")
     if job.objects_per_scene != ONE_OBJECT:
         raise InputError("objects_per_scene is not 1: the benchmark compares scenes of one object, leave it at 1")
     switches = {

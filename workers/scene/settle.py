@@ -47,6 +47,9 @@ DROP_SHARE = 0.002
 THIN_SHARE = 0.05
 """Of the thinnest object: how far a point may go in a step."""
 
+ON_MESH = ("table_mesh", "decomposition")
+"""Effects that are called for together where a footprint left the flat top."""
+
 LEFT_TOP = "a footprint left the table's flat top"
 LEFT_ROOM = "an object left the room that it had to itself"
 
@@ -125,6 +128,7 @@ def settle(
         motion = _settle_flat(task)
         if motion is not None:
             return _describe(task, motion, "flat_top")
+        task = dataclasses.replace(task, ran=(*ran, *ON_MESH))
     motion = _simulate(task, physics.max_settle_s, flat=False)
     _require_rest(task, motion)
     return _describe(task, motion, "mesh")
@@ -163,7 +167,7 @@ def recheck(start: ObjectStart, settled: Settled, table: Table, physics: Physics
 
     For `RECHECK_S`, in the finest steps, on the ground that it came to rest on. Nothing is corrected afterwards.
     """
-    ran = called_for((start,), table, physics)
+    ran = called_for((start,), table, physics) | set(ON_MESH if settled.support == "mesh" else ())
     return moved_by(start, settled.T_world_obj, _let_go(start, settled, table, physics, ran, RECHECK_S))
 
 
@@ -274,12 +278,12 @@ def _simulate(task: _Task, seconds: float, flat: bool) -> Fall:
     """Drop the object onto the flat top or the mesh; a watch happens where its footprint leaves the flat top.
 
     What stands on a level plane touches it with few of its vertices as long as it does not tip, and Bullet's time goes
-    with their number. So it falls with these alone, and falls again with all of them should it tip. On the mesh it falls as
-    its convex parts.
+    with their number. So it falls with these alone, and falls again with all of them should it tip. Where `decomposition`
+    runs it falls as its convex parts, else as its hull.
     """
     start, table = task.start, task.ground.table
     cut: Sequence[Array] = ()
-    if not flat and not is_convex(start):
+    if "decomposition" in task.ran and not is_convex(start):
         parts = convex_parts(start.asset.shape.mesh, start.asset.sha256)
         cut = parts if len(parts) > 1 else ()
     faller = make_faller(start, task.physics, "rolling_friction" in task.ran, task.damping, cut)
@@ -301,7 +305,7 @@ def _simulate(task: _Task, seconds: float, flat: bool) -> Fall:
         return motion
 
     down = -T_world_body[2, :3]
-    if flat and stands_on_face(faller.body.parts[0], down):
+    if flat and not cut and stands_on_face(faller.body.parts[0], down):
         vertices = faller.body.parts[0]
         motion = drop(faller.only(vertices[can_touch(vertices, down)]), watch_tilt(T_world_body))
         if motion.happened != 2:

@@ -1,0 +1,190 @@
+"""`verso bench --effects N`: what settling takes by each scene's own plan of effects, and with what the plan leaves out."""
+
+import argparse
+import json
+import shlex
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from schemas.base import Array
+from schemas.errors import RunError, SceneError
+from schemas.job import Job
+from services.bench.machine import describe_machine, pinned
+from services.bench.ratios import Spread
+from workers.assets.catalogue import open_catalogue
+from workers.context import WorkerContext, settings_digest
+from workers.render.gbuffer import shared_renderer
+from workers.scene.dynamics import PHYSICS_EFFECTS, called_for
+from workers.scene.effect import EffectPlan, Facts
+from workers.scene.effects import plan_effects
+from workers.scene.settle import settle_scene
+from workers.scene_steps import plan_with_assets
+
+ROUNDS = 3
+"""Each scene is settled so often in each way, after once in each way that fills the caches."""
+
+EFFECTS = tuple(effect.name for effect in PHYSICS_EFFECTS if effect.kind == "approximation")
+
+PLAN, WHOLE, EVERYTHING = "plan", "all but decomposition", "all"
+"""Names of what is timed: by the plan, and with every approximation forced, once as hulls and once as convex parts."""
+
+FORCED: dict[str, frozenset[str]] = {
+    PLAN: frozenset(),
+    WHOLE: frozenset(EFFECTS) - {"decomposition"},
+    EVERYTHING: frozenset(EFFECTS),
+    **{name: frozenset({name}) for name in EFFECTS},
+}
+"""What is forced, by name; an effect's own name stands for the plan and that effect."""
+
+
+@dataclass(frozen=True, eq=False)
+class Timed:
+    """Seconds of processor by what was forced, [rounds, scenes]: nan where the plan has the effect, or settling failed."""
+
+    seconds: Mapping[str, Array]
+    failed: Mapping[str, int]
+
+
+def measure_effects(options: argparse.Namespace, job: Job, job_folder: Path) -> int:
+    """Time the job's first scenes, print and answer in JSON. Raises RunError where none of them settles."""
+    with pinned() as core:
+        catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
+        renderer = shared_renderer()
+        context = WorkerContext(job, catalogue, renderer, settings_digest(job, catalogue.digest))
+        timed = time_settling(_draw(context, options.effects), ROUNDS)
+        figures = {
+            "ok": True,
+            "command": shlex.join(["verso", *sys.argv[1:]]),
+            "job": job.name,
+            "machine": describe_machine(renderer.name),
+            "core": core,
+            **summarise(timed),
+        }
+    print("\n".join(describe(figures)), flush=True)
+    if options.json:
+        print(json.dumps(figures))
+    return 0
+
+
+def _draw(context: WorkerContext, count: int) -> list[Facts]:
+    """The first scenes as they are drawn, those that can be."""
+    drawn = []
+    for scene_id in range(context.job.first_scene, context.job.first_scene + count):
+        try:
+            drawn.append(Facts(context.job, plan_with_assets(context, scene_id), raycast_checked=False))
+        except SceneError:
+            continue
+    return drawn
+
+
+def time_settling(scenes: Sequence[Facts], rounds: int) -> Timed:
+    """Settle each scene in each way in turn. Raises RunError where no scene settles by plan and with all forced."""
+    seconds = {name: np.full((rounds + 1, len(scenes)), np.nan) for name in FORCED}
+    failed = dict.fromkeys(FORCED, 0)
+    for lap in range(rounds + 1):
+        for number, facts in enumerate(scenes):
+            for name, forced in FORCED.items():
+                if lap and np.isnan(seconds[name][0, number]):
+                    continue
+                plan = plan_effects(facts, forced)
+                if name in EFFECTS and name not in plan_effects(facts).skipped:
+                    continue
+                took = _settle_s(facts, plan, by_plan=name not in (WHOLE, EVERYTHING))
+                failed[name] += took is None
+                seconds[name][lap, number] = np.nan if took is None else took
+    timed = {name: found[1:] for name, found in seconds.items()}
+    if not _compared(timed).any():
+        raise RunError(f"none of {len(scenes)} scenes comes to rest both by its plan and with every effect forced")
+    return Timed(timed, failed)
+
+
+def _settle_s(facts: Facts, plan: EffectPlan, by_plan: bool) -> float | None:
+    """Seconds of processor, those for choosing the effects included `by_plan`; None where it does not come to rest."""
+    scene, physics = facts.plan, facts.job.physics
+    began = time.process_time()
+    if by_plan:
+        called_for(scene.objects, scene.table, physics)
+    try:
+        settle_scene(scene, physics, plan)
+    except SceneError:
+        return None
+    return time.process_time() - began
+
+
+def _compared(seconds: Mapping[str, Array]) -> Array:
+    """[scenes] bool: those that settle by plan and with all forced."""
+    return ~np.any([np.isnan(seconds[name]).any(axis=0) for name in (PLAN, WHOLE, EVERYTHING)], axis=0)
+
+
+def summarise(timed: Timed) -> dict[str, Any]:
+    """Milliseconds a scene, the share of all scenes' time that the plan saves, and what each effect would cost."""
+    seconds, both = timed.seconds, _compared(timed.seconds)
+    plan = seconds[PLAN][:, both]
+    forced = {}
+    for name in (WHOLE, EVERYTHING):
+        own = seconds[name][:, both]
+        forced[name] = {
+            **_side(own),
+            "saved": asdict(Spread.of([float(1.0 - a.sum() / b.sum()) for a, b in zip(plan, own, strict=True)])),
+        }
+    return {
+        "scenes": int(both.sum()),
+        "rounds": len(plan),
+        "plan": _side(plan),
+        "forced": forced,
+        "effects": {name: _cost(seconds[name], seconds[PLAN]) for name in EFFECTS},
+        "failed": dict(timed.failed),
+    }
+
+
+def _side(seconds: Array) -> dict[str, float]:
+    """Of seconds [rounds, scenes]: over scenes, each scene's being its median over rounds."""
+    each = np.median(seconds, axis=0) * 1e3
+    return {"median_ms": float(np.median(each)), "mean_ms": float(each.mean())}
+
+
+def _cost(own: Array, plan: Array) -> dict[str, Any]:
+    """How much longer scenes take that leave an effect out when it is forced, alone; None where there are none."""
+    both = ~(np.isnan(own) | np.isnan(plan)).any(axis=0)
+    more = [float(a.mean() * 1e3) for a in (own - plan)[:, both]] if both.any() else []
+    return {"scenes": int(both.sum()), "more_ms": asdict(Spread.of(more)) if more else None}
+
+
+def describe(figures: dict[str, Any]) -> list[str]:
+    """The same for a reader, one line each."""
+    machine = figures["machine"]
+    lines = [
+        f"machine    {machine['cpu']}, load {machine['load_1min']:.1f}",
+        f"command    {figures['command']}",
+        f"measured   settling of {figures['scenes']} scenes, {figures['rounds']} times in each way in turn on core "
+        f"{figures['core']}, caches warm; ms of processor a scene, median (mean)",
+        "",
+        f"{'by the plan':34} {_ms(figures['plan'])}",
+    ]
+    for name, side in figures["forced"].items():
+        saved = side["saved"]
+        lines.append(
+            f"{name + ' forced':34} {_ms(side)}   the plan saves {saved['median']:.1%} "
+            f"[{saved['least']:.1%} to {saved['most']:.1%}]"
+        )
+    for name, cost in figures["effects"].items():
+        lines.append(f"  {'plan and ' + name:32} {_more(cost)}")
+    failed = [f"{name} {count}" for name, count in figures["failed"].items() if count]
+    return [*lines, f"did not come to rest: {', '.join(failed) or 'none'}"]
+
+
+def _ms(side: Mapping[str, float]) -> str:
+    return f"{side['median_ms']:8.1f} ({side['mean_ms']:.1f})"
+
+
+def _more(cost: Mapping[str, Any]) -> str:
+    if cost["more_ms"] is None:
+        return "every scene calls for it"
+    more = cost["more_ms"]
+    return f"{more['median']:+8.1f} [{more['least']:+.1f} to {more['most']:+.1f}] a scene, in {cost['scenes']} scenes"

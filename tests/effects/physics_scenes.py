@@ -1,0 +1,80 @@
+"""Scenes for effects of physics: objects and a table in a drawn scene's place, settled with effects left out or forced."""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cache
+
+from schemas.base import Pose
+from schemas.scene import ScenePlan, Settled
+from services.audit_motion import MOST_DEG, MOST_MM
+from tests.effects.scenes import Setting, facts_of
+from tests.hard_cases.drops import Drop
+from workers.scene.effect import EffectPlan, Facts
+from workers.scene.effects import plan_effects
+from workers.scene.fall import Fall, Pace, fall, make_faller
+from workers.scene.settle import Rest, moved_by, release_again, settle_scene
+from workers.scene.watch import watch_gone
+
+RELEASE_S = 1.0
+
+
+@cache
+def _drawn() -> Facts:
+    return facts_of(Setting({}))
+
+
+def facts_with(*cases: Drop) -> Facts:
+    """A scene of the default physics with these objects, on the first one's table."""
+    objects = tuple(dataclasses.replace(case.start, region_id=3 + k) for k, case in enumerate(cases))
+    plan: ScenePlan = dataclasses.replace(_drawn().plan, objects=objects, table=cases[0].table)
+    return dataclasses.replace(_drawn(), plan=plan)
+
+
+def without(effects: EffectPlan, *names: str) -> EffectPlan:
+    """The plan with effects left out, whether called for or not."""
+    left_out = dict.fromkeys(names, "left out by a test")
+    return EffectPlan(tuple(name for name in effects.ran if name not in names), {**effects.skipped, **left_out})
+
+
+def settled(facts: Facts, effects: EffectPlan | None = None) -> Rest:
+    """The scene at rest, by its own plan or another. Raises SettleError."""
+    return settle_scene(facts.plan, facts.job.physics, plan_effects(facts) if effects is None else effects)
+
+
+def moved_when_forced(facts: Facts, *names: str) -> tuple[float, float]:
+    """(mm, degrees) that the most any object of the scene, settled by its plan, moves and turns with effects forced."""
+    rest, forced = settled(facts), plan_effects(facts, frozenset(names))
+    return moved_under(facts, rest.settled, EffectPlan((*forced.ran, *rest.called), forced.skipped))
+
+
+def moved_from(facts: Facts, poses: Sequence[Pose], effects: EffectPlan) -> tuple[float, float]:
+    """The same from poses that nothing came to rest in."""
+    rests = [Settled(T, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "flat_top") for T in poses]
+    return moved_under(facts, rests, effects)
+
+
+def moved_under(facts: Facts, rests: Sequence[Settled], effects: EffectPlan) -> tuple[float, float]:
+    """Released where they rest for `RELEASE_S` under these effects."""
+    poses = release_again(facts.plan, rests, facts.job.physics, effects, RELEASE_S)
+    moved = [
+        moved_by(start, before.T_world_obj, after)
+        for start, before, after in zip(facts.plan.objects, rests, poses, strict=True)
+    ]
+    return max(mm for mm, _ in moved), max(degrees for _, degrees in moved)
+
+
+def is_still(moved: tuple[float, float]) -> bool:
+    """Whether a motion (mm, degrees) is within what an approximation may change."""
+    return moved[0] <= MOST_MM and moved[1] <= MOST_DEG
+
+
+def drop_on(case: Drop, slab: bool) -> Fall:
+    """The object dropped by the simulator alone, as its hull, onto a level without end or onto the table's mesh.
+
+    For 3 s, or until it is 0.2 m below the top.
+    """
+    physics = _drawn().job.physics
+    ground = case.table.top.height_m if slab else case.table.mesh
+    pace = Pace(physics.step_hz, physics.way_mm / 1e3)
+    faller, gone = make_faller(case.start, physics, True), watch_gone(case.table.top.height_m - 0.2)
+    return fall([faller], [case.start.T_world_obj], ground, physics, pace, 3.0, 0.0, [gone])
