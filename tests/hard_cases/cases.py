@@ -36,7 +36,7 @@ from tests.hard_cases.drops import (
 from tests.hard_cases.groups import leaning_on_a_wall
 from tests.hard_cases.measures import Z, flat, gap, height, leaning, shift, tilt
 from tests.hard_cases.mesh_cases import OUTSIDE
-from tests.hard_cases.rolling_cases import ONE_POINT, ROLLING, SMOOTH, SPINS
+from tests.hard_cases.rolling_cases import ROLLING, SMOOTH, SPINS
 from tests.shapes import asset_of, box
 
 
@@ -202,13 +202,12 @@ SURFACES = (
 
 MISSES = {
     "can spun upright at 200 rad/s": "its rim goes 0.4 mm in the shortest step, over sides 4 mm wide: it falls over",
-    "can spun lying at 50 rad/s": ONE_POINT,
+    "cube leaning against the wall of a tray": "it slides down the wall in the steps that production takes, and leans there in "
+    "steps of 1/960 s: not understood",
 }
 """Cases that the program does not meet yet, and why."""
 
 MOVES = {
-    "cube leaning against the wall of a tray": "it slips by 0.26 mm and 0.25 degrees: the correction lifts it off its edge by "
-    "26 um, and leaves it 30 um in the wall",
     "mug hung by its handle on a peg at the edge": "convex parts stand 2 mm out of the handle's inner side: once it is set "
     "down on the peg they overlap it, and throw the mug off",
 }

@@ -9,11 +9,6 @@ from tests.shapes import asset_of, box
 SMOOTH = {"friction": 0.0, "rolling_friction": 0.0, "spinning_friction": 0.0}
 NO_ROLLING = {"rolling_friction": 0.0}
 
-ONE_POINT = (
-    "under what is round and spins fast Bullet keeps one point of contact, in the middle: of friction only that "
-)
-ONE_POINT += "against spinning slows it, a tenth of what there should be, and it still spins after 8 s"
-
 ROLLING = (
     Case("can lying", SETTLE, gap(), lambda: drop(built_in("can"), level(), R=turn(X, 90) @ turn(Z, 1))),
     Case(

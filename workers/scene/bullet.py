@@ -15,7 +15,7 @@ from schemas.errors import SettleError
 from schemas.job import Physics
 from schemas.shape import Mesh
 from workers.scene.quiet import silence_c_stderr
-from workers.scene.watch import Motion
+from workers.scene.watch import SAME_PLANE_M, Motion
 
 with silence_c_stderr():
     import pybullet
@@ -152,7 +152,8 @@ def open_world(
         things.append(_add_mesh(client, ground) if isinstance(ground, Mesh) else _add_slab(client, ground))
         _set_surface(client, things[0], physics, Body(0.0, np.zeros(3), (), 0.0, rolls=False))
         for body, T_world_body in placed:
-            things.append(_add_body(client, body, T_world_body[:3, :3] if len(placed) == 1 else None))
+            level = len(placed) == 1 and _lies_flat(body, T_world_body)
+            things.append(_add_body(client, body, T_world_body[:3, :3] if level else None))
             _set_surface(client, things[-1], physics, body)
             _place(client, things[-1], T_world_body)
         world = World(client, things[0], tuple(things[1:]), steps)
@@ -251,6 +252,12 @@ def _add_mesh(client: int, mesh: Mesh) -> int:
         physicsClientId=client,
     )
     return pybullet.createMultiBody(0, shape, physicsClientId=client)
+
+
+def _lies_flat(body: Body, T_world_body: Pose) -> bool:
+    """Whether at least three vertices of the body are its lowest."""
+    height = np.concatenate(body.parts) @ T_world_body[2, :3]
+    return bool(np.count_nonzero(height <= height.min() + SAME_PLANE_M) >= 3)
 
 
 def _add_body(client: int, body: Body, R_world_body: Array | None) -> int:

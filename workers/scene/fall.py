@@ -61,9 +61,9 @@ class Pace:
     slowest_hz: float
     way_m: float
 
-    def rate(self, speed_m_s: float, time_s: float = math.inf) -> float:
-        """Steps a second for the fastest point's speed: `slowest_hz` times a power of two, the highest at touchdown."""
-        if math.isfinite(self.way_m) and time_s < TOUCHDOWN_S:
+    def rate(self, speed_m_s: float, lands: bool = False) -> float:
+        """Steps a second for the fastest point's speed: `slowest_hz` times a power of two, the highest where it `lands`."""
+        if math.isfinite(self.way_m) and lands:
             return FINEST * self.slowest_hz
         rate = self.slowest_hz
         while speed_m_s > rate * self.way_m and rate < FINEST * self.slowest_hz:
@@ -125,11 +125,12 @@ def fall(
     fallen = min(max(0.0, free_m - SKIPPED_TO_M), GRAVITY_M_S2 * seconds**2 / 2)
     lowered = [_lowered(T, fallen) @ f.T_obj_body for T, f in zip(poses, fallers, strict=True)]
     speed = math.sqrt(2.0 * GRAVITY_M_S2 * fallen)
+    touchdown = TOUCHDOWN_S if fallen > 0.0 else 0.0
     placed = [(f.body, T) for f, T in zip(fallers, lowered, strict=True)]
     with open_world(placed, ground, physics, SAMPLE_STEPS) as world:
         for number in range(len(fallers)):
             world.push((0.0, 0.0, -speed), body=number)
-        found = _run(world, fallers, physics, pace, seconds - speed / GRAVITY_M_S2, watches)
+        found = _run(world, fallers, physics, pace, seconds - speed / GRAVITY_M_S2, watches, touchdown)
     ended = tuple(T @ invert(f.T_obj_body) for T, f in zip(found.poses, fallers, strict=True))
     return dataclasses.replace(found, poses=ended, seconds=found.seconds + speed / GRAVITY_M_S2)
 
@@ -156,6 +157,7 @@ def _run(
     pace: Pace,
     seconds: float,
     watches: Sequence[Watch],
+    touchdown_s: float,
 ) -> Fall:
     """Step until everything rests, the time is over, or something that was watched for happens.
 
@@ -172,7 +174,7 @@ def _run(
     time, rate, bounces = 0.0, physics.step_hz * 1.0, physics.restitution > 0.0
     speeds = _speeds(world, fallers)
     while True:
-        wanted = pace.rate(max(speeds), time)
+        wanted = pace.rate(max(speeds), time < touchdown_s)
         if bounces and max(speeds) < BOUNCES_M_S:
             world.bounce(0.0)
             bounces, rate = False, 0.0

@@ -13,7 +13,7 @@ from tests.shapes import asset_of, box
 from workers.geometry.frames import pose, transform, translation, uniform_rotation
 from workers.geometry.hull import convex_hull
 from workers.scene.bullet import GRAVITY_M_S2, SLOP_M, quaternion_of
-from workers.scene.fall import FINEST, ROUND_TO, SKIPPED_TO_M, Faller, Pace, as_pose, fall, make_faller
+from workers.scene.fall import FINEST, SKIPPED_TO_M, Faller, Pace, as_pose, fall, make_faller
 
 PHYSICS = Job(name="t").physics
 MARGIN_M = PHYSICS.margin_mm / 1e3
@@ -90,8 +90,8 @@ def test_the_shape_with_its_margin_lies_in_the_hull_and_touches_its_planes_but_f
         normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         inside = (start.hull.vertices @ normals.T).max(axis=0) - (vertices @ normals.T).max(axis=0)
         beyond = faller.body.margin_m - SLOP_M - inside
-        assert beyond.max() < 3.0 * 10.0**-ROUND_TO
-        assert not tight or beyond.min() > -3.0 * 10.0**-ROUND_TO
+        assert beyond.max() < 1e-9
+        assert not tight or beyond.min() > -1e-9
     assert faller.body.margin_m == pytest.approx(MARGIN_M)
 
 
@@ -101,14 +101,6 @@ def test_a_plate_thinner_than_four_margins_gets_a_margin_of_a_quarter_of_its_thi
     assert faller.body.margin_m == pytest.approx(0.0002 / 4 + SLOP_M)
     half = transform(faller.T_obj_body, faller.body.parts[0])[:, 2].max()
     assert half == pytest.approx(0.0001 - 0.0002 / 4, abs=1e-8)
-
-
-@pytest.mark.parametrize("name", SHAPES)
-def test_vertices_are_rounded_so_that_those_of_one_plane_stay_in_it(name):
-    """Every coordinate is a multiple of 10 nm; Bullet reads doubles."""
-    _, faller = faller_of(name)
-    scaled = faller.body.parts[0] * 10.0**ROUND_TO
-    assert scaled == pytest.approx(np.round(scaled), abs=1e-6)
 
 
 def test_parts_become_parts_of_one_body_with_one_margin_about_the_centre_of_mass_of_all():
