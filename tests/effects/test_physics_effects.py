@@ -18,12 +18,12 @@ from tests.hard_cases.measures import Z
 from tests.shapes import asset_of
 from workers.geometry.frames import transform
 from workers.geometry.heights import survey
+from workers.scene.alone import settle_alone
 from workers.scene.clearance import clearances
 from workers.scene.dynamics import PHYSICS_EFFECTS
 from workers.scene.effect import Facts
 from workers.scene.effects import plan_effects
 from workers.scene.landing import gap_m, ground_of, placed_mesh
-from workers.scene.settle import settle
 
 GAP_MM = 0.1
 """The most that may be between a resting object and what it rests on, or that they may overlap."""
@@ -88,7 +88,7 @@ def test_without_object_contacts_the_cubes_of_a_stack_overlap_by_their_size():
     plan, physics, effects = facts.plan, facts.job.physics, plan_effects(facts)
     assert effects.runs("object_contacts")
     alone = without(effects, "object_contacts").ran
-    through = [settle(start, plan.table, physics, alone).T_world_obj for start in plan.objects]
+    through = [settle_alone(start, plan.table, physics, alone).T_world_obj for start in plan.objects]
     stacked = [rest.T_world_obj for rest in settled(facts).settled]
     gaps = [
         clearances([placed_mesh(s, T) for s, T in zip(plan.objects, poses, strict=True)], survey(plan.table.mesh))

@@ -17,10 +17,11 @@ from tests.hard_cases.group_cases import GROUPS, GroupCase
 from tests.hard_cases.group_measures import worst_gap_mm
 from tests.hard_cases.groups import Group
 from tests.hard_cases.test_hard_cases import GAP_MM, MOVED_MM, TURNED_DEG
+from workers.scene.alone import UNBALANCED
 from workers.scene.dynamics import called_for
 from workers.scene.effect import EffectPlan
 from workers.scene.plan import plan_scene
-from workers.scene.settle import UNBALANCED, moved_by, settle_scene
+from workers.scene.settle import moved_by, settle_scene
 from workers.scene.together import release_together
 
 PHYSICS = Job(name="t").physics

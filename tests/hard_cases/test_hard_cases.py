@@ -18,7 +18,8 @@ from tests.hard_cases.drops import Drop
 from tests.hard_cases.group_cases import GROUPS
 from tests.hard_cases.measures import gap_mm
 from tests.hard_cases.spin import spinning
-from workers.scene.settle import recheck, settle
+from workers.scene.alone import settle_alone
+from workers.scene.settle import recheck
 
 PHYSICS = Job(name="t").physics
 
@@ -38,7 +39,7 @@ def ending(case: Case) -> tuple[Drop | None, Settled | SceneError]:
     try:
         made = case.make()
         with spinning(case.spin):
-            return made, settle(made.start, made.table, PHYSICS.model_copy(update=case.physics))
+            return made, settle_alone(made.start, made.table, PHYSICS.model_copy(update=case.physics))
     except SceneError as error:
         return made, error
 

@@ -29,11 +29,12 @@ from workers.assets.catalogue import Catalogue, choose_object, choose_table, loa
 from workers.geometry.frames import rotation_from_quaternion, transform
 from workers.geometry.heights import heights_at
 from workers.scene import bullet
+from workers.scene.alone import settle_alone
 from workers.scene.bullet import World
 from workers.scene.fall import body_frame
 from workers.scene.plan import choose_category, plan_scene
 from workers.scene.randomness import Stream, stream
-from workers.scene.settle import recheck, settle
+from workers.scene.settle import recheck
 
 ENERGY_SHARE, ENERGY_LIFT_M = 1e-3, 2e-5
 """Mechanical energy may rise above its running minimum by the larger of this share of what the drop sets free, and of what
@@ -129,7 +130,7 @@ def try_scene(job: Job, catalogue: Catalogue, scene_id: int, again: bool) -> Out
         plan = draw(job, catalogue, scene_id)
         start = plan.objects[0]
         with watched_energy(plan.objects) as falls:
-            rest = settle(start, plan.table, job.physics)
+            rest = settle_alone(start, plan.table, job.physics)
     except SceneError as error:
         through = error.reason == "not_at_rest" and "-" in error.detail
         return Outcome(scene_id, category, f"{error.reason}: {error.detail}", through)

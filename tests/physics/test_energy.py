@@ -23,11 +23,11 @@ from tests.shapes import asset_of, box, table
 from workers.assets.procedural.make import make_asset
 from workers.geometry.frames import rotation_from_quaternion
 from workers.scene import bullet
+from workers.scene.alone import settle_alone
 from workers.scene.bullet import World
 from workers.scene.dynamics import called_for
 from workers.scene.fall import body_frame
 from workers.scene.plan import draw_start
-from workers.scene.settle import settle
 from workers.scene.support import place_table
 from workers.scene.together import settle_together
 
@@ -72,7 +72,7 @@ def worst_rise(category: str, start: str, seed: int, refine: int = 1) -> Rise:
     job = Job.model_validate({"name": "t", "seed": seed, "start": {"pose": start}})
     drawn = draw_start(job, seed, asset, TABLE)
     with watched([asset]) as falls:
-        settle(drawn, TABLE, physics(step_hz=960 * refine, way_mm=0.1 / refine))
+        settle_alone(drawn, TABLE, physics(step_hz=960 * refine, way_mm=0.1 / refine))
     return worst_of(falls(), asset.mass.mass_kg * G)
 
 
@@ -170,7 +170,7 @@ def test_what_spins_when_it_is_let_go_gains_no_energy(category, spin, record_fig
     asset = asset_for(category, 0)
     start = draw_start(Job(name="t"), 0, asset, TABLE)
     with watched([asset], spin) as falls, suppress(SettleError):  # some leave the table, and some spin for too long
-        settle(start, TABLE, physics(max_settle_s=1.0))
+        settle_alone(start, TABLE, physics(max_settle_s=1.0))
     rise = worst_of(falls(), asset.mass.mass_kg * G)
     outcome = "known miss" if max(spin) > 100.0 else "passed"
     record_figure(f"energy, {category} spun by {spin} rad/s: worst rise over its bound", outcome, rise.over_bound, 1)

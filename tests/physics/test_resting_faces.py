@@ -19,9 +19,9 @@ from tests.physics.room import PHYSICS, physics
 from tests.shapes import asset_of, box, table
 from workers.geometry.frames import pose, rotation_between, transform
 from workers.geometry.hull import convex_hull
+from workers.scene.alone import settle_alone
 from workers.scene.contact import DOWN, SAME_PLANE_M, support_margin
 from workers.scene.plan import draw_start
-from workers.scene.settle import settle
 from workers.scene.support import place_table
 
 TABLE = place_table(table())
@@ -117,7 +117,7 @@ def drop_many(asset: Asset, settings: Physics, first: int, drops: int) -> Array:
     normals = np.array([normal for normal, _ in predict_shares(asset).values()])
     counts = np.zeros(len(normals))
     for number in range(first, first + drops):
-        rest = settle(draw_start(job, number, asset, TABLE), TABLE, settings)
+        rest = settle_alone(draw_start(job, number, asset, TABLE), TABLE, settings)
         alike = normals @ (rest.T_world_obj[:3, :3].T @ DOWN)
         assert alike.max() > 1 - 1e-6  # it stands on a face that can be stood on
         counts[np.argmax(alike)] += 1

@@ -88,3 +88,18 @@ def angle_between(A: Array, B: Array) -> float:
     D = A.T @ B
     sine = 0.5 * np.linalg.norm([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
     return math.atan2(float(sine), 0.5 * (float(np.trace(D)) - 1.0))
+
+
+def quaternion_of(R: Array) -> Array:
+    """(x, y, z, w) of a rotation [3, 3], by the largest of the four components (Shepperd 1978)."""
+    trace = float(np.trace(R))
+    squares = np.array([R[0, 0], R[1, 1], R[2, 2], trace])
+    k = int(np.argmax(squares))
+    q = np.empty(4)
+    if k == 3:
+        q[:] = [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1.0 + trace]
+    else:
+        i, j, m = k, (k + 1) % 3, (k + 2) % 3
+        q[i] = 1.0 + 2.0 * R[i, i] - trace
+        q[j], q[m], q[3] = R[i, j] + R[j, i], R[i, m] + R[m, i], R[m, j] - R[j, m]
+    return q / np.linalg.norm(q)

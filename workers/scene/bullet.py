@@ -3,17 +3,18 @@
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.errors import SettleError
 from schemas.job import Physics
 from schemas.shape import Mesh
+from workers.geometry.frames import quaternion_of
+from workers.scene.lists import Numbers
 from workers.scene.quiet import silence_c_stderr
 from workers.scene.watch import SAME_PLANE_M, Motion
 
@@ -180,35 +181,7 @@ class _Use:
     worlds: int = 0
 
 
-@dataclass(frozen=True)
-class _Numbers:
-    """Python objects that are handed to PyBullet again and again.
-
-    PyBullet 3.2.7 takes a reference to each list of vertices or indices, and to each of their items, and never gives it
-    back (190 bytes a vertex). So it is given the same objects each time, with other contents.
-    """
-
-    points: list[list[float]] = field(default_factory=list)
-    integers: list[int] = field(default_factory=list)
-    vertex_list: list[list[float]] = field(default_factory=list)
-    index_list: list[int] = field(default_factory=list)
-
-    def vertices(self, points: Array) -> list[list[float]]:
-        """[N, 3] as lists, valid until the next call."""
-        self.points.extend([0.0, 0.0, 0.0] for _ in range(len(points) - len(self.points)))
-        for mine, point in zip(self.points, points.tolist(), strict=False):
-            mine[:] = point
-        self.vertex_list[:] = self.points[: len(points)]
-        return self.vertex_list
-
-    def indices(self, values: NDArray[np.integer]) -> list[int]:
-        """[N] non-negative integers as a list, valid until the next call."""
-        self.integers.extend(range(len(self.integers), int(values.max()) + 1))
-        self.index_list[:] = [self.integers[value] for value in values.tolist()]
-        return self.index_list
-
-
-_NUMBERS = _Numbers()
+_NUMBERS = Numbers()
 _USE = _Use()
 
 
@@ -324,18 +297,3 @@ def _set_surface(client: int, thing: int, physics: Physics, body: Body) -> None:
 def _place(client: int, thing: int, T: Pose) -> None:
     quaternion = quaternion_of(T[:3, :3])
     pybullet.resetBasePositionAndOrientation(thing, T[:3, 3].tolist(), quaternion.tolist(), physicsClientId=client)
-
-
-def quaternion_of(R: Array) -> Array:
-    """(x, y, z, w) of a rotation [3, 3], by the largest of the four components (Shepperd 1978)."""
-    trace = float(np.trace(R))
-    squares = np.array([R[0, 0], R[1, 1], R[2, 2], trace])
-    k = int(np.argmax(squares))
-    q = np.empty(4)
-    if k == 3:
-        q[:] = [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1.0 + trace]
-    else:
-        i, j, m = k, (k + 1) % 3, (k + 2) % 3
-        q[i] = 1.0 + 2.0 * R[i, i] - trace
-        q[j], q[m], q[3] = R[i, j] + R[j, i], R[i, m] + R[m, i], R[m, j] - R[j, m]
-    return q / np.linalg.norm(q)

@@ -1,61 +1,26 @@
-"""From release to rest: when an object rests, and what is made of the pose that the simulator stopped at."""
+"""From release to rest: the objects of a scene, one by one or together, and what becomes of them if they are let go again."""
 
 import dataclasses
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from schemas.base import Array, Pose, frozen_array
-from schemas.errors import SettleError
+from schemas.base import Pose
 from schemas.job import Physics
-from schemas.scene import ObjectStart, ScenePlan, Settled, SupportedBy, Table
-from workers.geometry.decompose import convex_parts
+from schemas.scene import ObjectStart, ScenePlan, Settled, Table
 from workers.geometry.frames import transform
-from workers.geometry.heights import heights_at
-from workers.geometry.inset import least_width_m
-from workers.scene.contact import snap_to_face, support_margin, tip_onto_face, touching
+from workers.scene.alone import ON_MESH, LeftRoomError, let_go, settle_alone, watching
 from workers.scene.dynamics import called_for, is_convex, rooms_m
 from workers.scene.effect import EffectPlan
-from workers.scene.fall import FINEST, Fall, Faller, Pace, fall, make_faller
-from workers.scene.landing import Ground, gap_m, ground_of, support_of, touch_down
-from workers.scene.support import support_height
 from workers.scene.together import release_together, settle_together
-from workers.scene.watch import Watch, can_touch, stands_on_face, watch_edge, watch_gone, watch_room, watch_tilt
-
-LEFT_M = 0.05
-"""An object whose table lies this far below the top has left it."""
-
-LESS_ROLLING_FRICTION = (1.0, 0.1, 0.01, 0.0)
-"""Shares of the rolling friction that an object is dropped with, each where the one before left it on an edge."""
-
-DAMPING = 0.9
-"""Of what is let go again with less rolling friction: it loses nine tenths of its speed in a second."""
 
 RECHECK_S = 1.0
 """How long an object is watched when it is released again."""
 
-UNBALANCED = 0.05
-"""Share of its weight, and of weight times size, that contacts may fail to balance: what their positions, known to
-`CONTACT_M`, leave open."""
-
-DROP_SHARE = 0.002
-"""Of the height that things fall: how far a point may go in a step onto level ground, if that is more than
-`physics.way_mm`. What it sinks in by is then within the thousandth of the fall's energy that may come back."""
-
-THIN_SHARE = 0.05
-"""Of the thinnest object: how far a point may go in a step."""
-
-ON_MESH = ("table_mesh", "decomposition")
-"""Effects that are called for together where a footprint left the flat top."""
-
 LEFT_TOP = "a footprint left the table's flat top"
 LEFT_ROOM = "an object left the room that it had to itself"
-
-
-class _LeftRoomError(Exception):
-    """An object came where it may meet another."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,18 +31,6 @@ class Rest:
     called: Mapping[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
-class _Task:
-    """One object to be dropped: where it starts, on what, and with which effects."""
-
-    start: ObjectStart
-    ground: Ground
-    physics: Physics
-    ran: Collection[str]
-    room_m: float = math.inf
-    damping: float = 0.0
-
-
 def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan) -> Rest:
     """Drop the scene's objects, wait until they rest, and remove what the simulator left of gap and tilt.
 
@@ -86,16 +39,17 @@ def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan) -> Rest
     """
     starts, table, called = plan.objects, plan.table, dict[str, str]()
     if len(starts) == 1:
-        settled: tuple[Settled, ...] = (settle(starts[0], table, physics, effects.ran),)
+        settled: tuple[Settled, ...] = (settle_alone(starts[0], table, physics, effects.ran),)
     elif effects.runs("object_contacts"):
         settled = settle_together(starts, table, physics, effects.ran)
     else:
         try:
             rooms = rooms_m(starts)
             settled = tuple(
-                settle(start, table, physics, effects.ran, room) for start, room in zip(starts, rooms, strict=True)
+                settle_alone(start, table, physics, effects.ran, room)
+                for start, room in zip(starts, rooms, strict=True)
             )
-        except _LeftRoomError:
+        except LeftRoomError:
             called["object_contacts"] = LEFT_ROOM
             ran = (*effects.ran, "object_contacts")
             if not all(is_convex(start) for start in starts):
@@ -109,66 +63,13 @@ def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan) -> Rest
     return Rest(settled, {name: why for name, why in called.items() if not effects.runs(name)})
 
 
-def settle(
-    start: ObjectStart,
-    table: Table,
-    physics: Physics,
-    ran: Collection[str] | None = None,
-    room_m: float = math.inf,
-) -> Settled:
-    """One object on its own, with the effects that are named, or else those that it calls for. Raises SettleError.
-
-    Its centre of mass may go `room_m` sideways.
-    """
-    ran = called_for((start,), table, physics) if ran is None else ran
-    task = _Task(start, ground_of(table), physics, ran, room_m)
-    if "dynamics" not in ran:
-        return _describe(task, Fall((start.T_world_obj,), 0.0, 0.0, True), "placed")
-    if "table_mesh" not in ran:
-        motion = _settle_flat(task)
-        if motion is not None:
-            return _describe(task, motion, "flat_top")
-        task = dataclasses.replace(task, ran=(*ran, *ON_MESH))
-    motion = _simulate(task, physics.max_settle_s, flat=False)
-    _require_rest(task, motion)
-    return _describe(task, motion, "mesh")
-
-
-def _settle_flat(task: _Task) -> Fall | None:
-    """Rest on the flat top alone; None where the footprint left it, so that the table's edges may have mattered.
-
-    Rolling friction can hold an object within that lever arm of an edge of its hull, where in truth it would tip on.
-    Such a pose has no face below the centre of mass. It is tipped on by geometry, because thin rods that are let go on
-    an edge gain speed in Bullet; where the next face is far, it is let go once more with less rolling friction. Then it is
-    damped, because what little Bullet adds in energy at each edge of a bottle on its side, nothing else takes away.
-    """
-    seconds, physics, asset = 0.0, task.physics, task.start.asset
-    shares = LESS_ROLLING_FRICTION if "rolling_friction" in task.ran else LESS_ROLLING_FRICTION[:1]
-    for share in shares:
-        less = physics.model_copy(update={"rolling_friction": share * physics.rolling_friction})
-        damping = 0.0 if share == 1.0 else DAMPING
-        motion = _simulate(dataclasses.replace(task, physics=less, damping=damping), physics.max_settle_s, flat=True)
-        if motion.happened is not None:
-            return None
-        _require_rest(task, motion)
-        seconds += motion.seconds
-        stopped = motion.poses[0]
-        T = snap_to_face(stopped, task.start.hull, asset.mass.com, physics.snap_rad)
-        tipped = tip_onto_face(T, task.start.hull, asset.mass.com)
-        motion = Fall((T if tipped is None else tipped,), motion.speed_m_s, seconds, True)
-        if tipped is not None:
-            break
-        task = dataclasses.replace(task, start=dataclasses.replace(task.start, T_world_obj=T))
-    return motion
-
-
 def recheck(start: ObjectStart, settled: Settled, table: Table, physics: Physics) -> tuple[float, float]:
     """How far the farthest point moves, mm, and the object turns, degrees, when it is released again where it rests.
 
     For `RECHECK_S`, in the finest steps, on the ground that it came to rest on. Nothing is corrected afterwards.
     """
     ran = called_for((start,), table, physics) | set(ON_MESH if settled.support == "mesh" else ())
-    return moved_by(start, settled.T_world_obj, _let_go(start, settled, table, physics, ran, RECHECK_S))
+    return moved_by(start, settled.T_world_obj, let_go(start, settled, table, physics, ran, RECHECK_S))
 
 
 def recheck_scene(plan: ScenePlan, rest: Rest, physics: Physics, effects: EffectPlan) -> Rest:
@@ -194,23 +95,9 @@ def release_again(
         poses = [rest.T_world_obj for rest in settled]
         return release_together(plan.objects, poses, plan.table, watching(physics, seconds), effects.ran, flat).poses
     return tuple(
-        _let_go(start, rest, plan.table, physics, effects.ran, seconds)
+        let_go(start, rest, plan.table, physics, effects.ran, seconds)
         for start, rest in zip(plan.objects, settled, strict=True)
     )
-
-
-def watching(physics: Physics, seconds: float) -> Physics:
-    """The same physics in the finest steps, in which nothing counts as resting before the time is over."""
-    rest = physics.rest.model_copy(update={"window_s": 2.0 * seconds})
-    return physics.model_copy(update={"step_hz": FINEST * physics.step_hz, "max_settle_s": seconds, "rest": rest})
-
-
-def _let_go(
-    start: ObjectStart, rest: Settled, table: Table, physics: Physics, ran: Collection[str], seconds: float
-) -> Pose:
-    again = dataclasses.replace(start, T_world_obj=rest.T_world_obj, placed=False)
-    task = _Task(again, ground_of(table), watching(physics, seconds), ran)
-    return _simulate(task, seconds, rest.support != "mesh" and "table_mesh" not in ran).poses[0]
 
 
 def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, float]:
@@ -218,105 +105,3 @@ def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, floa
     way = transform(before, start.hull.vertices) - transform(after, start.hull.vertices)
     turned = float(np.linalg.norm(before[:3, :3] - after[:3, :3])) / math.sqrt(8.0)  # the sine of half the angle
     return float(np.linalg.norm(way, axis=1).max() * 1e3), math.degrees(2.0 * math.asin(min(1.0, turned)))
-
-
-def _require_rest(task: _Task, motion: Fall) -> None:
-    table, start = task.ground.table, task.start
-    com = transform(motion.poses[0], start.asset.mass.com[None, :])[0]
-    over_top = heights_at(com[None, :2], task.ground.terrain)[0] >= table.top.height_m - LEFT_M  # nan compares false
-    high = com[2] >= table.top.height_m - LEFT_M
-    if not (over_top and high) and not (motion.rested and _is_held(task, motion)):
-        raise SettleError(
-            "left_table",
-            f"after {motion.seconds:.2f} s the centre of mass was at ({com[0]:.3f}, {com[1]:.3f}, {com[2]:.3f}) m, off the "
-            "table's top: narrow start.offset_m or use larger tables",
-        )
-    if not motion.rested:
-        raise SettleError(
-            "not_at_rest",
-            f"still moving at {motion.speed_m_s * 1e3:.2f} mm/s after {motion.seconds:.1f} s: raise physics.max_settle_s "
-            "or physics.rolling_friction",
-        )
-
-
-def _is_held(task: _Task, motion: Fall) -> bool:
-    """Whether the top holds it though its centre of mass is not over the top: over a hole, or hung on an edge."""
-    T = touch_down(task.start, motion.poses[0], task.ground)
-    support = support_of(task.start, T, task.ground, task.physics.friction**2)
-    return support.residual <= UNBALANCED and support.highest_m >= task.ground.table.top.height_m - LEFT_M
-
-
-def _describe(task: _Task, motion: Fall, support: SupportedBy) -> Settled:
-    """The figures of a rest pose, measured between the meshes and not taken from the simulator."""
-    start = task.start
-    T = motion.poses[0] if support == "placed" else touch_down(start, motion.poses[0], task.ground)
-    gap_mm = gap_m(start, T, task.ground) * 1e3
-    com = transform(T, start.asset.mass.com[None, :])[0]
-    margin, residual = support_margin(touching(start.hull, T, task.ground.terrain), com[:2]), 0.0
-    if support == "mesh":
-        held = support_of(start, T, task.ground, task.physics.friction**2)
-        margin, residual = held.margin_m, held.residual
-    if residual > UNBALANCED or (support != "mesh" and not margin > 0.0):
-        raise SettleError(
-            "unsupported",
-            f"it came to rest with its centre of mass {-margin * 1e3:.2f} mm outside the hull of its contacts, which leave "
-            f"{residual:.0%} of its weight without balance: raise physics.snap_rad or lower physics.rest.speed_mm_s",
-        )
-    return Settled(
-        T_world_obj=frozen_array(T),
-        penetration_mm=max(0.0, -gap_mm),
-        hover_gap_mm=max(0.0, gap_mm),
-        support_margin_mm=margin * 1e3,
-        equilibrium_residual=residual,
-        residual_speed_mm_s=motion.speed_m_s * 1e3,
-        settle_s=motion.seconds,
-        support=support,
-    )
-
-
-def _simulate(task: _Task, seconds: float, flat: bool) -> Fall:
-    """Drop the object onto the flat top or the mesh; a watch happens where its footprint leaves the flat top.
-
-    What stands on a level plane touches it with few of its vertices as long as it does not tip, and Bullet's time goes
-    with their number. So it falls with these alone, and falls again with all of them should it tip. Where `decomposition`
-    runs it falls as its convex parts, else as its hull.
-    """
-    start, table = task.start, task.ground.table
-    cut: Sequence[Array] = ()
-    if "decomposition" in task.ran and not is_convex(start):
-        parts = convex_parts(start.asset.shape.mesh, start.asset.sha256)
-        cut = parts if len(parts) > 1 else ()
-    faller = make_faller(start, task.physics, "rolling_friction" in task.ran, task.damping, cut)
-    points = transform(start.T_world_obj, start.hull.vertices)
-    below = table.top.height_m if flat else support_height(points[:, :2], table.mesh)
-    free = max(0.0, float(points[:, 2].min()) - below) if math.isfinite(below) else 0.0
-    pace = _pace(task, free if flat else 0.0)
-    ground = table.top.height_m if flat else table.mesh
-    T_world_body = start.T_world_obj @ faller.T_obj_body
-    gone = watch_gone(float(table.mesh.vertices[:, 2].min()) - faller.reach_m)
-    leaves = watch_edge(table.top.outline, faller.reach_m) if flat else gone
-    strays = watch_room(T_world_body[:2, 3], task.room_m)
-
-    def drop(faller: Faller, *more: Watch) -> Fall:
-        watches = (leaves, strays, *more)
-        motion = fall([faller], [start.T_world_obj], ground, task.physics, pace, seconds, free, watches)
-        if motion.happened == 1:
-            raise _LeftRoomError
-        return motion
-
-    down = -T_world_body[2, :3]
-    if flat and not cut and stands_on_face(faller.body.parts[0], down):
-        vertices = faller.body.parts[0]
-        motion = drop(faller.only(vertices[can_touch(vertices, down)]), watch_tilt(T_world_body))
-        if motion.happened != 2:
-            return motion
-    return drop(faller)
-
-
-def _pace(task: _Task, drop_m: float) -> Pace:
-    """Steps from the scene's own scales: how far it falls, and how thin the object is."""
-    physics = task.physics
-    if "fine_step" not in task.ran:
-        return Pace(physics.step_hz, math.inf)
-    way_m = max(physics.way_mm / 1e3, DROP_SHARE * drop_m)
-    return Pace(physics.step_hz, min(way_m, THIN_SHARE * least_width_m(task.start.hull)))

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from schemas.job import Job
 from tests.shapes import box
-from workers.geometry.frames import pose, rotation_about
-from workers.scene.bullet import GRAVITY_M_S2, WORLDS_BEFORE_RESET, Body, drop, quaternion_of
+from workers.geometry.frames import pose, quaternion_of, rotation_about
+from workers.scene.bullet import GRAVITY_M_S2, WORLDS_BEFORE_RESET, Body, drop
 
 ROOT = Path(__file__).resolve().parents[3]
 PHYSICS = Job(name="t").physics

@@ -16,9 +16,9 @@ from tests.shapes import asset_of, box, shape_of, table
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.geometry.raycast import cast_view, edge_distance_px
+from workers.scene.alone import settle_alone
 from workers.scene.check import check_against_rays, check_pair, is_raycast_scene
 from workers.scene.plan import plan_scene
-from workers.scene.settle import settle
 from workers.scene.views import pose_scene
 
 STORED = Range(0.2, 8.0)
@@ -33,7 +33,7 @@ def scene() -> PosedScene:
     plan = plan_scene(
         Job.model_validate({"name": "t", "start": {"offset_m": [0, 0]}}), 0, table(), asset_of(box(0.2, 0.2, 0.25))
     )
-    return pose_scene(plan, (settle(plan.objects[0], plan.table, Job(name="t").physics),))
+    return pose_scene(plan, (settle_alone(plan.objects[0], plan.table, Job(name="t").physics),))
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ from schemas.job import Job
 from schemas.scene import ObjectStart
 from schemas.shape import Asset
 from tests.shapes import asset_of, box
-from workers.geometry.frames import pose, transform, translation, uniform_rotation
+from workers.geometry.frames import pose, quaternion_of, transform, translation, uniform_rotation
 from workers.geometry.hull import convex_hull
-from workers.scene.bullet import GRAVITY_M_S2, SLOP_M, quaternion_of
+from workers.scene.bullet import GRAVITY_M_S2, SLOP_M
 from workers.scene.fall import FINEST, SKIPPED_TO_M, Faller, Pace, as_pose, fall, make_faller
 
 PHYSICS = Job(name="t").physics

@@ -13,11 +13,12 @@ from schemas.shape import Asset
 from tests.shapes import asset_of, box, table
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.geometry.hull import convex_hull
+from workers.scene.alone import settle_alone
 from workers.scene.dynamics import called_for
 from workers.scene.effect import EffectPlan
 from workers.scene.fall import fall
 from workers.scene.plan import plan_scene
-from workers.scene.settle import LEFT_ROOM, LEFT_TOP, Rest, settle, settle_scene
+from workers.scene.settle import LEFT_ROOM, LEFT_TOP, Rest, settle_scene
 from workers.scene.support import place_table
 from workers.scene.together import settle_together
 
@@ -68,7 +69,7 @@ def test_objects_far_apart_settle_each_as_it_would_alone_to_the_last_bit():
     rest = scene(starts)
     assert rest.called == {}
     for start, each in zip(starts, rest.settled, strict=True):
-        alone = settle(start, TABLE, PHYSICS)
+        alone = settle_alone(start, TABLE, PHYSICS)
         assert each.T_world_obj.tobytes() == alone.T_world_obj.tobytes()
         assert (each.settle_s, each.support) == (alone.settle_s, alone.support)
 
@@ -77,7 +78,7 @@ def test_far_apart_together_or_alone_is_the_same_within_the_simulations_gap():
     starts = [start_of(CUBE, x, 0.0, 0.04) for x in (-0.3, 0.3)]
     both = settle_together(starts, TABLE, PHYSICS, ALL)
     for start, each in zip(starts, both, strict=True):
-        assert each.T_world_obj == pytest.approx(settle(start, TABLE, PHYSICS).T_world_obj, abs=5e-5)
+        assert each.T_world_obj == pytest.approx(settle_alone(start, TABLE, PHYSICS).T_world_obj, abs=5e-5)
 
 
 def test_contacts_are_called_for_after_all_where_a_ball_rolls_towards_another_object():
@@ -147,7 +148,7 @@ def test_what_does_not_rest_in_time_says_so():
 def test_the_same_starts_give_the_same_bits_whatever_was_simulated_before():
     starts = [start_of(CUBE, 0, 0, 0.031), start_of(CUBE, 0.01, 0.005, 0.12, rotation_about(np.eye(3)[2], 0.5))]
     first = settle_together(starts, TABLE, PHYSICS, ALL)
-    settle(start_of(CUBE, 0, 0, 0.3, rotation_about(np.eye(3)[0], 0.7)), TABLE, PHYSICS)
+    settle_alone(start_of(CUBE, 0, 0, 0.3, rotation_about(np.eye(3)[0], 0.7)), TABLE, PHYSICS)
     second = settle_together(starts, TABLE, PHYSICS, ALL)
     assert [a.T_world_obj.tobytes() for a in first] == [b.T_world_obj.tobytes() for b in second]
 

@@ -7,9 +7,8 @@ import pytest
 import trimesh
 
 from tests.shapes import box
-from workers.geometry.frames import pose, rotation_about, uniform_rotation
+from workers.geometry.frames import pose, quaternion_of, rotation_about, uniform_rotation
 from workers.geometry.hull import convex_hull
-from workers.scene.bullet import quaternion_of
 from workers.scene.watch import (
     TIPPED_RAD,
     TOUCH_RAD,

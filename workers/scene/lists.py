@@ -1,0 +1,36 @@
+"""Lists that are handed to PyBullet again and again."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Python objects that are handed to PyBullet again and again.
+
+    PyBullet 3.2.7 takes a reference to each list of vertices or indices, and to each of their items, and never gives it
+    back (190 bytes a vertex). So it is given the same objects each time, with other contents.
+    """
+
+    points: list[list[float]] = field(default_factory=list)
+    integers: list[int] = field(default_factory=list)
+    vertex_list: list[list[float]] = field(default_factory=list)
+    index_list: list[int] = field(default_factory=list)
+
+    def vertices(self, points: Array) -> list[list[float]]:
+        """[N, 3] as lists, valid until the next call."""
+        self.points.extend([0.0, 0.0, 0.0] for _ in range(len(points) - len(self.points)))
+        for mine, point in zip(self.points, points.tolist(), strict=False):
+            mine[:] = point
+        self.vertex_list[:] = self.points[: len(points)]
+        return self.vertex_list
+
+    def indices(self, values: NDArray[np.integer]) -> list[int]:
+        """[N] non-negative integers as a list, valid until the next call."""
+        self.integers.extend(range(len(self.integers), int(values.max()) + 1))
+        self.index_list[:] = [self.integers[value] for value in values.tolist()]
+        return self.index_list
