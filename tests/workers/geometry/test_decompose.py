@@ -113,6 +113,7 @@ def test_a_dent_is_as_deep_as_it_is():
     assert concavity_m(flat) < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flaw", ["open", "inside out", "mixed", "sheet", "double"])
 def test_a_flawed_mesh_has_parts_within_its_hull(flaw):
     mesh = tray()
@@ -176,6 +177,7 @@ for category in sys.argv[2:]:
 """
 
 
+@pytest.mark.slow
 def test_parts_are_the_same_bytes_on_one_core_and_two_and_after_other_meshes():
     """Without the variable that tells OpenMP to use one thread, too."""
     told = {**os.environ, "PYTHONPATH": str(ROOT)}
