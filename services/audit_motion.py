@@ -13,7 +13,7 @@ from schemas.scene import Placed, PosedScene, View
 from schemas.shape import Shape
 from workers.context import WorkerContext
 from workers.geometry.camera import project
-from workers.geometry.frames import invert, transform
+from workers.geometry.frames import invert, moved_between, transform
 from workers.geometry.raycast import NEAR_M, edge_distance_px
 from workers.render.gbuffer import Renderer
 from workers.scene.effect import Facts
@@ -78,11 +78,8 @@ def measure_motion(context: WorkerContext, scene: Scene) -> Motion:
 
 def move_between(shape: Shape, before: Pose, after: Pose) -> Motion:
     """How far the farthest point of a shape moves between two poses [4, 4], and by what angle it turns."""
-    vertices = shape.vertices
-    moved = np.linalg.norm(transform(after, vertices) - transform(before, vertices), axis=1).max()
-    # The chord between two rotations, |R - Q| = 2 sqrt(2) sin(angle / 2): the trace loses half its digits at small angles.
-    chord = np.linalg.norm(after[:3, :3] - before[:3, :3])
-    return Motion(float(moved) * 1e3, math.degrees(2.0 * math.asin(min(1.0, float(chord) / math.sqrt(8.0)))))
+    moved_m, turned_rad = moved_between(shape.vertices, before, after)
+    return Motion(moved_m * 1e3, math.degrees(turned_rad))
 
 
 def moved_things(scene: Scene, poses: Sequence[Pose]) -> tuple[Placed, ...]:

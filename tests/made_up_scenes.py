@@ -132,6 +132,17 @@ def _scene(scene_id: int, category: str, instance: str, table: str) -> dict[str,
         "redraws": scene_id % 3,
         "effects": ["drop", "snap"],
         "skipped": [{"effect": "tip", "why": "stands"}],
+        **_rest(scene_id),
+        "settle_s": 0.7,
+        "raycast_checked": scene_id % 2 == 0,
+        "settings_digest": "d" * 64,
+        "bodies": [_body(scene_id, region, category, instance) for region in (3, 4)],
+    }
+
+
+def _rest(scene_id: int) -> dict[str, object]:
+    """How a body rests; a scene's own columns are the worst of its bodies', which are alike here."""
+    return {
         "penetration_mm": 0.01,
         "hover_gap_mm": -0.0,
         "support_margin_mm": 12.5,
@@ -139,10 +150,6 @@ def _scene(scene_id: int, category: str, instance: str, table: str) -> dict[str,
         "recheck_move_mm": None if scene_id % 2 else 0.02,
         "recheck_turn_deg": None if scene_id % 2 else 0.01,
         "equilibrium_residual": 0.001,
-        "settle_s": 0.7,
-        "raycast_checked": scene_id % 2 == 0,
-        "settings_digest": "d" * 64,
-        "bodies": [_body(scene_id, region, category, instance) for region in (3, 4)],
     }
 
 
@@ -156,13 +163,7 @@ def _body(scene_id: int, region: int, category: str, instance: str) -> dict[str,
         "object_scale": 0.25,
         "T_world_obj": matrix_of(scene_id, 1 if region == 3 else region),
         "redraws": scene_id % 3,
-        "penetration_mm": 0.01,
-        "hover_gap_mm": -0.0,
-        "support_margin_mm": 12.5,
-        "residual_speed_mm_s": 0.1,
-        "recheck_move_mm": None if scene_id % 2 else 0.02,
-        "recheck_turn_deg": None if scene_id % 2 else 0.01,
-        "equilibrium_residual": 0.001,
+        **_rest(scene_id),
     }
 
 

@@ -8,37 +8,27 @@ import argparse
 import itertools
 import json
 from collections import Counter
-from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
-import pybullet
 
 from schemas.base import Array
 from schemas.errors import SceneError
 from schemas.job import Job
-from schemas.scene import ObjectStart, ScenePlan, Table
+from schemas.scene import ScenePlan, Table
 from schemas.shape import Mesh
+from tests.physics.energy import watched, worst_of
 from tests.physics.room import G
 from workers.assets.catalogue import Catalogue, choose_object, choose_table, load_asset, open_catalogue
-from workers.geometry.frames import rotation_from_quaternion, transform
+from workers.geometry.frames import transform
 from workers.geometry.heights import heights_at
-from workers.scene import bullet
 from workers.scene.alone import settle_alone
-from workers.scene.bullet import World
-from workers.scene.fall import body_frame
 from workers.scene.plan import choose_category, plan_scene
 from workers.scene.randomness import Stream, stream
 from workers.scene.settle import recheck
-
-ENERGY_SHARE, ENERGY_LIFT_M = 1e-3, 2e-5
-"""Mechanical energy may rise above its running minimum by the larger of this share of what the drop sets free, and of what
-lifts the object by so much."""
 
 GAP_MM, MOVE_MM, TURN_DEG = 0.1, 0.1, 0.1
 
@@ -57,49 +47,6 @@ class Outcome:
     """Largest rise of energy over its bound."""
     moved_mm: float | None = None
     turned_deg: float | None = None
-
-
-@contextmanager
-def watched_energy(starts: tuple[ObjectStart, ...]) -> Iterator[list[list[float]]]:
-    """Kinetic and potential energy of all bodies, joules, after every step of each fall that the block simulates."""
-    falls: list[list[float]] = []
-    masses = [start.asset.mass for start in starts]
-    moments = [body_frame(mass)[1] for mass in masses]
-
-    class Watched(World):
-        """Steps one at a time, and looks at the energy after each."""
-
-        def advance(self) -> None:
-            for _ in range(self.steps):
-                pybullet.stepSimulation(physicsClientId=self.client)
-                falls[-1].append(sum(self._energy(k) for k in range(len(self.bodies))))
-
-        def _energy(self, k: int) -> float:
-            (x, quaternion), (v, w) = self.pose(k), self.velocity(k)
-            spin = rotation_from_quaternion(np.array(quaternion)).T @ np.array(w)
-            return masses[k].mass_kg * (float(np.dot(v, v)) / 2 + G * x[2]) + float(moments[k] @ (spin * spin)) / 2
-
-        def pace(self, step_hz: float, repair: float = bullet.REPAIR) -> None:
-            pybullet.setPhysicsEngineParameter(
-                fixedTimeStep=1.0 / step_hz, numSubSteps=0, contactERP=repair, physicsClientId=self.client
-            )
-
-    def begin(*of: Any) -> World:
-        falls.append([])
-        return Watched(*of)
-
-    with mock.patch.object(bullet, "World", begin):
-        yield falls
-
-
-def largest_rise(falls: list[list[float]], mass_kg: float) -> float:
-    """The most that the energy of any fall rises above its running minimum, over the bound."""
-    worst = 0.0
-    for fall in falls:
-        energy = np.array(fall)
-        bound = max(ENERGY_SHARE * (energy[0] - energy[-1]), ENERGY_LIFT_M * mass_kg * G)
-        worst = max(worst, float((energy - np.minimum.accumulate(energy)).max() / bound))
-    return worst
 
 
 def draw(job: Job, catalogue: Catalogue, scene_id: int) -> ScenePlan:
@@ -129,7 +76,7 @@ def try_scene(job: Job, catalogue: Catalogue, scene_id: int, again: bool) -> Out
     try:
         plan = draw(job, catalogue, scene_id)
         start = plan.objects[0]
-        with watched_energy(plan.objects) as falls:
+        with watched([start.asset]) as falls:
             rest = settle_alone(start, plan.table, job.physics)
     except SceneError as error:
         through = error.reason == "not_at_rest" and "-" in error.detail
@@ -137,7 +84,7 @@ def try_scene(job: Job, catalogue: Catalogue, scene_id: int, again: bool) -> Out
     points = transform(rest.T_world_obj, start.asset.shape.vertices)
     height = above(Mesh(points, start.asset.shape.faces), plan.table.mesh) * 1e3
     moved = recheck(start, rest, plan.table, job.physics) if again else (None, None)
-    rise = largest_rise(falls, start.asset.mass.mass_kg)
+    rise = worst_of(falls(), start.asset.mass.mass_kg * G).over_bound
     through = fell_through(points, plan.table)
     return Outcome(scene_id, category, "", through, max(0.0, -height), max(0.0, height), rise, *moved)
 

@@ -2,31 +2,23 @@
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from typing import Any
+from contextlib import suppress
 
 import numpy as np
-import pybullet
 import pytest
 
-from schemas.base import Array
 from schemas.errors import SettleError
 from schemas.job import Job
 from schemas.shape import Asset
 from schemas.sources import ProceduralSource
 from tests.hard_cases.bodies import cube
 from tests.hard_cases.groups import dominoes, pile, stack
+from tests.physics.energy import Rise, watched, worst_of
 from tests.physics.room import G, physics
 from tests.shapes import asset_of, box, table
 from workers.assets.procedural.make import make_asset
-from workers.geometry.frames import rotation_from_quaternion
-from workers.scene import bullet
 from workers.scene.alone import settle_alone
-from workers.scene.bullet import World
 from workers.scene.dynamics import called_for
-from workers.scene.fall import body_frame
 from workers.scene.plan import draw_start
 from workers.scene.support import place_table
 from workers.scene.together import settle_together
@@ -34,11 +26,6 @@ from workers.scene.together import settle_together
 TABLE = place_table(table())
 SEEDS = 20
 WATCHED_S = 1.2
-SHARE = 1e-3
-"""Of the energy that the drop sets free."""
-LIFT_M = 2e-5
-"""Height that the rise would lift the body by."""
-
 CATEGORIES = ("box", "can", "bottle", "mug")
 STARTS = ("upright", "tumbled")
 
@@ -49,23 +36,6 @@ def asset_for(category: str, index: int) -> Asset:
     return make_asset(category, ProceduralSource(source="procedural"), index, 600.0)
 
 
-@dataclass(frozen=True)
-class Rise:
-    """The most that energy rises above its running minimum: over the bound, and as a height."""
-
-    over_bound: float
-    lift_m: float
-
-
-def worst_of(falls: Iterable[Array], weight: float) -> Rise:
-    """Of each simulation's energies [steps], joules, of things of this weight, newtons."""
-    rises = []
-    for energy in falls:
-        rise = float((energy - np.minimum.accumulate(energy)).max())
-        rises.append(Rise(rise / max(SHARE * (energy[0] - energy[-1]), LIFT_M * weight), rise / weight))
-    return max(rises, key=lambda rise: rise.over_bound)
-
-
 @functools.cache
 def worst_rise(category: str, start: str, seed: int, refine: int = 1) -> Rise:
     asset = asset_for(category, seed)
@@ -74,46 +44,6 @@ def worst_rise(category: str, start: str, seed: int, refine: int = 1) -> Rise:
     with watched([asset]) as falls:
         settle_alone(drawn, TABLE, physics(step_hz=960 * refine, way_mm=0.1 / refine))
     return worst_of(falls(), asset.mass.mass_kg * G)
-
-
-@contextmanager
-def watched(assets: Sequence[Asset], spin: Sequence[float] = (0.0, 0.0, 0.0)) -> Iterator[Callable[[], list[Array]]]:
-    """Within the block production settles these objects; then [steps] joules in all after every step of each simulation.
-
-    Kinetic and potential energy. In the air semi-implicit Euler only loses energy, g^2 h / 2 a second and kilogram, so that
-    no rise is its own. `spin` is what they are let go with, rad/s.
-    """
-    falls = list[list[float]]()
-    moments = [body_frame(asset.mass)[1] for asset in assets]
-
-    def energy(world: World, body: int) -> float:
-        (x, quaternion), (v, w) = world.pose(body), world.velocity(body)
-        spins = rotation_from_quaternion(np.array(quaternion)).T @ np.array(w)
-        return assets[body].mass.mass_kg * (np.dot(v, v) / 2 + G * x[2]) + float(moments[body] @ (spins * spins)) / 2
-
-    class Watched(World):
-        """Steps one at a time, and looks at the energy after each."""
-
-        def advance(self) -> None:
-            for _ in range(self.steps):
-                pybullet.stepSimulation(physicsClientId=self.client)
-                falls[-1].append(sum(energy(self, body) for body in range(len(self.bodies))))
-
-        def pace(self, step_hz: float, repair: float = bullet.REPAIR) -> None:
-            pybullet.setPhysicsEngineParameter(
-                fixedTimeStep=1.0 / step_hz, numSubSteps=0, contactERP=repair, physicsClientId=self.client
-            )
-
-        def push(self, velocity: Sequence[float], _: Any = None, body: int = 0) -> None:
-            super().push(velocity, spin, body)
-
-    def begin(*of: Any) -> World:
-        falls.append([])
-        return Watched(*of)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bullet, "World", begin)
-        yield lambda: [np.array(energies) for energies in falls]
 
 
 SLIPS = "one can of twenty, which tumbles from its rim onto its side, rises by 88 um, 1.38 times its bound"

@@ -90,6 +90,12 @@ def angle_between(A: Array, B: Array) -> float:
     return math.atan2(float(sine), 0.5 * (float(np.trace(D)) - 1.0))
 
 
+def moved_between(points: Array, before: Array, after: Array) -> tuple[float, float]:
+    """Between two poses [4, 4] of a body: metres that the farthest of its points [N, 3] went, and radians that it turned."""
+    way = transform(after, points) - transform(before, points)
+    return float(np.linalg.norm(way, axis=1).max()), angle_between(before[:3, :3], after[:3, :3])
+
+
 def quaternion_of(R: Array) -> Array:
     """(x, y, z, w) of a rotation [3, 3], by the largest of the four components (Shepperd 1978)."""
     trace = float(np.trace(R))

@@ -18,7 +18,7 @@ PIXEL_BYTES = 4 + 8 + 1
 class ColourTarget:
     """A framebuffer of one size, the last that was asked for: colour, depth, and a stencil of the pixels to draw.
 
-    Depth grows with distance here, as the rasteriser makes it: fragments behind others are dropped before they are
+    Depth falls with distance here, as in the pass for labels: fragments behind others are dropped before they are
     shaded, and so is everything outside the stencil.
     """
 

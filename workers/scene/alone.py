@@ -2,26 +2,20 @@
 
 import dataclasses
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 
-from schemas.base import Array, Pose, frozen_array
+from schemas.base import Pose, frozen_array
 from schemas.errors import SettleError
 from schemas.job import Physics
 from schemas.scene import ObjectStart, Settled, SupportedBy, Table
-from workers.geometry.decompose import convex_parts
 from workers.geometry.frames import transform
 from workers.geometry.heights import heights_at
-from workers.geometry.inset import least_width_m
 from workers.scene.contact import snap_to_face, support_margin, tip_onto_face, touching
-from workers.scene.dynamics import called_for, is_convex
-from workers.scene.fall import FINEST, Fall, Faller, Pace, fall, make_faller
-from workers.scene.landing import Ground, gap_m, ground_of, support_of, touch_down
-from workers.scene.support import support_height
+from workers.scene.dynamics import called_for
+from workers.scene.fall import FINEST, Fall, Faller, choose_pace, fall, faller_of, free_fall_m
+from workers.scene.landing import LEFT_M, Ground, gap_m, ground_of, support_of, touch_down
 from workers.scene.watch import Watch, can_touch, stands_on_face, watch_edge, watch_gone, watch_room, watch_tilt
-
-LEFT_M = 0.05
-"""An object whose table lies this far below the top has left it."""
 
 LESS_ROLLING_FRICTION = (1.0, 0.1, 0.01, 0.0)
 """Shares of the rolling friction that an object is dropped with, each where the one before left it on an edge."""
@@ -32,13 +26,6 @@ DAMPING = 0.9
 UNBALANCED = 0.05
 """Share of its weight, and of weight times size, that contacts may fail to balance: what their positions, known to
 `CONTACT_M`, leave open."""
-
-DROP_SHARE = 0.002
-"""Of the height that things fall: how far a point may go in a step onto level ground, if that is more than
-`physics.way_mm`. What it sinks in by is then within the thousandth of the fall's energy that may come back."""
-
-THIN_SHARE = 0.05
-"""Of the thinnest object: how far a point may go in a step."""
 
 ON_MESH = ("table_mesh", "decomposition")
 """Effects that are called for together where a footprint left the flat top."""
@@ -190,15 +177,9 @@ def _simulate(task: _Task, seconds: float, flat: bool) -> Fall:
     runs it falls as its convex parts, else as its hull.
     """
     start, table = task.start, task.ground.table
-    cut: Sequence[Array] = ()
-    if "decomposition" in task.ran and not is_convex(start):
-        parts = convex_parts(start.asset.shape.mesh, start.asset.sha256)
-        cut = parts if len(parts) > 1 else ()
-    faller = make_faller(start, task.physics, "rolling_friction" in task.ran, task.damping, cut)
-    points = transform(start.T_world_obj, start.hull.vertices)
-    below = table.top.height_m if flat else support_height(points[:, :2], table.mesh)
-    free = max(0.0, float(points[:, 2].min()) - below) if math.isfinite(below) else 0.0
-    pace = _pace(task, free if flat else 0.0)
+    faller = faller_of(start, task.physics, task.ran, task.damping)
+    free = free_fall_m(transform(start.T_world_obj, start.hull.vertices), table, flat)
+    pace = choose_pace((start,), task.physics, task.ran, free if flat else 0.0)
     ground = table.top.height_m if flat else table.mesh
     T_world_body = start.T_world_obj @ faller.T_obj_body
     gone = watch_gone(float(table.mesh.vertices[:, 2].min()) - faller.reach_m)
@@ -213,18 +194,9 @@ def _simulate(task: _Task, seconds: float, flat: bool) -> Fall:
         return motion
 
     down = -T_world_body[2, :3]
-    if flat and not cut and stands_on_face(faller.body.parts[0], down):
+    if flat and len(faller.body.parts) == 1 and stands_on_face(faller.body.parts[0], down):
         vertices = faller.body.parts[0]
         motion = drop(faller.only(vertices[can_touch(vertices, down)]), watch_tilt(T_world_body))
         if motion.happened != 2:
             return motion
     return drop(faller)
-
-
-def _pace(task: _Task, drop_m: float) -> Pace:
-    """Steps from the scene's own scales: how far it falls, and how thin the object is."""
-    physics = task.physics
-    if "fine_step" not in task.ran:
-        return Pace(physics.step_hz, math.inf)
-    way_m = max(physics.way_mm / 1e3, DROP_SHARE * drop_m)
-    return Pace(physics.step_hz, min(way_m, THIN_SHARE * least_width_m(task.start.hull)))

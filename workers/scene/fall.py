@@ -2,19 +2,22 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from schemas.base import Array, Pose
 from schemas.job import Physics
-from schemas.scene import ObjectStart
+from schemas.scene import ObjectStart, Table
 from schemas.shape import MassProperties, Mesh
+from workers.geometry.decompose import convex_parts
 from workers.geometry.frames import invert, pose, rotation_from_quaternion, transform
 from workers.geometry.hull import convex_hull
-from workers.geometry.inset import inset_hull
+from workers.geometry.inset import inset_hull, least_width_m
 from workers.scene.bullet import BOUNCE_REPAIR, GRAVITY_M_S2, REPAIR, SLOP_M, Body, World, open_world
+from workers.scene.dynamics import is_convex
+from workers.scene.support import support_height
 from workers.scene.watch import Motion, Watch
 
 SAMPLE_STEPS = 8
@@ -30,6 +33,13 @@ FINEST = 16
 TOUCHDOWN_S = 0.005
 """So long, from `SKIPPED_TO_M` above the ground, steps are the shortest: what lands flat then stops at once, and no later
 step would mend how deep it went."""
+
+DROP_SHARE = 0.002
+"""Of the height that things fall: how far a point may go in a step, if that is more than `physics.way_mm`. What it sinks in by
+is then within the thousandth of the fall's energy that may come back."""
+
+THIN_SHARE = 0.05
+"""Of the thinnest object: how far a point may go in a step at most."""
 
 SKIPPED_TO_M = 2e-4
 """The fall through the air is not simulated until the lowest point is this near the ground."""
@@ -76,7 +86,7 @@ class Fall:
     """What a simulation ended with, for each body its `T_world_obj`.
 
     speed_m_s: of the fastest point, at which it drifted over the last window; seconds: simulated, and fallen before;
-    `stayed` is False as soon as something that was watched for happened, which then is the number of the watch.
+    happened: the number of the watch that ended it, None where none did.
     """
 
     poses: tuple[Pose, ...]
@@ -105,6 +115,29 @@ def make_faller(
     parts = tuple(transform(to_body, each) for each in shapes)
     body = Body(start.asset.mass.mass_kg, moments, parts, margin, rolls, damping)
     return Faller(body, T_obj_body, reach)
+
+
+def faller_of(start: ObjectStart, physics: Physics, ran: Collection[str], damping: float = 0.0) -> Faller:
+    """The object with the effects that ran: as its convex parts where `decomposition` did and it has several."""
+    cut: Sequence[Array] = ()
+    if "decomposition" in ran and not is_convex(start):
+        parts = convex_parts(start.asset.shape.mesh, start.asset.sha256)
+        cut = parts if len(parts) > 1 else ()
+    return make_faller(start, physics, "rolling_friction" in ran, damping, cut)
+
+
+def choose_pace(starts: Sequence[ObjectStart], physics: Physics, ran: Collection[str], drop_m: float) -> Pace:
+    """Steps from the scene's own scales: how far things fall, and how thin the thinnest is; all alike without `fine_step`."""
+    if "fine_step" not in ran:
+        return Pace(physics.step_hz, math.inf)
+    thinnest = min(least_width_m(start.hull) for start in starts)
+    return Pace(physics.step_hz, min(max(physics.way_mm / 1e3, DROP_SHARE * drop_m), THIN_SHARE * thinnest))
+
+
+def free_fall_m(points: Array, table: Table, flat: bool) -> float:
+    """How far a hull's vertices [N, 3] may fall, world, before one can touch the flat top or the mesh; 0 where none is below."""
+    below = table.top.height_m if flat else support_height(points[:, :2], table.mesh)
+    return max(0.0, float(points[:, 2].min()) - below) if math.isfinite(below) else 0.0
 
 
 def fall(

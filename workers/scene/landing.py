@@ -14,6 +14,9 @@ from workers.scene.clearance import above_ground, between, ground_gap_m
 from workers.scene.contact import CONTACT_M
 from workers.scene.equilibrium import FIXED, Contact, Weight, contact_points, equilibrium_residual, support_margin_m
 
+LEFT_M = 0.05
+"""An object whose table, or whose centre of mass, lies this far below the table's top has left it."""
+
 HOOKED_M = 0.03
 """An object that reaches this far below the table's top may have part of the table above part of it."""
 

@@ -5,12 +5,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from schemas.base import Pose
 from schemas.job import Physics
 from schemas.scene import ObjectStart, ScenePlan, Settled, Table
-from workers.geometry.frames import transform
+from workers.geometry.frames import moved_between
 from workers.scene.alone import ON_MESH, LeftRoomError, let_go, settle_alone, watching
 from workers.scene.dynamics import called_for, is_convex, rooms_m
 from workers.scene.effect import EffectPlan
@@ -102,6 +100,5 @@ def release_again(
 
 def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, float]:
     """Between two poses of an object: how far its farthest point went, mm, and by how much it turned, degrees."""
-    way = transform(before, start.hull.vertices) - transform(after, start.hull.vertices)
-    turned = float(np.linalg.norm(before[:3, :3] - after[:3, :3])) / math.sqrt(8.0)  # the sine of half the angle
-    return float(np.linalg.norm(way, axis=1).max() * 1e3), math.degrees(2.0 * math.asin(min(1.0, turned)))
+    moved_m, turned_rad = moved_between(start.hull.vertices, before, after)
+    return moved_m * 1e3, math.degrees(turned_rad)

@@ -6,32 +6,19 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from schemas.base import Array, Pose, frozen_array
+from schemas.base import Pose, frozen_array
 from schemas.errors import SettleError
 from schemas.job import Physics
 from schemas.scene import ObjectStart, Settled, SupportedBy, Table
 from schemas.shape import Mesh
-from workers.geometry.decompose import convex_parts
 from workers.geometry.frames import transform
 from workers.geometry.heights import survey
-from workers.geometry.inset import least_width_m
 from workers.scene.clearance import clearances, overlap_m
 from workers.scene.contact import CONTACT_M
 from workers.scene.equilibrium import FIXED, Contact, Weight, contact_points, equilibrium_residual, support_margin_m
-from workers.scene.fall import Fall, Faller, Pace, fall, make_faller
-from workers.scene.landing import HELD_FROM, placed_mesh
-from workers.scene.support import support_height
+from workers.scene.fall import Fall, choose_pace, fall, faller_of, free_fall_m
+from workers.scene.landing import HELD_FROM, LEFT_M, placed_mesh
 from workers.scene.watch import Watch, watch_edge, watch_gone
-
-LEFT_M = 0.05
-"""An object whose centre of mass is this far below the table's top has left it."""
-
-DROP_SHARE = 0.002
-"""Of the height that the highest object may fall: how far a point may go in a step, if that is more than
-`physics.way_mm`. What it sinks in by is then within the thousandth of the fall's energy that may come back."""
-
-THIN_SHARE = 0.05
-"""Of the thinnest object: how far a point may go in a step at most."""
 
 MOST_OVERLAP_M = 1e-4
 """How far objects may begin inside one another. What overlaps is pushed apart by a share of its depth in each step, which a
@@ -70,14 +57,6 @@ def _require_apart(starts: Sequence[ObjectStart]) -> None:
             )
 
 
-def _faller(start: ObjectStart, physics: Physics, ran: Collection[str]) -> Faller:
-    cut: Sequence[Array] = ()
-    if "decomposition" in ran:
-        parts = convex_parts(start.asset.shape.mesh, start.asset.sha256)
-        cut = parts if len(parts) > 1 else ()
-    return make_faller(start, physics, "rolling_friction" in ran, cut=cut)
-
-
 def release_together(
     starts: Sequence[ObjectStart],
     poses: Sequence[Pose],
@@ -91,14 +70,11 @@ def release_together(
     The solver goes from contact to contact: what one iteration carries down a stack is one object, and by a share that
     shrinks with the ratio of the masses. So there are more for more objects; it stops where they change nothing.
     """
-    fallers = [_faller(start, physics, ran) for start in starts]
+    fallers = [faller_of(start, physics, ran) for start in starts]
     hulls = [transform(T, start.hull.vertices) for T, start in zip(poses, starts, strict=True)]
-    free = min(_free_m(points, table, flat) for points in hulls)
+    free = min(free_fall_m(points, table, flat) for points in hulls)
     top = table.top.height_m
-    drop = max(float(points[:, 2].min()) for points in hulls) - top
-    thinnest = min(least_width_m(start.hull) for start in starts)
-    way = max(physics.way_mm / 1e3, DROP_SHARE * drop)
-    pace = Pace(physics.step_hz, min(way, THIN_SHARE * thinnest) if "fine_step" in ran else math.inf)
+    pace = choose_pace(starts, physics, ran, max(float(points[:, 2].min()) for points in hulls) - top)
     reach = max(faller.reach_m for faller in fallers)
     lowest = float(table.mesh.vertices[:, 2].min())
     watch: Watch = watch_edge(table.top.outline, reach) if flat else watch_gone(lowest - reach)
@@ -106,12 +82,7 @@ def release_together(
     times = len(starts) * math.ceil(math.sqrt(max(masses) / min(masses)))
     more = physics.model_copy(update={"solver_iterations": physics.solver_iterations * times})
     ground = top if flat else table.mesh
-    return fall(fallers, poses, ground, more, pace, physics.max_settle_s, max(0.0, free), (watch,))
-
-
-def _free_m(points: Array, table: Table, flat: bool) -> float:
-    below = table.top.height_m if flat else support_height(points[:, :2], table.mesh)
-    return float(points[:, 2].min()) - below if math.isfinite(below) else 0.0
+    return fall(fallers, poses, ground, more, pace, physics.max_settle_s, free, (watch,))
 
 
 def _require_rest(starts: Sequence[ObjectStart], table: Table, motion: Fall) -> None:
