@@ -1,0 +1,34 @@
+"""The errors that the study measures, and what each is held against. Truth never comes from the setting under test."""
+
+from services.tradeoff.model import ErrorKind
+
+_RAYS = "a ray caster in float64 at the same pixel centres"
+_DENSE = "cast rays, 16 in each pixel"
+_FINEST = "the finest steps, 1 s"
+
+KINDS: tuple[ErrorKind, ...] = (
+    ErrorKind("penetration_mm", "mm", "how deep an object stands in what it rests on", "the stored shapes", "physics"),
+    ErrorKind("gap_mm", "mm", "how high an object hovers", "the stored shapes", "physics"),
+    ErrorKind("moved_mm", "mm", "how far an object moves when it is let go again", _FINEST, "physics"),
+    ErrorKind("turned_deg", "deg", "how far it turns when it is let go again", _FINEST, "physics"),
+    ErrorKind(
+        "pose_mm", "mm", "pose off, where two finer settings agree", "twice and four times the finest", "physics"
+    ),
+    ErrorKind(
+        "outcome", "", "difference of outcomes: where and how things come to rest", "the finest steps", "physics", True
+    ),
+    ErrorKind("failed_share", "", "scenes that do not come to rest", "counted", "physics", True),
+    ErrorKind("depth_mm", "mm", "stored depth of objects off, 99 % of pixels", _RAYS, "labels"),
+    ErrorKind("table_depth_mm", "mm", "stored depth of the table off, 99 % of pixels", _RAYS, "labels"),
+    ErrorKind("mask_share", "", "object pixels that are wrong in the mask", _RAYS, "labels"),
+    ErrorKind("between_mm", "mm", "depth between pixels, read at the nearest", "rays at random in the patch", "labels"),
+    ErrorKind("outline_share", "", "rays at random whose region the nearest pixel has wrong", _DENSE, "labels"),
+    ErrorKind("mirror_mm", "mm", "mirror camera off, as d_z is", _DENSE, "mirror"),
+    ErrorKind("agreement_mm", "mm", "input depth carried into the mirror view, off", "the mirror view", "mirror"),
+    ErrorKind("unfilled_share", "", "object pixels of the mirror view seen by both that stay empty", _RAYS, "mirror"),
+    ErrorKind("hidden_share", "", "projected pixels that show what the mirror camera cannot see", _RAYS, "mirror"),
+    ErrorKind("flip", "", "colour: FLIP, 0 the same to 1", "a converged path-traced image", "colour"),
+)
+
+ERRORS: dict[str, ErrorKind] = {kind.name: kind for kind in KINDS}
+"""By name."""
