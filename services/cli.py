@@ -53,6 +53,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     test.add_argument("anything", nargs="*")
     _add_bench(commands)
+    _add_tradeoff(commands)
     doctor = _command(commands, "doctor", "what this machine has, and what is missing", "verso doctor")
     doctor.set_defaults(handler="services.doctor:main")
     return parser
@@ -186,6 +187,33 @@ def _add_bench(commands: "argparse._SubParsersAction") -> None:
         help="time settling instead: N scenes by their plan of effects, and with every effect of physics forced",
     )
     bench.set_defaults(handler="services.bench.command:main")
+
+
+def _add_tradeoff(commands: "argparse._SubParsersAction") -> None:
+    tradeoff = _command(
+        commands,
+        "tradeoff",
+        "what accuracy costs in time, measured on the job's own scenes",
+        "verso tradeoff deploy/jobs/tabletop.yaml --out data/tradeoff --target penetration_mm=0.1,depth_mm=0.5",
+    )
+    tradeoff.add_argument("job", type=Path, metavar="JOB.yaml")
+    tradeoff.add_argument("--out", type=Path, required=True, metavar="DIR", help="goes on there where it stopped")
+    tradeoff.add_argument(
+        "--target",
+        metavar="ERROR=MOST,...",
+        help="write DIR/job.yaml: the job with the cheapest setting that keeps these errors",
+    )
+    tradeoff.add_argument("--knobs", metavar="NAME,...", help="default: all that are known")
+    tradeoff.add_argument("--scenes", type=_count, metavar="N", default=48, help="scenes with images (default: 48)")
+    tradeoff.add_argument(
+        "--physics-scenes", type=_count, metavar="N", default=500, help="scenes that only come to rest (default: 500)"
+    )
+    tradeoff.add_argument("--laps", type=_count, metavar="N", default=3, help="rounds of timing (default: 3)")
+    tradeoff.add_argument("--workers", type=_count, metavar="N", help="default: the cores this container may use")
+    tradeoff.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes", help="change a key of the job"
+    )
+    tradeoff.set_defaults(handler="services.tradeoff.command:main")
 
 
 def _count(text: str) -> int:

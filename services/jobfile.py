@@ -34,6 +34,11 @@ _StrictLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _m
 
 def load_job(path: Path, changes: Sequence[str] = ()) -> Job:
     """Read a job file and apply `path.to.key=value` changes. Raises JobError."""
+    return validate_job(read_tree(path, changes), str(path))
+
+
+def read_tree(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
+    """The keys that a job file has, with `path.to.key=value` changes and without defaults. Raises JobError."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
@@ -52,7 +57,7 @@ def load_job(path: Path, changes: Sequence[str] = ()) -> Job:
         )
     for change in changes:
         set_key(tree, change)
-    return validate_job(tree, str(path))
+    return tree
 
 
 def set_key(tree: dict[str, Any], change: str) -> None:

@@ -23,26 +23,34 @@ _events.propagate = False
 
 
 class ProgressLine:
-    """Scenes done out of scenes asked, on standard error."""
+    """Scenes, or other units, done out of those asked, on standard error."""
 
-    def __init__(self, asked: int, what: str) -> None:
+    def __init__(self, asked: int, what: str, unit: str = "scene") -> None:
         self._asked = asked
         self._what = what
-        self._bar = tqdm(total=asked, unit="scene", desc=what, file=sys.stderr) if sys.stderr.isatty() else None
+        self._unit = unit
+        self._bar = tqdm(total=asked, unit=unit, desc=what, file=sys.stderr) if sys.stderr.isatty() else None
         self._begun = self._told = time.monotonic()
 
-    def show(self, done: int, failed: int) -> None:
-        """Tell how far it is."""
+    def expect(self, asked: int) -> None:
+        """More is to be done than was known at first."""
+        self._asked = asked
+        if self._bar is not None:
+            self._bar.total = asked
+
+    def show(self, done: int, failed: int | None = None) -> None:
+        """Tell how far it is; `failed` where that is counted."""
         if self._bar is not None:
             self._bar.n = done
-            self._bar.set_postfix(failed=failed, refresh=True)
+            self._bar.set_postfix({} if failed is None else {"failed": failed}, refresh=True)
             return
         now = time.monotonic()
         if now - self._told >= LINE_EVERY_S:
             self._told = now
-            rate = done / (now - self._begun)
+            rate, told = done / (now - self._begun), "" if failed is None else f"{failed} failed, "
             print(
-                f"{self._what}: {done} of {self._asked} scenes, {failed} failed, {rate:.1f} scenes/s", file=sys.stderr
+                f"{self._what}: {done} of {self._asked} {self._unit}s, {told}{rate:.1f} {self._unit}s/s",
+                file=sys.stderr,
             )
 
     def close(self) -> None:

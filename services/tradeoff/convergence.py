@@ -9,7 +9,7 @@ from schemas.base import Array
 from schemas.job import Job, Physics
 from workers.scene.bullet import GRAVITY_M_S2, Body, World, drop
 
-RATES_HZ = (480, 960, 1920, 3840)
+RATES_HZ = (960, 1920, 3840, 7680)
 FALL_S = 0.5
 SLIDE_M_S = 1.0
 FRICTION = 0.6

@@ -99,7 +99,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Study:
-    """Everything that a report says: the machine, the command, the table, and the slopes of smooth cases."""
+    """Everything that a report says: the machine, the command, the table, the slopes of smooth cases, and what is left out."""
 
     job: str
     command: str
@@ -108,4 +108,4 @@ class Study:
     physics_scenes: int
     rows: tuple[Row, ...]
     slopes: Mapping[str, float] = field(default_factory=dict)
-    preset: str = "balanced"
+    notes: tuple[str, ...] = ()

@@ -4,9 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import wasserstein_distance
 
-from schemas.base import Array
 from services.tradeoff.errors import ERRORS
 from services.tradeoff.model import Figure
 
@@ -19,6 +19,7 @@ RESAMPLES = 200
 INTERVAL = (2.5, 97.5)
 
 Answer = Mapping[str, Any]
+Rows = NDArray[np.int64]
 
 
 def figure_over_scenes(figures: Sequence[float]) -> Figure:
@@ -39,19 +40,19 @@ def apart(own: Sequence[float], truth: Sequence[float]) -> Figure:
     """How far apart two distributions are: the first Wasserstein distance of samples [N], scene by scene the same scenes.
 
     Their area between cumulative distributions, in the samples' unit (Villani 2009, Optimal Transport, 6.2; Ramdas, Garcia
-    and Cuturi 2017 for one dimension). Tumbling things end elsewhere in each run, and a distance of poses says nothing; that of the
-    distributions does. Its interval is a paired bootstrap's; a median has no meaning, and is the value.
+    and Cuturi 2017 for one dimension). Where a tumbling thing ends is chance, and the distance of two poses says nothing;
+    that of their distributions does. Its interval is a paired bootstrap's; its median is the value again.
     """
     mine, other = np.asarray(own, float), np.asarray(truth, float)
     whole = float(wasserstein_distance(mine, other))
     return _figure(len(mine), lambda rows: float(wasserstein_distance(mine[rows], other[rows])), whole)
 
 
-def _figure(count: int, measure: Callable[[Array], float], median: float) -> Figure:
+def _figure(count: int, measure: Callable[[Rows], float], median: float) -> Figure:
     rng = np.random.default_rng(0)
-    samples = [measure(rng.integers(0, count, count)) for _ in range(RESAMPLES)]
+    samples = [measure(rng.integers(0, count, count, dtype=np.int64)) for _ in range(RESAMPLES)]
     low, high = np.percentile(samples, INTERVAL)
-    return Figure(measure(np.arange(count)), float(low), float(high), median, count)
+    return Figure(measure(np.arange(count, dtype=np.int64)), float(low), float(high), median, count)
 
 
 def settling_figures(name: str, scenes: Sequence[Answer]) -> dict[str, Figure]:

@@ -1,0 +1,139 @@
+"""`verso tradeoff`: measures, chooses, and writes the table, the plots and the page."""
+
+import argparse
+import json
+import shlex
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from schemas.errors import InputError
+from schemas.job import Job
+from services.cores import usable_cores
+from services.jobfile import load_job, read_tree
+from services.progress import ProgressLine
+from services.tradeoff.choose import answer, choose, parse_targets
+from services.tradeoff.crew import Crew
+from services.tradeoff.journal import Journal
+from services.tradeoff.knobs import apply, choose_knobs, knobs_of, set_in, settings_of
+from services.tradeoff.model import Row
+from services.tradeoff.page import write_page
+from services.tradeoff.plots import write_plots
+from services.tradeoff.study import Plan, Progress, Sizes, header_of, run_study, study_of
+from services.tradeoff.tables import write_tables
+from workers.assets.catalogue import open_catalogue
+from workers.context import open_worker
+from workers.fingerprint import code_digest
+from workers.render.context import require_device
+from workers.render.tiers import require_tier
+
+LEAST_SCENES = 4
+"""Fewer say nothing of a 95th percentile."""
+
+USUAL_TARGETS = {"penetration_mm": 0.1, "gap_mm": 0.1, "depth_mm": 0.1, "mask_share": 0.001}
+"""What the sentence is about where no target is given."""
+
+
+def main(options: argparse.Namespace) -> int:
+    """0 where the study is whole and the targets are met; raises InputError or RunError otherwise."""
+    targets = parse_targets(options.target) if options.target else dict(USUAL_TARGETS)
+    asked = load_job(options.job, options.changes)
+    plan, left_out = make_plan(asked, options, targets)
+    require_tier(plan.job.render)
+    catalogue = open_catalogue(plan.job.assets, plan.job_folder, tuple(plan.job.categories))
+    context = open_worker(plan.job, catalogue)
+    require_device(context.renderer.name, plan.job.run.device)
+    journal = Journal(options.out, header_of(plan, context.settings_digest, code_digest()))
+    crew = Crew(plan.job, plan.job_folder, options.workers or usable_cores())
+    with _Bar() as bar:
+        rows = run_study(plan, journal, context, crew, bar)
+    journal.close()
+    study = study_of(plan, rows, context.renderer.name, shlex.join(["verso", *sys.argv[1:]]), left_out)
+    write_tables(study, options.out)
+    write_page(study, write_plots(study, options.out), options.out / "index.html")
+    for name, order in study.slopes.items():
+        print(f"convergence  {name}: error goes with the step to the power {order:.3f}")
+    for note in left_out:
+        print(f"left out     {note}")
+    print(answer(study, targets))
+    chosen = choose(rows, targets)
+    if options.target:
+        write_job(options.job, options.changes, chosen, options.out / "job.yaml", options.target)
+        print(f"{options.out / 'job.yaml'}: the job with {chosen.setting.name}")
+    if options.json:
+        print(json.dumps(_summary(options, chosen, study.rows)))
+    return 0
+
+
+def make_plan(asked: Job, options: argparse.Namespace, targets: dict[str, float]) -> tuple[Plan, list[str]]:
+    """What is measured for these options, and what is left out. Raises InputError."""
+    scenes = min(options.scenes, asked.scenes)
+    if scenes < LEAST_SCENES:
+        raise InputError(
+            f"{scenes} scene{'s' * (scenes > 1)} cannot tell how errors spread: ask for {LEAST_SCENES} or more with --scenes, "
+            f"of a job that has as many (scenes: {asked.scenes} in {options.job})"
+        )
+    job = apply(asked, {"check.raycast_share": 0.0, "output.layout": "files"})
+    knobs = choose_knobs(knobs_of(job), options.knobs.split(",") if options.knobs else None)
+    settings, left_out = settings_of(job, knobs)
+    usual = Sizes()
+    sizes = replace(
+        usual,
+        scenes=scenes,
+        posed=min(usual.posed, scenes),
+        released=min(usual.released, scenes),
+        timed=min(usual.timed, scenes),
+        settled=options.physics_scenes,
+        laps=options.laps,
+    )
+    return Plan(job, options.job.parent, knobs, settings, (), targets, sizes), list(left_out)
+
+
+def write_job(source: Path, changes: list[str], row: Row, path: Path, target: str) -> None:
+    """The user's job file with the chosen keys. Comments of the file are not kept."""
+    tree = read_tree(source, changes)
+    for key, value in row.setting.changes.items():
+        set_in(tree, key, value)
+    head = f"# {source.name} with {row.setting.name}: the cheapest measured setting with {target}.\n"
+    path.write_text(head + yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
+
+
+def _summary(options: argparse.Namespace, chosen: Row, rows: tuple[Row, ...]) -> dict[str, Any]:
+    return {
+        "ok": True,
+        "out": str(options.out),
+        "chosen": chosen.setting.name,
+        "changes": dict(chosen.setting.changes),
+        "ms": chosen.ms,
+        "ratio": chosen.ratio,
+        "settings": len(rows),
+    }
+
+
+class _Bar(Progress):
+    """Units on a progress line."""
+
+    def __init__(self) -> None:
+        self._asked = self._done = 0
+        self._line: ProgressLine | None = None
+
+    def __enter__(self) -> "_Bar":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._line is not None:
+            self._line.close()
+
+    def expect(self, units: int) -> None:
+        self._asked += units
+        if self._line is None:
+            self._line = ProgressLine(self._asked, "tradeoff", unit="measurement")
+        self._line.expect(self._asked)
+
+    def tick(self) -> None:
+        self._done += 1
+        assert self._line is not None
+        self._line.show(self._done)

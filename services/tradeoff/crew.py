@@ -1,0 +1,57 @@
+"""The processes that measure errors, one for each core; times are taken elsewhere, and not while these work."""
+
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from schemas.job import Job
+from services.tradeoff.model import Setting
+from services.tradeoff.pictures import measure_colour, measure_pictures
+from services.tradeoff.settling import measure_settling
+from workers.assets.catalogue import open_catalogue
+from workers.context import WorkerContext, open_worker
+
+Task = tuple[str, str, tuple[Setting, ...], int, dict[str, bool]]
+"""Name, kind, settings, scene and flags of what is measured."""
+
+
+@dataclass(frozen=True)
+class Crew:
+    """So many processes for one job."""
+
+    job: Job
+    job_folder: Path
+    processes: int
+
+    def measure(self, tasks: Sequence[Task]) -> Iterator[tuple[str, Any]]:
+        """Answers by name, as they are ready. What a task raises is raised here; the others are dropped."""
+        if not tasks:
+            return
+        fresh = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(self.processes, mp_context=fresh) as pool:
+            told = self.job.model_dump_json(), str(self.job_folder)
+            running = {pool.submit(_work, *told, task): task[0] for task in tasks}
+            try:
+                for done in as_completed(running):
+                    yield running[done], done.result()
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+
+
+@cache
+def _context(job: str, folder: str) -> WorkerContext:
+    parsed = Job.model_validate_json(job)
+    return open_worker(parsed, open_catalogue(parsed.assets, Path(folder), tuple(parsed.categories)))
+
+
+def _work(job: str, folder: str, task: Task) -> Any:
+    context = _context(job, folder)
+    _, kind, settings, scene_id, flags = task
+    if kind == "settling":
+        return measure_settling(context, settings, scene_id, **flags)
+    return (measure_pictures if kind == "images" else measure_colour)(context, settings, scene_id)
