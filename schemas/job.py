@@ -19,6 +19,7 @@ from schemas.base import (
     Range,
     Share,
 )
+from schemas.preset import PresetName, with_preset
 from schemas.sensor import SensorEffects
 from schemas.sources import Assets
 from schemas.start import ONE_OBJECT, ObjectCount, Start
@@ -252,6 +253,8 @@ class Job(Frozen):
     """schema_version."""
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
     """Names the dataset; the default output folder is data/<name>."""
+    preset: PresetName = "balanced"
+    """What keys that are not given are: `fast` and `exact` trade errors for time as docs/tradeoff has measured."""
     seed: NonNegativeInt = 0
     """Seed of everything that is drawn in a scene."""
     scenes: PositiveInt = 64
@@ -284,6 +287,11 @@ class Job(Frozen):
     """How files are laid out."""
     run: Run = Run()
     """How the work is driven: changes no byte of the dataset."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill(cls, value: object) -> object:
+        return with_preset(value) if isinstance(value, dict) else value
 
     @field_validator("categories", mode="before")
     @classmethod

@@ -9,7 +9,7 @@ from workers.allocator import keep_freed_memory
 from workers.assets.catalogue import Catalogue
 from workers.render.gbuffer import Renderer, shared_renderer
 
-OUTSIDE_SETTINGS = {"name", "scenes", "first_scene", "run", "output", "verso"}
+OUTSIDE_SETTINGS = {"name", "scenes", "first_scene", "run", "output", "verso", "preset"}
 """Keys of a job that do not change what a scene is."""
 
 
