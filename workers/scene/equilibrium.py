@@ -1,4 +1,4 @@
-"""Whether bodies that touch can be at rest: static equilibrium, the margin of support, the least of energy. Pure geometry."""
+"""Whether bodies that touch can be at rest: static equilibrium, and the margin of support. Pure geometry."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,24 +7,14 @@ import numpy as np
 from scipy.optimize import nnls
 from shapely.geometry import MultiPoint, Point
 
-from schemas.base import Array, Pose
+from schemas.base import Array
 from schemas.shape import Mesh
-from workers.geometry.frames import transform
 from workers.geometry.heights import Terrain
 from workers.geometry.touching import touching_points
 
 CONE_EDGES = 8
 """Of the pyramid that stands for a cone of friction, within it: it holds at least cos(pi / 8) = 92 % of the true friction
 in every direction, and all of it in eight."""
-
-ROCK_RAD = 1e-3
-"""How far a body is rocked to see whether its centre of mass sinks: less than half a facet of a round shape."""
-
-ROCK_AXES = 16
-"""Directions in which it is rocked."""
-
-SINKS_M = 1e-9
-"""A centre of mass that sinks by less did not sink."""
 
 FIXED = -1
 """The number of what does not move, such as the table."""
@@ -121,18 +111,3 @@ def support_margin_m(points: Array, com: Array) -> float:
     if outline.geom_type == "Polygon" and outline.contains(at):
         return float(outline.exterior.distance(at))
     return -float(outline.distance(at))
-
-
-def is_energy_minimum(vertices: Array, T_world_obj: Pose, com: Array) -> bool:
-    """Whether a body on a level plane, rocked a little any way, does not sink: for what touches in a point or a line.
-
-    vertices [N, 3] and com [3] in the object's frame. The centre of mass is as high above a plane with the upward
-    normal u as max over vertices of u . (com - v), whichever part of the body touches (its support function).
-    """
-    depth = transform(T_world_obj, com[None, :]) - transform(T_world_obj, vertices)
-    angle = 2.0 * np.pi * np.arange(ROCK_AXES) / ROCK_AXES
-    tilted = np.column_stack(
-        [np.sin(ROCK_RAD) * np.cos(angle), np.sin(ROCK_RAD) * np.sin(angle), np.full(ROCK_AXES, np.cos(ROCK_RAD))]
-    )
-    height = (depth @ tilted.T).max(axis=0)
-    return bool((height >= depth[:, 2].max() - SINKS_M).all())
