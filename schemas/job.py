@@ -12,13 +12,13 @@ from pydantic import Field, field_validator, model_validator
 from schemas.base import (
     Frozen,
     Interval,
-    NonNegative,
     NonNegativeInt,
     Positive,
     PositiveInt,
     Range,
     Share,
 )
+from schemas.physics import Physics
 from schemas.preset import PresetName, with_preset
 from schemas.sensor import SensorEffects
 from schemas.sources import Assets
@@ -32,44 +32,6 @@ Reach = Annotated[float, Field(gt=0, le=1e3)]
 Offset = Annotated[float, Field(ge=-1e3, le=1e3)]
 """Far beyond any camera, and what its numbers can be without overflow in float32 on the GPU."""
 CATEGORIES: tuple[Category, ...] = ("bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box")
-
-
-class Rest(Frozen):
-    """When an object counts as resting: it drifts and turns more slowly than this for the whole window."""
-
-    speed_mm_s: Positive = 1.0
-    """Bound on the drift of the object's farthest point."""
-    spin_rad_s: Positive = 0.01
-    """Bound on the rate at which it turns."""
-    window_s: Positive = 0.25
-    """How long both must hold."""
-
-
-class Physics(Frozen):
-    """PyBullet's settings."""
-
-    step_hz: Annotated[int, Field(ge=30, le=20_000)] = 960
-    """Steps a second where all moves slowly; up to 16 times as many where it does not."""
-    way_mm: Positive = 0.07
-    """How far the fastest point may go in a step; more in falls from above 35 mm, less for what is thinner than 2 mm."""
-    solver_iterations: Annotated[int, Field(ge=1, le=10_000)] = 100
-    """Iterations of the contact solver in each step."""
-    max_settle_s: Positive = 20.0
-    """Simulated time after which an object that still moves is a failure."""
-    rest: Rest = Rest()
-    """When an object counts as resting."""
-    margin_mm: Annotated[float, Field(ge=0.02)] = 0.1
-    """Collision margin of an object, which its collision shape is smaller by; less where it is thinner than four margins."""
-    friction: NonNegative = 0.7
-    """Of each body; contact friction is the product of the two."""
-    rolling_friction: NonNegative = 0.0005
-    """Of each body, metres: Bullet's torque against rolling is twice this, times `friction`, times the contact force."""
-    spinning_friction: NonNegative = 0.0005
-    """The same against spinning about the contact's normal."""
-    restitution: Share = 0.0
-    """Of each body; the restitution of a contact is the product of the two."""
-    snap_rad: NonNegative = 0.02
-    """The final correction turns the object by at most this angle onto the face that it stands on."""
 
 
 class Orbit(Frozen):

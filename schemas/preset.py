@@ -8,8 +8,18 @@ PresetName = Literal["fast", "balanced", "exact"]
 
 PRESETS: dict[PresetName, dict[str, Any]] = {
     "fast": {"physics.step_hz": 240, "render.tier": "flat", "render.samples": 1, "images.depth_units_per_m": 5000.0},
-    "balanced": {"physics.step_hz": 960, "render.tier": "raster", "render.samples": 1, "images.depth_units_per_m": 5000.0},
-    "exact": {"physics.step_hz": 1920, "render.tier": "raster", "render.samples": 4, "images.depth_units_per_m": 8000.0},
+    "balanced": {
+        "physics.step_hz": 960,
+        "render.tier": "raster",
+        "render.samples": 1,
+        "images.depth_units_per_m": 5000.0,
+    },
+    "exact": {
+        "physics.step_hz": 1920,
+        "render.tier": "raster",
+        "render.samples": 4,
+        "images.depth_units_per_m": 8000.0,
+    },
 }
 """By name, the same dotted keys in each. `balanced` is what the keys' own defaults say."""
 

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from schemas.base import Array
-from schemas.job import Job, Physics
+from schemas.job import Job
+from schemas.physics import Physics
 from workers.scene.bullet import GRAVITY_M_S2, Body, World, drop
 
 RATES_HZ = (960, 1920, 3840, 7680)

@@ -9,7 +9,8 @@ import numpy as np
 
 from schemas.base import Pose
 from schemas.errors import SceneError
-from schemas.job import Job, Physics
+from schemas.job import Job
+from schemas.physics import Physics
 from schemas.scene import ScenePlan, Settled
 from services.tradeoff.knobs import apply
 from services.tradeoff.model import Setting

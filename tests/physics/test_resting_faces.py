@@ -13,7 +13,8 @@ from scipy.spatial import ConvexHull
 from scipy.stats import chi2_contingency
 
 from schemas.base import Array
-from schemas.job import Job, Physics
+from schemas.job import Job
+from schemas.physics import Physics
 from schemas.shape import Asset
 from tests.physics.room import PHYSICS, physics
 from tests.shapes import asset_of, box, table

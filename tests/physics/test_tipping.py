@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from schemas.job import Physics
+from schemas.physics import Physics
 from tests.physics.room import G, advance, at, box_body, lean, order, physics, slope
 from workers.scene.bullet import drop
 

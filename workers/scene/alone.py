@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from schemas.base import Pose, frozen_array
 from schemas.errors import SettleError
-from schemas.job import Physics
+from schemas.physics import Physics
 from schemas.scene import ObjectStart, Settled, SupportedBy, Table
 from workers.geometry.frames import transform
 from workers.geometry.heights import heights_at

@@ -11,7 +11,7 @@ import numpy as np
 
 from schemas.base import Array, Pose
 from schemas.errors import SettleError
-from schemas.job import Physics
+from schemas.physics import Physics
 from schemas.shape import Mesh
 from workers.geometry.frames import quaternion_of
 from workers.scene.lists import Numbers

@@ -8,7 +8,7 @@ import manifold3d
 import numpy as np
 
 from schemas.base import Array
-from schemas.job import Physics
+from schemas.physics import Physics
 from schemas.scene import ObjectStart, Table
 from schemas.shape import Hull
 from workers.geometry.decompose import CONVEX_SHARE

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.base import Array, Pose
-from schemas.job import Physics
+from schemas.physics import Physics
 from schemas.scene import ObjectStart, Table
 from schemas.shape import MassProperties, Mesh
 from workers.geometry.decompose import convex_parts

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from schemas.base import Pose
-from schemas.job import Physics
+from schemas.physics import Physics
 from schemas.scene import ObjectStart, ScenePlan, Settled, Table
 from workers.geometry.frames import moved_between
 from workers.scene.alone import ON_MESH, LeftRoomError, let_go, settle_alone, watching

@@ -8,7 +8,7 @@ import numpy as np
 
 from schemas.base import Pose, frozen_array
 from schemas.errors import SettleError
-from schemas.job import Physics
+from schemas.physics import Physics
 from schemas.scene import ObjectStart, Settled, SupportedBy, Table
 from schemas.shape import Mesh
 from workers.geometry.frames import transform
