@@ -24,6 +24,8 @@ SPIN_PER_SPEED = 0.01
 WIDTHS = (160, 320, 640, 1280)
 """Pixels; the other lengths of the pinhole camera go with it."""
 
+_CORRECT = "physics.correction"
+
 _SETTLES = (
     "outcome_mm",
     "outcome_deg",
@@ -40,10 +42,10 @@ _MIRROR = ("mirror_mm", "agreement_mm", "unfilled_share", "hidden_share")
 
 def knobs_of(job: Job) -> tuple[Knob, ...]:
     """Every knob, with the values that mean something for this job."""
-    return (*_physics_knobs(), *_image_knobs(job))
+    return (*_physics_knobs(job), *_image_knobs(job))
 
 
-def _physics_knobs() -> tuple[Knob, ...]:
+def _physics_knobs(job: Job) -> tuple[Knob, ...]:
     def knob(name: str, title: str, values: Iterable[Value]) -> Knob:
         return Knob(name, title, "physics", _SETTLES, tuple(values))
 
@@ -52,7 +54,21 @@ def _physics_knobs() -> tuple[Knob, ...]:
         knob("way", "way of a point in a step, mm", _plain("physics.way_mm", (1.0, 0.3, 0.15, 0.07, 0.03))),
         knob("iterations", "solver iterations", _plain("physics.solver_iterations", (5, 10, 25, 50, 100, 200))),
         knob("rest", "speed that counts as rest, mm/s", map(_rest, (30.0, 10.0, 3.0, 1.0, 0.3))),
+        knob("collision", "shape in the simulator", _collisions(job)),
+        knob("correction", "final correction", (Value("off", {_CORRECT: False}), Value("on", {_CORRECT: True}))),
     )
+
+
+def _collisions(job: Job) -> list[Value]:
+    """From coarse to fine; parts of meshes from outside at several tolerances (parts of built-in shapes have none).
+
+    The mesh itself is no value: Bullet moves convex shapes alone.
+    """
+    key, depth = "physics.collision", "physics.concavity"
+    found = [Value(name, {key: name}) for name in ("box", "hull", "planned")]
+    if all(source.source == "procedural" for source in job.assets.objects):
+        return [*found, Value("parts", {key: "parts"})]
+    return [*found, *(Value(f"parts to {d:g}", {key: "parts", depth: d}) for d in (0.1, 0.05, 0.02))]
 
 
 def _image_knobs(job: Job) -> tuple[Knob, ...]:

@@ -12,8 +12,8 @@ from schemas.scene import ObjectStart, Settled, SupportedBy, Table
 from workers.geometry.frames import transform
 from workers.geometry.heights import heights_at
 from workers.scene.contact import snap_to_face, support_margin, tip_onto_face, touching
-from workers.scene.dynamics import called_for
-from workers.scene.fall import FINEST, Fall, Faller, choose_pace, fall, faller_of, free_fall_m
+from workers.scene.dynamics import called_for, on_mesh
+from workers.scene.fall import FINEST, Fall, Faller, choose_pace, fall, faller_of, free_fall_m, shaped
 from workers.scene.landing import LEFT_M, Ground, gap_m, ground_of, support_of, touch_down
 from workers.scene.watch import Watch, can_touch, stands_on_face, watch_edge, watch_gone, watch_room, watch_tilt
 
@@ -26,9 +26,6 @@ DAMPING = 0.9
 UNBALANCED = 0.05
 """Share of its weight, and of weight times size, that contacts may fail to balance: what their positions, known to
 `CONTACT_M`, leave open."""
-
-ON_MESH = ("table_mesh", "decomposition")
-"""Effects that are called for together where a footprint left the flat top."""
 
 
 class LeftRoomError(Exception):
@@ -66,7 +63,7 @@ def settle_alone(
         motion = _settle_flat(task)
         if motion is not None:
             return _describe(task, motion, "flat_top")
-        task = dataclasses.replace(task, ran=(*ran, *ON_MESH))
+        task = dataclasses.replace(task, ran=(*ran, *on_mesh((start,), physics)))
     motion = _simulate(task, physics.max_settle_s, flat=False)
     _require_rest(task, motion)
     return _describe(task, motion, "mesh")
@@ -90,6 +87,8 @@ def _settle_flat(task: _Task) -> Fall | None:
             return None
         _require_rest(task, motion)
         seconds += motion.seconds
+        if not physics.correction:
+            return dataclasses.replace(motion, seconds=seconds)
         stopped = motion.poses[0]
         T = snap_to_face(stopped, task.start.hull, asset.mass.com, physics.snap_rad)
         tipped = tip_onto_face(T, task.start.hull, asset.mass.com)
@@ -144,14 +143,17 @@ def _is_held(task: _Task, motion: Fall) -> bool:
 def _describe(task: _Task, motion: Fall, support: SupportedBy) -> Settled:
     """The figures of a rest pose, measured between the meshes and not taken from the simulator."""
     start = task.start
-    T = motion.poses[0] if support == "placed" else touch_down(start, motion.poses[0], task.ground)
+    corrected = support != "placed" and task.physics.correction
+    T = touch_down(start, motion.poses[0], task.ground) if corrected else motion.poses[0]
     gap_mm = gap_m(start, T, task.ground) * 1e3
     com = transform(T, start.asset.mass.com[None, :])[0]
     margin, residual = support_margin(touching(start.hull, T, task.ground.terrain), com[:2]), 0.0
     if support == "mesh":
         held = support_of(start, T, task.ground, task.physics.friction**2)
         margin, residual = held.margin_m, held.residual
-    if residual > UNBALANCED or (support != "mesh" and not margin > 0.0):
+    # Uncorrected, what stands on a face may touch with one of its corners, which tells nothing.
+    judged = support != "flat_top" or corrected
+    if judged and (residual > UNBALANCED or (support != "mesh" and not margin > 0.0)):
         raise SettleError(
             "unsupported",
             f"it came to rest with its centre of mass {-margin * 1e3:.2f} mm outside the hull of its contacts, which leave "
@@ -176,7 +178,7 @@ def _simulate(task: _Task, seconds: float, flat: bool) -> Fall:
     with their number. So it falls with these alone, and falls again with all of them should it tip. Where `decomposition`
     runs it falls as its convex parts, else as its hull.
     """
-    start, table = task.start, task.ground.table
+    start, table = shaped(task.start, task.physics), task.ground.table
     faller = faller_of(start, task.physics, task.ran, task.damping)
     free = free_fall_m(transform(start.T_world_obj, start.hull.vertices), table, flat)
     pace = choose_pace((start,), task.physics, task.ran, free if flat else 0.0)

@@ -110,10 +110,18 @@ def _object_contacts(starts: Sequence[ObjectStart], table: Table, physics: Physi
 
 
 def _decomposition(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
+    if physics.collision in ("box", "hull"):
+        return f"physics.collision is {physics.collision}"
     alone = _object_contacts(starts, table, physics) is not None
-    if alone and _over_top(starts, table):
+    if physics.collision == "planned" and alone and _over_top(starts, table):
         return "over a flat top an object touches with its hull alone"
     return "every object is convex" if all(is_convex(start) for start in starts) else None
+
+
+def on_mesh(starts: Sequence[ObjectStart], physics: Physics) -> tuple[str, ...]:
+    """Effects that are called for where a footprint left the flat top, or an object came where it may meet another."""
+    parts = physics.collision not in ("box", "hull") and not all(is_convex(start) for start in starts)
+    return ("table_mesh", "decomposition") if parts else ("table_mesh",)
 
 
 def _rolling(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.base import Array, Pose
+from schemas.base import Array, Pose, frozen_array
 from schemas.physics import Physics
 from schemas.scene import ObjectStart, Table
 from schemas.shape import MassProperties, Mesh
@@ -94,6 +94,21 @@ class Fall:
     seconds: float
     rested: bool
     happened: int | None = None
+
+
+def shaped(start: ObjectStart, physics: Physics) -> ObjectStart:
+    """The object as `physics.collision` has it fall: with the box about it, along its own axes, in place of its hull.
+
+    Its lowest point stays as high as the object's.
+    """
+    if physics.collision != "box":
+        return start
+    lower, upper = start.hull.vertices.min(axis=0), start.hull.vertices.max(axis=0)
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (upper - lower) + lower
+    low = [float(transform(start.T_world_obj, points)[:, 2].min()) for points in (start.hull.vertices, corners)]
+    T = start.T_world_obj.copy()
+    T[2, 3] += low[0] - low[1]
+    return dataclasses.replace(start, hull=convex_hull(corners), T_world_obj=frozen_array(T))
 
 
 def make_faller(

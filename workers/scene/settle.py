@@ -9,8 +9,8 @@ from schemas.base import Pose
 from schemas.physics import Physics
 from schemas.scene import ObjectStart, ScenePlan, Settled, Table
 from workers.geometry.frames import moved_between
-from workers.scene.alone import ON_MESH, LeftRoomError, let_go, settle_alone, watching
-from workers.scene.dynamics import called_for, is_convex, rooms_m
+from workers.scene.alone import LeftRoomError, let_go, settle_alone, watching
+from workers.scene.dynamics import called_for, on_mesh, rooms_m
 from workers.scene.effect import EffectPlan
 from workers.scene.together import release_together, settle_together
 
@@ -49,15 +49,10 @@ def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan) -> Rest
             )
         except LeftRoomError:
             called["object_contacts"] = LEFT_ROOM
-            ran = (*effects.ran, "object_contacts")
-            if not all(is_convex(start) for start in starts):
-                called["decomposition"] = LEFT_ROOM
-                ran = (*ran, "decomposition")
-            settled = settle_together(starts, table, physics, ran)
+            called |= {name: LEFT_ROOM for name in on_mesh(starts, physics) if name != "table_mesh"}
+            settled = settle_together(starts, table, physics, (*effects.ran, *called))
     if any(rest.support == "mesh" for rest in settled):
-        called["table_mesh"] = LEFT_TOP
-        if not all(is_convex(start) for start in starts):
-            called["decomposition"] = LEFT_TOP
+        called |= dict.fromkeys(on_mesh(starts, physics), LEFT_TOP)
     return Rest(settled, {name: why for name, why in called.items() if not effects.runs(name)})
 
 
@@ -66,7 +61,7 @@ def recheck(start: ObjectStart, settled: Settled, table: Table, physics: Physics
 
     For `RECHECK_S`, in the finest steps, on the ground that it came to rest on. Nothing is corrected afterwards.
     """
-    ran = called_for((start,), table, physics) | set(ON_MESH if settled.support == "mesh" else ())
+    ran = called_for((start,), table, physics) | set(on_mesh((start,), physics) if settled.support == "mesh" else ())
     return moved_by(start, settled.T_world_obj, let_go(start, settled, table, physics, ran, RECHECK_S))
 
 

@@ -16,7 +16,7 @@ from workers.geometry.heights import survey
 from workers.scene.clearance import clearances, overlap_m
 from workers.scene.contact import CONTACT_M
 from workers.scene.equilibrium import FIXED, Contact, Weight, contact_points, equilibrium_residual, support_margin_m
-from workers.scene.fall import Fall, choose_pace, fall, faller_of, free_fall_m
+from workers.scene.fall import Fall, choose_pace, fall, faller_of, free_fall_m, shaped
 from workers.scene.landing import HELD_FROM, LEFT_M, placed_mesh
 from workers.scene.watch import Watch, watch_edge, watch_gone
 
@@ -70,6 +70,7 @@ def release_together(
     The solver goes from contact to contact: what one iteration carries down a stack is one object, and by a share that
     shrinks with the ratio of the masses. So there are more for more objects; it stops where they change nothing.
     """
+    starts = [shaped(start, physics) for start in starts]
     fallers = [faller_of(start, physics, ran) for start in starts]
     hulls = [transform(T, start.hull.vertices) for T, start in zip(poses, starts, strict=True)]
     free = min(free_fall_m(points, table, flat) for points in hulls)
