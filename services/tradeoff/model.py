@@ -99,7 +99,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Study:
-    """Everything that a report says: the machine, the command, the table, the slopes of smooth cases, and what is left out."""
+    """Everything that a report says: the machine, the command, the table, and the slopes of smooth cases.
+
+    `scenes` were made with each setting, `physics_scenes` dropped; `job_scenes` are those of the whole job, whose cost is
+    told where there are any; `notes`: what holds for the study as a whole, such as what was not measured, and why.
+    """
 
     job: str
     command: str
@@ -108,4 +112,6 @@ class Study:
     physics_scenes: int
     rows: tuple[Row, ...]
     slopes: Mapping[str, float] = field(default_factory=dict)
+    preset: str = "balanced"
+    job_scenes: int = 0
     notes: tuple[str, ...] = ()

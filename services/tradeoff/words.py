@@ -1,0 +1,89 @@
+"""Pure: amounts, times and sizes in words, for the sentence, the plots and the page."""
+
+from services.tradeoff.errors import ERRORS
+
+SHORT: dict[str, str] = {
+    "penetration_mm": "penetration",
+    "gap_mm": "gap",
+    "moved_mm": "motion when let go again",
+    "turned_deg": "turn when let go again",
+    "pose_mm": "pose",
+    "outcome": "distance of outcomes",
+    "failed_share": "scenes that fail",
+    "depth_mm": "depth of objects",
+    "table_depth_mm": "depth of the table",
+    "mask_share": "the object's mask pixels",
+    "between_mm": "depth between pixels",
+    "outline_share": "regions between pixels",
+    "mirror_mm": "mirror camera",
+    "agreement_mm": "agreement of the views",
+    "unfilled_share": "projected pixels left empty",
+    "hidden_share": "projected pixels that show through",
+    "flip": "colour, FLIP",
+}
+"""What an error is called where there is no room for its title."""
+
+_SPANS = ((60.0, 1.0, "s"), (5400.0, 60.0, "min"), (float("inf"), 3600.0, "h"))
+_SIZES = ((1e3, 1.0, "kB"), (1e6, 1e3, "MB"), (1e9, 1e6, "GB"), (float("inf"), 1e9, "TB"))
+
+
+def short(name: str) -> str:
+    """What an error is called in few words."""
+    return SHORT.get(name, name.replace("_", " "))
+
+
+def is_share(name: str) -> bool:
+    """Whether an error is a share, which is shown in per cent."""
+    return name.endswith("_share")
+
+
+def unit(name: str) -> str:
+    """As it is shown: "mm", "deg", "%" or nothing."""
+    return "%" if is_share(name) else ERRORS[name].unit if name in ERRORS else ""
+
+
+def shown(name: str, value: float) -> float:
+    """In the unit that it is shown in."""
+    return value * 100.0 if is_share(name) else value
+
+
+def amount(name: str, value: float) -> str:
+    """An error with its unit, three digits: "0.1 mm", "0.25 %"."""
+    return f"{number(shown(name, value))} {unit(name)}".strip()
+
+
+def number(value: float) -> str:
+    """Three digits, without an exponent between a hundred-thousandth and a million: "0", "0.00012", "13.4", "1,250"."""
+    if value == 0.0 or not 1e-5 <= abs(value) < 1e6:
+        return f"{value:.3g}"
+    text = f"{float(f'{value:.3g}'):,.8f}"
+    return text.rstrip("0").rstrip(".")
+
+
+def times(ratio: float) -> str:
+    """A ratio of times: "0.62 times", "1.6 times", "47 times"."""
+    return f"{number(float(f'{ratio:.2g}') if ratio >= 1.095 or ratio < 0.95 else round(ratio, 2))} times"
+
+
+def milliseconds(ms: float) -> str:
+    """What a scene costs: "118 ms", "11.2 s"."""
+    return f"{number(ms)} ms" if ms < 9999.5 else f"{number(ms / 1e3)} s"
+
+
+def duration(seconds: float) -> str:
+    """What a job costs: "8 s", "12 min", "31 h"."""
+    return next(f"{number(_two(seconds / one))} {name}" for most, one, name in _SPANS if seconds < most)
+
+
+def size(kilobytes: float) -> str:
+    """What a job stores: "15 MB"."""
+    return next(f"{number(_two(kilobytes / one))} {name}" for most, one, name in _SIZES if kilobytes < most)
+
+
+def _two(value: float) -> float:
+    return float(f"{value:.2g}") if value < 100.0 else float(round(value))
+
+
+def listed(words: list[str], last: str = "and") -> str:
+    """Such as "a", "a and b" or "a, b and c"."""
+    return f" {last} ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
