@@ -4,6 +4,7 @@ import argparse
 import json
 import shlex
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,8 @@ from schemas.job import Job
 from services.cores import usable_cores
 from services.jobfile import load_job, read_tree
 from services.progress import ProgressLine
-from services.tradeoff.choose import answer, choose, parse_targets
+from services.tradeoff.answer import DEFAULT_TARGETS, answer, recommend
+from services.tradeoff.choose import parse_targets
 from services.tradeoff.crew import Crew
 from services.tradeoff.journal import Journal
 from services.tradeoff.knobs import apply, choose_knobs, knobs_of, set_in, settings_of
@@ -33,15 +35,12 @@ from workers.render.tiers import require_tier
 LEAST_SCENES = 4
 """Fewer say nothing of a 95th percentile."""
 
-USUAL_TARGETS = {"penetration_mm": 0.1, "gap_mm": 0.1, "depth_mm": 0.1, "mask_share": 0.001}
-"""What the sentence is about where no target is given."""
-
 
 def main(options: argparse.Namespace) -> int:
     """0 where the study is whole and the targets are met; raises InputError or RunError otherwise."""
-    targets = parse_targets(options.target) if options.target else dict(USUAL_TARGETS)
+    targets = parse_targets(options.target) if options.target else None
     asked = load_job(options.job, options.changes)
-    plan, left_out = make_plan(asked, options, targets)
+    plan, left_out = make_plan(asked, options, targets or DEFAULT_TARGETS)
     require_tier(plan.job.render)
     catalogue = open_catalogue(plan.job.assets, plan.job_folder, tuple(plan.job.categories))
     context = open_worker(plan.job, catalogue)
@@ -59,7 +58,7 @@ def main(options: argparse.Namespace) -> int:
     for note in left_out:
         print(f"left out     {note}")
     print(answer(study, targets))
-    chosen = choose(rows, targets)
+    chosen = recommend(study, targets)
     if options.target:
         write_job(options.job, options.changes, chosen, options.out / "job.yaml", options.target)
         print(f"{options.out / 'job.yaml'}: the job with {chosen.setting.name}")
@@ -68,7 +67,7 @@ def main(options: argparse.Namespace) -> int:
     return 0
 
 
-def make_plan(asked: Job, options: argparse.Namespace, targets: dict[str, float]) -> tuple[Plan, list[str]]:
+def make_plan(asked: Job, options: argparse.Namespace, targets: Mapping[str, float]) -> tuple[Plan, list[str]]:
     """What is measured for these options, and what is left out. Raises InputError."""
     scenes = min(options.scenes, asked.scenes)
     if scenes < LEAST_SCENES:

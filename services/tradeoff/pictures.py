@@ -7,6 +7,7 @@ from services.tradeoff.colour_errors import colour_truth_missing, converged_colo
 from services.tradeoff.image_errors import measure_images
 from services.tradeoff.model import Setting
 from services.tradeoff.settling import context_for
+from services.tradeoff.truth import truth_of
 from workers.context import WorkerContext
 from workers.scene_steps import Scene, Stopwatch, make_scene
 
@@ -15,8 +16,13 @@ CONVERGED_PATHS = 256
 
 def measure_pictures(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> dict[str, dict[str, float]]:
     """Errors of depth, masks, the mirror pose and the projection by the settings' names, where the scene can be made."""
-    made = {setting.name: _make(context_for(context, setting), scene_id) for setting in settings}
-    return {name: measure_images(*found) for name, found in made.items() if found is not None}
+    truth, answers = None, {}
+    for setting in settings:
+        found = _make(context_for(context, setting), scene_id)
+        if found is not None:
+            truth = truth_of(found[1], truth)
+            answers[setting.name] = measure_images(*found, truth)
+    return answers
 
 
 def measure_colour(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> dict[str, dict[str, float]]:

@@ -218,6 +218,7 @@ def study_of(plan: Plan, rows: Sequence[Row], renderer: str, command: str, left_
         machine=describe_machine(renderer),
         scenes=plan.sizes.scenes,
         physics_scenes=plan.sizes.settled,
+        job_scenes=plan.job.scenes,
         rows=tuple(rows),
         slopes=slopes(),
         notes=tuple(left_out),
