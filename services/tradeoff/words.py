@@ -60,9 +60,14 @@ def number(value: float) -> str:
     return text.rstrip("0").rstrip(".")
 
 
+def as_often(ratio: float) -> str:
+    """A ratio of times in two digits: "1" within the noise of 5 %, "0.62", "1.6", "47"."""
+    return "1" if abs(ratio - 1.0) < 0.05 else number(float(f"{ratio:.2g}"))
+
+
 def times(ratio: float) -> str:
-    """A ratio of times: "0.62 times", "1.6 times", "47 times"."""
-    return f"{number(float(f'{ratio:.2g}') if ratio >= 1.095 or ratio < 0.95 else round(ratio, 2))} times"
+    """The same with its word, and a third digit where it is near 1: "1.07 times"."""
+    return f"{number(round(ratio, 2)) if 0.9 <= ratio < 1.1 else as_often(ratio)} times"
 
 
 def milliseconds(ms: float) -> str:
