@@ -53,11 +53,11 @@ def amount(name: str, value: float) -> str:
 
 
 def number(value: float) -> str:
-    """Three digits, without an exponent between a hundred-thousandth and a million: "0", "0.00012", "13.4", "1,250"."""
-    if value == 0.0 or not 1e-5 <= abs(value) < 1e6:
-        return f"{value:.3g}"
-    text = f"{float(f'{value:.3g}'):,.8f}"
-    return text.rstrip("0").rstrip(".")
+    """Three digits: "0", "0.00012", "13.4", "1,250"; below a ten-thousandth and from a million on "3.5e-5"."""
+    if value != 0.0 and not 1e-4 <= abs(value) < 1e6:
+        digits, _, exponent = f"{value:.3g}".partition("e")
+        return f"{digits}e{int(exponent)}" if exponent else digits
+    return f"{float(f'{value:.3g}'):,.8f}".rstrip("0").rstrip(".")
 
 
 def as_often(ratio: float) -> str:
