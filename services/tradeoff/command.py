@@ -52,7 +52,7 @@ def main(options: argparse.Namespace) -> int:
     journal.close()
     study = study_of(plan, rows, context.renderer.name, shlex.join(["verso", *sys.argv[1:]]), left_out)
     write_tables(study, options.out)
-    write_page(study, write_plots(study, options.out), options.out / "index.html")
+    write_page(study, write_plots(study, options.out), options.out / "index.html", targets)
     for name, order in study.slopes.items():
         print(f"convergence  {name}: error goes with the step to the power {order:.3f}")
     for note in left_out:

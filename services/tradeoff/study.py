@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from services.tradeoff.knobs import apply, groups_of
 from services.tradeoff.model import Figure, Group, Knob, Row, Setting, Study
 from services.tradeoff.pairs import promising
 from services.tradeoff.statistics import image_figures, settling_figures
-from services.tradeoff.timing import cost_of, job_cost, time_scene
+from services.tradeoff.timing import cost_of, job_cost, time_scene, warm_up
 from workers.context import WorkerContext
 
 Tick = Callable[[], None]
@@ -67,6 +67,7 @@ def run_study(
     plan: Plan, journal: Journal, context: WorkerContext, crew: Crew, progress: "Progress"
 ) -> tuple[Row, ...]:
     """Measure what is not in the journal yet, and make the table. The job itself is its first row."""
+    warm_up(context, plan.settings, plan.job.first_scene + plan.sizes.timed)
     singles = _Round(plan, "alone", plan.settings)
     progress.expect(len(singles.units()))
     _measure(singles, journal, context, crew, progress.tick)
@@ -75,7 +76,8 @@ def run_study(
     together = _Round(plan, "together", (Setting(), *plan.presets, *promising(rows, units, plan.targets)))
     progress.expect(len(together.units()))
     _measure(together, journal, context, crew, progress.tick)
-    return (*rows, *together.rows(journal)[1:])
+    own = rows[0].ms
+    return (*rows, *(replace(row, ms=own * row.ratio) for row in together.rows(journal)[1:]))
 
 
 class Progress:

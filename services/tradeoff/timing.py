@@ -17,6 +17,8 @@ from workers.scene.settle import settle_scene
 from workers.scene_steps import Stopwatch, plan_with_assets
 from workers.shard import run_scene
 
+WARM_SCENES = 4
+
 Answer = dict[str, Any]
 
 
@@ -43,6 +45,14 @@ def time_scene(context: WorkerContext, whole: Sequence[Setting], settling: Seque
         if took_or_none is not None:
             answer["settling"][setting.name] = took_or_none
     return answer
+
+
+def warm_up(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> None:
+    """Make a scene that is not timed with everything at least once: code is compiled and shaders are made in a first run."""
+    for number in range(WARM_SCENES):
+        run_scene(context, scene_id + number, Stopwatch())
+    for setting in settings:
+        run_scene(context_for(context, setting), scene_id, Stopwatch())
 
 
 def _settle_s(context: WorkerContext, scene_id: int) -> float | None:

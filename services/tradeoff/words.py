@@ -53,16 +53,21 @@ def amount(name: str, value: float) -> str:
 
 
 def number(value: float) -> str:
-    """Three digits, without an exponent between a hundred-thousandth and a million: "0", "0.00012", "13.4", "1,250"."""
-    if value == 0.0 or not 1e-5 <= abs(value) < 1e6:
-        return f"{value:.3g}"
-    text = f"{float(f'{value:.3g}'):,.8f}"
-    return text.rstrip("0").rstrip(".")
+    """Three digits: "0", "0.00012", "13.4", "1,250"; below a ten-thousandth and from a million on "3.5e-5"."""
+    if value != 0.0 and not 1e-4 <= abs(value) < 1e6:
+        digits, _, exponent = f"{value:.3g}".partition("e")
+        return f"{digits}e{int(exponent)}" if exponent else digits
+    return f"{float(f'{value:.3g}'):,.8f}".rstrip("0").rstrip(".")
+
+
+def as_often(ratio: float) -> str:
+    """A ratio of times in two digits: "1" within the noise of 5 %, "0.62", "1.6", "47"."""
+    return "1" if abs(ratio - 1.0) < 0.05 else number(float(f"{ratio:.2g}"))
 
 
 def times(ratio: float) -> str:
-    """A ratio of times: "0.62 times", "1.6 times", "47 times"."""
-    return f"{number(float(f'{ratio:.2g}') if ratio >= 1.095 or ratio < 0.95 else round(ratio, 2))} times"
+    """The same with its word, and a third digit where it is near 1: "1.07 times"."""
+    return f"{number(round(ratio, 2)) if 0.9 <= ratio < 1.1 else as_often(ratio)} times"
 
 
 def milliseconds(ms: float) -> str:

@@ -1,0 +1,212 @@
+"""One panel: an error over processor time, a point for each setting that was measured."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.transforms import Bbox
+
+from services.tradeoff.choose import front, own_row
+from services.tradeoff.labels import Label, place_labels
+from services.tradeoff.model import Row, Study
+from services.tradeoff.pictures import (
+    COLORS,
+    INK,
+    PALE,
+    TEXT_COLORS,
+    boxed,
+    pieces,
+    place_of,
+    renderer_of,
+    set_axes,
+    single_look,
+    up_scale,
+)
+from services.tradeoff.scales import Scale, scale_of
+from services.tradeoff.words import as_often, shown
+
+_MAIN = (
+    ("at rest", "How objects rest", ("moved_mm", "outcome", "pose_mm", "penetration_mm", "gap_mm", "turned_deg")),
+    ("in depth", "Depth and masks", ("between_mm", "depth_mm", "outline_share", "mask_share", "table_depth_mm")),
+    ("in the mirror", "The other side", ("mirror_mm", "agreement_mm", "unfilled_share", "hidden_share")),
+    ("in colour", "Colour", ("flip",)),
+)
+"""Of each part of a scene its name in the title, its heading, and its main errors: the first that settings move is shown."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """What a panel shows: an error, and the cheapest setting that has at most half of the job's own, if any."""
+
+    name: str
+    heading: str
+    error: str
+    half: Row | None
+
+
+def panels_of(rows: Sequence[Row]) -> list[Panel]:
+    """One for each part of a scene of which something was measured."""
+    panels = []
+    for name, heading, errors in _MAIN:
+        measured = [error for error in errors if any(error in row.errors for row in rows)]
+        moved = [
+            error for error in measured if len({row.errors[error].value for row in rows if error in row.errors}) > 1
+        ]
+        for error in (moved or measured)[:1]:
+            panels.append(Panel(name, heading, error, half_row(rows, error)))
+    return panels
+
+
+def half_row(rows: Sequence[Row], error: str) -> Row | None:
+    """The cheapest setting that measured at most half of the job's own error."""
+    own = own_row(rows).errors.get(error)
+    if own is None or own.value <= 0.0:
+        return None
+    return next((row for row in front(rows, error) if row.errors[error].value <= own.value / 2), None)
+
+
+Looks = Mapping[str, int]
+"""Which colour and marker a knob has."""
+
+
+def looks_of(rows: Sequence[Row], panels: Sequence[Panel]) -> dict[str, Looks]:
+    """By panel's error: no two knobs of one panel look alike, as far as looks go, and a knob looks the same in all."""
+    turned = {
+        panel.error: list(dict.fromkeys(row.setting.parts[0][0] for row in _singles(rows, panel.error)))
+        for panel in panels
+    }
+    often = Counter(knob for knobs in turned.values() for knob in knobs)
+    everywhere: dict[str, int] = {}
+    for knob in sorted(often, key=lambda knob: -often[knob]):  # what several panels show chooses first
+        beside = {other for knobs in turned.values() if knob in knobs for other in knobs}
+        used = Counter(everywhere[other] for other in beside if other in everywhere)
+        everywhere[knob] = min(range(len(COLORS)), key=lambda look: (used[look], look))
+    return {error: {knob: everywhere[knob] for knob in knobs} for error, knobs in turned.items()}
+
+
+def _singles(rows: Sequence[Row], error: str) -> list[Row]:
+    return [row for row in rows if error in row.errors and kind_of(row) == "single"]
+
+
+def draw_panel(axes: Axes, study: Study, panel: Panel, looks: Looks) -> None:
+    """Points, intervals, front, labels, and a heading with its message."""
+    rows = [row for row in study.rows if panel.error in row.errors]
+    across = scale_of([row.ms for row in rows])
+    up = up_scale(rows, panel.error)
+    set_axes(axes, across, up, panel.error)
+    lines = pieces(axes, _draw_front(axes, rows, panel.error, up))
+    marks = [_draw_point(axes, row, panel.error, up, looks) for row in rows]
+    lines += [piece for row in rows for piece in _draw_interval(axes, row, panel.error, up, looks)]
+    _heading(axes, panel.heading, _message(study.rows, panel), 8.0 + 14.0 * _legend(axes, looks))
+    place_labels(axes, renderer_of(axes.figure), _labels(rows, panel, up, looks), marks, lines)
+
+
+def _message(rows: Sequence[Row], panel: Panel) -> str:
+    """What less of it costs."""
+    best = front(rows, panel.error)[-1]
+    if panel.half is not None:
+        return f"half the error takes {as_often(panel.half.ratio)} × the time"
+    if own_row(rows).errors.get(panel.error) in (None, best.errors[panel.error]):
+        return "nothing better was measured"
+    return f"the best takes {as_often(best.ratio)} × the time"
+
+
+def _heading(axes: Axes, heading: str, message: str, pad: float) -> None:
+    """What the panel is of in bold, and its message after it."""
+    title = axes.set_title(heading, loc="left", fontsize=12, fontweight="bold", color=INK, pad=pad)
+    axes.annotate(
+        message, (1.0, 0.0), (8.0, 0.0), xycoords=title, textcoords="offset points", fontsize=11, color=INK, va="bottom"
+    )
+
+
+def kind_of(row: Row) -> str:
+    """Whether a setting is the job ("own"), a preset, one knob turned ("single") or several ("pair")."""
+    parts = row.setting.parts
+    if not parts:
+        return "own"
+    return "preset" if parts[0][0] == "preset" else "single" if len(parts) == 1 else "pair"
+
+
+def _draw_front(axes: Axes, rows: Sequence[Row], error: str, up: Scale) -> list[tuple[float, float]]:
+    """A staircase: what is right of it and above is beaten. Returns its corners."""
+    best = front(rows, error)
+    places = [place_of(row, error, up) for row in best]
+    corners = places[:1]
+    for (_, before), (x, y) in pairwise(places):
+        corners += [(x, before), (x, y)]
+    axes.plot(*zip(*corners, strict=True), color=INK, lw=1.3, zorder=2, solid_joinstyle="round")
+    return corners
+
+
+def _draw_point(axes: Axes, row: Row, error: str, up: Scale, looks: Looks) -> Bbox:
+    """The marker of a setting; returns its box in pixels."""
+    kind, color, at = kind_of(row), _color(row, looks), place_of(row, error, up)
+    mark: dict[str, Any] = {"marker": "s", "ms": 10.0, "mfc": "none", "mew": 1.5, "zorder": 4.5}
+    if kind == "own":
+        mark = {"marker": "*", "ms": 17.0, "mec": "white", "mew": 0.8, "zorder": 5}
+    elif kind == "single":
+        mark = {**single_look(looks[row.setting.parts[0][0]]), "zorder": 4}
+    elif kind == "pair":
+        mark = {"marker": "d", "ms": 6.5, "mfc": "white", "mew": 1.0, "zorder": 4}
+    axes.plot(*[[place] for place in at], ls="", color=color, clip_on=False, **mark)
+    return boxed(axes, at, mark["ms"] / 2)
+
+
+def _draw_interval(axes: Axes, row: Row, error: str, up: Scale, looks: Looks) -> list[Bbox]:
+    """The interval of the error, thin; returns it in boxes of pixels."""
+    figure = row.errors[error]
+    ends = [(row.ms, up.place(shown(error, value))) for value in (figure.low, figure.high)]
+    axes.plot(*zip(*ends, strict=True), color=_color(row, looks), lw=0.8, alpha=0.55, zorder=2.5)
+    return pieces(axes, ends)
+
+
+def _color(row: Row, looks: Looks) -> str:
+    kind = kind_of(row)
+    return COLORS[looks[row.setting.parts[0][0]]] if kind == "single" else PALE if kind == "pair" else "black"
+
+
+def _legend(axes: Axes, looks: Looks) -> int:
+    """Which marker is which knob, between heading and axes; returns how many lines that takes."""
+    handles = [
+        Line2D([], [], ls="", color=COLORS[look], label=knob, **single_look(look)) for knob, look in looks.items()
+    ]
+    columns = 6
+    legend = axes.legend(
+        handles=handles,
+        loc="lower left",
+        bbox_to_anchor=(-0.02, 0.99),
+        ncols=columns,
+        frameon=False,
+        fontsize=9,
+        handletextpad=0.1,
+        columnspacing=0.9,
+        labelcolor=[TEXT_COLORS[look] for look in looks.values()],
+    )
+    legend.set_in_layout(False)
+    return -(-len(looks) // columns)
+
+
+def _labels(rows: Sequence[Row], panel: Panel, up: Scale, looks: Looks) -> list[Label]:
+    """The job, presets and who halves the error first, then the front, then the rest from the cheapest on."""
+    error, labels = panel.error, []
+    best = front(rows, error)
+    for order, row in enumerate(sorted(rows, key=lambda row: row.ratio)):
+        kind = kind_of(row)
+        text, color, must, rank = row.setting.name, INK, True, 0.0
+        if kind == "own":
+            text = "the job"
+        elif kind == "preset":
+            text = row.setting.parts[0][1]
+        elif kind == "single":
+            text = row.setting.parts[0][1]
+            color = TEXT_COLORS[looks[row.setting.parts[0][0]]]
+        if kind in ("single", "pair") and row is not panel.half:
+            must, rank = False, (1.0 if row in best else 2.0) + order * 1e-3
+        if kind == "pair":
+            text, color = ", ".join(label for _, label in row.setting.parts), PALE
+        labels.append(Label(text, *place_of(row, error, up), color, rank, must))
+    return labels
