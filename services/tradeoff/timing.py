@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
+import numpy as np
+
 from schemas.errors import SceneError
 from services.bench.ratios import Spread
 from services.tradeoff.model import Setting
@@ -22,17 +24,21 @@ WARM_SCENES = 4
 Answer = dict[str, Any]
 
 
-def time_scene(context: WorkerContext, whole: Sequence[Setting], settling: Sequence[Setting], scene_id: int) -> Answer:
+def time_scene(
+    context: WorkerContext, whole: Sequence[Setting], settling: Sequence[Setting], scene_id: int, lap: int
+) -> Answer:
     """Seconds of processor by setting: of the whole scene up to its encoded files, or of `settling` alone.
 
     The first run, of the job itself, meets the shapes for the first time, as a job does in every scene; all others have
-    them at hand, so that what new shapes cost is told apart, under "new". Bytes are those of all files and of no rows.
+    them at hand, so that what new shapes cost is told apart. The others are run in another order in each scene and `lap`, so
+    that none always follows the same one. Bytes are those of all files and of no rows.
     """
     began = time.process_time()
     run_scene(context, scene_id, Stopwatch())
     cold = time.process_time() - began
     answer: Answer = {"whole": {}, "settling": {}, "bytes": {}, "cold": cold}
-    for setting in whole:
+    order = np.random.default_rng([scene_id, lap])
+    for setting in _shuffled(whole, order):
         worker = context_for(context, setting)
         began = time.process_time()
         output = run_scene(worker, scene_id, Stopwatch())
@@ -40,11 +46,15 @@ def time_scene(context: WorkerContext, whole: Sequence[Setting], settling: Seque
         if output.files:
             answer["whole"][setting.name] = took
             answer["bytes"][setting.name] = sum(len(data) for _, data in output.files)
-    for setting in settling:
+    for setting in _shuffled(settling, order):
         took_or_none = _settle_s(context_for(context, setting), scene_id)
         if took_or_none is not None:
             answer["settling"][setting.name] = took_or_none
     return answer
+
+
+def _shuffled(settings: Sequence[Setting], order: np.random.Generator) -> list[Setting]:
+    return [settings[k] for k in order.permutation(len(settings))]
 
 
 def warm_up(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> None:
