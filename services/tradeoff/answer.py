@@ -23,7 +23,8 @@ def answer(study: Study, targets: Targets | None = None) -> str:
     except TargetError:
         return f"{wish[0].upper()}{wish[1:]} is met by nothing that was measured: {describe_miss(study.rows, asked)}."
     own = own_row(study.rows)
-    wish += " and nothing else worse than the job has it" if bounds and chosen is not own else ""
+    if bounds and (chosen is not own or not asked):
+        wish = f"{wish} and nothing else worse than the job has it" if asked else "nothing worse than the job has it"
     use = "use the job as it is" if chosen is own else f"use {chosen.setting.name}"
     cost = f"{milliseconds(chosen.ms)} of processor a scene{_whole(study, chosen)}"
     saved = "" if chosen is own else f", {times(chosen.ratio)} the job's time"
@@ -66,7 +67,7 @@ def describe_targets(targets: Targets) -> str:
     for name, target in targets.items():
         by_amount.setdefault(amount(name, target), []).append(short(name))
     words = [f"{most} ({', '.join(names)})" for most, names in by_amount.items()]
-    return f"at most {listed(words)}" if words else "what it is worth at the least cost"
+    return f"at most {listed(words)}" if words else "any error at all"
 
 
 def next_better(rows: Sequence[Row], chosen: Row, targets: Targets) -> Row | None:

@@ -10,11 +10,15 @@ from matplotlib.transforms import Bbox
 from services.tradeoff.choose import own_row
 from services.tradeoff.labels import Label, place_labels
 from services.tradeoff.model import Row, Study
+from services.tradeoff.panel import LONGEST
 from services.tradeoff.pictures import (
     COLORS,
+    DOTS,
     INK,
     TEXT_COLORS,
     boxed,
+    cut,
+    fit,
     new_picture,
     pieces,
     place_of,
@@ -64,7 +68,8 @@ def draw_knob(study: Study, knob: str) -> Picture | None:
     turned = knob_rows(study.rows, knob)
     least, most = (as_often(pick(row.ratio for row in turned)) for pick in (min, max))
     title = f"{knob}: {_span(least, most)} × the job's time"
-    picture.text(0.15 / wide, 1 - 0.15 / high, title, fontsize=13, fontweight="bold", color=INK, va="top")
+    head = picture.text(0.15 / wide, 1 - 0.15 / high, title, fontsize=13, fontweight="bold", color=INK, va="top")
+    fit(head, (wide - 0.3) * DOTS)
     for number, error in enumerate(errors):
         left = number * wide / len(errors) + 0.95
         box = (left / wide, 0.55 / high, (wide / len(errors) - 1.1) / wide, (HEIGHT - 1.15) / high)
@@ -93,7 +98,9 @@ def _draw_along(axes: Axes, study: Study, turned: Sequence[Row], error: str) -> 
         marks.append(_draw_mark(axes, place_of(row, error, up), is_own))
         lines += _draw_intervals(axes, row, error, up, own.ms)
         text, color = ("the job", INK) if is_own else (row.setting.parts[0][1], TEXT_COLORS[0])
-        labels.append(Label(text, *place_of(row, error, up), color, 0.0 if is_own else order + 1.0, must=is_own))
+        labels.append(
+            Label(cut(text, LONGEST), *place_of(row, error, up), color, 0.0 if is_own else order + 1.0, must=is_own)
+        )
     place_labels(axes, renderer_of(axes.figure), labels, marks, lines)
 
 

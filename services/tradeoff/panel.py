@@ -19,6 +19,7 @@ from services.tradeoff.pictures import (
     PALE,
     TEXT_COLORS,
     boxed,
+    cut,
     pieces,
     place_of,
     renderer_of,
@@ -36,6 +37,10 @@ _MAIN = (
     ("in colour", "Colour", ("flip",)),
 )
 """Of each part of a scene its name in the title, its heading, and its main errors: the first that settings move is shown."""
+
+
+LONGEST = 26
+"""Letters of a label or of a knob's name; the page has them whole."""
 
 
 @dataclass(frozen=True)
@@ -170,24 +175,28 @@ def _color(row: Row, looks: Looks) -> str:
 
 
 def _legend(axes: Axes, looks: Looks) -> int:
-    """Which marker is which knob, between heading and axes; returns how many lines that takes."""
+    """Which marker is which knob, between heading and axes; returns how many lines that takes, at most two."""
     handles = [
-        Line2D([], [], ls="", color=COLORS[look], label=knob, **single_look(look)) for knob, look in looks.items()
+        Line2D([], [], ls="", color=COLORS[look], label=cut(knob, LONGEST), **single_look(look))
+        for knob, look in looks.items()
     ]
-    columns = 6
-    legend = axes.legend(
-        handles=handles,
-        loc="lower left",
-        bbox_to_anchor=(-0.02, 0.99),
-        ncols=columns,
-        frameon=False,
-        fontsize=9,
-        handletextpad=0.1,
-        columnspacing=0.9,
-        labelcolor=[TEXT_COLORS[look] for look in looks.values()],
-    )
-    legend.set_in_layout(False)
-    return -(-len(looks) // columns)
+    columns = max(5, -(-len(looks) // 2))
+    renderer, size = renderer_of(axes.figure), 9.0
+    while True:
+        legend = axes.legend(
+            handles=handles,
+            loc="lower left",
+            bbox_to_anchor=(-0.02, 0.99),
+            ncols=columns,
+            frameon=False,
+            fontsize=size,
+            handletextpad=0.1,
+            columnspacing=0.9,
+            labelcolor=[TEXT_COLORS[look] for look in looks.values()],
+        )
+        if legend.get_window_extent(renderer).width <= axes.get_window_extent(renderer).width or size < 4.0:
+            return -(-len(looks) // columns)
+        size *= 0.95
 
 
 def _labels(rows: Sequence[Row], panel: Panel, up: Scale, looks: Looks) -> list[Label]:
@@ -208,5 +217,5 @@ def _labels(rows: Sequence[Row], panel: Panel, up: Scale, looks: Looks) -> list[
             must, rank = False, (1.0 if row in best else 2.0) + order * 1e-3
         if kind == "pair":
             text, color = ", ".join(label for _, label in row.setting.parts), PALE
-        labels.append(Label(text, *place_of(row, error, up), color, rank, must))
+        labels.append(Label(cut(text, LONGEST), *place_of(row, error, up), color, rank, must))
     return labels

@@ -69,10 +69,17 @@ def renderer_of(picture: Picture | SubFigure) -> RendererAgg:
 
 
 def fit(text: Text, most: float) -> None:
-    """Make a line as much smaller as it is wider than so many pixels."""
+    """Make a line smaller until it is at most so many pixels wide."""
     assert text.figure is not None
-    wide = text.get_window_extent(renderer_of(text.figure)).width
-    text.set_fontsize(float(text.get_fontsize()) * min(most / wide, 1.0))
+    renderer = renderer_of(text.figure)
+    # Step by step, because hinting makes small letters wider than their share.
+    while (wide := text.get_window_extent(renderer).width) > most:
+        text.set_fontsize(float(text.get_fontsize()) * min(most / wide, 0.98))
+
+
+def cut(words: str, most: int) -> str:
+    """At most so many letters, the last of them "…" where there were more."""
+    return words if len(words) <= most else f"{words[: most - 1].rstrip()}…"
 
 
 def set_axes(axes: Axes, across: Scale, up: Scale, error: str) -> None:

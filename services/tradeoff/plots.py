@@ -9,7 +9,7 @@ from services.tradeoff.choose import own_row
 from services.tradeoff.knob_plots import draw_knob, single_knobs
 from services.tradeoff.model import Study
 from services.tradeoff.panel import Panel, draw_panel, looks_of, panels_of
-from services.tradeoff.pictures import DOTS, INK, PALE, fit, new_picture, plain_style
+from services.tradeoff.pictures import DOTS, INK, PALE, cut, fit, new_picture, plain_style
 from services.tradeoff.words import as_often, milliseconds
 
 WIDTH = 12.0
@@ -71,7 +71,7 @@ def _head(picture: Picture, study: Study, panels: list[Panel]) -> None:
     fit(title, 0.965 * WIDTH * DOTS)
     measured = (
         f"{study.job}: {study.scenes} scenes made and {study.physics_scenes} dropped with each of {len(study.rows)}"
-        f" settings; one core of {study.machine.get('cpu', 'an unknown processor')}"
+        f" settings; one core of {cut(str(study.machine.get('cpu', 'an unknown processor')), 60)}"
     )
     below = 1 - 0.5 / picture.get_figheight()
     fit(picture.text(0.015, below, measured, fontsize=10, color=PALE, va="top"), 0.965 * WIDTH * DOTS)
