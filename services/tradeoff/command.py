@@ -45,11 +45,10 @@ def main(options: argparse.Namespace) -> int:
     catalogue = open_catalogue(plan.job.assets, plan.job_folder, tuple(plan.job.categories))
     context = open_worker(plan.job, catalogue)
     require_device(context.renderer.name, plan.job.run.device)
-    journal = Journal(options.out, header_of(plan, context.settings_digest, code_digest()))
     crew = Crew(plan.job, plan.job_folder, options.workers or usable_cores())
-    with _Bar() as bar:
+    header = header_of(plan, context.settings_digest, code_digest())
+    with Journal(options.out, header) as journal, _Bar() as bar:
         rows = run_study(plan, journal, context, crew, bar)
-    journal.close()
     study = study_of(plan, rows, context.renderer.name, shlex.join(["verso", *sys.argv[1:]]), left_out)
     write_tables(study, options.out)
     write_page(study, write_plots(study, options.out), options.out / "index.html", targets)

@@ -22,26 +22,31 @@ class Journal:
         self._answers: dict[str, Any] = {}
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            lines = self._path.read_text(encoding="utf-8").split("\n") if self._path.exists() else []
-            kept = self._read([line for line in lines[:-1] if line], header)
-            self._path.write_text("".join(f"{line}\n" for line in kept or [_line(header)]), encoding="utf-8")
-            self._file = self._path.open("a", encoding="utf-8")
+            self._file = self._path.open("a+b")
         except OSError as error:
             raise OutputError(f"{folder} cannot be written: {error.strerror or error}; choose another --out") from error
+        try:
+            self._read(header)
+        except BaseException:
+            self._file.close()
+            raise
 
-    def _read(self, lines: list[str], header: Mapping[str, Any]) -> list[str]:
-        if not lines:
-            return []
-        found = json.loads(lines[0])
-        if other := sorted(key for key in {*found, *header} if found.get(key) != header.get(key)):
+    def _read(self, header: Mapping[str, Any]) -> None:
+        self._file.seek(0)
+        written = self._file.read()
+        whole = written[: written.rfind(b"\n") + 1]
+        self._file.truncate(len(whole))
+        if not whole:
+            self._write(header)
+            return
+        first, *entries = map(json.loads, whole.splitlines())
+        wanted = json.loads(json.dumps(header))
+        if other := sorted(key for key in {*first, *wanted} if first.get(key) != wanted.get(key)):
             raise OutputError(
                 f"{self._path.parent} holds the measurements of another study (other {', '.join(other)}): choose another "
                 f"--out, or delete {self._path.name} there"
             )
-        for line in lines[1:]:
-            entry = json.loads(line)
-            self._answers[entry["unit"]] = entry["answer"]
-        return lines
+        self._answers = {entry["unit"]: entry["answer"] for entry in entries}
 
     def __contains__(self, unit: str) -> bool:
         return unit in self._answers
@@ -52,13 +57,14 @@ class Journal:
     def add(self, unit: str, answer: Any) -> None:
         """Keep what was measured."""
         self._answers[unit] = answer
-        self._file.write(_line({"unit": unit, "answer": answer}) + "\n")
+        self._write({"unit": unit, "answer": answer})
+
+    def _write(self, entry: Mapping[str, Any]) -> None:
+        self._file.write(json.dumps(entry, sort_keys=True).encode() + b"\n")
         self._file.flush()
 
-    def close(self) -> None:
-        """Give the file back."""
+    def __enter__(self) -> "Journal":
+        return self
+
+    def __exit__(self, *_: object) -> None:
         self._file.close()
-
-
-def _line(entry: Mapping[str, Any]) -> str:
-    return json.dumps(entry, sort_keys=True)
