@@ -1,5 +1,6 @@
 """The study from end to end: every knob by itself, then what is promising together, and the table of both."""
 
+import hashlib
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -67,17 +68,22 @@ def run_study(
     plan: Plan, journal: Journal, context: WorkerContext, crew: Crew, progress: "Progress"
 ) -> tuple[Row, ...]:
     """Measure what is not in the journal yet, and make the table. The job itself is its first row."""
-    warm_up(context, plan.settings, plan.job.first_scene + plan.sizes.timed)
     singles = _Round(plan, "alone", plan.settings)
     progress.expect(len(singles.units()))
     _measure(singles, journal, context, crew, progress.tick)
     rows = singles.rows(journal)
     units = {name: kind.unit for name, kind in ERRORS.items()}
-    together = _Round(plan, "together", (Setting(), *plan.presets, *promising(rows, units, plan.targets)))
+    chosen = (Setting(), *plan.presets, *promising(rows, units, plan.targets))
+    together = _Round(plan, f"together-{_digest(chosen)}", chosen)
     progress.expect(len(together.units()))
     _measure(together, journal, context, crew, progress.tick)
     own = rows[0].ms
     return (*rows, *(replace(row, ms=own * row.ratio) for row in together.rows(journal)[1:]))
+
+
+def _digest(settings: Sequence[Setting]) -> str:
+    """A few letters that tell these settings from others: which are promising depends on the targets."""
+    return hashlib.sha256("; ".join(setting.name for setting in settings).encode()).hexdigest()[:8]
 
 
 class Progress:
@@ -148,10 +154,14 @@ class _Round:
 
 def _measure(part: _Round, journal: Journal, context: WorkerContext, crew: Crew, tick: Tick) -> None:
     """Timing first and alone, then the rest beside one another."""
+    missing = [unit for unit in part.timings() if unit.name not in journal]
+    for _ in range(len(part.timings()) - len(missing)):
+        tick()
     with pinned():
-        for unit in part.timings():
-            if unit.name not in journal:
-                journal.add(unit.name, _time(part, context, unit))
+        if missing:
+            warm_up(context, part.settings, part.plan.job.first_scene + part.plan.sizes.timed)
+        for unit in missing:
+            journal.add(unit.name, _time(part, context, unit))
             tick()
     sizes, first = part.plan.sizes, part.plan.job.first_scene
     wanted = []
@@ -235,5 +245,4 @@ def header_of(plan: Plan, settings_digest: str, code: str) -> dict[str, Any]:
         "sizes": asdict(plan.sizes),
         "knobs": [knob.name for knob in plan.knobs],
         "settings": [setting.name for setting in plan.settings],
-        "targets": dict(plan.targets),
     }

@@ -92,5 +92,5 @@ def test_a_key_is_set_in_a_tree_that_lacks_its_branch():
 
 
 def test_a_value_that_the_job_cannot_have_is_told_by_its_key():
-    with pytest.raises(InputError, match="physics.step_hz"):
+    with pytest.raises(InputError, match=r"physics\.step_hz"):
         apply(JOB, {"physics.step_hz": 1})
