@@ -10,12 +10,16 @@ from schemas.base import Range, frozen_array
 from schemas.camera import Camera, Intrinsics
 from schemas.job import Images
 from schemas.scene import Agreement, Appearance, Pair, Placed, PosedScene, View
+from services.jobfile import validate_job
 from services.tradeoff.image_errors import measure_images
 from services.tradeoff.truth import Truth, truth_of
+from tests.effects.scenes import SMALL, context_of, merged
 from tests.shapes import box, shape_of
 from workers.geometry.camera import look_at
 from workers.geometry.frames import rotation_about
 from workers.geometry.mirror import mirror_pose
+from workers.geometry.raycast import cast_view
+from workers.scene_steps import Stopwatch, make_scene
 
 UNITS = 5000.0
 WIDTH, HEIGHT, F = 160, 120, 500.0
@@ -435,3 +439,45 @@ def test_a_scene_s_truth_forgets_the_views_asked_for_longest_ago(seen):
     for camera in cameras[1:]:
         truth.pixels(camera)
     assert truth.pixels(cameras[0]) is not first
+
+
+# ---------------------------------------------------------------------------------------------- scenes as they are made
+
+
+def made(**changes):
+    context = context_of(validate_job(merged(SMALL, changes), "a test"))
+    return context, make_scene(context, 0, Stopwatch())
+
+
+def test_a_made_scene_has_the_errors_that_its_units_and_pixels_leave():
+    """99 of 100 of errors that rounding spreads evenly are within 99 % of half a unit. Pixels twice as wide, and nothing
+    else changed, have twice the error between them, in as many more places along the outline."""
+    fine, scene = made()
+    truth = truth_of(scene)
+    found = measure_images(fine, scene, truth)
+    assert found["depth_mm"] == pytest.approx(0.99 * 0.1, abs=0.004)
+    assert found["table_depth_mm"] == pytest.approx(0.99 * 0.1, abs=0.002)
+    assert found["mask_share"] < 0.01
+    coarse, rough = made(images={"depth_units_per_m": 500.0, "patch": SMALL["images"]["patch"]})
+    again = measure_images(coarse, rough, truth_of(rough, truth))
+    assert again["depth_mm"] == pytest.approx(0.99, abs=0.04)
+    assert again["outline_share"] == found["outline_share"]
+    k = {"width": 320, "height": 240, "fx": 262.5, "fy": 262.5, "cx": 160.0, "cy": 120.0}
+    large, larger = made(cameras={"sensor": k})
+    twice = measure_images(large, larger, truth_of(larger, truth))
+    assert found["between_mm"] / twice["between_mm"] == pytest.approx(2.0, rel=0.25)
+    assert found["outline_share"] / twice["outline_share"] == pytest.approx(2.0, rel=0.3)
+    assert abs(found["mirror_mm"] - twice["mirror_mm"]) < found["mirror_mm"]
+
+
+def test_rays_through_pixels_are_those_of_the_ray_caster_s_own_view():
+    _, scene = made()
+    camera = scene.pairs[0].mirror.camera
+    depth_m, region, _ = cast_view(scene.posed.things, camera)
+    pixels = truth_of(scene).pixels(camera)
+    for seen in (pixels.box, pixels.spread):
+        assert np.array_equal(seen.region, seen.of(region)) and seen.depth_m == pytest.approx(
+            seen.of(depth_m), abs=1e-9
+        )
+    objects = np.count_nonzero(region >= 3)
+    assert np.count_nonzero(pixels.box.region >= 3) == objects > 50
