@@ -54,16 +54,15 @@ class Panel:
 
 
 def panels_of(rows: Sequence[Row]) -> list[Panel]:
-    """One for each part of a scene of which something was measured."""
-    panels = []
+    """One for each part of a scene of which two settings measured something; of one setting where that is all there is."""
+    panels, alone = [], []
     for name, heading, errors in _MAIN:
-        measured = [error for error in errors if any(error in row.errors for row in rows)]
-        moved = [
-            error for error in measured if len({row.errors[error].value for row in rows if error in row.errors}) > 1
-        ]
-        for error in (moved or measured)[:1]:
-            panels.append(Panel(name, heading, error, half_row(rows, error)))
-    return panels
+        values = {error: [row.errors[error].value for row in rows if error in row.errors] for error in errors}
+        moved = [error for error in errors if len(set(values[error])) > 1]
+        for error in (moved or [error for error in errors if values[error]])[:1]:
+            panel = Panel(name, heading, error, half_row(rows, error))
+            (panels if len(values[error]) > 1 else alone).append(panel)
+    return panels or alone
 
 
 def half_row(rows: Sequence[Row], error: str) -> Row | None:

@@ -70,7 +70,7 @@ def _head(picture: Picture, study: Study, panels: list[Panel]) -> None:
     title = picture.text(0.015, top, headline(study, panels), fontsize=15, fontweight="bold", color=INK, va="top")
     fit(title, 0.965 * WIDTH * DOTS)
     measured = (
-        f"{study.job}: {study.scenes} scenes made and {study.physics_scenes} dropped with each of {len(study.rows)}"
+        f"{cut(study.job, 40)}: {study.scenes} scenes made and {study.physics_scenes} dropped with each of {len(study.rows)}"
         f" settings; one core of {cut(str(study.machine.get('cpu', 'an unknown processor')), 60)}"
     )
     below = 1 - 0.5 / picture.get_figheight()

@@ -34,7 +34,7 @@ STUDIES = {
     "crowded": crowded(),
     "the job alone": study(OWN),
     "one panel": study(row(flip=0.1), row("tier=flat", 0.5, flip=0.2)),
-    "three panels": study(OWN, row("step=1", 3.0, moved_mm=0.0, mirror_mm=0.1)),
+    "three panels": study(OWN, row("step=1", 3.0, moved_mm=0.0, mirror_mm=0.1), row("units=1", 0.9, depth_mm=0.5)),
     "all 0": study(row(moved_mm=0.0), row("step=1", 1.0, moved_mm=0.0)),
     "many words": dataclasses.replace(study(OWN), job="a long name" * 20, machine={"cpu": "A processor " * 20}),
 }
@@ -193,7 +193,14 @@ def test_the_half_is_the_cheapest_with_at_most_half():
 
 def test_a_panel_shows_the_first_error_that_settings_move():
     rows = [row(moved_mm=0.0, outcome=0.1, depth_mm=0.1), row("step=1", 1.5, moved_mm=0.0, outcome=0.05)]
+    rows += [row("units=1", 0.9, depth_mm=0.1)]
     assert [panel.error for panel in panels_of(rows)] == ["outcome", "depth_mm"]
+
+
+def test_a_part_of_which_the_job_alone_is_known_has_a_panel_only_where_there_is_no_other():
+    rows = [row(moved_mm=0.1, depth_mm=0.1), row("step=1", 1.5, moved_mm=0.2)]
+    assert [panel.error for panel in panels_of(rows)] == ["moved_mm"]
+    assert [panel.error for panel in panels_of(rows[:1])] == ["moved_mm", "depth_mm"]
 
 
 def test_a_knob_looks_the_same_in_every_panel_and_as_no_other_in_it():
