@@ -117,7 +117,9 @@ def test_another_job_in_the_same_folder_is_refused(measured, capsys):
         (["--set", "physics.step_hz=1"], 2, ["physics.step_hz"]),
     ],
 )
-def test_bad_input_is_told_by_its_value_and_remedy_before_anything_is_measured(tmp_path, capsys, arguments, code, words):
+def test_bad_input_is_told_by_its_value_and_remedy_before_anything_is_measured(
+    tmp_path, capsys, arguments, code, words
+):
     found, text = told(capsys, "tradeoff", TABLETOP, "--out", str(tmp_path / "out"), *arguments)
     assert found == code
     for word in words:

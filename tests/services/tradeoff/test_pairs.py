@@ -34,9 +34,7 @@ def test_what_makes_an_error_grow_is_not_joined():
 
 
 def test_an_error_that_stays_negligible_may_grow_by_any_factor():
-    found = promising(
-        [row("", 1.0, 1e-6), row("a=1", 0.8, 1e-3), row("b=1", 0.9, 1e-4)], UNITS, {"depth_mm": 0.0}
-    )
+    found = promising([row("", 1.0, 1e-6), row("a=1", 0.8, 1e-3), row("b=1", 0.9, 1e-4)], UNITS, {"depth_mm": 0.0})
     assert [setting.name for setting in found] == ["a=1, b=1"]
 
 

@@ -73,5 +73,5 @@ def test_a_box_about_an_object_comes_to_rest_elsewhere_than_its_hull():
 def test_a_scene_that_cannot_be_drawn_has_no_answers():
     job = apply(Job(name="t"), {"start.offset_m": [50.0, 60.0]})
     catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
-    context = WorkerContext(job, catalogue, None, "")  # type: ignore[arg-type]
+    context = WorkerContext(job, catalogue, None, "")
     assert measure_settling(context, [Setting()], 0, posed=False, released=False) == {}
