@@ -55,7 +55,8 @@ class Panel:
 
 def panels_of(rows: Sequence[Row]) -> list[Panel]:
     """One for each part of a scene of which two settings measured something; of one setting where that is all there is."""
-    panels, alone = [], []
+    panels: list[Panel] = []
+    alone: list[Panel] = []
     for name, heading, errors in _MAIN:
         values = {error: [row.errors[error].value for row in rows if error in row.errors] for error in errors}
         moved = [error for error in errors if len(set(values[error])) > 1]
