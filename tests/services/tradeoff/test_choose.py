@@ -94,7 +94,7 @@ def test_an_error_that_a_setting_did_not_measure_is_the_jobs_own():
 
 
 def test_what_is_within_noise_of_the_job_does_not_replace_it():
-    just, well = row("step=1", 1 / AS_CHEAP + 1e-6), row("step=2", 1 / AS_CHEAP - 1e-6)
+    just, well = (row("step=1", 1 / AS_CHEAP + off, depth_mm=0.01) for off in (1e-6, -1e-6))
     assert choose([OWN, just], {"depth_mm": 1.0}) is OWN
     assert choose([OWN, well], {"depth_mm": 1.0}) is well
 
@@ -168,6 +168,16 @@ def test_the_loosened_targets_are_met_by_the_nearest(made: list[tuple[float, flo
     chosen = choose(rows, loosened)
     assert all(chosen.errors[name].value <= most <= 1.1 * most for name, most in loosened.items())
     assert f"nearest is {chosen.setting.name}," in str(caught.value) or len(made) > 1
+
+
+@pytest.mark.parametrize(
+    ("value", "most"), [(0.1, 0.1), (0.1 + 1e-14, 0.11), (0.0253, 0.026), (7.0, 7.0), (123.4, 130.0)]
+)
+def test_what_to_loosen_to_is_short_and_not_too_little(value: float, most: float):
+    with pytest.raises(TargetError) as caught:
+        choose([row(depth_mm=value)], {"depth_mm": 1e-3})
+    loosened = parse_targets(str(caught.value).rpartition("Loosen to at least ")[2])
+    assert value <= loosened["depth_mm"] <= most
 
 
 def test_a_target_of_zero_can_be_missed_and_met():
