@@ -18,9 +18,10 @@ from services.jobfile import load_job, read_tree
 from services.progress import ProgressLine
 from services.tradeoff.answer import DEFAULT_TARGETS, answer, recommend
 from services.tradeoff.choose import parse_targets
+from services.tradeoff.colour_errors import colour_truth_missing
 from services.tradeoff.crew import Crew
 from services.tradeoff.journal import Journal
-from services.tradeoff.knobs import apply, choose_knobs, knobs_of, set_in, settings_of
+from services.tradeoff.knobs import apply, choose_knobs, knobs_of, preset_settings, set_in, settings_of
 from services.tradeoff.model import Row
 from services.tradeoff.page import write_page
 from services.tradeoff.plots import write_plots
@@ -77,6 +78,8 @@ def make_plan(asked: Job, options: argparse.Namespace, targets: Mapping[str, flo
     job = apply(asked, {"check.raycast_share": 0.0, "output.layout": "files"})
     knobs = choose_knobs(knobs_of(job), options.knobs.split(",") if options.knobs else None)
     settings, left_out = settings_of(job, knobs)
+    if missing := colour_truth_missing():
+        left_out = (*left_out, missing)
     usual = Sizes()
     sizes = replace(
         usual,
@@ -87,7 +90,7 @@ def make_plan(asked: Job, options: argparse.Namespace, targets: Mapping[str, flo
         settled=options.physics_scenes,
         laps=options.laps,
     )
-    return Plan(job, options.job.parent, knobs, settings, (), targets, sizes), list(left_out)
+    return Plan(job, options.job.parent, knobs, settings, preset_settings(job), targets, sizes), list(left_out)
 
 
 def write_job(source: Path, changes: list[str], row: Row, path: Path, target: str) -> None:

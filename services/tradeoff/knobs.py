@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from schemas.errors import InputError
 from schemas.job import Job
 from schemas.job import Sensor as Pinhole
+from schemas.preset import PRESETS
 from services.jobfile import describe_fault
 from services.tradeoff.model import Changes, Group, Knob, Setting, Value
 
@@ -186,6 +187,12 @@ def settings_of(job: Job, knobs: Sequence[Knob]) -> tuple[tuple[Setting, ...], t
             if changed != job:
                 settings.append(setting)
     return tuple(settings), tuple(left_out)
+
+
+def preset_settings(job: Job) -> tuple[Setting, ...]:
+    """The job with each preset's values in place of its own, where that is another job."""
+    settings = [Setting((("preset", name),), changes) for name, changes in PRESETS.items()]
+    return tuple(setting for setting in settings if apply(job, setting.changes) != job)
 
 
 def own_label(job: Job, knob: Knob) -> str | None:
