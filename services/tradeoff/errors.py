@@ -5,18 +5,18 @@ from services.tradeoff.model import ErrorKind
 _RAYS = "a ray caster in float64 at the same pixel centres"
 _DENSE = "cast rays, 16 in each pixel"
 _FINEST = "the finest steps, 1 s"
+_REFERENCE = "finer steps than any that is measured"
 
 KINDS: tuple[ErrorKind, ...] = (
     ErrorKind("penetration_mm", "mm", "how deep an object stands in what it rests on", "the stored shapes", "physics"),
     ErrorKind("gap_mm", "mm", "how high an object hovers", "the stored shapes", "physics"),
     ErrorKind("moved_mm", "mm", "how far an object moves when it is let go again", _FINEST, "physics"),
     ErrorKind("turned_deg", "deg", "how far it turns when it is let go again", _FINEST, "physics"),
+    ErrorKind("pose_mm", "mm", "pose off, where two finer settings agree", _REFERENCE, "physics"),
     ErrorKind(
-        "pose_mm", "mm", "pose off, where two finer settings agree", "twice and four times the finest", "physics"
+        "outcome_mm", "mm", "how far things slide and roll: two distributions apart", _REFERENCE, "physics", True
     ),
-    ErrorKind(
-        "outcome", "", "difference of outcomes: where and how things come to rest", "the finest steps", "physics", True
-    ),
+    ErrorKind("outcome_deg", "deg", "how far things turn: two distributions apart", _REFERENCE, "physics", True),
     ErrorKind("failed_share", "", "scenes that do not come to rest", "counted", "physics", True),
     ErrorKind("depth_mm", "mm", "stored depth of objects off, 99 % of pixels", _RAYS, "labels"),
     ErrorKind("table_depth_mm", "mm", "stored depth of the table off, 99 % of pixels", _RAYS, "labels"),
