@@ -223,12 +223,17 @@ def _legend(axes: Axes, looks: Looks) -> int:
 
 
 def _labels(rows: Sequence[Row], panel: Panel, up: Scale, looks: Looks) -> list[Label]:
-    """The job, presets and who halves the error first, then the front, then the rest from the cheapest on."""
+    """The job, presets and who halves the error first, then the front, then the rest from the cheapest on.
+
+    What turns several knobs has a long name, and is named on the front alone.
+    """
     error, labels = panel.error, []
     best = front(rows, error)
     for order, row in enumerate(sorted(rows, key=lambda row: row.ratio)):
         kind = kind_of(row)
-        text, color, must, rank = row.setting.name, INK, True, 0.0
+        if kind == "pair" and row not in best:
+            continue
+        text, color, must, rank = row.setting.name, PALE if kind == "pair" else INK, True, 0.0
         if kind == "own":
             text = "the job"
         elif kind == "preset":
@@ -238,7 +243,5 @@ def _labels(rows: Sequence[Row], panel: Panel, up: Scale, looks: Looks) -> list[
             color = TEXT_COLORS[looks[row.setting.parts[0][0]]]
         if kind in ("single", "pair") and row is not panel.half:
             must, rank = False, (1.0 if row in best else 2.0) + order * 1e-3
-        if kind == "pair":
-            color = PALE
         labels.append(Label(cut(text, LONGEST), *place_of(row, error, up), color, rank, must))
     return labels

@@ -132,6 +132,13 @@ def test_what_matters_most_is_always_labelled():
         assert {"the job", "fast", "exact"} <= labels
 
 
+def test_what_turns_several_knobs_is_named_on_the_front_alone():
+    on, off = row("a=1, b=1", 2.0, flip=0.01), row("a=2, b=2", 3.0, flip=0.2)
+    made = study(row(flip=0.1), row("a=3", 1.5, flip=0.09), on, off)
+    labels = {text.get_text() for text in drawn(made)[0].axes[0].texts}
+    assert "a=1, b=1" in labels and "a=2, b=2" not in labels
+
+
 def test_the_pictures_open_and_one_is_of_each_knob(tmp_path: Path):
     written = write_plots(large_study(), tmp_path / "plots")
     assert written[0].name == "tradeoff.png" and sorted((tmp_path / "plots").iterdir()) == sorted(written)
