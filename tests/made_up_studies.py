@@ -40,7 +40,8 @@ OWN = {
     "moved_mm": 0.015,
     "turned_deg": 0.003,
     "pose_mm": 0.2,
-    "outcome": 0.021,
+    "outcome_mm": 0.21,
+    "outcome_deg": 0.4,
     "failed_share": 0.002,
     "depth_mm": 0.1,
     "table_depth_mm": 0.1,
@@ -64,10 +65,10 @@ TURNS: dict[str, list[Turn]] = {
     "step": [
         (f"{hz} Hz", {"physics": 0.35 + 0.65 * hz / 960}, {name: (960 / hz) ** order for name, order in orders.items()})
         for hz in (120, 240, 480, 1920, 3840)
-        for orders in [{"moved_mm": 1.0, "turned_deg": 1.1, "pose_mm": 1.0, "outcome": 0.7, "penetration_mm": 1.5}]
+        for orders in [{"moved_mm": 1.0, "turned_deg": 1.1, "pose_mm": 1.0, "outcome_mm": 0.7, "penetration_mm": 1.5}]
     ],
     "iterations": [
-        (str(n), {"physics": 0.7 + 0.3 * n / 50}, {"moved_mm": (50 / n) ** 0.4, "outcome": (50 / n) ** 0.2})
+        (str(n), {"physics": 0.7 + 0.3 * n / 50}, {"moved_mm": (50 / n) ** 0.4, "outcome_mm": (50 / n) ** 0.2})
         for n in (10, 20, 100, 200)
     ],
     "rest": [
@@ -75,11 +76,11 @@ TURNS: dict[str, list[Turn]] = {
         for mm in (0.1, 10.0, 100.0)
     ],
     "shape": [
-        ("box", {"physics": 0.8}, {"moved_mm": 90.0, "pose_mm": 40.0, "outcome": 12.0, "gap_mm": 1.0}),
-        ("hull", {"physics": 0.9}, {"moved_mm": 3.0, "outcome": 2.2}),
-        ("parts 5 %", {"physics": 3.2}, {"moved_mm": 1.2, "outcome": 0.9}),
-        ("parts 1 %", {"physics": 6.5}, {"moved_mm": 0.7, "outcome": 0.8}),
-        ("mesh", {"physics": 19.0}, {"moved_mm": 0.0, "outcome": 0.0, "pose_mm": 0.0}),
+        ("box", {"physics": 0.8}, {"moved_mm": 90.0, "pose_mm": 40.0, "outcome_mm": 12.0, "gap_mm": 1.0}),
+        ("hull", {"physics": 0.9}, {"moved_mm": 3.0, "outcome_mm": 2.2}),
+        ("parts 5 %", {"physics": 3.2}, {"moved_mm": 1.2, "outcome_mm": 0.9}),
+        ("parts 1 %", {"physics": 6.5}, {"moved_mm": 0.7, "outcome_mm": 0.8}),
+        ("mesh", {"physics": 19.0}, {"moved_mm": 0.0, "outcome_mm": 0.0, "pose_mm": 0.0}),
     ],
     "tier": [
         ("flat", {"render": 0.35, "encode": 0.8}, {"flip": 2.3}),

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from services.tradeoff.choose import AS_CHEAP, TargetError, Targets, choose, describe_miss, error_of, own_row
+from services.tradeoff.choose import AS_CHEAP, TargetError, Targets, candidates, cheapest, choose, error_of, own_row
 from services.tradeoff.model import Figure, Row, Study
 from services.tradeoff.words import amount, duration, listed, milliseconds, short, size, times
 
@@ -20,8 +20,8 @@ def answer(study: Study, targets: Targets | None = None) -> str:
     wish = describe_targets(asked)
     try:
         chosen = recommend(study, targets)
-    except TargetError:
-        return f"{wish[0].upper()}{wish[1:]} is met by nothing that was measured: {describe_miss(study.rows, asked)}."
+    except TargetError as error:
+        return f"{wish[0].upper()}{wish[1:]} is met by nothing that was measured: {error}."
     own = own_row(study.rows)
     if bounds and (chosen is not own or not asked):
         wish = f"{wish} and nothing else worse than the job has it" if asked else "nothing worse than the job has it"
@@ -30,13 +30,16 @@ def answer(study: Study, targets: Targets | None = None) -> str:
     saved = "" if chosen is own else f", {times(chosen.ratio)} the job's time"
     given_up = [] if bounds else worse_than(chosen, own, study.rows)
     loss = f", and gives up {listed(given_up)}" if given_up else ""
-    better = next_better(study.rows, chosen, {**bounds, **asked})
-    after = (
-        f"the next better, {better.setting.name}, costs {times(better.ratio / chosen.ratio)} as much"
-        if better
-        else "nothing that was measured is better"
-    )
+    after = _after(chosen, next_better(study.rows, chosen, {**bounds, **asked}))
     return f"For {wish}, {use}, which costs {cost}{saved}{loss}; {after}."
+
+
+def _after(chosen: Row, better: Row | None) -> str:
+    if better is None:
+        return "nothing that was measured is better"
+    if better.ratio <= chosen.ratio * AS_CHEAP:
+        return f"{better.setting.name} is better and costs as much"
+    return f"the next better, {better.setting.name}, costs {times(better.ratio / chosen.ratio)} as much"
 
 
 def recommend(study: Study, targets: Targets | None = None) -> Row:
@@ -71,9 +74,10 @@ def describe_targets(targets: Targets) -> str:
 
 
 def next_better(rows: Sequence[Row], chosen: Row, targets: Targets) -> Row | None:
-    """The cheapest that costs more and is better in what was asked: one interval below, and no other value above.
+    """The cheapest that is better in what was asked: one interval below, and no other value above.
 
-    Intervals decide, so that noise of a few scenes is not called better.
+    Intervals decide, so that noise of a few scenes is not called better; and of what costs as much as the cheapest
+    (`AS_CHEAP`) errors decide, as in `choose`.
     """
 
     def pair(row: Row, name: str) -> tuple[Figure, Figure] | None:
@@ -81,11 +85,11 @@ def next_better(rows: Sequence[Row], chosen: Row, targets: Targets) -> Row | Non
         return (theirs, ours) if theirs and ours else None
 
     better = []
-    for row in rows:
+    for row in candidates(rows, targets):
         pairs = [both for name in targets if (both := pair(row, name))]
-        if row.ratio > chosen.ratio * AS_CHEAP and all(theirs.value <= ours.high for theirs, ours in pairs):
+        if all(theirs.value <= ours.high for theirs, ours in pairs):
             better += [row] if any(theirs.high < ours.low for theirs, ours in pairs) else []
-    return min(better, key=lambda row: (row.ratio, row.setting.name), default=None)
+    return cheapest(better, rows) if better else None
 
 
 def worse_than(row: Row, own: Row, rows: Sequence[Row]) -> list[str]:

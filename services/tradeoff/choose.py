@@ -77,8 +77,13 @@ def choose(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None)
     meeting = [row for row in candidates(rows, targets) if meets(row, {**(bounds or {}), **targets}, rows)]
     if not meeting:
         raise TargetError(describe_miss(rows, targets))
-    least = min(row.ratio for row in meeting)
-    return min((row for row in meeting if row.ratio <= least * AS_CHEAP), key=lambda row: _steady_order(row, rows))
+    return cheapest(meeting, rows)
+
+
+def cheapest(some: Sequence[Row], rows: Sequence[Row]) -> Row:
+    """Of some of the rows, at least one, that which costs the least; among those as cheap, by what is told in `choose`."""
+    least = min(row.ratio for row in some)
+    return min((row for row in some if row.ratio <= least * AS_CHEAP), key=lambda row: _steady_order(row, rows))
 
 
 def _steady_order(row: Row, rows: Sequence[Row]) -> tuple[bool, float, int, str]:
@@ -140,16 +145,19 @@ def describe_miss(rows: Sequence[Row], targets: Targets) -> str:
     told, loosened = [], []
     for name, target in targets.items():
         found = error_of(nearest, name, rows)
-        if found is not None and found.value > target:
+        if found is None:
+            told.append(f"{name}, which was not measured with it")
+        elif found.value > target:
             over = (
                 f"{amount(name, found.value)} is {amount(name, found.value - target)} more than {amount(name, target)}"
             )
             told.append(f"{name}, {over}{f' ({times(found.value / target)})' if target > 0 else ''}")
             loosened.append(f"{name}={_above(found.value)}")
     asked = ", ".join(f"{name}={target:g}" for name, target in targets.items())
+    remedy = f". Loosen to at least {','.join(loosened)}" if loosened else ""
     return (
         f"no setting meets {asked}. The nearest is {nearest.setting.name}, at {times(nearest.ratio)} the job's time: it "
-        f"misses {listed(told)}. Loosen to at least {','.join(loosened)}"
+        f"misses {listed(told)}{remedy}"
     )
 
 

@@ -10,7 +10,7 @@ from matplotlib.transforms import Bbox
 from services.tradeoff.choose import own_row
 from services.tradeoff.labels import Label, place_labels
 from services.tradeoff.model import Row, Study
-from services.tradeoff.panel import LONGEST
+from services.tradeoff.panel import LONGEST, MOVED
 from services.tradeoff.pictures import (
     COLORS,
     DOTS,
@@ -53,7 +53,7 @@ def moved_errors(rows: Sequence[Row], knob: str) -> list[str]:
     spread = {}
     for name in dict.fromkeys(name for row in turned for name in row.errors):
         values = [row.errors[name].value for row in [own, *turned] if name in row.errors]
-        if max(values) > min(values):
+        if max(values) > min(values) * (1 + MOVED):
             spread[name] = math.inf if min(values) <= 0 else max(values) / min(values)
     return sorted(spread, key=lambda name: -spread[name])
 

@@ -66,7 +66,6 @@ def page_of(study: Study, plots: Sequence[Path], targets: Targets | None = None)
         *(_picture(plot, "Errors over processor time, a point for each setting") for plot in first),
         f"<p>{LEGEND}</p>",
         *tables,
-        _knobs(others),
         "<h2>What each error means, and what it is held against</h2>",
         _errors(study),
         _slopes(study),
@@ -74,6 +73,7 @@ def page_of(study: Study, plots: Sequence[Path], targets: Targets | None = None)
         _notes(study),
         "<h2>Measured on</h2>",
         _machine(study),
+        _knobs(others),
     ]
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{title}</title>'
     body = "\n".join(part for part in parts if part)

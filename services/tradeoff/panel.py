@@ -31,13 +31,20 @@ from services.tradeoff.scales import Scale, scale_of
 from services.tradeoff.words import as_often, shown
 
 _MAIN = (
-    ("at rest", "How objects rest", ("moved_mm", "outcome", "pose_mm", "penetration_mm", "gap_mm", "turned_deg")),
+    (
+        "at rest",
+        "How objects rest",
+        ("moved_mm", "pose_mm", "outcome_mm", "penetration_mm", "gap_mm", "turned_deg", "outcome_deg"),
+    ),
     ("in depth", "Depth and masks", ("between_mm", "depth_mm", "outline_share", "mask_share", "table_depth_mm")),
     ("in the mirror", "The other side", ("mirror_mm", "agreement_mm", "unfilled_share", "hidden_share")),
     ("in colour", "Colour", ("flip",)),
 )
 """Of each part of a scene its name in the title, its heading, and its main errors: the first that settings move is shown."""
 
+
+MOVED = 0.05
+"""A knob that moves an error by no more than this share of the job's own has nothing to say in its panel."""
 
 LONGEST = 26
 """Letters of a label or of a knob's name; the page has them whole."""
@@ -54,16 +61,30 @@ class Panel:
 
 
 def panels_of(rows: Sequence[Row]) -> list[Panel]:
-    """One for each part of a scene of which two settings measured something; of one setting where that is all there is."""
+    """One for each part of a scene in which a setting moved an error; of the job alone where that is all there is."""
     panels: list[Panel] = []
     alone: list[Panel] = []
     for name, heading, errors in _MAIN:
-        values = {error: [row.errors[error].value for row in rows if error in row.errors] for error in errors}
-        moved = [error for error in errors if len(set(values[error])) > 1]
-        for error in (moved or [error for error in errors if values[error]])[:1]:
-            panel = Panel(name, heading, error, half_row(rows, error))
-            (panels if len(values[error]) > 1 else alone).append(panel)
+        measured = [error for error in errors if any(error in row.errors for row in rows)]
+        moved = [error for error in measured if len(moving_rows(rows, error)) > 1]
+        for error in (moved or measured)[:1]:
+            (panels if moved else alone).append(Panel(name, heading, error, half_row(rows, error)))
     return panels or alone
+
+
+def moving_rows(rows: Sequence[Row], error: str) -> list[Row]:
+    """The settings that a panel shows.
+
+    The job, presets, knobs of which a value moves the error by more than `MOVED`, and what turns such a knob and others.
+    """
+    measured = [row for row in rows if error in row.errors]
+    own = own_row(rows).errors.get(error)
+    moving = {
+        row.setting.parts[0][0]
+        for row in measured
+        if kind_of(row) == "single" and (own is None or abs(row.errors[error].value - own.value) > MOVED * own.value)
+    }
+    return [row for row in measured if kind_of(row) in ("own", "preset") or set(dict(row.setting.parts)) & moving]
 
 
 def half_row(rows: Sequence[Row], error: str) -> Row | None:
@@ -94,12 +115,12 @@ def looks_of(rows: Sequence[Row], panels: Sequence[Panel]) -> dict[str, Looks]:
 
 
 def _singles(rows: Sequence[Row], error: str) -> list[Row]:
-    return [row for row in rows if error in row.errors and kind_of(row) == "single"]
+    return [row for row in moving_rows(rows, error) if kind_of(row) == "single"]
 
 
 def draw_panel(axes: Axes, study: Study, panel: Panel, looks: Looks) -> None:
     """Points, intervals, front, labels, and a heading with its message."""
-    rows = [row for row in study.rows if panel.error in row.errors]
+    rows = moving_rows(study.rows, panel.error)
     across = scale_of([row.ms for row in rows])
     up = up_scale(rows, panel.error)
     set_axes(axes, across, up, panel.error)
@@ -115,9 +136,11 @@ def _message(rows: Sequence[Row], panel: Panel) -> str:
     best = front(rows, panel.error)[-1]
     if panel.half is not None:
         return f"half the error takes {as_often(panel.half.ratio)} × the time"
-    if own_row(rows).errors.get(panel.error) in (None, best.errors[panel.error]):
+    own = own_row(rows).errors.get(panel.error)
+    if own is None or own.value <= best.errors[panel.error].value:
         return "nothing better was measured"
-    return f"the best takes {as_often(best.ratio)} × the time"
+    less = 1.0 - best.errors[panel.error].value / own.value
+    return f"{100 * less:.2g} % less error takes {as_often(best.ratio)} × the time"
 
 
 def _heading(axes: Axes, heading: str, message: str, pad: float) -> None:
@@ -200,12 +223,17 @@ def _legend(axes: Axes, looks: Looks) -> int:
 
 
 def _labels(rows: Sequence[Row], panel: Panel, up: Scale, looks: Looks) -> list[Label]:
-    """The job, presets and who halves the error first, then the front, then the rest from the cheapest on."""
+    """The job, presets and who halves the error first, then the front, then the rest from the cheapest on.
+
+    What turns several knobs has a long name, and is named on the front alone.
+    """
     error, labels = panel.error, []
     best = front(rows, error)
     for order, row in enumerate(sorted(rows, key=lambda row: row.ratio)):
         kind = kind_of(row)
-        text, color, must, rank = row.setting.name, INK, True, 0.0
+        if kind == "pair" and row not in best:
+            continue
+        text, color, must, rank = row.setting.name, PALE if kind == "pair" else INK, True, 0.0
         if kind == "own":
             text = "the job"
         elif kind == "preset":
@@ -215,7 +243,5 @@ def _labels(rows: Sequence[Row], panel: Panel, up: Scale, looks: Looks) -> list[
             color = TEXT_COLORS[looks[row.setting.parts[0][0]]]
         if kind in ("single", "pair") and row is not panel.half:
             must, rank = False, (1.0 if row in best else 2.0) + order * 1e-3
-        if kind == "pair":
-            text, color = ", ".join(label for _, label in row.setting.parts), PALE
         labels.append(Label(cut(text, LONGEST), *place_of(row, error, up), color, rank, must))
     return labels

@@ -91,7 +91,7 @@ def _foot(picture: Picture) -> None:
     kinds = [
         Line2D([], [], ls="", marker="*", ms=15, color="black", label="the job as it is"),
         Line2D([], [], ls="", marker="o", ms=6, color=PALE, label="one knob turned, named by its value"),
-        Line2D([], [], ls="", marker="d", ms=6, color=PALE, mfc="white", label="two at once"),
+        Line2D([], [], ls="", marker="d", ms=6, color=PALE, mfc="white", label="several at once"),
         Line2D([], [], ls="", marker="s", ms=10, color="black", mfc="none", mew=1.5, label="preset"),
         Line2D([], [], color=INK, lw=1.3, label="front: nothing is cheaper and better"),
         Line2D([0], [0], color=PALE, lw=0.8, label="95 % interval over scenes"),

@@ -87,6 +87,19 @@ def test_better_is_better_by_more_than_both_intervals_and_worse_in_nothing():
     assert next_better(rows[:3], OWN, targets) is None
 
 
+def test_what_is_better_at_the_same_cost_is_told():
+    made = study(OWN, row("splat=3", 1.01, depth_mm=0.05), row("splat=5", 1.04, depth_mm=0.01))
+    assert answer(made).endswith("; splat=5 is better and costs as much.")
+
+
+def test_a_target_that_was_not_measured_is_told():
+    told = answer(study(row(depth_mm=0.1)), {"penetration_mm": 0.1})
+    assert told.endswith("--target penetration_mm: this study did not measure it. It measured depth_mm.")
+    apart = study(row(mask_share=0.1), row("a=1", 0.5, depth_mm=0.1), row("b=1", 0.6, flip=0.1))
+    told = answer(apart, {"depth_mm": 0.2, "flip": 0.2})
+    assert "The nearest is a=1" in told and told.endswith("misses flip, which was not measured with it.")
+
+
 def test_a_large_study_has_a_sentence():
     assert answer(large_study()).startswith("For at most 0.1 mm (penetration, gap)")
 

@@ -14,7 +14,7 @@ from PIL import Image
 
 from services.tradeoff.knob_plots import draw_knob, knob_rows, moved_errors, single_knobs
 from services.tradeoff.model import Row, Study
-from services.tradeoff.panel import half_row, looks_of, panels_of
+from services.tradeoff.panel import half_row, looks_of, moving_rows, panels_of
 from services.tradeoff.pictures import COLORS, boxed, plain_style, renderer_of
 from services.tradeoff.plots import draw_tradeoff, headline, write_plots
 from tests.made_up_studies import figure, large_study, row, study
@@ -132,6 +132,13 @@ def test_what_matters_most_is_always_labelled():
         assert {"the job", "fast", "exact"} <= labels
 
 
+def test_what_turns_several_knobs_is_named_on_the_front_alone():
+    on, off = row("a=1, b=1", 2.0, flip=0.01), row("a=2, b=2", 3.0, flip=0.2)
+    made = study(row(flip=0.1), row("a=3", 1.5, flip=0.09), on, off)
+    labels = {text.get_text() for text in drawn(made)[0].axes[0].texts}
+    assert "a=1, b=1" in labels and "a=2, b=2" not in labels
+
+
 def test_the_pictures_open_and_one_is_of_each_knob(tmp_path: Path):
     written = write_plots(large_study(), tmp_path / "plots")
     assert written[0].name == "tradeoff.png" and sorted((tmp_path / "plots").iterdir()) == sorted(written)
@@ -184,6 +191,15 @@ def test_the_headline_says_what_half_the_error_takes():
     )
 
 
+def test_a_panel_says_what_less_error_takes():
+    def told(*rows: Row) -> set[str]:
+        return {text.get_text() for text in drawn(study(row(flip=0.1), *rows))[0].axes[0].texts}
+
+    assert "half the error takes 2 × the time" in told(row("a=1", 2.0, flip=0.05), row("a=2", 3.0, flip=0.01))
+    assert "40 % less error takes 1.5 × the time" in told(row("a=1", 1.5, flip=0.06))
+    assert "nothing better was measured" in told(row("a=1", 0.5, flip=0.2))
+
+
 def test_the_half_is_the_cheapest_with_at_most_half():
     rows = [OWN, row("a=1", 3.0, moved_mm=0.01), row("a=2", 2.0, moved_mm=0.05), row("a=3", 1.5, moved_mm=0.051)]
     half = half_row(rows, "moved_mm")
@@ -192,15 +208,22 @@ def test_the_half_is_the_cheapest_with_at_most_half():
 
 
 def test_a_panel_shows_the_first_error_that_settings_move():
-    rows = [row(moved_mm=0.0, outcome=0.1, depth_mm=0.1), row("step=1", 1.5, moved_mm=0.0, outcome=0.05)]
-    rows += [row("units=1", 0.9, depth_mm=0.1)]
-    assert [panel.error for panel in panels_of(rows)] == ["outcome", "depth_mm"]
+    rows = [row(moved_mm=0.0, outcome_mm=0.1, depth_mm=0.1), row("step=1", 1.5, moved_mm=0.0, outcome_mm=0.05)]
+    rows += [row("units=1", 0.9, depth_mm=0.2)]
+    assert [panel.error for panel in panels_of(rows)] == ["outcome_mm", "depth_mm"]
 
 
 def test_a_part_of_which_the_job_alone_is_known_has_a_panel_only_where_there_is_no_other():
     rows = [row(moved_mm=0.1, depth_mm=0.1), row("step=1", 1.5, moved_mm=0.2)]
     assert [panel.error for panel in panels_of(rows)] == ["moved_mm"]
     assert [panel.error for panel in panels_of(rows[:1])] == ["moved_mm", "depth_mm"]
+
+
+def test_a_knob_that_does_not_move_an_error_is_not_in_its_panel():
+    rows = [row(moved_mm=0.1), row("step=1", 1.5, moved_mm=0.2), row("step=2", 2.0, moved_mm=0.1)]
+    others = [row("way=1", 1.1, moved_mm=0.104), row("way=1, rest=1", 1.1, moved_mm=0.2)]
+    kept = [row("preset=fast", 0.5, moved_mm=0.1), row("step=1, way=1", 1.6, moved_mm=0.2)]
+    assert moving_rows([*rows, *others, *kept], "moved_mm") == [*rows, *kept]
 
 
 def test_a_knob_looks_the_same_in_every_panel_and_as_no_other_in_it():
@@ -211,9 +234,9 @@ def test_a_knob_looks_the_same_in_every_panel_and_as_no_other_in_it():
 
 
 def test_a_knobs_picture_shows_the_errors_that_it_moves_farthest_first():
-    rows: list[Row] = [row(moved_mm=0.1, outcome=0.1, depth_mm=0.1)]
-    rows += [row(f"step={n}", 1.0 + n, moved_mm=0.1 / n, outcome=0.1 / n**2, depth_mm=0.1) for n in (1, 2, 3)]
-    assert moved_errors(rows, "step") == ["outcome", "moved_mm"]
+    rows: list[Row] = [row(moved_mm=0.1, outcome_mm=0.1, depth_mm=0.1)]
+    rows += [row(f"step={n}", 1.0 + n, moved_mm=0.1 / n, outcome_mm=0.1 / n**2, depth_mm=0.1) for n in (1, 2, 3)]
+    assert moved_errors(rows, "step") == ["outcome_mm", "moved_mm"]
     assert [one.setting.name for one in knob_rows(rows, "step")] == ["step=1", "step=2", "step=3"]
     rows += [row("tier=flat", 0.5), row("preset=fast", 0.5, moved_mm=1.0), row("step=1, tier=flat", 0.4, moved_mm=1.0)]
     assert single_knobs(rows) == ["step", "tier"]
