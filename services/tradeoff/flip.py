@@ -1,15 +1,13 @@
-"""FLIP (Andersson et al. 2020): the difference that a person sees who flips between two images, 0 to 1. By flip-evaluator 1.7.
+"""FLIP (Andersson et al. 2020): the difference that a person sees who flips between two images, 0 to 1. By flip-evaluator.
 
-It calls `sys.exit` where its arguments are wrong, and takes whole numbers for something else: what it gets here is always
-float32 in [0, 1]. Its map is the same on one thread (`OMP_NUM_THREADS`) and on several; its own mean, in float32, is not used.
+Its observer sits as its authors' own: 0.7 m before a screen 0.7 m and 3840 pixels wide, 67 of the image's pixels in a degree.
+The package calls `sys.exit` where its arguments are wrong, and takes whole numbers for something else: so it gets float32 in
+[0, 1] alone. Its map is the same on one thread (`OMP_NUM_THREADS`) and on several; its mean, summed in float32, is not used.
 """
 
 import flip_evaluator
 import numpy as np
 from numpy.typing import NDArray
-
-PIXELS_PER_DEGREE = 67.0
-"""How FLIP's observer sits: 0.7 m before a 4K screen of 0.7 m, its authors' own."""
 
 
 def flip_between(reference: NDArray[np.uint8], rgb: NDArray[np.uint8]) -> float:
@@ -18,7 +16,5 @@ def flip_between(reference: NDArray[np.uint8], rgb: NDArray[np.uint8]) -> float:
         if image.shape != reference.shape or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise ValueError(f"FLIP compares [H, W, 3] uint8 of one size, not {image.shape} {image.dtype}")
     a, b = (np.ascontiguousarray(image, np.float32) / np.float32(255) for image in (reference, rgb))
-    seen, _, _ = flip_evaluator.evaluate(
-        a, b, "LDR", applyMagma=False, computeMeanError=False, parameters={"ppd": PIXELS_PER_DEGREE}
-    )
+    seen, _, _ = flip_evaluator.evaluate(a, b, "LDR", applyMagma=False, computeMeanError=False)
     return float(np.asarray(seen, np.float64).mean())

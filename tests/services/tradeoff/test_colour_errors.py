@@ -54,14 +54,18 @@ def test_points_are_where_the_crop_of_the_image_has_them():
 
 @pytest.mark.parametrize("size", [(480, 640), (240, 320), (960, 1280), (720, 960)])
 def test_images_of_all_sizes_are_cropped_to_the_same_part_of_the_picture(size):
-    """Brightness rises evenly across and down: from the size's own pixel centres to those of the crop."""
-    v, u = (np.arange(n) + 0.5 for n in size)
-    ramp = 250.0 * (0.5 * u[None, :] / size[1] + 0.5 * v[:, None] / size[0])
-    image = np.repeat(np.rint(ramp).astype(np.uint8)[..., None], 3, axis=2)
-    cut = crop_colour(image, Crop(100, 60, 180, 90))
-    across, down = (np.arange(100, 180) + 0.5) / 640, (np.arange(60, 90) + 0.5) / 480
+    """In the crop red rises evenly across and green down, by 2 and 6 for each of its pixels."""
+    v, u = ((np.arange(n) + 0.5) * full / n for n, full in zip(size, (480, 640), strict=True))
+    image = np.zeros((*size, 3), np.uint8)
+    image[..., 0], image[..., 1] = (
+        np.rint(np.clip(2 * (u - 80), 0, 255)),
+        np.rint(np.clip(6 * (v - 54), 0, 255))[:, None],
+    )
+    cut = crop_colour(image, Crop(100, 60, 180, 90)).astype(float)
+    across, down = np.arange(100, 180) + 0.5, np.arange(60, 90) + 0.5
     assert cut.shape == (30, 80, 3)
-    assert np.abs(cut[..., 0] - 125.0 * (across[None, :] + down[:, None])).max() <= 1.0
+    assert np.abs(cut[..., 0] - 2 * (across - 80)).max() <= 1.0
+    assert np.abs(cut[..., 1] - 6 * (down - 54)[:, None]).max() <= 1.0
 
 
 def test_only_the_crop_is_compared():
