@@ -16,7 +16,7 @@ from schemas.job import Job
 from services.cores import usable_cores
 from services.jobfile import load_job, read_tree
 from services.progress import ProgressLine
-from services.tradeoff.answer import DEFAULT_TARGETS, answer, recommend
+from services.tradeoff.answer import answer, recommend
 from services.tradeoff.choose import parse_targets
 from services.tradeoff.colour_errors import colour_truth_missing
 from services.tradeoff.crew import Crew
@@ -41,7 +41,7 @@ def main(options: argparse.Namespace) -> int:
     """0 where the study is whole and the targets are met; raises InputError or RunError otherwise."""
     targets = parse_targets(options.target) if options.target else None
     asked = load_job(options.job, options.changes)
-    plan, left_out = make_plan(asked, options, targets or DEFAULT_TARGETS)
+    plan, left_out = make_plan(asked, options, targets)
     require_tier(plan.job.render)
     catalogue = open_catalogue(plan.job.assets, plan.job_folder, tuple(plan.job.categories))
     context = open_worker(plan.job, catalogue)
@@ -67,7 +67,7 @@ def main(options: argparse.Namespace) -> int:
     return 0
 
 
-def make_plan(asked: Job, options: argparse.Namespace, targets: Mapping[str, float]) -> tuple[Plan, list[str]]:
+def make_plan(asked: Job, options: argparse.Namespace, targets: Mapping[str, float] | None) -> tuple[Plan, list[str]]:
     """What is measured for these options, and what is left out. Raises InputError."""
     scenes = min(options.scenes, asked.scenes)
     if scenes < LEAST_SCENES:

@@ -15,8 +15,17 @@ from services.tradeoff.settling import measure_settling
 from workers.assets.catalogue import open_catalogue
 from workers.context import WorkerContext, open_worker
 
-Task = tuple[str, str, tuple[Setting, ...], int, dict[str, bool]]
-"""Name, kind, settings, scene and flags of what is measured."""
+
+@dataclass(frozen=True)
+class Task:
+    """One scene with these settings: `kind` is settling, images or colour; `posed` and `released` are settling's."""
+
+    name: str
+    kind: str
+    settings: tuple[Setting, ...]
+    scene_id: int
+    posed: bool = False
+    released: bool = False
 
 
 @dataclass(frozen=True)
@@ -34,7 +43,7 @@ class Crew:
         fresh = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(self.processes, mp_context=fresh) as pool:
             told = self.job.model_dump_json(), str(self.job_folder)
-            running = {pool.submit(_work, *told, task): task[0] for task in tasks}
+            running = {pool.submit(_work, *told, task): task.name for task in tasks}
             try:
                 for done in as_completed(running):
                     yield running[done], done.result()
@@ -51,7 +60,7 @@ def _context(job: str, folder: str) -> WorkerContext:
 
 def _work(job: str, folder: str, task: Task) -> Any:
     context = _context(job, folder)
-    _, kind, settings, scene_id, flags = task
-    if kind == "settling":
-        return measure_settling(context, settings, scene_id, **flags)
-    return (measure_pictures if kind == "images" else measure_colour)(context, settings, scene_id)
+    if task.kind == "settling":
+        return measure_settling(context, task.settings, task.scene_id, task.posed, task.released)
+    measure = measure_pictures if task.kind == "images" else measure_colour
+    return measure(context, task.settings, task.scene_id)

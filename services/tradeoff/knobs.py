@@ -135,7 +135,7 @@ def _fronts() -> tuple[Value, ...]:
 def _splats() -> tuple[Value, ...]:
     key, removal = "images.projection.splat", "images.projection.hidden_point_removal"
     return tuple(
-        Value(f"{size}{', no backs' if removed else ''}", {key: size, removal: removed})
+        Value(f"{size}{' without backs' if removed else ''}", {key: size, removal: removed})
         for size, removed in itertools.product((1, 3, 5), (False, True))
     )
 

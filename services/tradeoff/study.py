@@ -2,25 +2,29 @@
 
 import hashlib
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from schemas.job import Job
 from services.bench.machine import describe_machine, pinned
+from services.tradeoff.answer import DEFAULT_TARGETS, default_targets
+from services.tradeoff.choose import TargetError
 from services.tradeoff.convergence import slopes
-from services.tradeoff.crew import Crew
+from services.tradeoff.crew import Crew, Task
 from services.tradeoff.errors import ERRORS
 from services.tradeoff.journal import Journal
 from services.tradeoff.knobs import apply, groups_of
 from services.tradeoff.model import Figure, Group, Knob, Row, Setting, Study
 from services.tradeoff.pairs import promising
 from services.tradeoff.statistics import image_figures, settling_figures
+from services.tradeoff.steady import close_calls
 from services.tradeoff.timing import cost_of, job_cost, time_scene, warm_up
 from workers.context import WorkerContext
 
-Tick = Callable[[], None]
+LAPS_OF_CLOSE_CALLS = 3
+"""So many times the rounds of timing for settings whose time decides the choice."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class Plan:
     knobs: tuple[Knob, ...]
     settings: tuple[Setting, ...]
     presets: tuple[Setting, ...]
-    targets: Mapping[str, float]
+    targets: Mapping[str, float] | None
     sizes: Sizes = field(default_factory=Sizes)
 
 
@@ -67,18 +71,37 @@ class _Unit:
 def run_study(
     plan: Plan, journal: Journal, context: WorkerContext, crew: Crew, progress: "Progress"
 ) -> tuple[Row, ...]:
-    """Measure what is not in the journal yet, and make the table. The job itself is its first row."""
-    singles = _Round(plan, "alone", plan.settings)
-    progress.expect(len(singles.units()))
-    _measure(singles, journal, context, crew, progress.tick)
-    rows = singles.rows(journal)
+    """Measure what is not in the journal yet, and make the table. The job itself is its first row.
+
+    Every knob by itself; then what is promising together; then those settings once more against the clock whose time decides
+    the choice.
+    """
+    bench = _Bench(journal, context, crew, progress)
+    rows = bench.measure(_Round(plan, "alone", plan.settings))
     units = {name: kind.unit for name, kind in ERRORS.items()}
-    chosen = (Setting(), *plan.presets, *promising(rows, units, plan.targets))
-    together = _Round(plan, f"together-{_digest(chosen)}", chosen)
-    progress.expect(len(together.units()))
-    _measure(together, journal, context, crew, progress.tick)
-    own = rows[0].ms
-    return (*rows, *(replace(row, ms=own * row.ratio) for row in together.rows(journal)[1:]))
+    chosen = (Setting(), *plan.presets, *promising(rows, units, plan.targets or DEFAULT_TARGETS))
+    together = bench.measure(_Round(plan, f"together-{_digest(chosen)}", chosen))
+    rows = (*rows, *(replace(row, ms=rows[0].ms * row.ratio) for row in together[1:]))
+    asked, bounds = (plan.targets, {}) if plan.targets else default_targets(rows)
+    try:
+        close = close_calls(rows, asked, bounds)
+    except TargetError:  # nothing meets them, however long it takes
+        return rows
+    if not close:
+        return rows
+    again = (Setting(), *(row.setting for row in close))
+    longer = replace(plan, sizes=replace(plan.sizes, laps=LAPS_OF_CLOSE_CALLS * plan.sizes.laps))
+    timed = bench.measure(_Round(longer, f"close-{_digest(again)}", again, times_only=True))
+    return tuple(_with_time(row, timed, rows[0].ms) for row in rows)
+
+
+def _with_time(row: Row, timed: Sequence[Row], own_ms: float) -> Row:
+    """The row with the time of the longer measurement, where it was in it."""
+    for other in timed[1:]:
+        if other.setting == row.setting:
+            ratios = {name: getattr(other, name) for name in ("ratio", "ratio_least", "ratio_most")}
+            return replace(row, ms=own_ms * other.ratio, **ratios)
+    return row
 
 
 def _digest(settings: Sequence[Setting]) -> str:
@@ -103,6 +126,7 @@ class _Round:
     plan: Plan
     name: str
     settings: tuple[Setting, ...]
+    times_only: bool = False
 
     def of(self, *groups: Group) -> tuple[Setting, ...]:
         """The settings that change any of these parts of a scene, and the job's own."""
@@ -133,7 +157,7 @@ class _Round:
             _Unit(f"{self.name}/{kind}/{scene}", kind, settings, scene)
             for kind, settings, count in kinds
             for scene in self._scenes(count)
-            if len(settings) > 1
+            if len(settings) > 1 and not self.times_only
         ]
 
     def units(self) -> list[_Unit]:
@@ -152,28 +176,50 @@ class _Round:
         return [journal[unit.name] for unit in self.errors() if unit.kind == kind]
 
 
-def _measure(part: _Round, journal: Journal, context: WorkerContext, crew: Crew, tick: Tick) -> None:
-    """Timing first and alone, then the rest beside one another."""
-    missing = [unit for unit in part.timings() if unit.name not in journal]
-    for _ in range(len(part.timings()) - len(missing)):
-        tick()
-    with pinned():
-        if missing:
-            warm_up(context, part.settings, part.plan.job.first_scene + part.plan.sizes.timed)
-        for unit in missing:
-            journal.add(unit.name, _time(part, context, unit))
-            tick()
-    sizes, first = part.plan.sizes, part.plan.job.first_scene
-    wanted = []
-    for unit in part.errors():
-        if unit.name in journal:
-            tick()
-        else:
-            flags = {"posed": unit.scene_id - first < sizes.posed, "released": unit.scene_id - first < sizes.released}
-            wanted.append((unit.name, unit.kind, unit.settings, unit.scene_id, flags))
-    for name, answer in crew.measure(wanted):
-        journal.add(name, answer)
-        tick()
+@dataclass(frozen=True)
+class _Bench:
+    """Who measures, and where it is kept."""
+
+    journal: Journal
+    context: WorkerContext
+    crew: Crew
+    progress: Progress
+
+    def measure(self, part: _Round) -> tuple[Row, ...]:
+        """What is missing of a round: its times first and alone, then the rest beside one another. The round's table."""
+        self.progress.expect(len(part.units()))
+        missing = [unit for unit in part.units() if unit.name not in self.journal]
+        for _ in range(len(part.units()) - len(missing)):
+            self.progress.tick()
+        self._take_times(part, [unit for unit in missing if unit.kind == "time"])
+        sizes, first = part.plan.sizes, part.plan.job.first_scene
+        tasks = [
+            Task(
+                unit.name,
+                unit.kind,
+                unit.settings,
+                unit.scene_id,
+                posed=unit.scene_id - first < sizes.posed,
+                released=unit.scene_id - first < sizes.released,
+            )
+            for unit in missing
+            if unit.kind != "time"
+        ]
+        for name, answer in self.crew.measure(tasks):
+            self._keep(name, answer)
+        return part.rows(self.journal)
+
+    def _take_times(self, part: _Round, missing: Sequence[_Unit]) -> None:
+        if not missing:
+            return
+        with pinned():
+            warm_up(self.context, part.settings, part.plan.job.first_scene + part.plan.sizes.timed)
+            for unit in missing:
+                self._keep(unit.name, _time(part, self.context, unit))
+
+    def _keep(self, name: str, answer: Any) -> None:
+        self.journal.add(name, answer)
+        self.progress.tick()
 
 
 def _time(part: _Round, context: WorkerContext, unit: _Unit) -> dict[str, Any]:
