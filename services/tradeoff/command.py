@@ -24,8 +24,9 @@ from services.tradeoff.journal import Journal
 from services.tradeoff.knobs import apply, choose_knobs, knobs_of, preset_settings, set_in, settings_of
 from services.tradeoff.model import Row
 from services.tradeoff.page import write_page
+from services.tradeoff.plan import Plan, Sizes
 from services.tradeoff.plots import write_plots
-from services.tradeoff.study import Plan, Progress, Sizes, header_of, run_study, study_of
+from services.tradeoff.study import Progress, header_of, run_study, study_of
 from services.tradeoff.tables import write_tables
 from workers.assets.catalogue import open_catalogue
 from workers.context import open_worker
