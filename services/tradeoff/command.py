@@ -18,16 +18,16 @@ from services.jobfile import load_job, read_tree
 from services.progress import ProgressLine
 from services.tradeoff.answer import answer, recommend
 from services.tradeoff.choose import parse_targets
-from services.tradeoff.colour_errors import colour_truth_missing
-from services.tradeoff.crew import Crew
 from services.tradeoff.journal import Journal
 from services.tradeoff.knobs import apply, choose_knobs, knobs_of, preset_settings, set_in, settings_of
+from services.tradeoff.measure.colour_errors import colour_truth_missing
+from services.tradeoff.measure.crew import Crew
 from services.tradeoff.model import Row
-from services.tradeoff.page import write_page
 from services.tradeoff.plan import Plan, Sizes
-from services.tradeoff.plots import write_plots
+from services.tradeoff.report.page import write_page
+from services.tradeoff.report.plots import write_plots
+from services.tradeoff.report.tables import write_tables
 from services.tradeoff.study import Progress, header_of, run_study, study_of
-from services.tradeoff.tables import write_tables
 from workers.assets.catalogue import open_catalogue
 from workers.context import open_worker
 from workers.fingerprint import code_digest

@@ -3,7 +3,8 @@
 from services.tradeoff.model import ErrorKind
 
 _RAYS = "a ray caster in float64 at the same pixel centres"
-_DENSE = "cast rays, 16 in each pixel"
+_FRONT = "65,536 rays about the objects, and their vertices"
+_PATCH = "rays at random in the objects' patch"
 _FINEST = "the finest steps, 1 s"
 _REFERENCE = "finer steps than any that is measured"
 
@@ -21,13 +22,16 @@ KINDS: tuple[ErrorKind, ...] = (
     ErrorKind("depth_mm", "mm", "stored depth of objects off, 99 % of pixels", _RAYS, "labels"),
     ErrorKind("table_depth_mm", "mm", "stored depth of the table off, 99 % of pixels", _RAYS, "labels"),
     ErrorKind("mask_share", "", "object pixels that are wrong in the mask", _RAYS, "labels"),
-    ErrorKind("between_mm", "mm", "depth between pixels, read at the nearest", "rays at random in the patch", "labels"),
-    ErrorKind("outline_share", "", "rays at random whose region the nearest pixel has wrong", _DENSE, "labels"),
-    ErrorKind("mirror_mm", "mm", "mirror camera off, as d_z is", _DENSE, "mirror"),
+    ErrorKind("between_mm", "mm", "depth between pixels, read at the nearest", _PATCH, "labels"),
+    ErrorKind("outline_share", "", "rays at random whose region the nearest pixel has wrong", _PATCH, "labels"),
+    ErrorKind("mirror_mm", "mm", "mirror camera off, as d_z is", _FRONT, "mirror"),
     ErrorKind("agreement_mm", "mm", "input depth carried into the mirror view, off", "the mirror view", "mirror"),
     ErrorKind("unfilled_share", "", "object pixels of the mirror view seen by both that stay empty", _RAYS, "mirror"),
     ErrorKind("hidden_share", "", "projected pixels that show what the mirror camera cannot see", _RAYS, "mirror"),
     ErrorKind("flip", "", "colour: FLIP, 0 the same to 1", "a converged path-traced image", "colour"),
+    ErrorKind(
+        "edge_flip", "", "smoothness of edges: FLIP, 0 the same to 1", "64 samples a pixel, same light", "colour"
+    ),
 )
 
 ERRORS: dict[str, ErrorKind] = {kind.name: kind for kind in KINDS}

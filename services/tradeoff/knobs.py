@@ -38,6 +38,7 @@ _SETTLES = (
     "failed_share",
 )
 _LABELS = ("depth_mm", "table_depth_mm", "mask_share", "between_mm", "outline_share")
+_COLOUR = ("flip", "edge_flip")
 _MIRROR = ("mirror_mm", "agreement_mm", "unfilled_share", "hidden_share")
 
 
@@ -95,7 +96,15 @@ def _image_knobs(job: Job) -> tuple[Knob, ...]:
                 Value("azure-kinect", {"sensor.depth_noise": {}}),
             ),
         ),
-        Knob(COLOUR_KNOB, "render tier and samples", "colour", ("flip",), _colours(), "mitsuba", frozenset(PATHTRACED)),
+        Knob(
+            COLOUR_KNOB,
+            "render tier and samples",
+            "colour",
+            ("flip", "edge_flip"),
+            _colours(),
+            "mitsuba",
+            frozenset(PATHTRACED),
+        ),
     )
 
 

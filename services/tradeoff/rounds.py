@@ -8,10 +8,10 @@ from typing import Any
 from services.tradeoff.errors import ERRORS
 from services.tradeoff.journal import Journal
 from services.tradeoff.knobs import groups_of
+from services.tradeoff.measure.statistics import image_figures, settling_figures
+from services.tradeoff.measure.timing import cost_of, job_cost
 from services.tradeoff.model import Figure, Group, Row, Setting
 from services.tradeoff.plan import Plan
-from services.tradeoff.statistics import image_figures, settling_figures
-from services.tradeoff.timing import cost_of, job_cost
 
 
 @dataclass(frozen=True)

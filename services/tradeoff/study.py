@@ -9,17 +9,17 @@ from schemas.job import Job
 from services.bench.machine import describe_machine, pinned
 from services.tradeoff.answer import DEFAULT_TARGETS, default_targets
 from services.tradeoff.choose import TargetError
-from services.tradeoff.convergence import slopes
-from services.tradeoff.crew import Crew, Task
 from services.tradeoff.errors import ERRORS
 from services.tradeoff.journal import Journal
 from services.tradeoff.knobs import apply
+from services.tradeoff.measure.convergence import slopes
+from services.tradeoff.measure.crew import Crew, Task
+from services.tradeoff.measure.timing import time_scene, warm_up
 from services.tradeoff.model import Row, Setting, Study
 from services.tradeoff.pairs import promising
 from services.tradeoff.plan import Plan
 from services.tradeoff.rounds import Round, Unit
 from services.tradeoff.steady import close_calls
-from services.tradeoff.timing import time_scene, warm_up
 from workers.context import WorkerContext
 
 LAPS_OF_CLOSE_CALLS = 3

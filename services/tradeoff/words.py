@@ -21,6 +21,7 @@ SHORT: dict[str, str] = {
     "unfilled_share": "projected pixels left empty",
     "hidden_share": "projected pixels that show through",
     "flip": "colour, FLIP",
+    "edge_flip": "edges, FLIP",
 }
 """What an error is called where there is no room for its title."""
 

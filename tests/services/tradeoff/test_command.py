@@ -11,7 +11,7 @@ from schemas.errors import MachineError
 from services.cli import main
 from services.tradeoff import command, study
 from services.tradeoff.journal import JOURNAL_FILE
-from services.tradeoff.tables import read_study
+from services.tradeoff.report.tables import read_study
 from tests.services.test_cli import TABLETOP, told
 
 SMALL = [

@@ -9,7 +9,7 @@ from schemas.preset import PRESETS
 from services.tradeoff.knobs import apply
 from services.tradeoff.model import Figure, Row, Setting
 from services.tradeoff.preset_front import SLACK, better_than, preset_row, rivals
-from services.tradeoff.tables import read_study
+from services.tradeoff.report.tables import read_study
 from workers.context import settings_digest
 
 EVIDENCE = Path(__file__).resolve().parents[3] / "docs" / "tradeoff"

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from schemas.camera import Camera
 from schemas.scene import Placed
-from services.tradeoff.patch_rays import Patch, cast_patch
-from services.tradeoff.pixel_rays import Pixels, cast_pixels, seen_by_other
+from services.tradeoff.measure.patch_rays import Patch, cast_patch
+from services.tradeoff.measure.pixel_rays import Pixels, cast_pixels, seen_by_other
 from workers.scene_steps import Scene
 
 KEPT = 12

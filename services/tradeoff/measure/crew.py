@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from schemas.job import Job
-from services.tradeoff.looking import measure_colour, measure_pictures
+from services.tradeoff.measure.looking import measure_colour, measure_pictures
+from services.tradeoff.measure.settling import measure_settling
 from services.tradeoff.model import Setting
-from services.tradeoff.settling import measure_settling
 from workers.assets.catalogue import open_catalogue
 from workers.context import WorkerContext, open_worker
 

@@ -8,8 +8,8 @@ import pytest
 from schemas.base import frozen_array
 from schemas.camera import Camera, Intrinsics
 from services.jobfile import validate_job
-from services.tradeoff import colour_errors
-from services.tradeoff.colour_errors import (
+from services.tradeoff.measure import colour_errors
+from services.tradeoff.measure.colour_errors import (
     ColourTruth,
     Crop,
     colour_truth_missing,

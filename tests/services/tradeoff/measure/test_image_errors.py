@@ -11,8 +11,8 @@ from schemas.camera import Camera, Intrinsics
 from schemas.job import Images
 from schemas.scene import Agreement, Appearance, Pair, Placed, PosedScene, View
 from services.jobfile import validate_job
-from services.tradeoff.image_errors import measure_images
-from services.tradeoff.truth import Truth, truth_of
+from services.tradeoff.measure.image_errors import measure_images
+from services.tradeoff.measure.truth import Truth, truth_of
 from tests.effects.scenes import SMALL, context_of, merged
 from tests.shapes import box, shape_of
 from workers.geometry.camera import look_at

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.camera import Camera
 from schemas.scene import REGION_FIRST_OBJECT, Placed
-from services.tradeoff.rays import Box, cast_at, objects_of, project_box, sees, vertices_in
+from services.tradeoff.measure.rays import Box, cast_at, objects_of, project_box, sees, vertices_in
 from workers.geometry.raycast import NEAR_M
 
 DENSE = 256

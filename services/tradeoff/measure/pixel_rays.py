@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.camera import Camera
 from schemas.scene import REGION_FIRST_OBJECT, Placed
-from services.tradeoff.rays import cast_at, objects_of, project_box, sees
+from services.tradeoff.measure.rays import cast_at, objects_of, project_box, sees
 from workers.geometry.camera import unproject
 from workers.geometry.frames import invert, transform
 from workers.geometry.raycast import NEAR_M

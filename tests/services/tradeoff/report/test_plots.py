@@ -12,11 +12,11 @@ from matplotlib.figure import Figure as Picture
 from matplotlib.text import Annotation, Text
 from PIL import Image
 
-from services.tradeoff.knob_plots import draw_knob, knob_rows, moved_errors, single_knobs
 from services.tradeoff.model import Row, Study
-from services.tradeoff.panel import half_row, looks_of, moving_rows, panels_of
-from services.tradeoff.pictures import COLORS, boxed, plain_style, renderer_of
-from services.tradeoff.plots import draw_tradeoff, headline, write_plots
+from services.tradeoff.report.knob_plots import draw_knob, knob_rows, moved_errors, single_knobs
+from services.tradeoff.report.panel import half_row, looks_of, moving_rows, panels_of
+from services.tradeoff.report.pictures import COLORS, boxed, plain_style, renderer_of
+from services.tradeoff.report.plots import draw_tradeoff, headline, write_plots
 from tests.made_up_studies import figure, large_study, row, study
 
 OWN = row(moved_mm=0.1, depth_mm=0.1, mirror_mm=1.0)
@@ -157,8 +157,8 @@ def test_the_same_study_gives_the_same_bytes(tmp_path: Path):
 
 
 def test_drawing_needs_no_window_and_no_state_of_pyplot():
-    code = "import sys, services.tradeoff.plots; sys.exit('matplotlib.pyplot' in sys.modules)"
-    root = Path(__file__).resolve().parents[3]
+    code = "import sys, services.tradeoff.report.plots; sys.exit('matplotlib.pyplot' in sys.modules)"
+    root = Path(__file__).resolve().parents[4]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, timeout=60, check=False).returncode == 0
 
 

@@ -12,9 +12,9 @@ from schemas.camera import Camera, Intrinsics
 from schemas.errors import InputError
 from schemas.job import Render
 from schemas.scene import REGION_FLOOR, Appearance, Placed
-from services.tradeoff.flip import flip_between
-from services.tradeoff.patch_rays import cast_patch
-from services.tradeoff.rays import Box
+from services.tradeoff.measure.flip import flip_between
+from services.tradeoff.measure.patch_rays import cast_patch
+from services.tradeoff.measure.rays import Box
 from workers.context import WorkerContext
 from workers.render.tiers import draw_view, require_tier
 from workers.scene.appearance import draw_look
@@ -72,16 +72,21 @@ def converged_colour(context: WorkerContext, scene: Scene, paths: int, salt: int
     Neither tier nor samples, seed of paths, bounces, sensor or size of the scene's own images decide it: its look is the one
     that the raster and path-traced tiers share, its seed its own. Another `salt` traces other paths.
     """
-    camera = scene.pairs[0].input.camera
-    patch = cast_patch(scene.posed.things, camera)
-    if patch.box is None:
+    crop = crop_of(scene)
+    if crop is None:
         return None
-    crop = crop_about(patch.box)
+    camera = scene.pairs[0].input.camera
     things, appearance = _in_studio(context, scene)
     render = Render(tier="pathtraced", path_samples=paths, path_bounces=BOUNCES)
     rng = np.random.default_rng([TRUTH_SEED, scene.plan.scene_id, salt])
     drawn = draw_view(context.renderer, things, appearance, crop_camera(camera, crop), render, rng)
     return ColourTruth(crop, drawn.rgb)
+
+
+def crop_of(scene: Scene) -> Crop | None:
+    """What is compared of the first pair's input view; None where it sees no object."""
+    patch = cast_patch(scene.posed.things, scene.pairs[0].input.camera)
+    return None if patch.box is None else crop_about(patch.box)
 
 
 def flip_error(truth: ColourTruth, rgb: NDArray[np.uint8]) -> float:

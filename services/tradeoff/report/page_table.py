@@ -6,7 +6,7 @@ from html import escape
 from services.tradeoff.choose import as_cheap, front, own_row
 from services.tradeoff.errors import KINDS
 from services.tradeoff.model import Figure, Group, Row, Study
-from services.tradeoff.panel import kind_of
+from services.tradeoff.report.panel import kind_of
 from services.tradeoff.words import duration, milliseconds, number, short, shown, size, times, unit
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from services.tradeoff.answer import answer
 from services.tradeoff.model import Study
-from services.tradeoff.page import page_of, write_page
+from services.tradeoff.report.page import page_of, write_page
 from tests.made_up_studies import large_study, row, study
 
 VOID = {"meta", "img", "br"}

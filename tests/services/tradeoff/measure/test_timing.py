@@ -2,7 +2,7 @@
 
 import pytest
 
-from services.tradeoff.timing import cost_of, job_cost
+from services.tradeoff.measure.timing import cost_of, job_cost
 
 OWN = "the job"
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.job import Images
 from schemas.scene import REGION_FIRST_OBJECT, REGION_TABLE, Pair, View
-from services.tradeoff.patch_rays import Patch
-from services.tradeoff.pixel_rays import Pixels, Seen
-from services.tradeoff.truth import Truth
+from services.tradeoff.measure.patch_rays import Patch
+from services.tradeoff.measure.pixel_rays import Pixels, Seen
+from services.tradeoff.measure.truth import Truth
 from workers.context import WorkerContext
 from workers.scene.views import stored_depth_m
 from workers.scene_steps import Scene

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.tradeoff.scales import MOST_TICKS, round_ticks, scale_of
+from services.tradeoff.report.scales import MOST_TICKS, round_ticks, scale_of
 
 POSITIVE = st.floats(1e-9, 1e9)
 

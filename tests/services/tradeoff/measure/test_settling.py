@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from schemas.job import Job
-from services.tradeoff.convergence import slopes
 from services.tradeoff.knobs import apply, knobs_of
+from services.tradeoff.measure.convergence import slopes
+from services.tradeoff.measure.settling import REFERENCES, measure_settling
 from services.tradeoff.model import Setting
-from services.tradeoff.settling import REFERENCES, measure_settling
 from workers.assets.catalogue import open_catalogue
 from workers.context import WorkerContext
 

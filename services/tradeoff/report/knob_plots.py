@@ -8,10 +8,10 @@ from matplotlib.figure import Figure as Picture
 from matplotlib.transforms import Bbox
 
 from services.tradeoff.choose import own_row
-from services.tradeoff.labels import Label, place_labels
 from services.tradeoff.model import Row, Study
-from services.tradeoff.panel import LONGEST, MOVED
-from services.tradeoff.pictures import (
+from services.tradeoff.report.labels import Label, place_labels
+from services.tradeoff.report.panel import LONGEST, MOVED
+from services.tradeoff.report.pictures import (
     COLORS,
     DOTS,
     INK,
@@ -26,7 +26,7 @@ from services.tradeoff.pictures import (
     set_axes,
     up_scale,
 )
-from services.tradeoff.scales import Scale, scale_of
+from services.tradeoff.report.scales import Scale, scale_of
 from services.tradeoff.words import as_often, shown
 
 MOST_ERRORS = 3

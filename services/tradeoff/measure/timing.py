@@ -10,8 +10,8 @@ import numpy as np
 
 from schemas.errors import SceneError
 from services.bench.ratios import Spread
+from services.tradeoff.measure.settling import context_for
 from services.tradeoff.model import Setting
-from services.tradeoff.settling import context_for
 from workers.context import WorkerContext
 from workers.scene.effect import Facts
 from workers.scene.effects import plan_effects

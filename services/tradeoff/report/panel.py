@@ -11,9 +11,9 @@ from matplotlib.lines import Line2D
 from matplotlib.transforms import Bbox
 
 from services.tradeoff.choose import front, own_row
-from services.tradeoff.labels import Label, place_labels
 from services.tradeoff.model import Row, Study
-from services.tradeoff.pictures import (
+from services.tradeoff.report.labels import Label, place_labels
+from services.tradeoff.report.pictures import (
     COLORS,
     INK,
     PALE,
@@ -27,18 +27,18 @@ from services.tradeoff.pictures import (
     single_look,
     up_scale,
 )
-from services.tradeoff.scales import Scale, scale_of
+from services.tradeoff.report.scales import Scale, scale_of
 from services.tradeoff.words import as_often, shown
 
 _MAIN = (
     (
         "at rest",
         "How objects rest",
-        ("moved_mm", "pose_mm", "outcome_mm", "penetration_mm", "gap_mm", "turned_deg", "outcome_deg"),
+        ("pose_mm", "moved_mm", "outcome_mm", "penetration_mm", "gap_mm", "turned_deg", "outcome_deg"),
     ),
     ("in depth", "Depth and masks", ("between_mm", "depth_mm", "outline_share", "mask_share", "table_depth_mm")),
     ("in the mirror", "The other side", ("mirror_mm", "agreement_mm", "unfilled_share", "hidden_share")),
-    ("in colour", "Colour", ("flip",)),
+    ("in colour", "Colour", ("flip", "edge_flip")),
 )
 """Of each part of a scene its name in the title, its heading, and its main errors: the first that settings move is shown."""
 

@@ -10,7 +10,7 @@ from services.tradeoff.answer import answer
 from services.tradeoff.choose import Targets, own_row
 from services.tradeoff.errors import KINDS
 from services.tradeoff.model import Study
-from services.tradeoff.page_table import group_table
+from services.tradeoff.report.page_table import group_table
 from services.tradeoff.words import duration, milliseconds, number, short, size
 
 GROUPS = {

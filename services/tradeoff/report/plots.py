@@ -6,10 +6,10 @@ from matplotlib.figure import Figure as Picture
 from matplotlib.lines import Line2D
 
 from services.tradeoff.choose import own_row
-from services.tradeoff.knob_plots import draw_knob, single_knobs
 from services.tradeoff.model import Study
-from services.tradeoff.panel import Panel, draw_panel, looks_of, panels_of
-from services.tradeoff.pictures import DOTS, INK, PALE, cut, fit, new_picture, plain_style
+from services.tradeoff.report.knob_plots import draw_knob, single_knobs
+from services.tradeoff.report.panel import Panel, draw_panel, looks_of, panels_of
+from services.tradeoff.report.pictures import DOTS, INK, PALE, cut, fit, new_picture, plain_style
 from services.tradeoff.words import as_often, milliseconds
 
 WIDTH = 12.0

@@ -15,7 +15,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from matplotlib.transforms import Bbox
 
 from services.tradeoff.model import Row
-from services.tradeoff.scales import Scale, scale_of
+from services.tradeoff.report.scales import Scale, scale_of
 from services.tradeoff.words import number, short, shown, unit
 
 DOTS = 150

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from schemas.errors import CorruptError, OutputError
 from services.tradeoff.errors import ERRORS
 from services.tradeoff.model import Figure, Row, Setting, Study
-from services.tradeoff.tables import STUDY_FILE, read_study, wide_schema, write_tables
+from services.tradeoff.report.tables import STUDY_FILE, read_study, wide_schema, write_tables
 from tests.made_up_studies import large_study, row, study
 
 TEXT, NUMBER = st.text(max_size=8), st.floats(allow_nan=False)
