@@ -94,7 +94,7 @@ def test_flip_prints_nothing_writes_nothing_and_is_the_same_on_any_number_of_thr
         "b = np.clip(a + rng.normal(0, 20, a.shape), 0, 255).astype(np.uint8);"
         "print(*{flip_between(a, b).hex() for _ in range(3)})"
     )
-    root = str(Path(__file__).parents[3])
+    root = str(Path(__file__).parents[4])
     said = [
         subprocess.run(
             [sys.executable, "-c", code],
