@@ -113,14 +113,13 @@ class Tube:
 
     def mapped(self, axes: Array, origin: Array) -> "Tube":
         """The tube with its x, y, z along the rows of `axes` [3, 3], of any length and no mirror, and its origin at `origin`."""
-        points = (p[..., 0:1] * axes[0] + p[..., 1:2] * axes[1] + p[..., 2:3] * axes[2] + origin for p in self._points)
+        rings, ends = (
+            p[..., 0:1] * axes[0] + p[..., 1:2] * axes[1] + p[..., 2:3] * axes[2] + origin
+            for p in (self.rings, self.ends)
+        )
         lengths = np.sqrt((axes * axes).sum(axis=1))[[0, 2]]
         profiles = None if self.profiles is None else self.profiles * lengths
-        return Tube(*points, profiles, tuple(cutter.mapped(axes, origin) for cutter in self.cutters))
-
-    @property
-    def _points(self) -> tuple[Array, Array]:
-        return self.rings, self.ends
+        return Tube(rings, ends, profiles, tuple(cutter.mapped(axes, origin) for cutter in self.cutters))
 
 
 @dataclass(frozen=True, eq=False)

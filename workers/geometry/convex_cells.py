@@ -49,7 +49,7 @@ class Cells:
         return np.concatenate(points)
 
     def sides_of(self, cell: Indices, corners: int) -> Indices:
-        """[M] int64: on which side of the outline, of so many corners, each side of a cell lies; -1 for cuts and the last side."""
+        """[M] int64: on which side of the outline, of so many corners, a cell's sides lie; -1: a cut, or the last side."""
         on = [{k - 1, k} for k in range(corners)]
         for a, b, _ in self.added:
             on.append({min(a, b)} if max(a, b) < corners and abs(a - b) == 1 else on[a] & on[b])
@@ -82,7 +82,9 @@ def convex_cells(outlines: Array, tolerance: float) -> Cells:
         before, after = cut.side, (cut.side + 1) % len(cell)
         if cut.share > 0.0:
             added.append(Between(int(cell[before]), int(cell[after]), cut.share))
-            points = np.concatenate([points, [points[cell[before]] * (1 - cut.share) + points[cell[after]] * cut.share]])
+            points = np.concatenate(
+                [points, [points[cell[before]] * (1 - cut.share) + points[cell[after]] * cut.share]]
+            )
             end = len(points) - 1
         else:
             end, before = int(cell[before]), (before - 1) % len(cell)

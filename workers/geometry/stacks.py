@@ -1,6 +1,7 @@
 """What of a tube's outline is seen from its axis, cut into convex bodies that are stacked along it. Pure."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -34,7 +35,7 @@ def seen_from_axis(outline: Array) -> list[Level]:
     heights = np.unique(outline[:, 1])
     heights = heights[(heights >= outline[0, 1]) & (heights <= outline[-1, 1])]
     border = []
-    for bottom, top in zip(heights[:-1], heights[1:], strict=True):
+    for bottom, top in itertools.pairwise(heights):
         spans = np.minimum(low[:, 1], high[:, 1]) <= bottom
         sides = np.flatnonzero(spans & (np.maximum(low[:, 1], high[:, 1]) >= top))
         a, b = low[sides], high[sides]

@@ -17,8 +17,9 @@ from schemas.shape import Tube
 from workers.geometry.convex_cells import Indices, convex_cells
 from workers.geometry.convexity import triangles_of
 from workers.geometry.hull import convex_hull
+from workers.geometry.inset import least_width_m
 from workers.geometry.manifold import hold_to_one_thread
-from workers.geometry.stacks import Level, is_covered, rings_at, seen_from_axis, stacks_of
+from workers.geometry.stacks import is_covered, rings_at, seen_from_axis, stacks_of
 
 TOLERANCE = 1.6e-4
 """Share of the size of all by which parts may reach out of a tube where that saves some: 40 micrometres of 0.25 m."""
@@ -29,9 +30,6 @@ TWIST = 4.0
 THIN = 1.6e-3
 """Cells narrower than this share of the size, 0.4 mm of 0.25 m, get some of their neighbours': a collision margin is a
 quarter of the least width of all parts at most."""
-
-HALF = 0.5
-"""What lies beyond a face of a cutter is cut where it lies beyond others too, if so much of it is left."""
 
 
 def parts_of_tubes(tubes: Sequence[Tube]) -> tuple[Array, ...]:
@@ -48,7 +46,7 @@ def _parts(tube: Tube, size: float) -> list[Array]:
     parts = _chain(tube.rings) if tube.profiles is None else _turned(tube.profiles, lines, size)
     for cutter in tube.cutters:
         for body in _parts(cutter, size):
-            parts = [left for part in parts for left in _without(part, body)]
+            parts = [left for part in parts for left in _without(part, body, 0.9 * THIN * size)]
     return parts
 
 
@@ -116,7 +114,7 @@ def _wedges(columns: Array, cell: Indices, sides: Indices, tolerance: float) -> 
 
 
 def _stands_out(begin: Array, end: Array) -> float:
-    """How far the sides of a cell lie outside of the planes of facets at most; begin, end [M, k, 3]: of each side, along k columns."""
+    """How far a cell lies outside of the planes of its facets; begin, end [M, k, 3]: of its sides, along k columns."""
     across = np.cross(begin[:, 1:] - end[:, :-1], end[:, 1:] - begin[:, :-1]).reshape(-1, 3)
     length = np.linalg.norm(across, axis=1)
     kept = length > 0.0
@@ -176,7 +174,7 @@ def _grown(cell: Indices, points: Array, outline: Array, tolerance: float, thin:
 
 
 def _width(corners: Array) -> float:
-    """Least width of a convex outline [M, 2], either way round: the farthest corner from a side, at the side where that is least."""
+    """Least width of a convex outline [M, 2]: from a side to the farthest corner, where that is least."""
     along = np.roll(corners, -1, axis=0) - corners
     length = np.sqrt((along * along).sum(axis=1))
     along = along[length > 0.0] / length[length > 0.0, None]
@@ -185,10 +183,10 @@ def _width(corners: Array) -> float:
     return float(np.abs(along[:, None, 0] * away[..., 1] - along[:, None, 1] * away[..., 0]).max(axis=1).min())
 
 
-def _without(part: Array, body: Array) -> list[Array]:
+def _without(part: Array, body: Array, thin: float) -> list[Array]:
     """Convex parts of a convex part without a convex body: what lies beyond each of the body's faces, the most first.
 
-    What lies beyond two faces is given to the first alone, unless too little would be left to the second.
+    What lies beyond two faces is given to the first alone, unless the second's would be thinner than `thin`, metres.
     """
     solid, cutter = (manifold3d.Manifold.hull_points(np.ascontiguousarray(points)) for points in (part, body))
     if (solid ^ cutter).is_empty():
@@ -203,11 +201,14 @@ def _without(part: Array, body: Array) -> list[Array]:
     for k in order:
         if beyond[k].is_empty():
             break
-        rest = beyond[k]
+        rest = new = beyond[k]
         for earlier in taken:
-            less = rest.trim_by_plane((-normals[earlier]).tolist(), -float(reach[earlier]))
-            if less.volume() >= HALF * beyond[k].volume():
+            inner = (-normals[earlier]).tolist(), -float(reach[earlier])
+            new, less = new.trim_by_plane(*inner), rest.trim_by_plane(*inner)
+            if not less.is_empty() and least_width_m(convex_hull(triangles_of(less).vertices)) >= thin:
                 rest = less
+        if new.is_empty():
+            continue
         taken.append(k)
         left.append(triangles_of(rest).vertices)
     return left

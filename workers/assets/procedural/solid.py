@@ -142,7 +142,7 @@ def _profiles(profile: Array, section: Array | None) -> Array:
 
 def _widened(profile: Array, factors: Array) -> Array:
     """The profile [P, 2] with the radii between its ends times the factors [P - 2]."""
-    wide = profile.copy()
+    wide = profile.astype(np.float64)
     wide[1:-1, 0] *= factors
     return wide
 

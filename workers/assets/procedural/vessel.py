@@ -138,5 +138,5 @@ def sides_apart(solid: Solid, surface: int, numbers: tuple[int, int, int, int]) 
     x, y, _ = np.cross(b - a, c - a).T
     side = np.where(np.abs(y) >= np.abs(x), np.where(y < 0, 0, 2), np.where(x > 0, 1, 3))
     chosen = solid.surface == surface
-    surface = np.where(chosen, np.array(numbers)[side], solid.surface)
-    return Solid(solid.vertices, solid.faces, surface, solid.smooth, solid.tubes)
+    sorted_out = np.where(chosen, np.array(numbers)[side], solid.surface)
+    return Solid(solid.vertices, solid.faces, sorted_out, solid.smooth, solid.tubes)
