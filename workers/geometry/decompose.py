@@ -1,5 +1,7 @@
 """Convex parts of a body that is not convex, by CoACD (Wei, Liu, Ling and Su 2022, doi 10.1145/3528223.3530103).
 
+Built-in shapes are not cut so, but by their making: see `workers.geometry.tubes`, with the same figures.
+
 Built-in shapes, number 0 of each category, 0.25 m along their diagonal, by CoACD's threshold: parts / their vertices in all /
 seconds on one busy core / millimetres that parts stand out of the surface at most. Half of all that parts show lies on
 the surface (but at 0.1), and nothing out of the hull.

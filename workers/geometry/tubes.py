@@ -4,6 +4,22 @@ A tube's length section along one column of its rings is an outline that ends at
 level with the rings, is cut into stacked bodies, each the hull of whole rings. The rest is cut into plane cells, and each
 cell, between two neighbouring columns, is a wedge: exact where columns lie in planes through the axis, because its facets
 are flat then.
+
+Of 20 of each category, 0.25 m along their diagonal: median / most parts, milliseconds on one busy core, micrometres that
+parts stand out of the surface at most, by points on them. Nothing of a surface is left uncovered by more than 70.
+
+    mug      415 / 495      70 / 91     35
+    bowl     794 / 1,288    125 / 428   83
+    jar      682 / 1,136    118 / 411   76
+    can      460 / 481      75 / 99     33
+    bottle   57 / 73        27 / 108    244
+    laptop   47 / 47        71 / 75     0
+    camera   83 / 98        22 / 30     21
+    box      3 / 5          3 / 12      0
+
+What is over 50 are soft squares that turn into circles, whose facets are twisted; a bottle's are not cut along them. A
+simulator's step with what stands on a foot ring takes three to nine times as long as with CoACD's parts, because each
+wedge of the ring touches the ground; on its side up to three times, a bowl up to ten.
 """
 
 from collections.abc import Sequence
