@@ -97,6 +97,32 @@ class Shape:
 
 
 @dataclass(frozen=True, eq=False)
+class Tube:
+    """A body whose making is known, from which its convex parts follow (`workers.geometry.tubes`).
+
+    rings [L, n, 3] metres, each convex and counter-clockwise seen from the end; ends [2, 3]: the points that close it by
+    fans. profiles [K, L + 2, 2]: radius and height of the first end, of every ring and of the last end, where all rings have
+    one axis and are level on it; they may then turn inwards and back. K such, where the columns of the rings differ, of the
+    most unlike columns. None where rings lie askew, each beyond the one before. What `cutters` hold is not in it.
+    """
+
+    rings: Array
+    ends: Array
+    profiles: Array | None = None
+    cutters: tuple["Tube", ...] = ()
+
+    def mapped(self, axes: Array, origin: Array) -> "Tube":
+        """The tube with its x, y, z along the rows of `axes` [3, 3], of any length and no mirror, and its origin at `origin`."""
+        rings, ends = (
+            p[..., 0:1] * axes[0] + p[..., 1:2] * axes[1] + p[..., 2:3] * axes[2] + origin
+            for p in (self.rings, self.ends)
+        )
+        lengths = np.sqrt((axes * axes).sum(axis=1))[[0, 2]]
+        profiles = None if self.profiles is None else self.profiles * lengths
+        return Tube(rings, ends, profiles, tuple(cutter.mapped(axes, origin) for cutter in self.cutters))
+
+
+@dataclass(frozen=True, eq=False)
 class MassProperties:
     """Of the true mesh, not of its collision shape.
 
@@ -118,7 +144,8 @@ class Asset:
     `sha256` the digest of the source file, or of the generated arrays where there is none. `T_source_to_object` takes
     the source's coordinates, *after* multiplying them by `scale`, to the object frame. `shareable` says whether the
     cleaned mesh may be written into the dataset. `volume_m3` is None where the mesh is not watertight.
-    `notes` says what of the source was mended or left out, such as a texture that is missing.
+    `notes` says what of the source was mended or left out, such as a texture that is missing. `tubes`: what the shape is the
+    union of, object frame, where that is known.
     """
 
     instance_id: str
@@ -135,6 +162,7 @@ class Asset:
     volume_m3: float | None
     shareable: bool
     notes: tuple[str, ...] = ()
+    tubes: tuple[Tube, ...] | None = None
 
     @property
     def extents_m(self) -> Array:

@@ -1,5 +1,7 @@
 """Convex parts of a body that is not convex, by CoACD (Wei, Liu, Ling and Su 2022, doi 10.1145/3528223.3530103).
 
+Built-in shapes are not cut so, but by their making: see `workers.geometry.tubes`, with the same figures.
+
 Built-in shapes, number 0 of each category, 0.25 m along their diagonal, by CoACD's threshold: parts / their vertices in all /
 seconds on one busy core / millimetres that parts stand out of the surface at most. Half of all that parts show lies on
 the surface (but at 0.1), and nothing out of the hull.
@@ -30,11 +32,12 @@ import numpy as np
 
 from schemas.base import Array, frozen_array
 from schemas.errors import MachineError, MeshError
-from schemas.shape import Mesh
+from schemas.shape import Asset, Mesh
 from workers.geometry.coacd_process import MISSING
 from workers.geometry.convexity import components, concavity_m, solid_of, triangles_of, weld
 from workers.geometry.hull import convex_hull
 from workers.geometry.parts_cache import USUAL_FOLDER, PartsCache, key_of
+from workers.geometry.tubes import parts_of_tubes
 
 THRESHOLD = 0.05
 """CoACD's concavity at which it stops, in units in which the mesh is 2 across: 0.02 halves what stands out, and has three
@@ -84,6 +87,15 @@ class Parts:
 
 
 _CACHE = PartsCache()
+
+
+def parts_of(asset: Asset) -> tuple[Array, ...]:
+    """Vertex clouds [N, 3] of an asset's convex parts, object frame: those that follow from its making, or else CoACD's."""
+    if asset.tubes is None:
+        return convex_parts(asset.shape.mesh, asset.sha256)
+    tubes = asset.tubes
+    key = key_of("tubes", asset.sha256, asset.shape.mesh.vertices.tobytes())
+    return _CACHE.get(key, None, lambda: ("tubes", parts_of_tubes(tubes)))[1]
 
 
 def convex_parts(mesh: Mesh, digest: str) -> tuple[Array, ...]:

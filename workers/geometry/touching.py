@@ -148,7 +148,8 @@ def _vertices_on_faces(above: _Side, below: _Side, within_m: float) -> tuple[Arr
     around = [_sides_of(below, below.faces[:, k], below.normals, within_m) for k in range(3)]
     on, beneath = (np.logical_and.reduce([one[k] for one in around])[face] for k in (0, 1))
     neither = ~on & ~beneath
-    upright, turned = over & (beneath | neither), under & (on | neither)
+    # About the deepest face of a hollow everything rises, as about the underside of a body: there the vertex tells
+    upright, turned = over & (beneath | neither | ~under), under & (on | neither)
     sign = np.where(upright, 1.0, -1.0)
     kept = upright | turned
     return points[pairs[kept, 0]], below.normals[face[kept]] * sign[kept, None]

@@ -11,7 +11,7 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.physics import Physics
 from schemas.scene import ObjectStart, Table
 from schemas.shape import MassProperties, Mesh
-from workers.geometry.decompose import convex_parts
+from workers.geometry.decompose import parts_of
 from workers.geometry.frames import invert, pose, rotation_from_quaternion, transform
 from workers.geometry.hull import convex_hull
 from workers.geometry.inset import inset_hull, least_width_m
@@ -122,8 +122,11 @@ def make_faller(
     T_obj_body, moments = body_frame(start.asset.mass)
     hulls = [convex_hull(part) for part in cut] or [start.hull]
     wanted = physics.margin_mm / 1e3 - SLOP_M
-    inset = min(inset_hull(hull, wanted).inset_m for hull in hulls) if cut else wanted
-    smaller = [inset_hull(hull, inset) for hull in hulls]
+    smaller = [inset_hull(hull, wanted) for hull in hulls]
+    inset = min(each.inset_m for each in smaller)
+    if cut:
+        each_to = zip(smaller, hulls, strict=True)
+        smaller = [each if each.inset_m == inset else inset_hull(hull, inset) for each, hull in each_to]
     shapes, margin = [each.vertices for each in smaller], min(each.inset_m for each in smaller) + SLOP_M
     to_body = invert(T_obj_body)
     reach = float(np.linalg.norm(transform(to_body, start.hull.vertices), axis=1).max())
@@ -136,7 +139,7 @@ def faller_of(start: ObjectStart, physics: Physics, ran: Collection[str], dampin
     """The object with the effects that ran: as its convex parts where `decomposition` did and it has several."""
     cut: Sequence[Array] = ()
     if "decomposition" in ran and not is_convex(start):
-        parts = convex_parts(start.asset.shape.mesh, start.asset.sha256)
+        parts = parts_of(start.asset)
         cut = parts if len(parts) > 1 else ()
     return make_faller(start, physics, "rolling_friction" in ran, damping, cut)
 

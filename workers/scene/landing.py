@@ -21,7 +21,7 @@ HOOKED_M = 0.03
 """An object that reaches this far below the table's top may have part of the table above part of it."""
 
 FARTHEST_M = 0.01
-"""How far convex parts stand out of a surface at most, and so how far an object hovers before it is set down."""
+"""How far convex parts by CoACD stand out of a surface at most, and so how far an object hovers before it is set down."""
 
 NEAREST_M = 1e-6
 """To what a distance is told."""

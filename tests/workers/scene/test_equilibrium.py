@@ -218,3 +218,22 @@ def test_the_margin_is_the_distance_to_the_outline():
     assert support_margin_m(square[:2], np.array([-1.2, 0.3, 0.0])) == pytest.approx(-0.2)
     assert support_margin_m(square[:1], np.array([-1.0, -1.5, 0.0])) == pytest.approx(-0.5)
     assert support_margin_m(np.empty((0, 3)), np.zeros(3)) == -np.inf
+
+
+def test_a_ball_on_the_deepest_face_of_a_hollow_is_held_by_it():
+    """All faces about the deepest one rise, as they do about the underside of a body; yet the ball is above."""
+    dish = trimesh.creation.box((0.2, 0.2, 0.1)).difference(
+        trimesh.creation.icosphere(3, 0.09).apply_translation([0, 0, 0.07])
+    )
+    vertices = np.asarray(dish.vertices)
+    over = dish.triangles_center
+    middle = (np.abs(over[:, :2]).max(axis=1) < 0.02) & (over[:, 2] > -0.04)
+    deepest = int(np.flatnonzero(middle)[np.argmin(over[middle, 2])])
+    point, normal = dish.triangles_center[deepest], dish.face_normals[deepest]
+    ball = trimesh.creation.icosphere(3, 0.03)
+    ball.apply_translation(point - ball.vertices[np.argmin(ball.vertices @ normal)])
+    points, normals = contact_points(
+        mesh_of(ball), Mesh(vertices, np.asarray(dish.faces, dtype=np.int32)), WITHIN_M / 10
+    )
+    assert len(points) >= 1
+    assert normals[np.argmin(np.linalg.norm(points - point, axis=1))] == pytest.approx(normal, abs=1e-6)

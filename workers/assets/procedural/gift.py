@@ -123,4 +123,4 @@ def _egg(radii: Array) -> Solid:
     half = circle(16)[4:13]
     profile = np.stack([-half[:, 0], -half[:, 1]], axis=1)
     ball = lathe(profile, [EXTRA] * (len(profile) - 1), 12)
-    return Solid(ball.vertices * radii, ball.faces, ball.surface, ball.smooth)
+    return ball.stretched(radii)

@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from schemas.base import frozen_array
-from schemas.shape import Asset, Shape
+from schemas.base import Array, frozen_array
+from schemas.shape import Asset, Shape, Tube
 from schemas.sources import ProceduralSource
 from workers.assets.mass import solid_mass
 from workers.assets.procedural.bottle import make_bottle
@@ -77,7 +77,13 @@ def make_asset(category: str, settings: ProceduralSource, index: int, density_kg
         watertight=True,
         volume_m3=mass.mass_kg / density_kg_m3,
         shareable=True,
+        tubes=_placed(model.solid.tubes, centre, scale),
     )
+
+
+def _placed(tubes: tuple[Tube, ...] | None, centre: Array, scale: float) -> tuple[Tube, ...] | None:
+    """The tubes with their points at scale * (point - centre)."""
+    return None if tubes is None else tuple(tube.mapped(scale * np.eye(3), -scale * centre) for tube in tubes)
 
 
 def shape_digest(shape: Shape) -> str:

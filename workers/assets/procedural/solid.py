@@ -4,6 +4,7 @@ Only +, -, *, / and square roots touch coordinates here and in `curves`: they gi
 Sines and cosines are rounded to `TRIG_DIGITS`, because C libraries and processors differ in the last bit of theirs.
 """
 
+import dataclasses
 import functools
 import math
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
+from schemas.shape import Tube
 from workers.geometry.manifold import hold_to_one_thread
 
 Indices = NDArray[np.int64]
@@ -33,13 +35,14 @@ class Solid:
     """A closed surface, counter-clockwise seen from outside.
 
     vertices [V, 3] float64 metres; faces [F, 3] int64; surface [F] int64: which look a face has; smooth [F] int64:
-    faces of one number share shading normals where they meet.
+    faces of one number share shading normals where they meet. tubes: what it is the union of, None where that is not known.
     """
 
     vertices: Array
     faces: Indices
     surface: Indices
     smooth: Indices
+    tubes: tuple[Tube, ...] | None = None
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Solid":
         """The solid shifted, metres."""
@@ -48,7 +51,16 @@ class Solid:
     def placed(self, axes: Array, origin: Array) -> "Solid":
         """The solid with its x, y, z along the rows of `axes` [3, 3] (a right-handed turn) and its origin at `origin`."""
         x, y, z = self.vertices[:, 0:1], self.vertices[:, 1:2], self.vertices[:, 2:3]
-        return Solid(x * axes[0] + y * axes[1] + z * axes[2] + origin, self.faces, self.surface, self.smooth)
+        placed = x * axes[0] + y * axes[1] + z * axes[2] + origin
+        return Solid(placed, self.faces, self.surface, self.smooth, self._mapped(axes, origin))
+
+    def stretched(self, factors: Array) -> "Solid":
+        """The solid with its x, y and z times the factors [3]."""
+        tubes = self._mapped(np.diag(factors), np.zeros(3))
+        return Solid(self.vertices * factors, self.faces, self.surface, self.smooth, tubes)
+
+    def _mapped(self, matrix: Array, origin: Array) -> tuple[Tube, ...] | None:
+        return None if self.tubes is None else tuple(tube.mapped(matrix, origin) for tube in self.tubes)
 
 
 @functools.cache
@@ -84,16 +96,24 @@ def _tube_faces(rings: int, count: int) -> tuple[Indices, Indices]:
 
 
 def loft(
-    rings: Array, start: Array, end: Array, surface: Sequence[int] | Indices, smooth: Sequence[int] | Indices
+    rings: Array,
+    start: Array,
+    end: Array,
+    surface: Sequence[int] | Indices,
+    smooth: Sequence[int] | Indices,
+    profiles: Array | None = None,
 ) -> Solid:
     """The tube through rings [L, n, 3] (each counter-clockwise seen from the end), closed by fans to two points.
 
     surface and smooth have one number for each band [L + 1]: the fan at the start, L - 1 bands, the fan at the end.
+    profiles [K, L + 2, 2]: as `Tube` has them.
     """
     levels, count = rings.shape[:2]
     faces, band = _tube_faces(levels, count)
     vertices = np.concatenate([rings.reshape(-1, 3), start[None], end[None]])
-    return Solid(vertices, faces, np.asarray(surface, dtype=np.int64)[band], np.asarray(smooth, dtype=np.int64)[band])
+    tubes = (Tube(rings, vertices[-2:], profiles),)
+    numbers = np.asarray(surface, dtype=np.int64)[band], np.asarray(smooth, dtype=np.int64)[band]
+    return Solid(vertices, faces, *numbers, tubes)
 
 
 def lathe(profile: Array, surface: Sequence[int] | Indices, count: int = 48, section: Array | None = None) -> Solid:
@@ -107,7 +127,24 @@ def lathe(profile: Array, surface: Sequence[int] | Indices, count: int = 48, sec
     level = np.broadcast_to(inner[:, 1][:, None, None], (len(inner), outline.shape[1], 1))
     rings = np.concatenate([outline * inner[:, 0][:, None, None], level], axis=2)
     start, end = np.array([0.0, 0.0, profile[0, 1]]), np.array([0.0, 0.0, profile[-1, 1]])
-    return loft(rings, start, end, surface, smooth_runs(profile))
+    return loft(rings, start, end, surface, smooth_runs(profile), _profiles(profile, section))
+
+
+def _profiles(profile: Array, section: Array | None) -> Array:
+    """[K, P, 2] float64: the profile along the columns of a section that are the most unlike; one, where there is none."""
+    if section is None:
+        return profile[None]
+    reach = np.sqrt(section[..., 0] * section[..., 0] + section[..., 1] * section[..., 1])  # [P - 2, n]
+    ring = reach[int((reach.max(axis=1) - reach.min(axis=1)).argmax())]
+    columns = reach[:, [int(ring.argmax()), int(ring.argmin())]].T
+    return np.stack([_widened(profile, column) for column in columns])
+
+
+def _widened(profile: Array, factors: Array) -> Array:
+    """The profile [P, 2] with the radii between its ends times the factors [P - 2]."""
+    wide = profile.astype(np.float64)
+    wide[1:-1, 0] *= factors
+    return wide
 
 
 def smooth_runs(profile: Array) -> Indices:
@@ -132,12 +169,23 @@ def together(solids: Sequence[Solid]) -> Solid:
         np.concatenate([solid.faces + start for solid, start in zip(solids, starts, strict=True)]),
         np.concatenate([solid.surface for solid in solids]),
         np.concatenate([solid.smooth + first for solid, first in zip(solids, smooths, strict=True)]),
+        _tubes_of(solids),
     )
+
+
+def _tubes_of(solids: Sequence[Solid]) -> tuple[Tube, ...] | None:
+    """Of all the solids, one after the other; None where one's are not known."""
+    found: list[Tube] = []
+    for solid in solids:
+        if solid.tubes is None:
+            return None
+        found += solid.tubes
+    return tuple(found)
 
 
 def union(solids: Sequence[Solid]) -> Solid:
     """All the solids as one, without what lies inside; MeshError never: a bad solid is a bug and raises ValueError."""
-    return _from_manifold(manifold3d.Manifold.batch_boolean(_tagged(solids), manifold3d.OpType.Add))
+    return _from_manifold(manifold3d.Manifold.batch_boolean(_tagged(solids), manifold3d.OpType.Add), _tubes_of(solids))
 
 
 def union_at(solid: Solid, touched: Mask, apex: Array, others: Sequence[Solid], beside: Sequence[Solid] = ()) -> Solid:
@@ -174,6 +222,7 @@ def union_at(solid: Solid, touched: Mask, apex: Array, others: Sequence[Solid], 
         faces,
         np.concatenate([joined.surface[kept], solid.surface[~touched]]),
         np.concatenate([joined.smooth[kept], solid.smooth[~touched]]),
+        _tubes_of([solid, *beside, *others]),
     )
 
 
@@ -186,7 +235,11 @@ def _renumbered(faces: Indices) -> tuple[Indices, Indices]:
 
 def difference(solid: Solid, cutters: Sequence[Solid]) -> Solid:
     """The solid without the cutters; the cuts have the cutters' surfaces."""
-    return _from_manifold(manifold3d.Manifold.batch_boolean(_tagged([solid, *cutters]), manifold3d.OpType.Subtract))
+    cut, tubes = _tubes_of(cutters), solid.tubes
+    if tubes is not None and cut is not None:
+        tubes = tuple(dataclasses.replace(tube, cutters=(*tube.cutters, *cut)) for tube in tubes)
+    manifold = manifold3d.Manifold.batch_boolean(_tagged([solid, *cutters]), manifold3d.OpType.Subtract)
+    return _from_manifold(manifold, None if cut is None else tubes)
 
 
 def _tagged(solids: Sequence[Solid]) -> list[manifold3d.Manifold]:
@@ -209,8 +262,8 @@ def _tagged(solids: Sequence[Solid]) -> list[manifold3d.Manifold]:
     return manifolds
 
 
-def _from_manifold(manifold: manifold3d.Manifold) -> Solid:
+def _from_manifold(manifold: manifold3d.Manifold, tubes: tuple[Tube, ...] | None) -> Solid:
     mesh = manifold.to_mesh64()
     tag = np.asarray(mesh.face_id, dtype=np.int64)
     vertices = np.array(mesh.vert_properties[:, :3], dtype=np.float64)
-    return Solid(vertices, np.asarray(mesh.tri_verts, dtype=np.int64), tag % _SURFACES, tag // _SURFACES)
+    return Solid(vertices, np.asarray(mesh.tri_verts, dtype=np.int64), tag % _SURFACES, tag // _SURFACES, tubes)

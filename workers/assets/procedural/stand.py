@@ -82,7 +82,7 @@ def _beam(size: tuple[float, float, float], at: tuple[float, float, float], surf
     low, high = (np.array([at[0], at[1], at[2] + dz]) for dz in (-z, z))
     flat = loft(np.stack(rings), low, high, [surface] * 3, [0, 1, 2])
     side = np.concatenate([np.zeros(4), np.repeat([1, 2, 3, 4], 2), np.full(4, 5)]).astype(np.int64)
-    return Solid(flat.vertices, flat.faces, flat.surface, side)
+    return Solid(flat.vertices, flat.faces, flat.surface, side, flat.tubes)
 
 
 def _apron_legs(rng: np.random.Generator, plan: Plan) -> list[Solid]:
@@ -153,7 +153,7 @@ def _sled(rng: np.random.Generator, plan: Plan) -> list[Solid]:
     stood = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     ends = [upright.placed(stood, np.array([side, 0.0, 0.5 * top])) for side in (-x, x)]
     legs = together(ends)
-    legs = Solid(legs.vertices, legs.faces, np.full(len(legs.faces), LEG), legs.smooth)
+    legs = Solid(legs.vertices, legs.faces, np.full(len(legs.faces), LEG), legs.smooth, legs.tubes)
     if not chance(rng, 0.5):
         return [legs]
     return [legs, _beam((2 * x, 0.8 * tube, 0.8 * tube), (0.0, 0.0, plan.under - 0.2 * tube), FRAME)]
@@ -194,7 +194,7 @@ def _cheek(half: Array, thick: float, at: float) -> Solid:
         np.array(rings), np.array([at, 0.0, 0.0]), np.array([at, 0.0, half[-1, 1]]), [LEG] * bands, range(bands)
     )
     corner = np.concatenate([np.zeros(4), np.tile(np.repeat(np.arange(4), 2), bands - 2), np.zeros(4)]).astype(np.int64)
-    return Solid(board.vertices, board.faces, board.surface, board.smooth * 4 + corner)
+    return Solid(board.vertices, board.faces, board.surface, board.smooth * 4 + corner, board.tubes)
 
 
 def _panels(rng: np.random.Generator, plan: Plan) -> list[Solid]:

@@ -78,7 +78,9 @@ def prism(
     ends = np.array([[0.0, 0.0, z[0]], [0.0, 0.0, z[-1]]])
     reach = np.array([[size[1], 0.0]])
     closed = np.concatenate([profile[:1] + reach, profile, profile[-1:] + reach])
-    return loft(rings, ends[0], ends[1], surface, smooth_runs(closed))
+    profiles = np.zeros((2, len(profile) + 2, 2))
+    profiles[:, 1:-1, 0], profiles[..., 1] = 0.5 * np.array(size)[:, None] - inset, z[[0, *range(len(z)), -1]]
+    return loft(rings, ends[0], ends[1], surface, smooth_runs(closed), profiles)
 
 
 def bevelled(height: float, bevel: float, bottom: float = 0.0) -> Array:
@@ -136,4 +138,5 @@ def sides_apart(solid: Solid, surface: int, numbers: tuple[int, int, int, int]) 
     x, y, _ = np.cross(b - a, c - a).T
     side = np.where(np.abs(y) >= np.abs(x), np.where(y < 0, 0, 2), np.where(x > 0, 1, 3))
     chosen = solid.surface == surface
-    return Solid(solid.vertices, solid.faces, np.where(chosen, np.array(numbers)[side], solid.surface), solid.smooth)
+    sorted_out = np.where(chosen, np.array(numbers)[side], solid.surface)
+    return Solid(solid.vertices, solid.faces, sorted_out, solid.smooth, solid.tubes)
