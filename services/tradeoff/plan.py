@@ -19,9 +19,9 @@ class Sizes:
 
     scenes: int = 48
     settled: int = 500
-    released: int = 24
+    released: int = 16
     posed: int = 48
-    timed: int = 16
+    timed: int = 12
     laps: int = 3
     coloured: int = 4
 

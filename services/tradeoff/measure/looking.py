@@ -22,6 +22,12 @@ from workers.scene_steps import Scene, Stopwatch, make_scene
 CONVERGED_PATHS = 256
 """Two truths with other seeds differ by 0.012 to 0.02 in FLIP, a tenth of what tiers do."""
 
+INPUT_ALONE = {
+    "cameras.depth.enabled": False,
+    "cameras.mirror.enabled": False,
+    "images.projection.enabled": False,
+}
+
 FINE_WIDTH = 2560
 """Pixels: 4 times the width that colours are compared at."""
 
@@ -43,7 +49,7 @@ def measure_colour(context: WorkerContext, settings: Sequence[Setting], scene_id
     Against a path-traced image, where that tier is installed; and, of tier raster, against the same tier's own light at 64
     samples a pixel, as FLIP against other light says little of edges.
     """
-    made = {setting.name: _make(context_for(context, setting), scene_id) for setting in settings}
+    made = {setting.name: _make(_input_alone(context, setting), scene_id) for setting in settings}
     found = {name: one for name, one in made.items() if one is not None}
     if not found:
         return {}
@@ -62,6 +68,11 @@ def measure_colour(context: WorkerContext, settings: Sequence[Setting], scene_id
     return answers
 
 
+def _input_alone(context: WorkerContext, setting: Setting) -> WorkerContext:
+    """The setting's job without the views whose colour nobody looks at."""
+    return context_for(context, Setting(setting.parts, {**setting.changes, **INPUT_ALONE}))
+
+
 def _smooth(context: WorkerContext, scene_id: int, crop: Crop) -> ColourTruth | None:
     """What an image of tier raster is with 64 samples a pixel: drawn 4 times as wide with 4 each, and averaged by area."""
     sensor = context.job.cameras.sensor
@@ -73,7 +84,7 @@ def _smooth(context: WorkerContext, scene_id: int, crop: Crop) -> ColourTruth | 
     }
     changes = {f"cameras.sensor.{name}": value for name, value in fine.items()}
     setting = Setting((("truth", "edges"),), {**changes, "render.tier": "raster", "render.samples": 4})
-    made = _make(context_for(context, setting), scene_id)
+    made = _make(_input_alone(context, setting), scene_id)
     rgb = None if made is None else made[1].pairs[0].input.rgb
     return None if rgb is None else ColourTruth(crop, crop_colour(rgb, crop))
 
