@@ -14,7 +14,7 @@ from schemas.sources import ProceduralSource
 from tests.hard_cases.bodies import cube
 from tests.hard_cases.groups import dominoes, pile, stack
 from tests.physics.energy import Rise, watched, worst_of
-from tests.physics.room import G, physics
+from tests.physics.room import PHYSICS, G, physics
 from tests.shapes import asset_of, box, table
 from workers.assets.procedural.make import make_asset
 from workers.scene.alone import settle_alone
@@ -42,7 +42,7 @@ def worst_rise(category: str, start: str, seed: int, refine: int = 1) -> Rise:
     job = Job.model_validate({"name": "t", "seed": seed, "start": {"pose": start}})
     drawn = draw_start(job, seed, asset, TABLE)
     with watched([asset]) as falls:
-        settle_alone(drawn, TABLE, physics(step_hz=960 * refine, way_mm=0.1 / refine))
+        settle_alone(drawn, TABLE, physics(step_hz=PHYSICS.step_hz * refine, way_mm=PHYSICS.way_mm / refine))
     return worst_of(falls(), asset.mass.mass_kg * G)
 
 

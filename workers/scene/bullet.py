@@ -34,12 +34,16 @@ MOST_GROUND_VERTICES, MOST_GROUND_INDICES = 131_072, 524_288
 SLOP_M = 1e-5
 """How deep bodies overlap at rest: Bullet leaves as much where it is."""
 
-REPAIR = 0.05
-"""Share of what overlaps further that is pushed apart in a step. What is pushed keeps the speed, which is that share of the
-depth over the step: with 0.2 things that roll over edges gain energy, with 0.4 boxes are thrown up."""
+REPAIR_S = 1.0 / 48.0
+"""What overlaps further is pushed apart at its depth over this time, however long the steps are. Bullet takes the share of the
+depth that a step pushes apart, and what is pushed keeps the speed: with one share for all steps the shortest throw things up
+sixteen times as fast as the longest, and what rolls from one lowest corner to the next gains energy all the way."""
 
-BOUNCE_REPAIR = 0.005
+BOUNCE_REPAIR_S = 10.0 * REPAIR_S
 """The same while things bounce, which they do from where they overlap by a step's way: it throws them up by so much less."""
+
+MOST_REPAIR = 0.05
+"""Of what overlaps, the share that a step pushes apart at most: with 0.4 boxes are thrown up."""
 
 ROUND_TO = 8
 """Decimals of a collision shape's vertices, metres. Where more than three lie in a plane but for the last bits, Bullet's own
@@ -86,12 +90,12 @@ class World:
         """The steps that the world was opened for."""
         pybullet.stepSimulation(physicsClientId=self.client)
 
-    def pace(self, step_hz: float, repair: float = REPAIR) -> None:
-        """Go on at so many steps a second; in each, this share of what bodies overlap is pushed apart."""
+    def pace(self, step_hz: float, repair_s: float = REPAIR_S) -> None:
+        """Go on at so many steps a second; what bodies overlap is pushed apart in so many seconds."""
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=self.steps / step_hz,
             numSubSteps=self.steps,
-            contactERP=repair,
+            contactERP=min(1.0 / (step_hz * repair_s), MOST_REPAIR),
             physicsClientId=self.client,
         )
 
@@ -161,7 +165,7 @@ def open_world(
         world.pace(physics.step_hz)
         if physics.restitution > 0.0:
             world.bounce(physics.restitution)
-            world.pace(physics.step_hz, BOUNCE_REPAIR)
+            world.pace(physics.step_hz, BOUNCE_REPAIR_S)
         yield world
     finally:
         _clear(client, things, 1 + len(placed))

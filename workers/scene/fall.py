@@ -15,7 +15,7 @@ from workers.geometry.decompose import convex_parts
 from workers.geometry.frames import invert, pose, rotation_from_quaternion, transform
 from workers.geometry.hull import convex_hull
 from workers.geometry.inset import inset_hull, least_width_m
-from workers.scene.bullet import BOUNCE_REPAIR, GRAVITY_M_S2, REPAIR, SLOP_M, Body, World, open_world
+from workers.scene.bullet import BOUNCE_REPAIR_S, GRAVITY_M_S2, REPAIR_S, SLOP_M, Body, World, open_world
 from workers.scene.dynamics import is_convex
 from workers.scene.support import support_height
 from workers.scene.watch import Motion, Watch
@@ -212,7 +212,7 @@ def _run(
             world.bounce(0.0)
             bounces, rate = False, 0.0
         if wanted != rate:
-            world.pace(wanted, BOUNCE_REPAIR if bounces else REPAIR)
+            world.pace(wanted, BOUNCE_REPAIR_S if bounces else REPAIR_S)
             rate = wanted
         world.advance()
         time += SAMPLE_STEPS / rate
