@@ -71,7 +71,8 @@ class Body:
 
     moments [3] kg m^2; parts: the vertices [N, 3], metres, of convex bodies, each with a margin of `margin_m` about it. One
     part may be a single point, which makes a ball of the margin. `rolls` is False where friction against rolling and
-    spinning is left out. `damping` is Bullet's, of speed and spin: nothing is damped that falls.
+    spinning is left out. `damping` is Bullet's, of speed and spin: nothing is damped that falls. `stands` is True of what
+    is watched only for as long as it stands on a face.
     """
 
     mass_kg: float
@@ -80,6 +81,7 @@ class Body:
     margin_m: float
     rolls: bool = True
     damping: float = 0.0
+    stands: bool = False
 
 
 @dataclass(frozen=True)
@@ -146,10 +148,11 @@ def open_world(
 ) -> Iterator[World]:
     """A world with nothing but the bodies, each at its `T_world_body`, and the ground.
 
-    Which is level at a height in metres, or a mesh, which then has no margin. `reach_m` is how far from one another bodies may
-    have contacts; as far as Bullet has it where that is less. Of two contacts that a vertex has with triangles of a mesh
-    within that, Bullet keeps the one that it finds last: beside an edge, what comes down on one triangle sinks through it as
-    long as the next is in reach.
+    Which is level at a height in metres, or a mesh, which then has no margin. `reach_m` is how far from one another things may
+    have contacts, if it is less than Bullet's own, and unless what falls stands on a face or lies on others, whose contacts
+    must all be there beforehand. Of two contacts that a vertex has with triangles of a mesh Bullet keeps the one that it finds
+    last, so that beside an edge a corner sinks in as long as the next triangle is in reach. Of one body it keeps the four
+    contacts that span the most, so that those far off the ground push out, by turns, the two that a bottle rolls on.
 
     Bit-identical runs need deterministicOverlappingPairs. One connection serves the whole process: a new one costs as
     much as a simulation. What was simulated before leaves no trace in the bits: two bodies are one pair, so that no
@@ -158,10 +161,12 @@ def open_world(
     client = _connection()
     if len(placed) > 1:
         _reset(client)
+    near = isinstance(ground, Mesh) or (len(placed) == 1 and not placed[0][0].stands)
+    reach = reach_m if near else math.inf
     pybullet.setPhysicsEngineParameter(
         numSolverIterations=physics.solver_iterations,
         deterministicOverlappingPairs=1,
-        contactBreakingThreshold=min(REACH_SHARE, reach_m / min(_size_m(body) for body, _ in placed)),
+        contactBreakingThreshold=min(REACH_SHARE, reach / min(_size_m(body) for body, _ in placed)),
         physicsClientId=client,
     )
     pybullet.setGravity(0.0, 0.0, -GRAVITY_M_S2, physicsClientId=client)

@@ -39,8 +39,7 @@ DROP_SHARE = 0.002
 is then within the thousandth of the fall's energy that may come back."""
 
 REACH_STEPS = 6.0
-"""On a mesh, contacts reach as far as a point goes in so many steps: far enough to be there before they close, and no further.
-"""
+"""Contacts reach as far as a point goes in so many steps: far enough to be there before they close, and no further."""
 
 THIN_SHARE = 0.05
 """Of the thinnest object: how far a point may go in a step at most."""
@@ -64,8 +63,8 @@ class Faller:
     reach_m: float
 
     def only(self, vertices: Array) -> "Faller":
-        """The same body with other vertices [N, 3], body frame."""
-        return dataclasses.replace(self, body=dataclasses.replace(self.body, parts=(vertices,)))
+        """The same body, standing, with other vertices [N, 3], body frame."""
+        return dataclasses.replace(self, body=dataclasses.replace(self.body, parts=(vertices,), stands=True))
 
 
 @dataclass(frozen=True)
@@ -164,8 +163,7 @@ def fall(
     speed = math.sqrt(2.0 * GRAVITY_M_S2 * fallen)
     touchdown = TOUCHDOWN_S if fallen > 0.0 else 0.0
     placed = [(f.body, T) for f, T in zip(fallers, lowered, strict=True)]
-    longest = max(pace.way_m, speed / (FINEST * physics.step_hz))
-    reach = REACH_STEPS * longest if isinstance(ground, Mesh) else math.inf
+    reach = REACH_STEPS * max(pace.way_m, speed / (FINEST * physics.step_hz))
     with open_world(placed, ground, physics, SAMPLE_STEPS, reach) as world:
         for number in range(len(fallers)):
             world.push((0.0, 0.0, -speed), body=number)
