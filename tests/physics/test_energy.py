@@ -44,7 +44,7 @@ def worst_rise(category: str, start: str, seed: int, refine: int = 1) -> Rise:
     asset = asset_for(category, seed)
     job = Job.model_validate({"name": "t", "seed": seed, "start": {"pose": start}})
     drawn = draw_start(job, seed, asset, TABLE)
-    with watched([asset]) as falls, suppress(SettleError):  # one mug of twenty rocks on by some micrometres for 20 s
+    with watched([asset]) as falls, suppress(SettleError):  # that it rests is another test's
         settle_alone(drawn, TABLE, physics(step_hz=PHYSICS.step_hz * refine, way_mm=PHYSICS.way_mm / refine))
     return worst_of(falls(), asset.mass.mass_kg * G)
 
@@ -118,7 +118,7 @@ def test_what_spins_when_it_is_let_go_gains_no_energy(category, spin, record_fig
 
 @pytest.mark.parametrize(("scene_id", "what"), [(385, "bottle on its side"), (334, "bowl that falls onto its rim")])
 def test_what_rolls_gains_no_energy_from_contact_to_contact(scene_id, what, record_figure):
-    """Tumbled scenes of the population: Bullet found their lowest corners by turns, each deeper than the one before."""
+    """Tumbled scenes of the population: what Bullet found of them by turns was pushed up fast."""
     job = Job.model_validate({"name": "population", "seed": 0, "start": {"pose": "tumbled"}})
     catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
     rise = try_scene(job, catalogue, scene_id, again=False).rise

@@ -38,8 +38,8 @@ DROP_SHARE = 0.002
 """Of the height that things fall: how far a point may go in a step, if that is more than `physics.way_mm`. What it sinks in by
 is then within the thousandth of the fall's energy that may come back."""
 
-REACH_STEPS = 6.0
-"""Contacts reach as far as a point goes in so many steps: far enough to be there before they close, and no further."""
+REACH_STEPS = 4.0
+"""On a mesh, contacts reach as far as a point goes in so many steps: far enough to be there before they close, and no further."""
 
 THIN_SHARE = 0.05
 """Of the thinnest object: how far a point may go in a step at most."""
@@ -63,8 +63,8 @@ class Faller:
     reach_m: float
 
     def only(self, vertices: Array) -> "Faller":
-        """The same body, standing, with other vertices [N, 3], body frame."""
-        return dataclasses.replace(self, body=dataclasses.replace(self.body, parts=(vertices,), stands=True))
+        """The same body with other vertices [N, 3], body frame."""
+        return dataclasses.replace(self, body=dataclasses.replace(self.body, parts=(vertices,)))
 
 
 @dataclass(frozen=True)
