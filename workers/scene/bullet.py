@@ -40,9 +40,9 @@ REPAIR = 0.05
 depth over the step: with 0.2 things that roll over edges gain energy, with 0.4 boxes are thrown up."""
 
 REPAIR_S = 1.0 / 48.0
-"""Of one body alone, no more is pushed apart than its depth over this time: with one share for all steps the shortest throw it
-up sixteen times as fast as the longest, and what rolls from one lowest corner to the next gains energy all the way. In a
-pile, where bodies press on one another, that is too little."""
+"""Of one body on level ground, no more is pushed apart than its depth over this time: with one share for all steps the
+shortest throw it up sixteen times as fast as the longest, and what rolls from one lowest corner to the next gains energy all
+the way. In a pile, where bodies press on one another, and on a mesh that is too little."""
 
 BOUNCE_REPAIR_S = 10.0 * REPAIR_S
 """The same while things bounce, which they do from where they overlap by a step's way: it throws them up by so much less."""
@@ -84,12 +84,16 @@ class Body:
 
 @dataclass(frozen=True)
 class World:
-    """A ground and bodies on it, `steps` steps of the simulation at a time; bodies are told by their number."""
+    """A ground and bodies on it, `steps` steps of the simulation at a time; bodies are told by their number.
+
+    What overlaps is pushed apart at no more than its depth over `repair_s`.
+    """
 
     client: int
     ground: int
     bodies: tuple[int, ...]
     steps: int
+    repair_s: float = 0.0
 
     def advance(self) -> None:
         """The steps that the world was opened for."""
@@ -97,8 +101,7 @@ class World:
 
     def pace(self, step_hz: float, bounces: bool = False) -> None:
         """Go on at so many steps a second."""
-        alone_s = REPAIR_S if len(self.bodies) == 1 else 0.0
-        repair_s = max(BOUNCE_REPAIR_S if bounces else alone_s, 1.0 / (REPAIR * step_hz))
+        repair_s = max(BOUNCE_REPAIR_S if bounces else self.repair_s, 1.0 / (REPAIR * step_hz))
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=self.steps / step_hz,
             numSubSteps=self.steps,
@@ -175,7 +178,8 @@ def open_world(
             things.append(_add_body(client, body, T_world_body[:3, :3] if level else None))
             _set_surface(client, things[-1], physics, body)
             _place(client, things[-1], T_world_body)
-        world = World(client, things[0], tuple(things[1:]), steps)
+        repair_s = REPAIR_S if len(placed) == 1 and not isinstance(ground, Mesh) else 0.0
+        world = World(client, things[0], tuple(things[1:]), steps, repair_s)
         world.pace(physics.step_hz)
         if physics.restitution > 0.0:
             world.bounce(physics.restitution)
