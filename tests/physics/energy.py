@@ -7,7 +7,6 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-import pybullet
 
 from schemas.base import Array
 from schemas.shape import Asset
@@ -55,25 +54,23 @@ def watched(assets: Sequence[Asset], spin: Sequence[float] = (0.0, 0.0, 0.0)) ->
         spins = rotation_from_quaternion(np.array(quaternion)).T @ np.array(w)
         return assets[body].mass.mass_kg * (np.dot(v, v) / 2 + G * x[2]) + float(moments[body] @ (spins * spins)) / 2
 
+    @dataclass(frozen=True)
     class Watched(World):
         """Steps one at a time, and looks at the energy after each."""
 
-        def advance(self) -> None:
-            for _ in range(self.steps):
-                pybullet.stepSimulation(physicsClientId=self.client)
-                falls[-1].append(sum(energy(self, body) for body in range(len(self.bodies))))
+        together: int = 1
 
-        def pace(self, step_hz: float, repair: float = bullet.REPAIR) -> None:
-            pybullet.setPhysicsEngineParameter(
-                fixedTimeStep=1.0 / step_hz, numSubSteps=0, contactERP=repair, physicsClientId=self.client
-            )
+        def advance(self) -> None:
+            for _ in range(self.together):
+                super().advance()
+                falls[-1].append(sum(energy(self, body) for body in range(len(self.bodies))))
 
         def push(self, velocity: Sequence[float], _: Any = None, body: int = 0) -> None:
             super().push(velocity, spin, body)
 
-    def begin(*of: Any) -> World:
+    def begin(client: int, ground: int, bodies: tuple[int, ...], steps: int, repair_s: float) -> World:
         falls.append([])
-        return Watched(*of)
+        return Watched(client, ground, bodies, 1, repair_s, together=steps)
 
     with mock.patch.object(bullet, "World", begin):
         yield lambda: [np.array(energies) for energies in falls]

@@ -125,8 +125,14 @@ def main() -> None:
     ask.add_argument("--seed", type=int, default=0)
     ask.add_argument("--every", type=int, default=10, help="one scene of so many is released again")
     ask.add_argument("--processes", type=int, default=2)
+    ask.add_argument("--only", type=int, nargs="+", help="nothing but these scenes, by number, each printed")
     given = ask.parse_args()
     job = Job.model_validate({"name": "population", "seed": given.seed, "start": {"pose": given.pose}})
+    if given.only:
+        catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
+        for scene_id in given.only:
+            print(json.dumps(asdict(try_scene(job, catalogue, scene_id, again=True))))
+        return
     edges = np.linspace(0, given.scenes, 8 * given.processes + 1).astype(int).tolist()
     with ProcessPoolExecutor(given.processes) as pool:
         parts = [pool.submit(try_scenes, job, a, b, given.every) for a, b in itertools.pairwise(edges)]

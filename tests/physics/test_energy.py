@@ -3,6 +3,7 @@
 import functools
 import math
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +15,10 @@ from schemas.sources import ProceduralSource
 from tests.hard_cases.bodies import cube
 from tests.hard_cases.groups import dominoes, pile, stack
 from tests.physics.energy import Rise, watched, worst_of
-from tests.physics.room import G, physics
+from tests.physics.population import try_scene
+from tests.physics.room import PHYSICS, G, physics
 from tests.shapes import asset_of, box, table
+from workers.assets.catalogue import open_catalogue
 from workers.assets.procedural.make import make_asset
 from workers.scene.alone import settle_alone
 from workers.scene.dynamics import called_for
@@ -41,24 +44,13 @@ def worst_rise(category: str, start: str, seed: int, refine: int = 1) -> Rise:
     asset = asset_for(category, seed)
     job = Job.model_validate({"name": "t", "seed": seed, "start": {"pose": start}})
     drawn = draw_start(job, seed, asset, TABLE)
-    with watched([asset]) as falls:
-        settle_alone(drawn, TABLE, physics(step_hz=960 * refine, way_mm=0.1 / refine))
+    with watched([asset]) as falls, suppress(SettleError):  # that it rests is another test's
+        settle_alone(drawn, TABLE, physics(step_hz=PHYSICS.step_hz * refine, way_mm=PHYSICS.way_mm / refine))
     return worst_of(falls(), asset.mass.mass_kg * G)
 
 
-SLIPS = "one can of twenty, which tumbles from its rim onto its side, rises by 88 um, 1.38 times its bound"
-
-
-@pytest.mark.parametrize(
-    ("category", "start"),
-    [
-        pytest.param(
-            category, start, marks=[pytest.mark.xfail(reason=SLIPS)] if (category, start) == ("can", "tumbled") else []
-        )
-        for category in CATEGORIES
-        for start in STARTS
-    ],
-)
+@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("category", CATEGORIES)
 def test_energy_never_rises_above_its_running_minimum(category, start, record_figure):
     rises = [worst_rise(category, start, seed) for seed in range(SEEDS)]
     missed = sum(rise.over_bound > 1.0 for rise in rises)
@@ -92,14 +84,20 @@ def test_the_energy_of_all_that_falls_together_never_rises_above_its_running_min
 
 
 TOO_FAST = pytest.mark.xfail(
-    reason="steps are at most 16 times shorter: at 20 m/s a point goes 1.3 mm in one and sinks in as deep",
+    reason="at 20 m/s a point goes 1.3 mm in the shortest step and sinks in as deep; in shorter ones a cube that spins upright "
+    "climbs onto a corner and spins on",
+    raises=AssertionError,
+)
+TUMBLES = pytest.mark.xfail(
+    reason="Bullet takes the gyroscopic torque at a step's beginning: what tumbles at 200 rad/s gains energy while it flies, six "
+    "times the bound even in steps 256 times shorter",
     raises=AssertionError,
 )
 SPINS = [
     (0.0, 0.0, 50.0),
     (30.0, 40.0, 0.0),
     pytest.param((0.0, 0.0, 200.0), marks=TOO_FAST),
-    pytest.param((0.0, 160.0, 120.0), marks=TOO_FAST),
+    pytest.param((0.0, 160.0, 120.0), marks=TUMBLES),
 ]
 """Angular velocities, rad/s."""
 
@@ -116,6 +114,16 @@ def test_what_spins_when_it_is_let_go_gains_no_energy(category, spin, record_fig
     outcome = "known miss" if max(spin) > 100.0 else "passed"
     record_figure(f"energy, {category} spun by {spin} rad/s: worst rise over its bound", outcome, rise.over_bound, 1)
     assert rise.over_bound <= 1.0
+
+
+@pytest.mark.parametrize(("scene_id", "what"), [(385, "bottle on its side"), (334, "bowl that falls onto its rim")])
+def test_what_rolls_gains_no_energy_from_contact_to_contact(scene_id, what, record_figure):
+    """Tumbled scenes of the population: what Bullet found of them by turns was pushed up fast."""
+    job = Job.model_validate({"name": "population", "seed": 0, "start": {"pose": "tumbled"}})
+    catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
+    rise = try_scene(job, catalogue, scene_id, again=False).rise
+    record_figure(f"energy, {what}: worst rise over its bound", "passed", rise, 1)
+    assert rise <= 1.0
 
 
 @pytest.mark.slow

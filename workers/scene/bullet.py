@@ -1,5 +1,6 @@
 """Rigid bodies falling onto a ground, in PyBullet. The one file that imports PyBullet, so that it can be replaced."""
 
+import math
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -38,12 +39,20 @@ REPAIR = 0.05
 """Share of what overlaps further that is pushed apart in a step. What is pushed keeps the speed, which is that share of the
 depth over the step: with 0.2 things that roll over edges gain energy, with 0.4 boxes are thrown up."""
 
-BOUNCE_REPAIR = 0.005
+REPAIR_S = 1.0 / 48.0
+"""Of one body on level ground, no more is pushed apart than its depth over this time: with one share for all steps the
+shortest throw it up sixteen times as fast as the longest, and what rolls from one lowest corner to the next gains energy all
+the way. In a pile, where bodies press on one another, and on a mesh that is too little."""
+
+BOUNCE_REPAIR_S = 10.0 * REPAIR_S
 """The same while things bounce, which they do from where they overlap by a step's way: it throws them up by so much less."""
 
 ROUND_TO = 8
 """Decimals of a collision shape's vertices, metres. Where more than three lie in a plane but for the last bits, Bullet's own
 hull leaves out some that are in it."""
+
+REACH_SHARE = 0.02
+"""Bullet's own: contacts are looked for and kept at up to this share of the smaller body's size."""
 
 NO_THRESHOLD = 1e18
 """Bullet's own: contacts count as soon as they are foreseen."""
@@ -75,23 +84,28 @@ class Body:
 
 @dataclass(frozen=True)
 class World:
-    """A ground and bodies on it, `steps` steps of the simulation at a time; bodies are told by their number."""
+    """A ground and bodies on it, `steps` steps of the simulation at a time; bodies are told by their number.
+
+    What overlaps is pushed apart at no more than its depth over `repair_s`.
+    """
 
     client: int
     ground: int
     bodies: tuple[int, ...]
     steps: int
+    repair_s: float = 0.0
 
     def advance(self) -> None:
         """The steps that the world was opened for."""
         pybullet.stepSimulation(physicsClientId=self.client)
 
-    def pace(self, step_hz: float, repair: float = REPAIR) -> None:
-        """Go on at so many steps a second; in each, this share of what bodies overlap is pushed apart."""
+    def pace(self, step_hz: float, bounces: bool = False) -> None:
+        """Go on at so many steps a second."""
+        repair_s = max(BOUNCE_REPAIR_S if bounces else self.repair_s, 1.0 / (REPAIR * step_hz))
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=self.steps / step_hz,
             numSubSteps=self.steps,
-            contactERP=repair,
+            contactERP=1.0 / (step_hz * repair_s),
             physicsClientId=self.client,
         )
 
@@ -131,11 +145,14 @@ class World:
 
 @contextmanager
 def open_world(
-    placed: Sequence[tuple[Body, Pose]], ground: float | Mesh, physics: Physics, steps: int
+    placed: Sequence[tuple[Body, Pose]], ground: float | Mesh, physics: Physics, steps: int, reach_m: float = math.inf
 ) -> Iterator[World]:
     """A world with nothing but the bodies, each at its `T_world_body`, and the ground.
 
-    Which is level at a height in metres, or a mesh, which then has no margin.
+    Which is level at a height in metres, or a mesh, which then has no margin. `reach_m` is how far from a mesh things may have
+    contacts, if it is less than Bullet's own. Of two contacts that a vertex has with triangles of a mesh Bullet keeps the one
+    that it finds last: beside an edge a corner sinks in as long as the next triangle is in reach. On level ground less reach
+    would keep more of what rolls from gaining energy, but bowls then spin for ever.
 
     Bit-identical runs need deterministicOverlappingPairs. One connection serves the whole process: a new one costs as
     much as a simulation. What was simulated before leaves no trace in the bits: two bodies are one pair, so that no
@@ -144,8 +161,12 @@ def open_world(
     client = _connection()
     if len(placed) > 1:
         _reset(client)
+    reach = reach_m if isinstance(ground, Mesh) else math.inf
     pybullet.setPhysicsEngineParameter(
-        numSolverIterations=physics.solver_iterations, deterministicOverlappingPairs=1, physicsClientId=client
+        numSolverIterations=physics.solver_iterations,
+        deterministicOverlappingPairs=1,
+        contactBreakingThreshold=min(REACH_SHARE, reach / min(_size_m(body) for body, _ in placed)),
+        physicsClientId=client,
     )
     pybullet.setGravity(0.0, 0.0, -GRAVITY_M_S2, physicsClientId=client)
     things: list[int] = []
@@ -157,11 +178,12 @@ def open_world(
             things.append(_add_body(client, body, T_world_body[:3, :3] if level else None))
             _set_surface(client, things[-1], physics, body)
             _place(client, things[-1], T_world_body)
-        world = World(client, things[0], tuple(things[1:]), steps)
+        repair_s = REPAIR_S if len(placed) == 1 and not isinstance(ground, Mesh) else 0.0
+        world = World(client, things[0], tuple(things[1:]), steps, repair_s)
         world.pace(physics.step_hz)
         if physics.restitution > 0.0:
             world.bounce(physics.restitution)
-            world.pace(physics.step_hz, BOUNCE_REPAIR)
+            world.pace(physics.step_hz, bounces=True)
         yield world
     finally:
         _clear(client, things, 1 + len(placed))
@@ -292,6 +314,13 @@ def _set_surface(client: int, thing: int, physics: Physics, body: Body) -> None:
         maxJointVelocity=FASTEST,
         physicsClientId=client,
     )
+
+
+def _size_m(body: Body) -> float:
+    """What Bullet takes for a body's size: half the diagonal of its box, and how far its middle is from its centre of mass."""
+    points = np.concatenate(body.parts)
+    low, high = points.min(axis=0) - body.margin_m, points.max(axis=0) + body.margin_m
+    return float(np.linalg.norm(high - low) + np.linalg.norm(high + low)) / 2.0
 
 
 def _place(client: int, thing: int, T: Pose) -> None:

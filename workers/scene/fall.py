@@ -15,7 +15,7 @@ from workers.geometry.decompose import parts_of
 from workers.geometry.frames import invert, pose, rotation_from_quaternion, transform
 from workers.geometry.hull import convex_hull
 from workers.geometry.inset import inset_hull, least_width_m
-from workers.scene.bullet import BOUNCE_REPAIR, GRAVITY_M_S2, REPAIR, SLOP_M, Body, World, open_world
+from workers.scene.bullet import GRAVITY_M_S2, SLOP_M, Body, World, open_world
 from workers.scene.dynamics import is_convex
 from workers.scene.support import support_height
 from workers.scene.watch import Motion, Watch
@@ -37,6 +37,9 @@ step would mend how deep it went."""
 DROP_SHARE = 0.002
 """Of the height that things fall: how far a point may go in a step, if that is more than `physics.way_mm`. What it sinks in by
 is then within the thousandth of the fall's energy that may come back."""
+
+REACH_STEPS = 4.0
+"""On a mesh, contacts reach as far as a point goes in so many steps: far enough to be there before they close, and no further."""
 
 THIN_SHARE = 0.05
 """Of the thinnest object: how far a point may go in a step at most."""
@@ -178,7 +181,8 @@ def fall(
     speed = math.sqrt(2.0 * GRAVITY_M_S2 * fallen)
     touchdown = TOUCHDOWN_S if fallen > 0.0 else 0.0
     placed = [(f.body, T) for f, T in zip(fallers, lowered, strict=True)]
-    with open_world(placed, ground, physics, SAMPLE_STEPS) as world:
+    reach = REACH_STEPS * max(pace.way_m, speed / (FINEST * physics.step_hz))
+    with open_world(placed, ground, physics, SAMPLE_STEPS, reach) as world:
         for number in range(len(fallers)):
             world.push((0.0, 0.0, -speed), body=number)
         found = _run(world, fallers, physics, pace, seconds - speed / GRAVITY_M_S2, watches, touchdown)
@@ -230,7 +234,7 @@ def _run(
             world.bounce(0.0)
             bounces, rate = False, 0.0
         if wanted != rate:
-            world.pace(wanted, BOUNCE_REPAIR if bounces else REPAIR)
+            world.pace(wanted, bounces)
             rate = wanted
         world.advance()
         time += SAMPLE_STEPS / rate

@@ -11,9 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from schemas.job import Job
+from tests.physics.room import at, ball_body, physics
 from tests.shapes import box
 from workers.geometry.frames import pose, quaternion_of, rotation_about
-from workers.scene.bullet import GRAVITY_M_S2, WORLDS_BEFORE_RESET, Body, drop
+from workers.scene.bullet import GRAVITY_M_S2, REPAIR_S, SLOP_M, WORLDS_BEFORE_RESET, Body, drop
 
 ROOT = Path(__file__).resolve().parents[3]
 PHYSICS = Job(name="t").physics
@@ -108,3 +109,12 @@ def test_quaternions_agree_with_scipy(seed):
     assert abs(quaternion_of(R) @ Rotation.from_matrix(R).as_quat()) == pytest.approx(1.0)
     half = Rotation.from_rotvec(math.pi * np.eye(3)[seed % 3]).as_matrix()
     assert Rotation.from_quat(quaternion_of(half)).as_matrix() == pytest.approx(half, abs=1e-12)
+
+
+@pytest.mark.parametrize("step_hz", [960, 3840, 15360])
+def test_what_overlaps_is_pushed_apart_at_its_depth_over_one_time_in_steps_of_any_length(step_hz):
+    deep = 1e-4
+    with drop(ball_body(0.05), at(0.0, 0.05 - deep), 0.0, physics(step_hz=step_hz), 1) as world:
+        world.pull((0.0, 0.0, 0.0))
+        world.advance()
+        assert world.velocity()[0][2] == pytest.approx((deep - SLOP_M) / REPAIR_S, rel=0.01)

@@ -8,14 +8,15 @@ import trimesh
 
 from schemas.job import Job
 from schemas.scene import ObjectStart
-from schemas.shape import Asset
+from schemas.shape import Asset, Mesh
 from tests.shapes import asset_of, box
-from workers.geometry.frames import pose, quaternion_of, transform, translation, uniform_rotation
+from workers.geometry.frames import pose, quaternion_of, rotation_about, transform, translation, uniform_rotation
 from workers.geometry.hull import convex_hull
-from workers.scene.bullet import GRAVITY_M_S2, SLOP_M
+from workers.scene.bullet import GRAVITY_M_S2, SLOP_M, Body
 from workers.scene.fall import FINEST, SKIPPED_TO_M, Faller, Pace, as_pose, fall, make_faller
 
 PHYSICS = Job(name="t").physics
+Z = np.array([0.0, 0.0, 1.0])
 MARGIN_M = PHYSICS.margin_mm / 1e3
 COARSE = Pace(PHYSICS.step_hz, math.inf)
 UP = np.array([0.0, 0.0, 1.0])
@@ -144,3 +145,25 @@ def test_a_pose_comes_back_from_its_quaternion():
     T = pose(uniform_rotation(np.random.default_rng(2)), np.array([0.1, 0.2, 0.3]))
     quaternion = quaternion_of(T[:3, :3])
     assert as_pose(((0.1, 0.2, 0.3), tuple(quaternion))) == pytest.approx(T, abs=1e-12)
+
+
+def bevelled(heading: int) -> Mesh:
+    """Level up to x = 0, from there down by 22 degrees and by 63, turned about z by so many quarters."""
+    x, z = np.array([-0.5, 0.0, 0.004, 0.006]), np.array([0.0, 0.0, -0.0016, -0.0055])
+    vertices = np.stack([np.repeat(x, 2), np.tile([-0.5, 0.5], 4), np.repeat(z, 2)], axis=1)
+    faces = np.concatenate([2 * k + np.array([[0, 2, 3], [0, 3, 1]]) for k in range(3)])
+    return Mesh(transform(pose(rotation_about(Z, heading * math.pi / 2), np.zeros(3)), vertices), faces)
+
+
+@pytest.mark.parametrize("inside_m", [0.0005, 0.001, 0.0015, 0.002])
+@pytest.mark.parametrize("heading", range(4))
+def test_a_corner_that_comes_down_beside_an_edge_of_a_mesh_does_not_sink_in(heading, inside_m):
+    """A hundredth of a millimetre is what Bullet leaves: the steps that foresee a contact end at it."""
+    corners = 0.08 * np.concatenate([np.eye(3), -np.eye(3)])
+    faller = Faller(Body(0.3, np.full(3, 4e-4), (corners,), 1e-4), np.eye(4), 0.08)
+    start = rotation_about(Z, heading * math.pi / 2) @ np.array([-inside_m, 0.013, 0.0801 + 0.005])
+    pace = Pace(PHYSICS.step_hz, PHYSICS.way_mm / 1e3)
+    end = fall([faller], [translation(*start)], bevelled(heading), PHYSICS, pace, 0.04, 0.005)
+    lowest = transform(end.poses[0], corners)[:, 2].min() - 1e-4
+    assert end.seconds > 0.035
+    assert -1.3e-5 < lowest < 1e-5
