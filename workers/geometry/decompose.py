@@ -89,10 +89,13 @@ class Parts:
 _CACHE = PartsCache()
 
 
-def parts_of(asset: Asset) -> tuple[Array, ...]:
-    """Vertex clouds [N, 3] of an asset's convex parts, object frame: those that follow from its making, or else CoACD's."""
+def parts_of(asset: Asset, threshold: float = THRESHOLD) -> tuple[Array, ...]:
+    """Vertex clouds [N, 3] of an asset's convex parts, object frame: those that follow from its making, or else CoACD's.
+
+    `threshold` is CoACD's.
+    """
     if asset.tubes is None:
-        return convex_parts(asset.shape.mesh, asset.sha256)
+        return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
     tubes = asset.tubes
     key = key_of("tubes", asset.sha256, asset.shape.mesh.vertices.tobytes())
     return _CACHE.get(key, None, lambda: ("tubes", parts_of_tubes(tubes)))[1]

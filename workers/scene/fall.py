@@ -142,7 +142,7 @@ def faller_of(start: ObjectStart, physics: Physics, ran: Collection[str], dampin
     """The object with the effects that ran: as its convex parts where `decomposition` did and it has several."""
     cut: Sequence[Array] = ()
     if "decomposition" in ran and not is_convex(start):
-        parts = parts_of(start.asset)
+        parts = parts_of(start.asset, physics.concavity)
         cut = parts if len(parts) > 1 else ()
     return make_faller(start, physics, "rolling_friction" in ran, damping, cut)
 

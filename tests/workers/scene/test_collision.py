@@ -12,6 +12,7 @@ from schemas.scene import ObjectStart
 from tests.shapes import asset_of, box, table
 from workers.geometry.frames import angle_between, pose, rotation_about, transform
 from workers.geometry.hull import convex_hull
+from workers.scene import fall
 from workers.scene.alone import settle_alone
 from workers.scene.dynamics import PREDICATES, called_for
 from workers.scene.fall import shaped
@@ -86,3 +87,16 @@ def test_without_correction_an_object_stays_where_the_simulator_left_it():
         assert corrected.penetration_mm + corrected.hover_gap_mm < 1e-9
         assert np.abs(corrected.T_world_obj[2, :3]).max() == pytest.approx(1.0, abs=1e-12)
         assert np.abs(raw.T_world_obj[2, :3]).max() == pytest.approx(1.0, abs=1e-5)
+
+
+def test_convex_parts_of_a_mesh_from_outside_are_as_fine_as_the_key_says(monkeypatch):
+    asked = []
+
+    def parts_of(asset, threshold):
+        asked.append(threshold)
+        return (asset.shape.vertices,)
+
+    monkeypatch.setattr(fall, "parts_of", parts_of)
+    for concavity in (0.1, 0.02):
+        fall.faller_of(start_of(TRAY), with_(concavity=concavity), {"decomposition"})
+    assert asked == [0.1, 0.02]
