@@ -22,6 +22,9 @@ NEGLIGIBLE: Mapping[str, float] = {
 }
 """By unit: errors below this are as good as none, however they compare."""
 
+DEAREST = 5.0
+"""A value that takes so many times the job's time is an end of its own, and is not measured with others."""
+
 MOST_OF_A_KIND = 3
 """So many knobs are paired among those that save time, and among those that are more exact."""
 
@@ -33,7 +36,7 @@ def promising(rows: Sequence[Row], units: Mapping[str, str], targets: Mapping[st
     that keeps every error, and the most exact one that shrinks one; of either kind the knobs that do most, two by two and
     all at once; and of every knob the cheapest value that meets the targets, at once.
     """
-    own, singles = rows[0], [row for row in rows[1:] if len(row.setting.parts) == 1]
+    own, singles = rows[0], [row for row in rows[1:] if len(row.setting.parts) == 1 and row.ratio < DEAREST]
     saving = _best_of_knobs([row for row in singles if row.ratio < SAVES and _keeps(row, own, units)], _by_time)
     exact = _best_of_knobs(
         [row for row in singles if _shrinks(row, own, units) < BETTER], lambda r: _shrinks(r, own, units)

@@ -114,7 +114,8 @@ class _Bench:
         if not missing:
             return
         with pinned():
-            warm_up(self.context, part.settings, part.plan.job.first_scene + part.plan.sizes.timed)
+            quick = [setting for setting in part.settings if not _is_slow(self.context.job, setting)]
+            warm_up(self.context, quick, part.plan.job.first_scene + part.plan.sizes.timed)
             for unit in missing:
                 self._keep(unit.name, _time(part, self.context, unit))
 

@@ -46,6 +46,10 @@ def test_more_exact_values_are_joined_too():
     assert names(row("a=1", 1.5, 0.02), row("b=1", 1.1, 0.1, mask=0.002)) == {"a=1, b=1"}
 
 
+def test_what_takes_many_times_as_long_is_not_measured_with_others():
+    assert names(row("a=1", 9.0, 0.001), row("b=1", 1.1, 0.1, mask=0.002)) == set()
+
+
 def test_three_knobs_make_three_pairs_and_all_at_once():
     three = [row("a=1", 0.8, 0.1), row("b=1", 0.9, 0.1), row("c=1", 0.7, 0.1)]
     assert names(*three) == {"a=1, b=1", "a=1, c=1", "b=1, c=1", "a=1, b=1, c=1"}
