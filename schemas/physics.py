@@ -25,8 +25,8 @@ class Physics(Frozen):
 
     step_hz: Annotated[int, Field(ge=30, le=20_000)] = 960
     """Steps a second where all moves slowly; up to 16 times as many where it does not."""
-    way_mm: Positive = 0.07
-    """How far the fastest point may go in a step; more in falls from above 35 mm, less for what is thinner than 1.4 mm."""
+    way_mm: Positive = 0.05
+    """How far the fastest point may go in a step; more in falls from above 35 mm, less for what is thinner than 1 mm."""
     solver_iterations: Annotated[int, Field(ge=1, le=10_000)] = 100
     """Iterations of the contact solver in each step."""
     max_settle_s: Positive = 20.0

@@ -7,14 +7,9 @@ from typing import Any, Literal
 PresetName = Literal["fast", "balanced", "exact"]
 
 PRESETS: dict[PresetName, dict[str, Any]] = {
-    "fast": {"physics.step_hz": 240, "physics.solver_iterations": 25, "render.tier": "flat", "render.samples": 1},
-    "balanced": {
-        "physics.step_hz": 960,
-        "physics.solver_iterations": 100,
-        "render.tier": "raster",
-        "render.samples": 1,
-    },
-    "exact": {"physics.step_hz": 1920, "physics.solver_iterations": 200, "render.tier": "raster", "render.samples": 4},
+    "fast": {"physics.step_hz": 240, "render.tier": "flat", "render.samples": 1},
+    "balanced": {"physics.step_hz": 960, "render.tier": "raster", "render.samples": 1},
+    "exact": {"physics.step_hz": 1920, "render.tier": "raster", "render.samples": 4},
 }
 """By name, the same dotted keys in each: how hard is tried, and never what is stored (image size, units, how d_z is read).
 `balanced` is what the keys' own defaults say."""

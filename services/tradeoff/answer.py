@@ -6,7 +6,7 @@ from services.tradeoff.choose import AS_CHEAP, TargetError, Targets, candidates,
 from services.tradeoff.model import Figure, Row, Study
 from services.tradeoff.words import amount, duration, listed, milliseconds, short, size, times
 
-DEFAULT_TARGETS: Targets = {"penetration_mm": 0.1, "gap_mm": 0.1, "mask_share": 0.001}
+DEFAULT_TARGETS: Targets = {"penetration_mm": 0.1, "gap_mm": 0.1, "pose_mm": 0.1, "depth_mm": 0.1, "mask_share": 0.001}
 """What is asked where nothing is: what a dataset's labels are promised to keep to."""
 
 

@@ -53,7 +53,7 @@ def _physics_knobs(job: Job) -> tuple[Knob, ...]:
 
     return (
         knob("step", "physics steps a second", _plain("physics.step_hz", (60, 120, 240, 480, 960, 1920))),
-        knob("way", "way of a point in a step, mm", _plain("physics.way_mm", (1.0, 0.3, 0.15, 0.07, 0.03))),
+        knob("way", "way of a point in a step, mm", _plain("physics.way_mm", (1.0, 0.3, 0.1, 0.05, 0.035))),
         knob("iterations", "solver iterations", _plain("physics.solver_iterations", (5, 10, 25, 50, 100, 200))),
         knob("rest", "speed that counts as rest, mm/s", map(_rest, (30.0, 10.0, 3.0, 1.0, 0.3))),
         knob("collision", "shape in the simulator", _collisions(job)),

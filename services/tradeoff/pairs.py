@@ -16,8 +16,8 @@ BETTER = 0.67
 """An error that shrinks below this share of the job's own is better."""
 
 NEGLIGIBLE: Mapping[str, float] = {
-    "mm": 0.01,
-    "deg": 0.01,
+    "mm": 0.02,
+    "deg": 0.02,
     "": 0.001,
 }
 """By unit: errors below this are as good as none, however they compare."""

@@ -11,8 +11,18 @@ from services.tradeoff.pairs import NEGLIGIBLE
 SLACK = 0.1
 """A preset may take a tenth more time than a setting that is as good, and have errors a tenth larger than one as cheap."""
 
-BY_EFFORT = frozenset(key for changes in PRESETS.values() for key in changes)
-"""What a preset chooses: settings that change anything else store something else, and are no rivals."""
+MORE_EFFORT = (
+    "physics.way_mm",
+    "physics.solver_iterations",
+    "physics.rest.speed_mm_s",
+    "physics.rest.spin_rad_s",
+    "physics.collision",
+    "physics.correction",
+    "render.path_samples",
+)
+
+BY_EFFORT = frozenset((*PRESETS["balanced"], *MORE_EFFORT))
+"""What presets choose or could: settings that change anything else store something else, and are no rivals."""
 
 
 def preset_row(rows: Sequence[Row], name: str) -> Row:
