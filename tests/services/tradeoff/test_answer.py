@@ -15,22 +15,22 @@ OWN = row(penetration_mm=0.01, gap_mm=0.0, mask_share=0.0002, depth_mm=0.1, flip
 def test_the_job_is_kept_where_nothing_is_cheaper_and_as_good():
     made = study(OWN, row("step=60", 0.5, penetration_mm=0.4), row("units=10000", 1.6, depth_mm=0.05))
     assert answer(made) == (
-        "For at most 0.1 mm (penetration, gap) and 0.1 % (the object's mask pixels), use the job as it is, which costs "
-        "118 ms of processor a scene (64 scenes: 7.6 s, 15 MB); the next better, units=10000, costs 1.6 times as much."
+        "For at most 0.1 mm (penetration, gap, depth of objects) and 0.1 % (the object's mask pixels), use the job as it is, "
+        "which costs 118 ms of processor a scene (64 scenes: 7.6 s, 15 MB); the next better, units=10000, costs 1.6 times as much."
     )
 
 
 def test_another_setting_is_named_with_what_it_saves():
     made = study(OWN, row("step=240", 0.5, penetration_mm=0.05), job_scenes=1_000_000)
     assert answer(made) == (
-        "For at most 0.1 mm (penetration, gap) and 0.1 % (the object's mask pixels) and nothing else worse than the job "
-        "has it, use step=240, which costs 59 ms of processor a scene (1,000,000 scenes: 16 h, 235 GB), 0.5 times the "
+        "For at most 0.1 mm (penetration, gap, depth of objects) and 0.1 % (the object's mask pixels) and nothing else worse "
+        "than the job has it, use step=240, which costs 59 ms of processor a scene (1,000,000 scenes: 16 h, 235 GB), 0.5 times the "
         "job's time; the next better, the job, costs 2 times as much."
     )
 
 
 def test_whoever_asks_for_nothing_keeps_the_images_that_they_have():
-    made = study(OWN, row("tier=flat", 0.5, flip=0.3), row("size=small", 0.4, depth_mm=0.11))
+    made = study(OWN, row("tier=flat", 0.5, flip=0.3), row("size=small", 0.4, flip=0.11))
     assert (
         recommend(made).setting.name == "size=small"
     )  # as good as the scenes can tell: the job's interval ends at 0.11
@@ -74,9 +74,9 @@ def test_without_the_number_of_scenes_the_whole_job_is_left_out():
 
 
 def test_the_default_targets_are_those_that_were_measured():
-    told = answer(study(row(depth_mm=0.1), job_scenes=0))
+    told = answer(study(row(between_mm=0.1), job_scenes=0))
     assert told.startswith("For nothing worse than the job has it, use the job as it is")
-    assert answer(study(row(depth_mm=0.1)), {}).startswith("For any error at all, use the job as it is")
+    assert answer(study(row(between_mm=0.1)), {}).startswith("For any error at all, use the job as it is")
 
 
 def test_better_is_better_by_more_than_both_intervals_and_worse_in_nothing():
@@ -101,7 +101,7 @@ def test_a_target_that_was_not_measured_is_told():
 
 
 def test_a_large_study_has_a_sentence():
-    assert answer(large_study()).startswith("For at most 0.1 mm (penetration, gap)")
+    assert answer(large_study()).startswith("For at most 0.1 mm (penetration, gap, pose, depth of objects)")
 
 
 def test_every_error_has_a_short_name():
