@@ -67,6 +67,12 @@ def as_often(ratio: float) -> str:
     return "1" if abs(ratio - 1.0) < 0.05 else number(float(f"{ratio:.2g}"))
 
 
+def cost(ratio: float, of: str = "the time") -> str:
+    """What takes so many times as long: "2 × the time", or "no more time" within the noise."""
+    often = as_often(ratio)
+    return "no more time" if often == "1" else f"{often} × {of}".rstrip()
+
+
 def times(ratio: float) -> str:
     """The same with its word, and a third digit where it is near 1: "1.07 times"."""
     return f"{number(round(ratio, 2)) if 0.9 <= ratio < 1.1 else as_often(ratio)} times"

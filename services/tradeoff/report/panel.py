@@ -28,7 +28,7 @@ from services.tradeoff.report.pictures import (
     up_scale,
 )
 from services.tradeoff.report.scales import Scale, scale_of
-from services.tradeoff.words import as_often, shown
+from services.tradeoff.words import cost, shown
 
 _MAIN = (
     (
@@ -135,12 +135,12 @@ def _message(rows: Sequence[Row], panel: Panel) -> str:
     """What less of it costs."""
     best = front(rows, panel.error)[-1]
     if panel.half is not None:
-        return f"half the error takes {as_often(panel.half.ratio)} × the time"
+        return f"half the error takes {cost(panel.half.ratio)}"
     own = own_row(rows).errors.get(panel.error)
     if own is None or own.value <= best.errors[panel.error].value:
         return "nothing better was measured"
     less = 1.0 - best.errors[panel.error].value / own.value
-    return f"{100 * less:.2g} % less error takes {as_often(best.ratio)} × the time"
+    return f"{100 * less:.2g} % less error takes {cost(best.ratio)}"
 
 
 def _heading(axes: Axes, heading: str, message: str, pad: float) -> None:

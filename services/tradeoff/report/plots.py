@@ -10,7 +10,7 @@ from services.tradeoff.model import Study
 from services.tradeoff.report.knob_plots import draw_knob, single_knobs
 from services.tradeoff.report.panel import Panel, draw_panel, looks_of, panels_of
 from services.tradeoff.report.pictures import DOTS, INK, PALE, cut, fit, new_picture, plain_style
-from services.tradeoff.words import as_often, milliseconds
+from services.tradeoff.words import cost, milliseconds
 
 WIDTH = 12.0
 
@@ -79,11 +79,11 @@ def _head(picture: Picture, study: Study, panels: list[Panel]) -> None:
 
 def headline(study: Study, panels: list[Panel]) -> str:
     """What half of each error costs, in one line."""
-    costs = [f"{as_often(half.ratio)} × {panel.name}" for panel in panels if (half := panel.half) is not None]
+    costs = [f"{cost(half.ratio)} {panel.name}" for panel in panels if (half := panel.half) is not None]
     scene = f"A scene takes {milliseconds(own_row(study.rows).ms)}"
     if not costs:
         return f"{scene}; no setting that was measured halves an error"
-    return f"{scene}; half the error takes {', '.join([costs[0].replace('×', '× that'), *costs[1:]])}"
+    return f"{scene}; half the error takes {', '.join(costs)}"
 
 
 def _foot(picture: Picture) -> None:

@@ -184,7 +184,7 @@ def test_the_headline_says_what_half_the_error_takes():
         OWN, row("step=1", 1.6, moved_mm=0.05), row("step=2", 1.2, moved_mm=0.06), row("dz=a", 0.98, mirror_mm=0.1)
     )
     told = headline(made, panels_of(made.rows))
-    assert told == "A scene takes 118 ms; half the error takes 1.6 × that at rest, 1 × in the mirror"
+    assert told == "A scene takes 118 ms; half the error takes 1.6 × the time at rest, no more time in the mirror"
     alone = study(OWN)
     assert (
         headline(alone, panels_of(alone.rows)) == "A scene takes 118 ms; no setting that was measured halves an error"
