@@ -16,7 +16,8 @@ def test_the_job_is_kept_where_nothing_is_cheaper_and_as_good():
     made = study(OWN, row("step=60", 0.5, penetration_mm=0.4), row("units=10000", 1.6, depth_mm=0.05))
     assert answer(made) == (
         "For at most 0.1 mm (penetration, gap, depth of objects) and 0.1 % (the object's mask pixels), use the job as it is, "
-        "which costs 118 ms of processor a scene (64 scenes: 7.6 s, 15 MB); the next better, units=10000, costs 1.6 times as much."
+        "which costs 118 ms of processor a scene (64 scenes: 7.6 s, 15 MB); the next better, units=10000, costs 1.6 times as "
+        "much."
     )
 
 
@@ -24,8 +25,8 @@ def test_another_setting_is_named_with_what_it_saves():
     made = study(OWN, row("step=240", 0.5, penetration_mm=0.05), job_scenes=1_000_000)
     assert answer(made) == (
         "For at most 0.1 mm (penetration, gap, depth of objects) and 0.1 % (the object's mask pixels) and nothing else worse "
-        "than the job has it, use step=240, which costs 59 ms of processor a scene (1,000,000 scenes: 16 h, 235 GB), 0.5 times the "
-        "job's time; the next better, the job, costs 2 times as much."
+        "than the job has it, use step=240, which costs 59 ms of processor a scene (1,000,000 scenes: 16 h, 235 GB), 0.5 times "
+        "the job's time; the next better, the job, costs 2 times as much."
     )
 
 
