@@ -28,6 +28,10 @@ UNBALANCED = 0.05
 `CONTACT_M`, leave open."""
 
 
+BALANCED = 1e-3
+"""The same share where what is left is noise: two tenths of a millimetre between a centre of mass and the contacts."""
+
+
 class LeftRoomError(Exception):
     """An object came where it may meet another."""
 
@@ -64,9 +68,7 @@ def settle_alone(
         if motion is not None:
             return _describe(task, motion, "flat_top")
         task = dataclasses.replace(task, ran=(*ran, *on_mesh((start,), physics)))
-    motion = _simulate(task, physics.max_settle_s, flat=False)
-    _require_rest(task, motion)
-    return _describe(task, motion, "mesh")
+    return _describe(task, _settle_on_mesh(task), "mesh")
 
 
 def _settle_flat(task: _Task) -> Fall | None:
@@ -96,6 +98,28 @@ def _settle_flat(task: _Task) -> Fall | None:
         if tipped is not None:
             break
         task = dataclasses.replace(task, start=dataclasses.replace(task.start, T_world_obj=T))
+    return motion
+
+
+def _settle_on_mesh(task: _Task) -> Fall:
+    """Rest on the table's mesh; what rolling friction held out of balance is let go once more with less of it.
+
+    It holds a centre of mass that is within its lever arm beyond the contacts, half a millimetre with the defaults, where an
+    object would in truth tip on.
+    """
+    seconds, physics = 0.0, task.physics
+    shares = LESS_ROLLING_FRICTION if "rolling_friction" in task.ran else LESS_ROLLING_FRICTION[:1]
+    for share in shares:
+        less = physics.model_copy(update={"rolling_friction": share * physics.rolling_friction})
+        damping = 0.0 if share == 1.0 else DAMPING
+        motion = _simulate(dataclasses.replace(task, physics=less, damping=damping), physics.max_settle_s, flat=False)
+        _require_rest(task, motion)
+        seconds += motion.seconds
+        motion = dataclasses.replace(motion, seconds=seconds)
+        T = touch_down(task.start, motion.poses[0], task.ground)
+        if support_of(task.start, T, task.ground, physics.friction**2).residual <= BALANCED:
+            break
+        task = dataclasses.replace(task, start=dataclasses.replace(task.start, T_world_obj=motion.poses[0]))
     return motion
 
 

@@ -12,7 +12,9 @@ from schemas.job import Job
 from schemas.scene import ObjectStart
 from schemas.shape import Mesh
 from schemas.sources import ProceduralSource
+from tests.physics.population import draw
 from tests.shapes import asset_of, box, shape_of, table
+from workers.assets.catalogue import open_catalogue
 from workers.assets.procedural.make import make_asset
 from workers.geometry.frames import angle_between, pose, rotation_about, transform, translation
 from workers.geometry.heights import vertical_gap
@@ -81,6 +83,17 @@ def test_a_bottle_that_rolling_friction_held_on_an_edge_rolls_onto_a_face_and_no
     assert rest.support == "flat_top"
     assert rest.support_margin_mm > 0.0
     assert recheck(start, rest, TABLE, PHYSICS)[0] < 0.1
+
+
+def test_a_mug_on_a_mesh_that_rolling_friction_held_out_of_balance_tips_on(tmp_path):
+    """Its centre of mass was half a millimetre beyond its contacts, and went on from there at a third of a mm/s."""
+    job = Job.model_validate({"name": "t", "start": {"pose": "tumbled"}})
+    plan = draw(job, open_catalogue(job.assets, tmp_path, tuple(job.categories)), 360)
+    rest = settle_alone(plan.objects[0], plan.table, job.physics)
+    assert rest.support == "mesh"
+    assert rest.support_margin_mm > 1.0 and rest.equilibrium_residual < 1e-3
+    moved_mm, turned_deg = recheck(plan.objects[0], rest, plan.table, job.physics)
+    assert moved_mm < 0.1 and turned_deg < 0.1
 
 
 def test_what_is_let_go_again_is_watched_to_the_end_however_still_it_stands(monkeypatch):
