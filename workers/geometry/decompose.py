@@ -29,6 +29,7 @@ from typing import Literal
 
 import manifold3d
 import numpy as np
+import shapely
 
 from schemas.base import Array, frozen_array
 from schemas.errors import MachineError, MeshError
@@ -92,13 +93,17 @@ _CACHE = PartsCache()
 def parts_of(asset: Asset, threshold: float = THRESHOLD) -> tuple[Array, ...]:
     """Vertex clouds [N, 3] of an asset's convex parts, object frame: those that follow from its making, or else CoACD's.
 
-    `threshold` is CoACD's.
+    `threshold` is CoACD's. Where a built-in shape's own outlines cannot be cut, for they meet but for the last bits, it is
+    cut by CoACD too.
     """
-    if asset.tubes is None:
-        return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
     tubes = asset.tubes
+    if tubes is None:
+        return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
     key = key_of("tubes", asset.sha256, asset.shape.mesh.vertices.tobytes())
-    return _CACHE.get(key, None, lambda: ("tubes", parts_of_tubes(tubes)))[1]
+    try:
+        return _CACHE.get(key, None, lambda: ("tubes", parts_of_tubes(tubes)))[1]
+    except (ValueError, shapely.errors.GEOSException):
+        return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
 
 
 def convex_parts(mesh: Mesh, digest: str) -> tuple[Array, ...]:

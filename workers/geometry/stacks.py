@@ -14,6 +14,10 @@ INNER = 0.5
 """What is added to a thin body is so much narrower than it."""
 
 
+GRID_SHARE = 1e-4
+"""Of the tolerance: the grid on which outlines are compared."""
+
+
 @dataclass(frozen=True)
 class Level:
     """A ring of a body about the axis: a copy of the outline's point at `share` of the side after `corner`.
@@ -89,7 +93,10 @@ def _thickened(levels: list[Level], seen: shapely.Polygon, tolerance: float, thi
 
 def is_covered(cell: Array, seen: shapely.Polygon, tolerance: float) -> bool:
     """Whether a cell [M, 2] lies in what is seen, but for slivers narrower than the tolerance."""
-    return bool(shapely.Polygon(cell).difference(seen).buffer(-0.5 * tolerance).is_empty)
+    # On a grid: sides that lie on one another but for the last bits have no difference in plain doubles.
+    whole, visible = shapely.make_valid([shapely.Polygon(cell), seen])
+    left = shapely.difference(whole, visible, grid_size=GRID_SHARE * tolerance)
+    return bool(left.buffer(-0.5 * tolerance).is_empty)
 
 
 def rings_at(lines: Array, outline: Array, levels: Sequence[Level]) -> Array:

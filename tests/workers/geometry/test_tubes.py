@@ -3,6 +3,7 @@
 import manifold3d
 import numpy as np
 import pytest
+import shapely
 import trimesh
 from scipy.spatial import ConvexHull
 
@@ -153,3 +154,29 @@ def test_built_in_shapes_are_never_handed_to_coacd(monkeypatch):
     monkeypatch.setattr(decompose, "_run", lambda *_: pytest.fail("CoACD was asked"))
     for category in ("mug", "bowl", "jar", "can", "bottle", "box", "laptop", "camera"):
         assert len(parts_of(built_in(category, 7))) > 1
+
+
+OUTLINES_THAT_MEET = [("camera", 100026), ("camera", 100226), ("camera", 500199), ("camera", 500231), ("box", 500231)]
+"""Sides that lie on one another but for the last bits, or cross: one camera of a hundred, and fewer boxes."""
+
+
+@pytest.mark.parametrize(("category", "number"), OUTLINES_THAT_MEET)
+def test_a_shape_whose_outlines_meet_or_cross_has_parts_all_the_same(category, number):
+    asset = make_asset(category, ProceduralSource(source="procedural"), number, 600.0)
+    parts = parts_of(asset)
+    assert len(parts) > 1
+    corners = np.concatenate(parts)
+    assert corners.min(axis=0) == pytest.approx(asset.shape.vertices.min(axis=0), abs=1e-9)
+    assert corners.max(axis=0) == pytest.approx(asset.shape.vertices.max(axis=0), abs=1e-9)
+
+
+def test_a_shape_whose_outlines_cannot_be_cut_is_cut_as_a_mesh_from_outside_is(monkeypatch):
+    def fails(_: object) -> None:
+        raise shapely.errors.GEOSException("TopologyException: side location conflict")
+
+    monkeypatch.setattr(decompose, "parts_of_tubes", fails)
+    monkeypatch.setattr(
+        decompose, "decompose", lambda mesh, digest, threshold: decompose.Parts((mesh.vertices,), "coacd")
+    )
+    asset = make_asset("laptop", ProceduralSource(source="procedural"), 77, 600.0)
+    assert len(parts_of(asset)) == 1

@@ -122,9 +122,9 @@ def test_objects_that_begin_inside_one_another_are_refused_and_not_thrown_apart(
         assert rest[1].T_world_obj[0, 3] == pytest.approx(0.06 - deep_m, abs=1e-3)
 
 
-@pytest.mark.parametrize(("height_m", "side_m", "way_m"), [(0.02, 0.06, 7e-5), (0.3, 0.06, 6e-4), (0.3, 0.006, 3e-4)])
+@pytest.mark.parametrize(("height_m", "side_m", "way_m"), [(0.02, 0.06, 5e-5), (0.3, 0.06, 6e-4), (0.3, 0.006, 3e-4)])
 def test_steps_are_as_fine_as_the_highest_fall_and_the_thinnest_object_ask(height_m, side_m, way_m, monkeypatch):
-    """0.07 mm, or 0.002 of the fall if that is more, or 0.05 of the thinnest if that is less."""
+    """0.05 mm, or 0.002 of the fall if that is more, or 0.05 of the thinnest if that is less."""
     seen = []
 
     def told(*arguments):
