@@ -38,7 +38,7 @@ from workers.geometry.coacd_process import MISSING
 from workers.geometry.convexity import components, concavity_m, solid_of, triangles_of, weld
 from workers.geometry.hull import convex_hull
 from workers.geometry.parts_cache import USUAL_FOLDER, PartsCache, key_of
-from workers.geometry.tubes import parts_of_tubes
+from workers.geometry.tubes import TOLERANCE, parts_of_tubes
 
 THRESHOLD = 0.05
 """CoACD's concavity at which it stops, in units in which the mesh is 2 across: 0.02 halves what stands out, and has three
@@ -90,18 +90,18 @@ class Parts:
 _CACHE = PartsCache()
 
 
-def parts_of(asset: Asset, threshold: float = THRESHOLD) -> tuple[Array, ...]:
+def parts_of(asset: Asset, threshold: float = THRESHOLD, share: float = TOLERANCE) -> tuple[Array, ...]:
     """Vertex clouds [N, 3] of an asset's convex parts, object frame: those that follow from its making, or else CoACD's.
 
-    `threshold` is CoACD's. Where a built-in shape's own outlines cannot be cut, for they meet but for the last bits, it is
-    cut by CoACD too.
+    `threshold` is CoACD's, `share` that of `parts_of_tubes`. Where a built-in shape's own outlines cannot be cut, for they
+    meet but for the last bits, it is cut by CoACD too.
     """
     tubes = asset.tubes
     if tubes is None:
         return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
-    key = key_of("tubes", asset.sha256, asset.shape.mesh.vertices.tobytes())
+    key = key_of("tubes", repr(share), asset.sha256, asset.shape.mesh.vertices.tobytes())
     try:
-        return _CACHE.get(key, None, lambda: ("tubes", parts_of_tubes(tubes)))[1]
+        return _CACHE.get(key, None, lambda: ("tubes", parts_of_tubes(tubes, share)))[1]
     except (ValueError, shapely.errors.GEOSException):
         return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
 

@@ -15,6 +15,7 @@ from workers.geometry.decompose import parts_of
 from workers.geometry.frames import invert, pose, rotation_from_quaternion, transform
 from workers.geometry.hull import convex_hull
 from workers.geometry.inset import inset_hull, least_width_m
+from workers.geometry.tubes import TOLERANCE
 from workers.scene.bullet import GRAVITY_M_S2, SLOP_M, Body, World, open_world
 from workers.scene.dynamics import is_convex
 from workers.scene.support import support_height
@@ -138,11 +139,16 @@ def make_faller(
     return Faller(body, T_obj_body, reach)
 
 
-def faller_of(start: ObjectStart, physics: Physics, ran: Collection[str], damping: float = 0.0) -> Faller:
-    """The object with the effects that ran: as its convex parts where `decomposition` did and it has several."""
+def faller_of(
+    start: ObjectStart, physics: Physics, ran: Collection[str], damping: float = 0.0, share: float = TOLERANCE
+) -> Faller:
+    """The object with the effects that ran: as its convex parts where `decomposition` did and it has several.
+
+    Parts of built-in shapes may reach out by this share of their size.
+    """
     cut: Sequence[Array] = ()
     if "decomposition" in ran and not is_convex(start):
-        parts = parts_of(start.asset, physics.concavity)
+        parts = parts_of(start.asset, physics.concavity, share)
         cut = parts if len(parts) > 1 else ()
     return make_faller(start, physics, "rolling_friction" in ran, damping, cut)
 

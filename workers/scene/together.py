@@ -13,6 +13,7 @@ from schemas.scene import ObjectStart, Settled, SupportedBy, Table
 from schemas.shape import Mesh
 from workers.geometry.frames import transform
 from workers.geometry.heights import survey
+from workers.geometry.tubes import COARSE, TOLERANCE
 from workers.scene.clearance import clearances, overlap_m
 from workers.scene.contact import CONTACT_M
 from workers.scene.equilibrium import FIXED, Contact, Weight, contact_points, equilibrium_residual, support_margin_m
@@ -23,6 +24,10 @@ from workers.scene.watch import Watch, watch_edge, watch_gone
 MOST_OVERLAP_M = 1e-4
 """How far objects may begin inside one another. What overlaps is pushed apart by a share of its depth in each step, which a
 depth of centimetres turns into tens of metres a second."""
+
+
+MANY = 4
+"""So many objects fall as coarser convex parts: Bullet's time goes with the pairs of parts that come near one another."""
 
 
 def settle_together(
@@ -71,7 +76,8 @@ def release_together(
     shrinks with the ratio of the masses. So there are more for more objects; it stops where they change nothing.
     """
     starts = [shaped(start, physics) for start in starts]
-    fallers = [faller_of(start, physics, ran) for start in starts]
+    share = TOLERANCE if len(starts) < MANY else COARSE
+    fallers = [faller_of(start, physics, ran, share=share) for start in starts]
     hulls = [transform(T, start.hull.vertices) for T, start in zip(poses, starts, strict=True)]
     free = min(free_fall_m(points, table, flat) for points in hulls)
     top = table.top.height_m

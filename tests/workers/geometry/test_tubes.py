@@ -16,7 +16,7 @@ from workers.geometry import decompose
 from workers.geometry.convexity import solid_of, weld
 from workers.geometry.decompose import parts_of
 from workers.geometry.nearest import nearest_on_mesh
-from workers.geometry.tubes import parts_of_tubes
+from workers.geometry.tubes import COARSE, parts_of_tubes
 
 AIM_M = 5e-5
 """Of parts in any shape 0.25 m along its diagonal: so far they may stand out, or leave something uncovered."""
@@ -171,7 +171,7 @@ def test_a_shape_whose_outlines_meet_or_cross_has_parts_all_the_same(category, n
 
 
 def test_a_shape_whose_outlines_cannot_be_cut_is_cut_as_a_mesh_from_outside_is(monkeypatch):
-    def fails(_: object) -> None:
+    def fails(*_: object) -> None:
         raise shapely.errors.GEOSException("TopologyException: side location conflict")
 
     monkeypatch.setattr(decompose, "parts_of_tubes", fails)
@@ -180,3 +180,17 @@ def test_a_shape_whose_outlines_cannot_be_cut_is_cut_as_a_mesh_from_outside_is(m
     )
     asset = make_asset("laptop", ProceduralSource(source="procedural"), 77, 600.0)
     assert len(parts_of(asset)) == 1
+
+
+@pytest.mark.parametrize("category", ["mug", "bowl", "jar", "can"])
+def test_coarser_parts_are_fewer_and_reach_out_no_further_than_they_may(category):
+    asset = make_asset(category, ProceduralSource(source="procedural"), 1, 600.0)
+    fine, coarse = parts_of(asset), parts_of(asset, share=COARSE)
+    assert len(coarse) < 0.5 * len(fine)
+    solid = solid_of(weld(asset.shape.mesh))
+    assert solid is not None
+    mesh = trimesh.Trimesh(asset.shape.vertices, asset.shape.faces)
+    middles = np.concatenate([(part[:-1] + part[1:]) / 2 for part in coarse])
+    outside = middles[~mesh.contains(middles)]
+    away = np.linalg.norm(nearest_on_mesh(outside, asset.shape.mesh)[0] - outside, axis=1)
+    assert away.max(initial=0.0) < 2e-3

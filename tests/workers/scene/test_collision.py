@@ -92,7 +92,7 @@ def test_without_correction_an_object_stays_where_the_simulator_left_it():
 def test_convex_parts_of_a_mesh_from_outside_are_as_fine_as_the_key_says(monkeypatch):
     asked = []
 
-    def parts_of(asset, threshold):
+    def parts_of(asset, threshold, share):
         asked.append(threshold)
         return (asset.shape.vertices,)
 
