@@ -96,9 +96,7 @@ def _add_run(commands: "argparse._SubParsersAction") -> None:
     run.add_argument(
         "--address", metavar="HOST:PORT", help="a Ray cluster that runs already (default: a private Ray here)"
     )
-    run.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes", help="change a key of the job"
-    )
+    _add_set(run)
     run.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
     run.add_argument(
         "--retry-failed", action="store_true", help="try scenes again that failed for environmental reasons"
@@ -170,9 +168,7 @@ def _add_bench(commands: "argparse._SubParsersAction") -> None:
     bench.add_argument(
         "--scaling-scenes", type=_count, metavar="N", default=512, help="how many scenes that comparison makes"
     )
-    bench.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes", help="change a key of the job"
-    )
+    _add_set(bench)
     bench.add_argument(
         "--pathtraced",
         nargs="?",
@@ -210,10 +206,14 @@ def _add_tradeoff(commands: "argparse._SubParsersAction") -> None:
     )
     tradeoff.add_argument("--laps", type=_count, metavar="N", default=3, help="rounds of timing (default: 3)")
     tradeoff.add_argument("--workers", type=_count, metavar="N", help="default: the cores this container may use")
-    tradeoff.add_argument(
+    _add_set(tradeoff)
+    tradeoff.set_defaults(handler="services.tradeoff.command:main")
+
+
+def _add_set(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes", help="change a key of the job"
     )
-    tradeoff.set_defaults(handler="services.tradeoff.command:main")
 
 
 def _count(text: str) -> int:

@@ -3,11 +3,10 @@
 import difflib
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from schemas.errors import InputError, RunError
 from services.tradeoff.errors import ERRORS
-from services.tradeoff.model import Changes, Figure, Row
+from services.tradeoff.model import Figure, Row
 from services.tradeoff.words import amount, listed, number, shown, times, unit
 
 Targets = Mapping[str, float]
@@ -215,28 +214,3 @@ def _amount(name: str, text: str) -> float:
         example = f", a share such as 0.001 for {number(shown(name, 0.001))} %" if unit(name) == "%" else ""
         raise InputError(f"--target {name}={text}: must be a number from 0 up{example}")
     return value
-
-
-def job_tree_with(changes: Changes, tree: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Keys and values of a job file with these changes made, nested: {"physics": {"step_hz": 240}}.
-
-    `tree`, if given, is what they are made to; it is left as it is. Raises ValueError where a change's path goes through
-    what has no keys.
-    """
-    made: dict[str, Any] = _copied(tree or {})
-    for path, value in changes.items():
-        *parents, last = path.split(".")
-        place = made
-        for key in parents:
-            below = place.setdefault(key, {})
-            if not isinstance(below, dict):
-                raise ValueError(f"{path}: '{key}' is {below!r} and has no keys")
-            place = below
-        place[last] = _copied(value)
-    return made
-
-
-def _copied(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _copied(below) for key, below in value.items()}
-    return [_copied(below) for below in value] if isinstance(value, list | tuple) else value

@@ -19,7 +19,7 @@ from services.progress import ProgressLine
 from services.tradeoff.answer import answer, recommend
 from services.tradeoff.choose import parse_targets
 from services.tradeoff.journal import Journal
-from services.tradeoff.knobs import apply, choose_knobs, knobs_of, preset_settings, set_in, settings_of
+from services.tradeoff.knobs import apply, choose_knobs, job_tree_with, knobs_of, preset_settings, settings_of
 from services.tradeoff.measure.colour_errors import colour_truth_missing
 from services.tradeoff.measure.crew import Crew
 from services.tradeoff.model import Row
@@ -96,9 +96,7 @@ def make_plan(asked: Job, options: argparse.Namespace, targets: Mapping[str, flo
 
 def write_job(source: Path, changes: list[str], row: Row, path: Path, target: str) -> None:
     """The user's job file with the chosen keys. Comments of the file are not kept."""
-    tree = read_tree(source, changes)
-    for key, value in row.setting.changes.items():
-        set_in(tree, key, value)
+    tree = job_tree_with(row.setting.changes, read_tree(source, changes))
     head = f"# {source.name} with {row.setting.name}: the cheapest measured setting with {target}.\n"
     path.write_text(head + yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
 

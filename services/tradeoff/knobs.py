@@ -223,21 +223,35 @@ def joined(settings: Sequence[Setting]) -> Setting:
 
 def apply(job: Job, changes: Changes) -> Job:
     """The job with these keys. Raises InputError where they do not go together with the rest of it."""
-    tree = job.model_dump(mode="json")
-    for path, value in changes.items():
-        set_in(tree, path, value)
     try:
-        return Job.model_validate(tree)
+        return Job.model_validate(job_tree_with(changes, job.model_dump(mode="json")))
     except ValidationError as error:
         raise InputError("; ".join(describe_fault(fault) for fault in error.errors())) from error
 
 
-def set_in(tree: dict[str, Any], path: str, value: Any) -> None:
-    """Set a dotted key in nested dicts, with those on the way made where they are missing."""
-    *parents, last = path.split(".")
-    for key in parents:
-        tree = tree.setdefault(key, {})
-    tree[last] = value
+def job_tree_with(changes: Changes, tree: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Keys and values of a job file with these changes made, nested: {"physics": {"step_hz": 240}}.
+
+    `tree`, if given, is what they are made to; it is left as it is. Raises ValueError where a change's path goes through
+    what has no keys.
+    """
+    made: dict[str, Any] = _copied(tree or {})
+    for path, value in changes.items():
+        *parents, last = path.split(".")
+        place = made
+        for key in parents:
+            below = place.setdefault(key, {})
+            if not isinstance(below, dict):
+                raise ValueError(f"{path}: '{key}' is {below!r} and has no keys")
+            place = below
+        place[last] = _copied(value)
+    return made
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _copied(below) for key, below in value.items()}
+    return [_copied(below) for below in value] if isinstance(value, list | tuple) else value
 
 
 def groups_of(setting: Setting, knobs: Mapping[str, Knob]) -> frozenset[Group]:

@@ -22,6 +22,7 @@ class Unit:
     kind: str
     settings: tuple[Setting, ...]
     scene_id: int
+    lap: int = 0
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Round:
         """Rounds of timing, one unit a scene."""
         scenes, sizes = self._scenes(self.plan.sizes.timed), self.plan.sizes
         return [
-            Unit(f"{self.name}/time/{lap}/{scene}", "time", self.settings, scene)
+            Unit(f"{self.name}/time/{lap}/{scene}", "time", self.settings, scene, lap)
             for lap, scene in itertools.product(range(sizes.laps), scenes)
         ]
 
@@ -85,7 +86,7 @@ def _rows(part: Round, journal: Journal) -> Iterator[Row]:
     own = part.settings[0].name
     laps: list[dict[int, dict[str, Any]]] = [{} for _ in range(part.plan.sizes.laps)]
     for unit in part.timings():
-        laps[int(unit.name.split("/")[2])][unit.scene_id] = journal[unit.name]
+        laps[unit.lap][unit.scene_id] = journal[unit.name]
     own_ms, own_kb = job_cost(laps, own)
     for setting in part.settings:
         cost = cost_of(setting.name, own, laps)

@@ -130,7 +130,7 @@ def _time(part: Round, context: WorkerContext, unit: Unit) -> dict[str, Any]:
     first = unit.name == part.timings()[0].name
     whole = [one for one in drawn if first or not _is_slow(context.job, one)]
     own, settles = part.settings[0], [one for one in part.settings if one not in drawn]
-    return time_scene(context, whole, [own, *settles], unit.scene_id, int(unit.name.split("/")[2]))
+    return time_scene(context, whole, [own, *settles], unit.scene_id, unit.lap)
 
 
 def _is_slow(job: Job, setting: Setting) -> bool:

@@ -106,11 +106,6 @@ def parts_of(asset: Asset, threshold: float = THRESHOLD, share: float = TOLERANC
         return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
 
 
-def convex_parts(mesh: Mesh, digest: str) -> tuple[Array, ...]:
-    """Vertex clouds [N, 3] of the convex parts of a mesh with this digest, in its own coordinates; see `decompose`."""
-    return decompose(mesh, digest).clouds
-
-
 def decompose(mesh: Mesh, digest: str, threshold: float = THRESHOLD, folder: Path | None = USUAL_FOLDER) -> Parts:
     """Convex parts of a mesh: none reaches out of its hull, and together they have the hull's vertices.
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 from schemas.base import Pose, frozen_array
@@ -80,10 +80,7 @@ def _settle_flat(task: _Task) -> Fall | None:
     damped, because what little Bullet adds in energy at each edge of a bottle on its side, nothing else takes away.
     """
     seconds, physics, asset = 0.0, task.physics, task.start.asset
-    shares = LESS_ROLLING_FRICTION if "rolling_friction" in task.ran else LESS_ROLLING_FRICTION[:1]
-    for share in shares:
-        less = physics.model_copy(update={"rolling_friction": share * physics.rolling_friction})
-        damping = 0.0 if share == 1.0 else DAMPING
+    for less, damping in _less_and_less(task):
         motion = _simulate(dataclasses.replace(task, physics=less, damping=damping), physics.max_settle_s, flat=True)
         if motion.happened is not None:
             return None
@@ -101,6 +98,14 @@ def _settle_flat(task: _Task) -> Fall | None:
     return motion
 
 
+def _less_and_less(task: _Task) -> Iterator[tuple[Physics, float]]:
+    """The physics, and damping, of each time that an object is let go: at first as asked, then with less rolling friction."""
+    physics = task.physics
+    for share in LESS_ROLLING_FRICTION if "rolling_friction" in task.ran else LESS_ROLLING_FRICTION[:1]:
+        less = physics.model_copy(update={"rolling_friction": share * physics.rolling_friction})
+        yield less, 0.0 if share == 1.0 else DAMPING
+
+
 def _settle_on_mesh(task: _Task) -> Fall:
     """Rest on the table's mesh; what rolling friction held out of balance is let go once more with less of it.
 
@@ -108,10 +113,7 @@ def _settle_on_mesh(task: _Task) -> Fall:
     object would in truth tip on.
     """
     seconds, physics = 0.0, task.physics
-    shares = LESS_ROLLING_FRICTION if "rolling_friction" in task.ran else LESS_ROLLING_FRICTION[:1]
-    for share in shares:
-        less = physics.model_copy(update={"rolling_friction": share * physics.rolling_friction})
-        damping = 0.0 if share == 1.0 else DAMPING
+    for less, damping in _less_and_less(task):
         motion = _simulate(dataclasses.replace(task, physics=less, damping=damping), physics.max_settle_s, flat=False)
         _require_rest(task, motion)
         seconds += motion.seconds

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from schemas.base import Pose
 from schemas.errors import SceneError
 from schemas.job import Job
 from schemas.physics import Physics
@@ -16,15 +15,13 @@ from services.tradeoff.knobs import apply
 from services.tradeoff.model import Setting
 from workers.context import WorkerContext
 from workers.geometry.frames import moved_between, transform
-from workers.scene.effect import EffectPlan, Facts
+from workers.scene.effect import Facts
 from workers.scene.effects import plan_effects
-from workers.scene.settle import Rest, moved_by, release_again, settle_scene
+from workers.scene.settle import Rest, moved_by, recheck_scene, settle_scene
 from workers.scene_steps import plan_with_assets
 
 AGREE_MM = 0.05
 """Two finer settings that end nearer than this agree, and a pose has an error."""
-
-RELEASE_S = 1.0
 
 REFERENCES: tuple[Mapping[str, Any], ...] = (
     {"step_hz": 3840, "way_mm": 0.03, "solver_iterations": 400},
@@ -119,15 +116,12 @@ def _apart_mm(plan: ScenePlan, one: Rest, other: Rest) -> float:
 
 def _release(job: Job, plan: ScenePlan, rest: Rest) -> dict[str, float]:
     physics = _physics(job, RELEASED)
-    facts = Facts(job.model_copy(update={"physics": physics}), plan, raycast_checked=False)
-    planned = plan_effects(facts)
-    effects = EffectPlan((*planned.ran, *(name for name in rest.called if name not in planned.ran)), planned.skipped)
-    poses: tuple[Pose, ...] = release_again(plan, rest.settled, physics, effects, RELEASE_S)
-    moves = [
-        moved_by(start, before.T_world_obj, after)
-        for start, before, after in zip(plan.objects, rest.settled, poses, strict=True)
-    ]
-    return {"moved_mm": max(moved for moved, _ in moves), "turned_deg": max(turned for _, turned in moves)}
+    planned = plan_effects(Facts(job.model_copy(update={"physics": physics}), plan, raycast_checked=False))
+    again = recheck_scene(plan, rest, physics, planned).settled
+    return {
+        "moved_mm": max(one.recheck_move_mm or 0.0 for one in again),
+        "turned_deg": max(one.recheck_turn_deg or 0.0 for one in again),
+    }
 
 
 def context_for(context: WorkerContext, setting: Setting) -> WorkerContext:

@@ -15,11 +15,11 @@ from services.tradeoff.choose import (
     choose,
     error_of,
     front,
-    job_tree_with,
     own_row,
     parse_targets,
 )
 from services.tradeoff.errors import ERRORS
+from services.tradeoff.knobs import job_tree_with
 from services.tradeoff.model import Row
 from services.tradeoff.steady import close_calls
 from tests.made_up_studies import large_study, row

@@ -6,7 +6,16 @@ from schemas.errors import InputError
 from schemas.job import Job
 from services.tradeoff import knobs
 from services.tradeoff.errors import ERRORS
-from services.tradeoff.knobs import apply, choose_knobs, groups_of, joined, knobs_of, own_label, set_in, settings_of
+from services.tradeoff.knobs import (
+    apply,
+    choose_knobs,
+    groups_of,
+    job_tree_with,
+    joined,
+    knobs_of,
+    own_label,
+    settings_of,
+)
 from services.tradeoff.model import Setting
 
 JOB = Job(name="t")
@@ -85,9 +94,7 @@ def test_what_is_no_knobs_changes_every_part_of_a_scene():
 
 
 def test_a_key_is_set_in_a_tree_that_lacks_its_branch():
-    tree = {"a": {"b": 1}}
-    set_in(tree, "a.c", 2)
-    set_in(tree, "d.e.f", 3)
+    tree = job_tree_with({"a.c": 2, "d.e.f": 3}, {"a": {"b": 1}})
     assert tree == {"a": {"b": 1, "c": 2}, "d": {"e": {"f": 3}}}
 
 

@@ -17,7 +17,7 @@ from schemas.sources import ProceduralSource
 from workers.assets.procedural.make import make_asset
 from workers.geometry import decompose as module
 from workers.geometry.convexity import components, concavity_m, weld
-from workers.geometry.decompose import convex_parts, decompose
+from workers.geometry.decompose import decompose
 from workers.geometry.hull import convex_hull
 from workers.geometry.parts_cache import PartsCache
 
@@ -225,8 +225,8 @@ def test_another_mesh_under_the_same_digest_is_another_mesh():
     """A digest may be that of a source file, which is the same at every scale."""
     small, large = angle_iron(), angle_iron()
     large = Mesh(large.vertices * 2.0, large.faces)
-    assert np.ptp(np.concatenate(convex_parts(small, "same")), axis=0).max() == pytest.approx(0.1)
-    assert np.ptp(np.concatenate(convex_parts(large, "same")), axis=0).max() == pytest.approx(0.2)
+    assert np.ptp(np.concatenate(decompose(small, "same").clouds), axis=0).max() == pytest.approx(0.1)
+    assert np.ptp(np.concatenate(decompose(large, "same").clouds), axis=0).max() == pytest.approx(0.2)
 
 
 def test_memory_is_bounded_and_the_latest_stay():
