@@ -1,15 +1,12 @@
-"""What a Verso process must find in its environment, and how it gets it.
+"""The environment variables that a process must have for its bytes to be the same everywhere.
 
 numpy, OpenBLAS, Mesa and Python's own hashing read these variables once, while they load; setting them later does
-nothing. So a command that finds another environment starts itself again, once, before it imports anything heavy.
-The launcher and the console script both pass through here; deploy/Dockerfile repeats the table as ENV lines, because
-there it must also hold for what is started without us (`ray start`), and a test keeps the two alike.
+nothing. services/cli/environment.py restarts a command that finds another environment, before anything heavy is imported.
+deploy/Dockerfile repeats the table as ENV lines, because there it must also hold for what is started without this
+project's commands (`ray start`); a test keeps the two alike.
 """
 
-import os
-import sys
 from collections.abc import Mapping
-from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
@@ -52,23 +49,3 @@ def settings_to_change(environ: Mapping[str, str], flags: frozenset[str]) -> dic
     if environ.get(KEEP) == "1":
         return {}
     return {name: value for name, value in stack_environment(flags).items() if environ.get(name) != value}
-
-
-def processor_flags(cpuinfo: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
-    """The features of this machine's first core as Linux names them; empty where it does not say."""
-    try:
-        with cpuinfo.open() as lines:
-            first = next((line for line in lines if line.startswith("flags")), "")
-    except OSError:
-        return frozenset()
-    return frozenset(first.partition(":")[2].split())
-
-
-def enter_stack_environment() -> None:
-    """Return at once if the environment is the stack's; else run this same command line again in it.
-
-    For a command's own start only: the process is replaced, with the same interpreter, options and arguments.
-    """
-    changes = settings_to_change(os.environ, processor_flags())
-    if changes:
-        os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], {**os.environ, **changes})

@@ -11,7 +11,8 @@ from typing import Any, Protocol
 import pytest
 from hypothesis import settings
 
-from schemas.environment import processor_flags, settings_to_change
+from schemas.environment import settings_to_change
+from services.cli.environment import processor_flags
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -3,17 +3,17 @@
 from pathlib import Path
 from typing import Any
 
-from schemas.commit import CommitTerms, Span
-from schemas.layout import FINGERPRINT_FILE, JOB_FILE
-from services.jobfile import validate_job
-from services.jobrecord import encode_job, record_job
-from services.merge import merge
-from services.verify import verify
+from schemas.dataset.commit import CommitTerms, Span
+from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
+from services.job.read import validate_job
+from services.job.record import encode_job, record_job
+from services.merge.step import merge
+from services.read.verify import verify
 from workers.assets.catalogue import open_catalogue
-from workers.context import open_worker
-from workers.fingerprint import take_fingerprint
-from workers.scene_steps import Stopwatch
-from workers.shard import run_scene
+from workers.pipeline.context import open_worker
+from workers.pipeline.fingerprint import take_fingerprint
+from workers.pipeline.make_scene import Stopwatch
+from workers.pipeline.run_shard import run_scene
 from workers.store.attempt import begin_attempt
 from workers.store.local import LocalStore
 

@@ -4,9 +4,9 @@ import hashlib
 
 import numpy as np
 
-from schemas.commit import CommitTerms, Span
-from schemas.layout import IMAGES, asset_path, file_pose_id, image_path, input_pose_id, patch_path
-from schemas.scene import SceneOutput
+from schemas.dataset.commit import CommitTerms, Span
+from schemas.dataset.layout import IMAGES, asset_path, file_pose_id, image_path, input_pose_id, patch_path
+from schemas.scene.scene import SceneOutput
 from workers.store.attempt import Attempt, begin_attempt
 from workers.store.store import Store
 

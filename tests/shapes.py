@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.shape import Asset, MassProperties, Material, Part, Shape
+from schemas.scene.shape import Asset, MassProperties, Material, Part, Shape
 
 
 def shape_of(*meshes: trimesh.Trimesh) -> Shape:

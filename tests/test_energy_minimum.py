@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.job import Job
+from schemas.job.job import Job
 from tests.energy_minimum import is_energy_minimum
 from tests.physics.population import draw
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.frames import pose, rotation_about
-from workers.scene.alone import settle_alone
+from workers.physics.settle_single import settle_alone
 
 
 def ellipsoid(x, y, z):

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.job import Job
-from schemas.scene import REGION_FIRST_OBJECT
-from schemas.shape import Part, Shape
+from schemas.job.job import Job
+from schemas.scene.scene import REGION_FIRST_OBJECT
+from schemas.scene.shape import Part, Shape
 from tests.shapes import asset_of
+from workers.assets.builtin.solid import circle, lathe
 from workers.assets.catalogue import open_catalogue
 from workers.assets.glb import asset_glb
-from workers.assets.procedural.solid import circle, lathe
-from workers.context import WorkerContext
-from workers.render.gbuffer import shared_renderer
-from workers.scene_steps import Stopwatch, make_scene
+from workers.pipeline.context import WorkerContext
+from workers.pipeline.make_scene import Stopwatch, make_scene
+from workers.render.raster.gbuffer import shared_renderer
 
 FACETS = 1000
 

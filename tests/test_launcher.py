@@ -27,7 +27,7 @@ case "$*" in
      [ -e "$FAULTS/pip-fails" ] && exit 1
      [ -e "$FAULTS/pip-hangs" ] && { touch "$FAULTS/hanging"; sleep 60; }
      [ -e "$FAULTS/pip-is-slow" ] && sleep 0.5; true ;;
-  "-P -m services.cli"*) printf '%s|' "${@:4}" "path=${PYTHONPATH-}" "in=$PWD"
+  "-P -m services.cli.main"*) printf '%s|' "${@:4}" "path=${PYTHONPATH-}" "in=$PWD"
      [ ! -e "$FAULTS/exit" ] || exit "$(cat "$FAULTS/exit")" ;;
   *) echo "unexpected: $*" >&2; exit 99 ;;
 esac

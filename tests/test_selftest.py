@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from services import selftest
+from services.cli import selftest
 
 SUITE = """
 import numpy

@@ -21,13 +21,13 @@ import trimesh
 
 from schemas.base import Counts
 from schemas.errors import SceneError
-from schemas.job import Job
-from schemas.scene import Pair, PosedScene
-from services.jobfile import load_job
+from schemas.job.job import Job
+from schemas.scene.scene import Pair, PosedScene
+from services.job.read import load_job
 from workers.assets.catalogue import open_catalogue
-from workers.context import WorkerContext, settings_digest
-from workers.render.gbuffer import shared_renderer
-from workers.scene_steps import Stopwatch, make_scene
+from workers.pipeline.context import WorkerContext, settings_digest
+from workers.pipeline.make_scene import Stopwatch, make_scene
+from workers.render.raster.gbuffer import shared_renderer
 
 JOB = load_job(Path(__file__).resolve().parents[1] / "deploy" / "jobs" / "tabletop.yaml")
 MEDIAN_MM = 0.1

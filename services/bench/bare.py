@@ -12,9 +12,9 @@ from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from schemas.commit import Span
+from schemas.dataset.commit import Span
 from schemas.errors import RunError
-from schemas.job import Job
+from schemas.job.job import Job
 from services.bench.ratios import Lap
 from services.bench.stages import open_workbench
 

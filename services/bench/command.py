@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import InputError
-from schemas.job import Job
-from schemas.start import ONE_OBJECT
+from schemas.job.job import Job
+from schemas.job.start import ONE_OBJECT
 from services.bench.effects import measure_effects
 from services.bench.measure import bench_folder, measure
 from services.bench.others import other_systems
 from services.bench.report import describe, summarise
 from services.bench.traced import measure_traced
-from services.jobfile import load_job, set_key, validate_job
+from services.job.read import load_job, set_key, validate_job
 from workers.store.mounts import file_system_of
 
 

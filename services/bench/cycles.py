@@ -13,18 +13,18 @@ from typing import IO, Any
 import numpy as np
 
 from schemas.base import Array
-from schemas.camera import Camera
 from schemas.errors import MachineError
-from schemas.job import Render
-from schemas.scene import PosedScene
-from schemas.shape import Part
+from schemas.job.job import Render
+from schemas.scene.camera import Camera
+from schemas.scene.scene import PosedScene
+from schemas.scene.shape import Part
 from services.bench.ratios import Lap
 from workers.geometry.frames import transform
-from workers.render.baking import LAMP_RAD
-from workers.render.batches import decode_srgb
-from workers.render.pathlights import GLOW, SKY_PX, sky_directions, sky_picture
-from workers.render.pathmaterials import tint_of
-from workers.render.tiers import shared_tracer
+from workers.geometry.srgb import decode_srgb
+from workers.render.pathtraced.lights import GLOW, SKY_PX, sky_directions, sky_picture
+from workers.render.pathtraced.materials import tint_of
+from workers.render.raster.baking import LAMP_RAD
+from workers.render.step import shared_tracer
 
 SCRIPT = Path(__file__).with_name("cycles_script.py")
 

@@ -14,17 +14,18 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.errors import RunError, SceneError
-from schemas.job import Job
+from schemas.job.job import Job
+from schemas.scene.effects import EffectPlan
 from services.bench.machine import describe_machine, pinned
 from services.bench.ratios import Spread
 from workers.assets.catalogue import open_catalogue
-from workers.context import WorkerContext, settings_digest
-from workers.render.gbuffer import shared_renderer
-from workers.scene.dynamics import PHYSICS_EFFECTS, called_for
-from workers.scene.effect import EffectPlan, Facts
-from workers.scene.effects import plan_effects
-from workers.scene.settle import settle_scene
-from workers.scene_steps import plan_with_assets
+from workers.physics.effects import called_for
+from workers.physics.step import settle_scene
+from workers.pipeline.context import WorkerContext, settings_digest
+from workers.pipeline.make_scene import plan_with_assets
+from workers.plan.effect import Facts
+from workers.plan.effects import PHYSICS_EFFECTS, plan_effects
+from workers.render.raster.gbuffer import shared_renderer
 
 ROUNDS = 3
 """Each scene is settled so often in each way, after once in each way that fills the caches."""

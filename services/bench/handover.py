@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from schemas.base import Pose
-from schemas.job import Job
-from schemas.scene import Pair, Placed
-from schemas.shape import Asset, Mesh, Shape
+from schemas.job.job import Job
+from schemas.scene.scene import Pair, Placed
+from schemas.scene.shape import Asset, Mesh, Shape
 from workers.assets.glb import asset_glb
-from workers.pictures import image_boxes
-from workers.render.batches import SRGB_STEPS, decode_srgb, encode_srgb
-from workers.scene_steps import Scene
+from workers.geometry.srgb import SRGB_STEPS, decode_srgb, encode_srgb
+from workers.pipeline.image_files import image_boxes
+from workers.pipeline.make_scene import Scene
 from workers.store.images import encode_png
 
 URDF = """<robot name="{name}"><link name="base">

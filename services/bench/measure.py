@@ -6,12 +6,12 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from schemas.commit import Span
+from schemas.dataset.commit import Span
 from schemas.errors import MachineError, OutputError
-from schemas.job import Job
+from schemas.job.job import Job
 from services.bench.encoders import Encoder, choose_encoders
-from services.bench.floor import committed_files, images_of, run_floor
 from services.bench.handover import hand_over
+from services.bench.lower_bound import committed_files, images_of, run_floor
 from services.bench.machine import describe_machine, pinned, process_age_s
 from services.bench.others import Side, sides_of
 from services.bench.ratios import Lap

@@ -8,7 +8,7 @@ from itertools import accumulate
 from pathlib import Path
 from statistics import median
 
-from schemas.job import Job
+from schemas.job.job import Job
 from services.bench.machine import peak_resident_mb, resident_mb
 from services.bench.ratios import by_processor, growth
 from services.bench.stages import open_workbench

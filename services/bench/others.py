@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 
-from schemas.job import Job
+from schemas.job.job import Job
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,14 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from schemas.commit import Span
-from schemas.job import Job
+from schemas.dataset.commit import Span
+from schemas.job.job import Job
 from services.bench.bare import bare_processes
 from services.bench.ratios import Lap, Spread, by_processor, idle_share
 from services.bench.stages import bench_order
-from services.coordinator import Limits, Tally, run_spans
-from services.ray_cluster import PREFETCH, private_ray
-from services.run import USUAL_SHARD, group_shards
+from services.run.coordinator import Limits, Tally, run_spans
+from services.run.ray_cluster import PREFETCH, private_ray
+from services.run.step import USUAL_SHARD, group_shards
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.store.local import LocalStore
 

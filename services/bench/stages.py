@@ -4,18 +4,18 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from schemas.commit import CommitRecord, CommitTerms, Span
+from schemas.dataset.commit import CommitRecord, CommitTerms, Span
+from schemas.dataset.shard import ShardOrder
 from schemas.errors import RunError, SceneError
-from schemas.job import Job
-from schemas.report import ShardOrder
+from schemas.job.job import Job
 from services.bench.ratios import Lap
-from workers.allocator import keep_freed_memory
 from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.context import WorkerContext, settings_digest
-from workers.render.context import require_device
-from workers.render.gbuffer import shared_renderer
-from workers.scene_steps import Scene, Stopwatch, make_scene
-from workers.shard import run_span
+from workers.pipeline.allocator import keep_freed_memory
+from workers.pipeline.context import WorkerContext, settings_digest
+from workers.pipeline.make_scene import Scene, Stopwatch, make_scene
+from workers.pipeline.run_shard import run_span
+from workers.render.raster.context import require_device
+from workers.render.raster.gbuffer import shared_renderer
 from workers.store.commit import read_record
 from workers.store.local import LocalStore
 

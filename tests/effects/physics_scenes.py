@@ -5,15 +5,16 @@ from collections.abc import Sequence
 from functools import cache
 
 from schemas.base import Pose
-from schemas.scene import ScenePlan, Settled
-from services.audit_motion import MOST_DEG, MOST_MM
+from schemas.scene.effects import EffectPlan
+from schemas.scene.scene import ScenePlan, Settled
+from services.read.audit_motion import MOST_DEG, MOST_MM
 from tests.effects.scenes import Setting, facts_of
 from tests.hard_cases.drops import Drop
-from workers.scene.effect import EffectPlan, Facts
-from workers.scene.effects import plan_effects
-from workers.scene.fall import Fall, Pace, fall, make_faller
-from workers.scene.settle import Rest, moved_by, release_again, settle_scene
-from workers.scene.watch import watch_gone
+from workers.physics.fall import Fall, Pace, fall, make_faller
+from workers.physics.step import Rest, moved_by, release_again, settle_scene
+from workers.physics.stop_conditions import watch_gone
+from workers.plan.effect import Facts
+from workers.plan.effects import plan_effects
 
 RELEASE_S = 1.0
 
@@ -75,6 +76,6 @@ def drop_on(case: Drop, slab: bool) -> Fall:
     """
     physics = _drawn().job.physics
     ground = case.table.top.height_m if slab else case.table.mesh
-    pace = Pace(physics.step_hz, physics.way_mm / 1e3)
+    pace = Pace(physics.step_hz, physics.max_step_travel_mm / 1e3)
     faller, gone = make_faller(case.start, physics, True), watch_gone(case.table.top.height_m - 0.2)
     return fall([faller], [case.start.T_world_obj], ground, physics, pace, 3.0, 0.0, [gone])

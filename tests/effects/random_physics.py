@@ -10,12 +10,12 @@ import shapely
 import trimesh
 
 from schemas.base import Pose
-from schemas.job import CATEGORIES
-from schemas.scene import ObjectStart, Settled, Table
+from schemas.job.job import CATEGORIES
+from schemas.scene.scene import ObjectStart, Settled, Table
 from tests.effects.physics_cases import on_a_bumpy_table
 from tests.effects.scenes import Setting
 from workers.geometry.frames import transform
-from workers.scene.effect import Facts
+from workers.plan.effect import Facts
 
 TOUCH_M = 1e-4
 """More than this above the table, an object falls."""

@@ -10,19 +10,19 @@ from unittest import mock
 
 import numpy as np
 
-import workers.scene_steps
-from schemas.job import Category, Job
-from schemas.scene import ScenePlan
-from schemas.shape import Part, Shape
-from services.jobfile import validate_job
+import workers.pipeline.make_scene
+from schemas.job.job import Category, Job
+from schemas.scene.effects import EffectPlan
+from schemas.scene.scene import ScenePlan
+from schemas.scene.shape import Part, Shape
+from services.job.read import validate_job
 from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.context import WorkerContext, settings_digest
-from workers.records import record_scene
-from workers.render.gbuffer import shared_renderer
-from workers.scene.check import is_raycast_scene
-from workers.scene.effect import EffectPlan, Facts
-from workers.scene.effects import plan_effects
-from workers.scene_steps import Scene, Stopwatch, make_scene, plan_with_assets
+from workers.pipeline.context import WorkerContext, settings_digest
+from workers.pipeline.make_scene import Scene, Stopwatch, make_scene, plan_with_assets
+from workers.pipeline.rows import record_scene
+from workers.plan.effect import Facts
+from workers.plan.effects import is_raycast_scene, plan_effects
+from workers.render.raster.gbuffer import shared_renderer
 
 SMALL: dict[str, Any] = {
     "name": "effects",
@@ -115,8 +115,8 @@ def make(setting: Setting, forced: str | None = None, left_out: str | None = Non
 
     watch = Stopwatch()
     with (
-        mock.patch.object(workers.scene_steps, "plan_with_assets", draw),
-        mock.patch.object(workers.scene_steps, "plan_effects", leave_out),
+        mock.patch.object(workers.pipeline.make_scene, "plan_with_assets", draw),
+        mock.patch.object(workers.pipeline.make_scene, "plan_effects", leave_out),
     ):
         scene = make_scene(context, setting.scene_id, watch)
     output = record_scene(context, scene, watch)

@@ -8,9 +8,9 @@ import pytest
 from tests.effects.cases import ASKED, NO_OPS, Case
 from tests.effects.physics_cases import PHYSICS
 from tests.effects.scenes import Setting, facts_of, make
-from workers.records import timing_row
-from workers.scene.effects import EFFECTS, names_of_kind, plan_effects, write_receipt
-from workers.scene_steps import Stopwatch
+from workers.pipeline.make_scene import Stopwatch
+from workers.pipeline.rows import timing_row
+from workers.plan.effects import EFFECTS, names_of_kind, plan_effects, write_receipt
 
 CASES: dict[str, Case] = {**PHYSICS, **ASKED, **NO_OPS}
 

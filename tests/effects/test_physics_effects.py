@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from schemas.errors import SettleError
-from schemas.scene import ObjectStart
+from schemas.scene.scene import ObjectStart
 from tests.effects.physics_cases import PHYSICS
 from tests.effects.physics_scenes import drop_on, facts_with, is_still, moved_from, moved_when_forced, settled, without
 from tests.effects.scenes import Setting, facts_of
@@ -16,14 +16,13 @@ from tests.hard_cases.bodies import built_in, cube, mug_on_peg, over_edge, rod
 from tests.hard_cases.drops import EDGE_M, X, Y, drop, level, lowered, ring, turn
 from tests.hard_cases.measures import Z
 from tests.shapes import asset_of
+from workers.geometry.elevation import survey
 from workers.geometry.frames import transform
-from workers.geometry.heights import survey
-from workers.scene.alone import settle_alone
-from workers.scene.clearance import clearances
-from workers.scene.dynamics import PHYSICS_EFFECTS
-from workers.scene.effect import Facts
-from workers.scene.effects import plan_effects
-from workers.scene.landing import gap_m, ground_of, placed_mesh
+from workers.physics.placement import gap_m, ground_of, placed_mesh
+from workers.physics.separation import clearances
+from workers.physics.settle_single import settle_alone
+from workers.plan.effect import Facts
+from workers.plan.effects import PHYSICS_EFFECTS, plan_effects
 
 GAP_MM = 0.1
 """The most that may be between a resting object and what it rests on, or that they may overlap."""

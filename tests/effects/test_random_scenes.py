@@ -7,19 +7,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.camera import Camera
 from schemas.errors import SceneError
-from schemas.job import CATEGORIES
-from schemas.scene import REGION_FLOOR, REGION_TABLE, Placed
+from schemas.job.job import CATEGORIES
+from schemas.scene.camera import Camera
+from schemas.scene.scene import REGION_FLOOR, REGION_TABLE, Placed
 from tests.effects.cases import NO_OPS
 from tests.effects.physics_cases import PHYSICS
 from tests.effects.random_physics import needed, random_physics
 from tests.effects.scenes import Setting, facts_of, make, with_holes, without_textures
+from workers.cameras.placement import place_aligned_camera, place_mirror_camera
 from workers.geometry.raycast import cast_view
-from workers.scene.effect import Facts
-from workers.scene.effects import EFFECTS, names_of_kind, plan_effects
-from workers.scene.settle import settle_scene
-from workers.scene.views import place_aligned_camera, place_mirror_camera
+from workers.physics.step import settle_scene
+from workers.plan.effect import Facts
+from workers.plan.effects import EFFECTS, names_of_kind, plan_effects
 
 SCENES = 200
 

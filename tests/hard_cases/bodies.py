@@ -8,12 +8,12 @@ import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
 
-from schemas.shape import Asset
-from schemas.sources import ProceduralSource
+from schemas.job.assets import ProceduralSource
+from schemas.scene.shape import Asset
 from tests.hard_cases.drops import EDGE_M, Drop, X, drop, level, turn, with_peg
 from tests.shapes import asset_of, box
 from tests.workers.assets.oracles import hits
-from workers.assets.procedural.make import make_asset
+from workers.assets.builtin.make import make_asset
 
 
 def cube(side_m: float = 0.1) -> Asset:

@@ -12,18 +12,20 @@ import numpy as np
 import trimesh
 
 from schemas.base import Array, Pose, Range, frozen_array
-from schemas.camera import Camera, Intrinsics
-from schemas.job import Job
-from schemas.scene import Placed, PosedScene
+from schemas.job.job import Job
+from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.scene import Placed, PosedScene
 from tests.hard_cases.case import refuse
 from tests.shapes import box, shape_of, table
 from tests.workers.render.random_scenes import APPEARANCE, VGA, floor
+from workers.cameras.pivot_depth import object_distance
+from workers.cameras.placement import place_mirror_camera
 from workers.geometry.camera import look_at, orbit_pose, yaw
 from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.geometry.raycast import cast_view, edge_distance_px
-from workers.render.gbuffer import Renderer
-from workers.scene.check import EDGE_PX, check_against_rays
-from workers.scene.views import object_distance, place_mirror_camera, quantise_depth
+from workers.geometry.stored_depth import quantise_depth
+from workers.labels.ray_check import EDGE_PX, check_against_rays
+from workers.render.raster.gbuffer import Renderer
 
 JOB = Job(name="t")
 HOLD = "must hold"

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.base import Array
-from schemas.scene import Settled
+from schemas.scene.scene import Settled
 from tests.hard_cases.groups import Group
+from workers.geometry.elevation import survey
 from workers.geometry.frames import transform
-from workers.geometry.heights import survey
-from workers.scene.clearance import clearances
-from workers.scene.landing import placed_mesh
+from workers.physics.placement import placed_mesh
+from workers.physics.separation import clearances
 
 
 @dataclass(frozen=True)

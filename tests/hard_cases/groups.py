@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.base import Array, frozen_array
-from schemas.scene import ObjectStart, Table
-from schemas.shape import Asset
+from schemas.scene.scene import ObjectStart, Table
+from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import ball, built_in, cube
 from tests.hard_cases.drops import Drop, Y, level, table_of, turn
 from tests.shapes import asset_of, box

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.base import Array
-from schemas.scene import Settled
+from schemas.scene.scene import Settled
 from tests.hard_cases.drops import Drop
 from workers.geometry.frames import transform
-from workers.scene.landing import gap_m, ground_of
+from workers.physics.placement import gap_m, ground_of
 
 Z = np.array([0.0, 0.0, 1.0])
 

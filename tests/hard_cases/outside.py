@@ -10,11 +10,11 @@ import trimesh
 from PIL import Image
 
 from schemas.base import Array
-from schemas.shape import Asset
-from schemas.sources import MeshLimits
+from schemas.job.assets import MeshLimits
+from schemas.scene.shape import Asset
 from tests.shapes import box
 from tests.workers.assets.oracles import textured_cube, write
-from workers.assets.mesh import load_shape
+from workers.assets.external.mesh import load_shape
 from workers.assets.sources import Entry, Placement, SourceShape, Weights, hashed, placed_asset
 
 SIDE_M = 0.1

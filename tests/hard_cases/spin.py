@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from workers.scene import bullet
-from workers.scene.bullet import World
+from workers.physics import bullet
+from workers.physics.bullet import World
 
 
 @contextmanager

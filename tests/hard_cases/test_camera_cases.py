@@ -4,7 +4,7 @@ import pytest
 
 from schemas.errors import SceneError
 from tests.hard_cases.camera_cases import CAMERAS, HOLD
-from workers.render.gbuffer import shared_renderer
+from workers.render.raster.gbuffer import shared_renderer
 
 
 @pytest.mark.parametrize("case", [pytest.param(case, id=case.name) for case in CAMERAS])

@@ -10,19 +10,19 @@ from typing import Any
 import pytest
 
 from schemas.errors import SceneError
-from schemas.job import Job
-from schemas.scene import Settled
+from schemas.job.job import Job
+from schemas.scene.effects import EffectPlan
+from schemas.scene.scene import Settled
 from tests.hard_cases.case import EITHER
 from tests.hard_cases.group_cases import GROUPS, GroupCase
 from tests.hard_cases.group_measures import worst_gap_mm
 from tests.hard_cases.groups import Group
 from tests.hard_cases.test_hard_cases import GAP_MM, MOVED_MM, TURNED_DEG
-from workers.scene.alone import UNBALANCED
-from workers.scene.dynamics import called_for
-from workers.scene.effect import EffectPlan
-from workers.scene.plan import plan_scene
-from workers.scene.settle import moved_by, settle_scene
-from workers.scene.together import release_together
+from workers.physics.effects import called_for
+from workers.physics.settle_group import release_together
+from workers.physics.settle_single import UNBALANCED
+from workers.physics.step import moved_by, settle_scene
+from workers.plan.step import plan_scene
 
 PHYSICS = Job(name="t").physics
 FINEST, WATCHED_S = 16, 1.0

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from schemas.errors import SceneError
-from schemas.job import Job
-from schemas.scene import Settled
+from schemas.job.job import Job
+from schemas.scene.scene import Settled
 from tests.hard_cases.camera_cases import CAMERAS
 from tests.hard_cases.case import EITHER, FALL, SETTLE, Case
 from tests.hard_cases.cases import CASES
@@ -18,8 +18,8 @@ from tests.hard_cases.drops import Drop
 from tests.hard_cases.group_cases import GROUPS
 from tests.hard_cases.measures import gap_mm
 from tests.hard_cases.spin import spinning
-from workers.scene.alone import settle_alone
-from workers.scene.settle import recheck
+from workers.physics.settle_single import settle_alone
+from workers.physics.step import recheck
 
 PHYSICS = Job(name="t").physics
 

@@ -9,12 +9,12 @@ from unittest import mock
 import numpy as np
 
 from schemas.base import Array
-from schemas.shape import Asset
+from schemas.scene.shape import Asset
 from tests.physics.room import G
 from workers.geometry.frames import rotation_from_quaternion
-from workers.scene import bullet
-from workers.scene.bullet import World
-from workers.scene.fall import body_frame
+from workers.physics import bullet
+from workers.physics.bullet import World
+from workers.physics.fall import body_frame
 
 SHARE = 1e-3
 """Of the energy that the drop sets free."""

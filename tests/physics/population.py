@@ -17,18 +17,18 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.errors import SceneError
-from schemas.job import Job
-from schemas.scene import ScenePlan, Table
-from schemas.shape import Mesh
+from schemas.job.job import Job
+from schemas.scene.scene import ScenePlan, Table
+from schemas.scene.shape import Mesh
 from tests.physics.energy import watched, worst_of
 from tests.physics.room import G
 from workers.assets.catalogue import Catalogue, choose_object, choose_table, load_asset, open_catalogue
+from workers.geometry.elevation import heights_at
 from workers.geometry.frames import transform
-from workers.geometry.heights import heights_at
-from workers.scene.alone import settle_alone
-from workers.scene.plan import choose_category, plan_scene
-from workers.scene.randomness import Stream, stream
-from workers.scene.settle import recheck
+from workers.physics.settle_single import settle_alone
+from workers.physics.step import recheck
+from workers.plan.randomness import Stream, stream
+from workers.plan.step import choose_category, plan_scene
 
 GAP_MM, MOVE_MM, TURN_DEG = 0.1, 0.1, 0.1
 

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from schemas.base import Array, Pose
-from schemas.job import Job
-from schemas.physics import Physics
+from schemas.job.job import Job
+from schemas.job.physics import Physics
 from workers.geometry.frames import pose, rotation_about
-from workers.scene.bullet import GRAVITY_M_S2, Body, World
+from workers.physics.bullet import GRAVITY_M_S2, Body, World
 
 G = GRAVITY_M_S2
 PHYSICS = Job(name="t").physics

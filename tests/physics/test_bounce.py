@@ -3,7 +3,7 @@
 import pytest
 
 from tests.physics.room import at, ball_body, physics
-from workers.scene.bullet import drop
+from workers.physics.bullet import drop
 
 RADIUS_M = 0.05
 RATES_HZ = (480, 960, 1920, 3840)

@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 
 from schemas.errors import SettleError
-from schemas.job import Job
-from schemas.shape import Asset
-from schemas.sources import ProceduralSource
+from schemas.job.assets import ProceduralSource
+from schemas.job.job import Job
+from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import cube
 from tests.hard_cases.groups import dominoes, pile, stack
 from tests.physics.energy import Rise, watched, worst_of
 from tests.physics.population import try_scene
 from tests.physics.room import PHYSICS, G, physics
 from tests.shapes import asset_of, box, table
+from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
-from workers.assets.procedural.make import make_asset
-from workers.scene.alone import settle_alone
-from workers.scene.dynamics import called_for
-from workers.scene.plan import draw_start
-from workers.scene.support import place_table
-from workers.scene.together import settle_together
+from workers.physics.effects import called_for
+from workers.physics.settle_group import settle_together
+from workers.physics.settle_single import settle_alone
+from workers.physics.table_top import place_table
+from workers.plan.step import draw_start
 
 TABLE = place_table(table())
 SEEDS = 20
@@ -45,7 +45,11 @@ def worst_rise(category: str, start: str, seed: int, refine: int = 1) -> Rise:
     job = Job.model_validate({"name": "t", "seed": seed, "start": {"pose": start}})
     drawn = draw_start(job, seed, asset, TABLE)
     with watched([asset]) as falls, suppress(SettleError):  # that it rests is another test's
-        settle_alone(drawn, TABLE, physics(step_hz=PHYSICS.step_hz * refine, way_mm=PHYSICS.way_mm / refine))
+        settle_alone(
+            drawn,
+            TABLE,
+            physics(step_hz=PHYSICS.step_hz * refine, max_step_travel_mm=PHYSICS.max_step_travel_mm / refine),
+        )
     return worst_of(falls(), asset.mass.mass_kg * G)
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from tests.physics.room import RATES_HZ, G, advance, at, box_body, order, physics
-from workers.scene.bullet import drop
+from workers.physics.bullet import drop
 
 FALL_S = 0.5
 HEIGHT_M = 3.0

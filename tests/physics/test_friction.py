@@ -5,7 +5,7 @@ import math
 import pytest
 
 from tests.physics.room import MARGIN_M, PHYSICS, G, advance, at, box_body, order, physics, slope
-from workers.scene.bullet import drop
+from workers.physics.bullet import drop
 
 MU = PHYSICS.friction**2
 CRITICAL_RAD = math.atan(MU)

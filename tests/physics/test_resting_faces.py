@@ -13,17 +13,17 @@ from scipy.spatial import ConvexHull
 from scipy.stats import chi2_contingency
 
 from schemas.base import Array
-from schemas.job import Job
-from schemas.physics import Physics
-from schemas.shape import Asset
+from schemas.job.job import Job
+from schemas.job.physics import Physics
+from schemas.scene.shape import Asset
 from tests.physics.room import PHYSICS, physics
 from tests.shapes import asset_of, box, table
 from workers.geometry.frames import pose, rotation_between, transform
 from workers.geometry.hull import convex_hull
-from workers.scene.alone import settle_alone
-from workers.scene.contact import DOWN, SAME_PLANE_M, support_margin
-from workers.scene.plan import draw_start
-from workers.scene.support import place_table
+from workers.physics.rest_pose import DOWN, SAME_PLANE_M, support_margin
+from workers.physics.settle_single import settle_alone
+from workers.physics.table_top import place_table
+from workers.plan.step import draw_start
 
 TABLE = place_table(table())
 SIGNIFICANCE = 0.001

@@ -3,7 +3,7 @@
 import pytest
 
 from tests.physics.room import PHYSICS, RATES_HZ, G, advance, at, ball_body, physics
-from workers.scene.bullet import drop
+from workers.physics.bullet import drop
 
 RADIUS_M = 0.05
 ARM_M = 2 * PHYSICS.rolling_friction * PHYSICS.friction

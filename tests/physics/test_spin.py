@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from schemas.base import Array
 from tests.physics.room import advance, at, box_body, order, physics
 from workers.geometry.frames import rotation_from_quaternion
-from workers.scene.bullet import drop
+from workers.physics.bullet import drop
 
 BOX = box_body(0.02, 0.06, 0.1)
 """Its intermediate axis is y."""

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from schemas.physics import Physics
+from schemas.job.physics import Physics
 from tests.physics.room import G, advance, at, box_body, lean, order, physics, slope
-from workers.scene.bullet import drop
+from workers.physics.bullet import drop
 
 WIDTH_M, HEIGHT_M = 0.06, 0.2
 MARGIN_M = 1e-6

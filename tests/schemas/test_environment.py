@@ -8,13 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from schemas.environment import KEEP, STACK_ENVIRONMENT, WITH_AVX2, processor_flags, settings_to_change
+from schemas.environment import KEEP, STACK_ENVIRONMENT, WITH_AVX2, settings_to_change
+from services.cli.environment import processor_flags
 
 ROOT = Path(__file__).resolve().parents[2]
 
 PRINT_ENVIRONMENT = """
 import json, os, sys
-from schemas.environment import enter_stack_environment
+from services.cli.environment import enter_stack_environment
 enter_stack_environment()
 print(json.dumps([dict(os.environ), sys.argv, hash("verso"), sys.flags.safe_path]))
 """
@@ -86,7 +87,11 @@ def test_numpy_runs_without_avx512_and_does_not_complain():
 
 
 @pytest.mark.parametrize(
-    "door", [["-P", "-m", "services.cli", "--version"], ["-P", "-c", "import services.cli as c; c.main()", "--version"]]
+    "door",
+    [
+        ["-P", "-m", "services.cli.main", "--version"],
+        ["-P", "-c", "import services.cli.main as c; c.main()", "--version"],
+    ],
 )
 def test_the_command_line_runs_in_the_stacks_environment_through_either_door(tmp_path, door):
     starts = tmp_path / "starts"

@@ -4,7 +4,7 @@ import sys
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 
-from schemas.shape import Asset
+from schemas.scene.shape import Asset
 
 
 def asset_bytes(asset: Asset) -> int:

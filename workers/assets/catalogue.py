@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.shape import Asset
-from schemas.sources import Assets, FolderSource, ProceduralSource, ShapeNetSource, SplitShares
+from schemas.job.assets import Assets, FolderSource, ProceduralSource, ShapeNetSource, SplitShares
+from schemas.scene.shape import Asset
+from workers.assets.builtin.make import VERSION, instance_id, make_asset
 from workers.assets.cache import AssetCache
-from workers.assets.procedural.make import VERSION, instance_id, make_asset
-from workers.assets.shapenet import list_shapenet, load_shapenet
+from workers.assets.external.folder import list_folder, load_folder_entry, locate_folder
+from workers.assets.external.shapenet import list_shapenet, load_shapenet
 from workers.assets.sources import TABLE, Entry, Listing, Weights
-from workers.assets.urdf import list_folder, load_folder_entry, locate_folder
 
 AnySource = ProceduralSource | ShapeNetSource | FolderSource
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from schemas.shape import Asset, Part
-from workers.assets.materials import linear_from_srgb
+from schemas.scene.shape import Asset, Part
+from workers.assets.external.materials import linear_from_srgb
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963

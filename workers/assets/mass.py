@@ -3,8 +3,8 @@
 import numpy as np
 
 from schemas.base import Array, frozen_array
-from schemas.shape import MassProperties, Shape
-from workers.assets.topology import is_solid
+from schemas.scene.shape import MassProperties, Shape
+from workers.assets.external.topology import is_solid
 
 
 def mass_properties(shape: Shape, density_kg_m3: float, shell_kg_m2: float) -> MassProperties:

@@ -11,11 +11,10 @@ import numpy as np
 
 from schemas.base import Array, frozen_array
 from schemas.errors import MeshError
-from schemas.shape import Asset, MassProperties, Shape
-from schemas.sources import MeshLimits
-from workers.assets.mass import mass_properties
-from workers.assets.mesh import transform_shape
-from workers.assets.reading import (
+from schemas.job.assets import MeshLimits
+from schemas.scene.shape import Asset, MassProperties, Shape
+from workers.assets.external.mesh import transform_shape
+from workers.assets.external.reading import (
     FolderResolver,
     check_counts,
     declared_counts,
@@ -23,6 +22,7 @@ from workers.assets.reading import (
     may_be_too_large,
     read_bytes,
 )
+from workers.assets.mass import mass_properties
 
 TABLE = "table"
 """The category name of tables."""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
-from schemas.camera import Intrinsics
+from schemas.scene.camera import Intrinsics
 from workers.geometry.frames import UP, pose
 
 

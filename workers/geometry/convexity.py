@@ -7,7 +7,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from schemas.base import Array
-from schemas.shape import Mesh
+from schemas.scene.shape import Mesh
 from workers.geometry.manifold import hold_to_one_thread
 from workers.geometry.nearest import nearest_on_mesh
 

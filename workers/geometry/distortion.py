@@ -3,8 +3,8 @@
 import numpy as np
 
 from schemas.base import Array
-from schemas.camera import Intrinsics
-from schemas.sensor import Distortion
+from schemas.job.sensor import Distortion
+from schemas.scene.camera import Intrinsics
 
 STEPS = 20
 """Of Newton's method; a lens that can be inverted needs fewer than ten."""

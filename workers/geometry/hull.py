@@ -5,7 +5,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from schemas.base import Array, frozen_array
-from schemas.shape import Hull
+from schemas.scene.shape import Hull
 from workers.geometry.manifold import hold_to_one_thread
 
 THIN = 1e-4

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.shape import Mesh
-from workers.geometry.loops import compiled
+from schemas.scene.shape import Mesh
+from workers.geometry.jit import compiled
 
 
 def nearest_on_mesh(points: Array, mesh: Mesh, within_m: float = np.inf) -> tuple[Array, NDArray[np.int64]]:

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.camera import Camera
-from workers.geometry.loops import compiled
+from schemas.scene.camera import Camera
+from workers.geometry.jit import compiled
 
 Depth = NDArray[np.floating] | NDArray[np.uint16]
 """[H, W] z along the optical axis, in units of which there are `units_per_m`; 0 where there is none."""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from workers.geometry.loops import compiled
+from workers.geometry.jit import compiled
 
 
 class Extent(NamedTuple):

@@ -15,8 +15,8 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.camera import Camera
-from schemas.scene import Placed
+from schemas.scene.camera import Camera
+from schemas.scene.scene import Placed
 from workers.geometry.frames import invert, transform
 
 NEAR_M = 0.05

@@ -11,11 +11,11 @@ from collections.abc import Iterator, Mapping
 
 import pyarrow as pa
 
-from schemas.commit import CommitRecord, CommitResult, CommitTerms, FileEntry, SceneMark, Span, TableEntry
+from schemas.dataset.commit import CommitRecord, CommitResult, CommitTerms, FileEntry, SceneMark, Span, TableEntry
+from schemas.dataset.layout import commit_path, range_table_path, staging_path
+from schemas.dataset.tables import SCHEMA_VERSION, SCHEMAS, TABLES
 from schemas.errors import OutputError, RunError
-from schemas.layout import commit_path, range_table_path, staging_path
-from schemas.manifest import SCHEMA_VERSION, SCHEMAS, TABLES
-from schemas.scene import SceneOutput
+from schemas.scene.scene import SceneOutput
 from workers.store.canonical import rows_digest
 from workers.store.commit import compare_records, encode_record, publish, read_record
 from workers.store.manifest import encode_table, sorted_rows, table_of_rows

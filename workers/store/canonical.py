@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from schemas.manifest import SCHEMAS
+from schemas.dataset.tables import SCHEMAS
 
 _PRIMITIVES: dict[pa.DataType, tuple[str, float | bool]] = {
     pa.float64(): ("<f8", 0.0),

@@ -12,10 +12,10 @@ from collections.abc import Iterator
 
 from pydantic import ValidationError
 
-from schemas.commit import CommitRecord, CommitSummary, FileEntry
+from schemas.dataset.commit import CommitRecord, CommitSummary, FileEntry
+from schemas.dataset.layout import ASSETS, COMMITS, commit_path, staging_path
+from schemas.dataset.tables import SCHEMA_VERSION
 from schemas.errors import CommitConflict, CorruptError, OutputError
-from schemas.layout import ASSETS, COMMITS, commit_path, staging_path
-from schemas.manifest import SCHEMA_VERSION
 from workers.store.store import Store, fenced_key
 
 _NAME = re.compile(r"(\d{10,})(?:\.retry-(\d+))?\.json")

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO
 
+from schemas.dataset.layout import COMMITS, RANGES, STAGING
 from schemas.errors import OutputError
-from schemas.layout import COMMITS, RANGES, STAGING
 from workers.store.disk_errors import told_plainly
 from workers.store.durable import sync_file, sync_folder, sync_folders, sync_tree
 from workers.store.probe import probe_folder

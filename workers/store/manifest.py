@@ -7,8 +7,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from schemas.dataset.tables import SCHEMAS, SORT_KEYS
 from schemas.errors import CorruptError
-from schemas.manifest import SCHEMAS, SORT_KEYS
 
 PARQUET_OPTIONS = {"compression": "zstd", "write_page_checksum": True}
 """Every Parquet file of a dataset: a flipped bit is found when the page is read."""

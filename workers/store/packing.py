@@ -7,8 +7,8 @@ import weakref
 from collections.abc import Iterable, Iterator, Mapping
 from typing import IO, Protocol
 
-from schemas.commit import CommitRecord, FileEntry, Span
-from schemas.layout import ASSETS, RANGES
+from schemas.dataset.commit import CommitRecord, FileEntry, Span
+from schemas.dataset.layout import ASSETS, RANGES
 from workers.store.commit import read_committed
 from workers.store.store import Store
 from workers.store.tars import member_header, member_of, member_order, read_tar, tar_path

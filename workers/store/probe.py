@@ -5,8 +5,8 @@ import os
 import uuid
 from pathlib import Path
 
+from schemas.dataset.layout import COMMITS
 from schemas.errors import OutputError
-from schemas.layout import COMMITS
 from workers.store.durable import sync_file, sync_folder
 from workers.store.mounts import file_system_of
 from workers.store.store import PROBE_PREFIX, TEMPORARY

@@ -9,10 +9,10 @@ from typing import Any, cast
 import numpy as np
 import pyarrow as pa
 
-from schemas.commit import FileEntry, Outcome
-from schemas.layout import ASSETS
-from schemas.manifest import DETERMINISTIC_TABLES, SORT_KEYS
-from schemas.scene import SceneOutput
+from schemas.dataset.commit import FileEntry, Outcome
+from schemas.dataset.layout import ASSETS
+from schemas.dataset.tables import DETERMINISTIC_TABLES, SORT_KEYS
+from schemas.scene.scene import SceneOutput
 
 _UNSAFE = re.compile(r"[\x00-\x1f\x7f\\]")
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, NamedTuple, Protocol
 
-from schemas.layout import STAGING
+from schemas.dataset.layout import STAGING
 
 TEMPORARY = f"{STAGING}/_tmp"
 """Files on their way to `put_if_absent` and `write_whole`; one that a killed process left is swept."""

@@ -2,8 +2,8 @@
 
 from collections.abc import Collection
 
+from schemas.dataset.layout import COMMITS, STAGING, commit_path, staging_path
 from schemas.errors import CorruptError
-from schemas.layout import COMMITS, STAGING, commit_path, staging_path
 from workers.store.attempt import retry_of_attempt
 from workers.store.commit import publish, read_record
 from workers.store.store import PROBE_PREFIX, TEMPORARY, Store, fenced_key

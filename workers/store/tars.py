@@ -10,8 +10,8 @@ import re
 import tarfile
 from collections.abc import Iterator
 
+from schemas.dataset.layout import IMAGES, range_key
 from schemas.errors import CorruptError
-from schemas.layout import IMAGES, range_key
 
 _PATH = re.compile(
     r"(?P<category>[^/]+)/(?P<patch>patches/)?(?P<content>[A-Za-z]+)(?P<pose>\d{5,})(?:obj(?P<object>\d+))?\.png"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from schemas.errors import RunError
-from schemas.job import Job
+from schemas.job.job import Job
 from services.bench import effects
 from services.bench.effects import (
     EVERYTHING,
@@ -24,8 +24,8 @@ from services.bench.effects import (
 from tests.effects.physics_scenes import facts_with
 from tests.hard_cases.bodies import cube
 from tests.hard_cases.drops import drop, level
-from workers.scene.dynamics import PREDICATES
-from workers.scene.effects import names_of_kind
+from workers.physics.effects import PREDICATES
+from workers.plan.effects import names_of_kind
 
 NEVER = np.full((2, 3), np.nan)
 

@@ -5,7 +5,7 @@ import pytest
 from services.bench.bare import bare_processes
 from services.bench.ratios import Lap, Spread
 from services.bench.scaling import Gain, measure_scaling
-from services.jobfile import validate_job
+from services.job.read import validate_job
 
 SMALL = {
     "name": "small",

@@ -11,13 +11,13 @@ import pytest
 from schemas.errors import MachineError
 from services.bench import others
 from services.bench.encoders import choose_encoders, encoders, kind_of
-from services.bench.floor import committed_files, images_of, run_floor, write_durably
 from services.bench.handover import hand_over
+from services.bench.lower_bound import committed_files, images_of, run_floor, write_durably
 from services.bench.machine import pinned
 from services.bench.side_process import side_process
 from services.bench.stages import open_workbench
-from services.cli import main
-from services.jobfile import validate_job
+from services.cli.main import main
+from services.job.read import validate_job
 
 SMALL = {
     "name": "small",

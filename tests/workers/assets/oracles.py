@@ -7,7 +7,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from schemas.base import Array, frozen_array
-from schemas.shape import Part, Shape
+from schemas.scene.shape import Part, Shape
 
 
 def shape_of(*meshes: trimesh.Trimesh) -> Shape:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job import CATEGORIES
-from schemas.sources import Assets, FolderSource, ProceduralSource, ShapeNetSource, SplitShares
+from schemas.job.assets import Assets, FolderSource, ProceduralSource, ShapeNetSource, SplitShares
+from schemas.job.job import CATEGORIES
 from tests.workers.assets.oracles import CUBE, write
 from workers.assets.catalogue import choose_object, choose_table, load_asset, open_catalogue, split_of
 

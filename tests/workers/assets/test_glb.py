@@ -9,14 +9,14 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.job import CATEGORIES
-from schemas.shape import Material, Part, Shape
-from schemas.sources import MeshLimits, ProceduralSource
+from schemas.job.assets import MeshLimits, ProceduralSource
+from schemas.job.job import CATEGORIES
+from schemas.scene.shape import Material, Part, Shape
 from tests.shapes import asset_of
 from tests.workers.assets.oracles import welded, write
+from workers.assets.builtin.make import make_asset
+from workers.assets.external.mesh import load_shape
 from workers.assets.glb import asset_glb
-from workers.assets.mesh import load_shape
-from workers.assets.procedural.make import make_asset
 
 SOURCE = ProceduralSource(source="procedural")
 

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from schemas.errors import MeshError
-from schemas.sources import MeshLimits
+from schemas.job.assets import MeshLimits
 from tests.workers.assets.oracles import CUBE, shape_of, welded, write
 from workers.assets.sources import (
     UP_AXES,

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from schemas.camera import Intrinsics
+from schemas.scene.camera import Intrinsics
 from workers.geometry.camera import image_coordinates, inclination, look_at, orbit_pose, project, unproject, yaw
 from workers.geometry.frames import translation
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from schemas.job import CATEGORIES
-from schemas.sources import ProceduralSource
-from workers.assets.procedural.make import make_asset
+from schemas.job.assets import ProceduralSource
+from schemas.job.job import CATEGORIES
+from workers.assets.builtin.make import make_asset
 from workers.geometry.hull import MOST_VERTICES, convex_hull
 
 SOURCE = ProceduralSource(source="procedural")

@@ -10,7 +10,7 @@ import pytest
 COUNT = """
 import os, re
 import numpy as np
-from workers.assets.procedural.make import make_model
+from workers.assets.builtin.make import make_model
 from workers.geometry.hull import convex_hull
 threads = lambda: int(re.search(r"Threads:\\s+(\\d+)", open("/proc/self/status").read()).group(1))
 before, cores = threads(), os.sched_getaffinity(0)

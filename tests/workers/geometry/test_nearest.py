@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.shape import Mesh
+from schemas.scene.shape import Mesh
 from workers.geometry.nearest import nearest_on_mesh
 
 

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from workers.geometry.loops import compiled
+from workers.geometry.jit import compiled
 from workers.geometry.pixels import Extent, count_filled, measure_regions, round_depth, take_colours
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from workers.render.gbuffer import Renderer, shared_renderer
+from workers.render.raster.gbuffer import Renderer, shared_renderer
 
 
 @pytest.fixture(scope="session")

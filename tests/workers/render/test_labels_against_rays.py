@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import pytest
 
-from schemas.camera import Camera
-from schemas.scene import Placed
+from schemas.scene.camera import Camera
+from schemas.scene.scene import Placed
 from tests.workers.render.random_scenes import (
     APPEARANCE,
     VGA,
@@ -18,7 +18,7 @@ from tests.workers.render.random_scenes import (
     random_things,
 )
 from workers.geometry.raycast import cast_view, edge_distance_px
-from workers.render.gbuffer import Renderer
+from workers.render.raster.gbuffer import Renderer
 
 EDGE_PX = 1 / 64
 """A pixel centre nearer than this to a projected edge may fall to either side."""

@@ -3,11 +3,11 @@ import hashlib
 
 import pytest
 
-from schemas.commit import Span
+from schemas.dataset.commit import Span
+from schemas.dataset.layout import STAGING, commit_path, range_table_path
+from schemas.dataset.tables import TABLES
 from schemas.errors import RunError
-from schemas.layout import STAGING, commit_path, range_table_path
-from schemas.manifest import TABLES
-from schemas.scene import SceneOutput
+from schemas.scene.scene import SceneOutput
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene, terms
 from workers.store.attempt import attempts_at, begin_attempt, blamed_scene, retry_of_attempt
 from workers.store.commit import read_record

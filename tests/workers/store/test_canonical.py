@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.manifest import SCHEMAS, TABLES
+from schemas.dataset.tables import SCHEMAS, TABLES
 from tests.made_up_scenes import failed_scene, made_scene
 from workers.store.canonical import TableDigest, rows_digest
 from workers.store.manifest import table_of_rows

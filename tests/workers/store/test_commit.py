@@ -2,8 +2,8 @@ import json
 
 import pytest
 
+from schemas.dataset.layout import STAGING, commit_path
 from schemas.errors import CommitConflict, CorruptError, OutputError
-from schemas.layout import STAGING, commit_path
 from tests.made_up_scenes import attempt_at, made_scene, terms
 from workers.store.commit import (
     check_published,

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from schemas.dataset.layout import STAGING
 from schemas.errors import RunError
-from schemas.layout import STAGING
-from services.merge import merge
-from services.ranges import committed_ranges, list_commits, plan_ranges
+from services.merge.step import merge
+from services.run.range_planner import committed_ranges, list_commits, plan_ranges
 from tests.disk_faults import Killed, disk, lose_power
 from tests.made_up_scenes import attempt_at, small_scene, terms
 from workers.store.commit import check_published, iter_records, publish

@@ -3,8 +3,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError
-from schemas.manifest import SCHEMAS, TABLES
 from tests.made_up_scenes import failed_scene, made_scene
 from workers.store.manifest import decode_table, encode_table, sorted_rows, table_of_rows
 

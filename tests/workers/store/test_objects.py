@@ -5,14 +5,14 @@ import pytest
 from obstore.store import HTTPStore, MemoryStore, S3Store
 from obstore.store import LocalStore as FolderStore
 
-from schemas.commit import Span
+from schemas.dataset.commit import Span
+from schemas.dataset.layout import STAGING
 from schemas.errors import MachineError, OutputError, RunError
-from schemas.layout import STAGING
-from services.lock import Beat, hold_lock, read_holder
-from services.merge import merge, read_success
-from services.query import query
-from services.ranges import committed_ranges, list_commits, plan_ranges
-from services.status import read_status
+from services.merge.step import merge, read_success
+from services.read.query import query
+from services.read.status import read_status
+from services.run.lock import Beat, hold_lock, read_holder
+from services.run.range_planner import committed_ranges, list_commits, plan_ranges
 from tests.made_up_scenes import attempt_at, made_scene, scene, small_scene, terms
 from tests.s3_server import Bucket, s3_server
 from workers.store import objects

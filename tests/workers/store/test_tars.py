@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from schemas.dataset.layout import IMAGES, image_path, patch_path
 from schemas.errors import CorruptError
-from schemas.layout import IMAGES, image_path, patch_path
 from tests.made_up_scenes import attempt_at, made_scene, scene, terms
 from workers.store.local import LocalStore
 from workers.store.packing import read_images

@@ -1,0 +1,171 @@
+"""Shapes in memory: parts with materials, and what is known of an asset. Arrays are read-only."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array, Pose
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Bare triangles: vertices [V, 3] float64 metres, faces [F, 3] int32."""
+
+    vertices: Array
+    faces: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class Hull:
+    """A convex hull: its vertices [V, 3] float64, and the unit outward normals [F, 3] of its triangles."""
+
+    vertices: Array
+    normals: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """A surface in the terms of glTF's metallic-roughness model.
+
+    `base_color` is sRGB with straight alpha, each in [0, 1]; it multiplies the texture and the vertex colours.
+    `texture` is [h, w, 3 or 4] uint8 sRGB, row 0 at the top; uv (0, 0) is its lower left corner (OpenGL, trimesh).
+    `transmission` is the share of what is not mirrored that crosses the surface as through glass, for the path-traced tier
+    alone; `transmission_map` [h, w] uint8 multiplies it, and `ior` is the index of refraction. A surface that transmits is a
+    thin sheet there; an `ior` of 1 lets all light pass, as on the second side of a wall whose first stands for both.
+    """
+
+    base_color: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
+    metallic: float = 0.0
+    roughness: float = 0.6
+    texture: NDArray[np.uint8] | None = None
+    transmission: float = 0.0
+    transmission_map: NDArray[np.uint8] | None = None
+    ior: float = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One triangle mesh with one material.
+
+    vertices [V, 3] float64 metres; faces [F, 3] int32, counter-clockwise seen from outside; normals [V, 3] float64 unit
+    shading normals or None (flat); uv [V, 2] float64 or None; colors [V, 4] uint8 sRGB or None.
+    """
+
+    name: str
+    vertices: Array
+    faces: NDArray[np.int32]
+    material: Material = Material()
+    normals: Array | None = None
+    uv: Array | None = None
+    colors: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """The parts of one rigid thing, all in one frame.
+
+    `closed`: together they are closed bodies, wound outwards, so that from outside no back of a face is seen.
+    """
+
+    parts: tuple[Part, ...]
+    closed: bool = False
+
+    @property
+    def vertices(self) -> Array:
+        """[V, 3] float64: the vertices of every part, in order."""
+        return np.concatenate([part.vertices for part in self.parts])
+
+    @property
+    def faces(self) -> NDArray[np.int32]:
+        """[F, 3] int32 into `vertices`."""
+        starts = np.cumsum([0] + [len(part.vertices) for part in self.parts[:-1]])
+        return np.concatenate([part.faces + start for part, start in zip(self.parts, starts, strict=True)]).astype(
+            np.int32
+        )
+
+    @property
+    def mesh(self) -> Mesh:
+        """All parts as one mesh, without their materials."""
+        return Mesh(self.vertices, self.faces)
+
+    @property
+    def bounds(self) -> Array:
+        """[2, 3] float64: lower and upper corner of the axis-aligned bounding box."""
+        vertices = self.vertices
+        return np.stack([vertices.min(axis=0), vertices.max(axis=0)])
+
+
+@dataclass(frozen=True, eq=False)
+class Loft:
+    """A body whose making is known, from which its convex parts follow (`workers.geometry.lathe_decomposition`).
+
+    rings [L, n, 3] metres, each convex and counter-clockwise seen from the end; ends [2, 3]: the points that close it by
+    fans. profiles [K, L + 2, 2]: radius and height of the first end, of every ring and of the last end, where all rings have
+    one axis and are level on it; they may then turn inwards and back. K such, where the columns of the rings differ, of the
+    most unlike columns. None where rings lie askew, each beyond the one before. What `cutters` hold is not in it.
+    """
+
+    rings: Array
+    ends: Array
+    profiles: Array | None = None
+    cutters: tuple["Loft", ...] = ()
+
+    def mapped(self, axes: Array, origin: Array) -> "Loft":
+        """The loft with its x, y, z along the rows of `axes` [3, 3], of any length and no mirror, and its origin at `origin`."""
+        rings, ends = (
+            p[..., 0:1] * axes[0] + p[..., 1:2] * axes[1] + p[..., 2:3] * axes[2] + origin
+            for p in (self.rings, self.ends)
+        )
+        lengths = np.sqrt((axes * axes).sum(axis=1))[[0, 2]]
+        profiles = None if self.profiles is None else self.profiles * lengths
+        return Loft(rings, ends, profiles, tuple(cutter.mapped(axes, origin) for cutter in self.cutters))
+
+
+@dataclass(frozen=True, eq=False)
+class MassProperties:
+    """Of the true mesh, not of its collision shape.
+
+    mass_kg; com [3] metres in the object frame; inertia [3, 3] kg m^2 about the centre of mass, object axes.
+    `solid` tells a watertight solid from a mesh treated as a thin shell.
+    """
+
+    mass_kg: float
+    com: Array
+    inertia: Array
+    solid: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Asset:
+    """A shape that is ready for a scene: cleaned, metric, in the object frame (dataset.md section 1).
+
+    `source` names where it comes from (`procedural`, `shapenet`, `urdf`), `path` the file within that source or None,
+    `sha256` the digest of the source file, or of the generated arrays where there is none. `T_source_to_object` takes
+    the source's coordinates, *after* multiplying them by `scale`, to the object frame. `shareable` says whether the
+    cleaned mesh may be written into the dataset. `volume_m3` is None where the mesh is not watertight.
+    `notes` says what of the source was mended or left out, such as a texture that is missing. `lofts`: what the shape is the
+    union of, object frame, where that is known.
+    """
+
+    instance_id: str
+    category: str
+    source: str
+    licence: str
+    path: str | None
+    sha256: str
+    shape: Shape
+    mass: MassProperties
+    T_source_to_object: Pose
+    scale: float
+    watertight: bool
+    volume_m3: float | None
+    shareable: bool
+    notes: tuple[str, ...] = ()
+    lofts: tuple[Loft, ...] | None = None
+
+    @property
+    def extents_m(self) -> Array:
+        """[3] float64: size of the bounding box along the object axes."""
+        lower, upper = self.shape.bounds
+        return upper - lower

@@ -1,0 +1,180 @@
+"""What each command prints. Each takes the parsed arguments and returns an exit code."""
+
+import argparse
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from schemas.dataset.layout import JOB_FILE
+from schemas.errors import OutputError
+from services.job.read import load_job
+
+if TYPE_CHECKING:
+    from services.read.audit import Audit
+    from workers.store.store import Store
+
+
+def run(options: argparse.Namespace) -> int:
+    """`verso run`."""
+    from services.run.step import RunRequest, describe_plan, run_job
+
+    job = load_job(options.job, _changes(options))
+    out = options.out or f"data/{job.name}"
+    absolute = out if "://" in out else str(Path(out).resolve())
+    request = RunRequest(job, options.job.parent, absolute, options.address, options.retry_failed)
+    if options.dry_run:
+        print("\n".join(describe_plan(request)))
+        return 0
+    result = run_job(request)
+    merged = result.merged
+    made, failed = merged.scenes["made"], merged.scenes["intrinsic"] + merged.scenes["environmental"]
+    share = failed / job.scenes
+    complete = merged.complete and share <= job.run.max_failure_share
+    rate = f", {result.made_now / result.seconds:.1f} scenes/s" if result.made_now else ""
+    print(f"{out}: {made} scenes made, {failed} failed, in {result.seconds:.1f} s{rate}")
+    print(f"dataset digest {merged.digest}")
+    if merged.scenes["environmental"]:
+        print(
+            f"verso: {merged.scenes['environmental']} scenes failed for environmental reasons: try again with --retry-failed",
+            file=sys.stderr,
+        )
+    elif not complete:
+        print(
+            f"verso: {share:.1%} of the scenes failed, run.max_failure_share is {job.run.max_failure_share:.1%}: "
+            f'`verso query {out} "select reason, count(*) from failures group by reason"` says why',
+            file=sys.stderr,
+        )
+    _answer(
+        options,
+        {"ok": complete, "out": out, "digest": merged.digest, "scenes": merged.scenes, "seconds": result.seconds},
+    )
+    return 0 if complete else 1
+
+
+def _changes(options: argparse.Namespace) -> list[str]:
+    """The options that stand for a key of the job, then --set."""
+    named = {
+        "scenes": options.scenes,
+        "first_scene": options.first_scene,
+        "run.workers": options.workers,
+        "run.shard_size": options.shard_size,
+    }
+    return [f"{key}={value}" for key, value in named.items() if value is not None] + options.changes
+
+
+def _answer(options: argparse.Namespace, answer: dict) -> None:
+    if options.json:
+        print(json.dumps(answer))
+
+
+def status(options: argparse.Namespace) -> int:
+    """`verso status`."""
+    from services.job.record import require_job
+    from services.read.status import read_status
+
+    store = _dataset(options.out)
+    job = require_job(store).job
+    now = read_status(store, job.first_scene, job.stop_scene)
+    done = now.made + sum(now.failed.values())
+    print(f"{options.out}: {done} of {now.asked} scenes done, {now.missing} missing")
+    for reason, count in sorted(now.failed.items()):
+        print(f"  failed, {reason}: {count}")
+    if now.scenes_per_s:
+        print(f"  rate: {now.scenes_per_s:.2f} scenes/s")
+    for one in now.running:
+        doing = "between scenes" if one.scene_id is None else f"scene {one.scene_id}"
+        print(f"  running: range from {one.start}, {doing} ({one.attempt})")
+    if now.holder is not None:
+        print(f"  held by process {now.holder.pid} on {now.holder.host}")
+    print(f"  digest: {now.digest}" if now.digest else "  not merged: run the job again to finish it")
+    _answer(options, {"ok": now.digest is not None, **dataclasses.asdict(now)})
+    return 0 if now.digest else 1
+
+
+def verify(options: argparse.Namespace) -> int:
+    """`verso verify`."""
+    from services.job.record import require_job
+    from services.read.verify import verify as read_back
+    from services.run.progress import ProgressLine
+
+    store = _dataset(options.out)
+    line = ProgressLine(require_job(store).job.scenes, "verify")
+    try:
+        verdict = read_back(store, lambda now: line.show(now.scenes, len(now.faults)))
+    finally:
+        line.close()
+    for fault in verdict.faults:
+        print(fault)
+    print(
+        f"{options.out}: {verdict.files} files ({verdict.bytes / 1e6:.1f} MB), {verdict.scenes} scenes, labels of "
+        f"{verdict.pairs} pairs derived again: {len(verdict.faults) or 'nothing'} off"
+    )
+    answer, faults = dataclasses.asdict(verdict), list(verdict.faults)
+    if options.audit:
+        found = _audit(options, store)
+        faults += found.faults
+        answer["audit"] = dataclasses.asdict(found)
+    _answer(options, {"ok": not faults, **answer})
+    return 1 if faults else 0
+
+
+def _audit(options: argparse.Namespace, store: "Store") -> "Audit":
+    from services.read.audit import audit
+    from services.read.audit_words import describe_audit
+    from services.run.progress import ProgressLine
+
+    line = ProgressLine(options.audit, "audit")
+    try:
+        found = audit(store, options.audit, lambda now: line.show(now.scenes, len(now.faults)))
+    finally:
+        line.close()
+    print("\n".join(describe_audit(found)))
+    return found
+
+
+def query(options: argparse.Namespace) -> int:
+    """`verso query`."""
+    from services.read.query import query as run_query
+    from services.read.query_formats import format_rows
+
+    rows = run_query(_dataset(options.out), options.sql)
+    sys.stdout.buffer.write(format_rows(rows, "json" if options.json else options.format))
+    sys.stdout.flush()
+    return 0
+
+
+def replay(options: argparse.Namespace) -> int:
+    """`verso replay`."""
+    from services.read.replay import replay_scene
+
+    came = replay_scene(_dataset(options.out), options.scene)
+    for difference in came.differences:
+        print(difference)
+    how = "to the byte" if came.same_stack else "within tolerances, because this stack is not the one that made it"
+    print(
+        f"scene {options.scene}: {came.compared} files and tables compared {how}: {len(came.differences) or 'none'} differ"
+    )
+    _answer(options, {"ok": not came.differences, **dataclasses.asdict(came)})
+    return 1 if came.differences else 0
+
+
+def scene(options: argparse.Namespace) -> int:
+    """`verso scene`."""
+    from services.read.scene_export import export_scene
+
+    size = export_scene(_dataset(options.out), options.scene, options.glb)
+    print(f"{options.glb}: {size / 1e6:.2f} MB, world frame, z up, metres")
+    _answer(options, {"ok": True, "file": str(options.glb), "bytes": size})
+    return 0
+
+
+def _dataset(out: str) -> "Store":
+    """The store of a folder that must be there."""
+    from workers.store.opening import open_store
+
+    store = open_store(out)
+    if store.size(JOB_FILE) is None:
+        raise OutputError(f"{out} holds no {JOB_FILE}: it is not an output folder of `verso run`")
+    return store

@@ -1,0 +1,111 @@
+"""`verso doctor`: what this machine has, what is missing, and the fingerprint of its stack."""
+
+import argparse
+import json
+import os
+import platform
+import shutil
+import sys
+import tempfile
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from schemas.errors import MachineError, VersoError
+from services.run.cores import usable_cores
+
+SCENE_BYTES = 3_500_000
+"""About what a scene with one pair takes on disk; `verso query` on a dataset of yours tells the true figure."""
+
+LEAST_SHM_BYTES = 200 * 2**20
+"""Ray's object store wants this much shared memory."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line: what was looked at, whether it will do, what was found, and the remedy where it will not."""
+
+    what: str
+    ok: bool
+    found: str
+    remedy: str = ""
+
+
+def main(options: argparse.Namespace) -> int:
+    """Look at everything and print it; 1 where something is missing."""
+    findings = [look() for look in (_python, _cores, _memory, _disk, _shared_memory, _ray, _renderer, _stack)]
+    width = max(len(finding.what) for finding in findings)
+    for finding in findings:
+        print(f"{'ok     ' if finding.ok else 'MISSING'}  {finding.what:{width}}  {finding.found}")
+        if not finding.ok:
+            print(f"         {'':{width}}  -> {finding.remedy}")
+    ok = all(finding.ok for finding in findings)
+    if options.json:
+        print(json.dumps({"ok": ok, "findings": [asdict(finding) for finding in findings]}))
+    return 0 if ok else 1
+
+
+def _python() -> Finding:
+    right = sys.version_info[:2] == (3, 11)
+    found = f"CPython {platform.python_version()} on {platform.machine()}, glibc {platform.libc_ver()[1] or 'unknown'}"
+    return Finding(
+        "python", right and platform.machine() == "x86_64", found, "use CPython 3.11 on x86-64, or docker compose"
+    )
+
+
+def _cores() -> Finding:
+    return Finding("cores", True, f"{usable_cores()} usable of {os.cpu_count()}: the default for --workers")
+
+
+def _memory() -> Finding:
+    available = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return Finding(
+        "memory", available > 2**30, f"{available / 2**30:.1f} GiB free", "a worker takes up to 0.7 GiB: free some"
+    )
+
+
+def _disk() -> Finding:
+    free = shutil.disk_usage(Path.cwd()).free
+    return Finding(
+        "disk",
+        free > 2**30,
+        f"{free / 2**30:.0f} GiB free here, room for about {free // SCENE_BYTES:,} scenes",
+        "free some",
+    )
+
+
+def _shared_memory() -> Finding:
+    free = shutil.disk_usage("/dev/shm").free if Path("/dev/shm").exists() else 0
+    return Finding("/dev/shm", free > LEAST_SHM_BYTES, f"{free / 2**20:.0f} MiB free", "docker run --shm-size=1g")
+
+
+def _ray() -> Finding:
+    try:
+        return Finding("ray", True, f"{version('ray')}, temporary files in {tempfile.gettempdir()}")
+    except PackageNotFoundError:
+        return Finding("ray", False, "not installed", "run ./verso once: it installs what the lock file names")
+
+
+def _renderer() -> Finding:
+    try:
+        from workers.render.raster.context import is_software
+        from workers.render.raster.gbuffer import shared_renderer
+
+        name = shared_renderer().name
+    except MachineError as error:
+        return Finding("GL", False, "no off-screen OpenGL", str(error))
+    kind = "software, on the CPU" if is_software(name) else "hardware"
+    return Finding("GL", True, f"{name} ({kind})")
+
+
+def _stack() -> Finding:
+    try:
+        from workers.pipeline.fingerprint import take_fingerprint
+        from workers.render.raster.gbuffer import shared_renderer
+
+        stack = take_fingerprint(shared_renderer(), "raster")
+    except VersoError as error:
+        return Finding("fingerprint", False, "the canary scene could not be made", str(error))
+    return Finding(
+        "fingerprint", True, f"{stack.digest[:16]} (canary {stack.canary[:16]}, numpy up to {stack.simd.split()[-1]})"
+    )

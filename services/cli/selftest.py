@@ -1,0 +1,150 @@
+"""`verso test`: lint, types, layer rules and tests, and at the end what was skipped and why."""
+
+import argparse
+import importlib.util
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+from xml.etree import ElementTree
+
+from services.run.cores import usable_cores
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+
+# A test process may hold a GL context, a PyBullet world and a Ray: about 1 GB. Beyond this many nothing is gained.
+MAX_PROCESSES: Final = 8
+
+PYTEST_FOUND_NO_TEST: Final = 5
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was run: its name, whether it passed, how long it took, and a remark for the summary."""
+
+    name: str
+    passed: bool
+    seconds: float
+    remark: str = ""
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What pytest wrote down: how many tests ended how, and the reasons of those it skipped."""
+
+    passed: int
+    failed: int
+    skipped: Counter[str]
+
+    @classmethod
+    def read(cls, junit: Path) -> "Tally":
+        """Read a JUnit file; all zero where pytest died before it wrote one."""
+        try:
+            cases = list(ElementTree.parse(junit).iter("testcase"))
+        except (OSError, ElementTree.ParseError):
+            return cls(0, 0, Counter())
+        failed = sum(case.find("failure") is not None or case.find("error") is not None for case in cases)
+        skips = [skip for case in cases if (skip := case.find("skipped")) is not None]
+        return cls(len(cases) - failed - len(skips), failed, Counter(skip.get("message", "") for skip in skips))
+
+
+def main(args: list[str]) -> int:
+    """Run what `verso test ARGS` asks for; 0 if all of it passed, 1 if not, 2 if it cannot be run as asked."""
+    asked = _parser().parse_args(args)
+    if reason := _why_not_here() or _why_not_these(asked.paths):
+        print(f"verso test: {reason}", file=sys.stderr)
+        return 2
+    checks = [] if asked.paths else [_run_check(name, command) for name, command in _static_checks().items()]
+    with tempfile.TemporaryDirectory(prefix="verso-test-") as folder:
+        junit = Path(folder, "junit.xml")
+        started = time.monotonic()
+        status = _call(_pytest_command(asked, junit))
+        tally = Tally.read(junit)
+    remark = f"{tally.passed} passed, {tally.failed} failed, {tally.skipped.total()} skipped"
+    if status == PYTEST_FOUND_NO_TEST:
+        remark = "no test was found"
+    checks.append(Check("pytest", status == 0, time.monotonic() - started, remark))
+    print(_summary(checks, tally.skipped), flush=True)
+    return 0 if all(check.passed for check in checks) else 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="verso test",
+        description="Lint, types, layer rules and tests. Says at the end what was skipped and why.",
+        epilog="example: verso test tests/hard_cases --figures figures.json",
+    )
+    parser.add_argument("paths", nargs="*", metavar="PATH", help="only the tests in this file, folder or FILE::TEST")
+    scope = parser.add_mutually_exclusive_group()
+    scope.add_argument("--ci", dest="scope", action="store_const", const="ci", help="also what needs root or Docker")
+    scope.add_argument(
+        "--all", dest="scope", action="store_const", const="all", help="also that, and what takes minutes"
+    )
+    parser.add_argument("--figures", type=Path, metavar="FILE", help="write what the tests measured there, as JSON")
+    parser.add_argument("-k", dest="matching", metavar="EXPR", help="only tests whose name matches, as in pytest")
+    parser.set_defaults(scope="default")
+    return parser
+
+
+def _why_not_here() -> str:
+    if not (ROOT / "tests").is_dir():
+        return "the tests are not part of the installed package; run ./verso test in a checkout"
+    if importlib.util.find_spec("pytest") is None:
+        return "the test tools are not installed here; ./verso test in a checkout installs them"
+    return ""
+
+
+def _why_not_these(paths: Sequence[str]) -> str:
+    gone = [path for path in paths if not Path(path.split("::")[0]).exists()]
+    return f"no such file or folder: {', '.join(gone)}" if gone else ""
+
+
+def _static_checks() -> dict[str, list[str]]:
+    return {
+        "ruff check": [sys.executable, "-m", "ruff", "check", "."],
+        "ruff format": [sys.executable, "-m", "ruff", "format", "--check", "."],
+        "mypy": [sys.executable, "-m", "mypy"],
+        "layers": [str(Path(sys.executable).with_name("lint-imports")), "--no-cache"],
+    }
+
+
+def _pytest_command(asked: argparse.Namespace, junit: Path) -> list[str]:
+    command = [sys.executable, "-m", "pytest", f"--scope={asked.scope}", f"--junitxml={junit}"]
+    # One file stays in one process: tests of a file share what is dear to start, such as a Ray.
+    one_file = len(asked.paths) == 1 and Path(asked.paths[0].split("::")[0]).is_file()
+    processes = min(usable_cores(), MAX_PROCESSES)
+    if processes > 1 and not one_file:
+        command += [f"--numprocesses={processes}", "--dist=loadfile"]
+    if asked.figures:
+        command.append(f"--figures={asked.figures.absolute()}")
+    if asked.matching:
+        command += ["-k", asked.matching]
+    return command + [os.path.abspath(path) for path in asked.paths]
+
+
+def _run_check(name: str, command: list[str]) -> Check:
+    started = time.monotonic()
+    print(f"== {name}", flush=True)
+    return Check(name, _call(command) == 0, time.monotonic() - started)
+
+
+def _call(command: list[str]) -> int:
+    # The checkout comes first on the path, also of the processes that the tests start.
+    return subprocess.run(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False).returncode
+
+
+def _summary(checks: Sequence[Check], skipped: Counter[str]) -> str:
+    lines = ["", "verso test:"]
+    for check in checks:
+        verdict = "ok" if check.passed else "FAILED"
+        lines.append(f"  {check.name:<12} {verdict:<7} {check.seconds:6.1f} s  {check.remark}".rstrip())
+    if skipped:
+        lines.append("skipped, and why:")
+        lines += [f"  {number:>4} x {reason}" for reason, number in skipped.most_common()]
+    return "\n".join(lines)

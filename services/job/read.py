@@ -1,0 +1,127 @@
+"""From a job file to a `Job`: every fault is told by file, key, value and what is allowed."""
+
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from schemas.errors import JobError
+from schemas.job.job import Job
+from services.job.reference import allowed_keys
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """A safe YAML loader that refuses a key written twice, which YAML's own would drop in silence."""
+
+
+def _mapping(loader: _StrictLoader, node: yaml.MappingNode) -> dict[Any, Any]:
+    seen: set[Any] = set()
+    for key_node, _ in node.value:
+        key = loader.construct_object(key_node)
+        if not isinstance(key, str):
+            raise JobError(f"line {key_node.start_mark.line + 1}: the key {key!r} is not a word")
+        if key in seen:
+            raise JobError(f"line {key_node.start_mark.line + 1}: the key '{key}' is written twice")
+        seen.add(key)
+    return loader.construct_mapping(node, deep=True)
+
+
+_StrictLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
+
+
+def load_job(path: Path, changes: Sequence[str] = ()) -> Job:
+    """Read a job file and apply `path.to.key=value` changes. Raises JobError."""
+    return validate_job(read_tree(path, changes), str(path))
+
+
+def read_tree(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
+    """The keys that a job file has, with `path.to.key=value` changes and without defaults. Raises JobError."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise JobError(f"{path}: no such file; the examples are in deploy/jobs/") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise JobError(f"{path}: cannot be read as text: {error}") from error
+    try:
+        tree = yaml.load(text, Loader=_StrictLoader)
+    except yaml.YAMLError as error:
+        raise JobError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+    except JobError as error:
+        raise JobError(f"{path}: {error}") from error
+    if not isinstance(tree, dict):
+        raise JobError(
+            f"{path}: holds {type(tree).__name__ if tree is not None else 'nothing'}, and must hold keys and values"
+        )
+    for change in changes:
+        set_key(tree, change)
+    return tree
+
+
+def set_key(tree: dict[str, Any], change: str) -> None:
+    """Apply one `path.to.key=value`; the value is read as YAML. Raises JobError."""
+    path, equals, text = change.partition("=")
+    if not equals or not path:
+        raise JobError(f"--set {change}: write it as path.to.key=value, for example --set physics.step_hz=480")
+    try:
+        value = yaml.load(text, Loader=_StrictLoader)
+    except yaml.YAMLError as error:
+        raise JobError(f"--set {change}: the value is not YAML: {' '.join(str(error).split())}") from error
+    *parents, last = path.split(".")
+    place: Any = tree
+    for key in parents:
+        place = place.setdefault(key, {}) if isinstance(place, dict) else _item(place, key, change)
+        if place is None:
+            raise JobError(f"--set {change}: there is nothing at '{key}' to set a key of")
+    if isinstance(place, list):
+        place[_index(place, last, change)] = value
+    elif isinstance(place, dict):
+        place[last] = value
+    else:
+        raise JobError(f"--set {change}: '{'.'.join(parents)}' is {place!r} and has no keys")
+
+
+def _index(place: list[Any], key: str, change: str) -> int:
+    if not key.isdigit() or int(key) >= len(place):
+        raise JobError(f"--set {change}: '{key}' must be a position from 0 to {len(place) - 1}")
+    return int(key)
+
+
+def _item(place: Any, key: str, change: str) -> Any:
+    if not isinstance(place, list):
+        raise JobError(f"--set {change}: {place!r} has no key '{key}'")
+    return place[_index(place, key, change)]
+
+
+def validate_job(tree: dict[str, Any], name: str) -> Job:
+    """A `Job` from parsed keys. Raises JobError with a line for each fault."""
+    version = tree.get("verso", 1)
+    if isinstance(version, int) and version > 1:
+        raise JobError(
+            f"{name}: verso: {version} is newer than this program, which reads version 1: install a newer Verso"
+        )
+    try:
+        return Job.model_validate(tree)
+    except ValidationError as error:
+        faults = error.errors()
+        # A fault inside an item of a list makes the list itself seem too short: that line would only confuse.
+        told = [fault for fault in faults if fault["type"] != "too_short" or len(faults) == 1]
+        raise JobError("\n".join(f"{name}: {describe_fault(fault)}" for fault in told)) from error
+
+
+def describe_fault(fault: Any) -> str:
+    """One line: the key's path, its value, and what is allowed."""
+    words = [str(part) for part in fault["loc"] if part not in ("procedural", "shapenet", "urdf", "[key]")]
+    key = ".".join(words) or "the job"
+    if fault["type"] == "extra_forbidden":
+        allowed = allowed_keys(words)
+        near = difflib.get_close_matches(words[-1], allowed, n=1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        return f"{key}: there is no such key; {hint}Allowed here: {', '.join(allowed) or 'nothing'}"
+    if fault["type"] == "missing":
+        return f"{key}: is missing, and has no default"
+    message = fault["msg"].removeprefix("Value error, ")
+    value = repr(fault["input"])
+    return f"{key}: {value if len(value) <= 80 else value[:77] + '...'}: {message[0].lower()}{message[1:]}"

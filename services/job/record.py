@@ -1,0 +1,129 @@
+"""OUT/job.yaml: which job a folder belongs to. A different job is refused, naming the keys."""
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from schemas.dataset.layout import JOB_FILE, LOCK_FILE, LOG_FOLDER, MANIFEST, STAGING
+from schemas.errors import CorruptError, OutputError
+from schemas.job.job import Job
+from services.job.read import validate_job
+from workers.store.store import Store
+
+FREE_KEYS = ("scenes", "run")
+"""Keys that may change from one run on a folder to the next: more scenes, and how the work is driven."""
+
+OWN = {MANIFEST, STAGING, LOCK_FILE, LOG_FOLDER}
+"""What a run makes before it writes the job: a run that was stopped there may go on."""
+
+HEADER = """\
+# The job as it was run, every default filled in. Written by the first run on this folder; `verso run` on the same
+# folder goes on where it stopped, and refuses a job that differs in anything but `scenes` (more of them) and `run`.
+# `digest` covers what the dataset is: all other keys and the files of the asset folders (`catalogue`). `folder` is where
+# the job file lay: relative asset folders start there.
+"""
+
+
+@dataclass(frozen=True)
+class JobRecord:
+    """A job, the digest of its asset catalogue, and the folder that its relative paths start from."""
+
+    job: Job
+    digest: str
+    catalogue: str
+    folder: str
+
+
+def record_job(job: Job, catalogue_digest: str, folder: Path) -> JobRecord:
+    """The record of a job over assets with this digest."""
+    text = json.dumps([_identity(job), catalogue_digest], sort_keys=True, separators=(",", ":"))
+    return JobRecord(job, hashlib.sha256(text.encode()).hexdigest(), catalogue_digest, str(folder.resolve()))
+
+
+def encode_job(record: JobRecord) -> bytes:
+    """OUT/job.yaml."""
+    tree = {
+        "digest": record.digest,
+        "catalogue": record.catalogue,
+        "folder": record.folder,
+        "job": record.job.model_dump(mode="json"),
+    }
+    return (HEADER + yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=110)).encode()
+
+
+def read_job(store: Store) -> JobRecord | None:
+    """The job that a folder belongs to, None where it belongs to none. Raises CorruptError."""
+    try:
+        text = store.read(JOB_FILE).decode()
+    except FileNotFoundError:
+        return None
+    try:
+        tree = yaml.safe_load(text)
+        job = validate_job(tree["job"], f"{store.name}/{JOB_FILE}")
+        return JobRecord(job, tree["digest"], tree["catalogue"], tree["folder"])
+    except (yaml.YAMLError, UnicodeDecodeError, TypeError, KeyError) as error:
+        raise CorruptError(f"{store.name}/{JOB_FILE} is not a job that `verso run` wrote: {error!r}") from error
+
+
+def require_job(store: Store) -> JobRecord:
+    """The job that a folder belongs to. Raises OutputError where it is no dataset."""
+    record = read_job(store)
+    if record is None:
+        raise OutputError(f"{store.name} holds no {JOB_FILE}: it is not an output folder of `verso run`")
+    return record
+
+
+def refuse_foreign(store: Store) -> None:
+    """Raises OutputError where a folder holds things, but no job: somebody's files are not to be mixed with a dataset."""
+    if store.size(JOB_FILE) is None:
+        foreign = sorted(set(store.children("")) - OWN)
+        if foreign:
+            raise OutputError(
+                f"{store.name} holds {', '.join(foreign[:3])}{' and more' if len(foreign) > 3 else ''}, and no {JOB_FILE}: "
+                "choose an empty or a new folder for --out"
+            )
+
+
+def adopt(store: Store, new: JobRecord) -> JobRecord:
+    """The record to run: `new`, with the range size of the folder's first run. Raises OutputError for another job."""
+    old = read_job(store)
+    if old is None:
+        return new
+    differing = [
+        f"  {key}: {before} there, {after} here"
+        for key, before, after in _differences(_identity(old.job), _identity(new.job))
+    ]
+    if old.catalogue != new.catalogue and not differing:
+        differing.append("  the files of the asset folders (their digest changed)")
+    if differing:
+        raise OutputError(
+            f"{store.name} belongs to another job; these differ:\n"
+            + "\n".join(differing)
+            + "\nchoose another --out, or change them back"
+        )
+    run = new.job.run.model_copy(update={"range_size": old.job.run.range_size})
+    return dataclasses.replace(new, job=new.job.model_copy(update={"run": run}))
+
+
+def _identity(job: Job) -> dict[str, Any]:
+    """What must stay as it is. Not where the asset folders lie: their files' digest is in the catalogue's."""
+    identity = job.model_dump(mode="json", exclude=set(FREE_KEYS))
+    for source in (*identity["assets"]["objects"], *identity["assets"]["tables"]):
+        source.pop("folder", None)
+    return identity
+
+
+def _differences(a: Any, b: Any, path: str = "") -> list[tuple[str, Any, Any]]:
+    if isinstance(a, dict) and isinstance(b, dict):
+        keys = [*a, *(key for key in b if key not in a)]
+        return [
+            line
+            for key in keys
+            for line in _differences(a.get(key, "absent"), b.get(key, "absent"), f"{path}.{key}" if path else key)
+        ]
+    return [] if a == b else [(path, a, b)]

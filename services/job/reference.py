@@ -1,0 +1,122 @@
+"""docs/job.md: every key of a job file with its type, default and meaning, written from the models themselves."""
+
+import re
+import types
+import typing
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
+
+from annotated_types import Ge, Gt, Le, Lt, MinLen
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from schemas.base import Counts, Range
+from schemas.job.job import Job
+from schemas.job.start import MOST_OBJECTS
+
+HEADER = """\
+# Keys of a job file
+
+Written from `schemas/job/job.py` by `python -m services.job.reference`; a test holds the two together. Every key but `name` has a
+default. A key that is not in this list is refused, and so is a value that is not allowed. Any key can be changed on the
+command line: `--set physics.step_hz=480`.
+
+| key | allowed | default | what it does |
+|---|---|---|---|
+"""
+
+
+def list_keys(model: type[BaseModel] = Job, prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """(path, field) of every key, depth first; the kinds of a source share the place of their list with a `[kind]`."""
+    for name, field in model.model_fields.items():
+        path = f"{prefix}{name}"
+        yield path, field
+        for kind, branch in _branches(field.annotation):
+            yield from list_keys(branch, f"{path}{kind}.")
+
+
+def _branches(annotation: Any) -> Iterator[tuple[str, type[BaseModel]]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        source = annotation.model_fields.get("source")
+        kind = f"[{typing.get_args(source.annotation)[0]}]" if source is not None else ""
+        yield kind, annotation
+        return
+    for argument in typing.get_args(annotation):
+        if argument is not Ellipsis:
+            yield from _branches(argument)
+
+
+def allowed_keys(path: Sequence[str]) -> list[str]:
+    """Names of the keys that may stand where a path's last part stands; positions in lists are part of the path."""
+    parent = ".".join(part for part in path[:-1] if not part.isdigit())
+    plain = (re.sub(r"\[\w+\]", "", key).rpartition(".") for key, _ in list_keys())
+    return sorted({name for above, _, name in plain if above == parent})
+
+
+def describe_allowed(field: FieldInfo) -> str:
+    """The values that a field takes, in a few words."""
+    words = [_name(field.annotation)]
+    for bound in field.metadata:
+        for kind, sign in ((Ge, ">="), (Gt, ">"), (Le, "<="), (Lt, "<")):
+            if isinstance(bound, kind):
+                words.append(f"{sign} {getattr(bound, kind.__name__.lower()):g}")
+        if isinstance(bound, MinLen):
+            words.append(f"at least {bound.min_length}")
+    return ", ".join(words)
+
+
+def _name(annotation: Any) -> str:
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Literal:
+        return ", ".join(f"`{value}`" for value in arguments)
+    if origin is typing.Annotated:
+        inner = FieldInfo.from_annotation(annotation)
+        return describe_allowed(inner)
+    if origin in (typing.Union, types.UnionType):
+        names = ["nothing" if argument is type(None) else _name(argument) for argument in arguments]
+        return " or ".join(dict.fromkeys(names))
+    if origin is tuple:
+        return "list" if Ellipsis in arguments else f"list of {len(arguments)} numbers"
+    if origin is dict:
+        return "map"
+    if annotation is Range:
+        return "[low, high]"
+    if annotation is Counts:
+        return f"whole number or [low, high], from 1 to {MOST_OBJECTS}"
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return "map"
+    return {int: "whole number", float: "number", bool: "`true` or `false`", str: "text"}[annotation]
+
+
+def _default(field: FieldInfo) -> str:
+    if field.is_required():
+        return "none: must be given"
+    value = field.get_default(call_default_factory=True)
+    if isinstance(value, BaseModel):
+        return "below"
+    if isinstance(value, Range):
+        return f"`[{value.low:.6g}, {value.high:.6g}]`"
+    if isinstance(value, Counts):
+        return f"`{value.low}`" if value.low == value.high else f"`{list(value)}`"
+    if isinstance(value, tuple):
+        return "one `procedural` source" if isinstance(value[0], BaseModel) else f"`{list(value)}`"
+    if isinstance(value, dict):
+        return "all, equal weights" if value else "nothing"
+    if value is None:
+        return "nothing"
+    return f"`{str(value).lower() if isinstance(value, bool) else value}`"
+
+
+def write_doc() -> str:
+    """The whole page."""
+    lines = []
+    for path, field in list_keys():
+        if path.rpartition(".")[2] == "source":
+            continue
+        meaning = " ".join((field.description or "").split())
+        lines.append(f"| `{path}` | {describe_allowed(field)} | {_default(field)} | {meaning} |")
+    return HEADER + "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    print(write_doc(), end="")

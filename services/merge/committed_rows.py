@@ -1,0 +1,82 @@
+"""Reading what is committed: whole ranges in order, and their rows with retries laid over."""
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from schemas.dataset.commit import CommitRecord
+from schemas.dataset.layout import COMMITS, range_table_path
+from schemas.dataset.tables import SORT_KEYS
+from schemas.errors import CorruptError, RunError
+from workers.store.commit import commit_names, read_committed, read_record
+from workers.store.manifest import decode_table
+from workers.store.store import Store
+
+
+def iter_ranges(store: Store, first_scene: int, stop_scene: int) -> Iterator[list[CommitRecord]]:
+    """The records of each range, itself and then its retries, in order: exactly the scenes [first_scene, stop_scene).
+
+    Raises RunError naming scenes that nobody committed, or that are committed beyond the end.
+    """
+    awaited = first_scene
+    for start, names in groupby(commit_names(store), key=lambda name: name[0]):
+        if start != awaited:
+            raise RunError(
+                _gap(awaited, min(start, stop_scene)) if start > awaited else _beyond(start, first_scene, stop_scene)
+            )
+        records = [record for _, retry, _ in names if (record := read_record(store, start, retry)) is not None]
+        check_retries(start, [record.span.retry for record in records])
+        awaited = records[0].span.stop
+        if awaited > stop_scene:
+            raise RunError(_beyond(awaited - 1, first_scene, stop_scene))
+        yield records
+    if awaited < stop_scene:
+        raise RunError(_gap(awaited, stop_scene))
+
+
+def range_rows(store: Store, records: Sequence[CommitRecord], table: str) -> pa.Table:
+    """The rows of one range, sorted by key; a retry's rows replace those of the scenes that it tried again.
+
+    Of `assets`, the rows of all records, repetitions among them. Raises CorruptError naming a file that does not match
+    its commit.
+    """
+    parts = [read_range_table(store, record, table) for record in records]
+    if len(parts) == 1:
+        return parts[0]
+    if "scene_id" in parts[0].column_names:
+        for number, part in enumerate(parts):
+            later = {scene_id for record in records[number + 1 :] for scene_id in record.span.scenes}
+            again = pc.is_in(part.column("scene_id"), value_set=pa.array(sorted(later), pa.int64()))
+            parts[number] = part.filter(pc.invert(again))
+    return pa.concat_tables(parts).sort_by([(key, "ascending") for key in SORT_KEYS[table]])
+
+
+def read_range_table(store: Store, record: CommitRecord, table: str) -> pa.Table:
+    """The rows that one record committed. Raises CorruptError naming a file that is missing or altered."""
+    path = range_table_path(record.span.start, table, record.span.retry)
+    entry = next((file for file in record.files if file.path == path), None)
+    if entry is None:
+        raise CorruptError(f"the commit of the range from scene {record.span.start} names no {path}")
+    data = read_committed(store, record, path)
+    if hashlib.sha256(data).hexdigest() != entry.sha256:
+        raise CorruptError(f"{path} does not match the SHA-256 in its commit: restore it from a copy")
+    return decode_table(table, data, path)
+
+
+def check_retries(start: int, retries: list[int]) -> None:
+    """Raises CorruptError where a retry of a range is missing."""
+    if retries != list(range(len(retries))):
+        raise CorruptError(
+            f"{COMMITS} has retries {retries} of the range from scene {start}, and must have all from 0: restore it"
+        )
+
+
+def _gap(start: int, stop: int) -> str:
+    return f"scenes {start} to {stop - 1} are not committed: run the job again to make them"
+
+
+def _beyond(scene: int, first_scene: int, stop_scene: int) -> str:
+    return f"scene {scene} is committed, outside the {first_scene} to {stop_scene - 1} that were asked for"

@@ -1,0 +1,91 @@
+"""OUT/DATASET.md: what a dataset is, what made it, and whose shapes are in it."""
+
+from schemas.base import Counts
+from schemas.dataset.fingerprint import Fingerprint
+from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE, stored_roles
+from schemas.job.assets import ProceduralSource
+from services.job.record import JobRecord
+from services.merge.step import MergeResult
+from workers.assets.catalogue import Catalogue
+from workers.store.store import Store
+
+ARTICLE = (
+    "R. Staszak and D. Belter, *3D object reconstruction: A comprehensive view-dependent dataset*, Data in Brief 55 "
+    "(2024) 110569, https://doi.org/10.1016/j.dib.2024.110569, CC BY"
+)
+
+
+def write_card(store: Store, record: JobRecord, catalogue: Catalogue, merged: MergeResult) -> None:
+    """Write DATASET.md."""
+    fingerprint = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
+    store.write_whole(README_FILE, describe_dataset(record, catalogue, merged, fingerprint).encode())
+
+
+def describe_dataset(record: JobRecord, catalogue: Catalogue, merged: MergeResult, fingerprint: Fingerprint) -> str:
+    """The text of DATASET.md."""
+    job = record.job
+    libraries = "\n".join(f"| {name} | {version} |" for name, version in sorted(fingerprint.libraries.items()))
+    sources = "\n".join(f"- {line}" for line in describe_sources(catalogue))
+    counts = ", ".join(f"{count} {outcome}" for outcome, count in merged.scenes.items())
+    return f"""# {job.name}
+
+View-dependent RGB-D pairs for reconstructing objects from a single view: what a camera sees, and what the camera on the
+other side sees. Made by Verso; the layout and the geometry follow {ARTICLE}.
+
+| | |
+|---|---|
+| scenes | {job.first_scene} to {job.stop_scene - 1}: {counts} |
+| pairs in each scene | {job.pairs_per_scene} |
+| objects in each scene | {_count(job.objects_per_scene)} |
+| views of each pair | {", ".join(stored_roles(job))}{"" if job.render.rgb else "; without RGB"} |
+| seed | {job.seed} |
+| dataset digest | `{merged.digest}` |
+| job digest | `{record.digest}` (the job is in `{JOB_FILE}`) |
+| stack's fingerprint | `{fingerprint.digest}` |
+| canary scene | `{fingerprint.canary}` |
+| renderer | {fingerprint.renderer} |
+
+| library | version |
+|---|---|
+{libraries}
+
+## Shapes
+
+{sources}
+
+Every shape, with its licence and its split by instance, is a row of the `assets` table.
+
+## Reading it
+
+`pyarrow.dataset.dataset("manifest/views", partitioning="hive")` has a row for each camera and the names and checksums of
+its images, `manifest/objects` one for each thing that it may see; `bodies` in `manifest/scenes` says where each object lies.
+Depth is 16-bit PNG, z along the optical axis, {job.images.depth_units_per_m:g} units a metre, 0 where there is none.
+Masks are 8-bit PNG: 0 nothing, 1 floor, 2 table, 3 and up objects. Poses are camera to world, optical frame (x right,
+y down, z forward), metres.
+"""
+
+
+def _count(count: Counts) -> str:
+    return str(count.low) if count.low == count.high else f"{count.low} to {count.high}"
+
+
+def describe_sources(catalogue: Catalogue) -> list[str]:
+    """One line for each source of objects and of tables, with its licence and what was left out."""
+    lines = []
+    for what, sources in (("objects", catalogue.assets.objects), ("tables", catalogue.assets.tables)):
+        for source in sources:
+            if isinstance(source, ProceduralSource):
+                lines.append(f"{what}, weight {source.weight:g}: made from seed {source.seed}, licence CC0-1.0")
+            else:
+                lines.append(
+                    f"{what}, weight {source.weight:g}: {source.source} folder {source.folder}, licence {source.licence}"
+                )
+    return lines + describe_left_out(catalogue)
+
+
+def describe_left_out(catalogue: Catalogue) -> list[str]:
+    """One line for each folder of which something was left out: how many, and why."""
+    return [
+        f"left out of {folder}: {', '.join(f'{count} {reason}' for reason, count in reasons.items())}"
+        for folder, reasons in catalogue.skipped.items()
+    ]

@@ -1,0 +1,112 @@
+"""The settled state of a scene released again with no effect of physics left out: how far it moves, and what masks make of it."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.base import Pose
+from schemas.scene.camera import Camera
+from schemas.scene.scene import Placed, PosedScene, View
+from schemas.scene.shape import Shape
+from workers.geometry.camera import project
+from workers.geometry.frames import invert, moved_between, transform
+from workers.geometry.raycast import NEAR_M, edge_distance_px
+from workers.physics.step import release_again
+from workers.pipeline.context import WorkerContext
+from workers.pipeline.make_scene import Scene
+from workers.plan.effect import Facts
+from workers.plan.effects import names_of_kind, plan_effects
+from workers.render.raster.gbuffer import Renderer
+
+RELEASE_S = 1.0
+
+MOST_MM = 0.05
+MOST_DEG = 0.01
+"""How far an object may move: what a mask shows of it is a few pixels."""
+
+EDGE_PX = 1.0 / 128.0
+"""The rasteriser keeps vertices to 1/256 px, in either of two pictures."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How far objects moved, and the mask pixels that changed: in all, and farther from a silhouette than it explains."""
+
+    moved_mm: float = 0.0
+    turned_deg: float = 0.0
+    pixels_changed: int = 0
+    pixels_outside: int = 0
+
+    def worse(self, other: "Motion") -> "Motion":
+        """The larger of both motions, and the pixels of both."""
+        return Motion(
+            max(self.moved_mm, other.moved_mm),
+            max(self.turned_deg, other.turned_deg),
+            self.pixels_changed + other.pixels_changed,
+            self.pixels_outside + other.pixels_outside,
+        )
+
+    def off(self) -> list[str]:
+        """What is beyond its bound, a phrase each."""
+        found = []
+        if not self.moved_mm <= MOST_MM:
+            found.append(f"it moved {self.moved_mm:.4f} mm, the bound is {MOST_MM} mm")
+        if not self.turned_deg <= MOST_DEG:
+            found.append(f"it turned {self.turned_deg:.5f} degrees, the bound is {MOST_DEG}")
+        if self.pixels_outside:
+            found.append(f"{self.pixels_outside} mask pixels changed away from any silhouette")
+        return found
+
+
+def measure_motion(context: WorkerContext, scene: Scene) -> Motion:
+    """Release the scene for `RELEASE_S` and look at it again."""
+    facts = Facts(context.job, scene.plan, scene.raycast_checked)
+    effects = plan_effects(facts, names_of_kind("approximation"))
+    poses = release_again(scene.plan, scene.settled, context.job.physics, effects, RELEASE_S)
+    found = Motion()
+    for start, rest, pose in zip(scene.plan.objects, scene.settled, poses, strict=True):
+        found = found.worse(move_between(start.asset.shape, rest.T_world_obj, pose))
+    after = dataclasses.replace(scene.posed, things=moved_things(scene, poses))
+    for view in (view for pair in scene.pairs for view in pair.views if view.region is not None):
+        changed, outside = compare_masks(context.renderer, scene.posed, after, view)
+        found = found.worse(Motion(pixels_changed=changed, pixels_outside=outside))
+    return found
+
+
+def move_between(shape: Shape, before: Pose, after: Pose) -> Motion:
+    """How far the farthest point of a shape moves between two poses [4, 4], and by what angle it turns."""
+    moved_m, turned_rad = moved_between(shape.vertices, before, after)
+    return Motion(moved_m * 1e3, math.degrees(turned_rad))
+
+
+def moved_things(scene: Scene, poses: Sequence[Pose]) -> tuple[Placed, ...]:
+    """The things of a scene with its objects at these poses."""
+    at = {start.region_id: pose for start, pose in zip(scene.plan.objects, poses, strict=True)}
+    return tuple(
+        dataclasses.replace(thing, T_world_shape=at[thing.region_id]) if thing.region_id in at else thing
+        for thing in scene.posed.things
+    )
+
+
+def compare_masks(renderer: Renderer, before: PosedScene, after: PosedScene, view: View) -> tuple[int, int]:
+    """(mask pixels that changed, those farther from a silhouette than the motion's projection and `EDGE_PX`)."""
+    region = renderer.draw(after.things, after.appearance, view.camera).region
+    changed = np.argwhere(region != view.region)
+    if not len(changed):
+        return 0, 0
+    reach = EDGE_PX + max(shift_px(a, b, view.camera) for a, b in zip(before.things, after.things, strict=True))
+    away = edge_distance_px(before.things, view.camera, changed, outline_only=True)
+    return len(changed), int((away > reach).sum())
+
+
+def shift_px(before: Placed, after: Placed, camera: Camera) -> float:
+    """The largest way, pixels, that a vertex in front of the camera goes in the picture."""
+    if before is after:
+        return 0.0
+    ends = [transform(invert(camera.T_world_cam) @ one.T_world_shape, one.shape.vertices) for one in (before, after)]
+    seen = (ends[0][:, 2] > NEAR_M) & (ends[1][:, 2] > NEAR_M)
+    (u0, v0), (u1, v1) = (project(points[seen], camera.intrinsics) for points in ends)
+    return float(np.hypot(u1 - u0, v1 - v0).max(initial=0.0))

@@ -1,0 +1,126 @@
+"""SQL over the manifests of a dataset, finished or being made. It reads nothing else and writes nothing."""
+
+import urllib.parse
+import warnings
+from collections.abc import Sequence
+from itertools import groupby
+from typing import TypeAlias
+
+import duckdb
+import pyarrow as pa
+import pyarrow.dataset as ds
+import pyarrow.parquet as pq
+
+from schemas.dataset.commit import CommitRecord
+from schemas.dataset.layout import COMMITS, MANIFEST, STAGING, range_key, range_table_path
+from schemas.dataset.tables import SCHEMAS, TABLES
+from schemas.errors import CorruptError, InputError, OutputError
+from services.merge.committed_rows import range_rows
+from services.merge.step import read_success
+from workers.store.commit import commit_names, read_record
+from workers.store.local import LocalStore
+from workers.store.store import Store
+
+_LOCKED = {
+    "enable_external_access": "false",
+    "python_enable_replacements": "false",
+    "autoinstall_known_extensions": "false",
+    "autoload_known_extensions": "false",
+}
+"""SQL sees the six tables and no file, no network, no variable of this process."""
+
+_NO_QUESTION = 'there is no question: write SQL, for example "select category, count(*) from scenes group by 1"'
+
+Rows: TypeAlias = ds.Dataset | pa.Table
+
+_FORMAT = ds.ParquetFileFormat(
+    default_fragment_scan_options=ds.ParquetFragmentScanOptions(page_checksum_verification=True)
+)
+
+
+def query(store: Store, sql: str) -> pa.Table:
+    """The answer to one question over the tables scenes, views, objects, assets, failures and timings.
+
+    A finished dataset is read from its merged tables, another one through its commits: only what is committed counts,
+    and a retry's rows replace the first. Raises InputError with the database's own line where the SQL is wrong,
+    OutputError where there is no dataset, CorruptError where a file is damaged.
+    """
+    with duckdb.connect(":memory:", config=dict(_LOCKED)) as connection:
+        _register(connection, store)
+        connection.execute("SET lock_configuration = true")
+        try:
+            if not connection.extract_statements(sql):
+                raise InputError(_NO_QUESTION)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # that a copy is made
+                return connection.execute(sql).to_arrow_table()
+        except duckdb.Error as error:
+            line = str(error).splitlines()[0]
+            if "orrupt" in line or "CRC" in line or "thrift" in line.lower():
+                raise CorruptError(f"{line}; `verso verify` lists every damaged file") from error
+            raise InputError(f"the query failed: {line}") from error
+
+
+def _register(connection: duckdb.DuckDBPyConnection, store: Store) -> None:
+    """Makes the six views."""
+    done = read_success(store)
+    committed = _Committed(store) if done is None else None
+    for table in TABLES:
+        parts = committed.parts(table) if committed else _merged(store, list((done or {})["files"]), table)
+        for number, part in enumerate(parts):
+            connection.register(f"_{table}_{number}", part)
+        columns = ", ".join(f'"{name}"' for name in SCHEMAS[table].names)
+        union = " UNION ALL ".join(f"SELECT {columns} FROM _{table}_{number}" for number in range(len(parts)))
+        once = "DISTINCT ON (instance_id)" if table == "assets" else ""
+        connection.execute(f"CREATE VIEW {table} AS SELECT {once} {columns} FROM ({union})")
+
+
+def _merged(store: Store, keys: Sequence[str], table: str) -> list[Rows]:
+    """The merged table: read as it is asked from a disk, in whole from elsewhere."""
+    folder = f"{MANIFEST}/{table}"
+    keys = [key for key in keys if key.startswith(f"{folder}/")]
+    if isinstance(store, LocalStore):
+        partitioning = ds.partitioning(pa.schema([("category", pa.string())]), flavor="hive")
+        paths = [str(store.path(key)) for key in keys]
+        base = str(store.path(folder))
+        return [
+            ds.dataset(paths, SCHEMAS[table], _FORMAT, partitioning=partitioning, partition_base_dir=base),
+        ]
+    return [pa.concat_tables([_with_category(table, key, store.read(key)) for key in keys])]
+
+
+def _with_category(table: str, key: str, data: bytes) -> pa.Table:
+    rows = pq.read_table(pa.BufferReader(data), page_checksum_verification=True)
+    category = urllib.parse.unquote(key.split("/")[-2].removeprefix("category="))
+    column = pa.array([category] * rows.num_rows, pa.string())
+    return rows.append_column("category", column).select(SCHEMAS[table].names).cast(SCHEMAS[table])
+
+
+class _Committed:
+    """What is committed at this moment: files that are in place, and rows in memory where there is more to a range."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._plain: list[int] = []
+        self._other: list[list[CommitRecord]] = []
+        names = commit_names(store)
+        if not names:
+            raise OutputError(f"{store.name} holds no dataset that can be asked: there is nothing in {COMMITS} yet")
+        # Looked at after the commits: a range without staging is published for good.
+        staged = set(store.children(STAGING))
+        for start, group in groupby(names, key=lambda name: name[0]):
+            retries = [retry for _, retry, _ in group]
+            if isinstance(store, LocalStore) and retries == [0] and range_key(start) not in staged:
+                self._plain.append(start)
+            else:
+                records = [record for retry in retries if (record := read_record(store, start, retry)) is not None]
+                self._other.append(records)
+
+    def parts(self, table: str) -> list[Rows]:
+        """The rows of one table, in as many pieces as there are ways to read them."""
+        rows = [range_rows(self._store, records, table) for records in self._other]
+        parts: list[Rows] = [pa.concat_tables([SCHEMAS[table].empty_table(), *rows])]
+        if self._plain and isinstance(self._store, LocalStore):
+            paths = [str(self._store.path(range_table_path(start, table))) for start in self._plain]
+            parts.append(ds.dataset(paths, SCHEMAS[table], _FORMAT))
+        return parts

@@ -1,0 +1,126 @@
+"""`verso replay` and `verso scene`: one scene made again from its job, and held against what is stored."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from schemas.dataset.fingerprint import Fingerprint
+from schemas.dataset.layout import FINGERPRINT_FILE
+from schemas.dataset.tables import DETERMINISTIC_TABLES
+from schemas.errors import MachineError
+from schemas.scene.scene import SceneOutput
+from services.job.record import JobRecord, require_job
+from services.read.dataset_reader import StoredRange, file_reader, find_scene
+from workers.assets.catalogue import open_catalogue
+from workers.pipeline.context import WorkerContext, open_worker
+from workers.pipeline.fingerprint import take_fingerprint
+from workers.pipeline.make_scene import Stopwatch
+from workers.pipeline.run_shard import run_scene
+from workers.store.images import decode_png
+from workers.store.manifest import table_of_rows
+from workers.store.store import Store
+
+DEPTH_UNITS = 2
+"""On another stack a stored depth may round the other way, and a rest pose may differ in its last bits."""
+
+PIXEL_SHARE = 0.002
+"""On another stack this share of an image's pixels may differ by more: silhouettes that fall to the other side."""
+
+RGB_STEPS = 3
+"""On another stack a colour may differ by this many of its 255 steps."""
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What came of making a scene again."""
+
+    same_stack: bool
+    compared: int
+    """Files and tables held against each other."""
+    differences: tuple[str, ...]
+
+
+def replay_scene(store: Store, scene_id: int) -> Replay:
+    """Make one scene again and compare every file and row: to the byte on the same stack, within tolerances on another."""
+    record, stored = require_job(store), find_scene(store, scene_id)
+    context = open_context(record)
+    theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
+    same_stack = take_fingerprint(context.renderer, context.job.render.tier) == theirs
+    output = run_scene(context, scene_id, Stopwatch())
+    differences = compare_files(store, stored, output, same_stack)
+    if same_stack:
+        differences += compare_rows(stored, output)
+    return Replay(same_stack, len(output.files) + (len(DETERMINISTIC_TABLES) if same_stack else 0), tuple(differences))
+
+
+def open_context(record: JobRecord) -> WorkerContext:
+    """What is needed to make a stored job's scenes here. Raises MachineError where the assets are others than they were."""
+    catalogue = open_catalogue(record.job.assets, Path(record.folder), tuple(record.job.categories))
+    if catalogue.digest != record.catalogue:
+        raise MachineError(
+            f"the asset folders of this job (from {record.folder}) do not hold what they held when it was run"
+        )
+    return open_worker(record.job, catalogue)
+
+
+def compare_files(store: Store, stored: StoredRange, output: SceneOutput, same_stack: bool) -> list[str]:
+    """How a scene's images, made now, differ from the stored ones: a sentence each."""
+    scene_files = {
+        file["path"]: file["sha256"]
+        for view in stored.rows["views"]
+        if view["scene_id"] == output.scene_id
+        for file in view["files"]
+    }
+    made = {path: data for path, data in output.files if not path.startswith("assets/")}
+    differences = [
+        f"{path}: only {'stored' if path in scene_files else 'made now'}"
+        for path in sorted(made.keys() ^ scene_files.keys())
+    ]
+    read = file_reader(store, stored)
+    for path in sorted(made.keys() & scene_files.keys()):
+        if hashlib.sha256(made[path]).hexdigest() == scene_files[path]:
+            continue
+        difference = _compare_pixels(read(path), made[path])
+        if same_stack or not difference.within:
+            differences.append(f"{path}: {difference.words}")
+    return differences
+
+
+@dataclass(frozen=True)
+class _PixelDifference:
+    within: bool
+    words: str
+
+
+def _compare_pixels(before: bytes, now: bytes) -> _PixelDifference:
+    a, b = decode_png(before), decode_png(now)
+    if a.shape != b.shape or a.dtype != b.dtype:
+        return _PixelDifference(False, f"was {a.dtype} {a.shape}, is {b.dtype} {b.shape}")
+    gap = np.abs(a.astype(np.int64) - b.astype(np.int64))
+    allowed = DEPTH_UNITS if a.dtype == np.uint16 else RGB_STEPS if a.ndim == 3 else 0
+    share = float((gap > allowed).mean())
+    return _PixelDifference(
+        share <= PIXEL_SHARE, f"{share:.4%} of its values differ by more than {allowed}, at most {gap.max()}"
+    )
+
+
+def compare_rows(stored: StoredRange, output: SceneOutput, but: frozenset[str] = frozenset()) -> list[str]:
+    """How a scene's rows, made now, differ from the stored ones, `but` for these columns: a sentence each."""
+    differences = []
+    for table in DETERMINISTIC_TABLES:
+        made = output.rows.get(table, [])
+        if table == "assets":
+            wanted = {row["instance_id"] for row in made}
+            before = [row for row in stored.rows[table] if row["instance_id"] in wanted]
+        else:
+            before = [row for row in stored.rows[table] if row["scene_id"] == output.scene_id]
+        now = table_of_rows(table, made).to_pylist()
+        before, now = ([{k: v for k, v in row.items() if k not in but} for row in rows] for rows in (before, now))
+        if sorted(map(repr, before)) != sorted(map(repr, now)):
+            columns = sorted(
+                {key for a, b in zip(before, now, strict=False) for key in a if repr(a[key]) != repr(b.get(key))}
+            )
+            differences.append(f"rows of {table}: {', '.join(columns) or f'{len(before)} stored, {len(now)} made now'}")
+    return differences

@@ -1,0 +1,103 @@
+"""What is committed, and which scenes are still to be made, as ranges that can never overlap."""
+
+from collections.abc import Iterable, Sequence
+
+from schemas.dataset.commit import CommitSummary, Span
+from schemas.errors import OutputError
+from services.merge.committed_rows import check_retries
+from workers.store.commit import commit_names, read_summary
+from workers.store.store import Store
+
+
+def plan_ranges(
+    first_scene: int, stop_scene: int, range_size: int, committed: Iterable[tuple[int, int]]
+) -> list[tuple[int, int]]:
+    """The ranges [start, stop) that are missing, in order. `committed` may be out of date: planners never conflict.
+
+    Grid lines lie at first_scene + k * range_size. No range crosses one. Within a cell, the only starts that are ever
+    planned are the cell's own line and the stop of a committed range; a range ends at the next line, or at stop_scene
+    where that comes first.
+
+    Why ranges cannot overlap, whatever planners with old views and other values of stop_scene do: a record is put only
+    if absent, so one start has one range for ever. Take the committed ranges of a cell. The first can only begin at the
+    line (no stop existed before it), and each later one begins where one of them stops. One start has one range, so
+    they form a single chain, each beginning where the one before ends. A chain has no overlap, and no range leaves its
+    cell, so cells do not overlap either. An old view lacks the end of a chain: it plans a start that is taken, and
+    loses the put.
+
+    Raises OutputError where scenes outside [first_scene, stop_scene) are committed: fewer scenes than committed is
+    refused; and where committed ranges do not lie on this grid.
+    """
+    if range_size < 1 or stop_scene <= first_scene:
+        raise ValueError(f"no ranges of {range_size} scenes in [{first_scene}, {stop_scene})")
+    stops = dict(committed)
+    _check_grid(first_scene, stop_scene, range_size, stops)
+    missing = []
+    for line in range(first_scene, stop_scene, range_size):
+        start, end = line, min(line + range_size, stop_scene)
+        while start in stops:
+            start = stops[start]
+        if start < end:
+            missing.append((start, end))
+    return missing
+
+
+def plan_retries(summaries: Sequence[CommitSummary]) -> list[Span]:
+    """One span for each range that still has environmental failures, holding those scenes alone."""
+    spans = []
+    for group in ranges_with_retries(summaries):
+        scenes = tuple(scene for scene, kind in effective_failures(group) if kind == "environmental")
+        if scenes:
+            spans.append(Span(start=group[0].start, stop=group[0].stop, retry=group[-1].retry + 1, scenes=scenes))
+    return spans
+
+
+def list_commits(store: Store) -> list[CommitSummary]:
+    """Every committed range in order, each followed by its retries.
+
+    Raises CorruptError for a damaged or missing record, OutputError for one of a newer version.
+    """
+    summaries = [read_summary(store, start, retry) for start, retry, _ in commit_names(store)]
+    for group in ranges_with_retries(summaries):
+        check_retries(group[0].start, [one.retry for one in group])
+    return summaries
+
+
+def committed_ranges(summaries: Iterable[CommitSummary]) -> list[tuple[int, int]]:
+    """(start, stop) of every committed range, in order."""
+    return [(one.start, one.stop) for one in summaries if one.retry == 0]
+
+
+def ranges_with_retries(summaries: Iterable[CommitSummary]) -> list[list[CommitSummary]]:
+    """The commits of each range: itself, then its retries in order."""
+    groups: dict[int, list[CommitSummary]] = {}
+    for one in summaries:
+        groups.setdefault(one.start, []).append(one)
+    return [sorted(groups[start], key=lambda one: one.retry) for start in sorted(groups)]
+
+
+def effective_failures(group: Sequence[CommitSummary]) -> list[tuple[int, str]]:
+    """(scene id, kind) of the scenes of one range that failed, after all its retries, in order."""
+    failed: dict[int, str] = {}
+    for one in group:
+        for scene in one.scenes:
+            failed.pop(scene, None)
+        failed.update(one.failed)
+    return sorted(failed.items())
+
+
+def _check_grid(first_scene: int, stop_scene: int, range_size: int, stops: dict[int, int]) -> None:
+    last = max(stops.values(), default=first_scene)
+    if min(stops, default=first_scene) < first_scene or last > stop_scene:
+        raise OutputError(
+            f"scenes {min(stops)} to {last - 1} are committed, more than the job's {first_scene} to {stop_scene - 1}: "
+            "fewer scenes than committed are refused, ask for at least as many or choose another --out"
+        )
+    known_stops = set(stops.values())
+    for start, stop in stops.items():
+        line = first_scene + (start - first_scene) // range_size * range_size
+        if stop <= start or stop > line + range_size or (start != line and start not in known_stops):
+            raise OutputError(
+                f"the committed range [{start}, {stop}) does not fit ranges of {range_size} scenes from {first_scene}: "
+                "a dataset keeps the range_size of its first run"
+            )

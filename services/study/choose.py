@@ -1,0 +1,216 @@
+"""Pure: which settings are worth their time, and which one meets a target at the least cost."""
+
+import difflib
+import math
+from collections.abc import Mapping, Sequence
+
+from schemas.errors import InputError, RunError
+from services.study.errors import ERRORS
+from services.study.model import Figure, Row
+from services.study.words import amount, listed, number, shown, times, unit
+
+Targets = Mapping[str, float]
+"""The most that an error may be, by name of `ERRORS`, in the unit of the table: shares from 0 to 1."""
+
+AS_CHEAP = 1.05
+"""Costs this many times the least count as the least: interleaved medians on one core come back within some 3 %."""
+
+MORE_FAILED = 0.01
+"""A setting may fail this many more of the scenes than the job does: beyond that, being cheap is leaving work out."""
+
+
+class TargetError(RunError):
+    """No setting meets the targets; the message names the nearest, by how much it misses, and what it would meet."""
+
+
+def own_row(rows: Sequence[Row]) -> Row:
+    """The row of the job as it is. Raises ValueError where there is none."""
+    for row in rows:
+        if not row.setting.parts:
+            return row
+    raise ValueError("a study has one row for the job as it is; here there is none")
+
+
+def error_of(row: Row, name: str, rows: Sequence[Row]) -> Figure | None:
+    """An error of a setting, or the job's own where this setting did not measure it, or None where neither did.
+
+    A setting measures the errors that its knobs can move: in the others it is as the job is.
+    """
+    found = row.errors.get(name)
+    if found is None and name == "failed_share":
+        found = Figure(row.failed_share, row.failed_share, row.failed_share, row.failed_share, 0)
+    return found or own_row(rows).errors.get(name)
+
+
+def front(rows: Sequence[Row], error: str) -> list[Row]:
+    """Those that measured an error and of which no other is as cheap and as good, from the cheapest to the best.
+
+    Of settings alike in both, the first by name stands for all.
+    """
+    kept: list[Row] = []
+    measured = [row for row in rows if error in row.errors and not math.isnan(row.errors[error].value)]
+    for row in sorted(measured, key=lambda row: (row.ratio, row.errors[error].value, row.setting.name)):
+        if not kept or row.errors[error].value < kept[-1].errors[error].value:
+            kept.append(row)
+    return kept
+
+
+def as_cheap(row: Row, other: Row) -> bool:
+    """Whether the times of two settings overlap, so that their order is noise."""
+    return row.ratio_least <= other.ratio_most and other.ratio_least <= row.ratio_most
+
+
+def choose(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None) -> Row:
+    """The cheapest setting all of whose errors meet the targets (`value <= target`). Raises InputError, TargetError.
+
+    An error that a setting did not measure is the job's own (`error_of`). Unless failed scenes are a target themselves, a
+    setting that fails `MORE_FAILED` more of them than the job is left out. `bounds` are further targets that the message
+    does not speak of.
+
+    Run twice, it should be the same one. Errors are, to the bit, as scenes are a pure function of job and seed; so
+    is who meets the targets. Times are not. Hence what costs at most `AS_CHEAP` times the least counts as the least, and
+    among those what does not change decides: the job itself before anything else, as a change for 5 % is not worth making;
+    then the least sum of errors relative to the job's own; then the fewest changes; then the name.
+    """
+    check_targets(rows, targets)
+    meeting = [row for row in candidates(rows, targets) if meets(row, {**(bounds or {}), **targets}, rows)]
+    if not meeting:
+        raise TargetError(describe_miss(rows, targets))
+    return cheapest(meeting, rows)
+
+
+def cheapest(some: Sequence[Row], rows: Sequence[Row]) -> Row:
+    """Of some of the rows, at least one, that which costs the least; among those as cheap, by what is told in `choose`."""
+    least = min(row.ratio for row in some)
+    return min((row for row in some if row.ratio <= least * AS_CHEAP), key=lambda row: _steady_order(row, rows))
+
+
+def _steady_order(row: Row, rows: Sequence[Row]) -> tuple[bool, float, int, str]:
+    setting = row.setting
+    return (bool(setting.parts), round(relative_error(row, rows), 6), len(setting.parts), setting.name)
+
+
+def relative_error(row: Row, rows: Sequence[Row]) -> float:
+    """The sum of a setting's errors, each in shares of the job's own: as many as there are errors where it is the job's.
+
+    Where the job's own is 0, any error counts as twice as much.
+    """
+    total = 0.0
+    for name, own in own_row(rows).errors.items():
+        found = error_of(row, name, rows)
+        value = own.value if found is None else found.value
+        total += value / own.value if own.value > 0 else 2.0 if value > 0 else 1.0
+    return total
+
+
+def candidates(rows: Sequence[Row], targets: Targets) -> list[Row]:
+    """Those that may be chosen at all."""
+    most = own_row(rows).failed_share + MORE_FAILED
+    return [row for row in rows if "failed_share" in targets or row.failed_share <= most]
+
+
+def meets(row: Row, targets: Targets, rows: Sequence[Row]) -> bool:
+    """Whether all errors are at most their targets; one that nothing measured meets none."""
+    return all(
+        (found := error_of(row, name, rows)) is not None and found.value <= target for name, target in targets.items()
+    )
+
+
+def check_targets(rows: Sequence[Row], targets: Targets) -> None:
+    """Raises InputError for an error that is not known, TargetError for one that no setting has measured."""
+    for name in targets:
+        if name not in ERRORS:
+            raise InputError(_unknown(name))
+        if all(error_of(row, name, rows) is None for row in rows):
+            why = sorted({note for row in rows for note in row.notes if name in note})
+            known = ", ".join(sorted({error for row in rows for error in row.errors}))
+            raise TargetError(
+                f"--target {name}: this study did not measure it{': ' + '; '.join(why) if why else ''}. It measured {known}"
+            )
+
+
+def _unknown(name: str) -> str:
+    near = difflib.get_close_matches(name, ERRORS, n=1)
+    hint = f"did you mean '{near[0]}'? " if near else ""
+    return f"--target {name}: there is no such error; {hint}Known: {', '.join(ERRORS)}"
+
+
+# ---------------------------------------------------------------------------------------------- nobody meets them
+
+
+def describe_miss(rows: Sequence[Row], targets: Targets) -> str:
+    """What the nearest setting misses the targets by, and what to ask for instead."""
+    nearest = nearest_row(rows, targets)
+    told, loosened = [], []
+    for name, target in targets.items():
+        found = error_of(nearest, name, rows)
+        if found is None:
+            told.append(f"{name}, which was not measured with it")
+        elif found.value > target:
+            over = (
+                f"{amount(name, found.value)} is {amount(name, found.value - target)} more than {amount(name, target)}"
+            )
+            told.append(f"{name}, {over}{f' ({times(found.value / target)})' if target > 0 else ''}")
+            loosened.append(f"{name}={_above(found.value)}")
+    asked = ", ".join(f"{name}={target:g}" for name, target in targets.items())
+    remedy = f". Loosen to at least {','.join(loosened)}" if loosened else ""
+    return (
+        f"no setting meets {asked}. The nearest is {nearest.setting.name}, at {times(nearest.ratio)} the job's time: it "
+        f"misses {listed(told)}{remedy}"
+    )
+
+
+def nearest_row(rows: Sequence[Row], targets: Targets) -> Row:
+    """The one whose farthest miss, as a multiple of its target, is the least; of such the cheapest, then by name."""
+
+    def key(row: Row) -> tuple[float, float, str]:
+        found = {name: error_of(row, name, rows) for name in targets}
+        values = {name: math.inf if figure is None else figure.value for name, figure in found.items()}
+        worst = max(_excess(values[name], target) for name, target in targets.items())
+        return (worst, row.ratio, row.setting.name)
+
+    return min(candidates(rows, targets), key=key)
+
+
+def _excess(value: float, target: float) -> float:
+    """How many times its target a value is; against a target of 0, as if that were a millionth."""
+    return value / max(target, 1e-6) if value > target else 1.0
+
+
+def _above(value: float) -> str:
+    """A short number, not under the value, so that a target of it is met."""
+    for digits in range(2, 18):
+        step = 10.0 ** (math.floor(math.log10(value)) - digits + 1)
+        text = f"{math.ceil(value / step * (1 - 1e-12)) * step:.{digits}g}"
+        if float(text) >= value:
+            return text
+    return repr(value)
+
+
+# ---------------------------------------------------------------------------------------------- what a user types
+
+
+def parse_targets(text: str) -> dict[str, float]:
+    """From "penetration_mm=0.1,depth_mm=0.5". Raises InputError with the remedy."""
+    targets: dict[str, float] = {}
+    for part in text.split(","):
+        name, equals, value = (piece.strip() for piece in part.partition("="))
+        if not equals or not name:
+            raise InputError(f"--target {part.strip() or text!r}: write it as penetration_mm=0.1,depth_mm=0.5")
+        if name not in ERRORS:
+            raise InputError(_unknown(name))
+        if name in targets:
+            raise InputError(f"--target {name}: is given twice, as {targets[name]:g} and as {value}")
+        targets[name] = _amount(name, value)
+    return targets
+
+
+def _amount(name: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value >= 0.0):
+        example = f", a share such as 0.001 for {number(shown(name, 0.001))} %" if unit(name) == "%" else ""
+        raise InputError(f"--target {name}={text}: must be a number from 0 up{example}")
+    return value

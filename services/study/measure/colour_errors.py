@@ -1,0 +1,142 @@
+"""How far a view's colour is from where the light really goes: FLIP against a path-traced image that has converged."""
+
+import importlib.util
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.errors import InputError
+from schemas.job.job import Render
+from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.scene import REGION_FLOOR, Appearance, Placed
+from services.study.measure.flip import flip_between
+from services.study.measure.patch_rays import cast_patch
+from services.study.measure.rays import Box
+from workers.assets.appearance.draw import draw_look
+from workers.pipeline.context import WorkerContext
+from workers.pipeline.make_scene import Scene
+from workers.plan.randomness import Stream, stream
+from workers.render.step import draw_view, require_tier
+
+WIDTH, HEIGHT = 640, 480
+"""Of the image that colours are compared in, whatever the size of the one under test: the patch in it is traced alone."""
+
+MARGIN_SHARE = 0.25
+MARGIN_PX = 4
+"""What is compared about the objects on each side: their contact shadows fall there."""
+
+BOUNCES = 16
+"""Of the truth's paths, whatever the job's: glass before glass takes eight."""
+
+TRUTH_SEED = 0xC0107
+"""Of the truth's paths: a stream of their own, which no job's seed reaches."""
+
+
+@dataclass(frozen=True)
+class Crop:
+    """Pixels of an image of `WIDTH` x `HEIGHT`."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+
+@dataclass(frozen=True, eq=False)
+class ColourTruth:
+    """rgb [bottom - top, right - left, 3] uint8 sRGB: the crop of the input view, path-traced."""
+
+    crop: Crop
+    rgb: NDArray[np.uint8]
+
+
+def colour_truth_missing() -> str | None:
+    """Why there is no truth of colour on this machine, and the remedy; None where there is."""
+    if importlib.util.find_spec("mitsuba") is None:
+        return (
+            "errors of colour need the path-traced tier, which is not installed: `./verso extra pathtraced` installs it"
+        )
+    try:
+        require_tier(Render(tier="pathtraced"))
+    except InputError as error:
+        return str(error)
+    return None
+
+
+def converged_colour(context: WorkerContext, scene: Scene, paths: int, salt: int = 0) -> ColourTruth | None:
+    """The first pair's input view about the objects by that many paths a pixel; None where it sees none of them.
+
+    Neither tier nor samples, seed of paths, bounces, sensor or size of the scene's own images decide it: its look is the one
+    that the raster and path-traced tiers share, its seed its own. Another `salt` traces other paths.
+    """
+    crop = crop_of(scene)
+    if crop is None:
+        return None
+    camera = scene.pairs[0].input.camera
+    things, appearance = _in_studio(context, scene)
+    render = Render(tier="pathtraced", path_samples=paths, path_bounces=BOUNCES)
+    rng = np.random.default_rng([TRUTH_SEED, scene.plan.scene_id, salt])
+    drawn = draw_view(context.renderer, things, appearance, crop_camera(camera, crop), render, rng)
+    return ColourTruth(crop, drawn.rgb)
+
+
+def crop_of(scene: Scene) -> Crop | None:
+    """What is compared of the first pair's input view; None where it sees no object."""
+    patch = cast_patch(scene.posed.things, scene.pairs[0].input.camera)
+    return None if patch.box is None else crop_about(patch.box)
+
+
+def flip_error(truth: ColourTruth, rgb: NDArray[np.uint8]) -> float:
+    """FLIP of a stored input view [H, W, 3] uint8 of any size in the truth's crop, the sensor's effects in it."""
+    return flip_between(truth.rgb, crop_colour(rgb, truth.crop))
+
+
+def crop_about(box: Box) -> Crop:
+    """A box in shares of an image (`Patch.box`) with a margin, in whole pixels of an image of `WIDTH` x `HEIGHT`."""
+    left, top, right, bottom = np.array(box) * (WIDTH, HEIGHT, WIDTH, HEIGHT)
+    margin = MARGIN_PX + MARGIN_SHARE * max(right - left, bottom - top)
+    low = np.floor(np.maximum((left - margin, top - margin), 0.0)).astype(int)
+    high = np.ceil(np.minimum((right + margin, bottom + margin), (WIDTH, HEIGHT))).astype(int)
+    return Crop(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+
+
+def crop_camera(camera: Camera, crop: Crop) -> Camera:
+    """The camera whose image is the crop of this one's, brought to `WIDTH` x `HEIGHT`."""
+    k = camera.intrinsics
+    across, down = WIDTH / k.width, HEIGHT / k.height
+    cropped = Intrinsics(
+        width=crop.right - crop.left,
+        height=crop.bottom - crop.top,
+        fx=k.fx * across,
+        fy=k.fy * down,
+        cx=k.cx * across - crop.left,
+        cy=k.cy * down - crop.top,
+    )
+    return Camera(cropped, camera.T_world_cam)
+
+
+def crop_colour(rgb: NDArray[np.uint8], crop: Crop) -> NDArray[np.uint8]:
+    """[bottom - top, right - left, 3] uint8: the crop of an image of any size.
+
+    A larger image is averaged by area, a smaller one interpolated linearly: so detail that it lacks counts against it.
+    """
+    here = (slice(crop.top, crop.bottom), slice(crop.left, crop.right))
+    if rgb.shape[:2] == (HEIGHT, WIDTH):
+        return rgb[here]
+    smaller = rgb.shape[0] < HEIGHT or rgb.shape[1] < WIDTH
+    way = cv2.INTER_LINEAR if smaller else cv2.INTER_AREA
+    return np.asarray(cv2.resize(rgb, (WIDTH, HEIGHT), interpolation=way), np.uint8)[here]
+
+
+def _in_studio(context: WorkerContext, scene: Scene) -> tuple[Sequence[Placed], Appearance]:
+    """The scene's things and light as tier pathtraced draws them: flat scenes have another floor and other lights."""
+    rng = stream(context.job.seed, scene.plan.scene_id, Stream.APPEARANCE)
+    floor, appearance = draw_look(rng, "pathtraced")
+    things = tuple(
+        Placed(thing.region_id, floor, thing.T_world_shape) if thing.region_id == REGION_FLOOR else thing
+        for thing in scene.posed.things
+    )
+    return things, appearance

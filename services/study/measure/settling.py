@@ -1,0 +1,129 @@
+"""How a scene comes to rest with each setting, against finer steps than any that is measured."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from schemas.errors import SceneError
+from schemas.job.job import Job
+from schemas.job.physics import Physics
+from schemas.scene.scene import ScenePlan, Settled
+from services.study.knobs import apply
+from services.study.model import Setting
+from workers.geometry.frames import moved_between, transform
+from workers.physics.step import Rest, moved_by, recheck_scene, settle_scene
+from workers.pipeline.context import WorkerContext
+from workers.pipeline.make_scene import plan_with_assets
+from workers.plan.effect import Facts
+from workers.plan.effects import plan_effects
+
+AGREE_MM = 0.05
+"""Two finer settings that end nearer than this agree, and a pose has an error."""
+
+REFERENCES: tuple[Mapping[str, Any], ...] = (
+    {"step_hz": 3840, "max_step_travel_mm": 0.03, "solver_iterations": 400},
+    {"step_hz": 7680, "max_step_travel_mm": 0.015, "solver_iterations": 400},
+)
+"""Of physics, finer than every value that is measured: the first gives the distribution of outcomes; a pose has a truth where
+the second ends where the first did."""
+
+RELEASED: Mapping[str, Any] = {"step_hz": 960, "max_step_travel_mm": 0.05, "solver_iterations": 400}
+"""With these, in steps 16 times shorter, is released again what came to rest with any setting."""
+
+Answer = dict[str, Any]
+
+
+def measure_settling(
+    context: WorkerContext, settings: Sequence[Setting], scene_id: int, posed: bool, released: bool
+) -> dict[str, Answer]:
+    """Figures of one scene by the settings' names, and of the reference under "reference".
+
+    Each has `failed`, or else penetration_mm and gap_mm, slid_mm and rolled_deg (how far the centre of mass went sideways and
+    the object turned from where it was let go; the most of several objects). With `posed` also pose_mm, where there is a
+    truth; with `released` moved_mm and turned_deg. A scene that cannot even be drawn has no answers.
+    """
+    try:
+        plan = plan_with_assets(context, scene_id)
+    except SceneError:
+        return {}
+    truths = [_settle(context.job, plan, reference) for reference in REFERENCES[: 2 if posed else 1]]
+    answers = {"reference": _describe(plan, truths[0])}
+    agreed = posed and None not in truths and _apart_mm(plan, *truths) <= AGREE_MM  # type: ignore[arg-type]
+    answers["reference"]["agreed"] = agreed if posed else None
+    again = dict[bytes, dict[str, float]]()
+    for setting in settings:
+        job = apply(context.job, setting.changes)
+        rest = _settle(job, plan)
+        answer = answers[setting.name] = _describe(plan, rest)
+        if rest is None:
+            continue
+        if agreed and truths[0] is not None:
+            answer["pose_mm"] = _apart_mm(plan, rest, truths[0])
+        if released:
+            key = b"".join(one.T_world_obj.tobytes() for one in rest.settled)
+            if key not in again:
+                again[key] = _release(context.job, plan, rest)
+            answer.update(again[key])
+    return answers
+
+
+def _settle(job: Job, plan: ScenePlan, physics: Mapping[str, Any] | None = None) -> Rest | None:
+    """None where the scene does not come to rest."""
+    finer = _physics(job, physics or {})
+    effects = plan_effects(Facts(job.model_copy(update={"physics": finer}), plan, raycast_checked=False))
+    try:
+        return settle_scene(plan, finer, effects)
+    except SceneError:
+        return None
+
+
+def _physics(job: Job, changes: Mapping[str, Any]) -> Physics:
+    return job.physics.model_copy(update=dict(changes))
+
+
+def _describe(plan: ScenePlan, rest: Rest | None) -> Answer:
+    if rest is None:
+        return {"failed": True}
+    ways = [_way(plan, number, one) for number, one in enumerate(rest.settled)]
+    return {
+        "failed": False,
+        "penetration_mm": max(one.penetration_mm for one in rest.settled),
+        "gap_mm": max(one.hover_gap_mm for one in rest.settled),
+        "slid_mm": max(slid for slid, _ in ways),
+        "rolled_deg": max(turned for _, turned in ways),
+    }
+
+
+def _way(plan: ScenePlan, number: int, rest: Settled) -> tuple[float, float]:
+    """Of an object from its start to its rest: sideways way of its centre of mass, mm, and its turn, degrees."""
+    start = plan.objects[number]
+    com = start.asset.mass.com[None, :]
+    before, after = (transform(T, com)[0, :2] for T in (start.T_world_obj, rest.T_world_obj))
+    _, turned = moved_between(start.hull.vertices, start.T_world_obj, rest.T_world_obj)
+    return float(np.linalg.norm(after - before)) * 1e3, math.degrees(turned)
+
+
+def _apart_mm(plan: ScenePlan, one: Rest, other: Rest) -> float:
+    """The farthest that a point of an object lies from where it lies in the other."""
+    return max(
+        moved_by(start, a.T_world_obj, b.T_world_obj)[0]
+        for start, a, b in zip(plan.objects, one.settled, other.settled, strict=True)
+    )
+
+
+def _release(job: Job, plan: ScenePlan, rest: Rest) -> dict[str, float]:
+    physics = _physics(job, RELEASED)
+    planned = plan_effects(Facts(job.model_copy(update={"physics": physics}), plan, raycast_checked=False))
+    again = recheck_scene(plan, rest, physics, planned).settled
+    return {
+        "moved_mm": max(one.recheck_move_mm or 0.0 for one in again),
+        "turned_deg": max(one.recheck_turn_deg or 0.0 for one in again),
+    }
+
+
+def context_for(context: WorkerContext, setting: Setting) -> WorkerContext:
+    """The same worker with the setting's job. The settings' digest stays: nothing is stored under it."""
+    return dataclasses.replace(context, job=apply(context.job, setting.changes))

@@ -1,0 +1,81 @@
+"""Pure: from figures scene by scene to a setting's errors with their confidence."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import wasserstein_distance
+
+from services.study.errors import ERRORS
+from services.study.model import Figure
+
+PERCENTILE = 95.0
+"""Of the scenes' figures: the error of a setting."""
+
+RESAMPLES = 200
+"""Of the scenes, with replacement, for an interval."""
+
+INTERVAL = (2.5, 97.5)
+
+Answer = Mapping[str, Any]
+Rows = NDArray[np.int64]
+
+
+def figure_over_scenes(figures: Sequence[float]) -> Figure:
+    """The 95th percentile of one figure a scene, at least one. ValueError where there is none."""
+    if not figures:
+        raise ValueError("an error of no scenes")
+    values = np.asarray(figures, float)
+    return _figure(len(values), lambda rows: float(np.percentile(values[rows], PERCENTILE)), float(np.median(values)))
+
+
+def share(flags: Sequence[bool]) -> Figure:
+    """The share that is true."""
+    values = np.asarray(flags, float)
+    return _figure(len(values), lambda rows: float(values[rows].mean()), float(values.mean()))
+
+
+def apart(own: Sequence[float], truth: Sequence[float]) -> Figure:
+    """How far apart two distributions are: the first Wasserstein distance of samples [N], scene by scene the same scenes.
+
+    Their area between cumulative distributions, in the samples' unit (Villani 2009, Optimal Transport, 6.2; Ramdas, Garcia
+    and Cuturi 2017 for one dimension). Where a tumbling thing ends is chance, and the distance of two poses says nothing;
+    that of their distributions does. Its interval is a paired bootstrap's; its median is the value again.
+    """
+    mine, other = np.asarray(own, float), np.asarray(truth, float)
+    whole = float(wasserstein_distance(mine, other))
+    return _figure(len(mine), lambda rows: float(wasserstein_distance(mine[rows], other[rows])), whole)
+
+
+def _figure(count: int, measure: Callable[[Rows], float], median: float) -> Figure:
+    rng = np.random.default_rng(0)
+    samples = [measure(rng.integers(0, count, count, dtype=np.int64)) for _ in range(RESAMPLES)]
+    low, high = np.percentile(samples, INTERVAL)
+    return Figure(measure(np.arange(count, dtype=np.int64)), float(low), float(high), median, count)
+
+
+def settling_figures(name: str, scenes: Sequence[Answer]) -> dict[str, Figure]:
+    """Errors of physics of a setting from the answers of `measure_settling`, of which each has those of all settings."""
+    mine = [scene[name] for scene in scenes if name in scene]
+    if not mine:
+        return {}
+    found = {"failed_share": share([one["failed"] for one in mine])}
+    for error in ("penetration_mm", "gap_mm", "pose_mm", "moved_mm", "turned_deg"):
+        if figures := [one[error] for one in mine if error in one]:
+            found[error] = figure_over_scenes(figures)
+    both = [
+        (scene[name], scene["reference"])
+        for scene in scenes
+        if name in scene and not scene[name]["failed"] and not scene["reference"]["failed"]
+    ]
+    if len(both) > 1:
+        found["outcome_mm"] = apart([a["slid_mm"] for a, _ in both], [b["slid_mm"] for _, b in both])
+        found["outcome_deg"] = apart([a["rolled_deg"] for a, _ in both], [b["rolled_deg"] for _, b in both])
+    return found
+
+
+def image_figures(scenes: Sequence[Mapping[str, float]]) -> dict[str, Figure]:
+    """Errors of images of a setting from one mapping a scene, in the order of `ERRORS`."""
+    names = [name for name in ERRORS if any(name in scene for scene in scenes)]
+    return {name: figure_over_scenes([scene[name] for scene in scenes if name in scene]) for name in names}

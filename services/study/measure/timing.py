@@ -1,0 +1,130 @@
+"""What a scene takes with each setting: in turn within a round, on one core."""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from schemas.errors import SceneError
+from services.bench.ratios import Spread
+from services.study.measure.settling import context_for
+from services.study.model import Setting
+from workers.physics.step import settle_scene
+from workers.pipeline.context import WorkerContext
+from workers.pipeline.make_scene import Stopwatch, plan_with_assets
+from workers.pipeline.run_shard import run_scene
+from workers.plan.effect import Facts
+from workers.plan.effects import plan_effects
+
+WARM_SCENES = 4
+
+Answer = dict[str, Any]
+
+
+def time_scene(
+    context: WorkerContext, whole: Sequence[Setting], settling: Sequence[Setting], scene_id: int, lap: int
+) -> Answer:
+    """Seconds of processor by setting: of the whole scene up to its encoded files, or of `settling` alone.
+
+    The first run, of the job itself, meets the shapes for the first time, as a job does in every scene; all others have
+    them at hand, so that what new shapes cost is told apart. The others are run in another order in each scene and `lap`, so
+    that none always follows the same one. Bytes are those of all files and of no rows.
+    """
+    began = time.process_time()
+    run_scene(context, scene_id, Stopwatch())
+    cold = time.process_time() - began
+    answer: Answer = {"whole": {}, "settling": {}, "bytes": {}, "cold": cold}
+    order = np.random.default_rng([scene_id, lap])
+    for setting in _shuffled(whole, order):
+        worker = context_for(context, setting)
+        began = time.process_time()
+        output = run_scene(worker, scene_id, Stopwatch())
+        took = time.process_time() - began
+        if output.files:
+            answer["whole"][setting.name] = took
+            answer["bytes"][setting.name] = sum(len(data) for _, data in output.files)
+    for setting in _shuffled(settling, order):
+        took_or_none = _settle_s(context_for(context, setting), scene_id)
+        if took_or_none is not None:
+            answer["settling"][setting.name] = took_or_none
+    return answer
+
+
+def _shuffled(settings: Sequence[Setting], order: np.random.Generator) -> list[Setting]:
+    return [settings[k] for k in order.permutation(len(settings))]
+
+
+def warm_up(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> None:
+    """Make a scene that is not timed with everything at least once: code is compiled and shaders are made in a first run."""
+    for number in range(WARM_SCENES):
+        run_scene(context, scene_id + number, Stopwatch())
+    for setting in settings:
+        run_scene(context_for(context, setting), scene_id, Stopwatch())
+
+
+def _settle_s(context: WorkerContext, scene_id: int) -> float | None:
+    """Seconds for choosing the effects and settling; None where it does not come to rest."""
+    try:
+        plan = plan_with_assets(context, scene_id)
+        began = time.process_time()
+        effects = plan_effects(Facts(context.job, plan, raycast_checked=False))
+        settle_scene(plan, context.job.physics, effects)
+    except SceneError:
+        return None
+    return time.process_time() - began
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Of a setting: its time over the job's own, round by round, and kilobytes a scene (None: as the job's own)."""
+
+    ratio: Spread
+    kilobytes: float | None
+    scenes: int
+
+
+def job_cost(laps: Sequence[Mapping[int, Answer]], own: str) -> tuple[float, float]:
+    """(milliseconds of processor, kilobytes) a scene of the job itself: medians over rounds, shapes new."""
+    times = [
+        sum(_own_s(lap, laps[0], scene, own) for scene in scenes) / len(scenes)
+        for lap in laps
+        if (scenes := _made(lap, own))
+    ]
+    sizes = [answer["bytes"][own] for answer in laps[0].values() if own in answer["bytes"]]
+    return median(times) * 1e3, sum(sizes) / len(sizes) / 1e3
+
+
+def _made(lap: Mapping[int, Answer], name: str) -> list[int]:
+    return [scene for scene, answer in lap.items() if name in answer["whole"]]
+
+
+def _own_s(lap: Mapping[int, Answer], first: Mapping[int, Answer], scene: int, own: str) -> float:
+    """Seconds of the job's own scene in this round with what new shapes cost, which is measured once."""
+    new = max(0.0, first[scene]["cold"] - first[scene]["whole"].get(own, first[scene]["cold"]))
+    return float(lap[scene]["whole"][own]) + new
+
+
+def cost_of(name: str, own: str, laps: Sequence[Mapping[int, Answer]]) -> Cost | None:
+    """A setting's cost over the scenes that it and the job made in a round; None where there are none.
+
+    What settles alone is compared by settling: its difference to the job's own is added to the whole.
+    """
+    ratios, scenes_seen = [], set[int]()
+    for lap in laps:
+        more, base = 0.0, 0.0
+        for scene, answer in lap.items():
+            key = "whole" if name in answer["whole"] else "settling"
+            if name not in answer[key] or own not in answer[key] or own not in answer["whole"]:
+                continue
+            more += answer[key][name] - answer[key][own]
+            base += _own_s(lap, laps[0], scene, own)
+            scenes_seen.add(scene)
+        if base:
+            ratios.append((base + more) / base)
+    if not ratios:
+        return None
+    sizes = [a["bytes"][name] for a in laps[0].values() if name in a["bytes"]]
+    return Cost(Spread.of(ratios), sum(sizes) / len(sizes) / 1e3 if sizes else None, len(scenes_seen))

@@ -1,0 +1,82 @@
+"""What rays say of one scene's geometry, kept from setting to setting while its things stand where they stood."""
+
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.scene.camera import Camera
+from schemas.scene.scene import Placed
+from services.study.measure.patch_rays import Patch, cast_patch
+from services.study.measure.pixel_rays import Pixels, cast_pixels, seen_by_other
+from workers.pipeline.make_scene import Scene
+
+KEPT = 12
+"""Answers kept of a scene, some 0.3 MB each: those asked for last. The input camera's are asked for by every setting; a
+mirror camera stands elsewhere whenever d_z changes."""
+
+Key = tuple[object, ...]
+Answer = TypeVar("Answer")
+
+
+class Truth:
+    """Rays of one scene; a cache, so not frozen: what it answers depends on the scene and the question alone."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene_id = scene.plan.scene_id
+        self.things = scene.posed.things
+        self._kept: OrderedDict[Key, object] = OrderedDict()
+
+    def fits(self, scene: Scene) -> bool:
+        """Whether this is the truth of that scene too: the same shapes at the same poses."""
+        theirs = scene.posed.things
+        return (
+            self.scene_id == scene.plan.scene_id
+            and len(self.things) == len(theirs)
+            and all(_same(mine, other) for mine, other in zip(self.things, theirs, strict=True))
+        )
+
+    def pixels(self, camera: Camera) -> Pixels:
+        """The view at its pixels."""
+        return self._keep(("pixels", *_key(camera)), lambda: cast_pixels(self.things, camera))
+
+    def patch(self, camera: Camera, pair: int) -> Patch:
+        """The objects in a pair's input view, alike for images of all sizes."""
+        k = camera.intrinsics
+        # To 12 digits: a camera scaled to another size is the same one but for rounding.
+        frame = [round(x, 12) for x in (k.fx / k.width, k.fy / k.height, k.cx / k.width, k.cy / k.height)]
+        key = ("patch", pair, *frame, camera.T_world_cam.tobytes())
+        return self._keep(key, lambda: cast_patch(self.things, camera, self.scene_id, pair))
+
+    def both(self, camera: Camera, other: Camera) -> NDArray[np.bool_]:
+        """Which pixels of `pixels(camera).box` show a point of an object that the other camera sees too."""
+        key = ("both", *_key(camera), *_key(other))
+        return self._keep(key, lambda: seen_by_other(self.things, camera, self.pixels(camera).box, other))
+
+    def _keep(self, key: Key, cast: Callable[[], Answer]) -> Answer:
+        if key not in self._kept:
+            self._kept[key] = cast()
+        self._kept.move_to_end(key)
+        while len(self._kept) > KEPT:
+            self._kept.popitem(last=False)
+        return self._kept[key]  # type: ignore[return-value]
+
+
+def truth_of(scene: Scene, kept: Truth | None = None) -> Truth:
+    """The truth to hold a scene against: `kept`, of an earlier setting, where it is of the same geometry, or a new one."""
+    return kept if kept is not None and kept.fits(scene) else Truth(scene)
+
+
+def _key(camera: Camera) -> Key:
+    return *camera.intrinsics.model_dump().values(), camera.T_world_cam.tobytes()
+
+
+def _same(mine: Placed, other: Placed) -> bool:
+    if mine.region_id != other.region_id or not np.array_equal(mine.T_world_shape, other.T_world_shape):
+        return False
+    return mine.shape is other.shape or (
+        np.array_equal(mine.shape.vertices, other.shape.vertices)
+        and np.array_equal(mine.shape.faces, other.shape.faces)
+    )

@@ -1,0 +1,39 @@
+"""What is asked of a study: the job, what is turned, and how much is measured."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from schemas.job.job import Job
+from services.study.model import Knob, Setting
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured, in scenes.
+
+    Of `scenes` the images are looked at; of `settled` only how they come to rest: `released` of them are let go again, and
+    `posed` have their poses compared with the truth. `timed` are timed in each of `laps` rounds; `coloured` are drawn with
+    very many paths.
+    """
+
+    scenes: int = 48
+    settled: int = 500
+    released: int = 16
+    posed: int = 48
+    timed: int = 12
+    laps: int = 3
+    coloured: int = 4
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is asked: the job that is timed, its knobs and settings, the presets, the targets."""
+
+    job: Job
+    job_folder: Path
+    knobs: tuple[Knob, ...]
+    settings: tuple[Setting, ...]
+    presets: tuple[Setting, ...]
+    targets: Mapping[str, float] | None
+    sizes: Sizes = field(default_factory=Sizes)

@@ -1,0 +1,128 @@
+"""A study on disk: two Parquet tables for whoever reads columns, and the study itself, exactly, as JSON."""
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from schemas.errors import CorruptError, OutputError
+from services.study.errors import ERRORS
+from services.study.model import Figure, Row, Setting, Study
+
+STUDY_FILE = "study.json"
+WIDE_FILE = "tradeoff.parquet"
+LONG_FILE = "errors.parquet"
+
+STUDY_VERSION = 1
+"""Of the JSON file; a newer one is refused."""
+
+_SETTING = [("setting", pa.string()), ("knob", pa.string()), ("value", pa.string())]
+_COST = ("ms", "ratio", "ratio_least", "ratio_most", "kilobytes", "failed_share")
+
+LONG_SCHEMA = pa.schema(
+    [
+        *_SETTING,
+        ("error", pa.string()),
+        ("unit", pa.string()),
+        ("group", pa.string()),
+        *((name, pa.float64()) for name in ("ms", "ratio", "amount", "low", "high", "median")),
+        ("scenes", pa.int64()),
+    ]
+)
+
+
+def wide_schema() -> pa.Schema:
+    """A row a setting. A column of each error, its interval beside it, null where it was not measured."""
+    errors = [name for name in ERRORS if name != "failed_share"]
+    figures = [
+        *((name, pa.float64()) for error in errors for name in (error, f"{error}_low", f"{error}_high")),
+        ("failed_share_low", pa.float64()),
+        ("failed_share_high", pa.float64()),
+    ]
+    cost = [(name, pa.float64()) for name in _COST]
+    return pa.schema([*_SETTING, ("changes", pa.string()), *cost, *figures, ("notes", pa.list_(pa.string()))])
+
+
+def write_tables(study: Study, folder: Path) -> list[Path]:
+    """Write `tradeoff.parquet`, `errors.parquet` and `study.json`, each whole or not at all; returns their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    wide = pa.Table.from_pylist([_wide(row) for row in study.rows], wide_schema())
+    long = pa.Table.from_pylist([line for row in study.rows for line in _long(row)], LONG_SCHEMA)
+    text = json.dumps({"verso_study": STUDY_VERSION, **_plain(study)}, indent=1, default=_plain) + "\n"
+    return [
+        _replace(folder / WIDE_FILE, lambda file: pq.write_table(wide, file)),
+        _replace(folder / LONG_FILE, lambda file: pq.write_table(long, file)),
+        _replace(folder / STUDY_FILE, lambda file: file.write_text(text, encoding="utf-8")),
+    ]
+
+
+def read_study(folder: Path) -> Study:
+    """What `write_tables` was given, exactly; a tuple among the values of changes or machine comes back as a list.
+
+    Raises OutputError where there is none or it is newer than this program, CorruptError where it cannot be read.
+    """
+    file = folder / STUDY_FILE
+    try:
+        tree = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise OutputError(
+            f"{folder} holds no {STUDY_FILE}: it is not a folder of a finished `verso tradeoff`"
+        ) from error
+    except ValueError as error:
+        raise CorruptError(f"{file}: cannot be read: {error}; measure again") from error
+    version = tree.pop("verso_study", None) if isinstance(tree, dict) else None
+    if isinstance(version, int) and version > STUDY_VERSION:
+        raise OutputError(
+            f"{file}: verso_study: {version} is newer than this program, which reads {STUDY_VERSION}: install a newer Verso"
+        )
+    try:
+        return Study(**(tree | {"rows": tuple(map(_row, tree["rows"])), "notes": tuple(tree["notes"])}))
+    except (KeyError, TypeError, ValueError) as error:
+        raise CorruptError(f"{file}: is not a study: {error!r}; measure again") from error
+
+
+def _row(tree: dict[str, Any]) -> Row:
+    setting = Setting(tuple((knob, label) for knob, label in tree["setting"]["parts"]), tree["setting"]["changes"])
+    errors = {name: Figure(**figure) for name, figure in tree["errors"].items()}
+    return Row(**(tree | {"setting": setting, "errors": errors, "notes": tuple(tree["notes"])}))
+
+
+def _names(row: Row) -> dict[str, str]:
+    """Of a pair, both knobs and both values."""
+    knobs, values = (", ".join(part[place] for part in row.setting.parts) for place in (0, 1))
+    return {"setting": row.setting.name, "knob": knobs, "value": values}
+
+
+def _wide(row: Row) -> dict[str, Any]:
+    line: dict[str, Any] = {**_names(row), "changes": json.dumps(dict(row.setting.changes)), "notes": list(row.notes)}
+    for name, figure in row.errors.items():
+        line |= {name: figure.value, f"{name}_low": figure.low, f"{name}_high": figure.high}
+    return line | {name: getattr(row, name) for name in _COST}
+
+
+def _long(row: Row) -> list[dict[str, Any]]:
+    setting, lines = _names(row) | {"ms": row.ms, "ratio": row.ratio}, []
+    for name, figure in row.errors.items():
+        error = {"error": name, "unit": ERRORS[name].unit, "group": ERRORS[name].group, "amount": figure.value}
+        lines.append({**asdict(figure), **error, **setting})
+    return lines
+
+
+def _plain(value: Any) -> Any:
+    """What JSON does not know, one level of it: dataclasses, mappings of other kinds, numpy's numbers."""
+    if is_dataclass(value):
+        return {field.name: getattr(value, field.name) for field in fields(value)}
+    return dict(value) if isinstance(value, Mapping) else value.item()
+
+
+def _replace(file: Path, write: Callable[[Path], Any]) -> Path:
+    """Under another name in the same folder first, so that a reader never sees half a file."""
+    partial = file.with_name(f".{file.name}.{os.getpid()}")
+    write(partial)
+    os.replace(partial, file)
+    return file

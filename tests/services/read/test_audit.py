@@ -1,0 +1,219 @@
+"""`verify --audit`: what was left out is put back, and a difference is found and named."""
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+
+import workers.pipeline.make_scene
+import workers.plan.effects
+from schemas.dataset.commit import Span
+from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
+from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.scene import Placed, PosedScene, View
+from services.bench.stages import open_workbench
+from services.cli.main import main
+from services.job.read import validate_job
+from services.job.record import encode_job, record_job
+from services.read import audit_motion
+from services.read.audit import Audit, audit, choose_evenly
+from services.read.audit_motion import Motion, compare_masks, move_between, shift_px
+from services.read.audit_words import describe_audit
+from tests.effects.scenes import SMALL, merged
+from tests.shapes import box, shape_of
+from tests.workers.render.random_scenes import APPEARANCE, floor
+from workers.geometry.frames import UP, pose, rotation_about, translation
+from workers.pipeline.fingerprint import take_fingerprint
+from workers.plan.effect import Effect
+from workers.plan.effects import EFFECTS
+from workers.render.raster.gbuffer import shared_renderer
+from workers.store.local import LocalStore
+
+JOB = validate_job(merged(SMALL, {"scenes": 4, "categories": ["can", "box"]}), "a test")
+
+
+def dataset(out: Path) -> LocalStore:
+    """Four scenes, made in this process."""
+    bench = open_workbench(JOB, Path(), out)
+    fingerprint = take_fingerprint(bench.context.renderer, JOB.render.tier)
+    bench.store.write_whole(JOB_FILE, encode_job(record_job(JOB, bench.context.catalogue.digest, Path())))
+    bench.store.write_whole(FINGERPRINT_FILE, fingerprint.model_dump_json().encode())
+    bench.run(Span(start=0, stop=4))
+    return bench.store
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> LocalStore:
+    return dataset(tmp_path_factory.mktemp("audit") / "small")
+
+
+@pytest.fixture
+def calm() -> Iterator[None]:
+    """Objects that stay where they are when they are released."""
+    with released(0.0):
+        yield
+
+
+def released(by_m: float):
+    """Every object moves along x by so much when it is released."""
+
+    def release_again(plan, settled, physics, effects, seconds):
+        assert effects.runs("dynamics") and effects.runs("table_mesh")
+        assert seconds == 1.0
+        return tuple(translation(by_m, 0.0, 0.0) @ rest.T_world_obj for rest in settled)
+
+    return mock.patch.object(audit_motion, "release_again", release_again)
+
+
+def run_audit(store: LocalStore, count: int = 4) -> Audit:
+    return audit(store, count, lambda _: None)
+
+
+@pytest.mark.usefixtures("calm")
+def test_a_healthy_dataset_passes_and_each_effect_that_was_left_out_is_proven(made):
+    found = run_audit(made)
+    assert found.faults == []
+    assert found.same_stack
+    assert found.scenes == found.released == 4
+    left_out = {name: tally.skipped for name, tally in found.effects.items() if tally.skipped}
+    names = {"table_mesh", "object_contacts", "decomposition", "transparency", "exact_agreement"}
+    assert left_out == dict.fromkeys(names, 4)
+    assert all(tally.proven == tally.skipped for tally in found.effects.values())
+    assert found.forced == 8
+    assert found.bytes > 4 * 10_000 and found.files >= 4 * 20
+    assert found.motion == Motion(0.0, 0.0, 0, 0)
+
+
+def test_what_moves_within_the_bound_changes_masks_at_silhouettes_alone(made):
+    with released(4e-5):
+        found = run_audit(made)
+    assert found.faults == []
+    assert found.motion.moved_mm == pytest.approx(0.04, rel=1e-6)
+    assert found.motion.turned_deg == 0.0
+    assert found.motion.pixels_outside == 0
+
+
+def test_what_moves_too_far_is_named_with_its_scene_effect_and_figure(made):
+    with released(6e-5):
+        found = run_audit(made, 1)
+    assert len(found.faults) == 1
+    assert "table_mesh: released with every effect, it moved 0.0600 mm, the bound is 0.05 mm" in found.faults[0]
+    assert found.effects["table_mesh"].proven == 0
+    assert found.effects["transparency"].proven == 1
+
+
+@pytest.mark.usefixtures("calm")
+def test_an_effect_that_was_left_out_wrongly_is_found_and_named(tmp_path):
+    """The floor is left out of scenes that see it: putting it back changes their images."""
+
+    def blind(effect: Effect) -> Effect:
+        blinded = dataclasses.replace(effect, skipped_because=lambda _: "nobody looks")
+        return blinded if effect.name == "floor" else effect
+
+    with mock.patch.object(workers.plan.effects, "EFFECTS", tuple(map(blind, EFFECTS))):
+        store = dataset(tmp_path / "blind")
+        found = run_audit(store, 2)
+    assert len(found.faults) == 2
+    assert all(", floor: forced, it changes" in fault for fault in found.faults)
+    assert found.effects["floor"].skipped == 2 and found.effects["floor"].proven == 0
+    assert found.effects["transparency"].proven == 2
+
+
+@pytest.mark.usefixtures("calm")
+def test_a_scene_that_is_not_made_the_same_again_blames_no_effect(tmp_path):
+    store = dataset(tmp_path / "other")
+    with mock.patch.object(
+        workers.pipeline.make_scene, "quantise_depth", lambda depth, images: (depth * 4999).astype(np.uint16)
+    ):
+        write_fingerprint(store, {})
+        found = run_audit(store, 1)
+    assert ["made again with nothing forced, it differs" in fault for fault in found.faults] == [True]
+    assert not any(tally.proven for name, tally in found.effects.items() if tally.kind == "no_op")
+
+
+def write_fingerprint(store: LocalStore, changes: dict[str, str]) -> None:
+    """This process's fingerprint, with changes, as the dataset's."""
+    fingerprint = take_fingerprint(shared_renderer(), JOB.render.tier)
+    store.write_whole(FINGERPRINT_FILE, fingerprint.model_copy(update=changes).model_dump_json().encode())
+
+
+@pytest.mark.usefixtures("calm")
+def test_on_another_stack_the_forced_scene_is_held_against_a_plain_one(tmp_path):
+    store = dataset(tmp_path / "foreign")
+    for path in (tmp_path / "foreign").glob("*/RGB*.png"):
+        path.write_bytes(b"what another stack made")
+    write_fingerprint(store, {"canary": "0" * 64})
+    found = run_audit(store, 2)
+    assert not found.same_stack
+    assert found.faults == []
+    assert "because another stack" in "\n".join(describe_audit(found))
+
+
+def test_the_command_exits_1_and_lists_what_is_off(made, capsys):
+    with released(1e-3):
+        assert main(["verify", made.name, "--audit", "2", "--json"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    answer = json.loads(lines[-1])
+    assert not answer["ok"] and answer["faults"] == []
+    assert len(answer["audit"]["faults"]) >= 2
+    assert answer["audit"]["effects"]["transparency"] == {"kind": "no_op", "skipped": 2, "proven": 2}
+    assert any(line.startswith("audit of 2 scenes: 4 no-ops forced") for line in lines)
+    with released(0.0):
+        assert main(["verify", made.name, "--audit", "1"]) == 0
+
+
+def test_scenes_are_chosen_evenly_and_by_seed():
+    ids = list(range(100, 300))
+    chosen = choose_evenly(ids, 8, 5)
+    assert len(set(chosen)) == 8
+    assert set(np.diff(chosen)) == {25}
+    assert chosen == choose_evenly(ids[::-1], 8, 5) != choose_evenly(ids, 8, 6)
+    assert choose_evenly(ids, 500, 5) == ids
+    assert choose_evenly([], 3, 5) == []
+
+
+def test_a_turn_and_a_shift_are_measured_exactly_however_small():
+    shape = shape_of(box(0.2, 0.2, 0.2))
+    turn = pose(rotation_about(UP, np.radians(1e-5)), np.zeros(3))
+    motion = move_between(shape, np.eye(4), turn)
+    assert motion.turned_deg == pytest.approx(1e-5, rel=1e-6)
+    assert motion.moved_mm == pytest.approx(np.radians(1e-5) * 0.1 * np.sqrt(2) * 1e3, rel=1e-6)
+    assert move_between(shape, turn, translation(0.0, 3e-5, 4e-5) @ turn).moved_mm == pytest.approx(0.05, rel=1e-6)
+
+
+# A camera 1 m above a box of 20 cm; a pixel is 1 mm on its top, 0.9 m away.
+LOOKS_DOWN = Camera(
+    Intrinsics(width=320, height=240, fx=900.0, fy=900.0, cx=160.3, cy=120.2),
+    pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 1.0])),
+)
+
+
+def seen_box(x_m: float = 0.0) -> PosedScene:
+    return PosedScene((floor(), Placed(3, shape_of(box(0.2, 0.2, 0.2)), translation(x_m, 0.0, 0.0))), APPEARANCE)
+
+
+def view_of(scene: PosedScene) -> View:
+    seen = shared_renderer().draw(scene.things, scene.appearance, LOOKS_DOWN)
+    return View("input", 0, 0, LOOKS_DOWN, seen.rgb, seen.depth_m.astype(np.uint16), seen.region, ())
+
+
+def test_the_rows_of_pixels_that_a_moved_box_uncovers_lie_within_its_motion():
+    before, after = seen_box(), seen_box(0.0013)
+    assert shift_px(before.things[1], after.things[1], LOOKS_DOWN) == pytest.approx(1.3, rel=1e-6)
+    changed, outside = compare_masks(shared_renderer(), before, after, view_of(before))
+    assert changed >= 2 * 200
+    assert outside == 0
+
+
+def test_a_mask_that_changed_where_no_silhouette_moved_is_counted():
+    before = seen_box()
+    view = view_of(before)
+    assert view.region is not None
+    region = view.region.copy()
+    region[120, 150:157] = 1
+    changed, outside = compare_masks(shared_renderer(), before, before, dataclasses.replace(view, region=region))
+    assert (changed, outside) == (7, 7)

@@ -1,0 +1,196 @@
+"""Convex parts that follow from how a shape is built, against manifold3d's booleans, rays and hulls."""
+
+import manifold3d
+import numpy as np
+import pytest
+import shapely
+import trimesh
+from scipy.spatial import ConvexHull
+
+from schemas.job.assets import ProceduralSource
+from schemas.scene.shape import Loft, Mesh
+from workers.assets.builtin.make import make_asset
+from workers.assets.builtin.solid import circle, difference, lathe, union
+from workers.assets.builtin.vessel import prism
+from workers.geometry.convexity import solid_of, weld
+from workers.geometry.lathe_decomposition import COARSE, parts_of_lofts
+from workers.geometry.nearest import nearest_on_mesh
+from workers.physics.convex_parts import step as decompose
+from workers.physics.convex_parts.step import parts_of
+
+AIM_M = 5e-5
+"""Of parts in any shape 0.25 m along its diagonal: so far they may stand out, or leave something uncovered."""
+
+TWISTED_M = 1.7e-4
+"""Soft squares that turn into circles have twisted facets, which may stand out by four times the tolerance."""
+
+ROUND = [("mug", 0), ("mug", 2), ("bowl", 3), ("jar", 1), ("jar", 3), ("can", 0), ("can", 3), ("bottle", 0)]
+ANGULAR = [("box", 0), ("box", 4), ("laptop", 1), ("camera", 0), ("camera", 2)]
+TWISTED = [("bowl", 2), ("jar", 0), ("bottle", 1)]
+
+CUP = np.array([(0, 0), (40, 0), (42, 60), (38, 60), (36, 5), (0, 5)], dtype=np.float64) / 1e3
+
+
+def built_in(category, number):
+    return make_asset(category, ProceduralSource(source="procedural"), number, 600.0)
+
+
+def volumes(parts, solid):
+    """(of the parts' union beyond the solid, of the solid beyond the parts' union), cubic metres.
+
+    Parts are made larger by a hundred-thousandth, so that no two faces lie in one plane.
+    """
+    middles = [part.mean(axis=0) for part in parts]
+    hulls = [
+        manifold3d.Manifold.hull_points(np.ascontiguousarray(at + 1.00001 * (part - at)))
+        for part, at in zip(parts, middles, strict=True)
+    ]
+    both = manifold3d.Manifold.batch_boolean(hulls, manifold3d.OpType.Add)
+    return float((both - solid).volume()), float((solid - both).volume())
+
+
+def standing_out_m(parts, mesh):
+    """How far the middles of the parts' faces and of their edges are outside of a closed mesh at most, by rays."""
+    points = []
+    for part in parts:
+        corners = part[ConvexHull(part).simplices]
+        points += [corners.mean(axis=1), corners[:, :2].mean(axis=1), corners[:, 1:].mean(axis=1)]
+    points = np.concatenate(points)
+    points = points[np.random.default_rng(0).permutation(len(points))[:4000]]
+    outside = points[~trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).contains(points)]
+    found, _ = nearest_on_mesh(outside, mesh) if len(outside) else (outside, None)
+    return float(np.linalg.norm(found - outside, axis=1).max(initial=0.0))
+
+
+def uncovered_m(parts, points):
+    """How far points lie outside of all parts, at most."""
+    away = np.full(len(points), np.inf)
+    for part in parts:
+        planes = ConvexHull(part).equations
+        away = np.minimum(away, (points @ planes[:, :3].T + planes[:, 3]).max(axis=1))
+    return float(away.max())
+
+
+@pytest.mark.parametrize(("category", "number"), [*ROUND, *ANGULAR, *TWISTED])
+def test_parts_of_a_built_in_shape_are_the_shape(category, number):
+    asset = built_in(category, number)
+    mesh, parts = weld(asset.shape.mesh), parts_of(asset)
+    out = TWISTED_M if (category, number) in TWISTED else AIM_M
+    assert standing_out_m(parts, mesh) <= out
+    inside, _ = trimesh.sample.sample_surface(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), 1500, seed=0)
+    assert uncovered_m(parts, np.concatenate([inside, mesh.vertices])) <= AIM_M
+    assert ConvexHull(np.concatenate(parts)).volume == pytest.approx(ConvexHull(mesh.vertices).volume, rel=1e-12)
+
+
+@pytest.mark.parametrize(("category", "number"), [("mug", 2), ("can", 3), ("laptop", 1), ("camera", 0), ("box", 4)])
+def test_parts_have_the_volume_of_the_shape(category, number):
+    asset = built_in(category, number)
+    solid = solid_of(weld(asset.shape.mesh))
+    beyond, missing = volumes(parts_of(asset), solid)
+    assert beyond < 2e-4 * solid.volume()
+    assert missing < 1e-5 * solid.volume()
+
+
+def test_a_cup_is_a_bottom_and_wedges():
+    """The volume of its wall and bottom over a polygon: Pappus with the polygon's area for the circle's."""
+    body = lathe(CUP, [0] * 5, 24)
+    parts = parts_of_lofts(body.lofts)
+    beyond, missing = volumes(parts, solid_of(Mesh(body.vertices, body.faces.astype(np.int32))))
+    assert (beyond, missing) == pytest.approx((0.0, 0.0), abs=1e-4 * 1e-4)
+    assert len(parts) == 1 + 24
+    assert uncovered_m(parts, np.array([(0.0, 0.0, 0.002), (0.0395, 0.0, 0.03)])) < 1e-9
+    assert uncovered_m(parts, np.array([(0.0, 0.0, 0.0052)])) > 1e-4
+
+
+def test_a_bolt_is_stacked_of_whole_rings():
+    """A solid of revolution that is seen from its axis everywhere needs no wedges."""
+    profile = np.array([(0, 0), (10, 0), (10, 5), (4, 5), (4, 30), (0, 30)], dtype=np.float64)
+    parts = parts_of_lofts(lathe(profile, [0] * 5, 24).lofts)
+    share = 12 * np.sin(np.pi / 12)  # of a polygon with 24 corners, over the square of its radius
+    assert sorted(ConvexHull(part).volume for part in parts) == pytest.approx([share * 16 * 25, share * 100 * 5])
+
+
+def test_a_notch_is_cut_out_of_a_block():
+    block = prism(np.array([(0.0, 0.0), (0.0, 1.0)]), (2.0, 2.0), 0.1, [0, 0, 0])
+    notch = prism(np.array([(0.0, 0.5), (0.0, 2.0)]), (3.0, 0.5), 0.01, [1, 1, 1])
+    body = difference(block, [notch])
+    parts = parts_of_lofts(body.lofts)
+    beyond, missing = volumes(parts, solid_of(Mesh(body.vertices, body.faces.astype(np.int32))))
+    assert (beyond, missing) == pytest.approx((0.0, 0.0), abs=1e-3)
+    assert len(parts) == 3
+
+
+def test_a_union_has_the_parts_of_all_and_moves_with_them():
+    cup, bar = lathe(CUP, [0] * 5, 24), prism(np.array([(0.0, 0.0), (0.0, 0.01)]), (0.2, 0.01), 0.001, [1, 1, 1])
+    both = union([cup, bar.moved(z=0.02)]).placed(
+        np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0, 0, 1.0]]), np.ones(3)
+    )
+    parts = parts_of_lofts(both.lofts)
+    assert len(parts) == 26
+    points = np.concatenate(parts)
+    assert points.min(axis=0) == pytest.approx(both.vertices.min(axis=0), abs=1e-12)
+    assert points.max(axis=0) == pytest.approx(both.vertices.max(axis=0), abs=1e-12)
+
+
+def test_a_union_with_what_is_not_known_is_not_known():
+    known = lathe(CUP, [0] * 5, 24)
+    unknown = prism(np.array([(0.0, 0.0), (0.0, 0.01)]), (0.2, 0.01), 0.001, [1, 1, 1])
+    unknown = type(unknown)(unknown.vertices, unknown.faces, unknown.surface, unknown.smooth)
+    assert union([known, unknown]).lofts is None
+    assert difference(known, [unknown]).lofts is None
+
+
+def test_a_straight_chain_of_rings_is_one_part_and_a_bent_one_several():
+    ring = np.concatenate([circle(8), np.zeros((8, 1))], axis=1)
+    up = np.array([0.0, 0.0, 1.0])
+    straight = np.stack([ring, ring + up, ring + 3.0 * up])
+    ends = np.array([(0, 0, 0), (0, 0, 3.0)])
+    assert len(parts_of_lofts([Loft(straight, ends)])) == 1
+    bent = np.stack([ring, ring + 2.0 * up, ring[:, [2, 1, 0]] * [1, 1, -1] + np.array([3.0, 0, 4.0])])
+    assert len(parts_of_lofts([Loft(bent, ends)])) == 2
+
+
+def test_built_in_shapes_are_never_handed_to_coacd(monkeypatch):
+    monkeypatch.setattr(decompose, "_run", lambda *_: pytest.fail("CoACD was asked"))
+    for category in ("mug", "bowl", "jar", "can", "bottle", "box", "laptop", "camera"):
+        assert len(parts_of(built_in(category, 7))) > 1
+
+
+OUTLINES_THAT_MEET = [("camera", 100026), ("camera", 100226), ("camera", 500199), ("camera", 500231), ("box", 500231)]
+"""Sides that lie on one another but for the last bits, or cross: one camera of a hundred, and fewer boxes."""
+
+
+@pytest.mark.parametrize(("category", "number"), OUTLINES_THAT_MEET)
+def test_a_shape_whose_outlines_meet_or_cross_has_parts_all_the_same(category, number):
+    asset = make_asset(category, ProceduralSource(source="procedural"), number, 600.0)
+    parts = parts_of(asset)
+    assert len(parts) > 1
+    corners = np.concatenate(parts)
+    assert corners.min(axis=0) == pytest.approx(asset.shape.vertices.min(axis=0), abs=1e-9)
+    assert corners.max(axis=0) == pytest.approx(asset.shape.vertices.max(axis=0), abs=1e-9)
+
+
+def test_a_shape_whose_outlines_cannot_be_cut_is_cut_as_a_mesh_from_outside_is(monkeypatch):
+    def fails(*_: object) -> None:
+        raise shapely.errors.GEOSException("TopologyException: side location conflict")
+
+    monkeypatch.setattr(decompose, "parts_of_lofts", fails)
+    monkeypatch.setattr(
+        decompose, "decompose", lambda mesh, digest, threshold: decompose.Parts((mesh.vertices,), "coacd")
+    )
+    asset = make_asset("laptop", ProceduralSource(source="procedural"), 77, 600.0)
+    assert len(parts_of(asset)) == 1
+
+
+@pytest.mark.parametrize("category", ["mug", "bowl", "jar", "can"])
+def test_coarser_parts_are_fewer_and_reach_out_no_further_than_they_may(category):
+    asset = make_asset(category, ProceduralSource(source="procedural"), 1, 600.0)
+    fine, coarse = parts_of(asset), parts_of(asset, share=COARSE)
+    assert len(coarse) < 0.5 * len(fine)
+    solid = solid_of(weld(asset.shape.mesh))
+    assert solid is not None
+    mesh = trimesh.Trimesh(asset.shape.vertices, asset.shape.faces)
+    middles = np.concatenate([(part[:-1] + part[1:]) / 2 for part in coarse])
+    outside = middles[~mesh.contains(middles)]
+    away = np.linalg.norm(nearest_on_mesh(outside, asset.shape.mesh)[0] - outside, axis=1)
+    assert away.max(initial=0.0) < 2e-3

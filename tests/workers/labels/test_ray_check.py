@@ -1,0 +1,151 @@
+"""A check that cannot fail is none: labels that are wrong by little are found."""
+
+import contextlib
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from schemas.base import Range
+from schemas.errors import LabelError
+from schemas.job.job import Job
+from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.scene import Agreement, GBuffer, Placed, PosedScene
+from tests.shapes import asset_of, box, shape_of, table
+from workers.geometry.camera import orbit_pose
+from workers.geometry.frames import UP, pose, rotation_about, translation
+from workers.geometry.raycast import cast_view, edge_distance_px
+from workers.labels.ray_check import check_against_rays, check_pair
+from workers.physics.settle_single import settle_alone
+from workers.pipeline.make_scene import pose_scene
+from workers.plan.effects import is_raycast_scene
+from workers.plan.step import plan_scene
+
+STORED = Range(0.2, 8.0)
+CAMERA = Camera(
+    Intrinsics(width=160, height=120, fx=262.0, fy=262.0, cx=80.0, cy=60.0),
+    orbit_pose(np.array([0, 0, 0.7]), 0.8, 1.0, 2.5),
+)
+
+
+@pytest.fixture(scope="module")
+def scene() -> PosedScene:
+    plan = plan_scene(
+        Job.model_validate({"name": "t", "start": {"offset_m": [0, 0]}}), 0, table(), asset_of(box(0.2, 0.2, 0.25))
+    )
+    return pose_scene(plan, (settle_alone(plan.objects[0], plan.table, Job(name="t").physics),))
+
+
+@pytest.fixture(scope="module")
+def truth(scene) -> GBuffer:
+    """What a perfect renderer would have made."""
+    depth, region, _ = cast_view(scene.things, CAMERA)
+    return GBuffer(np.zeros((120, 160, 3), np.uint8), depth.astype(np.float32), region)
+
+
+def test_right_labels_pass(scene, truth):
+    assert (truth.region == 3).sum() > 200
+    check_against_rays(scene, CAMERA, truth, STORED)
+
+
+@pytest.mark.parametrize(("region_id", "error_m"), [(1, 2e-5), (2, 2e-5), (3, 2e-5)])
+def test_depth_that_is_off_by_twenty_micrometres_is_found_in_every_region(scene, truth, region_id, error_m):
+    wrong = truth.depth_m + np.where(truth.region == region_id, np.float32(error_m), np.float32(0))
+    with pytest.raises(LabelError, match=f"region {region_id}"):
+        check_against_rays(scene, CAMERA, dataclasses.replace(truth, depth_m=wrong), STORED)
+
+
+def test_half_a_pixel_of_shift_is_found(scene, truth):
+    shifted = Camera(CAMERA.intrinsics.model_copy(update={"cx": 79.5}), CAMERA.T_world_cam)
+    depth, region, _ = cast_view(scene.things, shifted)
+    with pytest.raises(LabelError):
+        check_against_rays(scene, CAMERA, GBuffer(truth.rgb, depth.astype(np.float32), region), STORED)
+
+
+def test_one_wrong_pixel_away_from_every_edge_is_found(scene, truth):
+    region, depth = truth.region.copy(), truth.depth_m.copy()
+    row, column = (int(np.median(index)) for index in np.nonzero(region == 3))
+    region[row, column] = 2
+    depth[row, column] += 0.01
+    with pytest.raises(LabelError, match=rf"pixel \({column}, {row}\) is region 2 in the mask and 3 by ray"):
+        check_against_rays(scene, CAMERA, GBuffer(truth.rgb, depth, region), STORED)
+
+
+def test_a_pixel_at_an_edge_of_a_small_thing_may_show_either_side_and_one_amid_it_may_not(scene):
+    """A post before a slab, one region of fewer than a hundred pixels: one wrong depth is more than 1 % of them."""
+    shape = shape_of(box(0.01, 0.06, 0.12), box(0.012, 0.012, 0.12, (0.06, 0.0, 0.0)))
+    thing = Placed(3, shape, pose(rotation_about(UP, 1.0), np.array([0.0, 0.0, 0.76])))
+    scene = dataclasses.replace(scene, things=(*scene.things[:2], thing))
+    found = []
+    for step in range(400):
+        k = CAMERA.intrinsics.model_copy(update={"cx": 80.0 + 0.011 * step})
+        views = [
+            cast_view(scene.things, Camera(k.model_copy(update={"cx": k.cx + shift}), CAMERA.T_world_cam))
+            for shift in (0.0, 0.01)
+        ]
+        (depth, region, cosine), (moved, moved_region, _) = views
+        flips = (region == 3) & (moved_region == 3) & (np.abs(depth - moved) > 0.01) & (cosine > 0.3)
+        found += [(k, tuple(at), depth, moved, region) for at in np.argwhere(flips)]
+        if found:
+            break
+    k, at, depth, moved, region = found[0]
+    assert (region == 3).sum() < 100
+    camera, rgb = Camera(k, CAMERA.T_world_cam), np.zeros((120, 160, 3), np.uint8)
+    other = depth.copy()
+    other[at] = moved[at]
+    check_against_rays(scene, camera, GBuffer(rgb, other.astype(np.float32), region), STORED)
+    amid = depth.copy()
+    inside = np.argwhere((region == 3) & (np.abs(np.indices(region.shape)[1] - at[1]) > 1))
+    away = edge_distance_px(scene.things, camera, inside)
+    amid[tuple(inside[int(np.argmax(away))])] += 0.01
+    with pytest.raises(LabelError, match="region 3: 99 %"):
+        check_against_rays(scene, camera, GBuffer(rgb, amid.astype(np.float32), region), STORED)
+
+
+@pytest.mark.parametrize(("apart_mm", "passes"), [(0.04, True), (0.5, False)])
+def test_where_two_things_cut_through_one_another_either_may_be_shown_within_a_tenth_of_a_millimetre(
+    scene, apart_mm, passes
+):
+    """Two slabs that cross at a third of a degree, one of them drawn as if it stood so much higher, with its true depth."""
+    slab = shape_of(box(0.3, 0.3, 0.02))
+    level = translation(0.0, 0.0, 0.8)
+    tilted = level @ pose(rotation_about(np.array([0.0, 1.0, 0.0]), math.radians(0.3)), np.zeros(3))
+    things = (*scene.things[:2], Placed(3, slab, level), Placed(4, slab, tilted))
+    raised = (*things[:3], Placed(4, slab, translation(0.0, 0.0, apart_mm / 1e3) @ tilted))
+    alone = {t.region_id: cast_view([t], CAMERA)[0] for t in things}
+    _, region, _ = cast_view(raised, CAMERA)
+    _, right, _ = cast_view(things, CAMERA)
+    assert ((region != right) & (region == 4)).sum() > 5
+    region = np.where((region == 4) & (alone[4] > 0), region, right).astype(np.uint8)
+    depth = np.select([region == k for k in alone], list(alone.values())).astype(np.float32)
+    buffer = GBuffer(np.zeros((120, 160, 3), np.uint8), depth, region)
+    with contextlib.nullcontext() if passes else pytest.raises(LabelError, match="4 in the mask and 3 by ray"):
+        check_against_rays(dataclasses.replace(scene, things=things), CAMERA, buffer, STORED)
+
+
+def test_the_share_of_checked_scenes_is_the_jobs_and_a_function_of_the_scene():
+    job = Job.model_validate({"name": "t", "check": {"raycast_share": 0.1}})
+    chosen = [is_raycast_scene(job, scene) for scene in range(3000)]
+    assert abs(np.mean(chosen) - 0.1) < 4 * np.sqrt(0.09 / 3000)
+    assert chosen[:50] == [is_raycast_scene(job, scene) for scene in range(50)]
+    everything = Job.model_validate({"name": "t", "check": {"raycast_share": 1}})
+    assert all(is_raycast_scene(everything, scene) for scene in range(50))
+
+
+class PairLike:
+    """check_pair looks at nothing but the agreement."""
+
+    def __init__(self, object_mm: float | None, scene_mm: float | None) -> None:
+        self.exact_agreement = Agreement(object_mm, 1.0, 100, scene_mm)
+
+
+@pytest.mark.parametrize(("object_mm", "scene_mm", "what"), [(1.5, 0.1, "the object"), (0.1, 1.5, "the scene")])
+def test_views_that_disagree_are_a_failure_that_says_by_how_much(object_mm, scene_mm, what):
+    with pytest.raises(LabelError, match=f"of {what} carried into the mirror view is off by 1.500 mm"):
+        check_pair(PairLike(object_mm, scene_mm), Job(name="t").check)
+
+
+def test_views_that_agree_or_have_nothing_to_compare_pass():
+    check_pair(PairLike(0.1, 0.1), Job(name="t").check)
+    check_pair(PairLike(None, None), Job(name="t").check)

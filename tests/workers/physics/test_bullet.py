@@ -1,0 +1,120 @@
+"""The simulator's room: the same bits whatever came before, and nothing kept of what was."""
+
+import dataclasses
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from schemas.job.job import Job
+from tests.physics.room import at, ball_body, physics
+from tests.shapes import box
+from workers.geometry.frames import pose, quaternion_of, rotation_about
+from workers.physics.bullet import GRAVITY_M_S2, REPAIR_S, SLOP_M, WORLDS_BEFORE_RESET, Body, drop
+
+ROOT = Path(__file__).resolve().parents[3]
+PHYSICS = Job(name="t").physics
+STEPS = 8
+GROWTH = """
+import numpy as np
+from schemas.job.job import Job
+from schemas.scene.shape import Mesh
+from workers.physics.bullet import Body, drop
+
+def anonymous_kb():
+    return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("RssAnon"))
+
+points = np.random.default_rng(0).standard_normal((400, 3))
+body = Body(1.0, np.ones(3) * 1e-3, (0.1 * points / np.linalg.norm(points, axis=1)[:, None],), 1e-4)
+square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+plate = Mesh(np.tile(square, (100, 1)), np.arange(400)[:, None] // 4 * 4 + np.array([[0, 1, 2], [0, 2, 3]]).repeat(200, 0))
+T = np.eye(4)
+T[2, 3] = 3.0
+sizes = []
+for world in range(513):
+    with drop(body, T, plate if world % 2 else 0.0, Job(name="t").physics, 8) as falling:
+        falling.advance()
+    sizes.append(anonymous_kb())
+print((sizes[512] - sizes[256]) / 256)
+"""
+
+
+def body_of(shape) -> Body:
+    return Body(0.4, np.array([1.5e-3, 1.6e-3, 5e-4]), (np.asarray(shape.vertices),), 1e-4)
+
+
+def fall(body: Body, T, advances: int = 60):
+    with drop(body, T, 0.0, PHYSICS, STEPS) as world:
+        for _ in range(advances):
+            world.advance()
+        return world.pose(), world.velocity()
+
+
+def test_a_body_in_the_air_falls_as_half_g_t_squared():
+    position, velocity = fall(body_of(box(0.1, 0.08, 0.2)), pose(np.eye(3), np.array([0, 0, 3.0])), 60)
+    t = 60 * STEPS / PHYSICS.step_hz
+    # Semi-implicit steps of h fall g t h / 2 further.
+    assert position[0][2] == pytest.approx(3.0 - GRAVITY_M_S2 * t * (t + 1 / PHYSICS.step_hz) / 2, abs=1e-9)
+    assert velocity[0][2] == pytest.approx(-GRAVITY_M_S2 * t)
+
+
+def test_what_was_simulated_before_leaves_no_trace_in_the_bits():
+    T = pose(rotation_about(np.array([0.6, 0.8, 0]), 0.7), np.array([0.01, 0, 0.2]))
+    body = body_of(box(0.1, 0.08, 0.2))
+    other = dataclasses.replace(body_of(box(0.02, 0.3, 0.1)), mass_kg=7.0)
+    results = set()
+    for k in range(2 * WORLDS_BEFORE_RESET + 3):
+        results.add(fall(body, T))
+        if k % 3:
+            fall(other, pose(rotation_about(np.array([1.0, 0, 0]), 0.1 * k), np.array([0, 0, 0.3])), k % 7)
+    assert len(results) == 1
+
+
+def test_an_error_inside_a_world_does_not_harm_the_next():
+    T = pose(np.eye(3), np.array([0, 0, 0.2]))
+    body = body_of(box(0.1, 0.08, 0.2))
+    first = fall(body, T)
+    with pytest.raises(ZeroDivisionError), drop(body, T, 0.0, PHYSICS, STEPS):
+        raise ZeroDivisionError
+    assert fall(body, T) == first
+
+
+def test_a_push_and_another_gravity_end_with_their_world():
+    T = pose(np.eye(3), np.array([0, 0, 3.0]))
+    body = body_of(box(0.1, 0.08, 0.2))
+    first = fall(body, T)
+    with drop(body, T, 0.0, PHYSICS, STEPS) as world:
+        world.push((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
+        world.pull((0.0, 0.0, 0.0))
+        assert world.velocity() == ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
+        world.advance()
+        assert world.pose()[0] == pytest.approx(np.array([1.0, 2.0, 3.0]) * STEPS / PHYSICS.step_hz + T[:3, 3])
+    assert fall(body, T) == first
+
+
+def test_worlds_come_and_go_without_their_memory_staying():
+    run = [sys.executable, "-c", GROWTH]
+    kilobytes = float(subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()[-1])
+    # 400 vertices that PyBullet does not give back are 70 kB in each world, and the plate's indices 20 more.
+    assert kilobytes < 5.0
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_quaternions_agree_with_scipy(seed):
+    R = Rotation.random(random_state=seed).as_matrix()
+    assert abs(quaternion_of(R) @ Rotation.from_matrix(R).as_quat()) == pytest.approx(1.0)
+    half = Rotation.from_rotvec(math.pi * np.eye(3)[seed % 3]).as_matrix()
+    assert Rotation.from_quat(quaternion_of(half)).as_matrix() == pytest.approx(half, abs=1e-12)
+
+
+@pytest.mark.parametrize("step_hz", [960, 3840, 15360])
+def test_what_overlaps_is_pushed_apart_at_its_depth_over_one_time_in_steps_of_any_length(step_hz):
+    deep = 1e-4
+    with drop(ball_body(0.05), at(0.0, 0.05 - deep), 0.0, physics(step_hz=step_hz), 1) as world:
+        world.pull((0.0, 0.0, 0.0))
+        world.advance()
+        assert world.velocity()[0][2] == pytest.approx((deep - SLOP_M) / REPAIR_S, rel=0.01)

@@ -1,0 +1,156 @@
+"""Cameras that nobody would choose: each scene is made whole or is a row that says why not, and nothing crashes.
+
+Every scene runs through the shard's own path onto disk, and is held against the ray caster before it is committed.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from schemas.dataset.commit import CommitTerms, Span
+from schemas.dataset.layout import FINGERPRINT_FILE, IMAGES, commit_path
+from schemas.dataset.shard import ShardOrder
+from schemas.errors import JobError, MachineError
+from schemas.scene.scene import REGION_FIRST_OBJECT
+from services.job.read import validate_job
+from workers.assets.catalogue import open_catalogue
+from workers.geometry.frames import invert, transform
+from workers.pipeline.context import WorkerContext, settings_digest
+from workers.pipeline.make_scene import Stopwatch, make_scene
+from workers.pipeline.run_shard import run_shard
+from workers.render.raster.gbuffer import shared_renderer
+from workers.store.commit import read_record
+from workers.store.images import decode_png
+from workers.store.local import LocalStore
+
+IN_THE_MIDDLE = {"offset_m": [0.0, 0.0], "pose": "placed"}
+EVERY_EFFECT = {"depth_noise": {}, "distortion": {"k1": -0.1}, "rgb_noise": {}, "exposure": {}}
+HARD_TO_DERIVE = {"projection": {"splat": 15, "hidden_point_removal": True}}
+
+
+def job_of(width: int, height: int, focal: float, **changes):
+    """A job whose sensor looks along the middle of its image."""
+    sensor = {"width": width, "height": height, "fx": focal, "fy": focal, "cx": width / 2, "cy": height / 2}
+    cameras = {"sensor": sensor, **changes.pop("cameras", {})}
+    tree = {"name": "extreme", "seed": 5, "cameras": cameras, "check": {"raycast_share": 1.0}, **changes}
+    return validate_job(tree, "test")
+
+
+def order_of(job, out: Path, scenes: int) -> ShardOrder:
+    terms = CommitTerms(
+        job_digest="test", fingerprint="", fingerprint_mode="record", layout="files", first_scene=0, range_size=scenes
+    )
+    return ShardOrder(out=str(out), job=job, terms=terms, spans=(Span(start=0, stop=scenes),))
+
+
+def run(job, out: Path, scenes: int = 2):
+    """(scenes made, failures by reason, the store) of a shard of one range."""
+    LocalStore(out).prepare()
+    report = run_shard(order_of(job, out, scenes), open_catalogue(job.assets, Path(), tuple(job.categories)))
+    (span,) = report.spans
+    assert span.made + sum(span.failed.values()) == scenes
+    return span.made, span.failed, LocalStore(out)
+
+
+def images_of(store: LocalStore) -> dict[str, np.ndarray]:
+    """Every image of the range, read back."""
+    record = read_record(store, 0)
+    assert record is not None
+    paths = [entry.path for entry in record.files if entry.path.endswith(".png")]
+    return {path: decode_png(store.read(path), path) for path in paths}
+
+
+@pytest.mark.parametrize("changes", [{}, {"sensor": EVERY_EFFECT}, {"images": HARD_TO_DERIVE}])
+@pytest.mark.parametrize("samples", [1, 4])
+def test_an_image_of_one_pixel_is_made_whole(tmp_path, changes, samples):
+    job = job_of(1, 1, 525.0, start=IN_THE_MIDDLE, render={"samples": samples}, **changes)
+    made, failed, store = run(job, tmp_path, scenes=6)
+    assert made > 0 and set(failed) <= {"intrinsic: object_not_seen"}
+    images = images_of(store)
+    assert len(images) == made * len(IMAGES), "and no patch, which would be larger than the image"
+    assert {image.shape[:2] for image in images.values()} == {(1, 1)}
+
+
+@pytest.mark.parametrize(("width", "height"), [(2, 2), (3, 1), (1, 3), (2, 640), (4096, 1)])
+@pytest.mark.parametrize("changes", [{}, {"sensor": EVERY_EFFECT, "images": HARD_TO_DERIVE}])
+def test_images_too_narrow_to_have_an_inside_are_made(tmp_path, width, height, changes):
+    made, failed, store = run(job_of(width, height, 60.0, start=IN_THE_MIDDLE, **changes), tmp_path, scenes=4)
+    assert made > 0 and set(failed) <= {"intrinsic: object_not_seen"}
+    assert {image.shape[:2] for image in images_of(store).values()} == {(height, width)}
+
+
+def test_a_sensor_that_sees_half_the_world_in_a_pixel_says_that_it_sees_no_object(tmp_path):
+    for n, focal in enumerate((0.001, 0.5)):
+        made, failed, _ = run(job_of(64, 48, focal), tmp_path / str(n))
+        assert (made, failed) == (0, {"intrinsic: object_not_seen": 2})
+
+
+def test_a_sensor_that_sees_micrometres_makes_scenes_or_says_what_disagrees(tmp_path):
+    made, failed, store = run(job_of(64, 48, 1e6, start=IN_THE_MIDDLE), tmp_path, scenes=4)
+    assert set(failed) <= {f"intrinsic: {reason}" for reason in ("views_disagree", "object_not_seen")}
+    assert made > 0
+    paths = [path for path in images_of(store) if Path(path).name.startswith("segment") and "patch" not in path]
+    assert paths and all(decode_png(store.read(path), path).min() >= REGION_FIRST_OBJECT for path in paths[:1])
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("sensor.fx", 1e300),
+        ("sensor.fy", 1e-300),
+        ("sensor.cx", 1e300),
+        ("sensor.cy", -1e300),
+        ("sensor.width", 4097),
+        ("sensor.height", 0),
+        ("orbit.radius_m", 1e300),
+        ("mirror.T_z_m", 1e300),
+        ("depth.offset_m", [0.0, 1e300, 0.0]),
+    ],
+)
+def test_numbers_that_no_camera_has_are_refused_by_name(key, value):
+    branch, name = key.split(".")
+    with pytest.raises(JobError, match=rf"cameras\.{branch}\.{name}"):
+        validate_job({"name": "extreme", "cameras": {branch: {name: value}}}, "test")
+
+
+def test_a_camera_inside_an_object_sees_its_inside(tmp_path):
+    """The mirror camera 8 cm behind the front surface; labels agree with the ray caster's in every view."""
+    cameras = {"mirror": {"T_z_m": 0.08}, "orbit": {"inclination_rad": [0.1, 0.1]}}
+    job = job_of(640, 480, 525.0, cameras=cameras, categories=["box"], start=IN_THE_MIDDLE)
+    made, failed, _ = run(job, tmp_path, scenes=4)
+    assert made == 4 and not failed
+    catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
+    context = WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
+    surrounded = 0
+    for scene_id in range(4):
+        scene = make_scene(context, scene_id, Stopwatch())
+        mirror = scene.pairs[0].mirror
+        thing = scene.posed.things[-1]
+        low, high = (f(thing.shape.vertices, axis=0) for f in (np.min, np.max))
+        (eye,) = transform(invert(thing.T_world_shape), mirror.camera.position[None])
+        if ((low < eye) & (eye < high)).all():
+            surrounded += bool((mirror.region == REGION_FIRST_OBJECT).mean() > 0.5)
+    assert surrounded >= 2, "what faces it is nearer than 5 cm in the others, and not seen"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("changes", [{}, {"sensor": EVERY_EFFECT, "render": {"samples": 4}}])
+def test_the_largest_image_is_made_whole(tmp_path, changes):
+    job = job_of(4096, 4096, 3360.0, check={"raycast_share": 0.0}, run={"scene_timeout_s": 1000.0}, **changes)
+    made, failed, store = run(job, tmp_path, scenes=1)
+    assert (made, failed) == (1, {})
+    record = read_record(store, 0)
+    assert record is not None
+    whole = [entry.path for entry in record.files if entry.path.endswith(".png") and "/patches/" not in entry.path]
+    assert len(whole) == len(IMAGES)
+    for path in whole:
+        assert decode_png(store.read(path), path).shape[:2] == (4096, 4096)
+
+
+def test_a_gpu_that_is_asked_for_and_not_there_stops_the_shard_before_any_scene(tmp_path, monkeypatch):
+    monkeypatch.setattr(shared_renderer(), "name", "llvmpipe (LLVM 15.0.6, 256 bits)")
+    with pytest.raises(MachineError, match=r"run\.device is gpu"):
+        run(job_of(64, 48, 60.0, run={"device": "gpu"}), tmp_path)
+    assert not (tmp_path / FINGERPRINT_FILE).exists() and not (tmp_path / commit_path(0)).exists()

@@ -1,0 +1,93 @@
+"""Packing of shapes for the GPU."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from schemas.base import frozen_array
+from schemas.scene.shape import Material, Part, Shape
+from tests.workers.render.random_scenes import part_of
+from workers.geometry.srgb import decode_srgb, encode_srgb
+from workers.render.raster.batches import own_vertices, pack_shape
+
+BODIES = {
+    "sphere": trimesh.creation.icosphere(3, 0.1),
+    "box": trimesh.creation.box((1.0, 2.0, 3.0)),
+    "torus": trimesh.creation.torus(0.3, 0.1, 24, 12),
+    "fan": trimesh.Trimesh(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], [[0, i, i % 4 + 1] for i in (1, 2, 3, 4)]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_every_face_keeps_its_corners_and_owns_its_last_vertex(name):
+    body = BODIES[name]
+    faces, source = own_vertices(body.faces, len(body.vertices))
+    assert len(set(faces[:, 2])) == len(faces)
+    np.testing.assert_array_equal(source[: len(body.vertices)], np.arange(len(body.vertices)))
+    for turned, face in zip(source[faces], body.faces, strict=True):
+        assert tuple(turned) in {tuple(np.roll(face, shift)) for shift in range(3)}, (
+            "same corners, same sense of turning"
+        )
+    assert len(source) <= max(len(body.faces), len(body.vertices)) + 0.1 * len(body.faces), "hardly more than faces"
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_the_last_vertex_of_a_face_carries_its_plane(name):
+    part = part_of(BODIES[name])
+    (batch,) = pack_shape(Shape((part,)))
+    planes = batch.vertices[batch.indices[:, 2], -4:].astype(np.float64)
+    corners = batch.vertices[batch.indices, :3].astype(np.float64)
+    np.testing.assert_allclose(np.linalg.norm(planes[:, :3], axis=1), 1.0, atol=1e-6)
+    np.testing.assert_allclose(
+        np.einsum("fcx,fx->fc", corners, planes[:, :3]), planes[:, 3:].repeat(3, axis=1), atol=1e-6
+    )
+    outside = np.einsum("fx,fx->f", planes[:, :3], corners.mean(axis=1))
+    assert name in ("torus", "fan") or (outside > 0).all(), "normals of a convex body about the origin point outwards"
+
+
+def test_a_face_without_area_has_no_plane():
+    part = Part(
+        "p", frozen_array([[0, 0, 1], [1, 0, 1], [2, 0, 1], [0, 1, 1]]), frozen_array([[0, 1, 2], [0, 1, 3]], np.int32)
+    )
+    (batch,) = pack_shape(Shape((part,)))
+    planes = batch.vertices[batch.indices[:, 2], -4:]
+    flat = ~planes.any(axis=1)
+    assert flat.sum() == 1 and (planes[~flat] == [0, 0, 1, 1]).all()
+
+
+def test_faces_of_the_top_come_first():
+    box = BODIES["box"]
+    (batch,) = pack_shape(Shape((part_of(box),)))
+    highest = batch.vertices[batch.indices, 2] == np.float32(box.vertices[:, 2].max())
+    assert batch.top_faces == 2
+    assert highest.all(axis=1).tolist() == [True] * 2 + [False] * 10
+    upside_down = Part("p", box.vertices, frozen_array(box.faces[:, ::-1], np.int32))
+    assert pack_shape(Shape((upside_down,)))[0].top_faces == 0, "a face seen from below only is no top"
+
+
+def test_parts_share_a_batch_where_they_share_a_texture_or_have_none():
+    body, texture = BODIES["box"], np.zeros((4, 4, 3), np.uint8)
+    uv = frozen_array(np.zeros((len(body.vertices), 2)))
+    plain = part_of(body)
+    painted, mapless = (Part("p", plain.vertices, plain.faces, Material(texture=texture), uv=u) for u in (uv, None))
+    batches = pack_shape(Shape((plain, painted, mapless, painted)))
+    assert [(len(batch.indices), batch.texture is texture) for batch in batches] == [(24, False), (24, True)]
+    assert all(batch.indices.max() < len(batch.vertices) for batch in batches)
+
+
+def test_a_batch_is_matte_where_all_of_it_is():
+    (plain,) = Shape((part_of(BODIES["box"]),)).parts
+    for materials, matte in (((0.9, 0.0), True), ((0.9, 0.5), False), ((0.5, 0.0), False)):
+        roughness, metallic = materials
+        other = Part("p", plain.vertices, plain.faces, Material(roughness=roughness, metallic=metallic))
+        dull = Part("p", plain.vertices, plain.faces, Material(roughness=1.0))
+        assert pack_shape(Shape((dull, other)))[0].matte == matte
+
+
+def test_srgb_goes_there_and_back_and_has_its_known_values():
+    steps = np.arange(256) / 255.0
+    np.testing.assert_allclose(encode_srgb(decode_srgb(steps)), steps, atol=1e-12)
+    assert decode_srgb(np.array(0.5)) == pytest.approx(0.21404114)
+    np.testing.assert_allclose(encode_srgb(np.array([-1.0, 2.0])), [0.0, 1.0], atol=1e-12)

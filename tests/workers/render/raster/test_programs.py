@@ -1,0 +1,22 @@
+"""The projection that reaches the GPU."""
+
+import numpy as np
+
+from schemas.scene.camera import Intrinsics
+from workers.geometry.camera import project
+from workers.render.raster.programs import NEAR_M, clip_from_cam
+
+
+def test_clip_space_gives_the_cameras_image_coordinates():
+    k = Intrinsics(width=641, height=333, fx=512.3, fy=498.7, cx=301.4, cy=177.9)
+    points = np.random.default_rng(0).uniform([-2, -2, 0.1], [2, 2, 9], (50, 3))
+    clip = np.column_stack([points, np.ones(50)]) @ clip_from_cam(k).T
+    window = (clip[:, :2] / clip[:, 3:] + 1.0) / 2.0 * [k.width, k.height]
+    np.testing.assert_allclose(window, np.stack(project(points, k), axis=1), rtol=1e-12)
+
+
+def test_the_near_plane_cuts_and_nothing_is_cut_far_away():
+    k = Intrinsics(width=4, height=4, fx=1.0, fy=1.0, cx=2.0, cy=2.0)
+    for z, inside in ((NEAR_M * 0.999, False), (NEAR_M * 1.001, True), (1.0, True), (1e6, True)):
+        clip = clip_from_cam(k) @ [0.0, 0.0, z, 1.0]
+        assert (-clip[3] <= clip[2] <= clip[3]) == inside, z

@@ -1,0 +1,230 @@
+"""Pure: photographic cameras: reflex, rangefinder and compact."""
+
+import numpy as np
+
+from schemas.scene.shape import Material
+from workers.assets.builtin.curves import rounded
+from workers.assets.builtin.finish import Model, Surface
+from workers.assets.builtin.look import BLACK, Color, chance, mixed, near, pick, solid_color, steel, textured, vivid
+from workers.assets.builtin.paint import Picture, blend, noise
+from workers.assets.builtin.solid import Solid, lathe, loft, together, union_at
+from workers.assets.builtin.vessel import prism
+
+SKIN, SHELL, LENS, RING, GLASS, DIAL, DISPLAY, SHOE = 0, 1, 2, 3, 4, 5, 6, 7
+
+FORWARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Takes a solid turned about z to one that looks along -y."""
+
+
+def make_camera(rng: np.random.Generator) -> Model:
+    """A camera on its flat base, looking along -y: a body with a grip, a lens, a viewfinder, dials, a display."""
+    kind = int(rng.integers(3))
+    width = float(rng.uniform(*((0.12, 0.15), (0.115, 0.14), (0.09, 0.115))[kind]))
+    height = width * float(rng.uniform(*((0.6, 0.7), (0.54, 0.62), (0.54, 0.64))[kind]))
+    depth = width * float(rng.uniform(*((0.34, 0.44), (0.24, 0.32), (0.2, 0.28))[kind]))
+    size = width, depth, height
+    on_hump, on_body = _finder(rng, size, kind)
+    lens = _lens(rng, size, kind)
+    on_body += _controls(rng, size)
+    if kind == 0 or chance(rng, 0.35):
+        on_body.append(_grip(rng, size, kind))
+    # What stands on the body stands apart from all else on it, and is joined to it in one step.
+    layers = [_body(rng, size, kind)] + ([together(on_hump)] if on_hump else [])
+    return Model(_joined(lens, on_body, layers, depth), _surfaces(rng, size, kind))
+
+
+def _body(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> Solid:
+    """The body: a band of leather between a base plate and a top plate; round ends on rangefinders."""
+    width, depth, height = size
+    radius = depth * (0.42 if kind == 1 and chance(rng, 0.6) else float(rng.uniform(0.15, 0.3)))
+    low, high = height * float(rng.uniform(0.1, 0.16)), height * float(rng.uniform(0.74, 0.84))
+    b, line = 0.0022, 0.0006
+    profile = np.array(
+        [
+            [b, 0.0],
+            [0.3 * b, 0.25 * b],
+            [0.0, b],
+            [0.0, low],
+            [line, low + line],
+            [line, high - line],
+            [0.0, high],
+            [0.0, height - b],
+            [0.3 * b, height - 0.3 * b],
+            [b, height],
+        ]
+    )
+    surface = [SHELL, SHELL, SHELL, SHELL, SKIN, SKIN, SKIN, SHELL, SHELL, SHELL, SHELL]
+    return prism(profile, (width, depth), radius, surface, 4)
+
+
+def _lens(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> Solid:
+    """A lens of stepped barrels that ends in a sunken glass, its axis along -y."""
+    width, depth, height = size
+    radius = height * float(rng.uniform(*((0.34, 0.4), (0.27, 0.36), (0.24, 0.34))[kind]))
+    length = radius * float(rng.uniform(*((1.0, 1.7), (0.6, 1.2), (0.35, 0.8))[kind]))
+    front = radius * float(rng.uniform(0.8, 1.0))
+    a, b = float(rng.uniform(0.25, 0.4)), float(rng.uniform(0.6, 0.8))
+    corners = np.array(
+        [
+            [0.0, -0.2 * depth],
+            [radius, -0.2 * depth],
+            [radius, a * length],
+            [0.94 * radius, a * length + 0.0005],
+            [0.94 * radius, a * length + 0.0015],
+            [radius * 0.99, a * length + 0.002],
+            [radius * 0.99, b * length],
+            [front * 0.95, b * length + 0.001],
+            [front * 0.95, length],
+            [front * 0.84, length],
+            [front * 0.66, length - 0.22 * radius],
+            [front * 0.6, length - 0.22 * radius],
+            [front * 0.34, length - 0.1 * radius],
+            [0.0, length - 0.06 * radius],
+        ]
+    )
+    radii = [0.0, 0.0, 0.0008, 0.0, 0.0, 0.0, 0.0008, 0.0, 0.001, 0.0, 0.0, 0.0, 0.05 * radius, 0.0]
+    surface = np.array([LENS, LENS, LENS, RING, LENS, LENS, LENS, LENS, LENS, LENS, LENS, GLASS, GLASS])
+    profile, owner = rounded(corners, radii, 1)
+    barrel = lathe(profile, surface[owner], 28)
+    across = width * float(rng.uniform(0.0, 0.08))
+    # The barrel stays above the base, so that the camera stands on its body, and below its upper plate.
+    level = max(0.5 * height * float(rng.uniform(0.92, 1.06)), radius + 0.0015)
+    level = min(level, height - 0.007 - radius)
+    return barrel.placed(FORWARD, np.array([across, -0.5 * depth, level]))
+
+
+def _joined(lens: Solid, on_body: list[Solid], layers: list[Solid], depth: float) -> Solid:
+    """Everything as one. Of the lens only its first barrel, up to the first ring before the body, meets the body."""
+    along = lens.vertices[:, 1]
+    first = along[along < -0.5 * depth].max()
+    touched = (along >= first)[lens.faces].all(axis=1)
+    return union_at(lens, touched, np.array([lens.vertices[-1, 0], first, lens.vertices[-1, 2]]), layers, on_body)
+
+
+def _finder(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> tuple[list[Solid], list[Solid]]:
+    """What stands on the viewfinder's hump, and what stands on the body: a reflex's hump, or a window in the front."""
+    width, depth, height = size
+    if kind == 0:
+        w, h = width * float(rng.uniform(0.28, 0.33)), height * float(rng.uniform(0.2, 0.3))
+        hump = _frustum((w, 0.95 * depth), (0.55 * w, 0.6 * depth), height - 0.004, height + h, SHELL)
+        shoe = prism(
+            np.array([[0.0, height + h - 0.001], [0.0, height + h + 0.0016]]),
+            (0.15 * width, 0.13 * width),
+            0.0008,
+            [SHOE] * 3,
+            1,
+        )
+        eye = prism(
+            np.array([[0.0, height + 0.2 * h], [0.0, height + 0.75 * h]]), (0.55 * w, 0.012), 0.002, [DIAL] * 3, 2
+        )
+        return [shoe, eye.moved(y=0.44 * depth)], [hump]
+    size_x, size_z = width * float(rng.uniform(0.09, 0.14)), height * float(rng.uniform(0.09, 0.12))
+    middle = height * 0.89 - 0.5 * size_z
+    window = prism(np.array([[0.0, middle], [0.0, middle + size_z]]), (size_x, 0.004), 0.0012, [GLASS] * 3, 2)
+    parts = [window.moved(x=width * float(rng.uniform(0.3, 0.38)), y=-0.5 * depth + 0.0008)]
+    if chance(rng, 0.5):
+        parts.append(
+            prism(
+                np.array([[0.0, height - 0.001], [0.0, height + 0.0018]]),
+                (0.14 * width, 0.12 * width),
+                0.0008,
+                [SHOE] * 3,
+                1,
+            )
+        )
+    return [], parts
+
+
+def _frustum(low: tuple[float, float], high: tuple[float, float], bottom: float, top: float, surface: int) -> Solid:
+    """A box that narrows towards its top, its upper edges broken."""
+    levels = (
+        (low, bottom, 0.0),
+        (low, bottom + 0.35 * (top - bottom), 0.0),
+        (high, top - 0.0012, 0.0),
+        (high, top, 0.0016),
+    )
+    rings = []
+    for (w, d), z, inset in levels:
+        x, y = 0.5 * w - inset, 0.5 * d - inset
+        cut = 0.16 * min(w, d)
+        outline = [
+            (x, y - cut),
+            (x - cut, y),
+            (cut - x, y),
+            (-x, y - cut),
+            (-x, cut - y),
+            (cut - x, -y),
+            (x - cut, -y),
+            (x, cut - y),
+        ]
+        rings.append([(px, py, z) for px, py in outline])
+    return loft(
+        np.array(rings), np.array([0.0, 0.0, bottom]), np.array([0.0, 0.0, top]), [surface] * 5, [0, 1, 2, 3, 4]
+    )
+
+
+def _controls(rng: np.random.Generator, size: tuple[float, float, float]) -> list[Solid]:
+    """Shutter button, one or two dials on the top, and the display on the back."""
+    width, depth, height = size
+    solids = []
+    # Seen from the front, a right hand holds the side of -x. Places and radii are shares of the width.
+    spots = [(-0.4, 0.033, 0.0028), (-0.275, 0.055, 0.005)]
+    if chance(rng, 0.5):
+        spots.append((0.32, 0.065, 0.0045))
+    for x, radius, rise in spots:
+        r = min(radius * width * float(rng.uniform(0.85, 1.1)), 0.3 * depth)
+        top = height + rise
+        profile = np.array(
+            [[0.0, height - 0.003], [r, height - 0.003], [r, top - 0.0006], [r - 0.0006, top], [0.0, top]]
+        )
+        solids.append(lathe(profile, [DIAL] * 4, 12).moved(x=x * width, y=0.05 * depth))
+    w, h = width * float(rng.uniform(0.48, 0.56)), height * float(rng.uniform(0.5, 0.58))
+    display = prism(np.array([[0.0, 0.18 * height], [0.0, 0.18 * height + h]]), (w, 0.006), 0.0012, [DISPLAY] * 3, 1)
+    return [*solids, display.moved(x=0.08 * width, y=0.5 * depth - 0.0012)]
+
+
+def _grip(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> Solid:
+    """A round upright grip on the front of the side of -x."""
+    width, depth, height = size
+    grip_depth = depth * float(rng.uniform(0.8, 1.1) if kind == 0 else rng.uniform(0.3, 0.42))
+    w = width * float(rng.uniform(0.15, 0.18))
+    top = height * float(rng.uniform(0.86, 0.93))
+    # Its base lies just above the body's: the camera stands on its body, and no two planes coincide.
+    b = min(0.0016, 0.1 * grip_depth)
+    profile = np.array([[b, 0.0012], [0.0, 0.0012 + b], [0.0, top - 2.5 * b], [b, top - 0.6 * b], [2.5 * b, top]])
+    grip = prism(profile, (w, grip_depth), 0.45 * min(w, grip_depth), [SKIN] * 6, 5)
+    return grip.moved(x=-0.5 * width + 0.52 * w, y=-0.5 * depth - 0.12 * grip_depth if kind else -0.5 * depth)
+
+
+def _surfaces(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> tuple[Surface, ...]:
+    dark: Color = near(rng, (0.1, 0.1, 0.105), 0.03)
+    if kind == 0:
+        shell, skin = solid_color(dark, float(rng.uniform(0.5, 0.7))), dark
+    else:
+        plate = steel(rng) if chance(rng, 0.6) else solid_color(dark, 0.4)
+        colors = (dark, dark, (0.3, 0.17, 0.1), vivid(rng), mixed(vivid(rng), BLACK, 0.4))
+        shell, skin = plate, pick(rng, colors)
+        if kind == 2 and chance(rng, 0.6):
+            paint = solid_color(vivid(rng) if chance(rng, 0.5) else near(rng, (0.75, 0.75, 0.76)), 0.4)
+            return _order(textured(_leather(rng, paint.base_color[:3], 0.06), 0.4), paint, rng)
+    return _order(textured(_leather(rng, skin, 0.5), 0.75), shell, rng, max(size))
+
+
+def _order(skin: Material, shell: Material, rng: np.random.Generator, size: float = 0.1) -> tuple[Surface, ...]:
+    lens = solid_color(near(rng, (0.09, 0.09, 0.095), 0.03), 0.45) if chance(rng, 0.75) else steel(rng)
+    ring = pick(rng, (steel(rng), solid_color(near(rng, (0.75, 0.1, 0.1)), 0.4), steel(rng)))
+    return (
+        Surface("skin", skin, "grain", size=0.5 * size),
+        Surface("shell", shell),
+        Surface("lens", lens),
+        Surface("ring", ring),
+        Surface("glass", solid_color((0.08, 0.09, 0.16), 0.08)),
+        Surface("dial", steel(rng) if chance(rng, 0.5) else solid_color(BLACK, 0.5)),
+        Surface("display", solid_color((0.04, 0.045, 0.06), 0.15)),
+        Surface("shoe", solid_color((0.3, 0.3, 0.31), 0.45)),
+    )
+
+
+def _leather(rng: np.random.Generator, color: Color, depth: float) -> Picture:
+    """Grained leather."""
+    return blend(mixed(color, BLACK, depth), mixed(color, (0.9, 0.9, 0.9), 0.15 * depth), noise(rng, 64, 64, 32, 32))

@@ -1,0 +1,192 @@
+"""Pure: a painted solid becomes the parts of a shape, with shading normals and texture coordinates."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from schemas.base import Array
+from schemas.scene.shape import Material, Part, Shape
+from workers.assets.builtin.solid import TRIG_DIGITS, Indices, Solid
+
+Wrap = Literal["none", "cylinder", "plane", "grain"]
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The look of some faces of a solid, and how its texture lies on them.
+
+    `wrap`: `cylinder` turns u once round the z axis and v from `low` to `high` in z; `plane` runs u along `across` and
+    v along `up` (vectors [3] from `origin` whose lengths are one texture); `grain` projects along the axis that the
+    face looks along, u along the axis `grain` wherever that is not the same one, one texture for `size` metres.
+    """
+
+    name: str
+    material: Material
+    wrap: Wrap = "none"
+    low: float = 0.0
+    high: float = 1.0
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    across: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    size: float = 1.0
+    grain: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What a family makes: a closed solid, true metres, z up, standing on its lowest plane; and its surfaces by number."""
+
+    solid: Solid
+    surfaces: tuple[Surface, ...]
+
+
+_SIDES = (((1, 2), (0, 2), (0, 1)), ((1, 2), (0, 2), (1, 0)), ((2, 1), (2, 0), (0, 1)))
+"""u and v for the axis that the grain runs along and the axis that a face looks along."""
+
+
+def cut_into_parts(solid: Solid, surfaces: Sequence[Surface], centre: Array, scale: float) -> Shape:
+    """The solid as one part for each surface, its points at scale * (point - centre).
+
+    Points on a border between parts are the same doubles in both, so that the parts together are watertight.
+    """
+    vertices = (solid.vertices - centre) * scale
+    across, normals_at = _face_vectors(vertices, solid.faces)
+    shaded, point = _dense(solid.smooth[:, None] * len(vertices) + solid.faces)
+    point %= len(vertices)
+    normals = normals_at(shaded, len(point))
+    order = np.argsort(solid.surface, kind="stable")
+    stops = np.cumsum(np.bincount(solid.surface, minlength=len(surfaces)))
+    parts = []
+    for surface, start, stop in zip(surfaces, [0, *stops[:-1]], stops, strict=True):
+        if start < stop:
+            chosen = order[start:stop]
+            corners = shaded[chosen]
+            variant, coordinates = _texture_variants(surface, solid.vertices, point[corners], across[:, chosen])
+            if coordinates is None:
+                index, origin = _dense(corners)
+                uv = None
+            else:
+                index, origin = _dense(corners * 3 + variant)
+                origin, which = np.divmod(origin, 3)
+                uv = coordinates(point[origin], which)
+            parts.append(_part(surface, vertices[point[origin]], index, normals[origin], uv))
+    return Shape(tuple(parts), closed=True)
+
+
+def _part(surface: Surface, vertices: Array, faces: Indices, normals: Array, uv: Array | None) -> Part:
+    corners = faces.astype(np.int32)
+    for array in (vertices, corners, normals, uv):
+        if array is not None:
+            array.setflags(write=False)
+    return Part(surface.name, vertices, corners, surface.material, normals=normals, uv=uv)
+
+
+def _dense(keys: Indices) -> tuple[Indices, Indices]:
+    """Keys [...] int64 renumbered 0, 1, 2, ... in their order, and the key that each number stands for."""
+    flat = keys.ravel()
+    seen = np.zeros(int(flat.max()) + 1, dtype=np.bool_)
+    seen[flat] = True
+    number = np.cumsum(seen) - 1
+    return number[keys], np.flatnonzero(seen)
+
+
+def _face_vectors(vertices: Array, faces: Indices) -> tuple[Array, Callable[[Indices, int], Array]]:
+    """Area vectors of the faces, twice their area long, axis by axis [3, F]; and what gives the shading normals.
+
+    The function takes the faces [F, 3] as numbers of `count` points, and gives [count, 3]: for each point the unit mean
+    of the normals of the faces around it. A face counts by its area vector over the squares of the two sides that meet
+    in the point, which is exact on spheres and does not mind how a rectangle is cut in two (Max, "Weights for computing
+    vertex normals from facet normals", 1999).
+    """
+    axes = np.ascontiguousarray(vertices.T)
+    a, b, c = (np.take(axes, faces[:, k], axis=1) for k in range(3))
+    (x, y, z), (u, v, w) = b - a, c - a
+    across = np.stack([y * w - z * v, z * u - x * w, x * v - y * u])
+    ab, bc, ca = (side[0] * side[0] + side[1] * side[1] + side[2] * side[2] for side in (b - a, c - b, a - c))
+    pairs = np.stack([ca * ab, ab * bc, bc * ca])
+    weight = 1.0 / np.where(pairs == 0.0, 1.0, pairs)
+
+    def normals(corners: Indices, count: int) -> Array:
+        flat = np.ascontiguousarray(corners.T).ravel()
+        x, y, z = (np.bincount(flat, (weight * along).ravel(), count) for along in across)
+        length = np.sqrt(x * x + y * y + z * z)
+        return np.stack([x, y, z], axis=1) / np.where(length == 0.0, 1.0, length)[:, None]
+
+    return across, normals
+
+
+Coordinates = Callable[[Indices, Indices], Array]
+"""uv [N, 2] of points by number and variant (0, 1 or 2): a seam or an edge gives one point several places."""
+
+
+def _texture_variants(
+    surface: Surface, vertices: Array, faces: Indices, across: Array
+) -> tuple[Indices, Coordinates | None]:
+    """Which variant [F, 3] of its points each face uses, and the texture coordinates of a point's variants.
+
+    across [3, F]: the faces' area vectors.
+    """
+    if surface.wrap == "cylinder":
+        turn = _turns(vertices, faces)
+        beyond = turn[faces]
+        wrapped = (beyond.max(axis=1) - beyond.min(axis=1) > 0.5)[:, None] & (beyond < 0.5)
+        reach = surface.high - surface.low
+        return wrapped.astype(np.int64), lambda point, variant: np.stack(
+            [turn[point] + variant, (vertices[point, 2] - surface.low) / reach], axis=1
+        )
+    if surface.wrap == "plane":
+        axes = np.array([surface.across, surface.up])
+        axes /= (axes * axes).sum(axis=1)[:, None]
+        local = vertices - np.array(surface.origin)
+        return np.zeros_like(faces), lambda point, variant: np.stack(
+            [(local[point] * axis).sum(axis=1) for axis in axes], axis=1
+        )
+    if surface.wrap == "grain":
+        axis = np.abs(across).argmax(axis=0)
+        low = vertices.min(axis=0)
+        sides = np.array(_SIDES[surface.grain])
+        return np.repeat(axis[:, None], 3, axis=1), lambda point, variant: np.take_along_axis(
+            (vertices[point] - low) / surface.size, sides[variant], axis=1
+        )
+    return np.zeros_like(faces), None
+
+
+def _turns(vertices: Array, faces: Indices) -> Array:
+    """[V] float64: for the points that the faces name, the angle about the z axis in turns, in [0, 1)."""
+    turn = np.zeros(len(vertices))
+    used = np.zeros(len(vertices), dtype=np.bool_)
+    used[faces] = True
+    turn[used] = turns_about_z(vertices[used, 0], vertices[used, 1])
+    return turn
+
+
+def turns_about_z(x: Array, y: Array) -> Array:
+    """[N] float64: the angle of (x, y) in turns, in [0, 1), to `TRIG_DIGITS` digits; 0 at the origin.
+
+    By +, -, * and / alone, where numpy's atan2 gives other bits with other vector instructions: the tangent t in [0, 1]
+    of the angle to the nearest axis, less the nearest k/8, is small enough for a short series:
+    atan t = atan k/8 + atan s, s = (t - k/8) / (1 + t k/8).
+    """
+    wide, high = np.abs(x), np.abs(y)
+    steep = high > wide
+    long, short = np.where(steep, high, wide), np.where(steep, wide, high)
+    t = short / np.where(long == 0.0, 1.0, long)
+    step = np.rint(8.0 * t)
+    near = step / 8.0
+    s = (t - near) / (1.0 + t * near)
+    square = s * s
+    series = np.zeros_like(s)
+    for power in (11.0, 9.0, 7.0, 5.0, 3.0, 1.0):
+        series = 1.0 / power - square * series
+    turn = (_EIGHTHS[step.astype(np.int64)] + s * series) / (2.0 * math.pi)
+    turn = np.where(steep, 0.25 - turn, turn)
+    turn = np.where(x < 0.0, 0.5 - turn, turn)
+    turned = np.round(np.where(y < 0.0, 1.0 - turn, turn), TRIG_DIGITS)
+    return np.where(turned >= 1.0, 0.0, turned).astype(np.float64)
+
+
+_EIGHTHS = np.array([round(math.atan(k / 8.0), 15) for k in range(9)])
+"""[9] float64: the angles whose tangents are 0, 1/8, ... 1."""

@@ -1,0 +1,109 @@
+"""Pure: the built-in assets. Instance n of a category is the same for ever for one seed."""
+
+import hashlib
+from collections.abc import Callable
+
+import numpy as np
+
+from schemas.base import Array, frozen_array
+from schemas.job.assets import ProceduralSource
+from schemas.scene.shape import Asset, Loft, Shape
+from workers.assets.builtin.bottle import make_bottle
+from workers.assets.builtin.bowl import make_bowl
+from workers.assets.builtin.box import make_box
+from workers.assets.builtin.camera import make_camera
+from workers.assets.builtin.can import make_can
+from workers.assets.builtin.finish import Model, cut_into_parts
+from workers.assets.builtin.jar import make_jar
+from workers.assets.builtin.laptop import make_laptop
+from workers.assets.builtin.mug import make_mug
+from workers.assets.builtin.table import make_table
+from workers.assets.mass import solid_mass
+
+VERSION = 2
+"""Goes into the catalogue's digest: raise it with every change that moves a vertex or a colour of any instance."""
+
+LICENCE = "CC0-1.0"
+TABLE = "table"
+
+FAMILIES: dict[str, tuple[int, Callable[[np.random.Generator], Model]]] = {
+    "bottle": (0, make_bottle),
+    "camera": (1, make_camera),
+    "can": (2, make_can),
+    "jar": (3, make_jar),
+    "laptop": (4, make_laptop),
+    "mug": (5, make_mug),
+    "bowl": (6, make_bowl),
+    "box": (7, make_box),
+    TABLE: (8, make_table),
+}
+"""The number of each category in the seed's spawn key, which never changes, and who makes it."""
+
+
+def instance_id(category: str, seed: int, index: int) -> str:
+    """`mug-0-000123`: category, seed, and the index in six digits, so that ids sort."""
+    return f"{category}-{seed}-{index:06d}"
+
+
+def make_model(category: str, seed: int, index: int) -> Model:
+    """Instance `index` of a category, in true metres; the same bits for the same arguments."""
+    number, make = FAMILIES[category]
+    return make(np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, index))))
+
+
+def make_asset(category: str, settings: ProceduralSource, index: int, density_kg_m3: float) -> Asset:
+    """Instance `index` of a category as an asset; objects are scaled to `diagonal_m` unless `size` is metric."""
+    model = make_model(category, settings.seed, index)
+    lower, upper = model.solid.vertices.min(axis=0), model.solid.vertices.max(axis=0)
+    centre, extent = 0.5 * (lower + upper), upper - lower
+    scale = 1.0
+    if category != TABLE and settings.size == "article":
+        scale = settings.diagonal_m / float(np.sqrt((extent * extent).sum()))
+    shape = cut_into_parts(model.solid, model.surfaces, centre, scale)
+    mass = solid_mass((model.solid.vertices - centre) * scale, model.solid.faces, density_kg_m3)
+    T_source_to_object = np.eye(4)
+    T_source_to_object[:3, 3] = -scale * centre
+    return Asset(
+        instance_id=instance_id(category, settings.seed, index),
+        category=category,
+        source="procedural",
+        licence=LICENCE,
+        path=None,
+        sha256=shape_digest(shape),
+        shape=shape,
+        mass=mass,
+        T_source_to_object=frozen_array(T_source_to_object),
+        scale=scale,
+        watertight=True,
+        volume_m3=mass.mass_kg / density_kg_m3,
+        shareable=True,
+        lofts=_placed(model.solid.lofts, centre, scale),
+    )
+
+
+def _placed(lofts: tuple[Loft, ...] | None, centre: Array, scale: float) -> tuple[Loft, ...] | None:
+    """The lofts with their points at scale * (point - centre)."""
+    return None if lofts is None else tuple(loft.mapped(scale * np.eye(3), -scale * centre) for loft in lofts)
+
+
+def shape_digest(shape: Shape) -> str:
+    """SHA-256 over the arrays and materials of every part, in hexadecimal."""
+    digest = hashlib.sha256()
+    for part in shape.parts:
+        material = part.material
+        arrays = (
+            part.vertices,
+            part.faces,
+            part.normals,
+            part.uv,
+            part.colors,
+            material.texture,
+            material.transmission_map,
+        )
+        shapes = [None if array is None else array.shape for array in arrays]
+        looks = (material.base_color, material.metallic, material.roughness, material.transmission, material.ior)
+        digest.update(repr((part.name, *looks, shapes)).encode())
+        for array in arrays:
+            if array is not None:
+                digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()

@@ -1,0 +1,174 @@
+"""Pure: small pictures [h, w, 3] uint8 sRGB, row 0 at the top: labels, wood, stone, cardboard, glazes."""
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from workers.assets.builtin.look import Color, chance, ink_on, mixed, vivid
+
+Picture = NDArray[np.uint8]
+Plane = NDArray[np.float32]
+
+
+def rgb(color: Color) -> NDArray[np.uint8]:
+    """[3] uint8."""
+    return np.array([round(255.0 * c) for c in color], dtype=np.uint8)
+
+
+def blank(height: int, width: int, color: Color) -> Picture:
+    """A picture of one colour."""
+    picture = np.empty((height, width, 3), dtype=np.uint8)
+    picture[:] = rgb(color)
+    return picture
+
+
+def noise(rng: np.random.Generator, height: int, width: int, rows: int, columns: int) -> Plane:
+    """[height, width] float32 in [0, 1]: a random lattice of rows x columns, made smooth; it repeats in both directions."""
+    lattice = rng.random((columns, rows), dtype=np.float32)
+    return _stretched(np.ascontiguousarray(_stretched(lattice, width).T), height)
+
+
+def _stretched(lattice: Plane, size: int) -> Plane:
+    count = len(lattice)
+    at = np.arange(size, dtype=np.float32) * np.float32(count / size)
+    low = at.astype(np.int64)
+    step = np.take(np.roll(lattice, -1, axis=0) - lattice, low, axis=0)
+    step *= (at - low.astype(np.float32))[:, None]
+    step += np.take(lattice, low, axis=0)
+    return step
+
+
+def blend(a: Color, b: Color, share: Plane) -> Picture:
+    """a where `share` [h, w] is 0, b where it is 1, in 64 steps."""
+    t = np.minimum(np.arange(256) / 63.0, 1.0)[:, None, None]
+    steps = np.round(255.0 * (np.array(a) * (1 - t) + np.array(b) * t)).astype(np.uint8)
+    level = np.clip(share * np.float32(63.0) + np.float32(0.5), 0, 63).astype(np.uint8)
+    return np.asarray(cv2.applyColorMap(level, steps), np.uint8)
+
+
+def wood(rng: np.random.Generator, light: Color, dark: Color, planks: int = 0, size: int = 256) -> Picture:
+    """[size, size / 2, 3]: grain along u; with `planks`, boards of slightly different tone with dark seams between them."""
+    width = size // 2
+    share = 0.6 * noise(rng, size, width, size // 3, 4) + 0.4 * noise(rng, size, width, 10, 2) - np.float32(0.08)
+    if planks:
+        board = np.arange(size) * planks // size
+        share += (0.35 * rng.random(planks, dtype=np.float32) - np.float32(0.17))[board][:, None]
+        seam = np.zeros(size, dtype=np.bool_)
+        seam[np.flatnonzero(np.diff(board)) + 1] = True
+        share[seam] = 1.25
+    return blend(light, dark, share)
+
+
+def stone(rng: np.random.Generator, a: Color, b: Color, size: int = 192) -> Picture:
+    """Cloudy stone with veins."""
+    cloud = 0.6 * noise(rng, size, size, 6, 6) + 0.4 * noise(rng, size, size, 20, 20)
+    vein = np.abs(0.65 * noise(rng, size, size, 5, 4) + 0.35 * noise(rng, size, size, 17, 15) - np.float32(0.5))
+    share = np.float32(0.55) * cloud + np.clip(np.float32(0.5) - np.float32(14.0) * vein, 0, 1)
+    return blend(a, b, share.astype(np.float32))
+
+
+def band_height(low: float, high: float, radius: float, width: int = 256) -> int:
+    """Rows of a picture that is `width` pixels around, so that its pixels are square on a cylinder; 16 to 192."""
+    return min(max(round(width * (high - low) / (2.0 * math.pi * radius)), 16), 192)
+
+
+def speckled(
+    rng: np.random.Generator, ground: Color, spot: Color, share: float, height: int = 128, width: int = 256
+) -> Picture:
+    """A ground with small spots on this share of it."""
+    picture = blank(height, width, ground)
+    picture[rng.random((height, width), dtype=np.float32) < share] = rgb(spot)
+    return picture
+
+
+def bands(rng: np.random.Generator, colors: Sequence[Color], height: int = 128) -> Picture:
+    """Horizontal stripes of random widths; the first colour covers the most."""
+    picture = blank(height, 8, colors[0])
+    at = 0
+    for color in [*colors[1:], *colors[1:]]:
+        at += int(rng.integers(height // 12, height // 3))
+        picture[at : at + int(rng.integers(2, height // 6))] = rgb(color)
+    return picture
+
+
+def upright_stripes(rng: np.random.Generator, colors: Sequence[Color], width: int = 256) -> Picture:
+    """Vertical stripes that close around a vessel."""
+    period = width // int(rng.integers(6, 17))
+    stripe = (np.arange(width) % period) * len(colors) // period
+    return np.broadcast_to(np.stack([rgb(c) for c in colors])[stripe], (8, width, 3)).copy()
+
+
+def dots(rng: np.random.Generator, ground: Color, spot: Color, height: int = 128, width: int = 256) -> Picture:
+    """A regular pattern of round spots, shifted in every other row."""
+    pitch = width // int(rng.integers(8, 17))
+    y, x = np.arange(height)[:, None], np.arange(width)[None]
+    shift = np.where((y // pitch) % 2 == 1, pitch // 2, 0)
+    dx, dy = (x + shift) % pitch - pitch / 2, y % pitch - pitch / 2
+    picture = blank(height, width, ground)
+    picture[dx * dx + dy * dy < (pitch * float(rng.uniform(0.18, 0.36))) ** 2] = rgb(spot)
+    return picture
+
+
+def write_word(
+    rng: np.random.Generator, picture: Picture, top: int, left: int, letters: int, size: int, ink: Color
+) -> None:
+    """Draws letter-like signs of 3 x 5 squares into a picture, cut off at its border."""
+    signs = rng.random((letters, 5, 2)) < 0.62
+    signs[:, 0, 0] = signs[:, 4, 1] = True
+    full = np.concatenate([signs, signs[:, ::-1, :1], np.zeros((letters, 5, 1), dtype=np.bool_)], axis=2)
+    word = full.transpose(1, 0, 2).reshape(5, -1).repeat(size, axis=0).repeat(size, axis=1)
+    area = picture[max(top, 0) : top + len(word), max(left, 0) : left + word.shape[1]]
+    area[word[: area.shape[0], : area.shape[1]]] = rgb(ink)
+
+
+def write_lines(rng: np.random.Generator, picture: Picture, box: tuple[int, int, int, int], ink: Color) -> None:
+    """Draws lines of small print into the box (top, left, bottom, right)."""
+    top, left, bottom, right = box
+    for y in range(top, bottom - 1, 4):
+        ends = left + (right - left) * rng.uniform(0.55, 1.0)
+        words = rng.random(right - left) < 0.8
+        row = picture[y : y + 2, left:right]
+        row[:, words & (np.arange(left, right) < ends)] = rgb(ink)
+
+
+def emblem(rng: np.random.Generator, picture: Picture, centre: tuple[float, float], size: float, color: Color) -> None:
+    """Draws a round, square, diamond or ring-shaped emblem about (row, column), `size` its radius in pixels."""
+    height, width = picture.shape[:2]
+    y, x = (np.arange(height) - centre[0])[:, None] / size, (np.arange(width) - centre[1])[None] / size
+    kind = int(rng.integers(4))
+    if kind == 0:
+        inside = x * x + y * y < 1.0
+    elif kind == 1:
+        inside = np.maximum(np.abs(x) * 0.7, np.abs(y) * 1.2) < 0.9
+    elif kind == 2:
+        inside = np.abs(x) + np.abs(y) < 1.1
+    else:
+        inside = np.abs(x * x + y * y - 0.75) < 0.3
+    picture[inside] = rgb(color)
+
+
+def label(rng: np.random.Generator, paper: Color, height: int = 128, width: int = 256, faces: int = 2) -> Picture:
+    """A printed label: emblem, brand and small print, `faces` times around."""
+    ink, accent = ink_on(rng, paper), vivid(rng)
+    picture = blank(height, width, paper)
+    if chance(rng, 0.6):
+        edge = int(rng.integers(1, max(height // 8, 2)))
+        picture[:edge] = picture[-edge:] = rgb(accent)
+    if chance(rng, 0.35):
+        split = int(rng.uniform(0.3, 0.7) * height)
+        picture[split:] = rgb(mixed(paper, accent, 0.8))
+    face = width // faces
+    letters, size = int(rng.integers(4, 9)), int(rng.integers(3, 6))
+    size = max(1, min(size, face // (4 * letters + 2), height // 14))
+    top = int(rng.uniform(0.18, 0.5) * height)
+    emblem(
+        rng, picture[:, :face], (rng.uniform(0.35, 0.65) * height, face / 2), rng.uniform(0.14, 0.3) * height, accent
+    )
+    write_word(rng, picture[:, :face], top, (face - 4 * letters * size) // 2, letters, size, ink)
+    write_lines(rng, picture, (int(0.76 * height), face // 5, int(0.9 * height), face - face // 5), ink)
+    for k in range(1, faces):
+        picture[:, k * face : (k + 1) * face] = picture[:, :face]
+    return picture

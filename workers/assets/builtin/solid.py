@@ -1,0 +1,269 @@
+"""Pure: closed triangle solids, made by lofting rings and joined by manifold3d's exact booleans.
+
+Only +, -, *, / and square roots touch coordinates here and in `curves`: they give the same bits on every processor.
+Sines and cosines are rounded to `TRIG_DIGITS`, because C libraries and processors differ in the last bit of theirs.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import manifold3d
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array
+from schemas.scene.shape import Loft
+from workers.geometry.manifold import hold_to_one_thread
+
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+SMOOTH_COSINE = 0.8
+"""Neighbouring bands that turn by less than about 37 degrees are shaded as one smooth surface."""
+TRIG_DIGITS = 14
+"""A point of the unit circle is off by less than 1e-14 of its radius."""
+_FAN, _SURFACES = 63, 64
+"""More surfaces than any model has: a face's tag is smooth number * _SURFACES + surface number. _FAN is the surface of
+faces that only close a solid for a boolean."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A closed surface, counter-clockwise seen from outside.
+
+    vertices [V, 3] float64 metres; faces [F, 3] int64; surface [F] int64: which look a face has; smooth [F] int64:
+    faces of one number share shading normals where they meet. lofts: what it is the union of, None where that is not known.
+    """
+
+    vertices: Array
+    faces: Indices
+    surface: Indices
+    smooth: Indices
+    lofts: tuple[Loft, ...] | None = None
+
+    def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Solid":
+        """The solid shifted, metres."""
+        return self.placed(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.array([x, y, z]))
+
+    def placed(self, axes: Array, origin: Array) -> "Solid":
+        """The solid with its x, y, z along the rows of `axes` [3, 3] (a right-handed turn) and its origin at `origin`."""
+        x, y, z = self.vertices[:, 0:1], self.vertices[:, 1:2], self.vertices[:, 2:3]
+        placed = x * axes[0] + y * axes[1] + z * axes[2] + origin
+        return Solid(placed, self.faces, self.surface, self.smooth, self._mapped(axes, origin))
+
+    def stretched(self, factors: Array) -> "Solid":
+        """The solid with its x, y and z times the factors [3]."""
+        lofts = self._mapped(np.diag(factors), np.zeros(3))
+        return Solid(self.vertices * factors, self.faces, self.surface, self.smooth, lofts)
+
+    def _mapped(self, matrix: Array, origin: Array) -> tuple[Loft, ...] | None:
+        return None if self.lofts is None else tuple(loft.mapped(matrix, origin) for loft in self.lofts)
+
+
+@functools.cache
+def circle(count: int) -> Array:
+    """[count, 2] float64: points of the unit circle, counter-clockwise from (1, 0); quarters are exact."""
+    points = []
+    for k in range(count):
+        quarter, rest = divmod(4 * k, count)
+        angle = math.pi * rest / (2 * count)
+        c, s = round(math.cos(angle), TRIG_DIGITS), round(math.sin(angle), TRIG_DIGITS)
+        points.append(((c, s), (-s, c), (-c, -s), (s, -c))[quarter])
+    table = np.array(points)
+    table.setflags(write=False)
+    return table
+
+
+@functools.cache
+def _loft_faces(rings: int, count: int) -> tuple[Indices, Indices]:
+    """Faces of a loft and the band [F] of each: 0 the fan at the start, then band by band, last the fan at the end."""
+    j = np.arange(count)
+    nxt = (j + 1) % count
+    base = np.arange(rings - 1)[:, None] * count
+    a, b, c, d = base + j, base + nxt, base + count + nxt, base + count + j
+    body = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], axis=2).reshape(-1, 3)
+    start, end, top = rings * count, rings * count + 1, (rings - 1) * count
+    first = np.stack([np.full(count, start), nxt, j], -1)
+    last = np.stack([np.full(count, end), top + j, top + nxt], -1)
+    faces = np.concatenate([first, body, last])
+    band = np.repeat(np.arange(rings + 1), [count, *[2 * count] * (rings - 1), count])
+    faces.setflags(write=False)
+    band.setflags(write=False)
+    return faces, band
+
+
+def loft(
+    rings: Array,
+    start: Array,
+    end: Array,
+    surface: Sequence[int] | Indices,
+    smooth: Sequence[int] | Indices,
+    profiles: Array | None = None,
+) -> Solid:
+    """The loft through rings [L, n, 3] (each counter-clockwise seen from the end), closed by fans to two points.
+
+    surface and smooth have one number for each band [L + 1]: the fan at the start, L - 1 bands, the fan at the end.
+    profiles [K, L + 2, 2]: as `Loft` has them.
+    """
+    levels, count = rings.shape[:2]
+    faces, band = _loft_faces(levels, count)
+    vertices = np.concatenate([rings.reshape(-1, 3), start[None], end[None]])
+    lofts = (Loft(rings, vertices[-2:], profiles),)
+    numbers = np.asarray(surface, dtype=np.int64)[band], np.asarray(smooth, dtype=np.int64)[band]
+    return Solid(vertices, faces, *numbers, lofts)
+
+
+def lathe(profile: Array, surface: Sequence[int] | Indices, count: int = 48, section: Array | None = None) -> Solid:
+    """The solid of revolution of a profile [P, 2] of (radius, height), metres, from the axis to the axis.
+
+    Outside lies to the right along the profile: outwards along the bottom, up the wall, back to the axis. `surface`
+    has one number for each segment [P - 1]. `section` [P - 2, n, 2] replaces the unit circle ring by ring.
+    """
+    inner = profile[1:-1]
+    outline = circle(count)[None] if section is None else section
+    level = np.broadcast_to(inner[:, 1][:, None, None], (len(inner), outline.shape[1], 1))
+    rings = np.concatenate([outline * inner[:, 0][:, None, None], level], axis=2)
+    start, end = np.array([0.0, 0.0, profile[0, 1]]), np.array([0.0, 0.0, profile[-1, 1]])
+    return loft(rings, start, end, surface, smooth_runs(profile), _profiles(profile, section))
+
+
+def _profiles(profile: Array, section: Array | None) -> Array:
+    """[K, P, 2] float64: the profile along the columns of a section that are the most unlike; one, where there is none."""
+    if section is None:
+        return profile[None]
+    reach = np.sqrt(section[..., 0] * section[..., 0] + section[..., 1] * section[..., 1])  # [P - 2, n]
+    ring = reach[int((reach.max(axis=1) - reach.min(axis=1)).argmax())]
+    columns = reach[:, [int(ring.argmax()), int(ring.argmin())]].T
+    return np.stack([_widened(profile, column) for column in columns])
+
+
+def _widened(profile: Array, factors: Array) -> Array:
+    """The profile [P, 2] with the radii between its ends times the factors [P - 2]."""
+    wide = profile.astype(np.float64)
+    wide[1:-1, 0] *= factors
+    return wide
+
+
+def smooth_runs(profile: Array) -> Indices:
+    """[P - 1] int64: the number of the smooth run that each segment of a profile [P, 2] belongs to; flat ends stand alone."""
+    step = np.diff(profile, axis=0)
+    length = np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2)
+    along = step / np.where(length == 0.0, 1.0, length)[:, None]
+    cosine = along[1:, 0] * along[:-1, 0] + along[1:, 1] * along[:-1, 1]
+    sharp = cosine < SMOOTH_COSINE
+    # A flat end is large beside its rounded rim, and would be shaded as if it were domed.
+    sharp[0] |= step[0, 1] == 0.0
+    sharp[-1] |= step[-1, 1] == 0.0
+    return np.concatenate([[0], np.cumsum(sharp)]).astype(np.int64)
+
+
+def together(solids: Sequence[Solid]) -> Solid:
+    """Solids that do not touch one another, as one: booleans take them in one step."""
+    starts = np.cumsum([0, *(len(solid.vertices) for solid in solids[:-1])])
+    smooths = np.cumsum([0, *(int(solid.smooth.max()) + 1 for solid in solids[:-1])])
+    return Solid(
+        np.concatenate([solid.vertices for solid in solids]),
+        np.concatenate([solid.faces + start for solid, start in zip(solids, starts, strict=True)]),
+        np.concatenate([solid.surface for solid in solids]),
+        np.concatenate([solid.smooth + first for solid, first in zip(solids, smooths, strict=True)]),
+        _lofts_of(solids),
+    )
+
+
+def _lofts_of(solids: Sequence[Solid]) -> tuple[Loft, ...] | None:
+    """Of all the solids, one after the other; None where one's are not known."""
+    found: list[Loft] = []
+    for solid in solids:
+        if solid.lofts is None:
+            return None
+        found += solid.lofts
+    return tuple(found)
+
+
+def union(solids: Sequence[Solid]) -> Solid:
+    """All the solids as one, without what lies inside; MeshError never: a bad solid is a bug and raises ValueError."""
+    return _from_manifold(manifold3d.Manifold.batch_boolean(_tagged(solids), manifold3d.OpType.Add), _lofts_of(solids))
+
+
+def union_at(solid: Solid, touched: Mask, apex: Array, others: Sequence[Solid], beside: Sequence[Solid] = ()) -> Solid:
+    """The union of a solid and of others that meet it nowhere but in its faces `touched` [F].
+
+    What booleans cost grows with all faces that go in. So only these faces do, closed by fans from their border to
+    `apex`, a point on their inner side that sees them all; between the fans and them the others must find what the
+    whole solid has there. The fans are taken off again and the rest of the solid put back. `beside`: solids that meet
+    the others and not this one, and go in in the same step. Where another solid reaches through the fans, the whole
+    solid goes in: the same, but slower.
+    """
+    core = solid.faces[touched]
+    a, b = core.ravel(), core[:, [1, 2, 0]].ravel()
+    size = len(solid.vertices)
+    border = ~np.isin(a * size + b, b * size + a)
+    fan = np.stack([b[border], a[border], np.full(int(border.sum()), size)], axis=1)
+    faces, names = _renumbered(np.concatenate([core, fan]))
+    surface = np.concatenate([solid.surface[touched], np.full(len(fan), _FAN)])
+    smooth = np.concatenate([solid.smooth[touched], np.zeros(len(fan), dtype=np.int64)])
+    vertices = np.concatenate([solid.vertices, apex[None]])
+    joined = union([together([Solid(vertices[names], faces, surface, smooth), *beside]), *others])
+    place = {point: number for number, point in enumerate(map(tuple, joined.vertices.tolist()))}
+    rim = np.unique(a[border])
+    at = [place.get(point, -1) for point in map(tuple, solid.vertices[rim].tolist())]
+    kept = joined.surface != _FAN
+    if int((~kept).sum()) != len(fan) or -1 in at:
+        return union([together([solid, *beside]), *others])
+    target = len(joined.vertices) + np.arange(size)
+    target[rim] = at
+    faces = np.concatenate([joined.faces[kept], target[solid.faces[~touched]]])
+    faces, names = _renumbered(faces)
+    return Solid(
+        np.concatenate([joined.vertices, solid.vertices])[names],
+        faces,
+        np.concatenate([joined.surface[kept], solid.surface[~touched]]),
+        np.concatenate([joined.smooth[kept], solid.smooth[~touched]]),
+        _lofts_of([solid, *beside, *others]),
+    )
+
+
+def _renumbered(faces: Indices) -> tuple[Indices, Indices]:
+    """Faces into the vertices that they name alone, and the old number of each of these."""
+    used = np.zeros(int(faces.max()) + 1, dtype=np.bool_)
+    used[faces] = True
+    return (np.cumsum(used) - 1)[faces], np.flatnonzero(used)
+
+
+def difference(solid: Solid, cutters: Sequence[Solid]) -> Solid:
+    """The solid without the cutters; the cuts have the cutters' surfaces."""
+    cut, lofts = _lofts_of(cutters), solid.lofts
+    if lofts is not None and cut is not None:
+        lofts = tuple(dataclasses.replace(loft, cutters=(*loft.cutters, *cut)) for loft in lofts)
+    manifold = manifold3d.Manifold.batch_boolean(_tagged([solid, *cutters]), manifold3d.OpType.Subtract)
+    return _from_manifold(manifold, None if cut is None else lofts)
+
+
+def _tagged(solids: Sequence[Solid]) -> list[manifold3d.Manifold]:
+    """The solids in manifold3d, each face with its surface and a smooth number of its own solid's in its face id."""
+    hold_to_one_thread()
+    manifolds = []
+    first = 0
+    for solid in solids:
+        tag = (solid.smooth + first) * _SURFACES + solid.surface
+        first += int(solid.smooth.max()) + 1
+        mesh = manifold3d.Mesh64(
+            vert_properties=np.ascontiguousarray(solid.vertices),
+            tri_verts=solid.faces.astype(np.uint64),
+            face_id=tag.astype(np.uint64),
+        )
+        manifold = manifold3d.Manifold(mesh)
+        if manifold.status() != manifold3d.Error.NoError:
+            raise ValueError(f"not a closed solid: {manifold.status()}")
+        manifolds.append(manifold)
+    return manifolds
+
+
+def _from_manifold(manifold: manifold3d.Manifold, lofts: tuple[Loft, ...] | None) -> Solid:
+    mesh = manifold.to_mesh64()
+    tag = np.asarray(mesh.face_id, dtype=np.int64)
+    vertices = np.array(mesh.vert_properties[:, :3], dtype=np.float64)
+    return Solid(vertices, np.asarray(mesh.tri_verts, dtype=np.int64), tag % _SURFACES, tag // _SURFACES, lofts)

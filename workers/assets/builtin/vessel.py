@@ -1,0 +1,142 @@
+"""Pure: what mugs, bowls, jars, bottles and boxes are built from: walls around a hollow, prisms, bent rods."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.base import Array
+from workers.assets.builtin.curves import half_turn_points, outwards, rounded_rectangles
+from workers.assets.builtin.solid import Indices, Solid, loft, smooth_runs, union_at
+
+HANDLE_ROOM_M = 0.002
+"""Faces of a vessel this near a handle's bounding box are those that it may meet."""
+
+OUTSIDE, INSIDE, BASE = 0, 1, 2
+"""Surface numbers of a vessel."""
+
+
+@dataclass(frozen=True, eq=False)
+class Wall:
+    """The profile of a hollow vessel and the surface number of each of its segments.
+
+    profile [P, 2] of (radius, height), metres, axis to axis; surface [P - 1]; outer [Q, 2]: the stretch of the profile
+    that is the outside of the wall, bottom to rim; thickness_m: of the wall.
+    """
+
+    profile: Array
+    surface: Indices
+    outer: Array
+    thickness_m: float
+
+    def radius_at(self, z: float) -> float:
+        """Outer radius at a height, metres."""
+        return float(np.interp(z, self.outer[:, 1], self.outer[:, 0]))
+
+    def normal_at(self, z: float) -> Array:
+        """[2] float64: the unit normal (radius, height) of the outside at a height."""
+        low, high = z - 0.002, z + 0.002
+        step = np.array([self.radius_at(high) - self.radius_at(low), high - low])
+        return np.array([step[1], -step[0]]) / float(np.sqrt(step[0] * step[0] + step[1] * step[1]))
+
+
+def wall_around(hollow: Array, thickness_m: float, foot_radius: float, foot_width: float, recess: float) -> Wall:
+    """A wall of even thickness around a hollow [P, 2], which goes from (0, height of the inner bottom) to the rim.
+
+    It stands on a ring from foot_radius - foot_width to foot_radius at height 0; inside the ring the underside lies
+    `recess` higher. The rim is round.
+    """
+    offset = hollow + thickness_m * outwards(hollow)
+    outer = offset[int(((offset[:, 0] > foot_radius + 2e-4) & (offset[:, 1] > 2e-4)).argmax()) :]
+    inner_foot = foot_radius - foot_width
+    base = np.array([[0.0, recess], [inner_foot - 0.4 * recess, recess], [inner_foot, 0.0], [foot_radius, 0.0]])
+    rim = half_turn_points(outer[-1], hollow[-1], 3)
+    profile = np.concatenate([base, outer, rim, hollow[::-1]])
+    surface = np.repeat([BASE, OUTSIDE, INSIDE], [len(base) - 1, len(outer) + 2, len(hollow) + 1])
+    return Wall(profile, surface, np.concatenate([base[-1:], outer]), thickness_m)
+
+
+def prism(
+    profile: Array,
+    size: tuple[float, float],
+    radius: float,
+    surface: Sequence[int] | Indices,
+    steps: int = 3,
+    sides: tuple[int, int] = (1, 1),
+) -> Solid:
+    """A box with round upright edges: `profile` [L, 2] of (inset, height) from its bottom to its top, metres.
+
+    size: width along x and depth along y where the inset is 0; surface: one number for the bottom, each band, the top.
+    Raises ValueError where the sides have no room for the round edges: that is a bug of the caller's.
+    """
+    inset, z = profile[:, 0], profile[:, 1]
+    if (0.5 * min(size) - inset < np.maximum(radius - inset, 2e-4)).any():
+        raise ValueError(f"a prism of {size} with edges of radius {radius} has no room for an inset of {inset.max()}")
+    outline = rounded_rectangles(np.array(size) - 2.0 * inset[:, None], np.maximum(radius - inset, 2e-4), steps, sides)
+    rings = np.empty((*outline.shape[:2], 3))
+    rings[..., :2], rings[..., 2] = outline, z[:, None]
+    ends = np.array([[0.0, 0.0, z[0]], [0.0, 0.0, z[-1]]])
+    reach = np.array([[size[1], 0.0]])
+    closed = np.concatenate([profile[:1] + reach, profile, profile[-1:] + reach])
+    profiles = np.zeros((2, len(profile) + 2, 2))
+    profiles[:, 1:-1, 0], profiles[..., 1] = 0.5 * np.array(size)[:, None] - inset, z[[0, *range(len(z)), -1]]
+    return loft(rings, ends[0], ends[1], surface, smooth_runs(closed), profiles)
+
+
+def bevelled(height: float, bevel: float, bottom: float = 0.0) -> Array:
+    """[4, 2] float64: the (inset, height) profile of a slab from `bottom`, with a bevel along its upper and lower edge."""
+    top = bottom + height
+    return np.array([[bevel, bottom], [0.0, bottom + bevel], [0.0, top - bevel], [bevel, top]])
+
+
+def _tangents(path: Array, ends: tuple[Array, Array]) -> Array:
+    """[K, 2] float64: unit directions of a path [K, 2] whose first and last direction are given."""
+    tangent = np.empty_like(path)
+    tangent[1:-1] = path[2:] - path[:-2]
+    tangent[0], tangent[-1] = ends
+    return tangent / np.sqrt(tangent[:, 0] ** 2 + tangent[:, 1] ** 2)[:, None]
+
+
+def bend_radius(path: Array, ends: tuple[Array, Array]) -> float:
+    """How thick, metres, to each side of its path [K, 2] a rod may be at most before it folds at its tightest bend."""
+    step, turn = np.diff(path, axis=0), np.diff(_tangents(path, ends), axis=0)
+    length, bend = (np.sqrt(v[:, 0] ** 2 + v[:, 1] ** 2) for v in (step, turn))
+    return float((length / np.maximum(bend, 1e-9)).min())
+
+
+def rod(path: Array, section: Array, surface: int, ends: tuple[Array, Array], swell: Array | None = None) -> Solid:
+    """A rod bent along a path [K, 2] in the xz plane; section [n, 2]: across (along y) and in the plane of the path.
+
+    ends: the unit directions (x, z) in which the path begins and ends; swell [K]: factor on the section.
+    """
+    tangent = _tangents(path, ends)
+    factor = np.ones(len(path)) if swell is None else swell
+    u, v = section[:, 0] * factor[:, None], section[:, 1] * factor[:, None]
+    x = path[:, 0:1] - tangent[:, 1:2] * v
+    z = path[:, 1:2] + tangent[:, 0:1] * v
+    rings = np.stack([x, u, z], axis=2)
+    caps = [np.array([path[k, 0], 0.0, path[k, 1]]) for k in (0, -1)]
+    smooth = np.array([0, *[1] * (len(path) - 1), 2])
+    return loft(rings, caps[0], caps[1], np.full(len(path) + 1, surface), smooth)
+
+
+def with_handles(body: Solid, outside: int, handles: Sequence[Solid]) -> Solid:
+    """A vessel about the z axis with handles that reach into its outside (a surface number) and through no wall."""
+    low, high = (body.vertices[body.faces].min(axis=1), body.vertices[body.faces].max(axis=1))
+    touched = np.zeros(len(body.faces), dtype=np.bool_)
+    for handle in handles:
+        start, stop = handle.vertices.min(axis=0) - HANDLE_ROOM_M, handle.vertices.max(axis=0) + HANDLE_ROOM_M
+        touched |= ((high >= start) & (low <= stop)).all(axis=1)
+    touched &= body.surface == outside
+    middle = 0.5 * float(low[touched, 2].min() + high[touched, 2].max())
+    return union_at(body, touched, np.array([0.0, 0.0, middle]), handles)
+
+
+def sides_apart(solid: Solid, surface: int, numbers: tuple[int, int, int, int]) -> Solid:
+    """The faces of one surface sorted by the side that they look to: front (-y), right (+x), back (+y), left (-x)."""
+    a, b, c = (solid.vertices[solid.faces[:, k]] for k in range(3))
+    x, y, _ = np.cross(b - a, c - a).T
+    side = np.where(np.abs(y) >= np.abs(x), np.where(y < 0, 0, 2), np.where(x > 0, 1, 3))
+    chosen = solid.surface == surface
+    sorted_out = np.where(chosen, np.array(numbers)[side], solid.surface)
+    return Solid(solid.vertices, solid.faces, sorted_out, solid.smooth, solid.lofts)

@@ -1,0 +1,137 @@
+"""Pure: what trimesh read of a surface's look, in the terms of schemas.scene.shape."""
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
+
+from schemas.base import Array
+from schemas.scene.shape import Material
+from workers.assets.external.reading import plain_words
+
+BLACK = 0.02
+"""A base colour darker than this under a texture is an exporter's leftover: the texture shows as it is."""
+INVISIBLE = 0.01
+"""An alpha below this would hide the thing altogether: some exporters write opacity the wrong way round."""
+DEFAULT = Material()
+"""The look of what comes without one; a part that has it can be told by identity."""
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """Material, uv [V, 2] or None, colors [V, 4] uint8 sRGB or None; `per_face` [F, 4] uint8 where faces are coloured."""
+
+    material: Material
+    uv: Array | None = None
+    colors: NDArray[np.uint8] | None = None
+    per_face: NDArray[np.uint8] | None = None
+
+
+def srgb_from_linear(linear: Array) -> Array:
+    """sRGB in [0, 1] from linear values in [0, 1] (IEC 61966-2-1)."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(np.maximum(linear, 1e-12), 1 / 2.4) - 0.055)
+
+
+def linear_from_srgb(srgb: Array) -> Array:
+    """Linear values in [0, 1] from sRGB in [0, 1] (IEC 61966-2-1)."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, np.power((srgb + 0.055) / 1.055, 2.4))
+
+
+def look_of(mesh: trimesh.Trimesh, linear: bool) -> tuple[Look, tuple[str, ...]]:
+    """The look of one trimesh geometry, and notes. `linear`: its colours are linear, as glTF's are."""
+    visual: Any = mesh.visual
+    if visual.kind == "texture":
+        uv = getattr(visual, "uv", None)
+        usable = uv is not None and np.shape(uv) == (len(mesh.vertices), 2) and bool(np.isfinite(uv).all())
+        material, notes = _material(visual.material, textured=usable)
+        colors = _attribute_colors(visual.vertex_attributes.get("color"), len(mesh.vertices), linear)
+        return Look(material, np.asarray(uv, dtype=np.float64) if usable else None, colors), notes
+    if visual.kind == "vertex" and len(visual.vertex_colors) == len(mesh.vertices):
+        return Look(_white(), colors=_colors(visual.vertex_colors, linear)), ()
+    if visual.kind == "face" and len(visual.face_colors) == len(mesh.faces):
+        return Look(_white(), per_face=_colors(visual.face_colors, linear)), ()
+    return Look(DEFAULT), ()
+
+
+def _white() -> Material:
+    return Material(base_color=(1.0, 1.0, 1.0, 1.0))
+
+
+def _colors(values: NDArray, linear: bool) -> NDArray[np.uint8]:
+    rgba = np.asarray(values, dtype=np.uint8).copy()
+    if linear:
+        rgba[:, :3] = np.round(255.0 * srgb_from_linear(rgba[:, :3] / 255.0)).astype(np.uint8)
+    return rgba
+
+
+def _attribute_colors(values: NDArray | None, count: int, linear: bool) -> NDArray[np.uint8] | None:
+    """Vertex colours that come beside a material, as stored: floats, or whole numbers that fill their type."""
+    if values is None or np.shape(values) not in ((count, 3), (count, 4)):
+        return None
+    whole = np.issubdtype(values.dtype, np.integer)
+    share = np.ones((count, 4))
+    share[:, : values.shape[1]] = values / np.iinfo(values.dtype).max if whole else values
+    if not np.isfinite(share).all():
+        return None
+    share = np.clip(share, 0.0, 1.0)
+    if linear:
+        share[:, :3] = srgb_from_linear(share[:, :3])
+    return np.round(255.0 * share).astype(np.uint8)
+
+
+def _material(source: object, textured: bool) -> tuple[Material, tuple[str, ...]]:
+    if isinstance(source, MultiMaterial):
+        source = source.materials[0] if source.materials else None
+    notes: list[str] = []
+    if isinstance(source, PBRMaterial):
+        texture = _texture(source.baseColorTexture, notes) if textured else None
+        factor = np.ones(4) if source.baseColorFactor is None else np.asarray(source.baseColorFactor) / 255.0
+        color = np.append(srgb_from_linear(factor[:3]), factor[3])
+        metallic = 1.0 if source.metallicFactor is None else float(source.metallicFactor)
+        roughness = 1.0 if source.roughnessFactor is None else float(source.roughnessFactor)
+    elif isinstance(source, SimpleMaterial):
+        texture = _texture(source.image, notes) if textured else None
+        color = np.asarray(source.diffuse, dtype=np.float64) / 255.0
+        color[3] = _opacity(source, float(color[3]))
+        metallic = 0.0
+        # Blinn-Phong exponent to GGX alpha, and alpha to perceptual roughness (Karis, "Specular BRDF reference", 2013).
+        roughness = (2.0 / (max(source.glossiness, 0.0) + 2.0)) ** 0.25
+    else:
+        return DEFAULT, ()
+    if color[3] < INVISIBLE:
+        color[3] = 1.0
+        notes.append("an alpha of 0 was read as 1")
+    if texture is not None and color[:3].max() < BLACK:
+        color[:3] = 1.0
+    base = tuple(float(c) for c in np.clip(np.nan_to_num(color, nan=0.7), 0.0, 1.0))
+    finite = [float(np.clip(np.nan_to_num(value, nan=0.6), 0.0, 1.0)) for value in (metallic, roughness)]
+    return Material((base[0], base[1], base[2], base[3]), finite[0], finite[1], texture), tuple(notes)
+
+
+def _opacity(source: SimpleMaterial, otherwise: float) -> float:
+    """The `d` of an MTL file; `Tr` is left out, because half of the exporters write it the wrong way round."""
+    try:
+        return float(source.kwargs["d"][0])
+    except (KeyError, IndexError, TypeError, ValueError):
+        return otherwise
+
+
+def _texture(image: Image.Image | None, notes: list[str]) -> NDArray[np.uint8] | None:
+    """[h, w, 3 or 4] uint8, read-only; None with a note where the picture cannot be decoded."""
+    if image is None:
+        return None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            alpha = "A" in image.getbands() or "transparency" in image.info
+            pixels = np.array(image.convert("RGBA" if alpha else "RGB"), dtype=np.uint8)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
+        notes.append(f"a texture cannot be decoded ({plain_words(error)}): plain base colour used")
+        return None
+    pixels.setflags(write=False)
+    return pixels

@@ -1,0 +1,176 @@
+"""Edge: the visible geometry of a URDF file, read with the standard library and without trusting it."""
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import trimesh
+
+from schemas.base import Array, Pose, frozen_array
+from schemas.errors import MeshError
+from schemas.job.assets import MeshLimits
+from schemas.scene.shape import Material, Part, Shape
+from workers.assets.external.materials import DEFAULT
+from workers.assets.external.mesh import load_shape, transform_shape
+from workers.assets.external.reading import check_counts
+from workers.assets.sources import SourceShape
+from workers.geometry.frames import pose
+
+_DECLARATION = re.compile(rb"^\s*<\?xml[^>]*\?>")
+MAX_URDF_BYTES = 10_000_000
+SEGMENTS = 48
+"""Facets around a URDF's cylinders and spheres."""
+
+
+def parse_urdf(path: Path) -> ElementTree.Element:
+    """The root element; MeshError `missing`, `too_large` or `unreadable`. Documents with a DTD or entities are refused."""
+    try:
+        if path.stat().st_size > MAX_URDF_BYTES:
+            raise MeshError("too_large", f"{path} has {path.stat().st_size} bytes, over {MAX_URDF_BYTES}")
+        data = path.read_bytes()
+    except OSError as error:
+        raise MeshError("missing", f"{path} cannot be read: {error.strerror}") from error
+    if b"<!" in data.replace(b"<!--", b"") or b"\0" in data:
+        raise MeshError("unreadable", f"{path} has a document type or entities, which are refused, or is not UTF-8")
+    try:
+        # pybullet's own files declare XML version 0.0, which no parser accepts.
+        robot = ElementTree.fromstring(_DECLARATION.sub(b"", data, count=1))
+    except ElementTree.ParseError as error:
+        raise MeshError("unreadable", f"{path} is not XML: {error}") from error
+    if robot.tag != "robot":
+        raise MeshError("unreadable", f"{path} is not a URDF: its root is <{robot.tag:.40}>")
+    return robot
+
+
+def mesh_names(robot: ElementTree.Element) -> list[str]:
+    """The file names of the meshes of all visuals, in their order."""
+    return [mesh.get("filename", "") for mesh in robot.iterfind("link/visual/geometry/mesh")]
+
+
+def find_mesh(name: str, urdf: Path, root: Path) -> Path:
+    """The file that a mesh name means, inside `root` only; MeshError `missing`."""
+    bare = re.sub(r"^(package|file|model)://", "", name.strip().replace("\\", "/"))
+    tail = bare.split("/", 1)[-1]
+    for candidate in (urdf.parent / bare, root / bare, root / tail, urdf.parent / tail):
+        try:
+            path = candidate.resolve()
+            if path.is_relative_to(root.resolve()) and path.is_file():
+                return path
+        except (OSError, ValueError, RuntimeError):
+            continue
+    raise MeshError("missing", f"{urdf} names the mesh {name!r}, which is not inside {root}")
+
+
+def load_urdf(path: Path, root: Path, limits: MeshLimits) -> SourceShape:
+    """All visuals of all links, joints at zero, in the frame of the first root link, metres; MeshError as load_shape."""
+    robot = parse_urdf(path)
+    colors = {m.get("name", ""): _color(path, m) for m in robot.iterfind("material")}
+    parts: list[Part] = []
+    notes: list[str] = []
+    for link, T_root_link in _link_poses(path, robot):
+        for visual in link.iterfind("visual"):
+            shape, why = _visual(path, root, visual, limits)
+            notes += why
+            material = visual.find("material")
+            color = None if material is None else _color(path, material) or colors.get(material.get("name", ""))
+            T = T_root_link @ _origin(path, visual)
+            parts += [_painted(part, color) for part in transform_shape(shape, T[:3, :3], T[:3, 3]).parts]
+            check_counts(path, sum(len(p.vertices) for p in parts), sum(len(p.faces) for p in parts), limits)
+    if not parts:
+        raise MeshError("no_faces", f"{path} has no visual geometry")
+    shape = Shape(tuple(replace(part, name=f"part{number}") for number, part in enumerate(parts)))
+    return SourceShape(shape, tuple(dict.fromkeys(notes)))
+
+
+def _painted(part: Part, color: tuple[float, ...] | None) -> Part:
+    """A part that brought no look of its own takes the URDF's colour."""
+    if color is None or part.material is not DEFAULT or part.colors is not None:
+        return part
+    return replace(part, material=Material(base_color=(color[0], color[1], color[2], color[3] or 1.0)))
+
+
+def _color(path: Path, material: ElementTree.Element) -> tuple[float, ...] | None:
+    color = material.find("color")
+    return None if color is None else tuple(min(max(c, 0.0), 1.0) for c in _numbers(path, color.get("rgba"), 4))
+
+
+def _link_poses(path: Path, robot: ElementTree.Element) -> list[tuple[ElementTree.Element, Pose]]:
+    """Every link with its pose in the frame of its root, joints at zero; MeshError `unreadable` where joints go round."""
+    joints: dict[str, tuple[str, Pose]] = {}
+    for joint in robot.iterfind("joint"):
+        parent, child = joint.find("parent"), joint.find("child")
+        if parent is not None and child is not None:
+            joints[child.get("link", "")] = parent.get("link", ""), _origin(path, joint)
+    placed = []
+    for link in robot.iterfind("link"):
+        name, T = link.get("name", ""), np.eye(4)
+        for _ in range(len(joints) + 1):
+            if name not in joints:
+                break
+            name, step = joints[name]
+            T = step @ T
+        else:
+            raise MeshError("unreadable", f"{path}: the joints above link {link.get('name')!r} go round in a circle")
+        placed.append((link, T))
+    return placed
+
+
+def _visual(path: Path, root: Path, visual: ElementTree.Element, limits: MeshLimits) -> tuple[Shape, tuple[str, ...]]:
+    """One visual's geometry in its own frame, and what of it was mended or left out."""
+    for kind in visual.iterfind("geometry/*"):
+        if kind.tag == "mesh":
+            loaded = load_shape(find_mesh(kind.get("filename", ""), path, root), limits, root=root)
+            scale = _numbers(path, kind.get("scale", "1 1 1"), 3)
+            if 0.0 in scale:
+                raise MeshError("no_size", f"{path} scales a mesh by {scale}")
+            return transform_shape(loaded.shape, np.diag(scale), np.zeros(3)), loaded.notes
+        return Shape((_primitive(path, kind),)), ()
+    raise MeshError("unreadable", f"{path} has a visual without geometry")
+
+
+def _primitive(path: Path, kind: ElementTree.Element) -> Part:
+    if kind.tag == "box":
+        mesh = trimesh.creation.box(_numbers(path, kind.get("size"), 3, positive=True))
+    elif kind.tag == "sphere":
+        mesh = trimesh.creation.uv_sphere(
+            _numbers(path, kind.get("radius"), 1, positive=True)[0], count=[SEGMENTS, SEGMENTS]
+        )
+    elif kind.tag in ("cylinder", "capsule"):
+        radius = _numbers(path, kind.get("radius"), 1, positive=True)[0]
+        length = _numbers(path, kind.get("length"), 1, positive=True)[0]
+        make = trimesh.creation.cylinder if kind.tag == "cylinder" else trimesh.creation.capsule
+        mesh = make(radius=radius, height=length, **({"sections": SEGMENTS} if kind.tag == "cylinder" else {}))
+    else:
+        raise MeshError("unreadable", f"{path}: geometry <{kind.tag:.40}> is not known")
+    return Part(kind.tag, frozen_array(mesh.vertices), frozen_array(mesh.faces, np.int32), DEFAULT)
+
+
+def _origin(path: Path, element: ElementTree.Element) -> Pose:
+    """[4, 4] of an <origin>: fixed-axis roll, pitch, yaw, then the shift (URDF: R = Rz Ry Rx)."""
+    origin = element.find("origin")
+    if origin is None:
+        return np.eye(4)
+    roll, pitch, yaw = _numbers(path, origin.get("rpy", "0 0 0"), 3)
+    return pose(_turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll), _numbers(path, origin.get("xyz", "0 0 0"), 3))
+
+
+def _turn(axis: int, angle: float) -> Array:
+    a, b = ((1, 2), (2, 0), (0, 1))[axis]
+    R = np.eye(3)
+    R[a, a] = R[b, b] = math.cos(angle)
+    R[a, b], R[b, a] = -math.sin(angle), math.sin(angle)
+    return R
+
+
+def _numbers(path: Path, text: str | None, count: int, positive: bool = False) -> Array:
+    """[count] finite float64; MeshError `unreadable`."""
+    try:
+        values = np.array([float(word) for word in (text or "").split()])
+    except ValueError:
+        values = np.array([])
+    if len(values) != count or not np.isfinite(values).all() or (positive and (values <= 0).any()):
+        raise MeshError("unreadable", f"{path}: {text!r:.60} is not {count} {'positive ' if positive else ''}numbers")
+    return values

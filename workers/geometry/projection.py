@@ -1,0 +1,135 @@
+"""Forward projection of a depth image into another camera, and the comparison of two views of one surface."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array
+from schemas.scene.camera import Camera, Intrinsics
+from workers.geometry.camera import unproject
+from workers.geometry.frames import invert, transform
+from workers.geometry.jit import compiled
+from workers.geometry.normals import Depth
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """What a cloud looks like from another camera.
+
+    depth_m [H, W] float64, z, 0 in holes; source [H, W] int32, the flat index of the source pixel, -1 in holes.
+    """
+
+    depth_m: Array
+    source: NDArray[np.int32]
+
+
+def carry_pixels(
+    depth: Depth, pixels: NDArray[np.int64], source: Camera, target: Camera, units_per_m: float = 1.0
+) -> Array:
+    """[N, 3] float64: points in the target's frame of the source's pixels (flat indices [N]).
+
+    depth [H, W] is z along the source's axis.
+    """
+    rows, columns = np.divmod(pixels, depth.shape[1])
+    z = depth.ravel()[pixels].astype(np.float64) / units_per_m
+    points = unproject(rows, columns, z, source.intrinsics)
+    return transform(invert(target.T_world_cam) @ source.T_world_cam, points)
+
+
+def forward_project(
+    depth: Depth, source: Camera, target: Camera, splat: int = 1, units_per_m: float = 1.0
+) -> Projected:
+    """Carry a depth image into another camera.
+
+    The target pixel is the floor of (u, v); nearest z wins, ties to the lowest source index; holes stay 0
+    (dataset.md "Projection"). With `splat` n > 1 each point fills a square of n x n pixels.
+    """
+    m = target.intrinsics
+    carried, index = np.zeros((m.height, m.width)), np.full((m.height, m.width), -1, np.int32)
+    T = invert(target.T_world_cam) @ source.T_world_cam
+    k = source.intrinsics
+    _carry(depth, units_per_m, (k.cx, k.cy, k.fx, k.fy), T, (m.cx, m.cy, m.fx, m.fy), splat // 2, carried, index)
+    return Projected(carried, index)
+
+
+@compiled
+def _carry(
+    depth: Depth,
+    units_per_m: float,
+    k: tuple[float, float, float, float],
+    T_target_source: Array,
+    m: tuple[float, float, float, float],
+    reach: int,
+    carried: Array,
+    index: NDArray[np.int32],
+) -> None:
+    """Fill carried and index; k and m: cx, cy, fx, fy of source and target. Sums in the order of `carry_pixels`."""
+    height, width = carried.shape
+    T = T_target_source
+    for i in range(depth.shape[0]):
+        ray_y = (i + 0.5 - k[1]) / k[3]
+        for j in range(depth.shape[1]):
+            if not depth[i, j] > 0:
+                continue
+            z = depth[i, j] / units_per_m
+            x, y = (j + 0.5 - k[0]) / k[2] * z, ray_y * z
+            Z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+            if not Z > 0.0:
+                continue
+            u = m[2] * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / Z + m[0]
+            v = m[3] * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / Z + m[1]
+            if not (-reach <= u < width + reach and -reach <= v < height + reach):
+                continue
+            column, row = int(np.floor(u)), int(np.floor(v))
+            for at_row in range(max(row - reach, 0), min(row + reach + 1, height)):
+                for at in range(max(column - reach, 0), min(column + reach + 1, width)):
+                    if index[at_row, at] < 0 or carried[at_row, at] > Z:
+                        carried[at_row, at] = Z
+                        index[at_row, at] = i * depth.shape[1] + j
+
+
+def sample_inverse_depth(
+    depth: Depth, region: NDArray[np.uint8], u: Array, v: Array, units_per_m: float = 1.0
+) -> tuple[Array, NDArray[np.uint8]]:
+    """Depth at image coordinates (u, v), interpolated bilinearly in 1/z, and the region there.
+
+    Only where the four pixels about the point lie in the image, have depth and share one region; elsewhere depth is 0
+    and region 0. On a plane 1/z is linear in the image, so this is exact there. Returns [N] float64 metres and [N] uint8.
+    """
+    sampled, regions = np.zeros(len(u)), np.zeros(len(u), np.uint8)
+    _sample(depth, units_per_m, region, u, v, sampled, regions)
+    return sampled, regions
+
+
+@compiled
+def _sample(
+    depth: Depth,
+    units_per_m: float,
+    region: NDArray[np.uint8],
+    u: Array,
+    v: Array,
+    sampled: Array,
+    regions: NDArray[np.uint8],
+) -> None:
+    height, width = depth.shape
+    for n in range(len(u)):
+        x, y = u[n] - 0.5, v[n] - 0.5
+        if not (0.0 <= x < width - 1 and 0.0 <= y < height - 1):
+            continue
+        column, row = int(np.floor(x)), int(np.floor(y))
+        inverse, good = 0.0, True
+        for dy in range(2):
+            for dx in range(2):
+                z = depth[row + dy, column + dx] / units_per_m
+                good = good and z > 0.0 and region[row + dy, column + dx] == region[row, column]
+                share = abs(1 - dx - (x - column)) * abs(1 - dy - (y - row))
+                if z > 0.0:
+                    inverse += share / z
+        if good:
+            sampled[n], regions[n] = 1.0 / inverse, region[row, column]
+
+
+def in_frame(u: Array, v: Array, intrinsics: Intrinsics) -> NDArray[np.bool_]:
+    """[N] bool: whether image coordinates lie inside the image."""
+    return (u >= 0) & (u < intrinsics.width) & (v >= 0) & (v < intrinsics.height)

@@ -1,0 +1,38 @@
+"""CoACD in a process of its own: what it throws ends the process, and what it keeps in memory must not meet the next mesh.
+
+A script, started by `workers.physics.convex_parts.step` and imported by nobody. It reads `request.npz` in the folder that it is
+given (vertices [V, 3] float64, faces [F, 3] int32, options as JSON) and writes `parts.npz` there: vertices [N, 3] float64
+of all parts one after the other, counts [P]. Exit code 3 tells that the package is missing.
+"""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+
+MISSING = 3
+
+
+def main(folder: Path) -> int:
+    """Exit code."""
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})  # OpenMP counts them when it is loaded: a worker has one core
+    try:
+        import coacd  # type: ignore[import-untyped]
+    except ImportError:
+        return MISSING
+    finally:
+        os.sched_setaffinity(0, allowed)
+    coacd.set_log_level("off")
+    with np.load(folder / "request.npz") as request:
+        mesh = coacd.Mesh(request["vertices"], request["faces"])
+        options = json.loads(str(request["options"]))
+    clouds = [np.asarray(vertices, dtype=np.float64) for vertices, _ in coacd.run_coacd(mesh, **options)]
+    np.savez(folder / "parts.npz", vertices=np.concatenate(clouds), counts=np.array([len(c) for c in clouds]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

@@ -1,0 +1,91 @@
+"""What a table offers to stand on: its top, and the polygon of it."""
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from schemas.base import Array, frozen_array
+from schemas.errors import StartError
+from schemas.scene.scene import Table, TableTop
+from schemas.scene.shape import Asset, Mesh, Shape
+from workers.geometry.elevation import heights_at
+from workers.geometry.frames import transform, translation
+
+LEVEL = 0.999
+"""Cosine to the vertical of a face that counts as level: 2.6 degrees."""
+
+SAME_LEVEL_M = 1e-4
+"""Faces whose heights differ by less belong to one level."""
+
+TOP_SHARE = 0.5
+"""The top is the highest level with at least this share of the largest level's area: a shelf is not the top, and
+neither is a rim."""
+
+CONVEX_SHARE = 0.999
+"""A top that fills this share of its convex hull is convex and without holes."""
+
+
+def find_table_top(shape: Shape) -> TableTop:
+    """The level top of a table mesh. Raises StartError where no face is level."""
+    vertices, faces = shape.vertices, shape.faces
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    doubled = np.linalg.norm(normal, axis=1)
+    # Either side: a stranger's table may be wound inside out. Of a slab's two sides the upper one is chosen by height.
+    level = (np.abs(normal[:, 2]) > LEVEL * doubled) & (doubled > 0)
+    if not level.any():
+        raise StartError("no_table_top", "the table's mesh has no level face within 2.6 degrees: leave this table out")
+    height = (a[:, 2] + b[:, 2] + c[:, 2]) / 3
+    key = np.round(height[level] / SAME_LEVEL_M).astype(np.int64)
+    _, inverse = np.unique(key, return_inverse=True)
+    area = np.bincount(inverse, weights=doubled[level] / 2)
+    top = int(np.flatnonzero(area >= TOP_SHARE * area.max()).max())
+    members = np.flatnonzero(level)[inverse == top]
+    points = vertices[np.unique(faces[members])]
+    return _describe(points, float(area[top]), float(vertices[:, 2].max()))
+
+
+def _describe(points: Array, area_m2: float, highest_m: float) -> TableTop:
+    height = float(points[:, 2].max())
+    try:
+        hull = ConvexHull(points[:, :2])
+    except QhullError as error:
+        raise StartError("no_table_top", "the table's level faces have no area: leave this table out") from error
+    # A face that leans within `LEVEL` is no level: nothing may be dropped on a level plane at its highest point.
+    even = height - float(points[:, 2].min()) <= SAME_LEVEL_M
+    convex = even and area_m2 >= CONVEX_SHARE * hull.volume and highest_m <= height + SAME_LEVEL_M
+    middle = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
+    return TableTop(height, frozen_array(middle), frozen_array(points[hull.vertices, :2]), bool(convex))
+
+
+def place_table(asset: Asset) -> Table:
+    """The table on the floor, the centre of its top over the origin. Raises StartError where it has no level top."""
+    top = find_table_top(asset.shape)
+    lowest = float(asset.shape.bounds[0, 2])
+    T = translation(-top.centre[0], -top.centre[1], -lowest)
+    mesh = Mesh(frozen_array(transform(T, asset.shape.vertices)), asset.shape.faces)
+    outline = frozen_array(top.outline - top.centre)
+    return Table(
+        asset, frozen_array(T), mesh, TableTop(top.height_m - lowest, frozen_array([0.0, 0.0]), outline, top.convex)
+    )
+
+
+def inside_margin(points_xy: Array, outline: Array) -> Array:
+    """[N] float64 metres: how far each point lies inside a convex polygon [M, 2], counter-clockwise; negative outside.
+
+    The least signed distance to the polygon's edge lines.
+    """
+    edge = np.roll(outline, -1, axis=0) - outline
+    length = np.linalg.norm(edge, axis=1)
+    keep = length > 0
+    edge, start, length = edge[keep], outline[keep], length[keep]
+    relative = points_xy[:, None, :] - start
+    return ((edge[:, 0] * relative[..., 1] - edge[:, 1] * relative[..., 0]) / length).min(axis=1)
+
+
+def support_height(points_xy: Array, table: Mesh) -> float:
+    """The highest that a table reaches under, or within the bounding box of, points [N, 2]; -inf off the table."""
+    heights = heights_at(points_xy, table)
+    low, high = points_xy.min(axis=0), points_xy.max(axis=0)
+    inside = ((table.vertices[:, :2] >= low) & (table.vertices[:, :2] <= high)).all(axis=1)
+    candidates = np.concatenate([heights[np.isfinite(heights)], table.vertices[inside, 2]])
+    return float(candidates.max()) if len(candidates) else -np.inf

@@ -1,0 +1,156 @@
+"""A shard: ranges of scenes made one after another in one process, each range committed as soon as it is whole."""
+
+import faulthandler
+import os
+import socket
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from typing import IO
+
+from schemas.dataset.commit import Span
+from schemas.dataset.fingerprint import Fingerprint
+from schemas.dataset.layout import FINGERPRINT_FILE, staging_path
+from schemas.dataset.shard import Blame, ShardOrder, ShardReport, SpanReport
+from schemas.errors import FingerprintError, SceneError
+from schemas.job.job import Job, Tier
+from schemas.scene.scene import SceneOutput
+from workers.assets.catalogue import Catalogue
+from workers.pipeline.context import WorkerContext, open_worker
+from workers.pipeline.fingerprint import take_fingerprint
+from workers.pipeline.make_scene import Stopwatch, make_scene
+from workers.pipeline.rows import failed_scene, record_scene, timing_row
+from workers.plan.step import choose_category
+from workers.render.raster.context import require_device
+from workers.render.raster.gbuffer import shared_renderer
+from workers.render.step import require_tier
+from workers.store.attempt import Attempt, begin_attempt
+from workers.store.local import LocalStore
+from workers.store.opening import open_store
+from workers.store.store import Store
+
+TIMED_OUT = "_timed_out"
+"""In an attempt's folder: where a worker that hung in a scene left its traceback."""
+
+
+class BlamedScene(SceneError):
+    """A scene that is not tried again because its workers died in it."""
+
+    stage = "worker"
+    kind = "environmental"
+
+
+def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
+    """Make and commit every range of the order. What a scene cannot be is a row; anything else propagates."""
+    begun, cpu = time.perf_counter(), time.process_time()
+    require_tier(order.job.render)
+    context = open_worker(order.job, catalogue)
+    require_device(context.renderer.name, order.job.run.device)
+    fingerprint = _fingerprint(order.job.render.tier)
+    store = open_store(order.out)
+    _join_stack(store, fingerprint, order)
+    order = order.model_copy(update={"terms": order.terms.model_copy(update={"fingerprint": fingerprint.digest})})
+    total = Stopwatch()
+    reports = tuple(run_span(context, store, order, span, total) for span in order.spans)
+    return ShardReport(
+        spans=reports,
+        seconds=total.seconds,
+        wall_s=time.perf_counter() - begun,
+        cpu_s=time.process_time() - cpu,
+        fingerprint=fingerprint,
+        host=socket.gethostname(),
+        pid=os.getpid(),
+    )
+
+
+def run_span(context: WorkerContext, store: Store, order: ShardOrder, span: Span, total: Stopwatch) -> SpanReport:
+    """Make one range and commit it."""
+    blamed = {blame.scene_id: blame for blame in order.blamed}
+    attempt = begin_attempt(store, span, order.terms, order.label)
+    failed: Counter[str] = Counter()
+    with _traceback_file(store, attempt) as tracebacks:
+        for scene_id in span.scene_ids:
+            if scene_id in blamed:
+                output = record_blame(context.job, blamed[scene_id])
+            else:
+                attempt.begin_scene(scene_id)
+                with _time_limit(context.job.run.scene_timeout_s, tracebacks):
+                    output = run_scene(context, scene_id, total)
+            failed.update(f"{row['kind']}: {row['reason']}" for row in output.rows.get("failures", ()))
+            with total.stage("write"):
+                attempt.add_scene(output)
+    with total.stage("commit"):
+        result = attempt.commit()
+    return SpanReport(
+        start=span.start,
+        stop=span.stop,
+        retry=span.retry,
+        won=result.won,
+        conflict=result.conflict,
+        made=len(span.scene_ids) - failed.total(),
+        failed=dict(failed),
+    )
+
+
+def record_blame(job: Job, blame: Blame) -> SceneOutput:
+    """The row of a scene that is not tried again: it is not begun either, so that nobody is killed in it."""
+    error = BlamedScene(blame.reason, blame.detail)
+    return failed_scene(blame.scene_id, choose_category(job, blame.scene_id), error, blame.attempts)
+
+
+def run_scene(context: WorkerContext, scene_id: int, total: Stopwatch) -> SceneOutput:
+    """One scene, made or told why not."""
+    category = choose_category(context.job, scene_id)
+    watch = Stopwatch()
+    try:
+        output = record_scene(context, make_scene(context, scene_id, watch), watch)
+    except SceneError as error:
+        output = failed_scene(scene_id, category, error)
+    for stage, seconds in watch.seconds.items():
+        total.seconds[stage] = total.seconds.get(stage, 0.0) + seconds
+    return SceneOutput(scene_id, output.files, {**output.rows, "timings": [timing_row(scene_id, category, watch)]})
+
+
+@cache
+def _fingerprint(tier: Tier) -> Fingerprint:
+    return take_fingerprint(shared_renderer(), tier)
+
+
+def _join_stack(store: Store, mine: Fingerprint, order: ShardOrder) -> None:
+    """The first worker of a dataset writes its fingerprint down; every other must have the same, if the job is strict."""
+    if store.size(FINGERPRINT_FILE) is None:
+        store.put_if_absent(FINGERPRINT_FILE, mine.model_dump_json(indent=1).encode())
+    theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
+    if order.terms.fingerprint_mode == "strict" and mine != theirs:
+        raise FingerprintError(
+            f"the stack on {socket.gethostname()} has fingerprint {mine.digest[:12]}, the dataset's is {theirs.digest[:12]}: "
+            f"{'; '.join(mine.differences(theirs))}. Use the same stack (the image is one), or set run.fingerprint: record"
+        )
+
+
+@contextmanager
+def _traceback_file(store: Store, attempt: Attempt) -> Iterator[IO[str]]:
+    """Where a hung worker leaves its traceback: in the attempt's folder, so that the coordinator can tell."""
+    if not isinstance(store, LocalStore) or attempt.fenced:
+        yield sys.stderr
+        return
+    path = store.path(f"{staging_path(attempt.span.start, attempt.name)}/{TIMED_OUT}")
+    with open(path, "w", encoding="utf-8") as file:
+        yield file
+
+
+@contextmanager
+def _time_limit(seconds: float, tracebacks: IO[str]) -> Iterator[None]:
+    """Kills this process if the block takes longer.
+
+    PyBullet and GL hold the interpreter's lock while they work, so only a watchdog in C can end a worker that hangs
+    there.
+    """
+    faulthandler.dump_traceback_later(seconds, exit=True, file=tracebacks)
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()

@@ -1,0 +1,136 @@
+"""All randomness of a scene, drawn before anything moves."""
+
+import math
+
+import numpy as np
+
+from schemas.base import Array, Pose, frozen_array
+from schemas.errors import StartError
+from schemas.job.job import Cameras, Job
+from schemas.job.start import Start
+from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.scene import REGION_FIRST_OBJECT, ObjectStart, ScenePlan, Table
+from schemas.scene.shape import Asset, Hull, Mesh
+from workers.assets.appearance.draw import draw_look
+from workers.geometry.camera import orbit_pose
+from workers.geometry.elevation import heights_at
+from workers.geometry.frames import (
+    UP,
+    pose,
+    rotation_about,
+    transform,
+    translation,
+    uniform_rotation,
+)
+from workers.geometry.hull import convex_hull
+from workers.physics.rest_pose import support_margin, touching
+from workers.physics.table_top import place_table, support_height
+from workers.plan.arrange import has_room, rise_above
+from workers.plan.randomness import Stream, of_object, stream
+
+RECESS_M = 0.05
+"""Table this far below its top still counts as table under an object: a tray's bottom does, a lower shelf does not."""
+
+
+def count_objects(job: Job, scene_id: int) -> int:
+    """How many objects the scene has."""
+    low, high = job.objects_per_scene
+    return int(stream(job.seed, scene_id, Stream.COUNT).integers(low, high + 1))
+
+
+def choose_category(job: Job, scene_id: int, number: int = 0) -> str:
+    """The category of an object by its number, by the job's weights; the first one's is the scene's."""
+    names = sorted(job.categories)
+    weights = np.array([job.categories[name] for name in names])
+    edges = np.cumsum(weights) / weights.sum()
+    draw = stream(job.seed, scene_id, Stream.CATEGORY, *of_object(number)).random()
+    return names[min(int(np.searchsorted(edges, draw, side="right")), len(names) - 1)]
+
+
+def plan_scene(job: Job, scene_id: int, table_asset: Asset, *assets: Asset) -> ScenePlan:
+    """Everything about the scene that chance decides, for one asset or more. Raises StartError where no start is valid."""
+    table = place_table(table_asset)
+    rng = stream(job.seed, scene_id, Stream.CAMERA)
+    centre = np.array([0.0, 0.0, table.top.height_m])
+    floor, appearance = draw_look(stream(job.seed, scene_id, Stream.APPEARANCE), job.render.tier)
+    objects: tuple[ObjectStart, ...] = ()
+    for asset in assets:
+        objects += (draw_start(job, scene_id, asset, table, objects),)
+    return ScenePlan(
+        scene_id=scene_id,
+        category=assets[0].category,
+        table=table,
+        floor=floor,
+        objects=objects,
+        input_cameras=tuple(draw_camera(rng, job.cameras, centre) for _ in range(job.pairs_per_scene)),
+        appearance=appearance,
+    )
+
+
+def draw_start(
+    job: Job, scene_id: int, asset: Asset, table: Table, earlier: tuple[ObjectStart, ...] = ()
+) -> ObjectStart:
+    """Position, rotation and clearance of one object.
+
+    A position with no table under the centre of mass, or in the column of an earlier object, is redrawn. In a pile an
+    object begins above all earlier ones, about the place of the first.
+    """
+    spec, own, piled = job.start, of_object(len(earlier)), bool(earlier) and job.start.arrange == "pile"
+    middle, reach = (earlier[0].T_world_obj[:2, 3], spec.pile_offset_m) if piled else (np.zeros(2), spec.offset_m)
+    rng = stream(job.seed, scene_id, Stream.START, *own)
+    xy = middle + rng.uniform(reach.low, reach.high, size=2)
+    yaw = rng.uniform(-math.pi, math.pi)
+    clearance = rng.uniform(spec.clearance_m.low, spec.clearance_m.high)
+    R = uniform_rotation(rng) if spec.pose == "tumbled" else rotation_about(UP, yaw)
+    again = stream(job.seed, scene_id, Stream.REDRAW, *own)
+    hull = convex_hull(asset.shape.vertices)
+    over_table = False
+    for redraws in range(spec.max_redraws + 1):
+        com_xy = (R @ asset.mass.com)[:2] + xy
+        if heights_at(com_xy[None, :], table.mesh)[0] >= table.top.height_m - RECESS_M:  # nan compares false
+            over_table = True
+            rested = set_down(pose(R, np.array([xy[0], xy[1], 0.0])), hull, table.mesh)
+            points = transform(rested, hull.vertices)
+            if piled or has_room(points, earlier):
+                lift = rise_above(points, earlier) if piled else 0.0
+                placed = spec.pose == "placed" and not piled and stands_on(rested, hull, asset.mass.com, table.mesh)
+                T = rested if placed else translation(0.0, 0.0, lift + clearance) @ rested
+                return ObjectStart(asset, hull, REGION_FIRST_OBJECT + len(earlier), frozen_array(T), redraws, placed)
+        xy = middle + again.uniform(reach.low, reach.high, size=2)
+    raise _no_start(spec, len(earlier) + 1, over_table)
+
+
+def _no_start(spec: Start, number: int, over_table: bool) -> StartError:
+    """Why no position was valid; `over_table` where at least one had table below."""
+    if over_table:
+        return StartError(
+            "no_room",
+            f"none of {spec.max_redraws + 1} positions in {list(spec.offset_m)} m had room for object {number} beside the "
+            "others: raise start.max_redraws, widen start.offset_m, ask for fewer or smaller objects, or set "
+            "start.arrange: pile",
+        )
+    return StartError(
+        "no_table_below",
+        f"none of {spec.max_redraws + 1} positions in {list(spec.offset_m)} m had table under the centre of mass: "
+        "narrow start.offset_m or use larger tables",
+    )
+
+
+def set_down(T_world_obj: Pose, hull: Hull, table: Mesh) -> Pose:
+    """The pose moved along z until its lowest point is level with the highest of what is below it."""
+    points = transform(T_world_obj, hull.vertices)
+    return translation(0.0, 0.0, support_height(points[:, :2], table) - points[:, 2].min()) @ T_world_obj
+
+
+def stands_on(T_world_obj: Pose, hull: Hull, com: Array, table: Mesh) -> bool:
+    """Whether the centre of mass [3] lies inside the hull of the points that touch the table."""
+    contacts = touching(hull, T_world_obj, table)
+    return support_margin(contacts, transform(T_world_obj, com[None, :])[0, :2]) > 0.0
+
+
+def draw_camera(rng: np.random.Generator, cameras: Cameras, centre: Array) -> Camera:
+    """An input camera on the job's orbit about the centre of the table top."""
+    inclination = rng.uniform(cameras.orbit.inclination_rad.low, cameras.orbit.inclination_rad.high)
+    yaw = rng.uniform(cameras.orbit.yaw_rad.low, cameras.orbit.yaw_rad.high)
+    T = orbit_pose(centre, inclination, yaw, cameras.orbit.radius_m)
+    return Camera(Intrinsics.of(cameras.sensor), frozen_array(T))

@@ -1,0 +1,172 @@
+"""What is worked out once for a scene and its key light, and used by all of its views.
+
+**Shadow map.** The depth of everything but the floor as the key light sees it, `SHADOW_PX` square, fitted to the things.
+
+**Level maps.** One for the floor, about the table; one for the level that the objects stand on, about the objects. Each
+comes from the heights of things (heightfield.py) at `LEVEL_PX` square. RGBA8: openness of the level, openness of what is
+on top, the top's height in units of the box's, and share of key light: on the floor the table's shadow, as wide at its
+edge as a lamp of `LAMP_RAD` makes it from a table's height.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array, Pose
+from schemas.scene.scene import REGION_FIRST_OBJECT, REGION_FLOOR, Placed
+from workers.geometry.frames import transform
+from workers.render.raster.heightfield import column_heights
+from workers.render.raster.occlusion import openness
+
+SHADOW_PX = 768
+LEVEL_PX = 56
+MAP_PX = 192
+"""Side of a level's map, in which shadows have edges: 13 mm a pixel under a large table, 3 mm about an object."""
+
+LAMP_RAD = 0.06
+"""Angle across the key light, seen from the scene: a softbox of 12 cm at 2 m."""
+
+SOFT_M = 0.006
+"""Radius of the shadow's edge on tables and objects: a lamp of `LAMP_RAD` over 20 cm."""
+
+BIAS_M = 0.0015
+"""What lies this much deeper than the shadow map says is lit: half a pixel of the map, seen slantwise."""
+
+LOWEST_SINE = 0.2
+"""Of the key light's elevation, for which shadows on levels are followed to their end."""
+
+SCENE_MARGIN_M = 0.02
+FLOOR_REACH_M = 0.35
+"""How far around the table the floor's map goes."""
+STAND_REACH_M = 0.15
+"""How far around the objects their level's map goes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """An orthographic view: `T_view_world` [4, 4] (a rotation) and what it spans, [2, 3] lower and upper, metres."""
+
+    T_view_world: Pose
+    bounds: Array
+
+    @property
+    def unit_from_world(self) -> Pose:
+        """[4, 4]: world to (u, v, depth), each in [0, 1] within the box."""
+        size = self.bounds[1] - self.bounds[0]
+        scale = np.diag([*(1.0 / size), 1.0])
+        scale[:3, 3] = -self.bounds[0] / size
+        return scale @ self.T_view_world
+
+    @property
+    def clip_from_world(self) -> Pose:
+        """[4, 4]: the same in [-1, 1]."""
+        spread = np.diag([2.0, 2.0, 2.0, 1.0])
+        spread[:3, 3] = -1.0
+        return spread @ self.unit_from_world
+
+
+def light_box(vertices: Array, towards: Array) -> Box:
+    """What a distant light sees of vertices [N, 3]; depth grows away from it. `towards` [3]: unit, to the light."""
+    z = -towards
+    x = np.cross([0.0, 1.0, 0.0] if abs(towards[1]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z])
+    seen = transform(T, vertices)
+    margin = SCENE_MARGIN_M
+    return Box(T, np.stack([seen.min(axis=0) - margin, seen.max(axis=0) + margin]))
+
+
+def level_box(vertices: Array, level_m: float, towards: Array, reach_m: float) -> Box:
+    """A level square that holds vertices [N, 3], their shadow on the level, and `reach_m` around; depth is height."""
+    on_level = vertices[:, :2]
+    if towards[2] > LOWEST_SINE:
+        shadow = vertices - np.maximum(vertices[:, 2:] - level_m, 0.0) / towards[2] * towards
+        on_level = np.concatenate([on_level, shadow[:, :2]])
+    low, high = on_level.min(axis=0), on_level.max(axis=0)
+    centre, half = (low + high) / 2, float((high - low).max()) / 2 + reach_m
+    top = max(float(vertices[:, 2].max()), level_m + 0.01)
+    return Box(np.eye(4), np.array([[*(centre - half), level_m], [*(centre + half), top]]))
+
+
+def level_pixels(
+    vertices: Array, faces: NDArray[np.int32], box: Box, lit: NDArray[np.uint8], hollow: bool
+) -> NDArray[np.uint8]:
+    """[MAP_PX, MAP_PX, 4] uint8 of a level's map.
+
+    `hollow`: light comes in below what stands there, as under a table; else it reaches down to the level.
+    Vertices [V, 3] in the world and faces [F, 3] of what stands on the level or over it; lit [MAP_PX, MAP_PX]: share of
+    the key light.
+    """
+    size = box.bounds[1] - box.bounds[0]
+    step_m = float(size[0]) / LEVEL_PX
+    top, under = column_heights(vertices, faces, box.bounds[0], step_m, LEVEL_PX)
+    nothing = np.zeros_like(top)
+    under = under if hollow else nothing
+    on_level = openness(top, under, nothing, step_m)
+    on_top = openness(top, nothing, top, step_m) if not under.any() else on_level
+    soft = [cv2.GaussianBlur(image, (0, 0), 0.8) for image in (on_level, on_top)]
+    heights = top / np.float32(size[2])
+    image = cv2.resize(np.stack([*soft, heights], axis=-1), (MAP_PX, MAP_PX), interpolation=cv2.INTER_LINEAR)
+    return np.dstack([np.rint(255.0 * np.clip(image, 0.0, 1.0)).astype(np.uint8), lit])
+
+
+def level_shadow(depth: NDArray[np.float32], light: Box, level: Box, towards: Array) -> NDArray[np.uint8]:
+    """[MAP_PX, MAP_PX] uint8: share of the key light on a level, from the shadow map's depth [S, S].
+
+    The edge of a shadow is as wide as the lamp's angle times the way from what throws it: sharp where a thing stands, soft
+    where the top's shadow falls (percentage-closer soft shadows, Fernando 2005, as a blend of a narrow and a wide blur).
+    """
+    low, high = level.bounds
+    step = (high[:2] - low[:2]) / MAP_PX
+    columns, rows = (low[axis] + (np.arange(MAP_PX) + 0.5) * step[axis] for axis in (0, 1))
+    M = light.unit_from_world
+    u, v, z = (
+        (M[i, 0] * columns[None, :] + M[i, 1] * rows[:, None] + M[i, 2] * low[2] + M[i, 3]).astype(np.float32)
+        for i in range(3)
+    )
+    where = (u * len(depth) - 0.5, v * len(depth) - 0.5)
+    nearest = cv2.remap(depth, *where, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, 1.0)
+    depth_m = float(light.bounds[1, 2] - light.bounds[0, 2])
+    away_m = (z - nearest) * depth_m
+    dark = ((away_m > BIAS_M) & (nearest < 1.0)).astype(np.float32)
+    farthest_m = float((high[2] - low[2]) / max(float(towards[2]), LOWEST_SINE))
+    wide_px = max(0.3 * LAMP_RAD * farthest_m / float(step[0]), 1.0)
+    narrow = cv2.GaussianBlur(dark, (0, 0), 0.8)
+    wide = cv2.GaussianBlur(dark, (0, 0), wide_px)
+    mean_away_m = cv2.GaussianBlur(away_m * dark, (0, 0), wide_px) / np.maximum(wide, 1e-4)
+    share = np.clip(mean_away_m / farthest_m, 0.0, 1.0) * np.minimum(wide * 50.0, 1.0)
+    return np.rint(255.0 * (1.0 - np.clip(narrow + share * (wide - narrow), 0.0, 1.0))).astype(np.uint8)
+
+
+def triangles_of(things: Sequence[Placed]) -> tuple[Array, NDArray[np.int32]]:
+    """(vertices [V, 3] in the world, faces [F, 3]) of all of them."""
+    vertices = [transform(thing.T_world_shape, thing.shape.vertices) for thing in things]
+    starts = np.cumsum([0, *(len(one) for one in vertices)])[:-1]
+    faces = [thing.shape.faces + start for thing, start in zip(things, starts, strict=True)]
+    return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
+
+
+def casters(things: Sequence[Placed]) -> list[Placed]:
+    """Everything that throws a shadow: not the floor."""
+    return [thing for thing in things if thing.region_id > REGION_FLOOR]
+
+
+def standing(things: Sequence[Placed]) -> list[Placed]:
+    """What stands on the table."""
+    return [thing for thing in things if thing.region_id >= REGION_FIRST_OBJECT]
+
+
+def level_of(vertices: Array) -> float:
+    """The level on which vertices [N, 3] stand, metres."""
+    return float(vertices[:, 2].min())
+
+
+def soft_radius(light: Box) -> tuple[float, float, float]:
+    """(radius of the filter, bias, side of a pixel of the shadow map) in units of the light's box."""
+    size = light.bounds[1] - light.bounds[0]
+    return SOFT_M / float(math.sqrt(size[0] * size[1])), BIAS_M / float(size[2]), 1.0 / SHADOW_PX

@@ -1,0 +1,228 @@
+"""GLSL of the label pass and of the pixel counter.
+
+How what is the same for a whole draw (camera, region, light) reaches the fragment shader is a matter of speed alone.
+llvmpipe fetches a uniform anew for every fragment, which takes a third of the time of a floor that fills the image; and
+it sets up every input anew for every triangle, which takes two thirds of the time of an object with 20,000 of them. So
+there are two variants of one text: flat inputs where triangles are few, uniforms where they are many.
+"""
+
+from typing import NamedTuple
+
+from workers.render.raster.lit_shaders import LIT_FRAGMENT, LIT_VERTEX
+
+MAX_LIGHTS = 6
+"""What the 60 floats that OpenGL 4.1 promises between the two shaders have room for."""
+
+
+class Variant(NamedTuple):
+    """One of the label pass's programs; `lights` is at least 1 and at most `MAX_LIGHTS`."""
+
+    textured: bool
+    few_triangles: bool
+    matte: bool
+    lights: int
+    raster: bool = False
+    """With shadows and occlusion (lighting.py)."""
+    ground: bool = False
+    """A floor: its depth in the test is the rasteriser's, so that what things hide of it is not shaded."""
+    level: bool = False
+    """All of it lies on the level of its map, which then says where the key light falls: for `raster` only."""
+    labels: bool = True
+    """False: colour alone, tested by the depth that the rasteriser interpolates, so that hidden fragments cost nothing."""
+    cutout: bool = False
+    """Its texture has holes. Apart from the rest, because a program that may discard is not spared hidden fragments."""
+
+
+_VERTEX = """
+layout(location = 0) in vec3 position;
+layout(location = 1) in vec4 normal_metallic;
+layout(location = 2) in vec4 albedo_roughness;
+layout(location = 3) in vec2 uv;
+layout(location = 4) in vec4 face_plane;
+
+uniform mat4 cam_from_shape;
+uniform mat4 clip_from_cam;
+out vec4 v_normal_metallic;
+out vec4 v_albedo_roughness;
+out vec2 v_uv;
+flat out vec4 v_plane;
+#if GROUND || !LABELS
+uniform float ahead;
+#endif
+
+#if FEW_TRIANGLES
+uniform vec4 view;
+uniform vec2 thing;
+uniform vec3 ambient;
+uniform vec3 light_towards[LIGHTS];
+uniform vec3 light_color[LIGHTS];
+flat out vec4 v_view;
+flat out vec2 v_thing;
+flat out vec3 v_ambient;
+flat out vec3 v_light_towards[LIGHTS];
+flat out vec3 v_light_color[LIGHTS];
+
+void pass_on() {
+    v_view = view;
+    v_thing = thing;
+    v_ambient = ambient;
+    for (int i = 0; i < LIGHTS; ++i) {
+        v_light_towards[i] = light_towards[i];
+        v_light_color[i] = light_color[i];
+    }
+}
+#else
+void pass_on() {}
+#endif
+
+#if RASTER
+LIT_VERTEX
+#endif
+
+void main() {
+    pass_on();
+#if RASTER
+    pass_light();
+#endif
+    mat3 turn = mat3(cam_from_shape);
+    vec3 shift = cam_from_shape[3].xyz;
+    vec3 face_normal = turn * face_plane.xyz;
+    v_plane = vec4(face_normal, face_plane.w + dot(face_normal, shift));
+    v_normal_metallic = vec4(turn * normal_metallic.xyz, normal_metallic.w);
+    v_albedo_roughness = albedo_roughness;
+    v_uv = uv;
+    gl_Position = clip_from_cam * vec4(turn * position + shift, 1.0);
+#if GROUND || !LABELS
+    gl_Position.z += ahead;
+#endif
+}
+"""
+
+_FRAGMENT = """
+const float NEAR_M = 0.05;         // any length serves: it scales what the depth test compares
+const float HOLE = 0.5;          // texels more transparent than this are holes in colour, never in labels
+const float GRAZING = 0.01;        // cosine of incidence below which a face's plane says nothing about z
+
+in vec4 v_normal_metallic;
+in vec4 v_albedo_roughness;
+in vec2 v_uv;
+flat in vec4 v_plane;
+
+#if FEW_TRIANGLES
+flat in vec4 v_view;               // cx, cy, 1 / fx, 1 / fy
+flat in vec2 v_thing;              // region id / 255, share of its distance by which it stands back
+flat in vec3 v_ambient;
+flat in vec3 v_light_towards[LIGHTS];
+flat in vec3 v_light_color[LIGHTS];
+#else
+uniform vec4 view;
+uniform vec2 thing;
+uniform vec3 ambient;
+uniform vec3 light_towards[LIGHTS];
+uniform vec3 light_color[LIGHTS];
+#define v_view view
+#define v_thing thing
+#define v_ambient ambient
+#define v_light_towards light_towards
+#define v_light_color light_color
+#endif
+
+uniform sampler2D albedo_map;
+
+layout(location = 0) out vec4 out_color_region;
+#if LABELS
+layout(location = 1) out float out_z;
+#endif
+
+#if RASTER
+LIT_FRAGMENT
+#else
+// Radiance towards the eye: Lambert, and GGX's lobe (Walter et al. 2007) with its masking term taken as 1. The lobe is
+// written by the angle between the mirrored ray and the light, 1 - cos = 2 sin^2 of the half vector's, which saves the
+// half vectors. On a matte surface it is under 0.03 of the light, and is left out.
+vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float roughness) {
+    vec3 diffuse = albedo * (1.0 - metallic);
+    vec3 mirror = mix(vec3(0.04), albedo, metallic);
+    vec3 sum = v_ambient * (diffuse + mirror);
+#if MATTE
+    for (int i = 0; i < LIGHTS; ++i) sum += v_light_color[i] * diffuse * max(dot(normal, v_light_towards[i]), 0.0);
+#else
+    float width = max(roughness * roughness * roughness * roughness, 0.002);
+    vec3 bounced = 2.0 * dot(normal, towards_eye) * normal - towards_eye;
+    for (int i = 0; i < LIGHTS; ++i) {
+        float level = max(dot(normal, v_light_towards[i]), 0.0);
+        float miss = 1.0 - dot(bounced, v_light_towards[i]);
+        float lobe = width / mix(0.5 * miss, 1.0, width);
+        sum += v_light_color[i] * level * (diffuse + mirror * (0.25 / width * lobe * lobe));
+    }
+#endif
+    return sum;
+}
+#endif
+
+// The curve is within 0.1 of a step of 8 bits of 1.055 c^(1 / 2.4) - 0.055, and square roots cost a third of powers.
+vec3 encode_srgb(vec3 c) {
+    c = clamp(c, 0.0, 1.0);
+    vec3 root = sqrt(c);
+    vec3 curve = 0.83375144 * root + 0.29810974 * sqrt(root) - 0.05531654 * c - 0.07690398;
+    return mix(12.92 * c, curve, step(0.0031308, c));
+}
+
+void main() {
+    vec3 ray = vec3((gl_FragCoord.xy - v_view.xy) * v_view.zw, 1.0);
+    float per_length = inversesqrt(dot(ray, ray));
+    float across = dot(v_plane.xyz, ray);
+    float cosine = abs(across) * per_length;
+    float z = cosine > GRAZING ? v_plane.w / across : 1.0 / gl_FragCoord.w;
+#if LABELS
+    out_z = z;
+#if !GROUND
+    gl_FragDepth = NEAR_M / (z * (1.0 + v_thing.y / max(cosine, GRAZING)));
+#endif
+#endif
+
+    vec3 face_normal = across > 0.0 ? -v_plane.xyz : v_plane.xyz;
+    vec3 normal = v_normal_metallic.xyz;
+    float length2 = dot(normal, normal);
+    normal = length2 > 0.01 ? normal * inversesqrt(length2) : face_normal;
+    normal = dot(normal, face_normal) < 0.0 ? -normal : normal;
+    vec3 albedo = v_albedo_roughness.rgb;
+#if TEXTURED
+    vec4 texel = texture(albedo_map, v_uv);
+    albedo *= texel.rgb * texel.rgb;
+#if CUTOUT && !LABELS
+    if (texel.a < HOLE) discard;
+#endif
+#endif
+    vec3 light = shade(normal, -ray * per_length, albedo, v_normal_metallic.w, v_albedo_roughness.w);
+#if RASTER
+    light = compress(light);
+#endif
+    out_color_region = vec4(encode_srgb(light), v_thing.x);
+}
+"""
+
+COUNT_VERTEX = """
+#version 410 core
+layout(location = 0) in vec3 position;
+uniform mat4 cam_from_shape;
+uniform mat4 clip_from_cam;
+
+void main() {
+    gl_Position = clip_from_cam * vec4(mat3(cam_from_shape) * position + cam_from_shape[3].xyz, 1.0);
+}
+"""
+
+COUNT_FRAGMENT = """
+#version 410 core
+void main() {}
+"""
+
+
+def label_sources(variant: Variant) -> tuple[str, str]:
+    """(vertex, fragment) shader of the label pass."""
+    head = "#version 410 core\n" + "".join(
+        f"#define {name.upper()} {int(v)}\n" for name, v in variant._asdict().items()
+    )
+    vertex, fragment = _VERTEX.replace("LIT_VERTEX", LIT_VERTEX), _FRAGMENT.replace("LIT_FRAGMENT", LIT_FRAGMENT)
+    return head + vertex, head + fragment

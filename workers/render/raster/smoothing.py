@@ -1,0 +1,144 @@
+"""Anti-aliasing of colour: pure functions on images. Labels are never touched: they are the ones of the pixel's centre.
+
+Two ways. `smooth` blends each pixel at an edge with what lies along that edge (after FXAA, Lottes 2009), a millisecond or
+two an image. `blend` takes the mean, in linear light, with the same pixels drawn at three more points, which costs twice
+what the image itself does.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.scene.scene import REGION_FLOOR
+from workers.geometry.jit import compiled
+from workers.geometry.srgb import SRGB_STEPS, encode_srgb
+
+CONTRAST = 24
+"""Steps of 8 bits between a pixel and a neighbour from which on the pixel counts as an edge."""
+
+RADIUS_PX = 0.38
+OFFSETS_PX = tuple(
+    (RADIUS_PX * math.cos(math.radians(a)), RADIUS_PX * math.sin(math.radians(a))) for a in (15, 135, 255)
+)
+"""Where the three lie about the centre: no two of the four share a row or a column, and their mean is the centre."""
+
+SPAN_PX = 8.0
+
+LINEAR_STEPS = 16_383
+_LINEAR = np.rint(SRGB_STEPS * LINEAR_STEPS).astype(np.uint16)
+_SRGB = np.rint(255.0 * encode_srgb(np.arange(LINEAR_STEPS + 1) / LINEAR_STEPS)).astype(np.uint8)
+
+
+def edges(rgb: NDArray[np.uint8], region: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """[H, W] uint8, 255 where a pixel's colour is more than `CONTRAST` from one of the four beside it. rgb [H, W, 3].
+
+    Not amid the floor (region [H, W]): what is seen there is its texture, which is smooth already.
+    """
+    mask = np.zeros(region.shape, np.uint8)
+    _edges(np.ascontiguousarray(rgb), np.ascontiguousarray(region), REGION_FLOOR, CONTRAST, mask)
+    return mask
+
+
+@compiled
+def _edges(
+    rgb: NDArray[np.uint8], region: NDArray[np.uint8], floor: int, contrast: int, mask: NDArray[np.uint8]
+) -> None:
+    """Each pair of neighbours is compared once, and marks both."""
+    height, width = region.shape
+    for y in range(height):
+        for x in range(width):
+            for dy, dx in ((0, 1), (1, 0)):
+                v, u = y + dy, x + dx
+                if v >= height or u >= width or (region[y, x] == floor and region[v, u] == floor):
+                    continue
+                for channel in range(3):
+                    if abs(np.int32(rgb[y, x, channel]) - np.int32(rgb[v, u, channel])) > contrast:
+                        mask[y, x] = mask[v, u] = 255
+
+
+def smooth(rgb: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
+    """Blend `rgb` [H, W, 3] along its edges where the mask [H, W] says.
+
+    The edge runs across the gradient of brightness over the four pixels' corners. Along it, two taps close by and two as
+    far as the edge is flat, at most `SPAN_PX`: the farther ones count where they stay between the neighbours' brightness.
+    """
+    _smooth(rgb.copy(), mask, np.float32(SPAN_PX), rgb)
+
+
+@compiled
+def _smooth(seen: NDArray[np.uint8], mask: NDArray[np.uint8], span: np.float32, out: NDArray[np.uint8]) -> None:
+    height, width = mask.shape
+    half, quarter, one = np.float32(0.5), np.float32(0.25), np.float32(1.0)
+    around = np.empty((3, 3), np.float32)
+    near, far = np.empty(3, np.float32), np.empty(3, np.float32)
+    for y in range(height):
+        for x in range(width):
+            if mask[y, x] == 0:
+                continue
+            low, high = np.float32(255.0), np.float32(0.0)
+            for dy in range(3):
+                for dx in range(3):
+                    row, column = min(max(y + dy - 1, 0), height - 1), min(max(x + dx - 1, 0), width - 1)
+                    grey = _grey(seen[row, column, 0], seen[row, column, 1], seen[row, column, 2])
+                    around[dy, dx] = grey
+                    low, high = min(low, grey), max(high, grey)
+            # Binomial differences across the pixel: exactly 0 and 1 for the directions of level and upright edges.
+            two = np.float32(2.0)
+            across = (around[0, 2] + two * around[1, 2] + around[2, 2]) - (
+                around[0, 0] + two * around[1, 0] + around[2, 0]
+            )
+            down = (around[2, 0] + two * around[2, 1] + around[2, 2]) - (
+                around[0, 0] + two * around[0, 1] + around[0, 2]
+            )
+            along_x, along_y = down, -across
+            least = max(min(abs(along_x), abs(along_y)), one)
+            length = max(np.sqrt(along_x * along_x + along_y * along_y), one)
+            step_x = min(max(along_x / least, -span), span)
+            step_y = min(max(along_y / least, -span), span)
+            near[:], far[:] = np.float32(0.0), np.float32(0.0)
+            for sign in (-half, half):
+                _add_tap(seen, x + sign * along_x / length, y + sign * along_y / length, half, near)
+                _add_tap(seen, x + sign * step_x, y + sign * step_y, quarter, far)
+            for channel in range(3):
+                far[channel] += half * near[channel]
+            level = _grey(far[0], far[1], far[2])
+            for channel in range(3):
+                value = far[channel] if low <= level <= high else near[channel]
+                out[y, x, channel] = np.uint8(np.rint(value))
+
+
+@compiled
+def _grey(red: float, green: float, blue: float) -> np.float32:
+    return (
+        np.float32(0.299) * np.float32(red)
+        + np.float32(0.587) * np.float32(green)
+        + np.float32(0.114) * np.float32(blue)
+    )
+
+
+@compiled
+def _add_tap(image: NDArray[np.uint8], x: float, y: float, weight: np.float32, total: NDArray[np.float32]) -> None:
+    """Add the colour at (x, y), between the centres of four pixels, those at the border repeated."""
+    height, width = image.shape[:2]
+    x0, y0 = np.floor(x), np.floor(y)
+    fx, fy = np.float32(x - x0), np.float32(y - y0)
+    left, top = min(max(int(x0), 0), width - 1), min(max(int(y0), 0), height - 1)
+    right, bottom = min(max(int(x0) + 1, 0), width - 1), min(max(int(y0) + 1, 0), height - 1)
+    one = np.float32(1.0)
+    for channel in range(3):
+        above = (one - fx) * np.float32(image[top, left, channel]) + fx * np.float32(image[top, right, channel])
+        below = (one - fx) * np.float32(image[bottom, left, channel]) + fx * np.float32(image[bottom, right, channel])
+        total[channel] += weight * ((one - fy) * above + fy * below)
+
+
+def blend(rgb: NDArray[np.uint8], others: Sequence[NDArray[np.uint8]], mask: NDArray[np.uint8]) -> None:
+    """Put the mean, in linear light, of `rgb` [H, W, 3] and the others [H, W, 4] where the mask says, into `rgb`."""
+    chosen = np.flatnonzero(mask)
+    pixels = rgb.reshape(-1, 3)
+    total = _LINEAR[pixels[chosen]].astype(np.uint32)
+    for other in others:
+        total += _LINEAR[other.reshape(-1, 4)[chosen, :3]]
+    count = 1 + len(others)
+    pixels[chosen] = _SRGB[(total + count // 2) // count]
