@@ -1,4 +1,4 @@
-"""Convex parts kept in memory, and in files for the next process. A cache: it may be emptied at any time."""
+"""A cache of convex parts in memory and in files, which may be deleted at any time."""
 
 import hashlib
 import io
@@ -6,6 +6,7 @@ import os
 import tempfile
 from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,12 @@ import numpy as np
 from schemas.base import Array, frozen_array
 
 Answer = tuple[str, tuple[Array, ...]]
-"""How parts were made, and their vertices [N, 3] each."""
+"""The method that made the parts, and the vertices [N, 3] of each."""
 
 CAPACITY_BYTES = 64 * 1024 * 1024
-"""Of memory that a process keeps: a thousand mugs."""
+"""Memory per process: a thousand mugs."""
+
+DIGEST_BYTES = 32
 
 
 def _usual_folder() -> Path | None:
@@ -29,20 +32,20 @@ def _usual_folder() -> Path | None:
 USUAL_FOLDER = _usual_folder()
 
 
-def key_of(*what: str | bytes) -> str:
-    """SHA-256 of all that an answer depends on."""
+def key_of(*inputs: str | bytes) -> str:
+    """SHA-256 of everything that an answer depends on."""
     whole = hashlib.sha256()
-    for one in what:
+    for one in inputs:
         data = one.encode() if isinstance(one, str) else one
         whole.update(len(data).to_bytes(8, "little") + data)
     return whole.hexdigest()
 
 
 class PartsCache:
-    """The answers used last, as many as `capacity_bytes` hold, but at least one; each also as a file where there is a folder.
+    """The answers used last that fit `capacity_bytes`, at least one. Each is also kept as a file if a folder is given.
 
-    A file holds the SHA-256 of the rest before it, so that a torn one is seen and made again, and gets its name when it
-    is whole. Where the folder cannot be written, nothing is kept in it.
+    A file begins with the SHA-256 of its content, so that a torn one is found and made again, and is renamed into place.
+    A folder that cannot be written is ignored.
     """
 
     def __init__(self, capacity_bytes: int = CAPACITY_BYTES) -> None:
@@ -54,24 +57,22 @@ class PartsCache:
         return len(self._answers)
 
     def get(self, key: str, folder: Path | None, make: Callable[[], Answer]) -> Answer:
-        """The answer of this key: from memory, from the folder, or made; what `make` raises leaves no trace."""
+        """The answer of this key: from memory, from the folder, or made. An exception of `make` leaves no trace."""
         if key in self._answers:
             self._answers.move_to_end(key)
             return self._answers[key]
-        answer = _read(folder / key) if folder is not None else None
+        answer = None if folder is None else _read(folder / key)
         if answer is None:
             answer = make()
             if folder is not None:
-                _write(folder, key, answer)
+                with suppress(OSError):
+                    _write(folder, key, answer)
         self._answers[key] = answer
-        self.bytes += _bytes_of(answer)
+        self.bytes += sum(cloud.nbytes for cloud in answer[1])
         while self.bytes > self.capacity_bytes and len(self._answers) > 1:
-            self.bytes -= _bytes_of(self._answers.popitem(last=False)[1])
+            _, (_, clouds) = self._answers.popitem(last=False)
+            self.bytes -= sum(cloud.nbytes for cloud in clouds)
         return answer
-
-
-def _bytes_of(answer: Answer) -> int:
-    return sum(cloud.nbytes for cloud in answer[1])
 
 
 def _read(path: Path) -> Answer | None:
@@ -79,25 +80,23 @@ def _read(path: Path) -> Answer | None:
         data = path.read_bytes()
     except OSError:
         return None
-    if hashlib.sha256(data[32:]).digest() != data[:32]:
+    if hashlib.sha256(data[DIGEST_BYTES:]).digest() != data[:DIGEST_BYTES]:
         return None
-    with np.load(io.BytesIO(data[32:])) as stored:
+    with np.load(io.BytesIO(data[DIGEST_BYTES:])) as stored:
         clouds = np.split(stored["vertices"], np.cumsum(stored["counts"])[:-1])
-        return str(stored["way"]), tuple(frozen_array(cloud) for cloud in clouds)
+        return str(stored["method"]), tuple(frozen_array(cloud) for cloud in clouds)
 
 
 def _write(folder: Path, key: str, answer: Answer) -> None:
-    way, clouds = answer
-    whole = io.BytesIO()
-    np.savez(whole, way=way, vertices=np.concatenate(clouds), counts=np.array([len(cloud) for cloud in clouds]))
-    data = whole.getvalue()
-    name = None
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=folder, prefix=f".{key}.", delete=False) as file:
-            name = file.name
-            file.write(hashlib.sha256(data).digest() + data)
-        os.replace(name, folder / key)
-    except OSError:
-        if name is not None:
-            Path(name).unlink(missing_ok=True)
+    method, clouds = answer
+    content = io.BytesIO()
+    np.savez(content, method=method, vertices=np.concatenate(clouds), counts=[len(cloud) for cloud in clouds])
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=folder, prefix=f".{key}.", delete=False) as file:
+        try:
+            file.write(hashlib.sha256(content.getvalue()).digest() + content.getvalue())
+            file.flush()
+            os.replace(file.name, folder / key)
+        except OSError:
+            Path(file.name).unlink(missing_ok=True)
+            raise

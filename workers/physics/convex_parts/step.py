@@ -1,10 +1,10 @@
 """Convex parts of a body that is not convex, by CoACD (Wei, Liu, Ling and Su 2022, doi 10.1145/3528223.3530103).
 
-Built-in shapes are not cut so, but by their making: see `workers.geometry.lathe_decomposition`, with the same figures.
+Parts of built-in shapes follow from their making instead: see `workers.geometry.lathe_decomposition`.
 
-Built-in shapes, number 0 of each category, 0.25 m along their diagonal, by CoACD's threshold: parts / their vertices in all /
-seconds on one busy core / millimetres that parts stand out of the surface at most. Half of all that parts show lies on
-the surface (but at 0.1), and nothing out of the hull.
+CoACD on built-in shapes, number 0 of each category, 0.25 m along their diagonal, by threshold: parts / vertices of all parts /
+seconds on one busy core / greatest distance in millimetres that parts stand out of the surface. Half of the parts' surface
+lies on the shape's (except at 0.1), and nothing outside the hull.
 
              0.1                        0.05                       0.02
     mug      22 / 1,545 / 2.9 / 7.4     59 / 2,462 / 2.6 / 3.9     220 / 5,153 / 6.1 / 1.6
@@ -14,7 +14,7 @@ the surface (but at 0.1), and nothing out of the hull.
     laptop   2 / 153 / 0.3 / 3.1        3 / 178 / 0.3 / 1.4        3 / 178 / 0.3 / 1.4
     camera   3 / 592 / 0.4 / 6.9        25 / 1,201 / 1.1 / 4.4     164 / 3,917 / 7.5 / 2.3
 
-With CoACD's own depth of search the mug takes 142 s for 47 parts.
+With CoACD's own search depth the mug takes 142 s and has 47 parts.
 """
 
 import json
@@ -34,67 +34,61 @@ import shapely
 from schemas.base import Array, frozen_array
 from schemas.errors import MachineError, MeshError
 from schemas.scene.shape import Asset, Mesh
-from workers.geometry.convexity import components, concavity_m, solid_of, triangles_of, weld
+from workers.geometry import convexity
+from workers.geometry.convexity import components, is_convex_surface, solid_of, triangles_of, weld
 from workers.geometry.hull import convex_hull
 from workers.geometry.lathe_decomposition import TOLERANCE, parts_of_lofts
 from workers.physics.convex_parts.coacd_process import MISSING
 from workers.physics.convex_parts.parts_cache import USUAL_FOLDER, PartsCache, key_of
 
 THRESHOLD = 0.05
-"""CoACD's concavity at which it stops, in units in which the mesh is 2 across: 0.02 halves what stands out, and has three
-times the parts."""
-
-CONVEX_SHARE = 0.9999
-"""A body that fills this share of its hull is convex."""
-
-SHALLOW_M = 5e-5
-"""A surface nowhere deeper below its hull than this is convex: as near as counts as touching."""
+"""CoACD's concavity at which it stops, in units in which the mesh is 2 across. 0.02 halves the error and triples the parts."""
 
 SIMPLER = 2e-3
-"""Share of its size by which a closed body may be made simpler before it is cut: CoACD's time goes with the faces."""
+"""Tolerance, as a share of its size, to which a closed body is simplified first: CoACD's time grows with the faces."""
 
 MOST_PIECES = 128
 """A mesh in more pieces than this is cut as one."""
 
 OPTIONS = {"mcts_iterations": 10, "mcts_nodes": 6, "mcts_max_depth": 1, "resolution": 300, "seed": 0}
-"""A search one cut deep with few trials; CoACD's own is three deep with 150, fifty times as long, and makes a fifth fewer
-parts of a mug."""
+"""A search one cut deep with few trials. CoACD's own, three deep with 150, takes fifty times as long for a fifth fewer parts
+of a mug."""
 
 OPEN = {"preprocess_mode": "on", "preprocess_resolution": 40}
-"""What is not a closed manifold is first wrapped in voxels; CoACD ends the process without."""
+"""For a mesh that is not a closed manifold, which is wrapped in voxels first: without, CoACD ends the process."""
 
 CLOSED = {"preprocess_mode": "off"}
 
 LIBRARIES = ("coacd", "manifold3d", "numpy", "scipy")
-"""With other versions of these a mesh may have other parts."""
+"""Libraries whose versions change the parts of a mesh."""
 
 NOT_INSTALLED = "the package `{}` is not installed, or cannot be loaded: set Verso up again with `./verso test`"
 
 LONGEST_S = 300
-"""On some broken meshes CoACD never ends; the slowest that did end took a tenth of this."""
+"""Time limit: on some broken meshes CoACD never ends. The slowest that did end took a tenth of this."""
 
-Way = Literal["convex", "coacd", "pieces"]
+Method = Literal["convex", "coacd", "pieces"]
 
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """Vertex clouds [N, 3] float64, metres, the hulls of which are a body's convex parts.
+    """Vertices [N, 3] float64, metres, of each convex part, and how the parts were made.
 
-    `way`: the body or each of its pieces is convex; CoACD cut it; or CoACD failed and they are the hulls of its pieces.
+    convex: every piece of the body is; coacd: by CoACD; pieces: CoACD failed, and the parts are the hulls of the pieces.
     """
 
     clouds: tuple[Array, ...]
-    way: Way
+    method: Method
 
 
 _CACHE = PartsCache()
 
 
 def parts_of(asset: Asset, threshold: float = THRESHOLD, share: float = TOLERANCE) -> tuple[Array, ...]:
-    """Vertex clouds [N, 3] of an asset's convex parts, object frame: those that follow from its making, or else CoACD's.
+    """Vertices [N, 3], object frame, of each of an asset's convex parts: from its making if known, or else by CoACD.
 
-    `threshold` is CoACD's, `share` that of `parts_of_lofts`. Where a built-in shape's own outlines cannot be cut, for they
-    meet but for the last bits, it is cut by CoACD too.
+    `threshold` is CoACD's, `share` that of `parts_of_lofts`. CoACD also cuts a built-in shape whose outlines touch except
+    for the last bits, which cannot be cut by its making.
     """
     lofts = asset.lofts
     if lofts is None:
@@ -107,28 +101,30 @@ def parts_of(asset: Asset, threshold: float = THRESHOLD, share: float = TOLERANC
 
 
 def decompose(mesh: Mesh, digest: str, threshold: float = THRESHOLD, folder: Path | None = USUAL_FOLDER) -> Parts:
-    """Convex parts of a mesh: none reaches out of its hull, and together they have the hull's vertices.
+    """Convex parts of a mesh: all within its hull, and together with the hull's vertices.
 
-    Each piece that hangs together is cut by itself. The same arguments give the same bytes in every process, which is
-    why answers may be kept in memory and in `folder` (None: nowhere). Raises MachineError where CoACD is missing or was
-    killed from outside, MeshError `no_convex_parts` where it does not end.
+    Each connected piece is cut by itself. The same arguments give the same bytes in every process, so results are kept in
+    memory and in `folder` (None: nowhere). Raises MachineError where CoACD is missing or was killed from outside, MeshError
+    `no_convex_parts` where it does not end.
     """
-    key = key_of(_method(), repr(threshold), digest, mesh.vertices.tobytes(), mesh.faces.tobytes())
-    way, clouds = _CACHE.get(key, folder, lambda: _decompose(mesh, threshold))
-    return Parts(clouds, way)  # type: ignore[arg-type]
+    key = key_of(_version(), repr(threshold), digest, mesh.vertices.tobytes(), mesh.faces.tobytes())
+    method, clouds = _CACHE.get(key, folder, lambda: _decompose(mesh, threshold))
+    return Parts(clouds, method)  # type: ignore[arg-type]
 
 
 @cache
-def _method() -> str:
-    """What parts depend on beside the mesh and the threshold: this folder's files, and the versions of libraries."""
-    files = sorted(Path(__file__).parent.glob("*.py"))
+def _version() -> str:
+    """Digest of the code that parts depend on: this folder's and the geometry's files, and the versions of libraries."""
+    files = [
+        file for folder in (Path(__file__), Path(convexity.__file__)) for file in sorted(folder.parent.glob("*.py"))
+    ]
     try:
         return key_of(*(file.read_bytes() for file in files), *(version(name) for name in LIBRARIES))
     except PackageNotFoundError as error:
         raise MachineError(NOT_INSTALLED.format(error.name)) from error
 
 
-def _decompose(mesh: Mesh, threshold: float) -> tuple[Way, tuple[Array, ...]]:
+def _decompose(mesh: Mesh, threshold: float) -> tuple[Method, tuple[Array, ...]]:
     welded = weld(mesh)
     pieces = components(welded)
     if not pieces:
@@ -136,17 +132,16 @@ def _decompose(mesh: Mesh, threshold: float) -> tuple[Way, tuple[Array, ...]]:
     if len(pieces) > MOST_PIECES:
         pieces = [welded]
     made = [_parts_of(piece, threshold) for piece in pieces]
-    ways = {way for way, _ in made}
-    way: Way = "pieces" if "pieces" in ways else "coacd" if "coacd" in ways else "convex"
-    return way, tuple(frozen_array(cloud) for _, clouds in made for cloud in clouds)
+    methods = {method for method, _ in made}
+    method: Method = "pieces" if "pieces" in methods else "coacd" if "coacd" in methods else "convex"
+    return method, tuple(frozen_array(cloud) for _, clouds in made for cloud in clouds)
 
 
-def _parts_of(piece: Mesh, threshold: float) -> tuple[Way, list[Array]]:
+def _parts_of(piece: Mesh, threshold: float) -> tuple[Method, list[Array]]:
     if len(piece.vertices) < 4:
         return "convex", [piece.vertices]
     hull, solid = convex_hull(piece.vertices), solid_of(piece)
-    fills = solid is not None and solid.volume() >= CONVEX_SHARE * solid.hull().volume()
-    if fills or concavity_m(piece) <= SHALLOW_M:
+    if is_convex_surface(piece, solid):
         return "convex", [hull.vertices]
     size = float(np.linalg.norm(np.ptp(hull.vertices, axis=0)))
     if solid is None:
@@ -158,7 +153,7 @@ def _parts_of(piece: Mesh, threshold: float) -> tuple[Way, list[Array]]:
 
 
 def _run(mesh: Mesh, options: dict[str, object]) -> list[Array]:
-    """What CoACD makes of a mesh; nothing where it gives up."""
+    """CoACD's parts of a mesh; none where it gives up."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         np.savez(folder / "request.npz", vertices=mesh.vertices, faces=mesh.faces, options=json.dumps(options))
@@ -179,7 +174,7 @@ def _run(mesh: Mesh, options: dict[str, object]) -> list[Array]:
 
 
 def _fit(clouds: list[Array], vertices: Array, normals: Array) -> list[Array]:
-    """Parts cut off where they reach out of the hull, and given those of its vertices that they lost."""
+    """The parts clipped to the hull, with the vertices of the hull that they lost."""
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     reach = (vertices @ normals.T).max(axis=0)
     whole = manifold3d.Manifold.hull_points(np.ascontiguousarray(vertices))
@@ -189,7 +184,7 @@ def _fit(clouds: list[Array], vertices: Array, normals: Array) -> list[Array]:
             cloud = triangles_of(manifold3d.Manifold.hull_points(np.ascontiguousarray(cloud)) ^ whole).vertices
         if len(cloud) >= 4:
             fitted.append(cloud)
-    if not fitted:  # CoACD gave up, or the hull is flat and what is left of its voxels is nothing
+    if not fitted:  # CoACD gave up, or the hull is flat and clips all voxels away
         return []
     owner = np.concatenate([np.full(len(cloud), k) for k, cloud in enumerate(fitted)])
     points = np.concatenate(fitted)

@@ -58,14 +58,14 @@ def digest_of(parts):
 def test_a_convex_body_is_its_own_part():
     for body in (trimesh.creation.box((0.1, 0.2, 0.3)), trimesh.creation.icosphere(3, 0.05)):
         parts = decompose(mesh_of(body), "convex", folder=None)
-        assert parts.way == "convex"
+        assert parts.method == "convex"
         assert len(parts.clouds) == 1
         assert (parts.clouds[0] == convex_hull(np.asarray(body.vertices)).vertices).all()
 
 
 def test_an_l_is_two_bars():
     parts = decompose(angle_iron(), "l", folder=None)
-    assert parts.way == "coacd"
+    assert parts.method == "coacd"
     assert len(parts.clouds) == 2
     solid = sum(ConvexHull(cloud).volume for cloud in parts.clouds)
     assert solid == pytest.approx((0.1 * 0.01 + 0.09 * 0.01) * 0.05, rel=0.02)
@@ -74,7 +74,7 @@ def test_an_l_is_two_bars():
 def test_nothing_stands_in_a_tray_and_nothing_out_of_it():
     mesh = tray()
     parts = decompose(mesh, "tray", folder=None)
-    assert parts.way == "coacd"
+    assert parts.method == "coacd"
     hull = convex_hull(mesh.vertices)
     points = np.concatenate(parts.clouds)
     assert (points @ hull.normals.T - (hull.vertices @ hull.normals.T).max(axis=0)).max() < 1e-12
@@ -94,7 +94,7 @@ def test_the_parts_of_a_shape_have_its_hull(category):
 def test_every_piece_is_cut_by_itself():
     balls = [trimesh.creation.icosphere(2, 0.02).apply_translation((x, 0, 0)) for x in (0.0, 0.03, 1.0)]
     parts = decompose(mesh_of(trimesh.util.concatenate(balls)), "balls", folder=None)
-    assert parts.way == "convex"
+    assert parts.method == "convex"
     assert sorted(round(float(cloud[:, 0].mean()), 9) for cloud in parts.clouds) == [0.0, 0.03, 1.0]
 
 
@@ -125,7 +125,7 @@ def test_a_flawed_mesh_has_parts_within_its_hull(flaw):
         "double": np.concatenate([mesh.faces, mesh.faces]),
     }[flaw]
     parts = decompose(Mesh(mesh.vertices, np.ascontiguousarray(faces)), flaw, threshold=0.3, folder=None)
-    assert parts.way == "coacd"
+    assert parts.method == "coacd"
     hull = convex_hull(mesh.vertices)
     points = np.concatenate(parts.clouds)
     assert (points @ hull.normals.T - (hull.vertices @ hull.normals.T).max(axis=0)).max() < 1e-9
@@ -136,7 +136,7 @@ def test_a_flat_sheet_and_a_single_triangle_have_one_part():
     for points in ([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], [(0, 0, 0), (1, 0, 0), (0, 1, 0.5)]):
         faces = np.array([(0, 1, 2), (0, 2, 3)][: len(points) - 2], dtype=np.int32)
         parts = decompose(Mesh(np.array(points, dtype=np.float64), faces), "flat", folder=None)
-        assert (parts.way, len(parts.clouds)) == ("convex", 1)
+        assert (parts.method, len(parts.clouds)) == ("convex", 1)
 
 
 def test_a_flat_sheet_that_is_not_convex_has_a_part_all_the_same():
@@ -151,7 +151,7 @@ def test_where_coacd_gives_up_the_hulls_of_the_pieces_serve(monkeypatch):
     monkeypatch.setattr(module, "OPEN", {"preprocess_mode": "on", "preprocess_resolution": 1})
     mesh = tray()
     parts = decompose(Mesh(mesh.vertices, mesh.faces[2:]), "gives up", folder=None)
-    assert parts.way == "pieces"
+    assert parts.method == "pieces"
     assert ConvexHull(parts.clouds[0]).volume == pytest.approx(0.2 * 0.2 * 0.05, rel=1e-6)
 
 
@@ -200,7 +200,7 @@ def test_an_answer_comes_from_memory_then_from_the_folder_and_is_the_same(tmp_pa
     assert digest_of(decompose(angle_iron(), "kept", folder=None)) == digest_of(made), "from memory"
     monkeypatch.setattr(module, "_CACHE", PartsCache())
     again = decompose(angle_iron(), "kept", folder=tmp_path)
-    assert (again.way, digest_of(again)) == (made.way, digest_of(made))
+    assert (again.method, digest_of(again)) == (made.method, digest_of(made))
     assert not again.clouds[0].flags.writeable
 
 

@@ -1,0 +1,266 @@
+"""Objects from release to rest: simulate, require rest, correct a single object, and measure the rest pose."""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from schemas.base import Array, Pose, frozen_array
+from schemas.errors import SettleError
+from schemas.job.physics import Physics
+from schemas.scene.effects import EffectPlan
+from schemas.scene.scene import ObjectStart, Settled, SupportedBy, Table
+from workers.geometry.elevation import heights_at
+from workers.geometry.frames import transform
+from workers.physics.effects import called_for_with
+from workers.physics.fall import Outcome
+from workers.physics.placement import Ground, Support, gap_m, ground_of, measure_supports, placed_mesh, touch_down
+from workers.physics.release import release
+from workers.physics.rest_pose import find_contacts_xy, snap_to_face, support_margin, tip_onto_face
+from workers.physics.separation import clearances, overlap_m
+
+LEFT_M = 0.05
+"""Depth of a centre of mass below the table's top at which the object has left the table."""
+
+LESS_ROLLING_FRICTION = (1.0, 0.1, 0.01, 0.0)
+"""Shares of the rolling friction in successive releases, each where the one before left the object on an edge."""
+
+DAMPING = 0.9
+"""Damping of releases with less rolling friction: nine tenths of the speed per second. Nothing else removes the energy that
+Bullet adds at each edge of a bottle on its side."""
+
+UNBALANCED = 0.05
+"""Share of the weight, and of weight times size, that contacts may leave unbalanced: their positions are known to
+`CONTACT_M`."""
+
+BALANCED = 1e-3
+"""The same share as noise: two tenths of a millimetre between a centre of mass and the contacts."""
+
+MOST_OVERLAP_M = 1e-4
+"""Greatest overlap of objects at release. A share of the overlap is corrected per step, which makes tens of metres per second
+of centimetres."""
+
+
+class LeftRoomError(Exception):
+    """An object settled as if alone came where it may meet another."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Drop:
+    """The objects to be dropped, and the ground, settings and effects of the drop; `room_m` as in `settle`."""
+
+    starts: tuple[ObjectStart, ...]
+    ground: Ground
+    physics: Physics
+    effects: EffectPlan
+    room_m: float
+
+    @property
+    def single(self) -> bool:
+        return len(self.starts) == 1
+
+    def supports(self, poses: Sequence[Pose]) -> tuple[Support, ...]:
+        """The support of every object at these poses, between meshes."""
+        return measure_supports(self.starts, poses, self.ground.table.mesh, self.physics.friction**2)
+
+
+@dataclass(frozen=True, eq=False)
+class _Ending:
+    """The outcome of a drop after `seconds` in all releases.
+
+    The properties are of a single object, moved along z until it touches the table.
+    """
+
+    drop: _Drop
+    outcome: Outcome
+    seconds: float
+
+    @cached_property
+    def T_touching(self) -> Pose:
+        return touch_down(self.drop.starts[0], self.outcome.poses[0], self.drop.ground)
+
+    @cached_property
+    def support(self) -> Support:
+        return self.drop.supports((self.T_touching,))[0]
+
+
+def settle(
+    starts: Sequence[ObjectStart], table: Table, physics: Physics, effects: EffectPlan, room_m: float = math.inf
+) -> tuple[Settled, ...]:
+    """Settle a single object, or several that may touch one another.
+
+    Raises SettleError `objects_overlap`, `not_at_rest`, `left_table`, `unsupported` or `table_too_fine`, and LeftRoomError
+    where the centre of mass of a single object goes further than `room_m` sideways. Several objects are not corrected after
+    the simulation, which their figures then describe.
+    """
+    drop = _Drop(tuple(starts), ground_of(table), physics, effects, room_m)
+    if not effects.runs("dynamics"):
+        placed = Outcome(tuple(start.T_world_obj for start in starts), 0.0, 0.0, rested=True)
+        return _describe(_Ending(drop, placed, 0.0), "placed")
+    _require_apart(starts)
+    if not effects.runs("table_mesh"):
+        ending = _come_to_rest(drop, flat=True)
+        if ending is not None:
+            return _describe(ending, "flat_top")
+        ran = (*effects.ran, *called_for_with("table_mesh", starts, physics))
+        drop = dataclasses.replace(drop, effects=dataclasses.replace(effects, ran=ran))
+    ending = _come_to_rest(drop, flat=False)
+    assert ending is not None  # only the flat top has an edge
+    return _describe(ending, "mesh")
+
+
+def _require_apart(starts: Sequence[ObjectStart]) -> None:
+    for one, other in itertools.combinations(starts, 2):
+        overlap = overlap_m(*(placed_mesh(start, start.T_world_obj) for start in (one, other)))
+        if overlap > MOST_OVERLAP_M:
+            raise SettleError(
+                "objects_overlap",
+                f"regions {one.region_id} and {other.region_id} begin {overlap * 1e3:.2f} mm inside one another: let "
+                "them go apart, or one above the other",
+            )
+
+
+def _come_to_rest(drop: _Drop, flat: bool) -> _Ending | None:
+    """Release until at rest; None where a footprint left the flat top, so that the table's edges may matter.
+
+    Rolling friction can hold a single object out of balance, within its lever arm of an edge of the hull or of the contacts
+    (half a millimetre by default), where in truth it tips on. It is released again with less rolling friction.
+    """
+    seconds, ending = 0.0, None
+    for physics, damping in _attempts(drop):
+        table = drop.ground.table
+        outcome = release(drop.starts, table, physics, drop.effects, flat, drop.room_m, damping)
+        if outcome.stopped_by == "room":
+            raise LeftRoomError
+        if outcome.stopped_by == "edge":
+            return None
+        seconds += outcome.seconds
+        ending = _Ending(drop, outcome, seconds)
+        _require_rest(ending)
+        ending, balanced = _balance(ending, flat)
+        if balanced:
+            break
+        again = dataclasses.replace(drop.starts[0], T_world_obj=ending.outcome.poses[0])
+        drop = dataclasses.replace(drop, starts=(again,))
+    return ending
+
+
+def _attempts(drop: _Drop) -> Iterator[tuple[Physics, float]]:
+    """(settings, damping) of each release in turn."""
+    physics = drop.physics
+    repeated = drop.single and drop.effects.runs("rolling_friction")
+    for share in LESS_ROLLING_FRICTION if repeated else LESS_ROLLING_FRICTION[:1]:
+        less = physics.model_copy(update={"rolling_friction": share * physics.rolling_friction})
+        yield less, 0.0 if share == 1.0 else DAMPING
+
+
+def _balance(ending: _Ending, flat: bool) -> tuple[_Ending, bool]:
+    """(the ending with a single object on the flat top turned onto its face, whether no further release is needed).
+
+    An object on the flat top without a face below its centre of mass is tipped on by geometry: Bullet adds speed to thin
+    rods released on an edge. Where the next face is far, it is released again.
+    """
+    drop, outcome = ending.drop, ending.outcome
+    if not drop.single:
+        return ending, True
+    if not flat:
+        return ending, ending.support.residual <= BALANCED
+    if not drop.physics.correction:
+        return ending, True
+    hull, com = drop.starts[0].hull, drop.starts[0].asset.mass.com
+    T = snap_to_face(outcome.poses[0], hull, com, drop.physics.snap_rad)
+    tipped = tip_onto_face(T, hull, com)
+    corrected = dataclasses.replace(outcome, poses=(T if tipped is None else tipped,))
+    return dataclasses.replace(ending, outcome=corrected), tipped is not None
+
+
+def _require_rest(ending: _Ending) -> None:
+    drop, outcome = ending.drop, ending.outcome
+    for start, T in zip(drop.starts, outcome.poses, strict=True):
+        com = transform(T, start.asset.mass.com[None, :])[0]
+        if not _is_on_table(ending, com):
+            whose, advice = "", "narrow start.offset_m or use larger tables"
+            if not drop.single:
+                whose = f" of region {start.region_id}"
+                advice = "fewer objects_per_scene, a narrower start.offset_m or larger tables"
+            raise SettleError(
+                "left_table",
+                f"after {outcome.seconds:.2f} s the centre of mass{whose} was at ({com[0]:.3f}, {com[1]:.3f}, {com[2]:.3f}) "
+                f"m, off the table's top: {advice}",
+            )
+    if not outcome.rested:
+        raise SettleError(
+            "not_at_rest",
+            f"{'still moving' if drop.single else 'something still moves'} at {outcome.speed_m_s * 1e3:.2f} mm/s after "
+            f"{outcome.seconds:.1f} s: raise physics.max_settle_s or physics.rolling_friction",
+        )
+
+
+def _is_on_table(ending: _Ending, com: Array) -> bool:
+    """Whether a centre of mass [3] is not below the top and, of a single object, over it.
+
+    Otherwise a single object may be held by the top all the same: over a hole, or hung on an edge.
+    """
+    drop, ground = ending.drop, ending.drop.ground
+    lowest_m = ground.table.top.height_m - LEFT_M
+    high = bool(com[2] >= lowest_m)
+    if not drop.single:
+        return high
+    if high and heights_at(com[None, :2], ground.terrain)[0] >= lowest_m:  # nan compares false
+        return True
+    support = ending.support if ending.outcome.rested else None
+    return support is not None and support.residual <= UNBALANCED and support.highest_m >= lowest_m
+
+
+def _describe(ending: _Ending, support: SupportedBy) -> tuple[Settled, ...]:
+    """The rest poses with their figures, measured between the meshes and not taken from the simulator."""
+    poses, gaps_m, margins_m, residuals = (_measure_single if ending.drop.single else _measure_group)(ending, support)
+    return tuple(
+        Settled(
+            T_world_obj=frozen_array(T),
+            penetration_mm=max(0.0, -gap) * 1e3,
+            hover_gap_mm=max(0.0, gap) * 1e3,
+            support_margin_mm=margin * 1e3,
+            equilibrium_residual=residual,
+            residual_speed_mm_s=ending.outcome.speed_m_s * 1e3,
+            settle_s=ending.seconds,
+            support=support,
+        )
+        for T, gap, margin, residual in zip(poses, gaps_m, margins_m, residuals, strict=True)
+    )
+
+
+_Figures = tuple[Sequence[Pose], Sequence[float], Sequence[float], Sequence[float]]
+"""Poses, gaps in metres, margins of support in metres and equilibrium residuals, one of each per object."""
+
+
+def _measure_group(ending: _Ending, _: SupportedBy) -> _Figures:
+    drop, poses = ending.drop, ending.outcome.poses
+    meshes = [placed_mesh(start, T) for start, T in zip(drop.starts, poses, strict=True)]
+    supports = drop.supports(poses)
+    gaps_m = clearances(meshes, drop.ground.terrain)
+    return poses, gaps_m, [each.margin_m for each in supports], [each.residual for each in supports]
+
+
+def _measure_single(ending: _Ending, support: SupportedBy) -> _Figures:
+    """Raises SettleError `unsupported`."""
+    (start,), ground = ending.drop.starts, ending.drop.ground
+    corrected = support != "placed" and ending.drop.physics.correction
+    T = ending.T_touching if corrected else ending.outcome.poses[0]
+    if support == "mesh":
+        held = ending.support if corrected else ending.drop.supports((T,))[0]
+        margin_m, residual = held.margin_m, held.residual
+    else:
+        com = transform(T, start.asset.mass.com[None, :])[0]
+        margin_m, residual = support_margin(find_contacts_xy(start.hull, T, ground.terrain), com[:2]), 0.0
+    # Uncorrected, an object on a face may touch with one corner only, which shows nothing.
+    judged = support != "flat_top" or corrected
+    if judged and (residual > UNBALANCED or (support != "mesh" and not margin_m > 0.0)):
+        raise SettleError(
+            "unsupported",
+            f"it came to rest with its centre of mass {-margin_m * 1e3:.2f} mm outside the hull of its contacts, which leave "
+            f"{residual:.0%} of its weight without balance: raise physics.snap_rad or lower physics.rest.speed_mm_s",
+        )
+    return [T], [gap_m(start, T, ground)], [margin_m], [residual]
