@@ -69,7 +69,7 @@ def test_a_can_is_braked_against_rolling_only_where_the_plan_runs_rolling_fricti
 
 def test_objects_as_boxes_keep_the_height_of_their_lowest_point_together_as_alone():
     """A tilted can's box reaches lower than the can: let go 1 mm above the table it would begin within the top."""
-    tilted = turn(X, 40)
+    tilted = turn(X, 40) @ turn(np.array([0.0, 0.0, 1.0]), 45)
     can = rod(0.03, 0.1)
     low = float((can.shape.vertices @ tilted.T)[:, 2].min())
     starts = [start_of(can, x, 0.0, 0.001 - low, tilted) for x in (-0.1, 0.1)]
