@@ -19,7 +19,7 @@ from tests.physics.settling import settle_single
 from tests.shapes import asset_of
 from workers.geometry.elevation import survey
 from workers.geometry.frames import transform
-from workers.physics.placement import gap_m, ground_of, placed_mesh
+from workers.physics.placement import Ground, gap_m, placed_mesh
 from workers.physics.separation import clearances
 from workers.plan.effect import Facts
 from workers.plan.effects import PHYSICS_EFFECTS, plan_effects
@@ -52,7 +52,7 @@ def _on_a_ring_from_1_m() -> Facts:
 def test_without_dynamics_an_object_hangs_in_the_air_by_its_clearance():
     facts = facts_with(drop(built_in("mug"), level(), 0.005))
     (start,) = facts.plan.objects
-    air_mm = gap_m(start, start.T_world_obj, ground_of(facts.plan.table)) * 1e3
+    air_mm = gap_m(start, start.T_world_obj, Ground(facts.plan.table)) * 1e3
     assert air_mm == pytest.approx(5.0, abs=1e-6)
     assert air_mm > 10 * GAP_MM
     assert settled(facts).settled[0].hover_gap_mm <= GAP_MM

@@ -154,7 +154,8 @@ def open_world(
             level = len(placed) == 1 and stands_on_face(np.concatenate(body.parts), -T_world_body[2, :3])
             things.append(_add_body(client, body, T_world_body[:3, :3] if level else None))
             _set_surface(client, things[-1], physics, body)
-            _place(client, things[-1], T_world_body)
+            position, quaternion = T_world_body[:3, 3].tolist(), quaternion_of(T_world_body[:3, :3]).tolist()
+            pybullet.resetBasePositionAndOrientation(things[-1], position, quaternion, physicsClientId=client)
         repair_s = REPAIR_S if len(placed) == 1 and not isinstance(ground, Mesh) else 0.0
         world = World(client, things[0], tuple(things[1:]), steps, repair_s)
         world.set_rate(physics.step_hz)
@@ -282,8 +283,3 @@ def _size_m(body: Body) -> float:
     points = np.concatenate(body.parts)
     low, high = points.min(axis=0) - body.margin_m, points.max(axis=0) + body.margin_m
     return float(np.linalg.norm(high - low) + np.linalg.norm(high + low)) / 2.0
-
-
-def _place(client: int, thing: int, T: Pose) -> None:
-    quaternion = quaternion_of(T[:3, :3])
-    pybullet.resetBasePositionAndOrientation(thing, T[:3, 3].tolist(), quaternion.tolist(), physicsClientId=client)

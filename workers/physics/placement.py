@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -38,7 +39,11 @@ class Ground:
     """A table, and its mesh prepared for height queries."""
 
     table: Table
-    terrain: Terrain
+
+    @cached_property
+    def terrain(self) -> Terrain:
+        """The mesh, prepared."""
+        return survey(self.table.mesh)
 
 
 @dataclass(frozen=True)
@@ -53,11 +58,6 @@ class Support:
     margin_m: float
     residual: float
     highest_m: float
-
-
-def ground_of(table: Table) -> Ground:
-    """The table with its mesh prepared."""
-    return Ground(table, survey(table.mesh))
 
 
 def placed_mesh(start: ObjectStart, T_world_obj: Pose) -> Mesh:

@@ -1,5 +1,6 @@
 """The release of a scene's objects in the simulator, with the effects that the plan runs."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -53,8 +54,9 @@ def release(
     if flat and len(bodies) == len(parts) == 1 and stands_on_face(parts[0], down):
         # An object on a level plane touches it with few vertices until it tips, and the time grows with their number. It
         # falls with these, and once more with all of them if it tips.
-        reduced = bodies[0].only(parts[0][can_touch(parts[0], down)])
-        outcome = fall([reduced], poses, ground, physics, steps, free_m, stops | {"tilt": tips_over(T_world_body)})
+        reduced = dataclasses.replace(bodies[0].body, parts=(parts[0][can_touch(parts[0], down)],))
+        body, tilt = dataclasses.replace(bodies[0], body=reduced), {"tilt": tips_over(T_world_body)}
+        outcome = fall([body], poses, ground, physics, steps, free_m, stops | tilt)
         if outcome.stopped_by != "tilt":
             return outcome
     return fall(bodies, poses, ground, physics, steps, free_m, stops)

@@ -97,8 +97,9 @@ def _tipping_axis(low: Array, centre: Array, margin: float) -> tuple[Array, Arra
         return pivot, normal[nearest]
     pivot = _nearest_of_hull(low, centre)
     away = centre[:2] - pivot[:2]
-    if float(np.linalg.norm(away)) < SAME_PLANE_M:  # balanced on a ridge: either side will do
-        away = _across(low)
+    if float(np.linalg.norm(away)) < SAME_PLANE_M:  # balanced on a ridge or a corner: any side will do
+        far = low[np.argmax(np.linalg.norm(low - low[0], axis=1))] - low[0]
+        away = np.array([-far[1], far[0]]) if len(low) > 1 else np.array([1.0, 0.0])
     return pivot, away / np.linalg.norm(away)
 
 
@@ -113,12 +114,6 @@ def _nearest_of_hull(low: Array, centre: Array) -> Array:
             if np.linalg.norm(foot[:2] - centre[:2]) < np.linalg.norm(best[:2] - centre[:2]):
                 best = foot
     return best
-
-
-def _across(low: Array) -> Array:
-    """[2]: level, at right angles to the line to the farthest of the points [N, 3]; along x for one point."""
-    far = low[np.argmax(np.linalg.norm(low - low[0], axis=1))] - low[0]
-    return np.array([-far[1], far[0]]) if len(low) > 1 else np.array([1.0, 0.0])
 
 
 def stands_on_face(vertices: Array, down: Array) -> bool:

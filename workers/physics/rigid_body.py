@@ -50,10 +50,6 @@ class ObjectBody:
     T_obj_body: Pose
     reach_m: float
 
-    def only(self, vertices: Array) -> "ObjectBody":
-        """The same body with these vertices [N, 3], body frame, as its only part."""
-        return dataclasses.replace(self, body=dataclasses.replace(self.body, parts=(vertices,)))
-
 
 def choose_collision_shape(start: ObjectStart, physics: Physics) -> ObjectStart:
     """The object with its bounding box, along its own axes, as its hull where `physics.collision` is box.

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,7 +16,7 @@ from workers.geometry.elevation import heights_at
 from workers.geometry.frames import transform
 from workers.physics.effects import called_for_with
 from workers.physics.fall import Outcome
-from workers.physics.placement import Ground, Support, gap_m, ground_of, measure_supports, placed_mesh, touch_down
+from workers.physics.placement import Ground, Support, gap_m, measure_supports, placed_mesh, touch_down
 from workers.physics.release import release
 from workers.physics.rest_pose import find_contacts_xy, snap_to_face, support_margin, tip_onto_face
 from workers.physics.separation import clearances, overlap_m
@@ -68,10 +68,7 @@ class _Drop:
 
 @dataclass(frozen=True, eq=False)
 class _Ending:
-    """The outcome of a drop after `seconds` in all releases.
-
-    The properties are of a single object, moved along z until it touches the table.
-    """
+    """The outcome of a drop after `seconds` in all, with properties of a single object set down until it touches."""
 
     drop: _Drop
     outcome: Outcome
@@ -95,7 +92,7 @@ def settle(
     where the centre of mass of a single object goes further than `room_m` sideways. Several objects are not corrected after
     the simulation, which their figures then describe.
     """
-    drop = _Drop(tuple(starts), ground_of(table), physics, effects, room_m)
+    drop = _Drop(tuple(starts), Ground(table), physics, effects, room_m)
     if not effects.runs("dynamics"):
         placed = Outcome(tuple(start.T_world_obj for start in starts), 0.0, 0.0, rested=True)
         return _describe(_Ending(drop, placed, 0.0), "placed")
@@ -104,16 +101,22 @@ def settle(
         ending = _come_to_rest(drop, flat=True)
         if ending is not None:
             return _describe(ending, "flat_top")
-        ran = (*effects.ran, *called_for_with("table_mesh", starts, physics))
-        drop = dataclasses.replace(drop, effects=dataclasses.replace(effects, ran=ran))
+        late = called_for_with("table_mesh", starts, physics)
+        drop = dataclasses.replace(drop, effects=add_effects(effects, late))
     ending = _come_to_rest(drop, flat=False)
     assert ending is not None  # only the flat top has an edge
     return _describe(ending, "mesh")
 
 
+def add_effects(effects: EffectPlan, names: Iterable[str]) -> EffectPlan:
+    """The plan with these effects run too."""
+    return dataclasses.replace(effects, ran=(*effects.ran, *names))
+
+
 def _require_apart(starts: Sequence[ObjectStart]) -> None:
-    for one, other in itertools.combinations(starts, 2):
-        overlap = overlap_m(*(placed_mesh(start, start.T_world_obj) for start in (one, other)))
+    placed = [(start, placed_mesh(start, start.T_world_obj)) for start in starts]
+    for (one, mesh), (other, its_mesh) in itertools.combinations(placed, 2):
+        overlap = overlap_m(mesh, its_mesh)
         if overlap > MOST_OVERLAP_M:
             raise SettleError(
                 "objects_overlap",
@@ -128,10 +131,12 @@ def _come_to_rest(drop: _Drop, flat: bool) -> _Ending | None:
     Rolling friction can hold a single object out of balance, within its lever arm of an edge of the hull or of the contacts
     (half a millimetre by default), where in truth it tips on. It is released again with less rolling friction.
     """
-    seconds, ending = 0.0, None
-    for physics, damping in _attempts(drop):
-        table = drop.ground.table
-        outcome = release(drop.starts, table, physics, drop.effects, flat, drop.room_m, damping)
+    seconds, ending, physics = 0.0, None, drop.physics
+    repeated = drop.single and drop.effects.runs("rolling_friction")
+    for share in LESS_ROLLING_FRICTION if repeated else LESS_ROLLING_FRICTION[:1]:
+        less = physics.model_copy(update={"rolling_friction": share * physics.rolling_friction})
+        damping = 0.0 if share == 1.0 else DAMPING
+        outcome = release(drop.starts, drop.ground.table, less, drop.effects, flat, drop.room_m, damping)
         if outcome.stopped_by == "room":
             raise LeftRoomError
         if outcome.stopped_by == "edge":
@@ -147,15 +152,6 @@ def _come_to_rest(drop: _Drop, flat: bool) -> _Ending | None:
     return ending
 
 
-def _attempts(drop: _Drop) -> Iterator[tuple[Physics, float]]:
-    """(settings, damping) of each release in turn."""
-    physics = drop.physics
-    repeated = drop.single and drop.effects.runs("rolling_friction")
-    for share in LESS_ROLLING_FRICTION if repeated else LESS_ROLLING_FRICTION[:1]:
-        less = physics.model_copy(update={"rolling_friction": share * physics.rolling_friction})
-        yield less, 0.0 if share == 1.0 else DAMPING
-
-
 def _balance(ending: _Ending, flat: bool) -> tuple[_Ending, bool]:
     """(the ending with a single object on the flat top turned onto its face, whether no further release is needed).
 
@@ -163,11 +159,9 @@ def _balance(ending: _Ending, flat: bool) -> tuple[_Ending, bool]:
     rods released on an edge. Where the next face is far, it is released again.
     """
     drop, outcome = ending.drop, ending.outcome
-    if not drop.single:
-        return ending, True
-    if not flat:
+    if drop.single and not flat:
         return ending, ending.support.residual <= BALANCED
-    if not drop.physics.correction:
+    if not drop.single or not drop.physics.correction:
         return ending, True
     hull, com = drop.starts[0].hull, drop.starts[0].asset.mass.com
     T = snap_to_face(outcome.poses[0], hull, com, drop.physics.snap_rad)
@@ -206,17 +200,15 @@ def _is_on_table(ending: _Ending, com: Array) -> bool:
     drop, ground = ending.drop, ending.drop.ground
     lowest_m = ground.table.top.height_m - LEFT_M
     high = bool(com[2] >= lowest_m)
-    if not drop.single:
+    # nan compares false
+    if not drop.single or (high and heights_at(com[None, :2], ground.terrain)[0] >= lowest_m):
         return high
-    if high and heights_at(com[None, :2], ground.terrain)[0] >= lowest_m:  # nan compares false
-        return True
-    support = ending.support if ending.outcome.rested else None
-    return support is not None and support.residual <= UNBALANCED and support.highest_m >= lowest_m
+    return ending.outcome.rested and ending.support.residual <= UNBALANCED and ending.support.highest_m >= lowest_m
 
 
 def _describe(ending: _Ending, support: SupportedBy) -> tuple[Settled, ...]:
     """The rest poses with their figures, measured between the meshes and not taken from the simulator."""
-    poses, gaps_m, margins_m, residuals = (_measure_single if ending.drop.single else _measure_group)(ending, support)
+    measured = [_measure_single(ending, support)] if ending.drop.single else _measure_group(ending)
     return tuple(
         Settled(
             T_world_obj=frozen_array(T),
@@ -228,24 +220,20 @@ def _describe(ending: _Ending, support: SupportedBy) -> tuple[Settled, ...]:
             settle_s=ending.seconds,
             support=support,
         )
-        for T, gap, margin, residual in zip(poses, gaps_m, margins_m, residuals, strict=True)
+        for T, gap, margin, residual in measured
     )
 
 
-_Figures = tuple[Sequence[Pose], Sequence[float], Sequence[float], Sequence[float]]
-"""Poses, gaps in metres, margins of support in metres and equilibrium residuals, one of each per object."""
-
-
-def _measure_group(ending: _Ending, _: SupportedBy) -> _Figures:
+def _measure_group(ending: _Ending) -> list[tuple[Pose, float, float, float]]:
+    """(pose, gap in metres, margin of support in metres, equilibrium residual) of every object."""
     drop, poses = ending.drop, ending.outcome.poses
-    meshes = [placed_mesh(start, T) for start, T in zip(drop.starts, poses, strict=True)]
+    gaps_m = clearances([placed_mesh(*one) for one in zip(drop.starts, poses, strict=True)], drop.ground.terrain)
     supports = drop.supports(poses)
-    gaps_m = clearances(meshes, drop.ground.terrain)
-    return poses, gaps_m, [each.margin_m for each in supports], [each.residual for each in supports]
+    return [(T, gap, each.margin_m, each.residual) for T, gap, each in zip(poses, gaps_m, supports, strict=True)]
 
 
-def _measure_single(ending: _Ending, support: SupportedBy) -> _Figures:
-    """Raises SettleError `unsupported`."""
+def _measure_single(ending: _Ending, support: SupportedBy) -> tuple[Pose, float, float, float]:
+    """The same figures of a single object. Raises SettleError `unsupported`."""
     (start,), ground = ending.drop.starts, ending.drop.ground
     corrected = support != "placed" and ending.drop.physics.correction
     T = ending.T_touching if corrected else ending.outcome.poses[0]
@@ -263,4 +251,4 @@ def _measure_single(ending: _Ending, support: SupportedBy) -> _Figures:
             f"it came to rest with its centre of mass {-margin_m * 1e3:.2f} mm outside the hull of its contacts, which leave "
             f"{residual:.0%} of its weight without balance: raise physics.snap_rad or lower physics.rest.speed_mm_s",
         )
-    return [T], [gap_m(start, T, ground)], [margin_m], [residual]
+    return T, gap_m(start, T, ground), margin_m, residual

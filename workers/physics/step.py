@@ -13,7 +13,7 @@ from workers.geometry.frames import moved_between
 from workers.physics.effects import called_for_with, rooms_m
 from workers.physics.fall import FINEST
 from workers.physics.release import release
-from workers.physics.settle import LeftRoomError, settle
+from workers.physics.settle import LeftRoomError, add_effects, settle
 
 RECHECK_S = 1.0
 """Simulated time of the second release."""
@@ -47,7 +47,7 @@ def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan) -> Rest
             )
         except LeftRoomError:
             called = dict.fromkeys(called_for_with("object_contacts", starts, physics), LEFT_ROOM)
-            settled = settle(starts, table, physics, _adding(effects, called))
+            settled = settle(starts, table, physics, add_effects(effects, called))
     if any(rest.support == "mesh" for rest in settled):
         called |= dict.fromkeys(called_for_with("table_mesh", starts, physics), LEFT_TOP)
     return Rest(settled, {name: why for name, why in called.items() if not effects.runs(name)})
@@ -55,7 +55,7 @@ def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan) -> Rest
 
 def recheck_scene(plan: ScenePlan, rest: Rest, physics: Physics, effects: EffectPlan) -> Rest:
     """The same rest, with the motion of every object after a second release of all."""
-    poses = release_again(plan, rest.settled, physics, _adding(effects, rest.called), RECHECK_S)
+    poses = release_again(plan, rest.settled, physics, add_effects(effects, rest.called), RECHECK_S)
     settled = []
     for start, before, after in zip(plan.objects, rest.settled, poses, strict=True):
         moved_mm, turned_deg = moved_by(start, before.T_world_obj, after)
@@ -90,8 +90,3 @@ def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, floa
     """(mm that the farthest point of an object moves between two poses, degrees that it turns)."""
     moved_m, turned_rad = moved_between(start.hull.vertices, before, after)
     return moved_m * 1e3, math.degrees(turned_rad)
-
-
-def _adding(effects: EffectPlan, names: Mapping[str, str]) -> EffectPlan:
-    """The plan with these effects run too."""
-    return dataclasses.replace(effects, ran=(*effects.ran, *names))

@@ -62,10 +62,8 @@ def place_table(asset: Asset) -> Table:
     lowest = float(asset.shape.bounds[0, 2])
     T = translation(-top.centre[0], -top.centre[1], -lowest)
     mesh = Mesh(frozen_array(transform(T, asset.shape.vertices)), asset.shape.faces)
-    outline = frozen_array(top.outline - top.centre)
-    return Table(
-        asset, frozen_array(T), mesh, TableTop(top.height_m - lowest, frozen_array([0.0, 0.0]), outline, top.convex)
-    )
+    outline, centre = frozen_array(top.outline - top.centre), frozen_array([0.0, 0.0])
+    return Table(asset, frozen_array(T), mesh, TableTop(top.height_m - lowest, centre, outline, top.convex))
 
 
 def inside_margin(points_xy: Array, outline: Array) -> Array:

@@ -1,4 +1,4 @@
-"""A cache of convex parts in memory and in files, which may be deleted at any time."""
+"""A cache of convex parts in memory and in files, which may be deleted."""
 
 import hashlib
 import io
@@ -8,18 +8,27 @@ from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from schemas.base import Array, frozen_array
 
-Answer = tuple[str, tuple[Array, ...]]
-"""The method that made the parts, and the vertices [N, 3] of each."""
-
 CAPACITY_BYTES = 64 * 1024 * 1024
 """Memory per process: a thousand mugs."""
 
 DIGEST_BYTES = 32
+
+
+class Parts(NamedTuple):
+    """Vertices [N, 3] float64, metres, of each convex part of a body, and how they were made.
+
+    convex: every piece of the body is; coacd: by CoACD; pieces: CoACD failed, and they are the hulls of the pieces; lofts:
+    from the making of a built-in shape.
+    """
+
+    clouds: tuple[Array, ...]
+    method: str
 
 
 def _usual_folder() -> Path | None:
@@ -42,40 +51,39 @@ def key_of(*inputs: str | bytes) -> str:
 
 
 class PartsCache:
-    """The answers used last that fit `capacity_bytes`, at least one. Each is also kept as a file if a folder is given.
+    """The parts used last that fit `capacity_bytes`, at least of one body, and files of all parts if a folder is given.
 
-    A file begins with the SHA-256 of its content, so that a torn one is found and made again, and is renamed into place.
-    A folder that cannot be written is ignored.
+    A file begins with the SHA-256 of its content, by which a torn one is found and made again, and is renamed into place. A
+    folder that cannot be written is ignored.
     """
 
     def __init__(self, capacity_bytes: int = CAPACITY_BYTES) -> None:
         self.capacity_bytes = capacity_bytes
         self.bytes = 0
-        self._answers: OrderedDict[str, Answer] = OrderedDict()
+        self._kept: OrderedDict[str, Parts] = OrderedDict()
 
     def __len__(self) -> int:
-        return len(self._answers)
+        return len(self._kept)
 
-    def get(self, key: str, folder: Path | None, make: Callable[[], Answer]) -> Answer:
-        """The answer of this key: from memory, from the folder, or made. An exception of `make` leaves no trace."""
-        if key in self._answers:
-            self._answers.move_to_end(key)
-            return self._answers[key]
-        answer = None if folder is None else _read(folder / key)
-        if answer is None:
-            answer = make()
+    def get(self, key: str, folder: Path | None, make: Callable[[], Parts]) -> Parts:
+        """The parts of this key: from memory, from the folder, or made. An exception of `make` leaves no trace."""
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            return self._kept[key]
+        parts = None if folder is None else _read(folder / key)
+        if parts is None:
+            parts = make()
             if folder is not None:
                 with suppress(OSError):
-                    _write(folder, key, answer)
-        self._answers[key] = answer
-        self.bytes += sum(cloud.nbytes for cloud in answer[1])
-        while self.bytes > self.capacity_bytes and len(self._answers) > 1:
-            _, (_, clouds) = self._answers.popitem(last=False)
-            self.bytes -= sum(cloud.nbytes for cloud in clouds)
-        return answer
+                    _write(folder, key, parts)
+        self._kept[key] = parts
+        self.bytes += sum(cloud.nbytes for cloud in parts.clouds)
+        while self.bytes > self.capacity_bytes and len(self._kept) > 1:
+            self.bytes -= sum(cloud.nbytes for cloud in self._kept.popitem(last=False)[1].clouds)
+        return parts
 
 
-def _read(path: Path) -> Answer | None:
+def _read(path: Path) -> Parts | None:
     try:
         data = path.read_bytes()
     except OSError:
@@ -84,13 +92,12 @@ def _read(path: Path) -> Answer | None:
         return None
     with np.load(io.BytesIO(data[DIGEST_BYTES:])) as stored:
         clouds = np.split(stored["vertices"], np.cumsum(stored["counts"])[:-1])
-        return str(stored["method"]), tuple(frozen_array(cloud) for cloud in clouds)
+        return Parts(tuple(frozen_array(cloud) for cloud in clouds), str(stored["method"]))
 
 
-def _write(folder: Path, key: str, answer: Answer) -> None:
-    method, clouds = answer
-    content = io.BytesIO()
-    np.savez(content, method=method, vertices=np.concatenate(clouds), counts=[len(cloud) for cloud in clouds])
+def _write(folder: Path, key: str, parts: Parts) -> None:
+    content, counts = io.BytesIO(), [len(cloud) for cloud in parts.clouds]
+    np.savez(content, method=parts.method, vertices=np.concatenate(parts.clouds), counts=counts)
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=folder, prefix=f".{key}.", delete=False) as file:
         try:

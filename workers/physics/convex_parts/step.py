@@ -2,9 +2,8 @@
 
 Parts of built-in shapes follow from their making instead: see `workers.geometry.lathe_decomposition`.
 
-CoACD on built-in shapes, number 0 of each category, 0.25 m along their diagonal, by threshold: parts / vertices of all parts /
-seconds on one busy core / greatest distance in millimetres that parts stand out of the surface. Half of the parts' surface
-lies on the shape's (except at 0.1), and nothing outside the hull.
+CoACD on built-in shapes, number 0 of each category, 0.25 m along their diagonal, by threshold: parts / their vertices / seconds
+on one busy core / millimetres that parts stand out at most. Half of the parts' surface is the shape's (except at 0.1).
 
              0.1                        0.05                       0.02
     mug      22 / 1,545 / 2.9 / 7.4     59 / 2,462 / 2.6 / 3.9     220 / 5,153 / 6.1 / 1.6
@@ -21,11 +20,9 @@ import json
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Literal
 
 import manifold3d
 import numpy as np
@@ -39,7 +36,7 @@ from workers.geometry.convexity import components, is_convex_surface, solid_of, 
 from workers.geometry.hull import convex_hull
 from workers.geometry.lathe_decomposition import TOLERANCE, parts_of_lofts
 from workers.physics.convex_parts.coacd_process import MISSING
-from workers.physics.convex_parts.parts_cache import USUAL_FOLDER, PartsCache, key_of
+from workers.physics.convex_parts.parts_cache import USUAL_FOLDER, Parts, PartsCache, key_of
 
 THRESHOLD = 0.05
 """CoACD's concavity at which it stops, in units in which the mesh is 2 across. 0.02 halves the error and triples the parts."""
@@ -67,20 +64,6 @@ NOT_INSTALLED = "the package `{}` is not installed, or cannot be loaded: set Ver
 LONGEST_S = 300
 """Time limit: on some broken meshes CoACD never ends. The slowest that did end took a tenth of this."""
 
-Method = Literal["convex", "coacd", "pieces"]
-
-
-@dataclass(frozen=True, eq=False)
-class Parts:
-    """Vertices [N, 3] float64, metres, of each convex part, and how the parts were made.
-
-    convex: every piece of the body is; coacd: by CoACD; pieces: CoACD failed, and the parts are the hulls of the pieces.
-    """
-
-    clouds: tuple[Array, ...]
-    method: Method
-
-
 _CACHE = PartsCache()
 
 
@@ -95,21 +78,19 @@ def parts_of(asset: Asset, threshold: float = THRESHOLD, share: float = TOLERANC
         return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
     key = key_of("lofts", repr(share), asset.sha256, asset.shape.mesh.vertices.tobytes())
     try:
-        return _CACHE.get(key, None, lambda: ("lofts", parts_of_lofts(lofts, share)))[1]
+        return _CACHE.get(key, None, lambda: Parts(parts_of_lofts(lofts, share), "lofts")).clouds
     except (ValueError, shapely.errors.GEOSException):
         return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
 
 
 def decompose(mesh: Mesh, digest: str, threshold: float = THRESHOLD, folder: Path | None = USUAL_FOLDER) -> Parts:
-    """Convex parts of a mesh: all within its hull, and together with the hull's vertices.
+    """Convex parts of a mesh: all within its hull, and together with the hull's vertices. Connected pieces are cut apart.
 
-    Each connected piece is cut by itself. The same arguments give the same bytes in every process, so results are kept in
-    memory and in `folder` (None: nowhere). Raises MachineError where CoACD is missing or was killed from outside, MeshError
-    `no_convex_parts` where it does not end.
+    The same arguments give the same bytes in every process, so results are kept in memory and in `folder` (None: nowhere).
+    Raises MachineError if CoACD is missing or was killed from outside, MeshError `no_convex_parts` if it does not end.
     """
     key = key_of(_version(), repr(threshold), digest, mesh.vertices.tobytes(), mesh.faces.tobytes())
-    method, clouds = _CACHE.get(key, folder, lambda: _decompose(mesh, threshold))
-    return Parts(clouds, method)  # type: ignore[arg-type]
+    return _CACHE.get(key, folder, lambda: _decompose(mesh, threshold))
 
 
 @cache
@@ -124,31 +105,28 @@ def _version() -> str:
         raise MachineError(NOT_INSTALLED.format(error.name)) from error
 
 
-def _decompose(mesh: Mesh, threshold: float) -> tuple[Method, tuple[Array, ...]]:
+def _decompose(mesh: Mesh, threshold: float) -> Parts:
     welded = weld(mesh)
     pieces = components(welded)
     if not pieces:
-        return "convex", (frozen_array(convex_hull(mesh.vertices).vertices),)
+        return Parts((frozen_array(convex_hull(mesh.vertices).vertices),), "convex")
     if len(pieces) > MOST_PIECES:
         pieces = [welded]
     made = [_parts_of(piece, threshold) for piece in pieces]
-    methods = {method for method, _ in made}
-    method: Method = "pieces" if "pieces" in methods else "coacd" if "coacd" in methods else "convex"
-    return method, tuple(frozen_array(cloud) for _, clouds in made for cloud in clouds)
+    method = max((method for method, _ in made), key=("convex", "coacd", "pieces").index)
+    return Parts(tuple(frozen_array(cloud) for _, clouds in made for cloud in clouds), method)
 
 
-def _parts_of(piece: Mesh, threshold: float) -> tuple[Method, list[Array]]:
+def _parts_of(piece: Mesh, threshold: float) -> tuple[str, list[Array]]:
     if len(piece.vertices) < 4:
         return "convex", [piece.vertices]
     hull, solid = convex_hull(piece.vertices), solid_of(piece)
     if is_convex_surface(piece, solid):
         return "convex", [hull.vertices]
+    options = {**OPTIONS, **(OPEN if solid is None else CLOSED), "threshold": threshold}
     size = float(np.linalg.norm(np.ptp(hull.vertices, axis=0)))
-    if solid is None:
-        found = _run(piece, {**OPTIONS, **OPEN, "threshold": threshold})
-    else:
-        found = _run(triangles_of(solid.simplify(SIMPLER * size)), {**OPTIONS, **CLOSED, "threshold": threshold})
-    fitted = _fit(found, hull.vertices, hull.normals)
+    cut = _run(piece if solid is None else triangles_of(solid.simplify(SIMPLER * size)), options)
+    fitted = _fit(cut, hull.vertices, hull.normals)
     return ("coacd", fitted) if fitted else ("pieces", [hull.vertices])
 
 

@@ -1,6 +1,5 @@
 """Convex parts, against bodies whose parts are known, and in processes that must agree."""
 
-import hashlib
 import os
 import subprocess
 import sys
@@ -18,7 +17,6 @@ from workers.assets.builtin.make import make_asset
 from workers.geometry.convexity import components, concavity_m, weld
 from workers.geometry.hull import convex_hull
 from workers.physics.convex_parts import step as module
-from workers.physics.convex_parts.parts_cache import PartsCache
 from workers.physics.convex_parts.step import decompose
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -49,10 +47,6 @@ def tray():
 def holds(cloud, point):
     hull = ConvexHull(cloud)
     return bool((hull.equations[:, :3] @ point + hull.equations[:, 3] <= 1e-9).all())
-
-
-def digest_of(parts):
-    return hashlib.sha256(b"".join(cloud.tobytes() + b"|" for cloud in parts.clouds)).hexdigest()
 
 
 def test_a_convex_body_is_its_own_part():
@@ -193,45 +187,9 @@ def test_parts_are_the_same_bytes_on_one_core_and_two_and_after_other_meshes():
     assert run(free, "2", "camera", "laptop") == first
 
 
-def test_an_answer_comes_from_memory_then_from_the_folder_and_is_the_same(tmp_path, monkeypatch):
-    made = decompose(angle_iron(), "kept", folder=tmp_path)
-    assert len(list(tmp_path.iterdir())) == 1
-    monkeypatch.setattr(module, "_run", lambda *_: pytest.fail("made once more"))
-    assert digest_of(decompose(angle_iron(), "kept", folder=None)) == digest_of(made), "from memory"
-    monkeypatch.setattr(module, "_CACHE", PartsCache())
-    again = decompose(angle_iron(), "kept", folder=tmp_path)
-    assert (again.method, digest_of(again)) == (made.method, digest_of(made))
-    assert not again.clouds[0].flags.writeable
-
-
-@pytest.mark.parametrize("harm", [lambda data: data[:-7], lambda _: b"", lambda data: data[:60] + b"x" + data[61:]])
-def test_a_torn_file_is_made_again(tmp_path, monkeypatch, harm):
-    monkeypatch.setattr(module, "_CACHE", PartsCache())
-    made = decompose(angle_iron(), "torn", folder=tmp_path)
-    (path,) = tmp_path.iterdir()
-    whole = path.read_bytes()
-    path.write_bytes(harm(whole))
-    monkeypatch.setattr(module, "_CACHE", PartsCache())
-    assert digest_of(decompose(angle_iron(), "torn", folder=tmp_path)) == digest_of(made)
-    assert path.read_bytes() == whole
-
-
-def test_a_folder_that_cannot_be_written_costs_nothing_but_time(tmp_path):
-    (tmp_path / "file").write_text("no folder")
-    assert len(decompose(angle_iron(), "nowhere", folder=tmp_path / "file" / "parts").clouds) == 2
-
-
 def test_another_mesh_under_the_same_digest_is_another_mesh():
     """A digest may be that of a source file, which is the same at every scale."""
     small, large = angle_iron(), angle_iron()
     large = Mesh(large.vertices * 2.0, large.faces)
     assert np.ptp(np.concatenate(decompose(small, "same").clouds), axis=0).max() == pytest.approx(0.1)
     assert np.ptp(np.concatenate(decompose(large, "same").clouds), axis=0).max() == pytest.approx(0.2)
-
-
-def test_memory_is_bounded_and_the_latest_stay():
-    cache = PartsCache(capacity_bytes=100)
-    for key in "abc":
-        cache.get(key, None, lambda: ("convex", (np.zeros((2, 3)),)))
-    assert (len(cache), cache.bytes) == (2, 96)
-    cache.get("c", None, lambda: pytest.fail("forgotten"))
