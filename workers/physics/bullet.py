@@ -135,9 +135,10 @@ def open_world(
     much as a simulation. Earlier simulations leave no trace in the bits: one body and the ground are a single pair,
     without an order of pairs, contacts or islands; with more bodies everything is reset first. Blocks do not nest.
     """
-    client = _connection()
+    connection = _connect()
+    client = connection.client
     if len(placed) > 1:
-        _reset(client)
+        connection.reset()
     reach = reach_m if isinstance(ground, Mesh) else math.inf
     pybullet.setPhysicsEngineParameter(
         numSolverIterations=physics.solver_iterations,
@@ -148,7 +149,7 @@ def open_world(
     pybullet.setGravity(0.0, 0.0, -GRAVITY_M_S2, physicsClientId=client)
     things: list[int] = []
     try:
-        things.append(_add_mesh(client, ground) if isinstance(ground, Mesh) else _add_slab(client, ground))
+        things.append(_add_ground(client, ground))
         _set_surface(client, things[0], physics)
         for body, T_world_body in placed:
             level = len(placed) == 1 and stands_on_face(np.concatenate(body.parts), -T_world_body[2, :3])
@@ -164,46 +165,41 @@ def open_world(
             world.set_rate(physics.step_hz, bounces=True)
         yield world
     finally:
-        _clear(client, things, 1 + len(placed))
+        connection.clear(things, 1 + len(placed))
 
 
 @dataclass
-class _Use:
-    """Number of worlds since the last reset."""
+class _Connection:
+    """The connection of the process, with the number of worlds since its last reset."""
 
+    client: int
     worlds: int = 0
+
+    def reset(self) -> None:
+        pybullet.resetSimulation(physicsClientId=self.client)
+        self.worlds = 0
+
+    def clear(self, things: list[int], whole: int) -> None:
+        self.worlds += 1
+        if self.worlds >= WORLDS_BEFORE_RESET or len(things) < whole:
+            self.reset()
+            return
+        for thing in reversed(things):
+            pybullet.removeBody(thing, physicsClientId=self.client)
 
 
 _BUFFERS = BulletBuffers()
-_USE = _Use()
 
 
 @cache
-def _connection() -> int:
-    client: int = pybullet.connect(pybullet.DIRECT)
-    return client
+def _connect() -> _Connection:
+    return _Connection(pybullet.connect(pybullet.DIRECT))
 
 
-def _reset(client: int) -> None:
-    pybullet.resetSimulation(physicsClientId=client)
-    _USE.worlds = 0
-
-
-def _clear(client: int, things: list[int], whole: int) -> None:
-    _USE.worlds += 1
-    if _USE.worlds >= WORLDS_BEFORE_RESET or len(things) < whole:
-        _reset(client)
-        return
-    for thing in reversed(things):
-        pybullet.removeBody(thing, physicsClientId=client)
-
-
-def _add_slab(client: int, height_m: float) -> int:
-    shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=SLAB_HALF_M, physicsClientId=client)
-    return pybullet.createMultiBody(0, shape, basePosition=[0, 0, height_m - SLAB_HALF_M[2]], physicsClientId=client)
-
-
-def _add_mesh(client: int, mesh: Mesh) -> int:
+def _add_ground(client: int, mesh: float | Mesh) -> int:
+    if not isinstance(mesh, Mesh):
+        shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=SLAB_HALF_M, physicsClientId=client)
+        return pybullet.createMultiBody(0, shape, basePosition=[0, 0, mesh - SLAB_HALF_M[2]], physicsClientId=client)
     if len(mesh.vertices) > MOST_GROUND_VERTICES or 3 * len(mesh.faces) > MOST_GROUND_INDICES:
         raise SettleError(
             "table_too_fine",

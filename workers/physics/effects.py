@@ -84,10 +84,6 @@ def _resting(predicate: Predicate) -> Predicate:
     return skipped
 
 
-def _always(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
-    return None
-
-
 def _table_mesh(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
     over_top = all(starts_over_top(start, table) for start in starts)
     return "all starts over the table's convex flat top, and nothing left it" if over_top else None
@@ -127,11 +123,11 @@ def _restitution(starts: Sequence[ObjectStart], table: Table, physics: Physics) 
 
 
 PREDICATES: dict[str, Predicate] = {
-    "dynamics": _resting(_always),
+    "dynamics": _resting(lambda *_: None),
     "table_mesh": _resting(_table_mesh),
     "object_contacts": _resting(_object_contacts),
     "decomposition": _resting(_decomposition),
-    "fine_step": _resting(_always),
+    "fine_step": _resting(lambda *_: None),
     "rolling_friction": _resting(_rolling),
     "restitution": _resting(_restitution),
 }

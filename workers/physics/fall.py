@@ -15,7 +15,7 @@ from schemas.scene.shape import Mesh
 from workers.geometry.frames import invert, pose, rotation_from_quaternion, translation
 from workers.geometry.hull_offset import least_width_m
 from workers.physics.bullet import GRAVITY_M_S2, World, open_world
-from workers.physics.rigid_body import BodyPose, ObjectBody
+from workers.physics.rigid_body import Body, BodyPose
 from workers.physics.stop_conditions import StopCondition
 from workers.physics.table_top import support_height
 
@@ -97,7 +97,7 @@ def free_fall_m(points: Array, table: Table, flat: bool) -> float:
 
 
 def fall(
-    bodies: Sequence[ObjectBody],
+    bodies: Sequence[Body],
     poses: Sequence[Pose],
     ground: float | Mesh,
     physics: Physics,
@@ -112,7 +112,7 @@ def fall(
     """
     fallen_m = min(max(0.0, free_m - SKIPPED_TO_M), GRAVITY_M_S2 * physics.max_settle_s**2 / 2)
     lower = translation(0.0, 0.0, -fallen_m)
-    placed = [(one.body, lower @ T @ one.T_obj_body) for one, T in zip(bodies, poses, strict=True)]
+    placed = [(one, lower @ T @ one.T_obj_body) for one, T in zip(bodies, poses, strict=True)]
     speed_m_s = math.sqrt(2.0 * GRAVITY_M_S2 * fallen_m)
     fallen_s = speed_m_s / GRAVITY_M_S2
     reach_m = REACH_STEPS * max(steps.max_travel_m, speed_m_s / (FINEST * physics.step_hz))
@@ -136,7 +136,7 @@ class _Stillness:
 
 def _simulate(
     world: World,
-    bodies: Sequence[ObjectBody],
+    bodies: Sequence[Body],
     physics: Physics,
     steps: StepSizes,
     limits_s: tuple[float, float],
@@ -180,7 +180,7 @@ def _simulate(
             return Outcome(tuple(map(as_pose, at)), max(speeds), time, False)
 
 
-def _speeds(world: World, bodies: Sequence[ObjectBody]) -> list[float]:
+def _speeds(world: World, bodies: Sequence[Body]) -> list[float]:
     """For each body an upper bound on the speed of its fastest point, m/s."""
     moving = [world.velocity(k) for k in range(len(bodies))]
     return [math.hypot(*v) + math.hypot(*w) * body.reach_m for (v, w), body in zip(moving, bodies, strict=True)]

@@ -1,6 +1,5 @@
 """Objects on a table: the remaining gap, the final descent onto the mesh, and the contacts that hold them up. Pure."""
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +15,7 @@ from workers.geometry.elevation import Terrain, survey
 from workers.geometry.frames import transform, translation
 from workers.physics.equilibrium import FIXED, Contact, Weight, equilibrium_residual, support_margin_m
 from workers.physics.rest_pose import CONTACT_M
-from workers.physics.separation import above_ground, between, ground_gap_m
+from workers.physics.separation import above_ground, between, find_near, ground_gap_m
 
 HOOKED_M = 0.03
 """Depth below the table's top from which part of the table may be above part of the object."""
@@ -116,11 +115,8 @@ def measure_supports(
 def _find_contacts(meshes: Sequence[Mesh], table: Mesh) -> list[Contact]:
     """Contacts of every mesh with the table, and of every two whose boxes are near one another."""
     found = [Contact(k, FIXED, *touching_points(mesh, table, CONTACT_M)) for k, mesh in enumerate(meshes)]
-    boxes = [(mesh.vertices.min(axis=0) - CONTACT_M, mesh.vertices.max(axis=0) + CONTACT_M) for mesh in meshes]
-    for i, j in itertools.combinations(range(len(meshes)), 2):
-        if (boxes[i][0] <= boxes[j][1]).all() and (boxes[j][0] <= boxes[i][1]).all():
-            found.append(Contact(i, j, *touching_points(meshes[i], meshes[j], CONTACT_M)))
-    return found
+    pairs = find_near(meshes, 2.0 * CONTACT_M)
+    return found + [Contact(i, j, *touching_points(meshes[i], meshes[j], CONTACT_M)) for i, j in pairs]
 
 
 def _describe_support(number: int, contacts: Sequence[Contact], weight: Weight, residual: float) -> Support:

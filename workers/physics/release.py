@@ -50,13 +50,12 @@ def release(
     T_world_body = poses[0] @ bodies[0].T_obj_body
     if math.isfinite(room_m):
         stops["room"] = leaves_room(T_world_body[:2, 3], room_m)
-    parts, down = bodies[0].body.parts, -T_world_body[2, :3]
+    parts, down = bodies[0].parts, -T_world_body[2, :3]
     if flat and len(bodies) == len(parts) == 1 and stands_on_face(parts[0], down):
         # An object on a level plane touches it with few vertices until it tips, and the time grows with their number. It
         # falls with these, and once more with all of them if it tips.
-        reduced = dataclasses.replace(bodies[0].body, parts=(parts[0][can_touch(parts[0], down)],))
-        body, tilt = dataclasses.replace(bodies[0], body=reduced), {"tilt": tips_over(T_world_body)}
-        outcome = fall([body], poses, ground, physics, steps, free_m, stops | tilt)
+        reduced = dataclasses.replace(bodies[0], parts=(parts[0][can_touch(parts[0], down)],))
+        outcome = fall([reduced], poses, ground, physics, steps, free_m, stops | {"tilt": tips_over(T_world_body)})
         if outcome.stopped_by != "tilt":
             return outcome
     return fall(bodies, poses, ground, physics, steps, free_m, stops)

@@ -1,7 +1,7 @@
 """The rigid bodies that the simulator is given: convex parts about a centre of mass. Pure."""
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -26,10 +26,11 @@ BodyPose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A rigid body in its centre of mass and principal axes.
+    """A rigid body in its centre of mass and principal axes, which `T_obj_body` [4, 4] takes to the object's frame.
 
     moments [3] kg m^2; parts: the vertices [N, 3], metres, of convex parts, each with a margin of `margin_m` about it. One
-    part may be a single point, which makes a ball of the margin. `damping` is Bullet's, of speed and spin.
+    part may be a single point, which makes a ball of the margin. `damping` is Bullet's, of speed and spin; reach_m: from the
+    centre of mass to the farthest vertex of the object.
     """
 
     mass_kg: float
@@ -37,18 +38,8 @@ class Body:
     parts: tuple[Array, ...]
     margin_m: float
     damping: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectBody:
-    """An object's rigid body.
-
-    T_obj_body [4, 4]: centre of mass and principal axes; reach_m: from the centre of mass to the farthest vertex.
-    """
-
-    body: Body
-    T_obj_body: Pose
-    reach_m: float
+    T_obj_body: Pose = field(default_factory=lambda: np.eye(4))
+    reach_m: float = 0.0
 
 
 def choose_collision_shape(start: ObjectStart, physics: Physics) -> ObjectStart:
@@ -68,7 +59,7 @@ def choose_collision_shape(start: ObjectStart, physics: Physics) -> ObjectStart:
 
 def build_body(
     start: ObjectStart, physics: Physics, effects: EffectPlan, damping: float = 0.0, share: float = TOLERANCE
-) -> ObjectBody:
+) -> Body:
     """The object as its convex parts where the effect `decomposition` runs and it has several, else as its hull.
 
     share: of their size, by which parts of built-in shapes may stand out.
@@ -79,7 +70,7 @@ def build_body(
     return make_body(start, physics, damping, parts if len(parts) > 1 else ())
 
 
-def make_body(start: ObjectStart, physics: Physics, damping: float = 0.0, parts: tuple[Array, ...] = ()) -> ObjectBody:
+def make_body(start: ObjectStart, physics: Physics, damping: float = 0.0, parts: tuple[Array, ...] = ()) -> Body:
     """The object as its hull, or as convex `parts` (vertices [N, 3], object frame) where there are any.
 
     Bullet adds a margin around a collision shape. The shape is inset by the margin less `SLOP_M`, so that at rest its faces
@@ -96,7 +87,7 @@ def make_body(start: ObjectStart, physics: Physics, damping: float = 0.0, parts:
     T_body_obj = invert(T_obj_body)
     reach_m = float(np.linalg.norm(transform(T_body_obj, start.hull.vertices), axis=1).max())
     vertices = tuple(transform(T_body_obj, each.vertices) for each in insets)
-    return ObjectBody(Body(start.asset.mass.mass_kg, moments, vertices, margin_m, damping), T_obj_body, reach_m)
+    return Body(start.asset.mass.mass_kg, moments, vertices, margin_m, damping, T_obj_body, reach_m)
 
 
 def body_frame(mass: MassProperties) -> tuple[Pose, Array]:

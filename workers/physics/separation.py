@@ -1,7 +1,8 @@
 """Distance or overlap of objects with the table and with one another, between their meshes. Pure."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import cache
 
 import manifold3d
 import numpy as np
@@ -34,16 +35,25 @@ def clearances(meshes: Sequence[Mesh], ground: Terrain) -> list[float]:
 
     To the ground as `ground_gap_m`. Between two meshes as `between`, where a mesh that encloses no body counts as its hull.
     """
-    hold_to_one_thread()
-    solids = [_solid(mesh) for mesh in meshes]
-    boxes = [(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) for mesh in meshes]
     found = [ground_gap_m(mesh, ground) for mesh in meshes]
-    for i, j in itertools.combinations(range(len(meshes)), 2):
-        if (boxes[i][0] > boxes[j][1] + NEAR_M).any() or (boxes[j][0] > boxes[i][1] + NEAR_M).any():
-            continue
-        gap = between(solids[i], solids[j])
+    for i, j, gap in find_gaps_m(meshes):
         found[i], found[j] = min(found[i], gap), min(found[j], gap)
     return found
+
+
+def find_gaps_m(meshes: Sequence[Mesh], near_m: float = NEAR_M) -> Iterator[tuple[int, int, float]]:
+    """(i, j, `between` them) of every two meshes, in one frame, whose boxes are within `near_m` of one another."""
+    solids = cache(lambda k: _solid(meshes[k]))
+    for i, j in find_near(meshes, near_m):
+        yield i, j, between(solids(i), solids(j))
+
+
+def find_near(meshes: Sequence[Mesh], near_m: float) -> Iterator[tuple[int, int]]:
+    """The numbers i < j of every two meshes, in one frame, whose bounding boxes are within `near_m` of one another."""
+    boxes = [(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) for mesh in meshes]
+    for i, j in itertools.combinations(range(len(meshes)), 2):
+        if (boxes[i][0] <= boxes[j][1] + near_m).all() and (boxes[j][0] <= boxes[i][1] + near_m).all():
+            yield i, j
 
 
 def above_ground(mesh: Mesh, ground: Terrain) -> tuple[float, float]:
@@ -83,12 +93,6 @@ def between(a: manifold3d.Manifold, b: manifold3d.Manifold) -> float:
     if not pieces:
         return float(a.min_gap(b, NEAR_M))
     return -max(least_width_m(convex_hull(triangles_of(piece).vertices)) for piece in pieces)
-
-
-def overlap_m(a: Mesh, b: Mesh) -> float:
-    """Depth in metres of the overlap of two meshes (world coordinates); 0 without."""
-    apart = (a.vertices.min(axis=0) > b.vertices.max(axis=0)) | (b.vertices.min(axis=0) > a.vertices.max(axis=0))
-    return 0.0 if apart.any() else max(0.0, -between(_solid(a), _solid(b)))
 
 
 def _solid(mesh: Mesh) -> manifold3d.Manifold:

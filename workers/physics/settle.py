@@ -1,7 +1,6 @@
 """Objects from release to rest: simulate, require rest, correct a single object, and measure the rest pose."""
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from workers.physics.fall import Outcome
 from workers.physics.placement import Ground, Support, gap_m, measure_supports, placed_mesh, touch_down
 from workers.physics.release import release
 from workers.physics.rest_pose import find_contacts_xy, snap_to_face, support_margin, tip_onto_face
-from workers.physics.separation import clearances, overlap_m
+from workers.physics.separation import clearances, find_gaps_m
 
 LEFT_M = 0.05
 """Depth of a centre of mass below the table's top at which the object has left the table."""
@@ -114,13 +113,11 @@ def add_effects(effects: EffectPlan, names: Iterable[str]) -> EffectPlan:
 
 
 def _require_apart(starts: Sequence[ObjectStart]) -> None:
-    placed = [(start, placed_mesh(start, start.T_world_obj)) for start in starts]
-    for (one, mesh), (other, its_mesh) in itertools.combinations(placed, 2):
-        overlap = overlap_m(mesh, its_mesh)
-        if overlap > MOST_OVERLAP_M:
+    for i, j, gap in find_gaps_m([placed_mesh(start, start.T_world_obj) for start in starts], near_m=0.0):
+        if -gap > MOST_OVERLAP_M:
             raise SettleError(
                 "objects_overlap",
-                f"regions {one.region_id} and {other.region_id} begin {overlap * 1e3:.2f} mm inside one another: let "
+                f"regions {starts[i].region_id} and {starts[j].region_id} begin {-gap * 1e3:.2f} mm inside one another: let "
                 "them go apart, or one above the other",
             )
 

@@ -14,7 +14,7 @@ from workers.geometry.frames import pose, quaternion_of, rotation_about, transfo
 from workers.geometry.hull import convex_hull
 from workers.physics.bullet import GRAVITY_M_S2
 from workers.physics.fall import FINEST, SKIPPED_TO_M, StepSizes, as_pose, fall
-from workers.physics.rigid_body import Body, ObjectBody, make_body
+from workers.physics.rigid_body import Body, make_body
 
 PHYSICS = Job(name="t").physics
 Z = np.array([0.0, 0.0, 1.0])
@@ -100,7 +100,7 @@ def bevelled(heading: int) -> Mesh:
 def test_a_corner_that_comes_down_beside_an_edge_of_a_mesh_does_not_sink_in(heading, inside_m):
     """A hundredth of a millimetre is what Bullet leaves: the steps that foresee a contact end at it."""
     corners = 0.08 * np.concatenate([np.eye(3), -np.eye(3)])
-    body = ObjectBody(Body(0.3, np.full(3, 4e-4), (corners,), 1e-4), np.eye(4), 0.08)
+    body = Body(0.3, np.full(3, 4e-4), (corners,), 1e-4, reach_m=0.08)
     start = rotation_about(Z, heading * math.pi / 2) @ np.array([-inside_m, 0.013, 0.0801 + 0.005])
     steps = StepSizes(PHYSICS.step_hz, PHYSICS.max_step_travel_mm / 1e3)
     end = fall([body], [translation(*start)], bevelled(heading), for_seconds(0.04), steps, 0.005)

@@ -40,22 +40,22 @@ def test_the_shape_with_its_margin_lies_in_the_hull_and_touches_its_planes_but_f
     """Of a body and a ball about each of its points, the support function is the body's plus the ball's radius."""
     start = start_of(asset_of(SHAPES[name]))
     made = make_body(start, PHYSICS)
-    vertices = transform(made.T_obj_body, made.body.parts[0])
+    vertices = transform(made.T_obj_body, made.parts[0])
     rng = np.random.default_rng(0)
     for normals, tight in ((start.hull.normals, True), (rng.standard_normal((500, 3)), False)):
         normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         inside = (start.hull.vertices @ normals.T).max(axis=0) - (vertices @ normals.T).max(axis=0)
-        beyond = made.body.margin_m - SLOP_M - inside
+        beyond = made.margin_m - SLOP_M - inside
         assert beyond.max() < 1e-9
         assert not tight or beyond.min() > -1e-9
-    assert made.body.margin_m == pytest.approx(MARGIN_M)
+    assert made.margin_m == pytest.approx(MARGIN_M)
 
 
 def test_a_plate_thinner_than_four_margins_gets_a_margin_of_a_quarter_of_its_thickness():
     start = start_of(asset_of(box(0.2, 0.2, 0.0002)))
     made = make_body(start, PHYSICS)
-    assert made.body.margin_m == pytest.approx(0.0002 / 4 + SLOP_M)
-    half = transform(made.T_obj_body, made.body.parts[0])[:, 2].max()
+    assert made.margin_m == pytest.approx(0.0002 / 4 + SLOP_M)
+    half = transform(made.T_obj_body, made.parts[0])[:, 2].max()
     assert half == pytest.approx(0.0001 - 0.0002 / 4, abs=1e-8)
 
 
@@ -64,11 +64,11 @@ def test_parts_become_parts_of_one_body_with_one_margin_about_the_centre_of_mass
     top = box(0.2, 0.1, 0.001, (0, 0, 0.1005))
     start = start_of(asset_of(*legs, top))
     made = make_body(start, PHYSICS, parts=tuple(np.asarray(m.vertices) for m in (*legs, top)))
-    assert len(made.body.parts) == 3
-    assert made.body.margin_m == pytest.approx(MARGIN_M)  # the board's millimetre is ten margins
-    for part, mesh in zip(made.body.parts, (*legs, top), strict=True):
+    assert len(made.parts) == 3
+    assert made.margin_m == pytest.approx(MARGIN_M)  # the board's millimetre is ten margins
+    for part, mesh in zip(made.parts, (*legs, top), strict=True):
         back = transform(made.T_obj_body, part)
-        inset = made.body.margin_m - SLOP_M
+        inset = made.margin_m - SLOP_M
         assert back.min(axis=0) == pytest.approx(mesh.bounds[0] + inset, abs=2e-8)
         assert back.max(axis=0) == pytest.approx(mesh.bounds[1] - inset, abs=2e-8)
     far = np.linalg.norm(start.hull.vertices - start.asset.mass.com, axis=1).max()
@@ -80,8 +80,8 @@ def test_a_thin_part_makes_the_margin_of_all_smaller():
     start = start_of(asset_of(box(0.2, 0.1, 0.1, (0, 0, 0.05)), thin))
     cut = (np.asarray(box(0.2, 0.1, 0.1, (0, 0, 0.05)).vertices), np.asarray(thin.vertices))
     made = make_body(start, PHYSICS, parts=cut)
-    assert made.body.margin_m == pytest.approx(0.0002 / 4 + SLOP_M)
-    thick = transform(made.T_obj_body, made.body.parts[0])  # made smaller by as little as the thin one
+    assert made.margin_m == pytest.approx(0.0002 / 4 + SLOP_M)
+    thick = transform(made.T_obj_body, made.parts[0])  # made smaller by as little as the thin one
     assert thick.min(axis=0) == pytest.approx(np.array([-0.1, -0.05, 0.0]) + 0.0002 / 4, abs=2e-8)
 
 
