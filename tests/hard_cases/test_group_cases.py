@@ -18,7 +18,8 @@ from tests.hard_cases.group_measures import worst_gap_mm
 from tests.hard_cases.groups import Group
 from tests.hard_cases.test_hard_cases import GAP_MM, MOVED_MM, TURNED_DEG
 from tests.physics.settling import effects_of, settle_group
-from workers.physics.release import release
+from workers.physics.placement import Ground
+from workers.physics.release import Drop, release
 from workers.physics.settle import UNBALANCED
 from workers.physics.step import moved_by
 
@@ -76,8 +77,8 @@ def let_go_again(case: GroupCase, rest: Sequence[Settled]) -> tuple[float, float
     settings, effects = PHYSICS.model_copy(update=fine), effects_of(group.starts, group.table, PHYSICS)
     poses = [each.T_world_obj for each in rest]
     flat = rest[0].support == "flat_top"
-    starts = [dataclasses.replace(start, T_world_obj=T) for start, T in zip(group.starts, poses, strict=True)]
-    after = release(starts, group.table, settings, effects, flat)
+    starts = tuple(dataclasses.replace(start, T_world_obj=T) for start, T in zip(group.starts, poses, strict=True))
+    after = release(Drop(starts, Ground(group.table), settings, effects), flat)
     assert after.seconds >= WATCHED_S
     moved = [moved_by(*each) for each in zip(group.starts, poses, after.poses, strict=True)]
     return max(mm for mm, _ in moved), max(deg for _, deg in moved)

@@ -1,22 +1,20 @@
 """Objects from release to rest: simulate, require rest, correct a single object, and measure the rest pose."""
 
 import dataclasses
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import SettleError
-from schemas.job.physics import Physics
 from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import ObjectStart, Settled, SupportedBy, Table
+from schemas.scene.scene import ObjectStart, Settled, SupportedBy
 from workers.geometry.elevation import heights_at
 from workers.geometry.frames import transform
 from workers.physics.effects import called_for_with
 from workers.physics.fall import Outcome
-from workers.physics.placement import Ground, Support, gap_m, measure_supports, placed_mesh, touch_down
-from workers.physics.release import release
+from workers.physics.placement import Support, gap_m, measure_supports, placed_mesh, touch_down
+from workers.physics.release import Drop, release
 from workers.physics.rest_pose import find_contacts_xy, snap_to_face, support_margin, tip_onto_face
 from workers.physics.separation import clearances, find_gaps_m
 
@@ -47,29 +45,10 @@ class LeftRoomError(Exception):
 
 
 @dataclass(frozen=True, eq=False)
-class _Drop:
-    """The objects to be dropped, and the ground, settings and effects of the drop; `room_m` as in `settle`."""
-
-    starts: tuple[ObjectStart, ...]
-    ground: Ground
-    physics: Physics
-    effects: EffectPlan
-    room_m: float
-
-    @property
-    def single(self) -> bool:
-        return len(self.starts) == 1
-
-    def supports(self, poses: Sequence[Pose]) -> tuple[Support, ...]:
-        """The support of every object at these poses, between meshes."""
-        return measure_supports(self.starts, poses, self.ground.table.mesh, self.physics.friction**2)
-
-
-@dataclass(frozen=True, eq=False)
 class _Ending:
     """The outcome of a drop after `seconds` in all, with properties of a single object set down until it touches."""
 
-    drop: _Drop
+    drop: Drop
     outcome: Outcome
     seconds: float
 
@@ -79,29 +58,30 @@ class _Ending:
 
     @cached_property
     def support(self) -> Support:
-        return self.drop.supports((self.T_touching,))[0]
+        return self.supports_at((self.T_touching,))[0]
+
+    def supports_at(self, poses: Sequence[Pose]) -> tuple[Support, ...]:
+        """The support of every object at these poses, between meshes."""
+        drop = self.drop
+        return measure_supports(drop.starts, poses, drop.ground.table.mesh, drop.physics.friction**2)
 
 
-def settle(
-    starts: Sequence[ObjectStart], table: Table, physics: Physics, effects: EffectPlan, room_m: float = math.inf
-) -> tuple[Settled, ...]:
+def settle(drop: Drop) -> tuple[Settled, ...]:
     """Settle a single object, or several that may touch one another.
 
     Raises SettleError `objects_overlap`, `not_at_rest`, `left_table`, `unsupported` or `table_too_fine`, and LeftRoomError
-    where the centre of mass of a single object goes further than `room_m` sideways. Several objects are not corrected after
-    the simulation, which their figures then describe.
+    where a single object leaves its room. Several objects are not corrected: their figures are the simulation's.
     """
-    drop = _Drop(tuple(starts), Ground(table), physics, effects, room_m)
-    if not effects.runs("dynamics"):
-        placed = Outcome(tuple(start.T_world_obj for start in starts), 0.0, 0.0, rested=True)
+    if not drop.effects.runs("dynamics"):
+        placed = Outcome(tuple(start.T_world_obj for start in drop.starts), 0.0, 0.0, rested=True)
         return _describe(_Ending(drop, placed, 0.0), "placed")
-    _require_apart(starts)
-    if not effects.runs("table_mesh"):
+    _require_apart(drop.starts)
+    if not drop.effects.runs("table_mesh"):
         ending = _come_to_rest(drop, flat=True)
         if ending is not None:
             return _describe(ending, "flat_top")
-        late = called_for_with("table_mesh", starts, physics)
-        drop = dataclasses.replace(drop, effects=add_effects(effects, late))
+        late = called_for_with("table_mesh", drop.starts, drop.physics)
+        drop = dataclasses.replace(drop, effects=add_effects(drop.effects, late))
     ending = _come_to_rest(drop, flat=False)
     assert ending is not None  # only the flat top has an edge
     return _describe(ending, "mesh")
@@ -122,7 +102,7 @@ def _require_apart(starts: Sequence[ObjectStart]) -> None:
             )
 
 
-def _come_to_rest(drop: _Drop, flat: bool) -> _Ending | None:
+def _come_to_rest(drop: Drop, flat: bool) -> _Ending | None:
     """Release until at rest; None where a footprint left the flat top, so that the table's edges may matter.
 
     Rolling friction can hold a single object out of balance, within its lever arm of an edge of the hull or of the contacts
@@ -133,7 +113,7 @@ def _come_to_rest(drop: _Drop, flat: bool) -> _Ending | None:
     for share in LESS_ROLLING_FRICTION if repeated else LESS_ROLLING_FRICTION[:1]:
         less = physics.model_copy(update={"rolling_friction": share * physics.rolling_friction})
         damping = 0.0 if share == 1.0 else DAMPING
-        outcome = release(drop.starts, drop.ground.table, less, drop.effects, flat, drop.room_m, damping)
+        outcome = release(dataclasses.replace(drop, physics=less), flat, damping)
         if outcome.stopped_by == "room":
             raise LeftRoomError
         if outcome.stopped_by == "edge":
@@ -225,7 +205,7 @@ def _measure_group(ending: _Ending) -> list[tuple[Pose, float, float, float]]:
     """(pose, gap in metres, margin of support in metres, equilibrium residual) of every object."""
     drop, poses = ending.drop, ending.outcome.poses
     gaps_m = clearances([placed_mesh(*one) for one in zip(drop.starts, poses, strict=True)], drop.ground.terrain)
-    supports = drop.supports(poses)
+    supports = ending.supports_at(poses)
     return [(T, gap, each.margin_m, each.residual) for T, gap, each in zip(poses, gaps_m, supports, strict=True)]
 
 
@@ -235,7 +215,7 @@ def _measure_single(ending: _Ending, support: SupportedBy) -> tuple[Pose, float,
     corrected = support != "placed" and ending.drop.physics.correction
     T = ending.T_touching if corrected else ending.outcome.poses[0]
     if support == "mesh":
-        held = ending.support if corrected else ending.drop.supports((T,))[0]
+        held = ending.support if corrected else ending.supports_at((T,))[0]
         margin_m, residual = held.margin_m, held.residual
     else:
         com = transform(T, start.asset.mass.com[None, :])[0]

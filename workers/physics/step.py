@@ -12,7 +12,8 @@ from schemas.scene.scene import ObjectStart, ScenePlan, Settled
 from workers.geometry.frames import moved_between
 from workers.physics.effects import called_for_with, rooms_m
 from workers.physics.fall import FINEST
-from workers.physics.release import release
+from workers.physics.placement import Ground
+from workers.physics.release import Drop, release
 from workers.physics.settle import LeftRoomError, add_effects, settle
 
 RECHECK_S = 1.0
@@ -36,18 +37,16 @@ def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan) -> Rest
     Objects that cannot meet settle one by one. Raises SettleError `objects_overlap`, `not_at_rest`, `left_table`,
     `unsupported` or `table_too_fine`. A pure function: every simulation starts from an empty world.
     """
-    starts, table, called = plan.objects, plan.table, dict[str, str]()
+    starts, ground, called = plan.objects, Ground(plan.table), dict[str, str]()
     if len(starts) > 1 and effects.runs("object_contacts"):
-        settled = settle(starts, table, physics, effects)
+        settled = settle(Drop(starts, ground, physics, effects))
     else:
         try:
             rooms = zip(starts, rooms_m(starts), strict=True)
-            settled = tuple(
-                each for start, room_m in rooms for each in settle((start,), table, physics, effects, room_m)
-            )
+            settled = tuple(settle(Drop((start,), ground, physics, effects, room_m))[0] for start, room_m in rooms)
         except LeftRoomError:
             called = dict.fromkeys(called_for_with("object_contacts", starts, physics), LEFT_ROOM)
-            settled = settle(starts, table, physics, add_effects(effects, called))
+            settled = settle(Drop(starts, ground, physics, add_effects(effects, called)))
     if any(rest.support == "mesh" for rest in settled):
         called |= dict.fromkeys(called_for_with("table_mesh", starts, physics), LEFT_TOP)
     return Rest(settled, {name: why for name, why in called.items() if not effects.runs(name)})
@@ -77,13 +76,12 @@ def release_again(
         dataclasses.replace(start, T_world_obj=before.T_world_obj)
         for start, before in zip(plan.objects, settled, strict=True)
     )
+    drop = Drop(starts, Ground(plan.table), physics, effects)
     flat = [before.support != "mesh" and not effects.runs("table_mesh") for before in settled]
-    if len(starts) > 1 and effects.runs("object_contacts"):
-        return release(starts, plan.table, physics, effects, all(flat)).poses
-    return tuple(
-        release((start,), plan.table, physics, effects, on_top).poses[0]
-        for start, on_top in zip(starts, flat, strict=True)
-    )
+    if not drop.single and effects.runs("object_contacts"):
+        return release(drop, all(flat)).poses
+    alone = (dataclasses.replace(drop, starts=(start,)) for start in starts)
+    return tuple(release(each, on_top).poses[0] for each, on_top in zip(alone, flat, strict=True))
 
 
 def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, float]:

@@ -14,11 +14,13 @@ from tests.shapes import asset_of, box, table
 from workers.geometry.frames import pose
 from workers.geometry.hull import convex_hull
 from workers.physics.fall import fall
-from workers.physics.release import release
+from workers.physics.placement import Ground
+from workers.physics.release import Drop, release
 from workers.physics.table_top import place_table
 
 PHYSICS = Job(name="t").physics
 TABLE = place_table(table())
+GROUND = Ground(TABLE)
 TOP = TABLE.top.height_m
 ALL = ("dynamics", "fine_step", "object_contacts", "rolling_friction")
 CUBE = asset_of(box(0.06, 0.06, 0.06))
@@ -49,7 +51,7 @@ def test_steps_are_as_fine_as_the_highest_fall_and_the_thinnest_object_ask(heigh
 
 def seconds_to_rest(start: ObjectStart, names: tuple[str, ...], **changes) -> float:
     physics = PHYSICS.model_copy(update={"max_settle_s": 3.0, **changes})
-    return release((start,), TABLE, physics, EffectPlan(names, {}), flat=True).seconds
+    return release(Drop((start,), GROUND, physics, EffectPlan(names, {})), flat=True).seconds
 
 
 def test_a_cube_bounces_only_where_the_plan_runs_restitution():
@@ -75,7 +77,7 @@ def test_objects_as_boxes_keep_the_height_of_their_lowest_point_together_as_alon
     starts = [start_of(can, x, 0.0, 0.001 - low, tilted) for x in (-0.1, 0.1)]
     physics = PHYSICS.model_copy(update={"collision": "box", "max_settle_s": 0.01})
     plan = EffectPlan(("dynamics", "fine_step"), {})
-    both = release(starts, TABLE, physics, plan, flat=True)
-    alone = [release((start,), TABLE, physics, plan, flat=True) for start in starts]
+    both = release(Drop(tuple(starts), GROUND, physics, plan), flat=True)
+    alone = [release(Drop((start,), GROUND, physics, plan), flat=True) for start in starts]
     for together, one in zip(both.poses, alone, strict=True):
         assert together[2, 3] == pytest.approx(one.poses[0][2, 3], abs=1e-4)
