@@ -26,9 +26,8 @@ with silence_stderr():
 GRAVITY_M_S2 = 9.81
 
 SLAB_HALF_M = (2.0, 2.0, 0.25)
-"""Half extents of the box that stands for level ground: larger and thicker than any table, so that nothing sinks through.
-Bullet's plane is twice as fast but less accurate: it gives one contact per step, and a box that lands on an edge turns about
-the vertical by ten times as much."""
+"""Half extents of the box for level ground, larger and thicker than any table. Bullet's plane is twice as fast but has one
+contact per step: a box that lands on an edge turns about the vertical by ten times as much."""
 
 MOST_GROUND_VERTICES, MOST_GROUND_INDICES = 131_072, 524_288
 """PyBullet's limits on one collision mesh; beyond them it fails without a reason."""
@@ -38,12 +37,11 @@ REPAIR = 0.05
 per step: with 0.2 bodies that roll over edges gain energy, with 0.4 boxes are thrown up."""
 
 REPAIR_S = 1.0 / 48.0
-"""Shortest time in which the overlap of a single body with level ground is corrected. With one share for all steps the
-shortest steps throw a body up sixteen times as fast as the longest, and a body that rolls from corner to corner keeps gaining
-energy. Too slow for a pile, where bodies press on one another, and for a mesh."""
+"""Least time for correcting the overlap of a single body with level ground: one share for all steps would throw it up sixteen
+times as fast in the shortest as in the longest, and feed energy to what rolls over corners. Too slow for piles and meshes."""
 
 BOUNCE_REPAIR_S = 10.0 * REPAIR_S
-"""The same while bodies bounce: they bounce from an overlap of one step's travel, and its correction must not add to it."""
+"""The same while bodies bounce, from an overlap of one step's travel: its correction must not add to the rebound."""
 
 DECIMALS = 8
 """Decimals of a collision shape's vertices, metres. Bullet's hull drops vertices where more than three lie in one plane
@@ -125,15 +123,15 @@ class World:
 def open_world(
     placed: Sequence[tuple[Body, Pose]], ground: float | Mesh, physics: Physics, steps: int, reach_m: float = math.inf
 ) -> Iterator[World]:
-    """A world of the ground, level at a height in metres or a mesh, and of bodies at their `T_world_body`.
+    """Open a world of a ground, level at a height in metres or a mesh, and of bodies at their `T_world_body`.
 
     `reach_m`: contact distance on a mesh, if less than Bullet's own. Of two contacts of a vertex with triangles of a mesh
-    Bullet keeps the one found last: beside an edge a corner sinks in while the next triangle is in reach. On level ground
-    a shorter reach would keep more rolling bodies from gaining energy, but bowls would spin for ever.
+    Bullet keeps the one found last: beside an edge a corner sinks in while the next triangle is in reach. On level ground a
+    shorter reach would keep more rolling bodies from gaining energy, but bowls would spin for ever.
 
-    Runs are bit-identical with deterministicOverlappingPairs. One connection serves the whole process: a new one costs as
-    much as a simulation. Earlier simulations leave no trace in the bits: one body and the ground are a single pair,
-    without an order of pairs, contacts or islands; with more bodies everything is reset first. Blocks do not nest.
+    Runs are bit-identical with deterministicOverlappingPairs, whatever ran before: a single body and the ground are one
+    pair, without an order of pairs, contacts or islands, and for more bodies everything is reset first. One connection serves
+    the process, because a new one costs as much as a simulation. Blocks do not nest.
     """
     connection = _connect()
     client = connection.client

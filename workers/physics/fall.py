@@ -144,10 +144,10 @@ def _simulate(
 ) -> Outcome:
     """Step until all rest, the time is over or a stop condition holds; the poses are those of the body frames.
 
-    limits_s: the time to simulate, and the time of the touchdown at its beginning. A body rests when for the whole window
-    no point moved further than the rest speed allows, it turned no further than the rest spin allows, and no point was
-    faster than `CALM_M_S`. Displacement decides and not speed: Bullet's contact points flicker between the many vertices
-    of a round rim, and an object at rest may rattle by micrometres at some millimetres a second for ever.
+    limits_s: the time to simulate, and of it the touchdown. A body rests when for the whole window no point moved further than
+    the rest speed allows, it turned no further than the rest spin allows, and no point was faster than `CALM_M_S`. Displacement
+    decides and not speed: Bullet's contact points flicker between the many vertices of a round rim, and an object at rest may
+    rattle by micrometres at some millimetres per second for ever.
     """
     rest, (end_s, touchdown_s) = physics.rest, limits_s
     drift_m, turn_rad = rest.speed_mm_s / 1e3 * rest.window_s, rest.spin_rad_s * rest.window_s

@@ -57,11 +57,10 @@ def snap_to_face(T_world_obj: Pose, hull: Hull, com: Array, snap_rad: float) -> 
 def tip_onto_face(T_world_obj: Pose, hull: Hull, com: Array) -> Pose | None:
     """Turn the object over its lowest edges and corners, as it would tip on a level plane, until it stands on a face.
 
-    Corrects what rolling friction held between two faces. Each tip turns the object about the contact nearest to its centre
-    of mass, until the next vertex touches; the centre of mass only sinks. A face that is not steady is tipped over its
-    nearest edge, which lifts the centre of mass by less than a micrometre. Returns the first steady pose, else the
-    steadiest; None where there is none within `TIPPED_RAD` in all, where the object falls instead. The caller sets the
-    height.
+    For an object that rolling friction held between two faces. Each tip turns it about the contact nearest to its centre of
+    mass, until the next vertex touches; the centre of mass only sinks. A face that is not steady is tipped over its nearest
+    edge, which lifts the centre of mass by less than a micrometre. Returns the first steady pose, else the steadiest; None
+    without any within `TIPPED_RAD` in all: there the object falls instead. The caller sets the height.
     """
     T, turned = T_world_obj, 0.0
     best, most = None, 0.0

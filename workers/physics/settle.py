@@ -25,19 +25,17 @@ LESS_ROLLING_FRICTION = (1.0, 0.1, 0.01, 0.0)
 """Shares of the rolling friction in successive releases, each where the one before left the object on an edge."""
 
 DAMPING = 0.9
-"""Damping of releases with less rolling friction: nine tenths of the speed per second. Nothing else removes the energy that
-Bullet adds at each edge of a bottle on its side."""
+"""Damping of releases with less rolling friction: nine tenths of the speed per second. Nothing else removes the little energy
+that Bullet adds at each edge of a bottle on its side."""
 
 UNBALANCED = 0.05
-"""Share of the weight, and of weight times size, that contacts may leave unbalanced: their positions are known to
-`CONTACT_M`."""
+"""Share of the weight, and of weight times size, that contacts may leave unbalanced, as they are known to `CONTACT_M`."""
 
 BALANCED = 1e-3
 """The same share as noise: two tenths of a millimetre between a centre of mass and the contacts."""
 
 MOST_OVERLAP_M = 1e-4
-"""Greatest overlap of objects at release. A share of the overlap is corrected per step, which makes tens of metres per second
-of centimetres."""
+"""Greatest overlap of objects at release. Correcting centimetres by a share per step gives tens of metres per second."""
 
 
 class LeftRoomError(Exception):
@@ -170,9 +168,9 @@ def _require_rest(ending: _Ending) -> None:
 
 
 def _is_on_table(ending: _Ending, com: Array) -> bool:
-    """Whether a centre of mass [3] is not below the top and, of a single object, over it.
+    """Whether a centre of mass [3] is not below the top; of a single object also over it, unless the top holds it anyway.
 
-    Otherwise a single object may be held by the top all the same: over a hole, or hung on an edge.
+    As it does over a hole, or where the object hangs on an edge.
     """
     drop, ground = ending.drop, ending.drop.ground
     lowest_m = ground.table.top.height_m - LEFT_M

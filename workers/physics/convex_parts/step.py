@@ -48,8 +48,7 @@ MOST_PIECES = 128
 """A mesh in more pieces than this is cut as one."""
 
 OPTIONS = {"mcts_iterations": 10, "mcts_nodes": 6, "mcts_max_depth": 1, "resolution": 300, "seed": 0}
-"""A search one cut deep with few trials. CoACD's own, three deep with 150, takes fifty times as long for a fifth fewer parts
-of a mug."""
+"""A search one cut deep. CoACD's own, three deep with 150 trials, takes fifty times as long for a fifth fewer parts of a mug."""
 
 OPEN = {"preprocess_mode": "on", "preprocess_resolution": 40}
 """For a mesh that is not a closed manifold, which is wrapped in voxels first: without, CoACD ends the process."""
