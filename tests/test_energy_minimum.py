@@ -7,9 +7,9 @@ import trimesh
 from schemas.job.job import Job
 from tests.energy_minimum import is_energy_minimum
 from tests.physics.population import draw
+from tests.physics.settling import settle_single
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.frames import pose, rotation_about
-from workers.physics.settle_single import settle_alone
 
 
 def ellipsoid(x, y, z):
@@ -60,7 +60,7 @@ def test_what_settles_on_a_level_top_is_least_in_energy(pose_of_start, tmp_path)
     found = []
     for scene_id in range(24):
         plan = draw(job, catalogue, scene_id)
-        start, rest = plan.objects[0], settle_alone(plan.objects[0], plan.table, job.physics)
+        start, rest = plan.objects[0], settle_single(plan.objects[0], plan.table, job.physics)
         if rest.support == "flat_top":
             vertices = start.asset.shape.vertices
             found.append(is_energy_minimum(vertices, rest.T_world_obj, start.asset.mass.com))

@@ -11,9 +11,10 @@ from schemas.scene.scene import Settled
 from services.read.audit_motion import MOST_DEG, MOST_MM
 from tests.effects.scenes import Setting, facts_of
 from tests.hard_cases.drops import Drop
-from workers.physics.fall import Fall, Pace, fall, make_faller
+from workers.physics.fall import Outcome, StepSizes, fall
+from workers.physics.rigid_body import make_body
 from workers.physics.step import Rest, moved_by, release_again, settle_scene
-from workers.physics.stop_conditions import watch_gone
+from workers.physics.stop_conditions import falls_below
 from workers.plan.effect import Facts
 from workers.plan.effects import plan_effects
 
@@ -70,13 +71,13 @@ def is_still(moved: tuple[float, float]) -> bool:
     return moved[0] <= MOST_MM and moved[1] <= MOST_DEG
 
 
-def drop_on(case: Drop, slab: bool) -> Fall:
+def drop_on(case: Drop, slab: bool) -> Outcome:
     """The object dropped by the simulator alone, as its hull, onto a level without end or onto the table's mesh.
 
     For 3 s, or until it is 0.2 m below the top.
     """
-    physics = _drawn().job.physics
+    physics = _drawn().job.physics.model_copy(update={"max_settle_s": 3.0})
     ground = case.table.top.height_m if slab else case.table.mesh
-    pace = Pace(physics.step_hz, physics.max_step_travel_mm / 1e3)
-    faller, gone = make_faller(case.start, physics, True), watch_gone(case.table.top.height_m - 0.2)
-    return fall([faller], [case.start.T_world_obj], ground, physics, pace, 3.0, 0.0, [gone])
+    steps = StepSizes(physics.step_hz, physics.max_step_travel_mm / 1e3)
+    stops = {"below": falls_below(case.table.top.height_m - 0.2)}
+    return fall([make_body(case.start, physics)], [case.start.T_world_obj], ground, physics, steps, 0.0, stops)

@@ -15,12 +15,12 @@ from tests.effects.scenes import Setting, facts_of
 from tests.hard_cases.bodies import built_in, cube, mug_on_peg, over_edge, rod
 from tests.hard_cases.drops import EDGE_M, X, Y, drop, level, lowered, ring, turn
 from tests.hard_cases.measures import Z
+from tests.physics.settling import settle_single
 from tests.shapes import asset_of
 from workers.geometry.elevation import survey
 from workers.geometry.frames import transform
-from workers.physics.placement import gap_m, ground_of, placed_mesh
+from workers.physics.placement import Ground, gap_m, placed_mesh
 from workers.physics.separation import clearances
-from workers.physics.settle_single import settle_alone
 from workers.plan.effect import Facts
 from workers.plan.effects import PHYSICS_EFFECTS, plan_effects
 
@@ -52,7 +52,7 @@ def _on_a_ring_from_1_m() -> Facts:
 def test_without_dynamics_an_object_hangs_in_the_air_by_its_clearance():
     facts = facts_with(drop(built_in("mug"), level(), 0.005))
     (start,) = facts.plan.objects
-    air_mm = gap_m(start, start.T_world_obj, ground_of(facts.plan.table)) * 1e3
+    air_mm = gap_m(start, start.T_world_obj, Ground(facts.plan.table)) * 1e3
     assert air_mm == pytest.approx(5.0, abs=1e-6)
     assert air_mm > 10 * GAP_MM
     assert settled(facts).settled[0].hover_gap_mm <= GAP_MM
@@ -68,7 +68,7 @@ def test_without_the_tables_mesh_a_box_stands_on_air_beyond_the_edge():
     assert on_slab.rested
     assert standing[0] == pytest.approx(EDGE_M + 0.01, abs=1e-3)
     assert standing[2] == pytest.approx(case.table.top.height_m + 0.05, abs=1e-4)
-    assert on_mesh.happened == 0 and _com(case.start, on_mesh.poses[0])[2] < case.table.top.height_m - 0.2
+    assert on_mesh.stopped_by == "below" and _com(case.start, on_mesh.poses[0])[2] < case.table.top.height_m - 0.2
 
 
 def test_the_plan_calls_for_the_mesh_beyond_the_edge_and_settling_does_where_a_rod_falls_across_it():
@@ -87,7 +87,7 @@ def test_without_object_contacts_the_cubes_of_a_stack_overlap_by_their_size():
     plan, physics, effects = facts.plan, facts.job.physics, plan_effects(facts)
     assert effects.runs("object_contacts")
     alone = without(effects, "object_contacts").ran
-    through = [settle_alone(start, plan.table, physics, alone).T_world_obj for start in plan.objects]
+    through = [settle_single(start, plan.table, physics, alone).T_world_obj for start in plan.objects]
     stacked = [rest.T_world_obj for rest in settled(facts).settled]
     gaps = [
         clearances([placed_mesh(s, T) for s, T in zip(plan.objects, poses, strict=True)], survey(plan.table.mesh))

@@ -19,9 +19,9 @@ def spinning(spin: Sequence[float]) -> Iterator[None]:
     began = list[Any]()
 
     class Spun(World):
-        def push(self, velocity: Sequence[float], _: Any = None, body: int = 0) -> None:
+        def set_velocity(self, velocity: Sequence[float], _: Any = None, body: int = 0) -> None:
             began.append(self.pose(body)[1])
-            super().push(velocity, spin if began[-1] == began[0] else (0.0, 0.0, 0.0), body)
+            super().set_velocity(velocity, spin if began[-1] == began[0] else (0.0, 0.0, 0.0), body)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bullet, "World", Spun)

@@ -11,18 +11,17 @@ import pytest
 
 from schemas.errors import SceneError
 from schemas.job.job import Job
-from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import Settled
 from tests.hard_cases.case import EITHER
 from tests.hard_cases.group_cases import GROUPS, GroupCase
 from tests.hard_cases.group_measures import worst_gap_mm
 from tests.hard_cases.groups import Group
 from tests.hard_cases.test_hard_cases import GAP_MM, MOVED_MM, TURNED_DEG
-from workers.physics.effects import called_for
-from workers.physics.settle_group import release_together
-from workers.physics.settle_single import UNBALANCED
-from workers.physics.step import moved_by, settle_scene
-from workers.plan.step import plan_scene
+from tests.physics.settling import effects_of, settle_group
+from workers.physics.placement import Ground
+from workers.physics.release import Drop, release
+from workers.physics.settle import UNBALANCED
+from workers.physics.step import moved_by
 
 PHYSICS = Job(name="t").physics
 FINEST, WATCHED_S = 16, 1.0
@@ -36,11 +35,8 @@ def asked_for(case: GroupCase) -> Group:
 def ending(case: GroupCase) -> tuple[Settled, ...] | SceneError:
     """What production comes to: every rest pose, or why there is none."""
     group = asked_for(case)
-    ran = tuple(sorted(called_for(group.starts, group.table, PHYSICS)))
-    plan = plan_scene(Job(name="t"), 0, group.table.asset, group.starts[0].asset)
-    plan = dataclasses.replace(plan, table=group.table, objects=group.starts)
     try:
-        return settle_scene(plan, PHYSICS, EffectPlan(ran, {})).settled
+        return settle_group(group.starts, group.table, PHYSICS)
     except SceneError as error:
         return error
 
@@ -78,10 +74,11 @@ def let_go_again(case: GroupCase, rest: Sequence[Settled]) -> tuple[float, float
     group = asked_for(case)
     still = PHYSICS.rest.model_copy(update={"window_s": 2 * WATCHED_S})  # so that nothing counts as resting before
     fine = {"step_hz": FINEST * PHYSICS.step_hz, "max_settle_s": WATCHED_S, "rest": still}
-    settings, ran = PHYSICS.model_copy(update=fine), called_for(group.starts, group.table, PHYSICS)
+    settings, effects = PHYSICS.model_copy(update=fine), effects_of(group.starts, group.table, PHYSICS)
     poses = [each.T_world_obj for each in rest]
     flat = rest[0].support == "flat_top"
-    after = release_together(group.starts, poses, group.table, settings, ran, flat)
+    starts = tuple(dataclasses.replace(start, T_world_obj=T) for start, T in zip(group.starts, poses, strict=True))
+    after = release(Drop(starts, Ground(group.table), settings, effects), flat)
     assert after.seconds >= WATCHED_S
     moved = [moved_by(*each) for each in zip(group.starts, poses, after.poses, strict=True)]
     return max(mm for mm, _ in moved), max(deg for _, deg in moved)

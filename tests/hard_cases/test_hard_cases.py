@@ -18,8 +18,7 @@ from tests.hard_cases.drops import Drop
 from tests.hard_cases.group_cases import GROUPS
 from tests.hard_cases.measures import gap_mm
 from tests.hard_cases.spin import spinning
-from workers.physics.settle_single import settle_alone
-from workers.physics.step import recheck
+from tests.physics.settling import recheck, settle_single
 
 PHYSICS = Job(name="t").physics
 
@@ -39,7 +38,7 @@ def ending(case: Case) -> tuple[Drop | None, Settled | SceneError]:
     try:
         made = case.make()
         with spinning(case.spin):
-            return made, settle_alone(made.start, made.table, PHYSICS.model_copy(update=case.physics))
+            return made, settle_single(made.start, made.table, PHYSICS.model_copy(update=case.physics))
     except SceneError as error:
         return made, error
 

@@ -14,7 +14,7 @@ from tests.physics.room import G
 from workers.geometry.frames import rotation_from_quaternion
 from workers.physics import bullet
 from workers.physics.bullet import World
-from workers.physics.fall import body_frame
+from workers.physics.rigid_body import body_frame
 
 SHARE = 1e-3
 """Of the energy that the drop sets free."""
@@ -65,8 +65,8 @@ def watched(assets: Sequence[Asset], spin: Sequence[float] = (0.0, 0.0, 0.0)) ->
                 super().advance()
                 falls[-1].append(sum(energy(self, body) for body in range(len(self.bodies))))
 
-        def push(self, velocity: Sequence[float], _: Any = None, body: int = 0) -> None:
-            super().push(velocity, spin, body)
+        def set_velocity(self, velocity: Sequence[float], _: Any = None, body: int = 0) -> None:
+            super().set_velocity(velocity, spin, body)
 
     def begin(client: int, ground: int, bodies: tuple[int, ...], steps: int, repair_s: float) -> World:
         falls.append([])

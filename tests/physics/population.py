@@ -22,11 +22,10 @@ from schemas.scene.plan import ScenePlan, Table
 from schemas.scene.shape import Mesh
 from tests.physics.energy import watched, worst_of
 from tests.physics.room import G
+from tests.physics.settling import recheck, settle_single
 from workers.assets.catalogue import Catalogue, choose_object, choose_table, load_asset, open_catalogue
 from workers.geometry.elevation import heights_at
 from workers.geometry.frames import transform
-from workers.physics.settle_single import settle_alone
-from workers.physics.step import recheck
 from workers.plan.randomness import Stream, stream
 from workers.plan.step import choose_category, plan_scene
 
@@ -77,7 +76,7 @@ def try_scene(job: Job, catalogue: Catalogue, scene_id: int, again: bool) -> Out
         plan = draw(job, catalogue, scene_id)
         start = plan.objects[0]
         with watched([start.asset]) as falls:
-            rest = settle_alone(start, plan.table, job.physics)
+            rest = settle_single(start, plan.table, job.physics)
     except SceneError as error:
         through = error.reason == "not_at_rest" and "-" in error.detail
         return Outcome(scene_id, category, f"{error.reason}: {error.detail}", through)

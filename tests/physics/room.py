@@ -2,14 +2,17 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 
 import numpy as np
 
 from schemas.base import Array, Pose
 from schemas.job.job import Job
 from schemas.job.physics import Physics
+from schemas.scene.shape import Mesh
 from workers.geometry.frames import pose, rotation_about
-from workers.physics.bullet import GRAVITY_M_S2, Body, World
+from workers.physics.bullet import GRAVITY_M_S2, World, open_world
+from workers.physics.rigid_body import Body
 
 G = GRAVITY_M_S2
 PHYSICS = Job(name="t").physics
@@ -43,6 +46,13 @@ def ball_body(radius_m: float, mass_kg: float = 1.0) -> Body:
 def at(x: float, z: float, lean_rad: float = 0.0) -> Pose:
     """[4, 4]: a body there, leaning towards +x."""
     return pose(rotation_about(Y, lean_rad), np.array([x, 0.0, z]))
+
+
+def drop(
+    body: Body, T_world_body: Pose, ground: float | Mesh, settings: Physics, steps: int
+) -> AbstractContextManager[World]:
+    """A world with one body."""
+    return open_world([(body, T_world_body)], ground, settings, steps)
 
 
 def lean(world: World) -> float:

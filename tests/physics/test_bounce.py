@@ -2,8 +2,7 @@
 
 import pytest
 
-from tests.physics.room import at, ball_body, physics
-from workers.physics.bullet import drop
+from tests.physics.room import at, ball_body, drop, physics
 
 RADIUS_M = 0.05
 RATES_HZ = (480, 960, 1920, 3840)

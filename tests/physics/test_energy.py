@@ -17,12 +17,10 @@ from tests.hard_cases.groups import dominoes, pile, stack
 from tests.physics.energy import Rise, watched, worst_of
 from tests.physics.population import try_scene
 from tests.physics.room import PHYSICS, G, physics
+from tests.physics.settling import settle_group, settle_single
 from tests.shapes import asset_of, box, table
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
-from workers.physics.effects import called_for
-from workers.physics.settle_group import settle_together
-from workers.physics.settle_single import settle_alone
 from workers.physics.table_top import place_table
 from workers.plan.step import draw_start
 
@@ -45,7 +43,7 @@ def worst_rise(category: str, start: str, seed: int, refine: int = 1) -> Rise:
     job = Job.model_validate({"name": "t", "seed": seed, "start": {"pose": start}})
     drawn = draw_start(job, seed, asset, TABLE)
     with watched([asset]) as falls, suppress(SettleError):  # that it rests is another test's
-        settle_alone(
+        settle_single(
             drawn,
             TABLE,
             physics(step_hz=PHYSICS.step_hz * refine, max_step_travel_mm=PHYSICS.max_step_travel_mm / refine),
@@ -79,7 +77,7 @@ def test_the_energy_of_all_that_falls_together_never_rises_above_its_running_min
     assets = [start.asset for start in group.starts]
     settings = physics()
     with watched(assets) as falls:
-        settle_together(group.starts, group.table, settings, called_for(group.starts, group.table, settings))
+        settle_group(group.starts, group.table, settings)
     rise = worst_of(falls(), sum(asset.mass.mass_kg for asset in assets) * G)
     name = f"energy, {request.node.callspec.id}"
     record_figure(f"{name}: worst rise over its bound", "passed", rise.over_bound, 1)
@@ -113,7 +111,7 @@ def test_what_spins_when_it_is_let_go_gains_no_energy(category, spin, record_fig
     asset = asset_for(category, 0)
     start = draw_start(Job(name="t"), 0, asset, TABLE)
     with watched([asset], spin) as falls, suppress(SettleError):  # some leave the table, and some spin for too long
-        settle_alone(start, TABLE, physics(max_settle_s=1.0))
+        settle_single(start, TABLE, physics(max_settle_s=1.0))
     rise = worst_of(falls(), asset.mass.mass_kg * G)
     outcome = "known miss" if max(spin) > 100.0 else "passed"
     record_figure(f"energy, {category} spun by {spin} rad/s: worst rise over its bound", outcome, rise.over_bound, 1)

@@ -2,8 +2,7 @@
 
 import pytest
 
-from tests.physics.room import RATES_HZ, G, advance, at, box_body, order, physics
-from workers.physics.bullet import drop
+from tests.physics.room import RATES_HZ, G, advance, at, box_body, drop, order, physics
 
 FALL_S = 0.5
 HEIGHT_M = 3.0

@@ -4,8 +4,7 @@ import math
 
 import pytest
 
-from tests.physics.room import MARGIN_M, PHYSICS, G, advance, at, box_body, order, physics, slope
-from workers.physics.bullet import drop
+from tests.physics.room import MARGIN_M, PHYSICS, G, advance, at, box_body, drop, order, physics, slope
 
 MU = PHYSICS.friction**2
 CRITICAL_RAD = math.atan(MU)
@@ -20,7 +19,7 @@ def slid(rate_hz: int, speed_m_s: float) -> float:
     with drop(FLAT, at(0, 0.005 + MARGIN_M), 0.0, settings, 1) as world:
         advance(world, rate_hz)
         before = world.pose()[0][0]
-        world.push((speed_m_s, 0.0, 0.0))
+        world.set_velocity((speed_m_s, 0.0, 0.0))
         advance(world, rate_hz)
         return world.pose()[0][0] - before
 
@@ -30,7 +29,7 @@ def speed_on_slope(rate_hz: int, angle_rad: float, heading_rad: float) -> float:
     settings = physics(step_hz=rate_hz)
     with drop(FLAT, at(0, 0.005 + MARGIN_M), 0.0, settings, 1) as world:
         advance(world, rate_hz)
-        world.pull(slope(angle_rad, heading_rad))
+        world.set_gravity(slope(angle_rad, heading_rad))
         advance(world, rate_hz // 2)
         return math.hypot(*world.velocity()[0][:2])
 

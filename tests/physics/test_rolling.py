@@ -2,8 +2,7 @@
 
 import pytest
 
-from tests.physics.room import PHYSICS, RATES_HZ, G, advance, at, ball_body, physics
-from workers.physics.bullet import drop
+from tests.physics.room import PHYSICS, RATES_HZ, G, advance, at, ball_body, drop, physics
 
 RADIUS_M = 0.05
 ARM_M = 2 * PHYSICS.rolling_friction * PHYSICS.friction
@@ -15,7 +14,7 @@ def speeds(rate_hz: int, seconds: float, first_m_s: float, spin_rad_s: float, **
     settings = physics(step_hz=rate_hz, **changes)
     with drop(ball_body(RADIUS_M), at(0, RADIUS_M), 0.0, settings, 1) as world:
         advance(world, rate_hz // 4)
-        world.push((first_m_s, 0, 0), (0, spin_rad_s, 0))
+        world.set_velocity((first_m_s, 0, 0), (0, spin_rad_s, 0))
         advance(world, round(rate_hz * seconds))
         v, w = world.velocity()
         return v[0], w[1]

@@ -8,9 +8,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from schemas.base import Array
-from tests.physics.room import advance, at, box_body, order, physics
+from tests.physics.room import advance, at, box_body, drop, order, physics
 from workers.geometry.frames import rotation_from_quaternion
-from workers.physics.bullet import drop
 
 BOX = box_body(0.02, 0.06, 0.1)
 """Its intermediate axis is y."""
@@ -26,8 +25,8 @@ PUSHED = np.array([0.01, 1.0, 0.01]) * SPIN_RAD_S
 def simulated(rate_hz: int, seconds: float, spin: tuple[float, ...]) -> tuple[Array, Array]:
     """(R_world_body [3, 3], angular velocity [3] in the world), in the air without gravity."""
     with drop(BOX, at(0.0, 3.0), 0.0, physics(step_hz=rate_hz), 1) as world:
-        world.pull((0.0, 0.0, 0.0))
-        world.push((0.0, 0.0, 0.0), spin)
+        world.set_gravity((0.0, 0.0, 0.0))
+        world.set_velocity((0.0, 0.0, 0.0), spin)
         advance(world, round(rate_hz * seconds))
         return rotation_from_quaternion(np.array(world.pose()[1])), np.array(world.velocity()[1])
 

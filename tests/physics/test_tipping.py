@@ -8,8 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from schemas.job.physics import Physics
-from tests.physics.room import G, advance, at, box_body, lean, order, physics, slope
-from workers.physics.bullet import drop
+from tests.physics.room import G, advance, at, box_body, drop, lean, order, physics, slope
 
 WIDTH_M, HEIGHT_M = 0.06, 0.2
 MARGIN_M = 1e-6
@@ -40,9 +39,9 @@ def tips(settings: Physics, nearly_rad: float, angle_rad: float) -> bool:
     """
     with drop(BOX, at(0, HEIGHT_M / 2 + MARGIN_M), 0.0, settings, 1) as world:
         advance(world, settings.step_hz // 4)
-        world.pull(slope(nearly_rad))
+        world.set_gravity(slope(nearly_rad))
         advance(world, settings.step_hz // 2)
-        world.pull(slope(angle_rad))
+        world.set_gravity(slope(angle_rad))
         for _ in range(2 * settings.step_hz):
             world.advance()
             if abs(lean(world)) > TIPPED_RAD:

@@ -11,6 +11,23 @@ from schemas.scene.shape import Mesh
 from workers.geometry.manifold import hold_to_one_thread
 from workers.geometry.nearest import nearest_on_mesh
 
+CONVEX_SHARE = 0.9999
+"""Share of its hull's volume from which a body is convex."""
+
+SHALLOW_M = 5e-5
+"""Concavity up to which a surface is convex: the distance at which surfaces count as touching."""
+
+
+def fills_hull(volume_m3: float, points: Array) -> bool:
+    """Whether a body of this volume is convex: it fills the hull of its points [N, 3], metres."""
+    hold_to_one_thread()
+    return bool(volume_m3 >= CONVEX_SHARE * manifold3d.Manifold.hull_points(np.ascontiguousarray(points)).volume())
+
+
+def is_convex_surface(mesh: Mesh, solid: manifold3d.Manifold | None) -> bool:
+    """Whether a welded mesh is convex, by the volume of the `solid` that it encloses or by its concavity."""
+    return (solid is not None and fills_hull(solid.volume(), mesh.vertices)) or concavity_m(mesh) <= SHALLOW_M
+
 
 def weld(mesh: Mesh) -> Mesh:
     """The same triangles, each once, with one vertex at each place and none loose; none has two corners at one place."""

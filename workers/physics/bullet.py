@@ -1,9 +1,9 @@
-"""Rigid bodies falling onto a ground, in PyBullet. The one file that imports PyBullet, so that it can be replaced."""
+"""Rigid bodies on a ground, simulated by PyBullet. The only module that imports PyBullet, so that it can be replaced."""
 
 import math
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -15,79 +15,55 @@ from schemas.errors import SettleError
 from schemas.job.physics import Physics
 from schemas.scene.shape import Mesh
 from workers.geometry.frames import quaternion_of
-from workers.physics.bullet_buffers import Numbers
-from workers.physics.silence_stderr import silence_c_stderr
-from workers.physics.stop_conditions import SAME_PLANE_M, Motion
+from workers.physics.bullet_buffers import BulletBuffers
+from workers.physics.rest_pose import stands_on_face
+from workers.physics.rigid_body import Body, BodyPose
+from workers.physics.silence_stderr import silence_stderr
 
-with silence_c_stderr():
+with silence_stderr():
     import pybullet
 
 GRAVITY_M_S2 = 9.81
 
 SLAB_HALF_M = (2.0, 2.0, 0.25)
-"""Half the sides of the box that stands for level ground: larger and thicker than any table, so that nothing sinks
-through it. Bullet's plane is twice as fast and worse: it gives one contact a step, so that a box which lands on an edge
-turns about the vertical by ten times as much as on the box."""
+"""Half extents of the box for level ground, larger and thicker than any table. Bullet's plane is twice as fast but has one
+contact per step: a box that lands on an edge turns about the vertical by ten times as much."""
 
 MOST_GROUND_VERTICES, MOST_GROUND_INDICES = 131_072, 524_288
-"""PyBullet's limits on one collision mesh; it fails beyond them without a word why."""
-
-SLOP_M = 1e-5
-"""How deep bodies overlap at rest: Bullet leaves as much where it is."""
+"""PyBullet's limits on one collision mesh; beyond them it fails without a reason."""
 
 REPAIR = 0.05
-"""Share of what overlaps further that is pushed apart in a step. What is pushed keeps the speed, which is that share of the
-depth over the step: with 0.2 things that roll over edges gain energy, with 0.4 boxes are thrown up."""
+"""Share of the overlap beyond `SLOP_M` that is corrected per step. The correction leaves a speed of this share of the depth
+per step: with 0.2 bodies that roll over edges gain energy, with 0.4 boxes are thrown up."""
 
 REPAIR_S = 1.0 / 48.0
-"""Of one body on level ground, no more is pushed apart than its depth over this time: with one share for all steps the
-shortest throw it up sixteen times as fast as the longest, and what rolls from one lowest corner to the next gains energy all
-the way. In a pile, where bodies press on one another, and on a mesh that is too little."""
+"""Least time for correcting the overlap of a single body with level ground: one share for all steps would throw it up sixteen
+times as fast in the shortest as in the longest, and feed energy to what rolls over corners. Too slow for piles and meshes."""
 
 BOUNCE_REPAIR_S = 10.0 * REPAIR_S
-"""The same while things bounce, which they do from where they overlap by a step's way: it throws them up by so much less."""
+"""The same while bodies bounce, from an overlap of one step's travel: its correction must not add to the rebound."""
 
-ROUND_TO = 8
-"""Decimals of a collision shape's vertices, metres. Where more than three lie in a plane but for the last bits, Bullet's own
-hull leaves out some that are in it."""
+DECIMALS = 8
+"""Decimals of a collision shape's vertices, metres. Bullet's hull drops vertices where more than three lie in one plane
+except for the last bits."""
 
 REACH_SHARE = 0.02
-"""Bullet's own: contacts are looked for and kept at up to this share of the smaller body's size."""
+"""Bullet's default: contacts are found and kept within this share of the smaller body's size."""
 
 NO_THRESHOLD = 1e18
-"""Bullet's own: contacts count as soon as they are foreseen."""
+"""Bullet's default: contacts are solved as soon as they are predicted."""
 
 FASTEST = 1e4
-"""m/s and rad/s: what moves faster is held to it. Bullet's own is 100, and what is small spins faster where it lands."""
+"""Bound on speeds, m/s and rad/s. Bullet's default is 100, and small objects spin faster on landing."""
 
 WORLDS_BEFORE_RESET = 32
-"""What is removed from a simulation leaves some kilobytes behind, which only a reset frees; a reset costs as much as
-fifty milliseconds of simulated time."""
-
-
-@dataclass(frozen=True, eq=False)
-class Body:
-    """A rigid body about its centre of mass and along its principal axes.
-
-    moments [3] kg m^2; parts: the vertices [N, 3], metres, of convex bodies, each with a margin of `margin_m` about it. One
-    part may be a single point, which makes a ball of the margin. `rolls` is False where friction against rolling and
-    spinning is left out. `damping` is Bullet's, of speed and spin: nothing is damped that falls.
-    """
-
-    mass_kg: float
-    moments: Array
-    parts: tuple[Array, ...]
-    margin_m: float
-    rolls: bool = True
-    damping: float = 0.0
+"""Removed bodies leave some kilobytes behind, which only a reset frees; a reset costs as much as fifty milliseconds of
+simulated time."""
 
 
 @dataclass(frozen=True)
 class World:
-    """A ground and bodies on it, `steps` steps of the simulation at a time; bodies are told by their number.
-
-    What overlaps is pushed apart at no more than its depth over `repair_s`.
-    """
+    """A ground and bodies, numbered in order. `advance` takes `steps` steps; `repair_s` as `REPAIR_S`, or 0."""
 
     client: int
     ground: int
@@ -96,11 +72,11 @@ class World:
     repair_s: float = 0.0
 
     def advance(self) -> None:
-        """The steps that the world was opened for."""
+        """Take the steps that the world was opened for."""
         pybullet.stepSimulation(physicsClientId=self.client)
 
-    def pace(self, step_hz: float, bounces: bool = False) -> None:
-        """Go on at so many steps a second."""
+    def set_rate(self, step_hz: float, bounces: bool = False) -> None:
+        """Set the steps per second."""
         repair_s = max(BOUNCE_REPAIR_S if bounces else self.repair_s, 1.0 / (REPAIR * step_hz))
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=self.steps / step_hz,
@@ -109,29 +85,29 @@ class World:
             physicsClientId=self.client,
         )
 
-    def pose(self, body: int = 0) -> Motion:
-        """Where a body is."""
+    def pose(self, body: int = 0) -> BodyPose:
+        """Position and quaternion of a body frame."""
         position, quaternion = pybullet.getBasePositionAndOrientation(self.bodies[body], physicsClientId=self.client)
         return position, quaternion
 
     def velocity(self, body: int = 0) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-        """Velocity, m/s, of the centre of mass, and angular velocity, rad/s."""
+        """Velocity of the centre of mass, m/s, and angular velocity, rad/s, world axes."""
         v, w = pybullet.getBaseVelocity(self.bodies[body], physicsClientId=self.client)
         return v, w
 
-    def push(self, velocity: Sequence[float], spin: Sequence[float] = (0.0, 0.0, 0.0), body: int = 0) -> None:
-        """Give a centre of mass a velocity, m/s, and the body an angular velocity, rad/s, in world coordinates."""
+    def set_velocity(self, velocity: Sequence[float], spin: Sequence[float] = (0.0, 0.0, 0.0), body: int = 0) -> None:
+        """Set the velocity of a centre of mass, m/s, and the angular velocity, rad/s, world axes."""
         pybullet.resetBaseVelocity(self.bodies[body], list(velocity), list(spin), physicsClientId=self.client)
 
-    def pull(self, gravity: Sequence[float]) -> None:
-        """Another gravity, m/s^2, in this world alone: a level ground in it is a slope."""
+    def set_gravity(self, gravity: Sequence[float]) -> None:
+        """Set gravity, m/s^2, in this world alone."""
         pybullet.setGravity(*gravity, physicsClientId=self.client)
 
-    def bounce(self, restitution: float) -> None:
-        """Give ground and bodies this restitution from now on; a contact's is the product of its two.
+    def set_restitution(self, restitution: float) -> None:
+        """Set the restitution of ground and bodies; a contact's is the product of the two.
 
-        Bullet solves contacts before they close, and takes speed away in portions that are too slow to bounce: with steps
-        shorter than its contact distance over the speed nothing bounces. So what bounces waits until it overlaps.
+        Bullet solves contacts before they close and removes speed in portions too slow to bounce: with steps shorter than
+        its contact distance over the speed nothing bounces. So contacts that bounce are solved only once bodies overlap.
         """
         for thing in (self.ground, *self.bodies):
             pybullet.changeDynamics(
@@ -147,20 +123,20 @@ class World:
 def open_world(
     placed: Sequence[tuple[Body, Pose]], ground: float | Mesh, physics: Physics, steps: int, reach_m: float = math.inf
 ) -> Iterator[World]:
-    """A world with nothing but the bodies, each at its `T_world_body`, and the ground.
+    """Open a world of a ground, level at a height in metres or a mesh, and of bodies at their `T_world_body`.
 
-    Which is level at a height in metres, or a mesh, which then has no margin. `reach_m` is how far from a mesh things may have
-    contacts, if it is less than Bullet's own. Of two contacts that a vertex has with triangles of a mesh Bullet keeps the one
-    that it finds last: beside an edge a corner sinks in as long as the next triangle is in reach. On level ground less reach
-    would keep more of what rolls from gaining energy, but bowls then spin for ever.
+    `reach_m`: contact distance on a mesh, if less than Bullet's own. Of two contacts of a vertex with triangles of a mesh
+    Bullet keeps the one found last: beside an edge a corner sinks in while the next triangle is in reach. On level ground a
+    shorter reach would keep more rolling bodies from gaining energy, but bowls would spin for ever.
 
-    Bit-identical runs need deterministicOverlappingPairs. One connection serves the whole process: a new one costs as
-    much as a simulation. What was simulated before leaves no trace in the bits: two bodies are one pair, so that no
-    order of pairs, contacts or islands can differ, and for more bodies all is reset first. Blocks do not nest.
+    Runs are bit-identical with deterministicOverlappingPairs, whatever ran before: a single body and the ground are one
+    pair, without an order of pairs, contacts or islands, and for more bodies everything is reset first. One connection serves
+    the process, because a new one costs as much as a simulation. Blocks do not nest.
     """
-    client = _connection()
+    connection = _connect()
+    client = connection.client
     if len(placed) > 1:
-        _reset(client)
+        connection.reset()
     reach = reach_m if isinstance(ground, Mesh) else math.inf
     pybullet.setPhysicsEngineParameter(
         numSolverIterations=physics.solver_iterations,
@@ -171,68 +147,57 @@ def open_world(
     pybullet.setGravity(0.0, 0.0, -GRAVITY_M_S2, physicsClientId=client)
     things: list[int] = []
     try:
-        things.append(_add_mesh(client, ground) if isinstance(ground, Mesh) else _add_slab(client, ground))
-        _set_surface(client, things[0], physics, Body(0.0, np.zeros(3), (), 0.0, rolls=False))
+        things.append(_add_ground(client, ground))
+        _set_surface(client, things[0], physics)
         for body, T_world_body in placed:
-            level = len(placed) == 1 and _lies_flat(body, T_world_body)
+            level = len(placed) == 1 and stands_on_face(np.concatenate(body.parts), -T_world_body[2, :3])
             things.append(_add_body(client, body, T_world_body[:3, :3] if level else None))
             _set_surface(client, things[-1], physics, body)
-            _place(client, things[-1], T_world_body)
+            position, quaternion = T_world_body[:3, 3].tolist(), quaternion_of(T_world_body[:3, :3]).tolist()
+            pybullet.resetBasePositionAndOrientation(things[-1], position, quaternion, physicsClientId=client)
         repair_s = REPAIR_S if len(placed) == 1 and not isinstance(ground, Mesh) else 0.0
         world = World(client, things[0], tuple(things[1:]), steps, repair_s)
-        world.pace(physics.step_hz)
+        world.set_rate(physics.step_hz)
         if physics.restitution > 0.0:
-            world.bounce(physics.restitution)
-            world.pace(physics.step_hz, bounces=True)
+            world.set_restitution(physics.restitution)
+            world.set_rate(physics.step_hz, bounces=True)
         yield world
     finally:
-        _clear(client, things, 1 + len(placed))
-
-
-def drop(
-    body: Body, T_world_body: Pose, ground: float | Mesh, physics: Physics, steps: int
-) -> AbstractContextManager[World]:
-    """A world with one body."""
-    return open_world([(body, T_world_body)], ground, physics, steps)
+        connection.clear(things, 1 + len(placed))
 
 
 @dataclass
-class _Use:
-    """How many worlds a connection has seen since it was reset."""
+class _Connection:
+    """The connection of the process, with the number of worlds since its last reset."""
 
+    client: int
     worlds: int = 0
 
+    def reset(self) -> None:
+        pybullet.resetSimulation(physicsClientId=self.client)
+        self.worlds = 0
 
-_NUMBERS = Numbers()
-_USE = _Use()
+    def clear(self, things: list[int], whole: int) -> None:
+        self.worlds += 1
+        if self.worlds >= WORLDS_BEFORE_RESET or len(things) < whole:
+            self.reset()
+            return
+        for thing in reversed(things):
+            pybullet.removeBody(thing, physicsClientId=self.client)
+
+
+_BUFFERS = BulletBuffers()
 
 
 @cache
-def _connection() -> int:
-    client: int = pybullet.connect(pybullet.DIRECT)
-    return client
+def _connect() -> _Connection:
+    return _Connection(pybullet.connect(pybullet.DIRECT))
 
 
-def _reset(client: int) -> None:
-    pybullet.resetSimulation(physicsClientId=client)
-    _USE.worlds = 0
-
-
-def _clear(client: int, things: list[int], whole: int) -> None:
-    _USE.worlds += 1
-    if _USE.worlds >= WORLDS_BEFORE_RESET or len(things) < whole:
-        _reset(client)
-        return
-    for thing in reversed(things):
-        pybullet.removeBody(thing, physicsClientId=client)
-
-
-def _add_slab(client: int, height_m: float) -> int:
-    shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=SLAB_HALF_M, physicsClientId=client)
-    return pybullet.createMultiBody(0, shape, basePosition=[0, 0, height_m - SLAB_HALF_M[2]], physicsClientId=client)
-
-
-def _add_mesh(client: int, mesh: Mesh) -> int:
+def _add_ground(client: int, mesh: float | Mesh) -> int:
+    if not isinstance(mesh, Mesh):
+        shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=SLAB_HALF_M, physicsClientId=client)
+        return pybullet.createMultiBody(0, shape, basePosition=[0, 0, mesh - SLAB_HALF_M[2]], physicsClientId=client)
     if len(mesh.vertices) > MOST_GROUND_VERTICES or 3 * len(mesh.faces) > MOST_GROUND_INDICES:
         raise SettleError(
             "table_too_fine",
@@ -241,48 +206,36 @@ def _add_mesh(client: int, mesh: Mesh) -> int:
         )
     shape = pybullet.createCollisionShape(
         pybullet.GEOM_MESH,
-        vertices=_NUMBERS.vertices(mesh.vertices),
-        indices=_NUMBERS.indices(mesh.faces.ravel()),
+        vertices=_BUFFERS.vertices(mesh.vertices),
+        indices=_BUFFERS.indices(mesh.faces.ravel()),
         flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
         physicsClientId=client,
     )
     return pybullet.createMultiBody(0, shape, physicsClientId=client)
 
 
-def _lies_flat(body: Body, T_world_body: Pose) -> bool:
-    """Whether at least three vertices of the body are its lowest."""
-    height = np.concatenate(body.parts) @ T_world_body[2, :3]
-    return bool(np.count_nonzero(height <= height.min() + SAME_PLANE_M) >= 3)
-
-
 def _add_body(client: int, body: Body, R_world_body: Array | None) -> int:
-    """The body, its shape given to Bullet in the world's axes where `R_world_body` [3, 3] says how these lie.
+    """Add the body, with its shape in the world's axes where `R_world_body` [3, 3] is given.
 
-    Bullet's hulls are made on a grid of a ten-thousandth of their size along each axis, some 20 micrometres, on which only
-    the outermost vertices are where they belong. Those are, in the world's axes, the ones that the body stands on. But a
-    shape with axes of its own is a compound to Bullet, and compounds do not stay as well on one another.
+    Bullet builds hulls on a grid of a ten-thousandth of their size along each axis, some 20 micrometres, which keeps only
+    the outermost vertices exact. In the world's axes these are the ones that the body stands on. But a shape with axes of
+    its own is a compound to Bullet, and compounds are less stable on one another.
     """
-    parts = [np.round(part if R_world_body is None else part @ R_world_body.T, ROUND_TO) for part in body.parts]
+    parts = [np.round(part if R_world_body is None else part @ R_world_body.T, DECIMALS) for part in body.parts]
     orientation = [0.0, 0.0, 0.0, 1.0] if R_world_body is None else quaternion_of(R_world_body.T).tolist()
     if len(parts) > 1:
         shape = _compound(client, parts, orientation)
-    elif R_world_body is None:
-        vertices = _NUMBERS.vertices(parts[0])
-        shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client)
     else:
-        shape = pybullet.createCollisionShape(
-            pybullet.GEOM_MESH,
-            vertices=_NUMBERS.vertices(parts[0]),
-            collisionFrameOrientation=orientation,
-            physicsClientId=client,
-        )
+        own_axes = {} if R_world_body is None else {"collisionFrameOrientation": orientation}
+        vertices = _BUFFERS.vertices(parts[0])
+        shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client, **own_axes)
     thing: int = pybullet.createMultiBody(body.mass_kg, shape, physicsClientId=client)
     pybullet.changeDynamics(thing, -1, localInertiaDiagonal=body.moments.tolist(), physicsClientId=client)
     return thing
 
 
 def _compound(client: int, parts: Sequence[Array], orientation: list[float]) -> int:
-    """One collision shape of many convex parts, which PyBullet takes from a file alone: the objects of an OBJ."""
+    """A collision shape of several convex parts. PyBullet reads these from a file alone: the objects of an OBJ."""
     lines, first = [], 1
     for number, vertices in enumerate(parts):
         lines.append(f"o part{number}")
@@ -298,31 +251,29 @@ def _compound(client: int, parts: Sequence[Array], orientation: list[float]) -> 
     return shape
 
 
-def _set_surface(client: int, thing: int, physics: Physics, body: Body) -> None:
-    # The arm of a contact is the sum over both of one's rolling friction times the other's friction: the ground's part is
-    # given to the bodies, so that it is gone where a body has none.
+def _set_surface(client: int, thing: int, physics: Physics, body: Body | None = None) -> None:
+    """Set friction, margin and damping of a body, or of the ground."""
+    # A contact's arm is the sum over both of one's rolling friction times the other's friction. The bodies get the ground's
+    # share too, so that rolling friction can be left out for them.
+    share = 0.0 if body is None else 2.0
+    damping = 0.0 if body is None else body.damping
     pybullet.changeDynamics(
         thing,
         -1,
         lateralFriction=physics.friction,
-        rollingFriction=2.0 * physics.rolling_friction if body.rolls else 0.0,
-        spinningFriction=2.0 * physics.spinning_friction if body.rolls else 0.0,
+        rollingFriction=share * physics.rolling_friction,
+        spinningFriction=share * physics.spinning_friction,
         restitution=0.0,
-        collisionMargin=body.margin_m,
-        linearDamping=body.damping,
-        angularDamping=body.damping,
+        collisionMargin=0.0 if body is None else body.margin_m,
+        linearDamping=damping,
+        angularDamping=damping,
         maxJointVelocity=FASTEST,
         physicsClientId=client,
     )
 
 
 def _size_m(body: Body) -> float:
-    """What Bullet takes for a body's size: half the diagonal of its box, and how far its middle is from its centre of mass."""
+    """Bullet's measure of a body: half the diagonal of its box, plus the distance of its middle from the centre of mass."""
     points = np.concatenate(body.parts)
     low, high = points.min(axis=0) - body.margin_m, points.max(axis=0) + body.margin_m
     return float(np.linalg.norm(high - low) + np.linalg.norm(high + low)) / 2.0
-
-
-def _place(client: int, thing: int, T: Pose) -> None:
-    quaternion = quaternion_of(T[:3, :3])
-    pybullet.resetBasePositionAndOrientation(thing, T[:3, 3].tolist(), quaternion.tolist(), physicsClientId=client)

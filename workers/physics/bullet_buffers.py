@@ -1,4 +1,4 @@
-"""Lists that are handed to PyBullet again and again."""
+"""Lists that are passed to PyBullet and reused, because it leaks what it is given."""
 
 from dataclasses import dataclass, field
 
@@ -9,11 +9,11 @@ from schemas.base import Array
 
 
 @dataclass(frozen=True)
-class Numbers:
-    """Python objects that are handed to PyBullet again and again.
+class BulletBuffers:
+    """Python objects with new contents for every call.
 
-    PyBullet 3.2.7 takes a reference to each list of vertices or indices, and to each of their items, and never gives it
-    back (190 bytes a vertex). So it is given the same objects each time, with other contents.
+    PyBullet 3.2.7 takes a reference to each list of vertices or indices and to each item, and never releases it (190
+    bytes a vertex).
     """
 
     points: list[list[float]] = field(default_factory=list)

@@ -1,36 +1,34 @@
-"""The effects of physics: which of them the scene calls for, from its shapes and scales alone. Pure."""
+"""The effects of physics, and the predicates that decide from shapes and scales which of them a scene needs. Pure."""
 
 import itertools
 import math
 from collections.abc import Callable, Sequence
 
-import manifold3d
 import numpy as np
 
 from schemas.base import Array
 from schemas.job.physics import Physics
 from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.shape import Hull
+from workers.geometry.convexity import fills_hull
 from workers.geometry.frames import transform
-from workers.geometry.manifold import hold_to_one_thread
-from workers.physics.convex_parts.step import CONVEX_SHARE
 from workers.physics.table_top import inside_margin
 
 NEIGHBOUR_RAD = math.radians(30.0)
-"""Planes of a hull whose normals are this near belong to one stretch of its surface."""
+"""Greatest angle between normals of a hull that belong to one stretch of its surface."""
 
 ROUND_SHARE = 0.03
-"""A stretch on which the centre of mass is as high to within this share, over what it rests on, is round: a prism of 13
-sides or more. The height over the faces of a box grows by a sixth within 10 degrees."""
+"""A stretch is round if the height of the centre of mass over it varies by less than this share: a prism of 13 sides or more.
+The height over the faces of a box grows by a sixth within 10 degrees."""
 
 SAME_PLANE_RAD = 0.02
-"""Normals this near are of one plane: a hull's faces are triangles, known to rounding."""
+"""Greatest angle between normals of one plane: a hull's faces are triangles, known to rounding."""
 
 CELL = 0.04
-"""Of normals in one cell of this size one is looked at."""
+"""Size of the cells of normals, of which one normal each is kept."""
 
 LEAST_ROOM_M = 0.01
-"""Objects whose rooms are narrower than this are simulated together at once."""
+"""Objects with less room than this are simulated together."""
 
 AT_REST = "placed in a statically stable pose"
 
@@ -38,22 +36,22 @@ Predicate = Callable[[Sequence[ObjectStart], Table, Physics], str | None]
 
 
 def is_round(hull: Hull, com: Array) -> bool:
-    """Whether the object may rest on a stretch of its hull over which it rolls.
+    """Whether the object may rest on a stretch of its hull over which it rolls; com [3], object frame.
 
-    com [3], object frame. Where the object rests, its centre of mass is lower above the plane than above all neighbours;
-    on a round stretch it is hardly lower than above some of them.
+    At rest the centre of mass is lower over the plane than over all its neighbours, and on a round stretch hardly lower
+    than over some of them.
     """
     cells = np.round(hull.normals / CELL).astype(np.int64) @ np.array([10_000, 100, 1])
     normals = hull.normals[np.unique(cells, return_index=True)[1]]
     height = (hull.vertices @ normals.T).max(axis=0) - normals @ com
     cosine = normals @ normals.T
     near = (cosine > math.cos(NEIGHBOUR_RAD)) & (cosine < math.cos(SAME_PLANE_RAD))
-    lowest = np.where(near, height, np.inf).min(axis=1)  # of the neighbours
+    lowest = np.where(near, height, np.inf).min(axis=1)  # over the neighbours
     return bool(((height <= lowest) & (lowest <= height * (1.0 + ROUND_SHARE))).any())
 
 
 def starts_over_top(start: ObjectStart, table: Table) -> bool:
-    """Whether every point of the object is over the table's flat top, which is convex, when it is let go."""
+    """Whether the whole object is released over the table's top, and the top is flat and convex."""
     if not table.top.convex:
         return False
     points = transform(start.T_world_obj, start.hull.vertices)[:, :2]
@@ -61,17 +59,13 @@ def starts_over_top(start: ObjectStart, table: Table) -> bool:
 
 
 def is_convex(start: ObjectStart) -> bool:
-    """Whether the object fills its hull; what encloses no body does not."""
+    """Whether the object fills its hull; a mesh that encloses no body does not."""
     volume = start.asset.volume_m3
-    if volume is None:
-        return False
-    hold_to_one_thread()
-    hull = manifold3d.Manifold.hull_points(np.ascontiguousarray(start.hull.vertices))
-    return volume >= CONVEX_SHARE * hull.volume()
+    return volume is not None and fills_hull(volume, start.hull.vertices)
 
 
 def rooms_m(starts: Sequence[ObjectStart]) -> list[float]:
-    """How far each object's centre of mass may go sideways without any two having to meet; negative where they may."""
+    """Metres that each centre of mass may go sideways before any two objects can meet; negative where they already can."""
     middles = [transform(start.T_world_obj, start.asset.mass.com[None, :])[0, :2] for start in starts]
     reaches = [float(np.linalg.norm(start.hull.vertices - start.asset.mass.com, axis=1).max()) for start in starts]
     rooms = [math.inf] * len(starts)
@@ -82,7 +76,7 @@ def rooms_m(starts: Sequence[ObjectStart]) -> list[float]:
 
 
 def _resting(predicate: Predicate) -> Predicate:
-    """An effect of motion: not called for where nothing moves."""
+    """The predicate of an effect of motion, which is skipped where nothing moves."""
 
     def skipped(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
         return AT_REST if all(start.placed for start in starts) else predicate(starts, table, physics)
@@ -90,16 +84,9 @@ def _resting(predicate: Predicate) -> Predicate:
     return skipped
 
 
-def _always(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
-    return None
-
-
-def _over_top(starts: Sequence[ObjectStart], table: Table) -> bool:
-    return all(starts_over_top(start, table) for start in starts)
-
-
 def _table_mesh(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
-    return "all starts over the table's convex flat top, and nothing left it" if _over_top(starts, table) else None
+    over_top = all(starts_over_top(start, table) for start in starts)
+    return "all starts over the table's convex flat top, and nothing left it" if over_top else None
 
 
 def _object_contacts(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
@@ -109,18 +96,22 @@ def _object_contacts(starts: Sequence[ObjectStart], table: Table, physics: Physi
 
 
 def _decomposition(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
+    apart = _object_contacts(starts, table, physics) is not None
+    if physics.collision == "planned" and apart and _table_mesh(starts, table, physics) is not None:
+        return "over a flat top an object touches with its hull alone"
+    return _parts_needless(starts, physics)
+
+
+def _parts_needless(starts: Sequence[ObjectStart], physics: Physics) -> str | None:
+    """The reason why objects fall whole wherever they touch; None where one needs convex parts."""
     if physics.collision in ("box", "hull"):
         return f"physics.collision is {physics.collision}"
-    alone = _object_contacts(starts, table, physics) is not None
-    if physics.collision == "planned" and alone and _over_top(starts, table):
-        return "over a flat top an object touches with its hull alone"
     return "every object is convex" if all(is_convex(start) for start in starts) else None
 
 
-def on_mesh(starts: Sequence[ObjectStart], physics: Physics) -> tuple[str, ...]:
-    """Effects that are called for where a footprint left the flat top, or an object came where it may meet another."""
-    parts = physics.collision not in ("box", "hull") and not all(is_convex(start) for start in starts)
-    return ("table_mesh", "decomposition") if parts else ("table_mesh",)
+def called_for_with(name: str, starts: Sequence[ObjectStart], physics: Physics) -> tuple[str, ...]:
+    """`table_mesh` or `object_contacts`, needed after all, with `decomposition` where objects then need convex parts."""
+    return (name,) if _parts_needless(starts, physics) else (name, "decomposition")
 
 
 def _rolling(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
@@ -132,11 +123,11 @@ def _restitution(starts: Sequence[ObjectStart], table: Table, physics: Physics) 
 
 
 PREDICATES: dict[str, Predicate] = {
-    "dynamics": _resting(_always),
+    "dynamics": _resting(lambda *_: None),
     "table_mesh": _resting(_table_mesh),
     "object_contacts": _resting(_object_contacts),
     "decomposition": _resting(_decomposition),
-    "fine_step": _resting(_always),
+    "fine_step": _resting(lambda *_: None),
     "rolling_friction": _resting(_rolling),
     "restitution": _resting(_restitution),
 }
@@ -150,9 +141,9 @@ COSTS: dict[str, str] = {
     "rolling_friction": "three rows more for each pair in contact",
     "restitution": "the fall is simulated for longer",
 }
-"""What each costs where it runs."""
+"""Cost of each where it runs."""
 
 
 def called_for(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> frozenset[str]:
-    """Names of the effects of physics that these objects call for."""
+    """The names of the effects of physics that these objects need."""
     return frozenset(name for name, skipped in PREDICATES.items() if skipped(starts, table, physics) is None)

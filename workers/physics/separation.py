@@ -1,7 +1,8 @@
-"""How near the objects of a scene come to the table and to one another, between their meshes. Pure geometry."""
+"""Distance or overlap of objects with the table and with one another, between their meshes. Pure."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import cache
 
 import manifold3d
 import numpy as np
@@ -14,45 +15,52 @@ from workers.geometry.hull_offset import least_width_m
 from workers.geometry.manifold import hold_to_one_thread
 
 NEAR_M = 0.02
-"""How far from an object the next one is looked for."""
+"""Farthest distance between two objects that is measured."""
 
 NO_VOLUME = 1e-15
-"""Cubic metres: what two bodies share by rounding alone."""
-
+"""Cubic metres of overlap that are rounding alone."""
 
 BESIDE_M = 1e-3
-"""What seems to lie deeper in the ground than this, along z, may touch the side of a wall that rises beside it."""
+"""Depth in the ground, along z, beyond which an object may be touching the side of a wall instead."""
 
 SIDE_M = 5e-4
-"""It does if it is not as deep any more when its sides are so much further in."""
+"""It touches a wall if it is less deep once its sides are moved in by this much."""
 
 SIDE_TO_M = 1e-7
-"""To what its depth in the wall is told."""
+"""Resolution of its depth in the wall."""
 
 
 def clearances(meshes: Sequence[Mesh], ground: Terrain) -> list[float]:
-    """Of each mesh (world coordinates): metres to what is nearest, negative where they overlap most.
+    """For each mesh (world coordinates) the metres to the nearest other or to the ground; negative where they overlap most.
 
-    To the ground see `ground_gap_m`. Between two meshes the least distance, or minus the least width of what they share; a mesh
-    that encloses no body stands there as its hull.
+    To the ground as `ground_gap_m`. Between two meshes as `between`, where a mesh that encloses no body counts as its hull.
     """
-    hold_to_one_thread()
-    solids = [_solid(mesh) for mesh in meshes]
-    boxes = [(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) for mesh in meshes]
     found = [ground_gap_m(mesh, ground) for mesh in meshes]
-    for i, j in itertools.combinations(range(len(meshes)), 2):
-        if (boxes[i][0] > boxes[j][1] + NEAR_M).any() or (boxes[j][0] > boxes[i][1] + NEAR_M).any():
-            continue
-        gap = between(solids[i], solids[j])
+    for i, j, gap in find_gaps_m(meshes):
         found[i], found[j] = min(found[i], gap), min(found[j], gap)
     return found
 
 
-def above_ground(mesh: Mesh, ground: Terrain) -> tuple[float, float]:
-    """(metres along z down to the ground, negative where a mesh reaches into it; metres that it reaches into a wall's side).
+def find_gaps_m(meshes: Sequence[Mesh], near_m: float = NEAR_M) -> Iterator[tuple[int, int, float]]:
+    """(i, j, `between` them) of every two meshes, in one frame, whose boxes are within `near_m` of one another."""
+    solids = cache(lambda k: _solid(meshes[k]))
+    for i, j in find_near(meshes, near_m):
+        yield i, j, between(solids(i), solids(j))
 
-    Along z, what reaches into the side of a wall by a hair would be as deep as the wall is high. So where it is deep its
-    sides are moved in until it is not.
+
+def find_near(meshes: Sequence[Mesh], near_m: float) -> Iterator[tuple[int, int]]:
+    """The numbers i < j of every two meshes, in one frame, whose bounding boxes are within `near_m` of one another."""
+    boxes = [(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) for mesh in meshes]
+    for i, j in itertools.combinations(range(len(meshes)), 2):
+        if (boxes[i][0] <= boxes[j][1] + near_m).all() and (boxes[j][0] <= boxes[i][1] + near_m).all():
+            yield i, j
+
+
+def above_ground(mesh: Mesh, ground: Terrain) -> tuple[float, float]:
+    """(metres along z down to the ground, negative for a mesh that reaches into it; metres of overlap with a wall's side).
+
+    Along z a hair of overlap with a wall's side is as deep as the wall is high. So where the overlap is deep, the mesh is
+    narrowed until it is not.
     """
     gap = vertical_gap(mesh, ground)
     if gap >= -BESIDE_M or vertical_gap(_narrower(mesh, SIDE_M), ground) < -BESIDE_M:
@@ -65,7 +73,7 @@ def above_ground(mesh: Mesh, ground: Terrain) -> tuple[float, float]:
 
 
 def _narrower(mesh: Mesh, by_m: float) -> Mesh:
-    """The mesh drawn together about its middle, so that its sides are so much further in; heights stay."""
+    """The mesh scaled about its middle in x and y, so that each side moves in by `by_m`."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     shares = np.append(1.0 - 2.0 * by_m / np.maximum((high - low)[:2], 2.0 * by_m), 1.0)
     middle = (low + high) / 2
@@ -73,24 +81,18 @@ def _narrower(mesh: Mesh, by_m: float) -> Mesh:
 
 
 def ground_gap_m(mesh: Mesh, ground: Terrain) -> float:
-    """Metres from a mesh to the ground along z; minus how far it reaches into the ground, or into a wall's side if more."""
+    """Metres from a mesh to the ground along z; minus the depth of overlap with the ground, or with a wall's side if more."""
     below, beside = above_ground(mesh, ground)
     return min(below, -beside) if beside > 0.0 else below
 
 
 def between(a: manifold3d.Manifold, b: manifold3d.Manifold) -> float:
-    """Metres between two bodies, `NEAR_M` at most; minus the least width of the widest piece that both share."""
+    """Metres between two bodies, `NEAR_M` at most; minus the least width of the widest piece of their intersection."""
     hold_to_one_thread()
     pieces = [piece for piece in (a ^ b).decompose() if piece.volume() > NO_VOLUME]
     if not pieces:
         return float(a.min_gap(b, NEAR_M))
     return -max(least_width_m(convex_hull(triangles_of(piece).vertices)) for piece in pieces)
-
-
-def overlap_m(a: Mesh, b: Mesh) -> float:
-    """Metres that two meshes (world coordinates) reach into one another at most; 0 where they do not."""
-    apart = (a.vertices.min(axis=0) > b.vertices.max(axis=0)) | (b.vertices.min(axis=0) > a.vertices.max(axis=0))
-    return 0.0 if apart.any() else max(0.0, -between(_solid(a), _solid(b)))
 
 
 def _solid(mesh: Mesh) -> manifold3d.Manifold:

@@ -1,4 +1,4 @@
-"""Keeping compiled libraries from writing where a program's messages go."""
+"""A block in which compiled libraries cannot write to standard error."""
 
 import os
 import sys
@@ -9,17 +9,17 @@ STDERR = 2
 
 
 @contextmanager
-def silence_c_stderr() -> Iterator[None]:
-    """Drop what C code prints to standard error within the block; an exception is told after it, as ever.
+def silence_stderr() -> Iterator[None]:
+    """Discard what C code prints to standard error; an exception is reported after the block, as usual.
 
-    PyBullet prints its build time when it is imported, which would head every command's messages.
+    PyBullet prints its build time on import, at the head of every command's messages.
     """
     sys.stderr.flush()
-    kept, nowhere = os.dup(STDERR), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, STDERR)
+    with open(os.devnull, "wb") as devnull:
+        kept = os.dup(STDERR)
+        os.dup2(devnull.fileno(), STDERR)
     try:
         yield
     finally:
         os.dup2(kept, STDERR)
         os.close(kept)
-        os.close(nowhere)

@@ -1,4 +1,4 @@
-"""From release to rest: the objects of a scene, one by one or together, and what becomes of them if they are let go again."""
+"""The physics step: objects from release to rest, and their second release as a check."""
 
 import dataclasses
 import math
@@ -8,15 +8,17 @@ from dataclasses import dataclass, field
 from schemas.base import Pose
 from schemas.job.physics import Physics
 from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart, ScenePlan, Table
+from schemas.scene.plan import ObjectStart, ScenePlan
 from schemas.scene.scene import Settled
 from workers.geometry.frames import moved_between
-from workers.physics.effects import called_for, on_mesh, rooms_m
-from workers.physics.settle_group import release_together, settle_together
-from workers.physics.settle_single import LeftRoomError, let_go, settle_alone, watching
+from workers.physics.effects import called_for_with, rooms_m
+from workers.physics.fall import FINEST
+from workers.physics.placement import Ground
+from workers.physics.release import Drop, release
+from workers.physics.settle import LeftRoomError, add_effects, settle
 
 RECHECK_S = 1.0
-"""How long an object is watched when it is released again."""
+"""Simulated time of the second release."""
 
 LEFT_TOP = "a footprint left the table's flat top"
 LEFT_ROOM = "an object left the room that it had to itself"
@@ -24,77 +26,66 @@ LEFT_ROOM = "an object left the room that it had to itself"
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """Every object of a scene at rest, and the effects that the plan had left out and that were called for after all."""
+    """Every object of a scene at rest, and the reasons why effects that the plan had skipped ran after all."""
 
     settled: tuple[Settled, ...]
     called: Mapping[str, str] = field(default_factory=dict)
 
 
 def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan) -> Rest:
-    """Drop the scene's objects, wait until they rest, and remove what the simulator left of gap and tilt.
+    """Drop the scene's objects, wait until they rest, and correct the simulator's gap and tilt of single ones.
 
-    Raises SettleError `not_at_rest`, `left_table`, `unsupported` or `table_too_fine`. The result is a function of the
-    arguments alone: the world is made anew each time.
+    Objects that cannot meet settle one by one. Raises SettleError `objects_overlap`, `not_at_rest`, `left_table`,
+    `unsupported` or `table_too_fine`. A pure function: every simulation starts from an empty world.
     """
-    starts, table, called = plan.objects, plan.table, dict[str, str]()
-    if len(starts) == 1:
-        settled: tuple[Settled, ...] = (settle_alone(starts[0], table, physics, effects.ran),)
-    elif effects.runs("object_contacts"):
-        settled = settle_together(starts, table, physics, effects.ran)
+    starts, ground, called = plan.objects, Ground(plan.table), dict[str, str]()
+    if len(starts) > 1 and effects.runs("object_contacts"):
+        settled = settle(Drop(starts, ground, physics, effects))
     else:
         try:
-            rooms = rooms_m(starts)
-            settled = tuple(
-                settle_alone(start, table, physics, effects.ran, room)
-                for start, room in zip(starts, rooms, strict=True)
-            )
+            rooms = zip(starts, rooms_m(starts), strict=True)
+            settled = tuple(settle(Drop((start,), ground, physics, effects, room_m))[0] for start, room_m in rooms)
         except LeftRoomError:
-            called["object_contacts"] = LEFT_ROOM
-            called |= {name: LEFT_ROOM for name in on_mesh(starts, physics) if name != "table_mesh"}
-            settled = settle_together(starts, table, physics, (*effects.ran, *called))
+            called = dict.fromkeys(called_for_with("object_contacts", starts, physics), LEFT_ROOM)
+            settled = settle(Drop(starts, ground, physics, add_effects(effects, called)))
     if any(rest.support == "mesh" for rest in settled):
-        called |= dict.fromkeys(on_mesh(starts, physics), LEFT_TOP)
+        called |= dict.fromkeys(called_for_with("table_mesh", starts, physics), LEFT_TOP)
     return Rest(settled, {name: why for name, why in called.items() if not effects.runs(name)})
 
 
-def recheck(start: ObjectStart, settled: Settled, table: Table, physics: Physics) -> tuple[float, float]:
-    """How far the farthest point moves, mm, and the object turns, degrees, when it is released again where it rests.
-
-    For `RECHECK_S`, in the finest steps, on the ground that it came to rest on. Nothing is corrected afterwards.
-    """
-    ran = called_for((start,), table, physics) | set(on_mesh((start,), physics) if settled.support == "mesh" else ())
-    return moved_by(start, settled.T_world_obj, let_go(start, settled, table, physics, ran, RECHECK_S))
-
-
 def recheck_scene(plan: ScenePlan, rest: Rest, physics: Physics, effects: EffectPlan) -> Rest:
-    """The same, with how far every object moved and turned when all were released again."""
-    called = EffectPlan((*effects.ran, *rest.called), effects.skipped)
-    poses = release_again(plan, rest.settled, physics, called, RECHECK_S)
+    """The same rest, with the motion of every object after a second release of all."""
+    poses = release_again(plan, rest.settled, physics, add_effects(effects, rest.called), RECHECK_S)
     settled = []
     for start, before, after in zip(plan.objects, rest.settled, poses, strict=True):
-        moved, turned = moved_by(start, before.T_world_obj, after)
-        settled.append(dataclasses.replace(before, recheck_move_mm=moved, recheck_turn_deg=turned))
+        moved_mm, turned_deg = moved_by(start, before.T_world_obj, after)
+        settled.append(dataclasses.replace(before, recheck_move_mm=moved_mm, recheck_turn_deg=turned_deg))
     return dataclasses.replace(rest, settled=tuple(settled))
 
 
 def release_again(
     plan: ScenePlan, settled: Sequence[Settled], physics: Physics, effects: EffectPlan, seconds: float
 ) -> tuple[Pose, ...]:
-    """Where the objects are, `T_world_obj` [4, 4] each, that long after they were released where they rest.
+    """`T_world_obj` [4, 4] of every object this long after its release from where it rests.
 
-    With the effects that the plan names, in the finest steps; nothing is corrected afterwards.
+    With the effects of the plan and in the finest steps, without correction. Nothing counts as resting before the end.
     """
-    if len(plan.objects) > 1 and effects.runs("object_contacts"):
-        flat = not effects.runs("table_mesh") and all(rest.support != "mesh" for rest in settled)
-        poses = [rest.T_world_obj for rest in settled]
-        return release_together(plan.objects, poses, plan.table, watching(physics, seconds), effects.ran, flat).poses
-    return tuple(
-        let_go(start, rest, plan.table, physics, effects.ran, seconds)
-        for start, rest in zip(plan.objects, settled, strict=True)
+    rest = physics.rest.model_copy(update={"window_s": 2.0 * seconds})
+    fine = {"step_hz": FINEST * physics.step_hz, "max_settle_s": seconds, "rest": rest}
+    physics = physics.model_copy(update=fine)
+    starts = tuple(
+        dataclasses.replace(start, T_world_obj=before.T_world_obj)
+        for start, before in zip(plan.objects, settled, strict=True)
     )
+    drop = Drop(starts, Ground(plan.table), physics, effects)
+    flat = [before.support != "mesh" and not effects.runs("table_mesh") for before in settled]
+    if not drop.single and effects.runs("object_contacts"):
+        return release(drop, all(flat)).poses
+    alone = (dataclasses.replace(drop, starts=(start,)) for start in starts)
+    return tuple(release(each, on_top).poses[0] for each, on_top in zip(alone, flat, strict=True))
 
 
 def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, float]:
-    """Between two poses of an object: how far its farthest point went, mm, and by how much it turned, degrees."""
+    """(mm that the farthest point of an object moves between two poses, degrees that it turns)."""
     moved_m, turned_rad = moved_between(start.hull.vertices, before, after)
     return moved_m * 1e3, math.degrees(turned_rad)

@@ -1,4 +1,4 @@
-"""What a table offers to stand on: its top, and the polygon of it."""
+"""The level top of a table and its outline."""
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -14,13 +14,12 @@ LEVEL = 0.999
 """Cosine to the vertical of a face that counts as level: 2.6 degrees."""
 
 SAME_LEVEL_M = 1e-4
-"""Faces whose heights differ by less belong to one level."""
+"""Greatest difference in height of faces of one level."""
 
 TOP_SHARE = 0.5
-"""The top is the highest level with at least this share of the largest level's area: a shelf is not the top, and
-neither is a rim."""
+"""The top is the highest level with at least this share of the largest level's area, which excludes shelves and rims."""
 
-CONVEX_SHARE = 0.999
+FILLED_SHARE = 0.999
 """A top that fills this share of its convex hull is convex and without holes."""
 
 
@@ -30,7 +29,7 @@ def find_table_top(shape: Shape) -> TableTop:
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     doubled = np.linalg.norm(normal, axis=1)
-    # Either side: a stranger's table may be wound inside out. Of a slab's two sides the upper one is chosen by height.
+    # Both sides count: external tables may be wound inside out. Height selects the upper side of a slab.
     level = (np.abs(normal[:, 2]) > LEVEL * doubled) & (doubled > 0)
     if not level.any():
         raise StartError("no_table_top", "the table's mesh has no level face within 2.6 degrees: leave this table out")
@@ -50,9 +49,9 @@ def _describe(points: Array, area_m2: float, highest_m: float) -> TableTop:
         hull = ConvexHull(points[:, :2])
     except QhullError as error:
         raise StartError("no_table_top", "the table's level faces have no area: leave this table out") from error
-    # A face that leans within `LEVEL` is no level: nothing may be dropped on a level plane at its highest point.
+    # A face that leans within `LEVEL` is not flat: a level plane at its highest point would not stand for it.
     even = height - float(points[:, 2].min()) <= SAME_LEVEL_M
-    convex = even and area_m2 >= CONVEX_SHARE * hull.volume and highest_m <= height + SAME_LEVEL_M
+    convex = even and area_m2 >= FILLED_SHARE * hull.volume and highest_m <= height + SAME_LEVEL_M
     middle = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
     return TableTop(height, frozen_array(middle), frozen_array(points[hull.vertices, :2]), bool(convex))
 
@@ -63,14 +62,12 @@ def place_table(asset: Asset) -> Table:
     lowest = float(asset.shape.bounds[0, 2])
     T = translation(-top.centre[0], -top.centre[1], -lowest)
     mesh = Mesh(frozen_array(transform(T, asset.shape.vertices)), asset.shape.faces)
-    outline = frozen_array(top.outline - top.centre)
-    return Table(
-        asset, frozen_array(T), mesh, TableTop(top.height_m - lowest, frozen_array([0.0, 0.0]), outline, top.convex)
-    )
+    outline, centre = frozen_array(top.outline - top.centre), frozen_array([0.0, 0.0])
+    return Table(asset, frozen_array(T), mesh, TableTop(top.height_m - lowest, centre, outline, top.convex))
 
 
 def inside_margin(points_xy: Array, outline: Array) -> Array:
-    """[N] float64 metres: how far each point lies inside a convex polygon [M, 2], counter-clockwise; negative outside.
+    """[N] float64 metres: depth of each point inside a convex polygon [M, 2], counter-clockwise; negative outside.
 
     The least signed distance to the polygon's edge lines.
     """
@@ -83,7 +80,7 @@ def inside_margin(points_xy: Array, outline: Array) -> Array:
 
 
 def support_height(points_xy: Array, table: Mesh) -> float:
-    """The highest that a table reaches under, or within the bounding box of, points [N, 2]; -inf off the table."""
+    """Height of the table's highest point below, or within the bounding box of, points [N, 2]; -inf off the table."""
     heights = heights_at(points_xy, table)
     low, high = points_xy.min(axis=0), points_xy.max(axis=0)
     inside = ((table.vertices[:, :2] >= low) & (table.vertices[:, :2] <= high)).all(axis=1)

@@ -25,7 +25,7 @@ from workers.geometry.frames import (
     uniform_rotation,
 )
 from workers.geometry.hull import convex_hull
-from workers.physics.rest_pose import support_margin, touching
+from workers.physics.rest_pose import find_contacts_xy, support_margin
 from workers.physics.table_top import place_table, support_height
 from workers.plan.arrange import has_room, rise_above
 from workers.plan.randomness import Stream, of_object, stream
@@ -126,7 +126,7 @@ def set_down(T_world_obj: Pose, hull: Hull, table: Mesh) -> Pose:
 
 def stands_on(T_world_obj: Pose, hull: Hull, com: Array, table: Mesh) -> bool:
     """Whether the centre of mass [3] lies inside the hull of the points that touch the table."""
-    contacts = touching(hull, T_world_obj, table)
+    contacts = find_contacts_xy(hull, T_world_obj, table)
     return support_margin(contacts, transform(T_world_obj, com[None, :])[0, :2]) > 0.0
 
 

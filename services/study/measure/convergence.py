@@ -8,7 +8,8 @@ import numpy as np
 from schemas.base import Array
 from schemas.job.job import Job
 from schemas.job.physics import Physics
-from workers.physics.bullet import GRAVITY_M_S2, Body, World, drop
+from workers.physics.bullet import GRAVITY_M_S2, World, open_world
+from workers.physics.rigid_body import Body
 
 RATES_HZ = (960, 1920, 3840, 7680)
 FALL_S = 0.5
@@ -52,17 +53,17 @@ def _at(height_m: float) -> Array:
 
 def _fall_error_m(rate_hz: int) -> float:
     """Against half g t squared."""
-    with drop(_block(), _at(_HEIGHT_M), 0.0, _physics(rate_hz), 1) as world:
+    with open_world([(_block(), _at(_HEIGHT_M))], 0.0, _physics(rate_hz), 1) as world:
         _advance(world, round(FALL_S * rate_hz))
         return float(_HEIGHT_M - world.pose()[0][2] - GRAVITY_M_S2 * FALL_S**2 / 2)
 
 
 def _slide_error_m(rate_hz: int) -> float:
     """Against v squared / 2 mu g, as Coulomb friction brakes evenly; after a second in which the block comes to lie."""
-    with drop(_block(), _at(_SIDES_M[2] / 2 + _MARGIN_M), 0.0, _physics(rate_hz), 1) as world:
+    with open_world([(_block(), _at(_SIDES_M[2] / 2 + _MARGIN_M))], 0.0, _physics(rate_hz), 1) as world:
         _advance(world, rate_hz)
         before = world.pose()[0][0]
-        world.push((SLIDE_M_S, 0.0, 0.0))
+        world.set_velocity((SLIDE_M_S, 0.0, 0.0))
         _advance(world, rate_hz)
         return float(world.pose()[0][0] - before - SLIDE_M_S**2 / (2.0 * FRICTION * GRAVITY_M_S2))
 

@@ -13,12 +13,12 @@ from schemas.job.job import Job
 from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed, PosedScene
 from schemas.scene.view import Agreement, GBuffer
+from tests.physics.settling import settle_single
 from tests.shapes import asset_of, box, shape_of, table
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.geometry.raycast import cast_view, edge_distance_px
 from workers.labels.ray_check import check_against_rays, check_pair
-from workers.physics.settle_single import settle_alone
 from workers.pipeline.make_scene import pose_scene
 from workers.plan.effects import is_raycast_scene
 from workers.plan.step import plan_scene
@@ -35,7 +35,7 @@ def scene() -> PosedScene:
     plan = plan_scene(
         Job.model_validate({"name": "t", "start": {"offset_m": [0, 0]}}), 0, table(), asset_of(box(0.2, 0.2, 0.25))
     )
-    return pose_scene(plan, (settle_alone(plan.objects[0], plan.table, Job(name="t").physics),))
+    return pose_scene(plan, (settle_single(plan.objects[0], plan.table, Job(name="t").physics),))
 
 
 @pytest.fixture(scope="module")

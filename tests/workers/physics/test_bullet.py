@@ -11,10 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from schemas.job.job import Job
-from tests.physics.room import at, ball_body, physics
+from tests.physics.room import at, ball_body, drop, physics
 from tests.shapes import box
 from workers.geometry.frames import pose, quaternion_of, rotation_about
-from workers.physics.bullet import GRAVITY_M_S2, REPAIR_S, SLOP_M, WORLDS_BEFORE_RESET, Body, drop
+from workers.physics.bullet import GRAVITY_M_S2, REPAIR_S, WORLDS_BEFORE_RESET
+from workers.physics.rigid_body import SLOP_M, Body
 
 ROOT = Path(__file__).resolve().parents[3]
 PHYSICS = Job(name="t").physics
@@ -23,7 +24,8 @@ GROWTH = """
 import numpy as np
 from schemas.job.job import Job
 from schemas.scene.shape import Mesh
-from workers.physics.bullet import Body, drop
+from workers.physics.bullet import open_world
+from workers.physics.rigid_body import Body
 
 def anonymous_kb():
     return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("RssAnon"))
@@ -36,7 +38,7 @@ T = np.eye(4)
 T[2, 3] = 3.0
 sizes = []
 for world in range(513):
-    with drop(body, T, plate if world % 2 else 0.0, Job(name="t").physics, 8) as falling:
+    with open_world([(body, T)], plate if world % 2 else 0.0, Job(name="t").physics, 8) as falling:
         falling.advance()
     sizes.append(anonymous_kb())
 print((sizes[512] - sizes[256]) / 256)
@@ -88,8 +90,8 @@ def test_a_push_and_another_gravity_end_with_their_world():
     body = body_of(box(0.1, 0.08, 0.2))
     first = fall(body, T)
     with drop(body, T, 0.0, PHYSICS, STEPS) as world:
-        world.push((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
-        world.pull((0.0, 0.0, 0.0))
+        world.set_velocity((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
+        world.set_gravity((0.0, 0.0, 0.0))
         assert world.velocity() == ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
         world.advance()
         assert world.pose()[0] == pytest.approx(np.array([1.0, 2.0, 3.0]) * STEPS / PHYSICS.step_hz + T[:3, 3])
@@ -115,6 +117,6 @@ def test_quaternions_agree_with_scipy(seed):
 def test_what_overlaps_is_pushed_apart_at_its_depth_over_one_time_in_steps_of_any_length(step_hz):
     deep = 1e-4
     with drop(ball_body(0.05), at(0.0, 0.05 - deep), 0.0, physics(step_hz=step_hz), 1) as world:
-        world.pull((0.0, 0.0, 0.0))
+        world.set_gravity((0.0, 0.0, 0.0))
         world.advance()
         assert world.velocity()[0][2] == pytest.approx((deep - SLOP_M) / REPAIR_S, rel=0.01)

@@ -9,13 +9,11 @@ import trimesh
 from schemas.job.job import Job
 from schemas.job.physics import Collision, Physics
 from schemas.scene.plan import ObjectStart
+from tests.physics.settling import settle_single
 from tests.shapes import asset_of, box, table
-from workers.geometry.frames import angle_between, pose, rotation_about, transform
+from workers.geometry.frames import angle_between, pose, rotation_about
 from workers.geometry.hull import convex_hull
-from workers.physics import fall
 from workers.physics.effects import PREDICATES, called_for
-from workers.physics.fall import shaped
-from workers.physics.settle_single import settle_alone
 from workers.physics.table_top import place_table
 
 PHYSICS = Job(name="t").physics
@@ -40,22 +38,11 @@ def start_of(asset, turn=UPRIGHT, height: float = 0.1) -> ObjectStart:
 def test_a_can_that_falls_as_a_box_comes_to_lie_on_a_side_of_the_box():
     """A can on its side would roll to one of its 48 facets; its box lies on its own face, and does not roll."""
     turned = rotation_about(np.array([0.0, 1.0, 0.0]), math.radians(20.0)) @ LYING
-    rest = settle_alone(start_of(CAN, turned), TABLE, with_(collision="box"))
+    rest = settle_single(start_of(CAN, turned), TABLE, with_(collision="box"))
     moved = angle_between(rest.T_world_obj[:3, :3], turned)
     assert math.degrees(moved) == pytest.approx(20.0, abs=4.0)
-    own = settle_alone(start_of(CAN, turned), TABLE, PHYSICS)
+    own = settle_single(start_of(CAN, turned), TABLE, PHYSICS)
     assert math.degrees(angle_between(own.T_world_obj[:3, :3], turned)) < 10.0
-
-
-def test_the_box_about_an_object_has_its_size_along_its_own_axes_and_its_lowest_point():
-    turned = rotation_about(np.array([0.3, 0.9, 0.1]), 0.7)
-    start = start_of(CAN, turned)
-    boxed = shaped(start, with_(collision="box"))
-    assert np.ptp(boxed.hull.vertices, axis=0) == pytest.approx(np.ptp(start.hull.vertices, axis=0))
-    assert len(boxed.hull.vertices) == 8
-    lows = [transform(one.T_world_obj, one.hull.vertices)[:, 2].min() for one in (start, boxed)]
-    assert lows[0] == pytest.approx(lows[1], abs=1e-12)
-    assert shaped(start, PHYSICS) is start
 
 
 @pytest.mark.parametrize(
@@ -81,22 +68,9 @@ def test_without_correction_an_object_stays_where_the_simulator_left_it():
     """Bullet leaves what rests some micrometres deep or tilted; with correction nothing of that is left."""
     tilted = rotation_about(np.array([0.8, 0.6, 0.0]), math.radians(3.0))
     for asset in (CAN, TRAY):
-        raw = settle_alone(start_of(asset, tilted, 0.005), TABLE, with_(correction=False))
-        corrected = settle_alone(start_of(asset, tilted, 0.005), TABLE, PHYSICS)
+        raw = settle_single(start_of(asset, tilted, 0.005), TABLE, with_(correction=False))
+        corrected = settle_single(start_of(asset, tilted, 0.005), TABLE, PHYSICS)
         assert 1e-5 < raw.penetration_mm + raw.hover_gap_mm < 0.1
         assert corrected.penetration_mm + corrected.hover_gap_mm < 1e-9
         assert np.abs(corrected.T_world_obj[2, :3]).max() == pytest.approx(1.0, abs=1e-12)
         assert np.abs(raw.T_world_obj[2, :3]).max() == pytest.approx(1.0, abs=1e-5)
-
-
-def test_convex_parts_of_a_mesh_from_outside_are_as_fine_as_the_key_says(monkeypatch):
-    asked = []
-
-    def parts_of(asset, threshold, share):
-        asked.append(threshold)
-        return (asset.shape.vertices,)
-
-    monkeypatch.setattr(fall, "parts_of", parts_of)
-    for concavity in (0.1, 0.02):
-        fall.faller_of(start_of(TRAY), with_(concavity=concavity), {"decomposition"})
-    assert asked == [0.1, 0.02]

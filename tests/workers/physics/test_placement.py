@@ -11,7 +11,7 @@ from schemas.scene.shape import Asset
 from tests.shapes import asset_of, box, shape_of, table
 from workers.geometry.frames import pose, rotation_about, transform, translation
 from workers.geometry.hull import convex_hull
-from workers.physics.placement import HOOKED_M, Ground, gap_m, ground_of, placed_mesh, support_of, touch_down
+from workers.physics.placement import HOOKED_M, Ground, gap_m, measure_supports, placed_mesh, touch_down
 from workers.physics.rest_pose import CONTACT_M
 from workers.physics.separation import NEAR_M
 from workers.physics.table_top import place_table
@@ -37,7 +37,7 @@ def sloping() -> Table:
 
 
 CUBE = start_of(asset_of(box(0.1, 0.1, 0.1)))
-LEVEL = ground_of(place_table(table()))
+LEVEL = Ground(place_table(table()))
 TOP = LEVEL.table.top.height_m
 HOOK = start_of(asset_of(box(0.02, 0.02, 0.1, (-0.03, 0, -0.05)), box(0.08, 0.02, 0.02, (0, 0, 0.01))))
 """An L upside down: a bar that lies on something, 80 mm long, and a leg down from its end, whose inner side is at -20 mm."""
@@ -67,7 +67,7 @@ def test_the_gap_of_a_box_that_reaches_over_the_edge_is_that_of_its_part_above_t
 
 @pytest.mark.parametrize("gap", [0.002, -0.002])
 def test_the_gap_over_a_slope_is_told_along_z_above_its_highest_point_under_the_box(gap):
-    slab = ground_of(sloping())
+    slab = Ground(sloping())
     highest = float(transform(np.eye(4), slab.table.mesh.vertices)[:, 2].max())
     x_highest = slab.table.mesh.vertices[np.argmax(slab.table.mesh.vertices[:, 2]), 0]
     below = highest - (-0.05 - x_highest) * math.tan(SLOPE_RAD)  # under the box's side at -50 mm
@@ -109,17 +109,17 @@ def test_what_is_hooked_to_nothing_is_left_where_it_is():
 
 @pytest.mark.parametrize("deep_m", [1e-6, 3e-5])
 def test_what_touches_a_wall_is_not_lifted_onto_it(deep_m):
-    walled = ground_of(table_of(box(1.4, 1.4, 0.03, (0, 0, -0.015)), box(0.02, 1.4, 0.15, (0.69, 0, 0.075))))
+    walled = Ground(table_of(box(1.4, 1.4, 0.03, (0, 0, -0.015)), box(0.02, 1.4, 0.15, (0.69, 0, 0.075))))
     T = translation(0.68 - 0.05 + deep_m, 0.0, walled.table.top.height_m + 0.05)
     assert gap_m(CUBE, T, walled) == pytest.approx(-deep_m, abs=2e-7)
     lifted = translation(0.0, 0.0, 0.002) @ T
     for begun in (T, lifted):
         assert touch_down(CUBE, begun, walled) == pytest.approx(T, abs=1e-9)
-    assert support_of(CUBE, T, walled, FRICTION).residual < 1e-6
+    assert held(CUBE, T, walled).residual < 1e-6
 
 
-def held(start: ObjectStart, T: np.ndarray, ground: Ground = LEVEL):
-    return support_of(start, T, ground, FRICTION)
+def held(start: ObjectStart, T: np.ndarray, ground: Ground = LEVEL, friction: float = FRICTION):
+    return measure_supports([start], [T], ground.table.mesh, friction)[0]
 
 
 def test_a_box_on_a_level_is_held_with_a_margin_of_half_its_side():
@@ -167,7 +167,7 @@ def test_nothing_is_held_in_the_air():
 
 def test_a_steep_slope_holds_a_box_only_by_friction():
     """tan 2 degrees is 0.035."""
-    slab = ground_of(sloping())
+    slab = Ground(sloping())
     T = touch_down(CUBE, pose(rotation_about(Y, SLOPE_RAD), np.array([0.0, 0.0, 1.0])), slab)
-    assert support_of(CUBE, T, slab, 0.05).residual < 1e-6
-    assert support_of(CUBE, T, slab, 0.02).residual > 0.01
+    assert held(CUBE, T, slab, 0.05).residual < 1e-6
+    assert held(CUBE, T, slab, 0.02).residual > 0.01

@@ -10,7 +10,7 @@ from schemas.scene.shape import Mesh
 from tests.shapes import box
 from workers.geometry.frames import angle_between, pose, rotation_about, transform
 from workers.geometry.hull import convex_hull
-from workers.physics.rest_pose import snap_to_face, support_margin, tip_onto_face, touching
+from workers.physics.rest_pose import find_contacts_xy, snap_to_face, support_margin, tip_onto_face
 
 X = np.array([1.0, 0.0, 0.0])
 CUBE = convex_hull(np.asarray(box(0.1, 0.1, 0.1).vertices))
@@ -83,10 +83,10 @@ def test_a_cube_on_its_edge_is_not_tipped_without_a_simulation():
 
 def test_only_vertices_near_the_support_touch_it():
     flat = pose(np.eye(3), np.array([0, 0, 0.05]))
-    assert len(touching(CUBE, flat, GROUND)) == 4
-    assert len(touching(CUBE, pose(np.eye(3), np.array([0, 0, 0.0502])), GROUND)) == 0
+    assert len(find_contacts_xy(CUBE, flat, GROUND)) == 4
+    assert len(find_contacts_xy(CUBE, pose(np.eye(3), np.array([0, 0, 0.0502])), GROUND)) == 0
     edge = pose(rotation_about(X, math.pi / 4), np.array([0, 0, 0.05 * math.sqrt(2)]))
-    assert len(touching(CUBE, edge, GROUND)) == 2
+    assert len(find_contacts_xy(CUBE, edge, GROUND)) == 2
 
 
 def test_a_hull_has_outward_unit_normals_and_only_its_corners():

@@ -12,7 +12,7 @@ from tests.shapes import box
 from workers.geometry.convexity import solid_of, weld
 from workers.geometry.elevation import survey
 from workers.geometry.frames import pose, rotation_about, transform, uniform_rotation
-from workers.physics.separation import NEAR_M, between, clearances, overlap_m
+from workers.physics.separation import NEAR_M, between, clearances, find_gaps_m
 
 
 def mesh_of(body, T=None) -> Mesh:
@@ -90,7 +90,9 @@ def test_each_object_is_told_of_what_is_nearest_to_it_the_ground_or_another():
 
 def test_an_overlap_is_the_depth_and_nothing_where_two_bodies_only_touch_or_are_apart():
     for way, expected in ((0.098, 0.002), (0.1, 0.0), (0.11, 0.0), (3.0, 0.0)):
-        assert overlap_m(mesh_of(CUBE), mesh_of(box(0.1, 0.1, 0.1, (0, way, 0)))) == pytest.approx(expected, abs=1e-9)
+        pair = [mesh_of(CUBE), mesh_of(box(0.1, 0.1, 0.1, (0, way, 0)))]
+        depths = [-gap for _, _, gap in find_gaps_m(pair, near_m=0.0)]
+        assert max(0.0, *depths, 0.0) == pytest.approx(expected, abs=1e-9)
 
 
 def test_what_touches_the_side_of_a_wall_is_as_deep_in_it_as_it_reaches_and_not_as_the_wall_is_high():

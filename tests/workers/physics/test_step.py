@@ -14,15 +14,15 @@ from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import Mesh
 from tests.physics.population import draw
+from tests.physics.settling import recheck, settle_single
 from tests.shapes import asset_of, box, shape_of, table
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.elevation import vertical_gap
 from workers.geometry.frames import angle_between, pose, rotation_about, transform, translation
 from workers.geometry.hull import convex_hull
-from workers.physics.fall import body_frame, fall
-from workers.physics.settle_single import settle_alone
-from workers.physics.step import RECHECK_S, recheck, release_again
+from workers.physics.fall import fall
+from workers.physics.step import RECHECK_S, release_again
 from workers.physics.table_top import place_table
 from workers.plan.step import draw_start, plan_scene
 
@@ -42,7 +42,7 @@ def gap_of(asset, settled) -> float:
 def test_a_box_dropped_flat_stands_where_it_fell():
     asset = asset_of(box(0.1, 0.08, 0.2))
     R = rotation_about(np.array([0, 0, 1.0]), 0.4)
-    rest = settle_alone(start_of(asset, pose(R, np.array([0.1, -0.1, TOP + 0.13]))), TABLE, PHYSICS)
+    rest = settle_single(start_of(asset, pose(R, np.array([0.1, -0.1, TOP + 0.13]))), TABLE, PHYSICS)
     assert rest.T_world_obj[:3, 3] == pytest.approx([0.1, -0.1, TOP + 0.1], abs=1e-3)
     assert rest.T_world_obj[2, 3] == pytest.approx(TOP + 0.1, abs=1e-12)
     assert angle_between(rest.T_world_obj[:3, :3], R) < 0.01
@@ -56,7 +56,7 @@ def test_a_box_dropped_flat_stands_where_it_fell():
 def test_a_box_dropped_on_its_edge_ends_on_a_face():
     asset = asset_of(box(0.1, 0.1, 0.1))
     T = pose(rotation_about(np.array([1.0, 0, 0]), math.pi / 4 + 0.03), np.array([0, 0, TOP + 0.1]))
-    rest = settle_alone(start_of(asset, T), TABLE, PHYSICS)
+    rest = settle_single(start_of(asset, T), TABLE, PHYSICS)
     axes = np.abs(rest.T_world_obj[2, :3])
     assert np.sort(axes) == pytest.approx([0, 0, 1], abs=1e-9)
     assert abs(gap_of(asset, rest)) < 1e-12
@@ -67,7 +67,7 @@ def test_tumbled_cylinders_rest_on_a_face_with_their_centre_above_it_and_do_not_
     asset = asset_of(trimesh.creation.cylinder(0.04, 0.2))
     job = Job.model_validate({"name": "t", "seed": seed, "start": {"pose": "tumbled"}})
     plan = plan_scene(job, seed, table(), asset)
-    rest = settle_alone(plan.objects[0], plan.table, PHYSICS)
+    rest = settle_single(plan.objects[0], plan.table, PHYSICS)
     assert rest.penetration_mm < 1e-9
     assert rest.hover_gap_mm < 1e-9
     assert rest.support_margin_mm > 1.0
@@ -79,7 +79,7 @@ def test_a_bottle_that_rolling_friction_held_on_an_edge_rolls_onto_a_face_and_no
     asset = make_asset("bottle", ProceduralSource(source="procedural"), 822319, 600.0)
     job = Job.model_validate({"name": "t", "seed": 2024, "start": {"pose": "tumbled"}})
     start = draw_start(job, scene_id, asset, TABLE)
-    rest = settle_alone(start, TABLE, PHYSICS)
+    rest = settle_single(start, TABLE, PHYSICS)
     assert rest.support == "flat_top"
     assert rest.support_margin_mm > 0.0
     assert recheck(start, rest, TABLE, PHYSICS)[0] < 0.1
@@ -89,7 +89,7 @@ def test_a_mug_on_a_mesh_that_rolling_friction_held_out_of_balance_tips_on(tmp_p
     """Its centre of mass was half a millimetre beyond its contacts, and went on from there at a third of a mm/s."""
     job = Job.model_validate({"name": "t", "start": {"pose": "tumbled"}})
     plan = draw(job, open_catalogue(job.assets, tmp_path, tuple(job.categories)), 360)
-    rest = settle_alone(plan.objects[0], plan.table, job.physics)
+    rest = settle_single(plan.objects[0], plan.table, job.physics)
     assert rest.support == "mesh"
     assert rest.support_margin_mm > 1.0 and rest.equilibrium_residual < 1e-3
     moved_mm, turned_deg = recheck(plan.objects[0], rest, plan.table, job.physics)
@@ -98,13 +98,13 @@ def test_a_mug_on_a_mesh_that_rolling_friction_held_out_of_balance_tips_on(tmp_p
 
 def test_what_is_let_go_again_is_watched_to_the_end_however_still_it_stands(monkeypatch):
     start, watched = start_of(asset_of(box(0.1, 0.08, 0.2)), translation(0.0, 0.0, TOP + 0.11)), []
-    rest = settle_alone(start, TABLE, PHYSICS)
+    rest = settle_single(start, TABLE, PHYSICS)
 
     def told(*arguments):
         watched.append(fall(*arguments))
         return watched[-1]
 
-    monkeypatch.setattr("workers.physics.settle_single.fall", told)
+    monkeypatch.setattr("workers.physics.release.fall", told)
     recheck(start, rest, TABLE, PHYSICS)
     plan = plan_scene(Job(name="t"), 0, table(), start.asset)
     plan = dataclasses.replace(plan, objects=(start,), table=TABLE)
@@ -115,7 +115,7 @@ def test_what_is_let_go_again_is_watched_to_the_end_however_still_it_stands(monk
 def test_the_same_start_gives_the_same_bits():
     asset = asset_of(trimesh.creation.icosphere(subdivisions=1, radius=0.06))
     plan = plan_scene(Job.model_validate({"name": "t", "start": {"pose": "tumbled"}}), 4, table(), asset)
-    first, second = (settle_alone(plan.objects[0], plan.table, PHYSICS) for _ in range(2))
+    first, second = (settle_single(plan.objects[0], plan.table, PHYSICS) for _ in range(2))
     assert np.array_equal(first.T_world_obj, second.T_world_obj)
     assert first.settle_s == second.settle_s
 
@@ -124,20 +124,20 @@ def test_an_object_whose_frame_is_far_from_its_centre_of_mass_falls_the_same_way
     here = asset_of(box(0.1, 0.08, 0.2))
     shifted = asset_of(box(0.1, 0.08, 0.2, (0.3, -0.2, 0.1)))
     R = rotation_about(np.array([0, 1.0, 0]), 0.05)
-    a = settle_alone(start_of(here, pose(R, np.array([0, 0, TOP + 0.12]))), TABLE, PHYSICS)
+    a = settle_single(start_of(here, pose(R, np.array([0, 0, TOP + 0.12]))), TABLE, PHYSICS)
     offset = translation(-0.3, 0.2, -0.1)
-    b = settle_alone(start_of(shifted, pose(R, np.array([0, 0, TOP + 0.12])) @ offset), TABLE, PHYSICS)
+    b = settle_single(start_of(shifted, pose(R, np.array([0, 0, TOP + 0.12])) @ offset), TABLE, PHYSICS)
     # Two roundings of one drop that bounces on an edge differ by some tenths of a milliradian, and not by decimetres.
     assert b.T_world_obj @ np.linalg.inv(offset) == pytest.approx(a.T_world_obj, abs=2e-3)
 
 
 def test_an_object_over_the_edge_is_dropped_on_the_real_mesh_and_falls_where_it_must():
     asset = asset_of(box(0.1, 0.1, 0.1))
-    stands = settle_alone(start_of(asset, translation(0.7 - 0.02, 0.0, TOP + 0.055)), TABLE, PHYSICS)
+    stands = settle_single(start_of(asset, translation(0.7 - 0.02, 0.0, TOP + 0.055)), TABLE, PHYSICS)
     assert stands.support == "mesh"
     assert stands.T_world_obj[0, 3] == pytest.approx(0.68, abs=2e-3)
     with pytest.raises(SettleError) as caught:
-        settle_alone(start_of(asset, translation(0.7 + 0.01, 0.0, TOP + 0.055)), TABLE, PHYSICS)
+        settle_single(start_of(asset, translation(0.7 + 0.01, 0.0, TOP + 0.055)), TABLE, PHYSICS)
     assert caught.value.reason == "left_table"
 
 
@@ -150,12 +150,12 @@ def test_an_object_over_a_hole_rests_on_its_rim_if_it_is_larger(side, stays):
     top = holed.top.height_m
     start = start_of(asset_of(box(side, side, 0.05)), translation(0.0, 0.0, top + 0.03))
     if stays:
-        rest = settle_alone(start, holed, PHYSICS)
+        rest = settle_single(start, holed, PHYSICS)
         assert rest.T_world_obj[:3, 3] == pytest.approx([0.0, 0.0, top + 0.025], abs=2e-5)
         assert rest.support_margin_mm > 1e3 * (side - 0.001) / 2
     else:
         with pytest.raises(SettleError) as caught:
-            settle_alone(start, holed, PHYSICS)
+            settle_single(start, holed, PHYSICS)
         assert caught.value.reason == "left_table"
 
 
@@ -163,25 +163,17 @@ def test_an_object_that_does_not_rest_in_time_says_how_fast_it_still_is():
     asset = asset_of(trimesh.creation.icosphere(subdivisions=2, radius=0.05))
     hurried = PHYSICS.model_copy(update={"max_settle_s": 0.1})
     with pytest.raises(SettleError, match=r"mm/s after 0\.1 s") as caught:
-        settle_alone(start_of(asset, translation(0, 0, TOP + 0.2)), TABLE, hurried)
+        settle_single(start_of(asset, translation(0, 0, TOP + 0.2)), TABLE, hurried)
     assert caught.value.reason == "not_at_rest"
 
 
 def test_a_placed_object_is_not_simulated_and_not_moved():
     asset = asset_of(box(0.1, 0.1, 0.1))
     start = dataclasses.replace(start_of(asset, translation(0.1, 0.2, TOP + 0.05)), placed=True)
-    rest = settle_alone(start, TABLE, PHYSICS)
+    rest = settle_single(start, TABLE, PHYSICS)
     assert rest.support == "placed"
     assert rest.settle_s == 0.0
     assert np.array_equal(rest.T_world_obj, start.T_world_obj)
-
-
-def test_principal_axes_are_a_rotation_that_makes_the_inertia_diagonal():
-    mass = asset_of(box(0.1, 0.02, 0.05), box(0.03, 0.2, 0.01, (0.05, 0.1, 0.02))).mass
-    T, moments = body_frame(mass)
-    R = T[:3, :3]
-    assert np.linalg.det(R) == pytest.approx(1.0)
-    assert R.T @ mass.inertia @ R == pytest.approx(np.diag(moments), abs=1e-12)
 
 
 def test_a_table_finer_than_the_simulator_takes_is_a_failure_with_its_counts():
@@ -191,5 +183,5 @@ def test_a_table_finer_than_the_simulator_takes_is_a_failure_with_its_counts():
     uneven = dataclasses.replace(TABLE.top, convex=False)
     fine = dataclasses.replace(TABLE, mesh=Mesh(many, TABLE.mesh.faces), top=uneven)
     with pytest.raises(SettleError, match="takes 131072 and 174762") as error:
-        settle_alone(start_of(asset, translation(0.0, 0.0, TOP + 0.13)), fine, PHYSICS)
+        settle_single(start_of(asset, translation(0.0, 0.0, TOP + 0.13)), fine, PHYSICS)
     assert error.value.reason == "table_too_fine"

@@ -1,8 +1,8 @@
-"""CoACD in a process of its own: what it throws ends the process, and what it keeps in memory must not meet the next mesh.
+"""CoACD in a process of its own: its exceptions end the process, and its memory must not affect the next mesh.
 
-A script, started by `workers.physics.convex_parts.step` and imported by nobody. It reads `request.npz` in the folder that it is
-given (vertices [V, 3] float64, faces [F, 3] int32, options as JSON) and writes `parts.npz` there: vertices [N, 3] float64
-of all parts one after the other, counts [P]. Exit code 3 tells that the package is missing.
+A script, started by `workers.physics.convex_parts.step` and imported for `MISSING` alone. Reads `request.npz` in the given
+folder (vertices [V, 3] float64, faces [F, 3] int32, options as JSON) and writes `parts.npz` there: vertices [N, 3] float64 of
+all parts in turn, counts [P]. Exit code 3: the package is missing.
 """
 
 import json
@@ -18,7 +18,7 @@ MISSING = 3
 def main(folder: Path) -> int:
     """Exit code."""
     allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(allowed)})  # OpenMP counts them when it is loaded: a worker has one core
+    os.sched_setaffinity(0, {min(allowed)})  # a worker has one core; OpenMP counts them on loading
     try:
         import coacd  # type: ignore[import-untyped]
     except ImportError:

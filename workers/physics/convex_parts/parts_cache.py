@@ -1,4 +1,4 @@
-"""Convex parts kept in memory, and in files for the next process. A cache: it may be emptied at any time."""
+"""A cache of convex parts in memory and in files, which may be deleted."""
 
 import hashlib
 import io
@@ -6,17 +6,29 @@ import os
 import tempfile
 from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from schemas.base import Array, frozen_array
 
-Answer = tuple[str, tuple[Array, ...]]
-"""How parts were made, and their vertices [N, 3] each."""
-
 CAPACITY_BYTES = 64 * 1024 * 1024
-"""Of memory that a process keeps: a thousand mugs."""
+"""Memory per process: a thousand mugs."""
+
+DIGEST_BYTES = 32
+
+
+class Parts(NamedTuple):
+    """Vertices [N, 3] float64, metres, of each convex part of a body, and how they were made.
+
+    convex: every piece of the body is; coacd: by CoACD; pieces: CoACD failed, and they are the hulls of the pieces; lofts:
+    from the making of a built-in shape.
+    """
+
+    clouds: tuple[Array, ...]
+    method: str
 
 
 def _usual_folder() -> Path | None:
@@ -29,75 +41,69 @@ def _usual_folder() -> Path | None:
 USUAL_FOLDER = _usual_folder()
 
 
-def key_of(*what: str | bytes) -> str:
-    """SHA-256 of all that an answer depends on."""
+def key_of(*inputs: str | bytes) -> str:
+    """SHA-256 of everything that an answer depends on."""
     whole = hashlib.sha256()
-    for one in what:
+    for one in inputs:
         data = one.encode() if isinstance(one, str) else one
         whole.update(len(data).to_bytes(8, "little") + data)
     return whole.hexdigest()
 
 
 class PartsCache:
-    """The answers used last, as many as `capacity_bytes` hold, but at least one; each also as a file where there is a folder.
+    """The parts used last that fit `capacity_bytes`, at least of one body, and files of all parts if a folder is given.
 
-    A file holds the SHA-256 of the rest before it, so that a torn one is seen and made again, and gets its name when it
-    is whole. Where the folder cannot be written, nothing is kept in it.
+    A file begins with the SHA-256 of its content, by which a torn one is found and made again, and is renamed into place. A
+    folder that cannot be written is ignored.
     """
 
     def __init__(self, capacity_bytes: int = CAPACITY_BYTES) -> None:
         self.capacity_bytes = capacity_bytes
         self.bytes = 0
-        self._answers: OrderedDict[str, Answer] = OrderedDict()
+        self._kept: OrderedDict[str, Parts] = OrderedDict()
 
     def __len__(self) -> int:
-        return len(self._answers)
+        return len(self._kept)
 
-    def get(self, key: str, folder: Path | None, make: Callable[[], Answer]) -> Answer:
-        """The answer of this key: from memory, from the folder, or made; what `make` raises leaves no trace."""
-        if key in self._answers:
-            self._answers.move_to_end(key)
-            return self._answers[key]
-        answer = _read(folder / key) if folder is not None else None
-        if answer is None:
-            answer = make()
+    def get(self, key: str, folder: Path | None, make: Callable[[], Parts]) -> Parts:
+        """The parts of this key: from memory, from the folder, or made. An exception of `make` leaves no trace."""
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            return self._kept[key]
+        parts = None if folder is None else _read(folder / key)
+        if parts is None:
+            parts = make()
             if folder is not None:
-                _write(folder, key, answer)
-        self._answers[key] = answer
-        self.bytes += _bytes_of(answer)
-        while self.bytes > self.capacity_bytes and len(self._answers) > 1:
-            self.bytes -= _bytes_of(self._answers.popitem(last=False)[1])
-        return answer
+                with suppress(OSError):
+                    _write(folder, key, parts)
+        self._kept[key] = parts
+        self.bytes += sum(cloud.nbytes for cloud in parts.clouds)
+        while self.bytes > self.capacity_bytes and len(self._kept) > 1:
+            self.bytes -= sum(cloud.nbytes for cloud in self._kept.popitem(last=False)[1].clouds)
+        return parts
 
 
-def _bytes_of(answer: Answer) -> int:
-    return sum(cloud.nbytes for cloud in answer[1])
-
-
-def _read(path: Path) -> Answer | None:
+def _read(path: Path) -> Parts | None:
     try:
         data = path.read_bytes()
     except OSError:
         return None
-    if hashlib.sha256(data[32:]).digest() != data[:32]:
+    if hashlib.sha256(data[DIGEST_BYTES:]).digest() != data[:DIGEST_BYTES]:
         return None
-    with np.load(io.BytesIO(data[32:])) as stored:
+    with np.load(io.BytesIO(data[DIGEST_BYTES:])) as stored:
         clouds = np.split(stored["vertices"], np.cumsum(stored["counts"])[:-1])
-        return str(stored["way"]), tuple(frozen_array(cloud) for cloud in clouds)
+        return Parts(tuple(frozen_array(cloud) for cloud in clouds), str(stored["method"]))
 
 
-def _write(folder: Path, key: str, answer: Answer) -> None:
-    way, clouds = answer
-    whole = io.BytesIO()
-    np.savez(whole, way=way, vertices=np.concatenate(clouds), counts=np.array([len(cloud) for cloud in clouds]))
-    data = whole.getvalue()
-    name = None
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=folder, prefix=f".{key}.", delete=False) as file:
-            name = file.name
-            file.write(hashlib.sha256(data).digest() + data)
-        os.replace(name, folder / key)
-    except OSError:
-        if name is not None:
-            Path(name).unlink(missing_ok=True)
+def _write(folder: Path, key: str, parts: Parts) -> None:
+    content, counts = io.BytesIO(), [len(cloud) for cloud in parts.clouds]
+    np.savez(content, method=parts.method, vertices=np.concatenate(parts.clouds), counts=counts)
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=folder, prefix=f".{key}.", delete=False) as file:
+        try:
+            file.write(hashlib.sha256(content.getvalue()).digest() + content.getvalue())
+            file.flush()
+            os.replace(file.name, folder / key)
+        except OSError:
+            Path(file.name).unlink(missing_ok=True)
+            raise

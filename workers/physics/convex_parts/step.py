@@ -1,10 +1,9 @@
 """Convex parts of a body that is not convex, by CoACD (Wei, Liu, Ling and Su 2022, doi 10.1145/3528223.3530103).
 
-Built-in shapes are not cut so, but by their making: see `workers.geometry.lathe_decomposition`, with the same figures.
+Parts of built-in shapes follow from their making instead: see `workers.geometry.lathe_decomposition`.
 
-Built-in shapes, number 0 of each category, 0.25 m along their diagonal, by CoACD's threshold: parts / their vertices in all /
-seconds on one busy core / millimetres that parts stand out of the surface at most. Half of all that parts show lies on
-the surface (but at 0.1), and nothing out of the hull.
+CoACD on built-in shapes, number 0 of each category, 0.25 m along their diagonal, by threshold: parts / their vertices / seconds
+on one busy core / millimetres that parts stand out at most. Half of the parts' surface is the shape's (except at 0.1).
 
              0.1                        0.05                       0.02
     mug      22 / 1,545 / 2.9 / 7.4     59 / 2,462 / 2.6 / 3.9     220 / 5,153 / 6.1 / 1.6
@@ -14,18 +13,16 @@ the surface (but at 0.1), and nothing out of the hull.
     laptop   2 / 153 / 0.3 / 3.1        3 / 178 / 0.3 / 1.4        3 / 178 / 0.3 / 1.4
     camera   3 / 592 / 0.4 / 6.9        25 / 1,201 / 1.1 / 4.4     164 / 3,917 / 7.5 / 2.3
 
-With CoACD's own depth of search the mug takes 142 s for 47 parts.
+With CoACD's own search depth the mug takes 142 s and has 47 parts.
 """
 
 import json
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Literal
 
 import manifold3d
 import numpy as np
@@ -34,131 +31,106 @@ import shapely
 from schemas.base import Array, frozen_array
 from schemas.errors import MachineError, MeshError
 from schemas.scene.shape import Asset, Mesh
-from workers.geometry.convexity import components, concavity_m, solid_of, triangles_of, weld
+from workers.geometry import convexity
+from workers.geometry.convexity import components, is_convex_surface, solid_of, triangles_of, weld
 from workers.geometry.hull import convex_hull
 from workers.geometry.lathe_decomposition import TOLERANCE, parts_of_lofts
 from workers.physics.convex_parts.coacd_process import MISSING
-from workers.physics.convex_parts.parts_cache import USUAL_FOLDER, PartsCache, key_of
+from workers.physics.convex_parts.parts_cache import USUAL_FOLDER, Parts, PartsCache, key_of
 
 THRESHOLD = 0.05
-"""CoACD's concavity at which it stops, in units in which the mesh is 2 across: 0.02 halves what stands out, and has three
-times the parts."""
-
-CONVEX_SHARE = 0.9999
-"""A body that fills this share of its hull is convex."""
-
-SHALLOW_M = 5e-5
-"""A surface nowhere deeper below its hull than this is convex: as near as counts as touching."""
+"""CoACD's concavity at which it stops, in units in which the mesh is 2 across. 0.02 halves the error and triples the parts."""
 
 SIMPLER = 2e-3
-"""Share of its size by which a closed body may be made simpler before it is cut: CoACD's time goes with the faces."""
+"""Tolerance, as a share of its size, to which a closed body is simplified first: CoACD's time grows with the faces."""
 
 MOST_PIECES = 128
 """A mesh in more pieces than this is cut as one."""
 
 OPTIONS = {"mcts_iterations": 10, "mcts_nodes": 6, "mcts_max_depth": 1, "resolution": 300, "seed": 0}
-"""A search one cut deep with few trials; CoACD's own is three deep with 150, fifty times as long, and makes a fifth fewer
-parts of a mug."""
+"""A search one cut deep. CoACD's own, three deep with 150 trials, takes fifty times as long for a fifth fewer parts of a mug."""
 
 OPEN = {"preprocess_mode": "on", "preprocess_resolution": 40}
-"""What is not a closed manifold is first wrapped in voxels; CoACD ends the process without."""
+"""For a mesh that is not a closed manifold, which is wrapped in voxels first: without, CoACD ends the process."""
 
 CLOSED = {"preprocess_mode": "off"}
 
 LIBRARIES = ("coacd", "manifold3d", "numpy", "scipy")
-"""With other versions of these a mesh may have other parts."""
+"""Libraries whose versions change the parts of a mesh."""
 
 NOT_INSTALLED = "the package `{}` is not installed, or cannot be loaded: set Verso up again with `./verso test`"
 
 LONGEST_S = 300
-"""On some broken meshes CoACD never ends; the slowest that did end took a tenth of this."""
-
-Way = Literal["convex", "coacd", "pieces"]
-
-
-@dataclass(frozen=True, eq=False)
-class Parts:
-    """Vertex clouds [N, 3] float64, metres, the hulls of which are a body's convex parts.
-
-    `way`: the body or each of its pieces is convex; CoACD cut it; or CoACD failed and they are the hulls of its pieces.
-    """
-
-    clouds: tuple[Array, ...]
-    way: Way
-
+"""Time limit: on some broken meshes CoACD never ends. The slowest that did end took a tenth of this."""
 
 _CACHE = PartsCache()
 
 
 def parts_of(asset: Asset, threshold: float = THRESHOLD, share: float = TOLERANCE) -> tuple[Array, ...]:
-    """Vertex clouds [N, 3] of an asset's convex parts, object frame: those that follow from its making, or else CoACD's.
+    """Vertices [N, 3], object frame, of each of an asset's convex parts: from its making if known, or else by CoACD.
 
-    `threshold` is CoACD's, `share` that of `parts_of_lofts`. Where a built-in shape's own outlines cannot be cut, for they
-    meet but for the last bits, it is cut by CoACD too.
+    `threshold` is CoACD's, `share` that of `parts_of_lofts`. CoACD also cuts a built-in shape whose outlines touch except
+    for the last bits, which cannot be cut by its making.
     """
     lofts = asset.lofts
     if lofts is None:
         return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
     key = key_of("lofts", repr(share), asset.sha256, asset.shape.mesh.vertices.tobytes())
     try:
-        return _CACHE.get(key, None, lambda: ("lofts", parts_of_lofts(lofts, share)))[1]
+        return _CACHE.get(key, None, lambda: Parts(parts_of_lofts(lofts, share), "lofts")).clouds
     except (ValueError, shapely.errors.GEOSException):
         return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
 
 
 def decompose(mesh: Mesh, digest: str, threshold: float = THRESHOLD, folder: Path | None = USUAL_FOLDER) -> Parts:
-    """Convex parts of a mesh: none reaches out of its hull, and together they have the hull's vertices.
+    """Convex parts of a mesh: all within its hull, and together with the hull's vertices. Connected pieces are cut apart.
 
-    Each piece that hangs together is cut by itself. The same arguments give the same bytes in every process, which is
-    why answers may be kept in memory and in `folder` (None: nowhere). Raises MachineError where CoACD is missing or was
-    killed from outside, MeshError `no_convex_parts` where it does not end.
+    The same arguments give the same bytes in every process, so results are kept in memory and in `folder` (None: nowhere).
+    Raises MachineError if CoACD is missing or was killed from outside, MeshError `no_convex_parts` if it does not end.
     """
-    key = key_of(_method(), repr(threshold), digest, mesh.vertices.tobytes(), mesh.faces.tobytes())
-    way, clouds = _CACHE.get(key, folder, lambda: _decompose(mesh, threshold))
-    return Parts(clouds, way)  # type: ignore[arg-type]
+    key = key_of(_version(), repr(threshold), digest, mesh.vertices.tobytes(), mesh.faces.tobytes())
+    return _CACHE.get(key, folder, lambda: _decompose(mesh, threshold))
 
 
 @cache
-def _method() -> str:
-    """What parts depend on beside the mesh and the threshold: this folder's files, and the versions of libraries."""
-    files = sorted(Path(__file__).parent.glob("*.py"))
+def _version() -> str:
+    """Digest of the code that parts depend on: this folder's and the geometry's files, and the versions of libraries."""
+    files = [
+        file for folder in (Path(__file__), Path(convexity.__file__)) for file in sorted(folder.parent.glob("*.py"))
+    ]
     try:
         return key_of(*(file.read_bytes() for file in files), *(version(name) for name in LIBRARIES))
     except PackageNotFoundError as error:
         raise MachineError(NOT_INSTALLED.format(error.name)) from error
 
 
-def _decompose(mesh: Mesh, threshold: float) -> tuple[Way, tuple[Array, ...]]:
+def _decompose(mesh: Mesh, threshold: float) -> Parts:
     welded = weld(mesh)
     pieces = components(welded)
     if not pieces:
-        return "convex", (frozen_array(convex_hull(mesh.vertices).vertices),)
+        return Parts((frozen_array(convex_hull(mesh.vertices).vertices),), "convex")
     if len(pieces) > MOST_PIECES:
         pieces = [welded]
     made = [_parts_of(piece, threshold) for piece in pieces]
-    ways = {way for way, _ in made}
-    way: Way = "pieces" if "pieces" in ways else "coacd" if "coacd" in ways else "convex"
-    return way, tuple(frozen_array(cloud) for _, clouds in made for cloud in clouds)
+    method = max((method for method, _ in made), key=("convex", "coacd", "pieces").index)
+    return Parts(tuple(frozen_array(cloud) for _, clouds in made for cloud in clouds), method)
 
 
-def _parts_of(piece: Mesh, threshold: float) -> tuple[Way, list[Array]]:
+def _parts_of(piece: Mesh, threshold: float) -> tuple[str, list[Array]]:
     if len(piece.vertices) < 4:
         return "convex", [piece.vertices]
     hull, solid = convex_hull(piece.vertices), solid_of(piece)
-    fills = solid is not None and solid.volume() >= CONVEX_SHARE * solid.hull().volume()
-    if fills or concavity_m(piece) <= SHALLOW_M:
+    if is_convex_surface(piece, solid):
         return "convex", [hull.vertices]
+    options = {**OPTIONS, **(OPEN if solid is None else CLOSED), "threshold": threshold}
     size = float(np.linalg.norm(np.ptp(hull.vertices, axis=0)))
-    if solid is None:
-        found = _run(piece, {**OPTIONS, **OPEN, "threshold": threshold})
-    else:
-        found = _run(triangles_of(solid.simplify(SIMPLER * size)), {**OPTIONS, **CLOSED, "threshold": threshold})
-    fitted = _fit(found, hull.vertices, hull.normals)
+    cut = _run(piece if solid is None else triangles_of(solid.simplify(SIMPLER * size)), options)
+    fitted = _fit(cut, hull.vertices, hull.normals)
     return ("coacd", fitted) if fitted else ("pieces", [hull.vertices])
 
 
 def _run(mesh: Mesh, options: dict[str, object]) -> list[Array]:
-    """What CoACD makes of a mesh; nothing where it gives up."""
+    """CoACD's parts of a mesh; none where it gives up."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         np.savez(folder / "request.npz", vertices=mesh.vertices, faces=mesh.faces, options=json.dumps(options))
@@ -179,7 +151,7 @@ def _run(mesh: Mesh, options: dict[str, object]) -> list[Array]:
 
 
 def _fit(clouds: list[Array], vertices: Array, normals: Array) -> list[Array]:
-    """Parts cut off where they reach out of the hull, and given those of its vertices that they lost."""
+    """The parts clipped to the hull, with the vertices of the hull that they lost."""
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     reach = (vertices @ normals.T).max(axis=0)
     whole = manifold3d.Manifold.hull_points(np.ascontiguousarray(vertices))
@@ -189,7 +161,7 @@ def _fit(clouds: list[Array], vertices: Array, normals: Array) -> list[Array]:
             cloud = triangles_of(manifold3d.Manifold.hull_points(np.ascontiguousarray(cloud)) ^ whole).vertices
         if len(cloud) >= 4:
             fitted.append(cloud)
-    if not fitted:  # CoACD gave up, or the hull is flat and what is left of its voxels is nothing
+    if not fitted:  # CoACD gave up, or the hull is flat and clips all voxels away
         return []
     owner = np.concatenate([np.full(len(cloud), k) for k, cloud in enumerate(fitted)])
     points = np.concatenate(fitted)

@@ -1,6 +1,5 @@
 """Convex parts, against bodies whose parts are known, and in processes that must agree."""
 
-import hashlib
 import os
 import subprocess
 import sys
@@ -18,7 +17,6 @@ from workers.assets.builtin.make import make_asset
 from workers.geometry.convexity import components, concavity_m, weld
 from workers.geometry.hull import convex_hull
 from workers.physics.convex_parts import step as module
-from workers.physics.convex_parts.parts_cache import PartsCache
 from workers.physics.convex_parts.step import decompose
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -51,21 +49,17 @@ def holds(cloud, point):
     return bool((hull.equations[:, :3] @ point + hull.equations[:, 3] <= 1e-9).all())
 
 
-def digest_of(parts):
-    return hashlib.sha256(b"".join(cloud.tobytes() + b"|" for cloud in parts.clouds)).hexdigest()
-
-
 def test_a_convex_body_is_its_own_part():
     for body in (trimesh.creation.box((0.1, 0.2, 0.3)), trimesh.creation.icosphere(3, 0.05)):
         parts = decompose(mesh_of(body), "convex", folder=None)
-        assert parts.way == "convex"
+        assert parts.method == "convex"
         assert len(parts.clouds) == 1
         assert (parts.clouds[0] == convex_hull(np.asarray(body.vertices)).vertices).all()
 
 
 def test_an_l_is_two_bars():
     parts = decompose(angle_iron(), "l", folder=None)
-    assert parts.way == "coacd"
+    assert parts.method == "coacd"
     assert len(parts.clouds) == 2
     solid = sum(ConvexHull(cloud).volume for cloud in parts.clouds)
     assert solid == pytest.approx((0.1 * 0.01 + 0.09 * 0.01) * 0.05, rel=0.02)
@@ -74,7 +68,7 @@ def test_an_l_is_two_bars():
 def test_nothing_stands_in_a_tray_and_nothing_out_of_it():
     mesh = tray()
     parts = decompose(mesh, "tray", folder=None)
-    assert parts.way == "coacd"
+    assert parts.method == "coacd"
     hull = convex_hull(mesh.vertices)
     points = np.concatenate(parts.clouds)
     assert (points @ hull.normals.T - (hull.vertices @ hull.normals.T).max(axis=0)).max() < 1e-12
@@ -94,7 +88,7 @@ def test_the_parts_of_a_shape_have_its_hull(category):
 def test_every_piece_is_cut_by_itself():
     balls = [trimesh.creation.icosphere(2, 0.02).apply_translation((x, 0, 0)) for x in (0.0, 0.03, 1.0)]
     parts = decompose(mesh_of(trimesh.util.concatenate(balls)), "balls", folder=None)
-    assert parts.way == "convex"
+    assert parts.method == "convex"
     assert sorted(round(float(cloud[:, 0].mean()), 9) for cloud in parts.clouds) == [0.0, 0.03, 1.0]
 
 
@@ -125,7 +119,7 @@ def test_a_flawed_mesh_has_parts_within_its_hull(flaw):
         "double": np.concatenate([mesh.faces, mesh.faces]),
     }[flaw]
     parts = decompose(Mesh(mesh.vertices, np.ascontiguousarray(faces)), flaw, threshold=0.3, folder=None)
-    assert parts.way == "coacd"
+    assert parts.method == "coacd"
     hull = convex_hull(mesh.vertices)
     points = np.concatenate(parts.clouds)
     assert (points @ hull.normals.T - (hull.vertices @ hull.normals.T).max(axis=0)).max() < 1e-9
@@ -136,7 +130,7 @@ def test_a_flat_sheet_and_a_single_triangle_have_one_part():
     for points in ([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], [(0, 0, 0), (1, 0, 0), (0, 1, 0.5)]):
         faces = np.array([(0, 1, 2), (0, 2, 3)][: len(points) - 2], dtype=np.int32)
         parts = decompose(Mesh(np.array(points, dtype=np.float64), faces), "flat", folder=None)
-        assert (parts.way, len(parts.clouds)) == ("convex", 1)
+        assert (parts.method, len(parts.clouds)) == ("convex", 1)
 
 
 def test_a_flat_sheet_that_is_not_convex_has_a_part_all_the_same():
@@ -151,7 +145,7 @@ def test_where_coacd_gives_up_the_hulls_of_the_pieces_serve(monkeypatch):
     monkeypatch.setattr(module, "OPEN", {"preprocess_mode": "on", "preprocess_resolution": 1})
     mesh = tray()
     parts = decompose(Mesh(mesh.vertices, mesh.faces[2:]), "gives up", folder=None)
-    assert parts.way == "pieces"
+    assert parts.method == "pieces"
     assert ConvexHull(parts.clouds[0]).volume == pytest.approx(0.2 * 0.2 * 0.05, rel=1e-6)
 
 
@@ -193,45 +187,9 @@ def test_parts_are_the_same_bytes_on_one_core_and_two_and_after_other_meshes():
     assert run(free, "2", "camera", "laptop") == first
 
 
-def test_an_answer_comes_from_memory_then_from_the_folder_and_is_the_same(tmp_path, monkeypatch):
-    made = decompose(angle_iron(), "kept", folder=tmp_path)
-    assert len(list(tmp_path.iterdir())) == 1
-    monkeypatch.setattr(module, "_run", lambda *_: pytest.fail("made once more"))
-    assert digest_of(decompose(angle_iron(), "kept", folder=None)) == digest_of(made), "from memory"
-    monkeypatch.setattr(module, "_CACHE", PartsCache())
-    again = decompose(angle_iron(), "kept", folder=tmp_path)
-    assert (again.way, digest_of(again)) == (made.way, digest_of(made))
-    assert not again.clouds[0].flags.writeable
-
-
-@pytest.mark.parametrize("harm", [lambda data: data[:-7], lambda _: b"", lambda data: data[:60] + b"x" + data[61:]])
-def test_a_torn_file_is_made_again(tmp_path, monkeypatch, harm):
-    monkeypatch.setattr(module, "_CACHE", PartsCache())
-    made = decompose(angle_iron(), "torn", folder=tmp_path)
-    (path,) = tmp_path.iterdir()
-    whole = path.read_bytes()
-    path.write_bytes(harm(whole))
-    monkeypatch.setattr(module, "_CACHE", PartsCache())
-    assert digest_of(decompose(angle_iron(), "torn", folder=tmp_path)) == digest_of(made)
-    assert path.read_bytes() == whole
-
-
-def test_a_folder_that_cannot_be_written_costs_nothing_but_time(tmp_path):
-    (tmp_path / "file").write_text("no folder")
-    assert len(decompose(angle_iron(), "nowhere", folder=tmp_path / "file" / "parts").clouds) == 2
-
-
 def test_another_mesh_under_the_same_digest_is_another_mesh():
     """A digest may be that of a source file, which is the same at every scale."""
     small, large = angle_iron(), angle_iron()
     large = Mesh(large.vertices * 2.0, large.faces)
     assert np.ptp(np.concatenate(decompose(small, "same").clouds), axis=0).max() == pytest.approx(0.1)
     assert np.ptp(np.concatenate(decompose(large, "same").clouds), axis=0).max() == pytest.approx(0.2)
-
-
-def test_memory_is_bounded_and_the_latest_stay():
-    cache = PartsCache(capacity_bytes=100)
-    for key in "abc":
-        cache.get(key, None, lambda: ("convex", (np.zeros((2, 3)),)))
-    assert (len(cache), cache.bytes) == (2, 96)
-    cache.get("c", None, lambda: pytest.fail("forgotten"))

@@ -8,20 +8,16 @@ import trimesh
 
 from schemas.errors import SettleError
 from schemas.job.job import Job
-from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart
 from schemas.scene.scene import Settled
 from schemas.scene.shape import Asset
+from tests.physics.settling import effects_of, scene_of, settle_group, settle_single
 from tests.shapes import asset_of, box, table
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.geometry.hull import convex_hull
 from workers.physics.effects import called_for
-from workers.physics.fall import fall
-from workers.physics.settle_group import settle_together
-from workers.physics.settle_single import settle_alone
 from workers.physics.step import LEFT_ROOM, LEFT_TOP, Rest, settle_scene
 from workers.physics.table_top import place_table
-from workers.plan.step import plan_scene
 
 PHYSICS = Job(name="t").physics
 TABLE = place_table(table())
@@ -41,14 +37,12 @@ def heights_of(rest: tuple[Settled, ...]) -> list[float]:
 
 def scene(starts: list[ObjectStart], physics=PHYSICS) -> Rest:
     """With what the scene calls for from its start."""
-    plan = plan_scene(Job(name="t"), 0, table(), starts[0].asset)
-    plan = dataclasses.replace(plan, table=TABLE, objects=tuple(starts))
-    return settle_scene(plan, physics, EffectPlan(tuple(sorted(called_for(starts, TABLE, physics))), {}))
+    return settle_scene(scene_of(starts, TABLE), physics, effects_of(starts, TABLE, physics))
 
 
 def test_a_stack_of_two_stands_as_high_as_its_parts_and_knows_its_contacts():
     low, high = asset_of(box(0.1, 0.1, 0.04)), asset_of(box(0.06, 0.04, 0.1))
-    rest = settle_together([start_of(low, 0, 0, 0.021), start_of(high, 0.01, 0, 0.092)], TABLE, PHYSICS, ALL)
+    rest = settle_group([start_of(low, 0, 0, 0.021), start_of(high, 0.01, 0, 0.092)], TABLE, PHYSICS, ALL)
     assert heights_of(rest) == pytest.approx([0.02, 0.09], abs=5e-5)
     assert [each.support_margin_mm for each in rest] == pytest.approx([50.0, 20.0], abs=0.5)
     assert max(each.equilibrium_residual for each in rest) < 1e-6
@@ -58,7 +52,7 @@ def test_a_stack_of_two_stands_as_high_as_its_parts_and_knows_its_contacts():
 
 def test_one_that_starts_over_the_side_of_another_falls_off_it():
     """By 6 mm more than half its width."""
-    rest = settle_together([start_of(CUBE, 0, 0, 0.031), start_of(CUBE, 0.036, 0.0, 0.0925)], TABLE, PHYSICS, ALL)
+    rest = settle_group([start_of(CUBE, 0, 0, 0.031), start_of(CUBE, 0.036, 0.0, 0.0925)], TABLE, PHYSICS, ALL)
     assert heights_of(rest)[0] == pytest.approx(0.03, abs=5e-5)
     assert heights_of(rest)[1] < 0.07
     assert rest[1].T_world_obj[0, 3] > 0.06
@@ -70,16 +64,16 @@ def test_objects_far_apart_settle_each_as_it_would_alone_to_the_last_bit():
     rest = scene(starts)
     assert rest.called == {}
     for start, each in zip(starts, rest.settled, strict=True):
-        alone = settle_alone(start, TABLE, PHYSICS)
+        alone = settle_single(start, TABLE, PHYSICS)
         assert each.T_world_obj.tobytes() == alone.T_world_obj.tobytes()
         assert (each.settle_s, each.support) == (alone.settle_s, alone.support)
 
 
 def test_far_apart_together_or_alone_is_the_same_within_the_simulations_gap():
     starts = [start_of(CUBE, x, 0.0, 0.04) for x in (-0.3, 0.3)]
-    both = settle_together(starts, TABLE, PHYSICS, ALL)
+    both = settle_group(starts, TABLE, PHYSICS, ALL)
     for start, each in zip(starts, both, strict=True):
-        assert each.T_world_obj == pytest.approx(settle_alone(start, TABLE, PHYSICS).T_world_obj, abs=5e-5)
+        assert each.T_world_obj == pytest.approx(settle_single(start, TABLE, PHYSICS).T_world_obj, abs=5e-5)
 
 
 def test_contacts_are_called_for_after_all_where_a_ball_rolls_towards_another_object():
@@ -97,7 +91,7 @@ def test_contacts_are_called_for_after_all_where_a_ball_rolls_towards_another_ob
 def test_the_mesh_is_called_for_after_all_where_one_of_two_leaves_the_flat_top():
     starts = [start_of(CUBE, -0.3, 0.0, 0.04), start_of(CUBE, 0.669, 0.0, 0.2, rotation_about(np.eye(3)[1], 0.4))]
     assert "table_mesh" not in called_for([starts[0]], TABLE, PHYSICS)
-    rest = settle_together(starts, TABLE, PHYSICS, ALL)
+    rest = settle_group(starts, TABLE, PHYSICS, ALL)
     assert {each.support for each in rest} == {"mesh"}
     near = [start_of(CUBE, -0.3, 0.0, 0.04), start_of(CUBE, 0.65, 0.0, 0.1)]
     assert "table_mesh" not in called_for(near, TABLE, PHYSICS)
@@ -107,7 +101,7 @@ def test_the_mesh_is_called_for_after_all_where_one_of_two_leaves_the_flat_top()
 def test_one_that_falls_off_the_table_is_named_by_its_region():
     starts = [start_of(CUBE, 0.0, 0.0, 0.04), dataclasses.replace(start_of(CUBE, 0.72, 0.0, 0.04), region_id=4)]
     with pytest.raises(SettleError, match="region 4") as caught:
-        settle_together(starts, TABLE, PHYSICS, (*ALL, "table_mesh"))
+        settle_group(starts, TABLE, PHYSICS, (*ALL, "table_mesh"))
     assert caught.value.reason == "left_table"
 
 
@@ -116,41 +110,25 @@ def test_objects_that_begin_inside_one_another_are_refused_and_not_thrown_apart(
     starts = [start_of(CUBE, 0, 0, 0.031), dataclasses.replace(start_of(CUBE, 0.06 - deep_m, 0.0, 0.031), region_id=4)]
     if refused:
         with pytest.raises(SettleError, match=f"regions 3 and 4 begin {deep_m * 1e3:.2f} mm") as caught:
-            settle_together(starts, TABLE, PHYSICS, ALL)
+            settle_group(starts, TABLE, PHYSICS, ALL)
         assert caught.value.reason == "objects_overlap"
     else:
-        rest = settle_together(starts, TABLE, PHYSICS, ALL)
+        rest = settle_group(starts, TABLE, PHYSICS, ALL)
         assert rest[1].T_world_obj[0, 3] == pytest.approx(0.06 - deep_m, abs=1e-3)
-
-
-@pytest.mark.parametrize(("height_m", "side_m", "way_m"), [(0.02, 0.06, 5e-5), (0.3, 0.06, 6e-4), (0.3, 0.006, 3e-4)])
-def test_steps_are_as_fine_as_the_highest_fall_and_the_thinnest_object_ask(height_m, side_m, way_m, monkeypatch):
-    """0.05 mm, or 0.002 of the fall if that is more, or 0.05 of the thinnest if that is less."""
-    seen = []
-
-    def told(*arguments):
-        seen.append(arguments[4])
-        return fall(*arguments)
-
-    monkeypatch.setattr("workers.physics.settle_group.fall", told)
-    small = asset_of(box(side_m, side_m, side_m))
-    starts = [start_of(CUBE, 0, 0, 0.031), start_of(small, 0.2, 0.0, height_m + side_m / 2)]
-    settle_together(starts, TABLE, PHYSICS, ALL)
-    assert [(pace.slowest_hz, pytest.approx(pace.way_m)) for pace in seen] == [(PHYSICS.step_hz, way_m)]
 
 
 def test_what_does_not_rest_in_time_says_so():
     hurried = PHYSICS.model_copy(update={"max_settle_s": 0.1})
     with pytest.raises(SettleError) as caught:
-        settle_together([start_of(CUBE, 0, 0, 0.04), start_of(CUBE, 0, 0, 0.2)], TABLE, hurried, ALL)
+        settle_group([start_of(CUBE, 0, 0, 0.04), start_of(CUBE, 0, 0, 0.2)], TABLE, hurried, ALL)
     assert caught.value.reason == "not_at_rest"
 
 
 def test_the_same_starts_give_the_same_bits_whatever_was_simulated_before():
     starts = [start_of(CUBE, 0, 0, 0.031), start_of(CUBE, 0.01, 0.005, 0.12, rotation_about(np.eye(3)[2], 0.5))]
-    first = settle_together(starts, TABLE, PHYSICS, ALL)
-    settle_alone(start_of(CUBE, 0, 0, 0.3, rotation_about(np.eye(3)[0], 0.7)), TABLE, PHYSICS)
-    second = settle_together(starts, TABLE, PHYSICS, ALL)
+    first = settle_group(starts, TABLE, PHYSICS, ALL)
+    settle_single(start_of(CUBE, 0, 0, 0.3, rotation_about(np.eye(3)[0], 0.7)), TABLE, PHYSICS)
+    second = settle_group(starts, TABLE, PHYSICS, ALL)
     assert [a.T_world_obj.tobytes() for a in first] == [b.T_world_obj.tobytes() for b in second]
 
 
@@ -170,7 +148,7 @@ def test_an_origin_away_from_the_centre_of_mass_changes_nothing():
     offset = translation(-0.2, 0.1, -0.05)
     low, high = start_of(CUBE, 0, 0, 0.031), start_of(CUBE, 0.01, 0, 0.0925)
     there = dataclasses.replace(start_of(shifted, 0, 0, 0), T_world_obj=high.T_world_obj @ offset)
-    rest = settle_together([low, there], TABLE, PHYSICS, ALL)
+    rest = settle_group([low, there], TABLE, PHYSICS, ALL)
     back = rest[1].T_world_obj @ np.linalg.inv(offset)
     assert back[2, 3] - TOP == pytest.approx(0.09, abs=5e-5)
     assert back[:2, 3] == pytest.approx([0.01, 0.0], abs=1e-3)

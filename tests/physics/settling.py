@@ -1,0 +1,59 @@
+"""The physics step for objects without a drawn scene: by the effects that they call for, or by others."""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from functools import cache
+
+from schemas.job.job import Job
+from schemas.job.physics import Physics
+from schemas.scene.effects import EffectPlan
+from schemas.scene.plan import ObjectStart, ScenePlan, Table
+from schemas.scene.scene import Settled
+from tests.shapes import asset_of, box, table
+from workers.physics.effects import called_for, called_for_with
+from workers.physics.step import RECHECK_S, moved_by, release_again, settle_scene
+from workers.plan.step import plan_scene
+
+PHYSICS = Job(name="t").physics
+
+
+@cache
+def _drawn() -> ScenePlan:
+    return plan_scene(Job(name="t"), 0, table(), asset_of(box(0.1, 0.1, 0.1)))
+
+
+def scene_of(starts: Sequence[ObjectStart], on: Table) -> ScenePlan:
+    """A scene of these objects over this table."""
+    return dataclasses.replace(_drawn(), table=on, objects=tuple(starts))
+
+
+def effects_of(starts: Sequence[ObjectStart], on: Table, physics: Physics) -> EffectPlan:
+    """The effects that the objects call for."""
+    return EffectPlan(tuple(sorted(called_for(starts, on, physics))), {})
+
+
+def settle_group(
+    starts: Sequence[ObjectStart], on: Table, physics: Physics = PHYSICS, names: Iterable[str] | None = None
+) -> tuple[Settled, ...]:
+    """The objects at rest, with the effects of these names or else those that they call for. Raises SettleError."""
+    effects = effects_of(starts, on, physics) if names is None else EffectPlan(tuple(names), {})
+    return settle_scene(scene_of(starts, on), physics, effects).settled
+
+
+def settle_single(
+    start: ObjectStart, on: Table, physics: Physics = PHYSICS, names: Iterable[str] | None = None
+) -> Settled:
+    """The same of one object."""
+    return settle_group((start,), on, physics, names)[0]
+
+
+def recheck(start: ObjectStart, settled: Settled, on: Table, physics: Physics) -> tuple[float, float]:
+    """(mm that the farthest point moves, degrees that the object turns) when it is released again where it rests.
+
+    For `RECHECK_S`, in the finest steps, on the ground that it came to rest on.
+    """
+    effects = effects_of((start,), on, physics)
+    if settled.support == "mesh":
+        effects = EffectPlan((*effects.ran, *called_for_with("table_mesh", (start,), physics)), {})
+    (after,) = release_again(scene_of((start,), on), (settled,), physics, effects, RECHECK_S)
+    return moved_by(start, settled.T_world_obj, after)

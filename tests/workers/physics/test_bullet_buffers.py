@@ -1,0 +1,24 @@
+"""Lists for PyBullet: new contents in the same objects."""
+
+import numpy as np
+
+from workers.physics.bullet_buffers import BulletBuffers
+
+
+def test_longer_and_shorter_lists_have_their_own_contents_in_the_same_objects():
+    buffers, rng = BulletBuffers(), np.random.default_rng(0)
+    seen = set()
+    for count in (5, 2, 7, 7):
+        points, values = rng.standard_normal((count, 3)), rng.integers(0, 300, count)
+        vertices, indices = buffers.vertices(points), buffers.indices(values)
+        assert np.array_equal(vertices, points)
+        assert indices == values.tolist()
+        seen |= {id(vertices), id(indices), *map(id, vertices)}
+    assert len(seen) == 2 + 7
+
+
+def test_an_index_is_the_same_object_each_time():
+    """Python makes integers above 256 anew."""
+    buffers = BulletBuffers()
+    first = id(buffers.indices(np.array([100_000]))[0])
+    assert id(buffers.indices(np.array([3, 100_000]))[1]) == first

@@ -1,0 +1,83 @@
+"""What the simulator is told of a scene: the size of steps, and the settings of the effects that the plan runs."""
+
+import numpy as np
+import pytest
+
+from schemas.job.job import Job
+from schemas.scene.effects import EffectPlan
+from schemas.scene.plan import ObjectStart
+from schemas.scene.shape import Asset
+from tests.hard_cases.bodies import rod
+from tests.hard_cases.drops import X, turn
+from tests.physics.settling import settle_group
+from tests.shapes import asset_of, box, table
+from workers.geometry.frames import pose
+from workers.geometry.hull import convex_hull
+from workers.physics.fall import fall
+from workers.physics.placement import Ground
+from workers.physics.release import Drop, release
+from workers.physics.table_top import place_table
+
+PHYSICS = Job(name="t").physics
+TABLE = place_table(table())
+GROUND = Ground(TABLE)
+TOP = TABLE.top.height_m
+ALL = ("dynamics", "fine_step", "object_contacts", "rolling_friction")
+CUBE = asset_of(box(0.06, 0.06, 0.06))
+
+
+def start_of(asset: Asset, x: float, y: float, z: float, R=None) -> ObjectStart:
+    T = pose(np.eye(3) if R is None else R, np.array([x, y, TOP + z]))
+    return ObjectStart(asset, convex_hull(asset.shape.vertices), 3, T, 0, False)
+
+
+@pytest.mark.parametrize(
+    ("height_m", "side_m", "travel_m"), [(0.02, 0.06, 5e-5), (0.3, 0.06, 6e-4), (0.3, 0.006, 3e-4)]
+)
+def test_steps_are_as_fine_as_the_highest_fall_and_the_thinnest_object_ask(height_m, side_m, travel_m, monkeypatch):
+    """0.05 mm, or 0.002 of the fall if that is more, or 0.05 of the thinnest if that is less."""
+    seen = []
+
+    def told(*arguments):
+        seen.append(arguments[4])
+        return fall(*arguments)
+
+    monkeypatch.setattr("workers.physics.release.fall", told)
+    small = asset_of(box(side_m, side_m, side_m))
+    starts = [start_of(CUBE, 0, 0, 0.031), start_of(small, 0.2, 0.0, height_m + side_m / 2)]
+    settle_group(starts, TABLE, PHYSICS, ALL)
+    assert [(steps.base_hz, pytest.approx(steps.max_travel_m)) for steps in seen] == [(PHYSICS.step_hz, travel_m)]
+
+
+def seconds_to_rest(start: ObjectStart, names: tuple[str, ...], **changes) -> float:
+    physics = PHYSICS.model_copy(update={"max_settle_s": 3.0, **changes})
+    return release(Drop((start,), GROUND, physics, EffectPlan(names, {})), flat=True).seconds
+
+
+def test_a_cube_bounces_only_where_the_plan_runs_restitution():
+    """From 0.2 m a restitution of 0.64 between the two makes it bounce for longer than the fall took."""
+    start = start_of(CUBE, 0.0, 0.0, 0.23)
+    still = seconds_to_rest(start, ("dynamics", "fine_step"))
+    assert seconds_to_rest(start, ("dynamics", "fine_step"), restitution=0.8) == still
+    assert seconds_to_rest(start, ("dynamics", "fine_step", "restitution"), restitution=0.8) > still + 0.202
+
+
+def test_a_can_is_braked_against_rolling_only_where_the_plan_runs_rolling_friction():
+    start = start_of(rod(0.033, 0.12, 360), 0.0, 0.0, 0.08, turn(X, 60) @ turn(np.array([0.0, 1.0, 0.0]), 20))
+    rolling = ("dynamics", "fine_step", "rolling_friction")
+    assert seconds_to_rest(start, rolling, rolling_friction=0.005) < 3.0
+    assert seconds_to_rest(start, rolling[:2], rolling_friction=0.005) >= 3.0
+
+
+def test_objects_as_boxes_keep_the_height_of_their_lowest_point_together_as_alone():
+    """A tilted can's box reaches lower than the can: let go 1 mm above the table it would begin within the top."""
+    tilted = turn(X, 40) @ turn(np.array([0.0, 0.0, 1.0]), 45)
+    can = rod(0.03, 0.1)
+    low = float((can.shape.vertices @ tilted.T)[:, 2].min())
+    starts = [start_of(can, x, 0.0, 0.001 - low, tilted) for x in (-0.1, 0.1)]
+    physics = PHYSICS.model_copy(update={"collision": "box", "max_settle_s": 0.01})
+    plan = EffectPlan(("dynamics", "fine_step"), {})
+    both = release(Drop(tuple(starts), GROUND, physics, plan), flat=True)
+    alone = [release(Drop((start,), GROUND, physics, plan), flat=True) for start in starts]
+    for together, one in zip(both.poses, alone, strict=True):
+        assert together[2, 3] == pytest.approx(one.poses[0][2, 3], abs=1e-4)
