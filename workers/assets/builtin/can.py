@@ -5,23 +5,13 @@ from collections.abc import Callable
 import numpy as np
 
 from schemas.base import Array
-from workers.assets.builtin.curves import rounded
-from workers.assets.builtin.finish import Model, Surface
-from workers.assets.builtin.look import (
-    Color,
-    chance,
-    ink_on,
-    mixed,
-    pale,
-    pick,
-    plastic,
-    solid_color,
-    steel,
-    textured,
-    vivid,
-)
-from workers.assets.builtin.paint import Picture, band_height, bands, blank, label, rgb
+from workers.assets.builtin.curves import fillet
+from workers.assets.builtin.draws import chance, pick
+from workers.assets.builtin.materials import plastic, solid_color, steel, textured
+from workers.assets.builtin.palette import Color, ink_on, mix, pale, vivid
+from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import lathe
+from workers.assets.builtin.textures import Texture, band_height, bands, blank, label, rgb
 
 SIDE, METAL, LID, TOP = 0, 1, 2, 3
 SEGMENTS = 48
@@ -38,7 +28,7 @@ def make_can(rng: np.random.Generator) -> Model:
     kind = rng.random()
     build = next(build for share, build in builders if kind < share)
     corners, radii, surface = build(rng)
-    profile, owner = rounded(corners, radii, 3)
+    profile, owner = fillet(corners, radii, 3)
     solid = lathe(profile, np.array(surface)[owner], SEGMENTS)
     on_side = np.flatnonzero(np.array(surface) == SIDE)
     low, high = float(corners[on_side[0], 1]), float(corners[on_side[-1] + 1, 1])
@@ -50,7 +40,7 @@ def make_can(rng: np.random.Generator) -> Model:
 def _drink(rng: np.random.Generator) -> tuple[Array, list[float], list[int]]:
     """A drinks can: domed base on a ring, tapered below and above, a rim around a sunken lid."""
     radius = float(pick(rng, (0.0265, 0.0289, 0.0331, 0.0331, 0.038)))
-    height = radius * float(rng.uniform(3.2, 4.9))
+    height = radius * rng.uniform(3.2, 4.9)
     ring, rim = 0.74 * radius, 0.82 * radius
     taper = 0.13 * radius / 0.033
     corners = np.array(
@@ -75,8 +65,8 @@ def _drink(rng: np.random.Generator) -> tuple[Array, list[float], list[int]]:
 
 def _food(rng: np.random.Generator) -> tuple[Array, list[float], list[int]]:
     """A food tin: straight, often with beads, a double seam at both ends; flat fish tins too."""
-    radius = float(rng.uniform(0.03, 0.055))
-    height = radius * float(rng.uniform(0.7, 1.0) if chance(rng, 0.25) else rng.uniform(1.8, 3.2))
+    radius = rng.uniform(0.03, 0.055)
+    height = radius * (rng.uniform(0.7, 1.0) if chance(rng, 0.25) else rng.uniform(1.8, 3.2))
     seam, deep = 0.0014, 0.0045
     lower = [
         [0.0, 0.003],
@@ -98,7 +88,7 @@ def _food(rng: np.random.Generator) -> tuple[Array, list[float], list[int]]:
     ]
     middle: list[list[float]] = []
     if height > 1.5 * radius and chance(rng, 0.5):
-        count, depth = int(rng.integers(4, 9)), float(rng.uniform(0.0006, 0.0012))
+        count, depth = int(rng.integers(4, 9)), rng.uniform(0.0006, 0.0012)
         for z in np.linspace(0.3 * height, 0.7 * height, count):
             step = 0.1 * height / count
             middle += [[radius, z - step], [radius - depth, z], [radius, z + step]]
@@ -111,10 +101,10 @@ def _food(rng: np.random.Generator) -> tuple[Array, list[float], list[int]]:
 
 def _spray(rng: np.random.Generator) -> tuple[Array, list[float], list[int]]:
     """A spray can: tall, domed shoulder, a cap on top."""
-    radius = float(rng.uniform(0.022, 0.033))
-    height = radius * float(rng.uniform(4.6, 6.4))
-    body = height * float(rng.uniform(0.74, 0.8))
-    cap = radius * float(rng.uniform(0.72, 0.97))
+    radius = rng.uniform(0.022, 0.033)
+    height = radius * rng.uniform(4.6, 6.4)
+    body = height * rng.uniform(0.74, 0.8)
+    cap = radius * rng.uniform(0.72, 0.97)
     start = body + 0.32 * radius
     corners = np.array(
         [
@@ -129,7 +119,7 @@ def _spray(rng: np.random.Generator) -> tuple[Array, list[float], list[int]]:
             [radius + 0.001, body + 0.003],
             [cap * 0.95, start],
             [cap, start],
-            [cap * float(rng.uniform(0.85, 1.0)), height],
+            [cap * rng.uniform(0.85, 1.0), height],
             [0.0, height],
         ]
     )
@@ -139,8 +129,8 @@ def _spray(rng: np.random.Generator) -> tuple[Array, list[float], list[int]]:
 
 def _paint(rng: np.random.Generator) -> tuple[Array, list[float], list[int]]:
     """A paint can: wide, with a channelled lid."""
-    radius = float(rng.uniform(0.045, 0.085))
-    height = radius * float(rng.uniform(1.7, 2.3))
+    radius = rng.uniform(0.045, 0.085)
+    height = radius * rng.uniform(1.7, 2.3)
     seam, deep = 0.002, 0.005
     corners = np.array(
         [
@@ -182,7 +172,7 @@ def _surfaces(
         )
         shiny = drink or chance(rng, 0.4)
         side, wrap = (
-            textured(picture, float(rng.uniform(0.3, 0.5) if shiny else rng.uniform(0.6, 0.8)), 0.35 if drink else 0.0),
+            textured(picture, (rng.uniform(0.3, 0.5) if shiny else rng.uniform(0.6, 0.8)), 0.35 if drink else 0.0),
             True,
         )
     lid = Surface("lid", bare)
@@ -197,7 +187,7 @@ def _surfaces(
             across=(flat[0], 0.0, 0.0),
             up=(0.0, flat[1], 0.0),
         )
-    top = plastic(rng) if chance(rng, 0.8) else solid_color(mixed(paper, (0.95, 0.95, 0.95), 0.5), 0.5)
+    top = plastic(rng) if chance(rng, 0.8) else solid_color(mix(paper, (0.95, 0.95, 0.95), 0.5), 0.5)
     return (
         Surface("side", side, "cylinder" if wrap else "none", low=low, high=high),
         Surface("metal", bare),
@@ -206,14 +196,14 @@ def _surfaces(
     )
 
 
-def _opener(color: Color) -> Picture:
+def _opener(color: Color) -> Texture:
     """A drinks lid seen from above: the score line of the mouth, and the ring pull."""
     picture = blank(64, 64, color)
     y, x = (np.arange(64)[:, None] - 31.5) / 32, (np.arange(64)[None] - 31.5) / 32
     mouth = (x / 0.3) ** 2 + ((y - 0.42) / 0.4) ** 2
-    picture[np.abs(mouth - 1.0) < 0.14] = rgb(mixed(color, (0.2, 0.2, 0.2), 0.6))
+    picture[np.abs(mouth - 1.0) < 0.14] = rgb(mix(color, (0.2, 0.2, 0.2), 0.6))
     tab = (x / 0.2) ** 2 + ((y + 0.16) / 0.4) ** 2
     hole = (x / 0.11) ** 2 + ((y + 0.3) / 0.14) ** 2
-    picture[(tab < 1.0) & (hole > 1.0)] = rgb(mixed(color, (1.0, 1.0, 1.0), 0.4))
-    picture[(np.abs(tab - 1.0) < 0.16) | (np.abs(hole - 1.0) < 0.3)] = rgb(mixed(color, (0.1, 0.1, 0.1), 0.6))
+    picture[(tab < 1.0) & (hole > 1.0)] = rgb(mix(color, (1.0, 1.0, 1.0), 0.4))
+    picture[(np.abs(tab - 1.0) < 0.16) | (np.abs(hole - 1.0) < 0.3)] = rgb(mix(color, (0.1, 0.1, 0.1), 0.6))
     return picture

@@ -13,10 +13,10 @@ from workers.assets.builtin.bowl import make_bowl
 from workers.assets.builtin.box import make_box
 from workers.assets.builtin.camera import make_camera
 from workers.assets.builtin.can import make_can
-from workers.assets.builtin.finish import Model, cut_into_parts
 from workers.assets.builtin.jar import make_jar
 from workers.assets.builtin.laptop import make_laptop
 from workers.assets.builtin.mug import make_mug
+from workers.assets.builtin.parts import Model, cut_into_parts
 from workers.assets.builtin.table import make_table
 from workers.assets.mass import solid_mass
 

@@ -127,7 +127,7 @@ def lathe(profile: Array, surface: Sequence[int] | Indices, count: int = 48, sec
     level = np.broadcast_to(inner[:, 1][:, None, None], (len(inner), outline.shape[1], 1))
     rings = np.concatenate([outline * inner[:, 0][:, None, None], level], axis=2)
     start, end = np.array([0.0, 0.0, profile[0, 1]]), np.array([0.0, 0.0, profile[-1, 1]])
-    return loft(rings, start, end, surface, smooth_runs(profile), _profiles(profile, section))
+    return loft(rings, start, end, surface, smoothing_groups(profile), _profiles(profile, section))
 
 
 def _profiles(profile: Array, section: Array | None) -> Array:
@@ -147,7 +147,7 @@ def _widened(profile: Array, factors: Array) -> Array:
     return wide
 
 
-def smooth_runs(profile: Array) -> Indices:
+def smoothing_groups(profile: Array) -> Indices:
     """[P - 1] int64: the number of the smooth run that each segment of a profile [P, 2] belongs to; flat ends stand alone."""
     step = np.diff(profile, axis=0)
     length = np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2)
@@ -160,7 +160,7 @@ def smooth_runs(profile: Array) -> Indices:
     return np.concatenate([[0], np.cumsum(sharp)]).astype(np.int64)
 
 
-def together(solids: Sequence[Solid]) -> Solid:
+def combine(solids: Sequence[Solid]) -> Solid:
     """Solids that do not touch one another, as one: booleans take them in one step."""
     starts = np.cumsum([0, *(len(solid.vertices) for solid in solids[:-1])])
     smooths = np.cumsum([0, *(int(solid.smooth.max()) + 1 for solid in solids[:-1])])
@@ -206,13 +206,13 @@ def union_at(solid: Solid, touched: Mask, apex: Array, others: Sequence[Solid], 
     surface = np.concatenate([solid.surface[touched], np.full(len(fan), _FAN)])
     smooth = np.concatenate([solid.smooth[touched], np.zeros(len(fan), dtype=np.int64)])
     vertices = np.concatenate([solid.vertices, apex[None]])
-    joined = union([together([Solid(vertices[names], faces, surface, smooth), *beside]), *others])
+    joined = union([combine([Solid(vertices[names], faces, surface, smooth), *beside]), *others])
     place = {point: number for number, point in enumerate(map(tuple, joined.vertices.tolist()))}
     rim = np.unique(a[border])
     at = [place.get(point, -1) for point in map(tuple, solid.vertices[rim].tolist())]
     kept = joined.surface != _FAN
     if int((~kept).sum()) != len(fan) or -1 in at:
-        return union([together([solid, *beside]), *others])
+        return union([combine([solid, *beside]), *others])
     target = len(joined.vertices) + np.arange(size)
     target[rim] = at
     faces = np.concatenate([joined.faces[kept], target[solid.faces[~touched]]])

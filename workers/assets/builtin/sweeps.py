@@ -1,59 +1,12 @@
-"""Pure: what mugs, bowls, jars, bottles and boxes are built from: walls around a hollow, prisms, bent rods."""
+"""Pure: solids swept from an outline: prisms with round edges, and bent rods."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from schemas.base import Array
-from workers.assets.builtin.curves import half_turn_points, outwards, rounded_rectangles
-from workers.assets.builtin.solid import Indices, Solid, loft, smooth_runs, union_at
-
-HANDLE_ROOM_M = 0.002
-"""Faces of a vessel this near a handle's bounding box are those that it may meet."""
-
-OUTSIDE, INSIDE, BASE = 0, 1, 2
-"""Surface numbers of a vessel."""
-
-
-@dataclass(frozen=True, eq=False)
-class Wall:
-    """The profile of a hollow vessel and the surface number of each of its segments.
-
-    profile [P, 2] of (radius, height), metres, axis to axis; surface [P - 1]; outer [Q, 2]: the stretch of the profile
-    that is the outside of the wall, bottom to rim; thickness_m: of the wall.
-    """
-
-    profile: Array
-    surface: Indices
-    outer: Array
-    thickness_m: float
-
-    def radius_at(self, z: float) -> float:
-        """Outer radius at a height, metres."""
-        return float(np.interp(z, self.outer[:, 1], self.outer[:, 0]))
-
-    def normal_at(self, z: float) -> Array:
-        """[2] float64: the unit normal (radius, height) of the outside at a height."""
-        low, high = z - 0.002, z + 0.002
-        step = np.array([self.radius_at(high) - self.radius_at(low), high - low])
-        return np.array([step[1], -step[0]]) / float(np.sqrt(step[0] * step[0] + step[1] * step[1]))
-
-
-def wall_around(hollow: Array, thickness_m: float, foot_radius: float, foot_width: float, recess: float) -> Wall:
-    """A wall of even thickness around a hollow [P, 2], which goes from (0, height of the inner bottom) to the rim.
-
-    It stands on a ring from foot_radius - foot_width to foot_radius at height 0; inside the ring the underside lies
-    `recess` higher. The rim is round.
-    """
-    offset = hollow + thickness_m * outwards(hollow)
-    outer = offset[int(((offset[:, 0] > foot_radius + 2e-4) & (offset[:, 1] > 2e-4)).argmax()) :]
-    inner_foot = foot_radius - foot_width
-    base = np.array([[0.0, recess], [inner_foot - 0.4 * recess, recess], [inner_foot, 0.0], [foot_radius, 0.0]])
-    rim = half_turn_points(outer[-1], hollow[-1], 3)
-    profile = np.concatenate([base, outer, rim, hollow[::-1]])
-    surface = np.repeat([BASE, OUTSIDE, INSIDE], [len(base) - 1, len(outer) + 2, len(hollow) + 1])
-    return Wall(profile, surface, np.concatenate([base[-1:], outer]), thickness_m)
+from workers.assets.builtin.curves import rounded_rectangles
+from workers.assets.builtin.solid import Indices, Solid, loft, smoothing_groups
 
 
 def prism(
@@ -80,10 +33,10 @@ def prism(
     closed = np.concatenate([profile[:1] + reach, profile, profile[-1:] + reach])
     profiles = np.zeros((2, len(profile) + 2, 2))
     profiles[:, 1:-1, 0], profiles[..., 1] = 0.5 * np.array(size)[:, None] - inset, z[[0, *range(len(z)), -1]]
-    return loft(rings, ends[0], ends[1], surface, smooth_runs(closed), profiles)
+    return loft(rings, ends[0], ends[1], surface, smoothing_groups(closed), profiles)
 
 
-def bevelled(height: float, bevel: float, bottom: float = 0.0) -> Array:
+def bevelled_profile(height: float, bevel: float, bottom: float = 0.0) -> Array:
     """[4, 2] float64: the (inset, height) profile of a slab from `bottom`, with a bevel along its upper and lower edge."""
     top = bottom + height
     return np.array([[bevel, bottom], [0.0, bottom + bevel], [0.0, top - bevel], [bevel, top]])
@@ -120,19 +73,7 @@ def rod(path: Array, section: Array, surface: int, ends: tuple[Array, Array], sw
     return loft(rings, caps[0], caps[1], np.full(len(path) + 1, surface), smooth)
 
 
-def with_handles(body: Solid, outside: int, handles: Sequence[Solid]) -> Solid:
-    """A vessel about the z axis with handles that reach into its outside (a surface number) and through no wall."""
-    low, high = (body.vertices[body.faces].min(axis=1), body.vertices[body.faces].max(axis=1))
-    touched = np.zeros(len(body.faces), dtype=np.bool_)
-    for handle in handles:
-        start, stop = handle.vertices.min(axis=0) - HANDLE_ROOM_M, handle.vertices.max(axis=0) + HANDLE_ROOM_M
-        touched |= ((high >= start) & (low <= stop)).all(axis=1)
-    touched &= body.surface == outside
-    middle = 0.5 * float(low[touched, 2].min() + high[touched, 2].max())
-    return union_at(body, touched, np.array([0.0, 0.0, middle]), handles)
-
-
-def sides_apart(solid: Solid, surface: int, numbers: tuple[int, int, int, int]) -> Solid:
+def split_sides(solid: Solid, surface: int, numbers: tuple[int, int, int, int]) -> Solid:
     """The faces of one surface sorted by the side that they look to: front (-y), right (+x), back (+y), left (-x)."""
     a, b, c = (solid.vertices[solid.faces[:, k]] for k in range(3))
     x, y, _ = np.cross(b - a, c - a).T

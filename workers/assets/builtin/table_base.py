@@ -7,8 +7,8 @@ import numpy as np
 
 from schemas.base import Array
 from workers.assets.builtin.curves import bezier, rounded_rectangle
-from workers.assets.builtin.look import chance
-from workers.assets.builtin.solid import Solid, circle, lathe, loft, together
+from workers.assets.builtin.draws import chance, pick
+from workers.assets.builtin.solid import Solid, circle, combine, lathe, loft
 
 TOP, LEG, FRAME = 0, 1, 2
 """Surface numbers of a table."""
@@ -30,14 +30,14 @@ class Plan:
         return self.height - self.thick
 
 
-def make_stand(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+def make_base(rng: np.random.Generator, plan: Plan) -> list[Solid]:
     """One or two solids, standing at height 0, that reach into the table top from below."""
     stands = (
         (_pedestal, _legs, _panels)
         if plan.round_top
         else (_legs, _legs, _apron_legs, _apron_legs, _sled, _trestle, _panels)
     )
-    return stands[int(rng.integers(len(stands)))](rng, plan)
+    return pick(rng, stands)(rng, plan)
 
 
 def _leg_spots(plan: Plan, inset: float) -> list[tuple[float, float]]:
@@ -49,7 +49,7 @@ def _leg_spots(plan: Plan, inset: float) -> list[tuple[float, float]]:
 
 def _leg(rng: np.random.Generator, plan: Plan, spots: list[tuple[float, float]], splay: float, size: float) -> Solid:
     """Four like legs, square or round, tapered, leaning outwards by `splay` (a slope)."""
-    is_round, taper = chance(rng, 0.5), float(rng.uniform(0.55, 1.0))
+    is_round, taper = chance(rng, 0.5), rng.uniform(0.55, 1.0)
     outline = circle(12) * 0.5 if is_round else rounded_rectangle(1.0, 1.0, 0.08, 1)
     top = plan.under + 0.4 * plan.thick
     legs = []
@@ -63,13 +63,13 @@ def _leg(rng: np.random.Generator, plan: Plan, spots: list[tuple[float, float]],
         )
         ends = np.array([*(np.array([x, y]) + away * plan.under), 0.0]), np.array([x, y, top])
         legs.append(loft(np.stack([foot, head]), *ends, [LEG] * 3, [0, 1, 2]))
-    return together(legs)
+    return combine(legs)
 
 
 def _legs(rng: np.random.Generator, plan: Plan) -> list[Solid]:
     """Legs straight into the top, upright or splayed."""
-    size = float(rng.uniform(0.03, 0.06))
-    splay = float(rng.uniform(0.04, 0.16)) if chance(rng, 0.5) else 0.0
+    size = rng.uniform(0.03, 0.06)
+    splay = rng.uniform(0.04, 0.16) if chance(rng, 0.5) else 0.0
     inset = 0.6 * size + 0.02 + (splay * plan.under if not plan.round_top else 0.0)
     return [_leg(rng, plan, _leg_spots(plan, inset), splay, size)]
 
@@ -87,20 +87,20 @@ def _beam(size: tuple[float, float, float], at: tuple[float, float, float], surf
 
 def _apron_legs(rng: np.random.Generator, plan: Plan) -> list[Solid]:
     """Four upright legs joined by an apron, and often by a shelf or by stretchers."""
-    size = float(rng.uniform(0.045, 0.08))
-    spots = _leg_spots(plan, 0.5 * size + float(rng.uniform(0.012, 0.05)))
+    size = rng.uniform(0.045, 0.08)
+    spots = _leg_spots(plan, 0.5 * size + rng.uniform(0.012, 0.05))
     x, y = spots[0]
     legs = _leg(rng, plan, spots, 0.0, size)
-    deep, thin = float(rng.uniform(0.06, 0.11)), 0.4 * size
+    deep, thin = rng.uniform(0.06, 0.11), 0.4 * size
     middle = plan.under - 0.5 * deep + 0.3 * plan.thick
     solids = [_frame((2 * x + thin, 2 * y + thin), thin, middle - 0.5 * deep, middle + 0.5 * deep)]
     kind = rng.random()
-    low = plan.height * float(rng.uniform(0.15, 0.3))
+    low = plan.height * rng.uniform(0.15, 0.3)
     if kind < 0.35:
         solids.append(_beam((2 * x + 0.2 * thin, 2 * y + 0.2 * thin, 0.02), (0.0, 0.0, low), FRAME))
     elif kind < 0.6:
         solids.append(_frame((2 * x + thin, 2 * y + thin), thin, low - 0.5 * thin, low + 0.5 * thin))
-    return [legs, together(solids)]
+    return [legs, combine(solids)]
 
 
 def _frame(size: tuple[float, float], wide: float, low: float, high: float) -> Solid:
@@ -123,9 +123,9 @@ def _frame(size: tuple[float, float], wide: float, low: float, high: float) -> S
 
 def _pedestal(rng: np.random.Generator, plan: Plan) -> list[Solid]:
     """One turned column on a round plate or on a wide bell."""
-    column, foot = float(rng.uniform(0.03, 0.07)), plan.depth * float(rng.uniform(0.27, 0.34))
+    column, foot = rng.uniform(0.03, 0.07), plan.depth * rng.uniform(0.27, 0.34)
     top = plan.under + 0.4 * plan.thick
-    plate = float(rng.uniform(0.012, 0.03))
+    plate = rng.uniform(0.012, 0.03)
     if chance(rng, 0.5):
         stem = np.array(
             [[foot, plate], [column * 1.1, plate + 0.02], [column, 0.4 * plan.under], [column, plan.under - 0.05]]
@@ -145,14 +145,14 @@ def _pedestal(rng: np.random.Generator, plan: Plan) -> list[Solid]:
 
 def _sled(rng: np.random.Generator, plan: Plan) -> list[Solid]:
     """Two frames of square loft, one at each end, sometimes joined below the top."""
-    loft = float(rng.uniform(0.03, 0.055))
-    x, y = 0.5 * plan.width - float(rng.uniform(0.05, 0.18)), 0.5 * plan.depth - float(rng.uniform(0.03, 0.08))
+    loft = rng.uniform(0.03, 0.055)
+    x, y = 0.5 * plan.width - rng.uniform(0.05, 0.18), 0.5 * plan.depth - rng.uniform(0.03, 0.08)
     top = plan.under + 0.4 * plan.thick
     upright = _frame((top, 2 * y), loft, -0.5 * loft, 0.5 * loft)
     # The frame lies flat about the origin; turned about y, its first axis stands up.
     stood = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     ends = [upright.placed(stood, np.array([side, 0.0, 0.5 * top])) for side in (-x, x)]
-    legs = together(ends)
+    legs = combine(ends)
     legs = Solid(legs.vertices, legs.faces, np.full(len(legs.faces), LEG), legs.smooth, legs.lofts)
     if not chance(rng, 0.5):
         return [legs]
@@ -161,8 +161,8 @@ def _sled(rng: np.random.Generator, plan: Plan) -> list[Solid]:
 
 def _trestle(rng: np.random.Generator, plan: Plan) -> list[Solid]:
     """A board on edge at each end with a wide foot, joined by a long rail."""
-    x = 0.5 * plan.width - float(rng.uniform(0.15, 0.25))
-    board, thick = plan.depth * float(rng.uniform(0.25, 0.5)), float(rng.uniform(0.03, 0.06))
+    x = 0.5 * plan.width - rng.uniform(0.15, 0.25)
+    board, thick = plan.depth * rng.uniform(0.25, 0.5), rng.uniform(0.03, 0.06)
     top, foot = plan.under + 0.4 * plan.thick, 0.78 * plan.depth
     # An upright with a wide foot and a wide head, seen from its end: one outline, as thick as the board.
     half = np.array(
@@ -177,8 +177,8 @@ def _trestle(rng: np.random.Generator, plan: Plan) -> list[Solid]:
         ]
     )
     return [
-        together([_cheek(half, thick, side) for side in (-x, x)]),
-        _beam((2 * x + 0.1, 0.6 * thick, 0.09), (0.0, 0.0, plan.under * float(rng.uniform(0.3, 0.6))), FRAME),
+        combine([_cheek(half, thick, side) for side in (-x, x)]),
+        _beam((2 * x + 0.1, 0.6 * thick, 0.09), (0.0, 0.0, plan.under * rng.uniform(0.3, 0.6)), FRAME),
     ]
 
 
@@ -199,11 +199,11 @@ def _cheek(half: Array, thick: float, at: float) -> Solid:
 
 def _panels(rng: np.random.Generator, plan: Plan) -> list[Solid]:
     """Two panels that cross, or two ends like a bench's."""
-    thick, top = float(rng.uniform(0.02, 0.04)), plan.under + 0.4 * plan.thick
+    thick, top = rng.uniform(0.02, 0.04), plan.under + 0.4 * plan.thick
     reach = 0.62 if plan.round_top else 0.85
     x, y = reach * plan.width, reach * plan.depth
     if plan.round_top or chance(rng, 0.3):
         first = _beam((x, thick, top), (0.0, 0.0, 0.5 * top), LEG)
         return [first, _beam((thick, y, top), (0.0, 0.0, 0.5 * top), LEG)]
     ends = [_beam((thick, y, top), (side * 0.5 * x, 0.0, 0.5 * top), LEG) for side in (-1.0, 1.0)]
-    return [together(ends), _beam((x, thick, 0.25 * plan.height), (0.0, 0.0, 0.72 * plan.under), FRAME)]
+    return [combine(ends), _beam((x, thick, 0.25 * plan.height), (0.0, 0.0, 0.72 * plan.under), FRAME)]
