@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import workers.render.raster.gbuffer
-from schemas.job.job import Render
+from schemas.job.render import Render
 from tests.workers.render.random_scenes import APPEARANCE, orbit_and_mirror, procedural_things, random_things
 from tests.workers.render.raster.test_raster import FLAT, FOUR, RASTER
 from workers.plan.effects import names_of_kind

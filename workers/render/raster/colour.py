@@ -5,8 +5,8 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.scene.appearance import Appearance
 from schemas.scene.camera import Intrinsics
-from schemas.scene.scene import Appearance
 from workers.geometry.srgb import encode_srgb
 from workers.render.raster.lit_shaders import MASK_FRAGMENT, MASK_VERTEX
 from workers.render.raster.programs import Program

@@ -29,9 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Pose
-from schemas.job.job import Render
+from schemas.job.render import Render
+from schemas.scene.appearance import Appearance
 from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.scene import Appearance, GBuffer, Placed
+from schemas.scene.scene import Placed
+from schemas.scene.view import GBuffer
 from workers.geometry.frames import invert
 from workers.geometry.srgb import encode_srgb
 from workers.render.overrides import AS_CALLED_FOR, Passes

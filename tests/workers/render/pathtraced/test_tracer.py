@@ -12,8 +12,10 @@ import trimesh
 
 from schemas.base import frozen_array
 from schemas.errors import InputError
-from schemas.job.job import Render
-from schemas.scene.scene import REGION_FIRST_OBJECT, Appearance, Light, Placed
+from schemas.job.render import Render
+from schemas.scene.appearance import Appearance, Light
+from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.scene import Placed
 from schemas.scene.shape import Material, Part, Shape
 from tests.workers.render.random_scenes import (
     APPEARANCE,
@@ -148,7 +150,7 @@ def test_the_film_of_square_pixels_holds_the_image_and_is_no_coarser():
 RUN = """
 import hashlib, numpy as np
 from tests.workers.render.random_scenes import APPEARANCE, camera, orbit_and_mirror, random_things, small
-from schemas.job.job import Render
+from schemas.job.render import Render
 from workers.render.pathtraced.materials import tint_of
 from workers.render.pathtraced.tracer import Tracer
 rng = np.random.default_rng(5)

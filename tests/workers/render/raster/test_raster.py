@@ -9,8 +9,9 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.job.job import Render
-from schemas.scene.scene import Appearance, Light, Placed
+from schemas.job.render import Render
+from schemas.scene.appearance import Appearance, Light
+from schemas.scene.scene import Placed
 from schemas.scene.shape import Material, Part, Shape
 from tests.workers.render.random_scenes import (
     APPEARANCE,
@@ -184,7 +185,7 @@ def test_through_a_hole_in_a_texture_one_sees_what_is_behind_and_labels_are_soli
 def test_drawing_again_gives_the_same_bytes_also_in_another_process(renderer):
     code = (
         "import hashlib, numpy as np\n"
-        "from schemas.job.job import Render\n"
+        "from schemas.job.render import Render\n"
         "from tests.workers.render.random_scenes import *\n"
         "from workers.render.raster.gbuffer import shared_renderer\n"
         "rng = np.random.default_rng(31)\n"
