@@ -5,30 +5,15 @@ import importlib.util
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from schemas.errors import AssetSourceError, MeshError
-from schemas.job.assets import FolderSource, MeshLimits
-from schemas.job.job import CATEGORIES
+from schemas.errors import AssetSourceError
+from schemas.job.assets import Assets, FolderSource, MeshLimits
 from schemas.scene.shape import Asset
+from workers.assets.categories import ASSET_CATEGORIES, TABLE
+from workers.assets.external.listing import Entry, Listing, describe_folder, hash_files, list_entries
 from workers.assets.external.mesh import load_shape
+from workers.assets.external.placement import UP_AXES, Placement, place_asset
+from workers.assets.external.reading import list_mesh_files
 from workers.assets.external.urdf_file import find_mesh, load_urdf, mesh_names, parse_urdf
-from workers.assets.sources import (
-    TABLE,
-    UNKNOWN,
-    UP_AXES,
-    Entry,
-    Listing,
-    Placement,
-    SourceShape,
-    Weights,
-    check_unchanged,
-    found_in,
-    hashed,
-    licence_files,
-    licence_of,
-    mesh_files,
-    placed_asset,
-    tally,
-)
 
 PYBULLET_DATA = "pybullet_data"
 PYBULLET_MAP: Mapping[str, str] = {
@@ -38,6 +23,9 @@ PYBULLET_MAP: Mapping[str, str] = {
     "random_urdfs/*/*.urdf": "box",
 }
 """What of the meshes inside the pybullet_data package is one of our categories."""
+
+UNKNOWN = "unknown"
+"""The licence of a source whose user states none."""
 
 
 def locate_folder(name: str, job_folder: Path) -> Path:
@@ -50,29 +38,22 @@ def locate_folder(name: str, job_folder: Path) -> Path:
     return (job_folder / Path(name).expanduser()).resolve()
 
 
-def list_folder(settings: FolderSource, folder: Path, categories: Collection[str], limits: MeshLimits) -> Listing:
+def list_folder(settings: FolderSource, job_folder: Path, categories: Collection[str], limits: MeshLimits) -> Listing:
     """Every file that the map names, for the categories asked for; AssetSourceError where map or folder cannot be used.
 
     Reads and hashes these files and all that they refer to.
     """
-    folder = folder.resolve()  # what lies in it is compared with its resolved path
-    category_map = _map_of(settings, folder)
-    entries: dict[str, list[Entry]] = {
-        category: [] for category in sorted(set(category_map.values()) & set(categories))
-    }
-    skipped = []
-    licences = licence_files(folder.rglob("*")) if settings.licence == UNKNOWN else []
-    for path, category in sorted(_matches(category_map, folder).items()):
-        if category not in entries:
-            continue
-        try:
-            entries[category].append(_entry(settings, folder, path, limits, licences))
-        except MeshError as error:
-            skipped.append(error.reason)
-    return Listing(folder, {category: tuple(found) for category, found in entries.items()}, tally(skipped))
+    folder = locate_folder(settings.folder, job_folder)
+    category_map = _read_map(settings, folder)
+    candidates: dict[str, list[Path]] = {name: [] for name in sorted(set(category_map.values()) & set(categories))}
+    for path, category in sorted(_match_files(category_map, folder).items()):
+        if category in candidates:
+            candidates[category].append(path)
+    licences = list_licences(folder) if settings.licence == UNKNOWN else []
+    return list_entries(folder, candidates, lambda path: _make_entry(settings, folder, path, limits, licences))
 
 
-def _matches(category_map: Mapping[str, str], folder: Path) -> dict[Path, str]:
+def _match_files(category_map: Mapping[str, str], folder: Path) -> dict[Path, str]:
     """The category of every file inside the folder that a pattern finds; the first pattern wins."""
     matches: dict[Path, str] = {}
     for pattern, category in category_map.items():
@@ -86,7 +67,8 @@ def _matches(category_map: Mapping[str, str], folder: Path) -> dict[Path, str]:
     return matches
 
 
-def _map_of(settings: FolderSource, folder: Path) -> Mapping[str, str]:
+def _read_map(settings: FolderSource, folder: Path) -> Mapping[str, str]:
+    """The category by file pattern; AssetSourceError where there is none or it names another category."""
     if not folder.is_dir():
         raise AssetSourceError(
             f"{folder} is not a folder. Set `folder` of the urdf source to one, or to `{PYBULLET_DATA}`."
@@ -95,54 +77,52 @@ def _map_of(settings: FolderSource, folder: Path) -> Mapping[str, str]:
     if not category_map:
         raise AssetSourceError(
             f'{folder} needs a `category_map`, such as {{"mugs/*.obj": mug}}: nothing says what its files are. '
-            f"It has {found_in(folder)}."
+            f"It has {describe_folder(folder)}."
         )
     for pattern, category in category_map.items():
-        if category not in (*CATEGORIES, TABLE):
-            allowed = ", ".join((*CATEGORIES, TABLE))
+        if category not in ASSET_CATEGORIES:
+            allowed = ", ".join(ASSET_CATEGORIES)
             raise AssetSourceError(f"category_map: {pattern!r} is given {category!r}, which is none of {allowed}.")
     return category_map
 
 
-def _entry(settings: FolderSource, folder: Path, path: Path, limits: MeshLimits, licences: list[Path]) -> Entry:
-    paths = [path]
+def _make_entry(settings: FolderSource, folder: Path, path: Path, limits: MeshLimits, licences: list[Path]) -> Entry:
     if path.suffix.lower() == ".urdf":
-        for name in mesh_names(parse_urdf(path)):
-            paths += mesh_files(find_mesh(name, path, folder), folder, limits)
+        meshes = [find_mesh(name, path, folder) for name in mesh_names(parse_urdf(path))]
+        paths = [path, *(file for mesh in meshes for file in list_mesh_files(mesh, folder, limits))]
     else:
-        paths = mesh_files(path, folder, limits)
-    files = hashed(dict.fromkeys(paths), folder)
+        paths = list_mesh_files(path, folder, limits)
+    files = hash_files(dict.fromkeys(paths), folder)
     identity = _instance_id(settings, files[0].path, files[0].sha256)
-    return Entry(identity, files, licence_of(path, folder, settings.licence, licences))
+    return Entry(identity, files, find_licence(path, folder, settings.licence, licences))
 
 
 def _instance_id(settings: FolderSource, relative: str, sha256: str) -> str:
     """The path as one word, and eight digits of a digest of the file and of the settings that shape it."""
-    word = "".join(
-        c if c.isascii() and (c.isalnum() or c in "-_.") else "-" for c in str(Path(relative).with_suffix(""))
-    )
+    stem = str(Path(relative).with_suffix(""))
+    word = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "-" for c in stem)
     how = (relative, sha256, settings.up, settings.scale, settings.diagonal_m)
     return f"{word}-{hashlib.sha256(repr(how).encode()).hexdigest()[:8]}"
 
 
-def load_folder_entry(
-    settings: FolderSource, listing: Listing, entry: Entry, category: str, limits: MeshLimits, weights: Weights
-) -> Asset:
-    """One file, cleaned, z up, scaled; MeshError where it is refused or has changed."""
-    check_unchanged(listing.folder, entry)
-    path = listing.folder / entry.files[0].path
-    if path.suffix.lower() == ".urdf":
-        found = load_urdf(path, listing.folder, limits)
-    else:
-        loaded = load_shape(path, limits, root=listing.folder)
-        found = SourceShape(loaded.shape, loaded.notes)
-    diagonal = None if category == TABLE else settings.diagonal_m
-    return placed_asset(
-        found,
-        Placement(UP_AXES[settings.up], settings.scale, diagonal),
-        entry=entry,
-        category=category,
-        source="urdf",
-        shareable=settings.copy_assets,
-        weights=weights,
-    )
+def list_licences(folder: Path) -> list[Path]:
+    """The files below a folder whose name is a licence's."""
+    return sorted(path for path in folder.rglob("*") if path.stem.lower() in ("license", "licence", "copying"))
+
+
+def find_licence(path: Path, folder: Path, stated: str, licences: Collection[Path]) -> str:
+    """The stated licence; where none is stated, the nearest licence file from the mesh's folder up to the source's."""
+    if stated == UNKNOWN:
+        for parent in path.parents:
+            for file in licences:
+                if file.parent == parent:
+                    return f"see {file.relative_to(folder).as_posix()}"
+    return stated
+
+
+def load_folder_entry(settings: FolderSource, folder: Path, entry: Entry, category: str, assets: Assets) -> Asset:
+    """One file, cleaned, z up, scaled; MeshError where it is refused."""
+    path = folder / entry.files[0].path
+    load = load_urdf if path.suffix.lower() == ".urdf" else load_shape
+    placement = Placement(UP_AXES[settings.up], settings.scale, None if category == TABLE else settings.diagonal_m)
+    return place_asset(load(path, assets.limits, folder), placement, entry, category, settings, assets)

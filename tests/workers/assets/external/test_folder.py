@@ -8,19 +8,18 @@ import pytest
 
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import AssetSourceError
-from schemas.job.assets import FolderSource, MeshLimits
+from schemas.job.assets import Assets, FolderSource, MeshLimits
 from schemas.job.job import Job
 from tests.workers.assets.oracles import CUBE, textured_cube, write
-from workers.assets.external.folder import list_folder, load_folder_entry, locate_folder
-from workers.assets.sources import Weights
+from workers.assets.external.folder import find_licence, list_folder, list_licences, load_folder_entry, locate_folder
 from workers.pipeline.rows import asset_row
 
-LIMITS, WEIGHTS = MeshLimits(), Weights(600.0, 3.0)
+LIMITS, ASSETS = MeshLimits(), Assets(density_kg_m3=600.0, shell_kg_m2=3.0)
 SHARED = Path(__file__).resolve().parents[5] / "shared" / "data" / "meshes"
 
 
 def source(**more):
-    return FolderSource(source="urdf", folder="things", **more)
+    return FolderSource(source="urdf", folder=".", **more)
 
 
 def test_the_first_pattern_that_fits_gives_the_category(tmp_path):
@@ -36,10 +35,10 @@ def test_files_are_turned_scaled_and_sized_as_the_source_says(tmp_path):
     write(tmp_path / "a.obj", CUBE.replace("v 0 1", "v 0 3").replace("v 1 1", "v 1 3"))
     settings = source(category_map={"*.obj": "mug"}, up="y", scale=0.1)
     listing = list_folder(settings, tmp_path, {"mug"}, LIMITS)
-    asset = load_folder_entry(settings, listing, listing.entries["mug"][0], "mug", LIMITS, WEIGHTS)
+    asset = load_folder_entry(settings, listing.folder, listing.entries["mug"][0], "mug", ASSETS)
     assert asset.extents_m == pytest.approx([0.1, 0.1, 0.3])
     settings = source(category_map={"*.obj": "mug"}, up="y", diagonal_m=0.25)
-    asset = load_folder_entry(settings, listing, listing.entries["mug"][0], "mug", LIMITS, WEIGHTS)
+    asset = load_folder_entry(settings, listing.folder, listing.entries["mug"][0], "mug", ASSETS)
     assert float(np.linalg.norm(asset.extents_m)) == pytest.approx(0.25)
 
 
@@ -92,27 +91,26 @@ def test_folders_are_relative_to_the_job_file_and_pybullet_data_is_the_package(t
 
 def test_the_meshes_inside_pybullet_data_have_a_map_of_their_own(tmp_path):
     settings = FolderSource(source="urdf", folder="pybullet_data")
-    folder = locate_folder("pybullet_data", tmp_path)
-    listing = list_folder(settings, folder, {"mug", "table"}, LIMITS)
+    listing = list_folder(settings, tmp_path, {"mug", "table"}, LIMITS)
     assert [entry.files[0].path for entry in listing.entries["mug"]] == ["objects/mug.urdf"]
     assert {entry.licence for entries in listing.entries.values() for entry in entries} == {"unknown"}
-    tables = [load_folder_entry(settings, listing, e, "table", LIMITS, WEIGHTS) for e in listing.entries["table"]]
+    tables = [load_folder_entry(settings, listing.folder, e, "table", ASSETS) for e in listing.entries["table"]]
     # table.urdf: a top of 1.5 x 1 x 0.05 m whose middle is at 0.6 m, on legs that reach down to 0.
     assert tables[0].extents_m == pytest.approx([1.5, 1.0, 0.625])
     assert tables[1].extents_m == pytest.approx([0.6, 0.6, 0.64])
     assert all(table.watertight for table in tables)
-    mug = load_folder_entry(settings, listing, listing.entries["mug"][0], "mug", LIMITS, WEIGHTS)
+    mug = load_folder_entry(settings, listing.folder, listing.entries["mug"][0], "mug", ASSETS)
     assert mug.extents_m[2] == pytest.approx(0.1, abs=1e-3)
     assert mug.shape.parts[0].material.base_color == (1.0, 0.2, 0.2, 1.0)
 
 
 @pytest.mark.shared_data
 def test_scanned_things_load_through_their_urdfs():
-    settings = FolderSource(source="urdf", folder="x", category_map={"*/model.urdf": "mug"})
+    settings = FolderSource(source="urdf", folder=".", category_map={"*/model.urdf": "mug"})
     listing = list_folder(settings, SHARED, {"mug"}, LIMITS)
     assert len(listing.entries["mug"]) == 5
     for entry in listing.entries["mug"]:
-        asset = load_folder_entry(settings, listing, entry, "mug", LIMITS, WEIGHTS)
+        asset = load_folder_entry(settings, listing.folder, entry, "mug", ASSETS)
         assert asset.watertight
         assert asset.volume_m3 is not None
         assert 2e-5 < asset.volume_m3 < 3e-3
@@ -129,9 +127,19 @@ def test_what_was_left_out_of_a_mesh_is_told_by_its_row_in_the_assets_table(tmp_
     write(tmp_path / "thing.urdf", URDF)
     settings = source(category_map={name: "mug"})
     listing = list_folder(settings, tmp_path, {"mug"}, LIMITS)
-    asset = load_folder_entry(settings, listing, listing.entries["mug"][0], "mug", LIMITS, WEIGHTS)
+    asset = load_folder_entry(settings, listing.folder, listing.entries["mug"][0], "mug", ASSETS)
     row = asset_row(asset, Job(name="t"))
     table = pa.Table.from_pylist([row], schema=SCHEMAS["assets"])
     (note,) = table["notes"][0].as_py()
     assert note.startswith("skin.png cannot be opened") and note.endswith("plain base colour used")
     assert " at 0x" not in note, "an address is another in every run"
+
+
+def test_the_nearest_licence_file_is_named_unless_the_user_states_one(tmp_path):
+    for path in ("LICENSE", "mug/licence.txt", "mug/a/mug.obj", "bowl/bowl.obj"):
+        write(tmp_path / path, "x")
+    files = list_licences(tmp_path)
+    assert find_licence(tmp_path / "mug/a/mug.obj", tmp_path, "unknown", files) == "see mug/licence.txt"
+    assert find_licence(tmp_path / "bowl/bowl.obj", tmp_path, "unknown", files) == "see LICENSE"
+    assert find_licence(tmp_path / "bowl/bowl.obj", tmp_path, "MIT", files) == "MIT"
+    assert find_licence(tmp_path / "bowl/bowl.obj", tmp_path, "unknown", []) == "unknown"

@@ -4,17 +4,16 @@ import numpy as np
 import pytest
 
 from schemas.errors import AssetSourceError
-from schemas.job.assets import MeshLimits, ShapeNetSource
+from schemas.job.assets import Assets, MeshLimits, ShapeNetSource
 from tests.workers.assets.oracles import CUBE, write
 from workers.assets.external.shapenet import SYNSETS, list_shapenet, load_shapenet
-from workers.assets.sources import Weights
 
-LIMITS, WEIGHTS = MeshLimits(), Weights(600.0, 3.0)
+LIMITS, ASSETS = MeshLimits(), Assets(density_kg_m3=600.0, shell_kg_m2=3.0)
 TALL = CUBE.replace("v 0 1", "v 0 3").replace("v 1 1", "v 1 3")  # 1 x 3 x 1: +Y is up
 
 
 def settings(**more):
-    return ShapeNetSource(source="shapenet", folder="unused", **more)
+    return ShapeNetSource(source="shapenet", folder=".", **more)
 
 
 def version_2(root, category, model, text=TALL):
@@ -29,7 +28,7 @@ def version_1(root, category, model, text=TALL):
 def test_both_layouts_are_read_and_y_becomes_z(tmp_path, layout):
     layout(tmp_path, "mug", "abc")
     listing = list_shapenet(settings(), tmp_path, {"mug"}, LIMITS)
-    asset = load_shapenet(settings(), listing, listing.entries["mug"][0], "mug", LIMITS, WEIGHTS)
+    asset = load_shapenet(settings(), listing.folder, listing.entries["mug"][0], "mug", ASSETS)
     assert asset.extents_m == pytest.approx([0.25, 0.25, 0.75])
     assert asset.instance_id == "03797390-abc"
     assert asset.watertight
@@ -44,8 +43,8 @@ def test_tables_have_their_own_scale_and_a_setting_replaces_both(tmp_path):
     version_2(tmp_path, "table", "t")
     listing = list_shapenet(settings(), tmp_path, {"table"}, LIMITS)
     entry = listing.entries["table"][0]
-    assert load_shapenet(settings(), listing, entry, "table", LIMITS, WEIGHTS).scale == 1.5
-    assert load_shapenet(settings(scale=2.0), listing, entry, "table", LIMITS, WEIGHTS).scale == 2.0
+    assert load_shapenet(settings(), listing.folder, entry, "table", ASSETS).scale == 1.5
+    assert load_shapenet(settings(scale=2.0), listing.folder, entry, "table", ASSETS).scale == 2.0
 
 
 def test_models_without_a_usable_mesh_are_skipped_and_counted_by_reason(tmp_path):
