@@ -6,9 +6,10 @@ from pathlib import Path
 from schemas.job.assets import Assets, FolderSource, MeshLimits, ProceduralSource, ShapeNetSource
 from schemas.scene.shape import Asset
 from workers.assets.builtin.make import instance_id, make_asset
-from workers.assets.external.folder import list_folder, load_folder_entry
-from workers.assets.external.listing import Listing, check_unchanged
-from workers.assets.external.shapenet import list_shapenet, load_shapenet
+from workers.assets.external.folder import find_files
+from workers.assets.external.listing import Listing, read_listing
+from workers.assets.external.placement import load_entry
+from workers.assets.external.shapenet import find_models
 
 AnySource = ProceduralSource | ShapeNetSource | FolderSource
 
@@ -20,8 +21,8 @@ def list_source(
     if isinstance(settings, ProceduralSource):
         return None
     if isinstance(settings, ShapeNetSource):
-        return list_shapenet(settings, job_folder, categories, limits)
-    return list_folder(settings, job_folder, categories, limits)
+        return read_listing(settings, *find_models(settings, job_folder, categories), limits)
+    return read_listing(settings, *find_files(settings, job_folder, categories), limits)
 
 
 def count_instances(settings: AnySource, listing: Listing | None, category: str) -> int:
@@ -44,8 +45,4 @@ def load_instance(settings: AnySource, listing: Listing | None, category: str, i
     if isinstance(settings, ProceduralSource):
         return make_asset(category, settings, index, assets.density_kg_m3)
     assert listing is not None
-    entry = listing.entries[category][index]
-    check_unchanged(listing.folder, entry)
-    if isinstance(settings, ShapeNetSource):
-        return load_shapenet(settings, listing.folder, entry, category, assets)
-    return load_folder_entry(settings, listing.folder, entry, category, assets)
+    return load_entry(settings, listing.folder, listing.entries[category][index], category, assets)

@@ -7,8 +7,7 @@ from typing import Any
 
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
-from workers.assets.external.caps import check_counts
-from workers.assets.external.resolver import FolderResolver, describe_error, image_fault
+from workers.assets.external.caps import FolderResolver, check_counts, describe_error, image_fault
 
 
 def check_glb(path: Path, data: bytes, resolver: FolderResolver) -> bytes:
@@ -34,7 +33,7 @@ def check_glb(path: Path, data: bytes, resolver: FolderResolver) -> bytes:
     if not faults:
         return data
     resolver.notes += faults
-    return _without_pictures(tree, data[20 + length :])
+    return _without_images(tree, data[20 + length :])
 
 
 def _drawn_counts(tree: dict[str, Any], counts: list[int]) -> tuple[int, int]:
@@ -61,7 +60,7 @@ def _image_faults(tree: dict[str, Any], binary: bytes, limits: MeshLimits) -> li
     return faults
 
 
-def _without_pictures(tree: dict[str, Any], rest: bytes) -> bytes:
+def _without_images(tree: dict[str, Any], rest: bytes) -> bytes:
     """The GLB again, with no images; `rest` is everything after the JSON chunk."""
     bare = {key: value for key, value in tree.items() if key not in ("images", "textures", "samplers")}
     for material in bare.get("materials", []):

@@ -12,7 +12,7 @@ from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
 
 from schemas.base import Array
 from schemas.scene.shape import Material
-from workers.assets.external.resolver import describe_error
+from workers.assets.external.caps import describe_error
 
 BLACK = 0.02
 """A base colour darker than this under a texture is an exporter's leftover: the texture shows as it is."""

@@ -11,10 +11,9 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part, Shape
-from workers.assets.external.caps import check_counts
+from workers.assets.external.caps import FolderResolver, check_counts
 from workers.assets.external.materials import MeshVisual, read_visual
 from workers.assets.external.reading import read_bytes, read_scene
-from workers.assets.external.resolver import FolderResolver
 from workers.assets.external.topology import (
     Bodies,
     Indices,

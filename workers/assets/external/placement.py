@@ -1,7 +1,8 @@
-"""Pure: a cleaned shape becomes an asset: z up, metric, centred on its bounding box, with its mass."""
+"""Edge: loads an instance of a source of files as an asset: z up, metric, centred on its bounding box, weighed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -9,8 +10,10 @@ from schemas.base import Array, frozen_array
 from schemas.errors import MeshError
 from schemas.job.assets import Assets, FolderSource, ShapeNetSource
 from schemas.scene.shape import Asset
-from workers.assets.external.listing import Entry
-from workers.assets.external.mesh import LoadedMesh, transform_shape
+from workers.assets.categories import TABLE
+from workers.assets.external.listing import Entry, check_unchanged, mesh_root
+from workers.assets.external.mesh import LoadedMesh, load_shape, transform_shape
+from workers.assets.external.urdf_file import load_urdf
 from workers.assets.mass import mass_properties
 from workers.geometry.frames import pose
 
@@ -22,6 +25,10 @@ UP_AXES: Mapping[str, Array] = {
 """The rotation [3, 3] that takes a source's upward axis to z."""
 
 
+OBJECT_SCALE, TABLE_SCALE = 0.25, 1.5
+"""The article's factors on ShapeNetCore's normalised units."""
+
+
 @dataclass(frozen=True, eq=False)
 class Placement:
     """Source coordinates to the object frame: rotated by `axes` [3, 3], then times `scale` or to a diagonal in metres."""
@@ -29,6 +36,25 @@ class Placement:
     axes: Array
     scale: float
     diagonal_m: float | None = None
+
+
+def load_entry(
+    settings: ShapeNetSource | FolderSource, folder: Path, entry: Entry, category: str, assets: Assets
+) -> Asset:
+    """One instance, cleaned, z up, scaled; MeshError where its mesh is refused or has changed."""
+    check_unchanged(folder, entry)
+    path = folder / entry.files[0].path
+    if path.suffix.lower() == ".urdf":
+        loaded = load_urdf(path, assets.limits, folder)
+    else:
+        loaded = load_shape(path, assets.limits, mesh_root(settings, folder, path))
+    return place_asset(loaded, _placement(settings, category), entry, category, settings, assets)
+
+
+def _placement(settings: ShapeNetSource | FolderSource, category: str) -> Placement:
+    if isinstance(settings, ShapeNetSource):
+        return Placement(UP_AXES["y"], settings.scale or (TABLE_SCALE if category == TABLE else OBJECT_SCALE))
+    return Placement(UP_AXES[settings.up], settings.scale, None if category == TABLE else settings.diagonal_m)
 
 
 def place_asset(

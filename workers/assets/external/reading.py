@@ -10,9 +10,8 @@ import trimesh
 
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
-from workers.assets.external.caps import check_counts, declared_counts, may_be_too_large
+from workers.assets.external.caps import FolderResolver, check_counts, declared_counts, describe_error, may_be_too_large
 from workers.assets.external.glb_check import check_glb
-from workers.assets.external.resolver import FolderResolver, describe_error
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb")
 """What trimesh reads without further libraries."""

@@ -5,8 +5,17 @@ import pickle
 import pytest
 
 from schemas.errors import MeshError
+from schemas.job.assets import FolderSource, MeshLimits
 from tests.workers.assets.oracles import CUBE, write
-from workers.assets.external.listing import Entry, check_unchanged, describe_folder, hash_files, list_entries
+from workers.assets.external.listing import (
+    Entry,
+    check_unchanged,
+    describe_folder,
+    find_licence,
+    hash_files,
+    list_licences,
+    read_listing,
+)
 
 
 def test_a_file_that_changed_since_is_noticed(tmp_path):
@@ -31,14 +40,21 @@ def test_a_message_names_the_first_things_of_a_folder(tmp_path):
 
 
 def test_refused_candidates_are_counted_by_reason_and_others_keep_their_order(tmp_path):
-    def make_entry(name):
-        if name in ("a", "c"):
-            raise MeshError("format" if name == "a" else "missing", name)
-        return Entry(name, (), "MIT")
+    for name in ("c.obj", "d.obj", "b.obj"):
+        write(tmp_path / name, CUBE)
+    settings = FolderSource(source="urdf", folder=".", licence="MIT")
+    candidates = {"mug": [tmp_path / name for name in ("none.obj", "d.obj", "b.obj")], "can": [tmp_path / "a.dae"]}
+    listing = read_listing(settings, tmp_path, candidates, MeshLimits())
+    found = {name: [entry.files[0].path for entry in entries] for name, entries in listing.entries.items()}
+    assert found == {"mug": ["d.obj", "b.obj"], "can": []}
+    assert list(listing.skipped.items()) == [("format", 1), ("missing", 1)]
 
-    listing = list_entries(tmp_path, {"mug": ["c", "d", "b"], "can": ["a", "c"]}, make_entry)
-    assert {name: [e.instance_id for e in found] for name, found in listing.entries.items()} == {
-        "mug": ["d", "b"],
-        "can": [],
-    }
-    assert list(listing.skipped.items()) == [("format", 1), ("missing", 2)]
+
+def test_the_nearest_licence_file_is_named_unless_the_user_states_one(tmp_path):
+    for path in ("LICENSE", "mug/licence.txt", "mug/a/mug.obj", "bowl/bowl.obj"):
+        write(tmp_path / path, "x")
+    files = list_licences(tmp_path)
+    assert find_licence(tmp_path / "mug/a/mug.obj", tmp_path, "unknown", files) == "see mug/licence.txt"
+    assert find_licence(tmp_path / "bowl/bowl.obj", tmp_path, "unknown", files) == "see LICENSE"
+    assert find_licence(tmp_path / "bowl/bowl.obj", tmp_path, "MIT", files) == "MIT"
+    assert find_licence(tmp_path / "bowl/bowl.obj", tmp_path, "unknown", []) == "unknown"
