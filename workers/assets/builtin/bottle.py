@@ -161,14 +161,14 @@ def _surfaces(rng: np.random.Generator, kind: Kind, corners: Array, surface: Arr
 
 
 def _body_material(rng: np.random.Generator, kind: Kind) -> Material:
-    if kind.look == "glass":
+    if kind.material == "glass":
         return clear_glass(glass_color(rng), rng.uniform(0.08, 0.18))
-    if kind.look == "clear":
+    if kind.material == "clear":
         tint = pick(
             rng, ((0.72, 0.82, 0.85), (0.6, 0.74, 0.82), (0.66, 0.8, 0.66), (0.28, 0.12, 0.06), (0.78, 0.5, 0.16))
         )
         return clear_glass(jitter(rng, tint, 0.04), rng.uniform(0.1, 0.25))
-    if kind.look == "metal":
+    if kind.material == "metal":
         return steel(rng) if chance(rng, 0.3) else solid_color(jitter(rng, vivid(rng)), rng.uniform(0.35, 0.65))
     return plastic(rng)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from workers.assets.builtin.curves import bezier, squircle
 from workers.assets.builtin.draws import chance, pick
-from workers.assets.builtin.hollow import BASE, INSIDE, OUTSIDE, Wall, wall_around
+from workers.assets.builtin.hollow import Wall, wall_around
 from workers.assets.builtin.materials import solid_color, steel, textured
 from workers.assets.builtin.palette import BLACK, WHITE, glaze_color, ink_on, jitter, mix, pale, wood_colors
 from workers.assets.builtin.parts import Model, Surface
@@ -48,20 +48,16 @@ def _surfaces(rng: np.random.Generator, wall: Wall) -> tuple[Surface, ...]:
     kind = rng.random()
     if kind < 0.12:
         metal = steel(rng)
-        looks = (Surface("outside", metal), Surface("inside", metal), Surface("base", metal))
-    elif kind < 0.32:
+        return Surface("outside", metal), Surface("inside", metal), Surface("base", metal)
+    if kind < 0.32:
         light, dark = wood_colors(rng)
         timber = textured(wood(rng, light, dark, size=128), rng.uniform(0.45, 0.7))
         # The grain runs along x through the whole block that the bowl was turned from: no seam anywhere.
         reach = float(wall.profile[:, 0].max())
-        block = Surface("block", timber, "plane", origin=(-reach, -reach, 0.0), across=(2 * reach, 0.0, 0.0))
-        block = replace(block, up=(0.0, 1.6 * reach, 1.2 * reach))
-        grain = [replace(block, name=name) for name in ("outside", "inside", "base")]
-        looks = (grain[0], grain[1], grain[2])
-    else:
-        looks = _pottery(rng, high, float(wall.profile[:, 0].max()))
-    order = {OUTSIDE: looks[0], INSIDE: looks[1], BASE: looks[2]}
-    return tuple(order[number] for number in sorted(order))
+        across, up = (2 * reach, 0.0, 0.0), (0.0, 1.6 * reach, 1.2 * reach)
+        block = Surface("block", timber, "plane", origin=(-reach, -reach, 0.0), across=across, up=up)
+        return tuple(replace(block, name=name) for name in ("outside", "inside", "base"))
+    return _pottery(rng, high, float(wall.profile[:, 0].max()))
 
 
 def _pottery(rng: np.random.Generator, high: float, radius: float) -> tuple[Surface, Surface, Surface]:

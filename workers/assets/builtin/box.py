@@ -10,7 +10,7 @@ from workers.assets.builtin.materials import metal, solid_color, textured
 from workers.assets.builtin.palette import BLACK, WHITE, Color, jitter, mix, pale, vivid, wood_colors
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import difference, union
-from workers.assets.builtin.sweeps import bevelled_profile, prism, split_sides
+from workers.assets.builtin.sweeps import bevelled_profile, prism, split_sides, straight_prism
 from workers.assets.builtin.textures import Texture, band_height, bands, blank, blend, label, noise, rgb, wood
 
 
@@ -36,7 +36,7 @@ def _carton(rng: np.random.Generator) -> Model:
     crease = rng.uniform(0.0015, 0.003)
     profile = np.array([[crease, 0.0], [0.0, crease], [0.0, 0.5 * h], [0.0, h - crease], [crease, h]])
     body = prism(profile, (w, d), 0.004, [BOTTOM, SIDE, SIDE, SIDE, TOP, TOP], 3, (6, 6))
-    slot = prism(np.array([[0.0, h - 0.0015], [0.0, h + 0.01]]), (w + 0.02, 0.003), 0.0008, [OTHER] * 3, 1)
+    slot = straight_prism((w + 0.02, 0.003), h - 0.0015, h + 0.01, 0.0008, OTHER)
     body = split_sides(difference(body, [slot]), SIDE, (SIDE, LID, EXTRA, LID))
     paper = textured(_board(rng, board), 0.85)
     printed = _board(rng, board)
@@ -76,7 +76,7 @@ def _packet(rng: np.random.Generator) -> Model:
     b = 0.0015
     profile = np.array([[b, 0.0], [0.0, b], [0.0, 0.5 * h], [0.0, h - b], [b, h]])
     body = prism(profile, (w, d), 0.0025, [BOTTOM, SIDE, SIDE, SIDE, TOP, TOP], 3, (5, 5))
-    seam = prism(np.array([[0.0, h - 0.001], [0.0, h + 0.01]]), (w + 0.02, 0.0016), 0.0004, [OTHER] * 3, 1)
+    seam = straight_prism((w + 0.02, 0.0016), h - 0.001, h + 0.01, 0.0004, OTHER)
     body = split_sides(difference(body, [seam.moved(y=d * rng.uniform(-0.2, 0.2))]), SIDE, (SIDE, LID, EXTRA, LID))
     paper = vivid(rng) if chance(rng, 0.75) else pale(rng)
     picture = label(rng, paper, height=160, width=128, faces=1)

@@ -9,7 +9,7 @@ from workers.assets.builtin.materials import solid_color, steel, textured
 from workers.assets.builtin.palette import BLACK, Color, jitter, mix, vivid
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import Solid, combine, lathe, loft, union_at
-from workers.assets.builtin.sweeps import prism
+from workers.assets.builtin.sweeps import prism, straight_prism
 from workers.assets.builtin.textures import Texture, blend, noise
 
 SKIN, SHELL, LENS, RING, GLASS, DIAL, DISPLAY, SHOE = 0, 1, 2, 3, 4, 5, 6, 7
@@ -109,31 +109,15 @@ def _finder(rng: np.random.Generator, size: tuple[float, float, float], kind: in
     if kind == 0:
         w, h = width * rng.uniform(0.28, 0.33), height * rng.uniform(0.2, 0.3)
         hump = _frustum((w, 0.95 * depth), (0.55 * w, 0.6 * depth), height - 0.004, height + h, SHELL)
-        shoe = prism(
-            np.array([[0.0, height + h - 0.001], [0.0, height + h + 0.0016]]),
-            (0.15 * width, 0.13 * width),
-            0.0008,
-            [SHOE] * 3,
-            1,
-        )
-        eye = prism(
-            np.array([[0.0, height + 0.2 * h], [0.0, height + 0.75 * h]]), (0.55 * w, 0.012), 0.002, [DIAL] * 3, 2
-        )
+        shoe = straight_prism((0.15 * width, 0.13 * width), height + h - 0.001, height + h + 0.0016, 0.0008, SHOE)
+        eye = straight_prism((0.55 * w, 0.012), height + 0.2 * h, height + 0.75 * h, 0.002, DIAL, 2)
         return [shoe, eye.moved(y=0.44 * depth)], [hump]
     size_x, size_z = width * rng.uniform(0.09, 0.14), height * rng.uniform(0.09, 0.12)
     middle = height * 0.89 - 0.5 * size_z
-    window = prism(np.array([[0.0, middle], [0.0, middle + size_z]]), (size_x, 0.004), 0.0012, [GLASS] * 3, 2)
+    window = straight_prism((size_x, 0.004), middle, middle + size_z, 0.0012, GLASS, 2)
     parts = [window.moved(x=width * rng.uniform(0.3, 0.38), y=-0.5 * depth + 0.0008)]
     if chance(rng, 0.5):
-        parts.append(
-            prism(
-                np.array([[0.0, height - 0.001], [0.0, height + 0.0018]]),
-                (0.14 * width, 0.12 * width),
-                0.0008,
-                [SHOE] * 3,
-                1,
-            )
-        )
+        parts.append(straight_prism((0.14 * width, 0.12 * width), height - 0.001, height + 0.0018, 0.0008, SHOE))
     return [], parts
 
 
@@ -181,7 +165,7 @@ def _controls(rng: np.random.Generator, size: tuple[float, float, float]) -> lis
         )
         solids.append(lathe(profile, [DIAL] * 4, 12).moved(x=x * width, y=0.05 * depth))
     w, h = width * rng.uniform(0.48, 0.56), height * rng.uniform(0.5, 0.58)
-    display = prism(np.array([[0.0, 0.18 * height], [0.0, 0.18 * height + h]]), (w, 0.006), 0.0012, [DISPLAY] * 3, 1)
+    display = straight_prism((w, 0.006), 0.18 * height, 0.18 * height + h, 0.0012, DISPLAY)
     return [*solids, display.moved(x=0.08 * width, y=0.5 * depth - 0.0012)]
 
 

@@ -8,7 +8,7 @@ from workers.assets.builtin.materials import solid_color, textured
 from workers.assets.builtin.palette import BLACK, WHITE, Color, ink_on, jitter, mix, pale, vivid
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import Solid, circle, combine, lathe, union
-from workers.assets.builtin.sweeps import prism
+from workers.assets.builtin.sweeps import prism, straight_prism
 from workers.assets.builtin.textures import Texture, dots, label, upright_stripes
 
 SIDE, LID, TOP, BOTTOM, EXTRA, OTHER = 0, 1, 2, 3, 4, 5
@@ -84,8 +84,8 @@ def _ribbon(rng: np.random.Generator, size: Size) -> list[Solid]:
     w, d, h = size
     width, lift = min(w, d) * rng.uniform(0.08, 0.16), 0.0009
     bands_around = [
-        prism(np.array([[0.0, 0.0], [0.0, h + lift]]), (w + 2 * lift, width), 0.0008, [EXTRA] * 3, 1),
-        prism(np.array([[0.0, 0.0], [0.0, h + lift]]), (width, d + 2 * lift), 0.0008, [EXTRA] * 3, 1),
+        straight_prism((w + 2 * lift, width), 0.0, h + lift, 0.0008, EXTRA),
+        straight_prism((width, d + 2 * lift), 0.0, h + lift, 0.0008, EXTRA),
     ]
     if chance(rng, 0.3):
         return bands_around

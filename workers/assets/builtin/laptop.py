@@ -11,7 +11,7 @@ from workers.assets.builtin.materials import solid_color, textured
 from workers.assets.builtin.palette import BLACK, WHITE, Color, hsv, jitter, lightness, mix, vivid
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import TRIG_DIGITS, Solid, combine, difference, lathe, union
-from workers.assets.builtin.sweeps import bevelled_profile, prism
+from workers.assets.builtin.sweeps import bevelled_profile, prism, straight_prism
 from workers.assets.builtin.textures import Texture, blank, blend, draw_small_print, noise, rgb
 
 CASE, LID, SCREEN, BEZEL, DECK, PAD = 0, 1, 2, 3, 4, 5
@@ -51,7 +51,7 @@ def _base(rng: np.random.Generator, size: tuple[float, float], thick: float, rad
 
 
 def _plate(size: tuple[float, float], low: float, high: float, surface: int) -> Solid:
-    return prism(np.array([[0.0, low], [0.0, high]]), size, 0.0015, [surface] * 3, 2)
+    return straight_prism(size, low, high, 0.0015, surface, 2)
 
 
 def _screen(rng: np.random.Generator, size: tuple[float, float], thick: float, radius: float) -> Solid:

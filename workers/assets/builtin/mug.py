@@ -5,7 +5,7 @@ import numpy as np
 from schemas.base import Array
 from workers.assets.builtin.curves import bezier, fillet, spline, squircle
 from workers.assets.builtin.draws import chance
-from workers.assets.builtin.hollow import BASE, INSIDE, OUTSIDE, Wall, wall_around, with_handles
+from workers.assets.builtin.hollow import OUTSIDE, Wall, handle_ends, wall_around, with_handles
 from workers.assets.builtin.materials import metal, solid_color, textured
 from workers.assets.builtin.palette import BLACK, WHITE, Color, glaze_color, ink_on, jitter, mix, pale, vivid
 from workers.assets.builtin.parts import Model, Surface, Wrap
@@ -62,9 +62,7 @@ def _handle(rng: np.random.Generator, wall: Wall) -> Solid:
     # The end of the rod stays within the wall: half a chord of the wall's circle sinks by w^2 / 2r.
     half_width = min(half_width, float(np.sqrt(0.6 * wall.thickness_m * wall.radius_at(low))))
     slender = rng.uniform(0.5, 0.85)
-    ends = [np.array([wall.radius_at(z), z]) for z in (high, low)]
-    out = [wall.normal_at(z) for z in (high, low)]
-    start, stop = (end - 0.5 * wall.thickness_m * normal for end, normal in zip(ends, out, strict=True))
+    (start, stop), out = handle_ends(wall, high, low)
     reach = (high - low) * rng.uniform(0.5, 0.8)
     path = _path(rng, start, out[0], stop, out[1], max(reach, 0.022))
     half_depth = min(half_width * slender, 0.8 * bend_radius(path, (out[0], -out[1])))
@@ -100,14 +98,12 @@ def _surfaces(rng: np.random.Generator, wall: Wall) -> tuple[Surface, ...]:
     grip = ground if chance(rng, 0.75) else vivid(rng)
     handle = metal(rng) if chance(rng, 0.06) else solid_color(grip, roughness)
     base = solid_color(mix(ground, (0.75, 0.7, 0.62), 0.6), 0.8)
-    outside = Surface("body", body, wrap, low=low, high=high)
-    table = {
-        OUTSIDE: outside,
-        INSIDE: Surface("inside", solid_color(inside, roughness)),
-        BASE: Surface("base", base),
-        HANDLE: Surface("handle", handle),
-    }
-    return tuple(table[number] for number in sorted(table))
+    return (
+        Surface("body", body, wrap, low=low, high=high),
+        Surface("inside", solid_color(inside, roughness)),
+        Surface("base", base),
+        Surface("handle", handle),
+    )
 
 
 def _picture(rng: np.random.Generator, ground: Color, height: int) -> Texture:

@@ -36,6 +36,13 @@ def prism(
     return loft(rings, ends[0], ends[1], surface, smoothing_groups(closed), profiles)
 
 
+def straight_prism(
+    size: tuple[float, float], low: float, high: float, radius: float, surface: int, steps: int = 1
+) -> Solid:
+    """A prism of one size and surface number between two heights."""
+    return prism(np.array([[0.0, low], [0.0, high]]), size, radius, [surface] * 3, steps)
+
+
 def bevelled_profile(height: float, bevel: float, bottom: float = 0.0) -> Array:
     """[4, 2] float64: the (inset, height) profile of a slab from `bottom`, with a bevel along its upper and lower edge."""
     top = bottom + height

@@ -2,12 +2,11 @@
 
 import numpy as np
 
-from schemas.scene.shape import Material
 from workers.assets.builtin.curves import squircle
 from workers.assets.builtin.draws import chance, pick
 from workers.assets.builtin.materials import metal, solid_color, textured
 from workers.assets.builtin.palette import BLACK, WHITE, jitter, mix, pale, vivid, wood_colors
-from workers.assets.builtin.parts import Model, Surface
+from workers.assets.builtin.parts import Model, Surface, Wrap
 from workers.assets.builtin.solid import Solid, loft, union
 from workers.assets.builtin.sweeps import prism
 from workers.assets.builtin.table_base import TOP, Plan, make_base
@@ -61,13 +60,7 @@ def _surfaces(rng: np.random.Generator, plan: Plan) -> tuple[Surface, ...]:
     else:
         paint = pick(rng, (WHITE, (0.85, 0.85, 0.84), BLACK, (0.3, 0.32, 0.34), vivid(rng)))
         top = Surface("top", solid_color(jitter(rng, paint), rng.uniform(0.3, 0.6)))
-    if top.material is timber and chance(rng, 0.7):
-        legs: Material = timber
-    else:
-        legs = metal(rng) if chance(rng, 0.5) else timber
-    wrap = "grain" if legs is timber else "none"
-    return (
-        top,
-        Surface("legs", legs, "grain" if wrap == "grain" else "none", size=long, grain=2),
-        Surface("frame", legs, "grain" if wrap == "grain" else "none", size=long, grain=0),
-    )
+    matching = top.material is timber and chance(rng, 0.7)
+    legs = timber if matching or not chance(rng, 0.5) else metal(rng)
+    wrap: Wrap = "grain" if legs is timber else "none"
+    return top, Surface("legs", legs, wrap, size=long, grain=2), Surface("frame", legs, wrap, size=long, grain=0)
