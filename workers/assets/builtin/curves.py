@@ -33,7 +33,7 @@ def spline(points: Array, count: int) -> Array:
     return np.concatenate([curve.reshape(-1, points.shape[1]), points[-1:]])
 
 
-def fillet(points: Array, radii: Sequence[float], steps: int = 3) -> tuple[Array, Array]:
+def fillet(points: Array, radii: Sequence[float] | Array, steps: int = 3) -> tuple[Array, Array]:
     """A polyline [P, 2] with its inner corners replaced by quadratic arcs, and which segment each new segment is of.
 
     `radii` [P] is how far from each corner the arc begins (cut to 45 % of the shorter side; 0 keeps the corner). The
