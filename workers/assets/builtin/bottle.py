@@ -36,7 +36,7 @@ def make_bottle(rng: np.random.Generator) -> Model:
 def _outline(
     rng: np.random.Generator, kind: Kind, height: float, radius: float, levels: tuple[float, float], neck: float
 ) -> tuple[Array, list[float], Array]:
-    """Corners [P, 2] of the profile, how far each is rounded, and the surface of each segment [P - 1]."""
+    """Corners [P, 2] of the profile, their fillet radii, and the surface number of each segment [P - 1]."""
     body, shoulder = levels
     foot = radius * rng.uniform(0.08, 0.22)
     low, high = 0.12 * body + foot, body * rng.uniform(0.86, 0.97)
@@ -55,7 +55,7 @@ def _outline(
 
 
 def _side(rng: np.random.Generator, kind: Kind, radius: float, low: float, high: float) -> Array:
-    """[S, 2]: the stretch of the side that carries the label or the grooves."""
+    """[S, 2]: the part of the side profile with the label or the grooves."""
     if not chance(rng, kind.ribs):
         return np.array([[radius, low], [radius, high]])
     count, depth = int(rng.integers(3, 7)), radius * rng.uniform(0.03, 0.07)
@@ -74,7 +74,7 @@ def _side(rng: np.random.Generator, kind: Kind, radius: float, low: float, high:
 def _closure(
     rng: np.random.Generator, kind: Kind, height: float, radius: float, shoulder: float, neck: float
 ) -> tuple[Array, list[int]]:
-    """The profile above the shoulder, ending on the axis, and the surface of its segments (the last ones)."""
+    """The profile above the shoulder, up to the axis, and the surface numbers of its last segments."""
     room = height - shoulder
     if kind.cap == "foil":
         start, lip = shoulder + room * rng.uniform(0.15, 0.5), height - 0.018 * height / 0.3
@@ -131,7 +131,7 @@ def _closure(
 
 
 def _sections(profile: Array, body: float, shoulder: float, squareness: int, depth: float) -> Array | None:
-    """[P - 2, n, 2]: the body's section up to the shoulder, turning into a circle at the neck."""
+    """[P - 2, n, 2]: the body's section up to the shoulder, which becomes a circle at the neck."""
     if squareness == 0 and depth == 1.0:
         return None
     z = profile[1:-1, 1]
@@ -148,14 +148,14 @@ def _surfaces(rng: np.random.Generator, kind: Kind, corners: Array, surface: Arr
     on_label = np.flatnonzero(surface == LABEL)
     low, high = float(corners[on_label[0], 1]), float(corners[on_label[-1] + 1, 1])
     printed = body
-    wrap = chance(rng, 0.8)
-    if wrap:
+    mapping = chance(rng, 0.8)
+    if mapping:
         rows = band_height(low, high, float(corners[on_label[0], 0]))
         picture = label(rng, paper, rows) if chance(rng, 0.8) else bands(rng, [paper, vivid(rng), color])
         printed = textured(picture, rng.uniform(0.4, 0.7))
     return (
         Surface("body", body),
-        Surface("label", printed, "cylinder" if wrap else "none", low=low, high=high),
+        Surface("label", printed, "cylinder" if mapping else "none", low=low, high=high),
         Surface("cap", _cap_material(rng, kind)),
     )
 

@@ -50,8 +50,8 @@ def _carton(rng: np.random.Generator) -> Model:
         tape = pick(rng, ((0.8, 0.68, 0.45), (0.85, 0.83, 0.78), vivid(rng)))
         half = max(2, round(0.5 * 128 * rng.uniform(0.05, 0.07) / d))
         top[64 - half : 64 + half] = rgb(mix(board, tape, 0.8))
-    front = Surface("front", textured(printed, 0.85))
-    grain = Surface("sides", paper, "grain", size=max(size))
+    front = textured(printed, 0.85)
+    grain = Surface("sides", paper, "box", size=max(size))
     surfaces = (
         on_front("front", front, size, back=False),
         grain,
@@ -81,7 +81,7 @@ def _packet(rng: np.random.Generator) -> Model:
     paper = vivid(rng) if chance(rng, 0.75) else pale(rng)
     picture = label(rng, paper, height=160, width=128, faces=1)
     gloss = rng.uniform(0.35, 0.7)
-    front = Surface("front", textured(picture, gloss))
+    front = textured(picture, gloss)
     second = bands(rng, [paper, mix(paper, WHITE, 0.6)]) if chance(rng, 0.4) else blank(8, 8, jitter(rng, paper))
     side = Surface("sides", textured(second, gloss), "plane", origin=(0, -d / 2, 0), across=(0, d, 0), up=(0, 0, h))
     surfaces = (
@@ -148,5 +148,5 @@ def _chest(rng: np.random.Generator) -> Model:
         body = union([body, slab.moved(y=-d / 2, z=h - 1.25 * lid)])
     light, dark = wood_colors(rng)
     timber = textured(wood(rng, light, dark, size=128), rng.uniform(0.5, 0.8))
-    grain = [Surface(name, timber, "grain", size=max(size)) for name in ("side", "lid", "top", "bottom")]
+    grain = [Surface(name, timber, "box", size=max(size)) for name in ("side", "lid", "top", "bottom")]
     return Model(body, (*grain, Surface("clasp", metal(rng))))

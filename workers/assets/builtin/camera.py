@@ -15,7 +15,7 @@ from workers.assets.builtin.textures import Texture, blend, noise
 SKIN, SHELL, LENS, RING, GLASS, DIAL, DISPLAY, SHOE = 0, 1, 2, 3, 4, 5, 6, 7
 
 FORWARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Takes a solid turned about z to one that looks along -y."""
+"""Rotation that takes +z to -y, the direction of view."""
 
 
 def make_camera(rng: np.random.Generator) -> Model:
@@ -30,7 +30,7 @@ def make_camera(rng: np.random.Generator) -> Model:
     on_body += _controls(rng, size)
     if kind == 0 or chance(rng, 0.35):
         on_body.append(_grip(rng, size, kind))
-    # What stands on the body stands apart from all else on it, and is joined to it in one step.
+    # The solids on the body do not touch one another, so that one boolean joins them.
     layers = [_body(rng, size, kind)] + ([combine(on_hump)] if on_hump else [])
     return Model(_joined(lens, on_body, layers, depth), _surfaces(rng, size, kind))
 
@@ -96,7 +96,7 @@ def _lens(rng: np.random.Generator, size: tuple[float, float, float], kind: int)
 
 
 def _joined(lens: Solid, on_body: list[Solid], layers: list[Solid], depth: float) -> Solid:
-    """Everything as one. Of the lens only its first barrel, up to the first ring before the body, meets the body."""
+    """The union of all. Only the first barrel of the lens, up to the first ring before the body, meets the body."""
     along = lens.vertices[:, 1]
     first = along[along < -0.5 * depth].max()
     touched = (along >= first)[lens.faces].all(axis=1)
@@ -104,7 +104,7 @@ def _joined(lens: Solid, on_body: list[Solid], layers: list[Solid], depth: float
 
 
 def _finder(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> tuple[list[Solid], list[Solid]]:
-    """What stands on the viewfinder's hump, and what stands on the body: a reflex's hump, or a window in the front."""
+    """The solids on the viewfinder's hump, and those on the body: a reflex's hump, or a window in the front."""
     width, depth, height = size
     if kind == 0:
         w, h = width * rng.uniform(0.28, 0.33), height * rng.uniform(0.2, 0.3)
@@ -122,7 +122,7 @@ def _finder(rng: np.random.Generator, size: tuple[float, float, float], kind: in
 
 
 def _frustum(low: tuple[float, float], high: tuple[float, float], bottom: float, top: float, surface: int) -> Solid:
-    """A box that narrows towards its top, its upper edges broken."""
+    """A box that narrows towards its top, with bevelled upper edges."""
     levels = (
         (low, bottom, 0.0),
         (low, bottom + 0.35 * (top - bottom), 0.0),
@@ -170,12 +170,12 @@ def _controls(rng: np.random.Generator, size: tuple[float, float, float]) -> lis
 
 
 def _grip(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> Solid:
-    """A round upright grip on the front of the side of -x."""
+    """A round upright grip on the front, at the -x side."""
     width, depth, height = size
     grip_depth = depth * (rng.uniform(0.8, 1.1) if kind == 0 else rng.uniform(0.3, 0.42))
     w = width * rng.uniform(0.15, 0.18)
     top = height * rng.uniform(0.86, 0.93)
-    # Its base lies just above the body's: the camera stands on its body, and no two planes coincide.
+    # Its base lies just above the body's, so that the camera stands on its body and no two planes coincide.
     b = min(0.0016, 0.1 * grip_depth)
     profile = np.array([[b, 0.0012], [0.0, 0.0012 + b], [0.0, top - 2.5 * b], [b, top - 0.6 * b], [2.5 * b, top]])
     grip = prism(profile, (w, grip_depth), 0.45 * min(w, grip_depth), [SKIN] * 6, 5)
@@ -200,7 +200,7 @@ def _order(skin: Material, shell: Material, rng: np.random.Generator, size: floa
     lens = solid_color(jitter(rng, (0.09, 0.09, 0.095), 0.03), 0.45) if chance(rng, 0.75) else steel(rng)
     ring = pick(rng, (steel(rng), solid_color(jitter(rng, (0.75, 0.1, 0.1)), 0.4), steel(rng)))
     return (
-        Surface("skin", skin, "grain", size=0.5 * size),
+        Surface("skin", skin, "box", size=0.5 * size),
         Surface("shell", shell),
         Surface("lens", lens),
         Surface("ring", ring),
@@ -212,5 +212,5 @@ def _order(skin: Material, shell: Material, rng: np.random.Generator, size: floa
 
 
 def _leather(rng: np.random.Generator, color: Color, depth: float) -> Texture:
-    """Grained leather."""
+    """A texture of grained leather."""
     return blend(mix(color, BLACK, depth), mix(color, (0.9, 0.9, 0.9), 0.15 * depth), noise(rng, 64, 64, 32, 32))

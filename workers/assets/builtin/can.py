@@ -157,7 +157,7 @@ def _surfaces(
     bare = steel(rng)
     paper: Color = vivid(rng) if chance(rng, 0.6) else pale(rng)
     if chance(rng, 0.08):
-        side, wrap = bare, False
+        side, mapping = bare, False
     else:
         picture = (
             label(rng, paper, rows, faces=int(rng.integers(2, 4)))
@@ -165,7 +165,7 @@ def _surfaces(
             else bands(rng, [paper, ink_on(rng, paper), vivid(rng)])
         )
         shiny = drink or chance(rng, 0.4)
-        side, wrap = (
+        side, mapping = (
             textured(picture, (rng.uniform(0.3, 0.5) if shiny else rng.uniform(0.6, 0.8)), 0.35 if drink else 0.0),
             True,
         )
@@ -183,7 +183,7 @@ def _surfaces(
         )
     top = plastic(rng) if chance(rng, 0.8) else solid_color(mix(paper, (0.95, 0.95, 0.95), 0.5), 0.5)
     return (
-        Surface("side", side, "cylinder" if wrap else "none", low=low, high=high),
+        Surface("side", side, "cylinder" if mapping else "none", low=low, high=high),
         Surface("metal", bare),
         lid,
         Surface("cap", top),

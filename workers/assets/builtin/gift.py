@@ -1,8 +1,9 @@
-"""Pure: boxes with a separate lid, some wrapped as a gift; and what all boxes share."""
+"""Pure: boxes with a separate lid, some with a ribbon; and the sizes and faces that all boxes share."""
 
 import numpy as np
 
 from schemas.base import Array
+from schemas.scene.shape import Material
 from workers.assets.builtin.draws import chance, pick
 from workers.assets.builtin.materials import solid_color, textured
 from workers.assets.builtin.palette import BLACK, WHITE, Color, ink_on, jitter, mix, pale, vivid
@@ -20,25 +21,25 @@ Size = tuple[float, float, float]
 def draw_size(
     rng: np.random.Generator, width: tuple[float, float], depth: tuple[float, float], height: tuple[float, float]
 ) -> Size:
-    """Width in metres; depth and height as shares of the width."""
+    """Draws a size: width in metres, depth and height as shares of the width."""
     w = rng.uniform(*width)
     return w, w * rng.uniform(*depth), w * rng.uniform(*height)
 
 
 def on_top(name: str, picture: Texture, size: Size, roughness: float) -> Surface:
-    """A picture laid once over the top."""
+    """A surface with one texture over the whole top."""
     w, d, _ = size
     return Surface(
         name, textured(picture, roughness), "plane", origin=(-w / 2, -d / 2, 0.0), across=(w, 0, 0), up=(0, d, 0)
     )
 
 
-def on_front(name: str, material_of: Surface, size: Size, back: bool) -> Surface:
-    """The same picture on the front or the back, read from outside."""
+def on_front(name: str, material: Material, size: Size, back: bool) -> Surface:
+    """A material mapped once over the front or the back, upright seen from outside."""
     w, d, h = size
     sign = -1.0 if back else 1.0
     origin = (-sign * w / 2, sign * -d / 2, 0.0)
-    return Surface(name, material_of.material, "plane", origin=origin, across=(sign * w, 0, 0), up=(0, 0, h))
+    return Surface(name, material, "plane", origin=origin, across=(sign * w, 0, 0), up=(0, 0, h))
 
 
 def make_lidded(rng: np.random.Generator) -> Model:
@@ -68,7 +69,7 @@ def make_lidded(rng: np.random.Generator) -> Model:
             dots(rng, color, mix(color, ink_on(rng, color), 0.7), 256),
             upright_stripes(rng, [color, mix(color, WHITE, 0.5)]),
         )
-        side = Surface("side", textured(pick(rng, patterns), roughness), "grain", size=max(size))
+        side = Surface("side", textured(pick(rng, patterns), roughness), "box", size=max(size))
     surfaces = (
         side,
         Surface("lid", solid_color(cover, roughness)),
@@ -92,22 +93,22 @@ def _ribbon(rng: np.random.Generator, size: Size) -> list[Solid]:
     loop = min(w, d) * rng.uniform(0.13, 0.2)
     bow = []
     for sign in (-1.0, 1.0):
-        petal = _egg(np.array([loop, 0.55 * width, 0.5 * loop]))
+        petal = _ellipsoid(np.array([loop, 0.55 * width, 0.5 * loop]))
         turn = rng.uniform(0.2, 0.6)
         axes = _turned(sign, turn)
         bow.append(petal.placed(axes, np.array([sign * 1.08 * loop, 0.0, h + 0.3 * loop])))
-    knot = _egg(np.array([0.4 * loop, 0.6 * width, 0.42 * loop])).moved(z=h + 0.25 * loop)
+    knot = _ellipsoid(np.array([0.4 * loop, 0.6 * width, 0.42 * loop])).moved(z=h + 0.25 * loop)
     return [*bands_around, combine(bow), knot]
 
 
 def _turned(sign: float, slope: float) -> Array:
-    """[3, 3]: axes turned about y so that x rises by `slope` towards the side `sign`."""
+    """[3, 3]: rotation about y under which x rises with `slope` towards the side `sign`."""
     length = float(np.sqrt(1.0 + slope * slope))
     c, s = 1.0 / length, sign * slope / length
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
-def _egg(radii: Array) -> Solid:
+def _ellipsoid(radii: Array) -> Solid:
     """An ellipsoid about the origin."""
     half = circle(16)[4:13]
     profile = np.stack([-half[:, 0], -half[:, 1]], axis=1)

@@ -10,7 +10,7 @@ from workers.assets.builtin.curves import half_circle_points, outward_normals
 from workers.assets.builtin.solid import Indices, Solid, union_at
 
 HANDLE_ROOM_M = 0.002
-"""Faces of a vessel this near a handle's bounding box are those that it may meet."""
+"""A handle may meet the faces of a vessel that are this near to its bounding box."""
 
 OUTSIDE, INSIDE, BASE = 0, 1, 2
 """Surface numbers of a vessel."""
@@ -51,9 +51,9 @@ def handle_ends(wall: Wall, high: float, low: float) -> tuple[tuple[Array, Array
 
 
 def wall_around(hollow: Array, thickness_m: float, foot_radius: float, foot_width: float, recess: float) -> Wall:
-    """A wall of even thickness around a hollow [P, 2], which goes from (0, height of the inner bottom) to the rim.
+    """A wall of even thickness around a hollow [P, 2] from (0, height of the inner bottom) to the rim.
 
-    It stands on a ring from foot_radius - foot_width to foot_radius at height 0; inside the ring the underside lies
+    The vessel stands on a ring from foot_radius - foot_width to foot_radius at height 0; inside the ring the underside lies
     `recess` higher. The rim is round.
     """
     offset = hollow + thickness_m * outward_normals(hollow)
@@ -67,7 +67,7 @@ def wall_around(hollow: Array, thickness_m: float, foot_radius: float, foot_widt
 
 
 def with_handles(body: Solid, outside: int, handles: Sequence[Solid]) -> Solid:
-    """A vessel about the z axis with handles that reach into its outside (a surface number) and through no wall."""
+    """A vessel about the z axis with handles that end inside its wall; `outside`: the surface number of its outside."""
     low, high = (body.vertices[body.faces].min(axis=1), body.vertices[body.faces].max(axis=1))
     touched = np.zeros(len(body.faces), dtype=np.bool_)
     for handle in handles:

@@ -1,4 +1,4 @@
-"""Pure: opened laptops."""
+"""Pure: open laptops."""
 
 import itertools
 import math
@@ -16,7 +16,7 @@ from workers.assets.builtin.textures import Texture, blank, blend, draw_small_pr
 
 CASE, LID, SCREEN, BEZEL, DECK, PAD = 0, 1, 2, 3, 4, 5
 DECK_WIDTH, DECK_DEPTH, DECK_MIDDLE = 0.86, 0.44, 0.12
-"""Of the keys' deck: shares of the laptop's width and depth, and how far behind the middle it lies."""
+"""The deck of keys: width and depth, and its offset behind the middle, as shares of the laptop's width and depth."""
 
 
 def make_laptop(rng: np.random.Generator) -> Model:
@@ -55,7 +55,7 @@ def _plate(size: tuple[float, float], low: float, high: float, surface: int) -> 
 
 
 def _screen(rng: np.random.Generator, size: tuple[float, float], thick: float, radius: float) -> Solid:
-    """The upper half as it lies closed, hinge along the x axis: the sunken screen looks down, its lid up."""
+    """The upper half, closed, hinge along the x axis: the sunken screen faces down, the lid up."""
     width, depth = size
     border, sunk, b = rng.uniform(0.006, 0.015), 0.0006, 0.2 * thick
     profile = np.array([[border, sunk], [border, 0.0], [b, 0.0], [0.0, b], [0.0, thick - b], [b, thick]])
@@ -139,7 +139,7 @@ def _keyboard(rng: np.random.Generator, key: Color, deck: Color) -> Texture:
 
 
 def _desktop(rng: np.random.Generator) -> Texture:
-    """What the screen shows: nothing, a landscape of colours, or windows of text."""
+    """The picture on the screen: nothing, a landscape of colours, or windows of text."""
     height, width = 128, 192
     kind = rng.random()
     if kind < 0.25:

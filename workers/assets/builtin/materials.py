@@ -23,10 +23,10 @@ def clear_glass(color: Color, roughness: float) -> Material:
     return replace(solid_color(color, roughness), transmission=1.0)
 
 
-def textured(picture: NDArray[np.uint8], roughness: float, metallic: float = 0.0) -> Material:
-    """A material with a picture [h, w, 3] uint8."""
-    picture.setflags(write=False)
-    return Material((1.0, 1.0, 1.0, 1.0), metallic=metallic, roughness=float(roughness), texture=picture)
+def textured(texture: NDArray[np.uint8], roughness: float, metallic: float = 0.0) -> Material:
+    """A material with a texture [h, w, 3] uint8, which becomes read-only."""
+    texture.setflags(write=False)
+    return Material((1.0, 1.0, 1.0, 1.0), metallic=metallic, roughness=float(roughness), texture=texture)
 
 
 def plastic(rng: np.random.Generator) -> Material:

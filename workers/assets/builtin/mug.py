@@ -8,7 +8,7 @@ from workers.assets.builtin.draws import chance
 from workers.assets.builtin.hollow import OUTSIDE, Wall, handle_ends, wall_around, with_handles
 from workers.assets.builtin.materials import metal, solid_color, textured
 from workers.assets.builtin.palette import BLACK, WHITE, Color, glaze_color, ink_on, jitter, mix, pale, vivid
-from workers.assets.builtin.parts import Model, Surface, Wrap
+from workers.assets.builtin.parts import Model, Surface, UvMapping
 from workers.assets.builtin.solid import Solid, lathe
 from workers.assets.builtin.sweeps import bend_radius, rod
 from workers.assets.builtin.textures import Texture, band_height, bands, dots, label, speckled, upright_stripes
@@ -73,7 +73,7 @@ def _handle(rng: np.random.Generator, wall: Wall) -> Solid:
 
 
 def _path(rng: np.random.Generator, start: Array, out: Array, stop: Array, back: Array, reach: float) -> Array:
-    """[K, 2] of (x, z): from the upper end to the lower one; it leaves and meets the wall squarely."""
+    """[K, 2] of (x, z): from the upper end to the lower one; perpendicular to the wall at both."""
     kind = int(rng.integers(3))
     if kind == 0:  # a round C
         return bezier(start, start + 1.25 * reach * out, stop + 1.25 * reach * back, stop, 14)
@@ -91,15 +91,15 @@ def _surfaces(rng: np.random.Generator, wall: Wall) -> tuple[Surface, ...]:
     ground: Color = jitter(rng, WHITE, 0.03) if chance(rng, 0.35) else glaze_color(rng)
     inside = ground if chance(rng, 0.5) else jitter(rng, WHITE, 0.03)
     body = solid_color(ground, roughness)
-    wrap: Wrap = "none"
+    mapping: UvMapping = "none"
     if chance(rng, 0.55):
         height = band_height(low, high, wall.radius_at(0.5 * high))
-        body, wrap = textured(_picture(rng, ground, height), roughness), "cylinder"
+        body, mapping = textured(_picture(rng, ground, height), roughness), "cylinder"
     grip = ground if chance(rng, 0.75) else vivid(rng)
     handle = metal(rng) if chance(rng, 0.06) else solid_color(grip, roughness)
     base = solid_color(mix(ground, (0.75, 0.7, 0.62), 0.6), 0.8)
     return (
-        Surface("body", body, wrap, low=low, high=high),
+        Surface("body", body, mapping, low=low, high=high),
         Surface("inside", solid_color(inside, roughness)),
         Surface("base", base),
         Surface("handle", handle),

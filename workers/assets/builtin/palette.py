@@ -60,14 +60,14 @@ def pale(rng: np.random.Generator) -> Color:
 
 
 def jitter(rng: np.random.Generator, color: Color, by: float = 0.04) -> Color:
-    """A colour close to another."""
+    """The colour, each channel and the lightness varied by up to `by`."""
     shift = rng.uniform(-by, by, 4)
     r, g, b = (float(min(max(c + shift[3] + 0.5 * d, 0.02), 0.98)) for c, d in zip(color, shift[:3], strict=True))
     return (r, g, b)
 
 
 def mix(a: Color, b: Color, share: float) -> Color:
-    """`share` of b in a."""
+    """Colour a blended with `share` of b."""
     r, g, bl = (x + share * (y - x) for x, y in zip(a, b, strict=True))
     return (r, g, bl)
 
@@ -86,17 +86,18 @@ def ink_on(rng: np.random.Generator, paper: Color) -> Color:
 
 
 def glaze_color(rng: np.random.Generator) -> Color:
-    """Of glazed pottery."""
+    """A colour of glazed pottery."""
     return jitter(rng, pick(rng, _GLAZES), 0.05) if chance(rng, 0.8) else vivid(rng)
 
 
 def glass_color(rng: np.random.Generator) -> Color:
-    """Of bottle glass, seen as an opaque body."""
+    """A colour of bottle glass as an opaque body."""
     return jitter(rng, pick(rng, _GLASSES), 0.03)
 
 
 def wood_colors(rng: np.random.Generator) -> tuple[Color, Color]:
-    """The light and the dark of a wood."""
+    """The light and the dark colour of a wood."""
     light, dark = pick(rng, _WOODS)
     shift = rng.uniform(-0.05, 0.05)
-    return mix(light, WHITE if shift > 0 else BLACK, abs(shift)), mix(dark, WHITE if shift > 0 else BLACK, abs(shift))
+    towards = WHITE if shift > 0 else BLACK
+    return mix(light, towards, abs(shift)), mix(dark, towards, abs(shift))

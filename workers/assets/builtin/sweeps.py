@@ -1,6 +1,7 @@
 """Pure: solids swept from an outline: prisms with round edges, and bent rods."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -58,7 +59,7 @@ def _tangents(path: Array, ends: tuple[Array, Array]) -> Array:
 
 
 def bend_radius(path: Array, ends: tuple[Array, Array]) -> float:
-    """How thick, metres, to each side of its path [K, 2] a rod may be at most before it folds at its tightest bend."""
+    """The largest half thickness, metres, of a rod along a path [K, 2] that does not fold at its tightest bend."""
     step, turn = np.diff(path, axis=0), np.diff(_tangents(path, ends), axis=0)
     length, bend = (np.sqrt(v[:, 0] ** 2 + v[:, 1] ** 2) for v in (step, turn))
     return float((length / np.maximum(bend, 1e-9)).min())
@@ -81,10 +82,9 @@ def rod(path: Array, section: Array, surface: int, ends: tuple[Array, Array], sw
 
 
 def split_sides(solid: Solid, surface: int, numbers: tuple[int, int, int, int]) -> Solid:
-    """The faces of one surface sorted by the side that they look to: front (-y), right (+x), back (+y), left (-x)."""
+    """The solid with one surface split into four by the direction of its faces: front (-y), right (+x), back (+y), left (-x)."""
     a, b, c = (solid.vertices[solid.faces[:, k]] for k in range(3))
     x, y, _ = np.cross(b - a, c - a).T
     side = np.where(np.abs(y) >= np.abs(x), np.where(y < 0, 0, 2), np.where(x > 0, 1, 3))
     chosen = solid.surface == surface
-    sorted_out = np.where(chosen, np.array(numbers)[side], solid.surface)
-    return Solid(solid.vertices, solid.faces, sorted_out, solid.smooth, solid.lofts)
+    return replace(solid, surface=np.where(chosen, np.array(numbers)[side], solid.surface))

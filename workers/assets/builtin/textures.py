@@ -1,4 +1,4 @@
-"""Pure: small pictures [h, w, 3] uint8 sRGB, row 0 at the top: labels, wood, stone, cardboard, glazes."""
+"""Pure: small textures [h, w, 3] uint8 sRGB, row 0 at the top: labels, wood, stone, cardboard, glazes."""
 
 import math
 from collections.abc import Sequence
@@ -15,19 +15,19 @@ Plane = NDArray[np.float32]
 
 
 def rgb(color: Color) -> NDArray[np.uint8]:
-    """[3] uint8."""
+    """A colour as [3] uint8."""
     return np.array([round(255.0 * c) for c in color], dtype=np.uint8)
 
 
 def blank(height: int, width: int, color: Color) -> Texture:
-    """A picture of one colour."""
+    """A texture of one colour."""
     picture = np.empty((height, width, 3), dtype=np.uint8)
     picture[:] = rgb(color)
     return picture
 
 
 def noise(rng: np.random.Generator, height: int, width: int, rows: int, columns: int) -> Plane:
-    """[height, width] float32 in [0, 1]: a random lattice of rows x columns, made smooth; it repeats in both directions."""
+    """[height, width] float32 in [0, 1]: value noise on a lattice of rows x columns; repeats in both directions."""
     lattice = rng.random((columns, rows), dtype=np.float32)
     return _stretched(np.ascontiguousarray(_stretched(lattice, width).T), height)
 
@@ -43,7 +43,7 @@ def _stretched(lattice: Plane, size: int) -> Plane:
 
 
 def blend(a: Color, b: Color, share: Plane) -> Texture:
-    """a where `share` [h, w] is 0, b where it is 1, in 64 steps."""
+    """Colour a where `share` [h, w] is 0, colour b where it is 1, in 64 steps."""
     t = np.minimum(np.arange(256) / 63.0, 1.0)[:, None, None]
     steps = np.round(255.0 * (np.array(a) * (1 - t) + np.array(b) * t)).astype(np.uint8)
     level = np.clip(share * np.float32(63.0) + np.float32(0.5), 0, 63).astype(np.uint8)
@@ -72,14 +72,14 @@ def stone(rng: np.random.Generator, a: Color, b: Color, size: int = 192) -> Text
 
 
 def band_height(low: float, high: float, radius: float, width: int = 256) -> int:
-    """Rows of a picture that is `width` pixels around, so that its pixels are square on a cylinder; 16 to 192."""
+    """Rows, 16 to 192, that make the pixels of a texture square on a cylinder that it surrounds with `width` columns."""
     return min(max(round(width * (high - low) / (2.0 * math.pi * radius)), 16), 192)
 
 
 def speckled(
     rng: np.random.Generator, ground: Color, spot: Color, share: float, height: int = 128, width: int = 256
 ) -> Texture:
-    """A ground with small spots on this share of it."""
+    """A ground with small spots on a share of its pixels."""
     picture = blank(height, width, ground)
     picture[rng.random((height, width), dtype=np.float32) < share] = rgb(spot)
     return picture
@@ -116,7 +116,7 @@ def dots(rng: np.random.Generator, ground: Color, spot: Color, height: int = 128
 def draw_word(
     rng: np.random.Generator, picture: Texture, top: int, left: int, letters: int, size: int, ink: Color
 ) -> None:
-    """Draws letter-like signs of 3 x 5 squares into a picture, cut off at its border."""
+    """Draws letter-like signs of 3 x 5 squares into a texture, clipped at its border."""
     signs = rng.random((letters, 5, 2)) < 0.62
     signs[:, 0, 0] = signs[:, 4, 1] = True
     full = np.concatenate([signs, signs[:, ::-1, :1], np.zeros((letters, 5, 1), dtype=np.bool_)], axis=2)
