@@ -1,4 +1,4 @@
-"""Which assets a job can choose from."""
+"""The catalogue: every asset that a job can choose from."""
 
 import hashlib
 import json
@@ -14,7 +14,7 @@ from workers.assets.external.listing import Listing
 from workers.assets.sources import AnySource, count_instances, list_source, load_instance, name_instance
 
 PROBES = 3
-"""Meshes of a source and category that are tried when a catalogue is opened; if none can be read, it cannot be used."""
+"""Meshes of a source and category that are loaded to test it when a catalogue is opened; one must be usable."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class InstanceRef:
 
 @dataclass(frozen=True)
 class Catalogue:
-    """What a job can choose from. It pickles small and needs no files to choose, only to load.
+    """Every asset that a job can choose from. It pickles small; choosing needs no files, loading does.
 
     objects, tables: a listing for each source, None for a procedural one; skipped: how many instances were left out,
     by source folder and reason; digest: SHA-256 of everything that the choice and the shapes depend on.
@@ -64,7 +64,7 @@ class Catalogue:
 
 
 def open_catalogue(assets: Assets, job_folder: Path, categories: Collection[str]) -> Catalogue:
-    """Looks into every source now; raises AssetSourceError where a folder or a category cannot be served.
+    """Lists every source; raises AssetSourceError where a folder cannot be used or no source has a category.
 
     Cost: every mesh and texture of the categories asked for is read to hash it, about two seconds a gigabyte where
     disks allow; nothing for procedural sources. Workers take the opened catalogue and read only what they load.
@@ -81,7 +81,7 @@ def open_catalogue(assets: Assets, job_folder: Path, categories: Collection[str]
 
 
 def _refuse_ambiguous(assets: Assets) -> None:
-    """Two procedural sources of one seed and different sizes would give one id to two shapes."""
+    """AssetSourceError for two procedural sources of one seed and different sizes: they would give one id to two shapes."""
     sizes: dict[int, tuple[str, float]] = {}
     for source in assets.objects:
         if isinstance(source, ProceduralSource):
@@ -134,7 +134,7 @@ def _digest(
     """SHA-256 over the settings of every source and, for files, what was found: paths, sizes and digests."""
     record = []
     for settings, listing in zip((*assets.objects, *assets.tables), (*objects, *tables), strict=True):
-        # Where a folder lies is not what is in it: the same files elsewhere are the same catalogue.
+        # The folder's path is left out: the same files elsewhere are the same catalogue.
         plain = settings.model_dump(mode="json", exclude={"folder"})
         files = None
         if listing is not None:

@@ -13,13 +13,13 @@ from workers.assets.categories import TABLE
 from workers.assets.sources import load_instance
 
 MAX_CACHED_INSTANCES = 10_000
-"""Of more built-in instances than this hardly one comes again: keeping them fills memory and saves nothing."""
+"""Sources with more built-in instances are not cached: instances hardly ever repeat."""
 CACHE_BYTES = 256 * 1024 * 1024
-"""How much memory the assets that a process keeps may take."""
+"""Memory that the cached assets of a process may take."""
 
 
 def choose_object(catalogue: Catalogue, category: str, rng: np.random.Generator) -> InstanceRef:
-    """An instance of the category: a source by weight among those that have it, then any of its instances alike."""
+    """An instance of the category: a source by weight among those that have it, then one of its instances uniformly."""
     offers = catalogue.offers(category)
     if not offers:
         raise AssetSourceError(f"no source offers {category!r}")
@@ -60,7 +60,7 @@ def asset_bytes(asset: Asset) -> int:
 
 
 def open_cache(capacity_bytes: int) -> LRUCache[tuple[str, InstanceRef], Asset]:
-    """The assets used last, as many as the capacity holds, but at least one: an asset over it counts as all of it."""
+    """An LRU cache of assets. An asset larger than the capacity counts as the capacity, so that one is always kept."""
     return LRUCache(capacity_bytes, getsizeof=lambda asset: min(asset_bytes(asset), capacity_bytes))
 
 

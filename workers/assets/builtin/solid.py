@@ -78,6 +78,11 @@ def circle(count: int) -> Array:
     return table
 
 
+def level_ring(outline: Array, z: float) -> Array:
+    """[n, 3] float64: an outline [n, 2] at a height, metres."""
+    return np.concatenate([outline, np.full((len(outline), 1), z)], axis=1)
+
+
 @functools.cache
 def _loft_faces(rings: int, count: int) -> tuple[Indices, Indices]:
     """Faces of a loft and the band [F] of each: 0 the fan at the start, then band by band, last the fan at the end."""

@@ -7,7 +7,7 @@ from workers.assets.builtin.draws import chance, pick
 from workers.assets.builtin.materials import metal, solid_color, textured
 from workers.assets.builtin.palette import BLACK, WHITE, jitter, mix, pale, vivid, wood_colors
 from workers.assets.builtin.parts import Model, Surface, UvMapping
-from workers.assets.builtin.solid import Solid, loft, union
+from workers.assets.builtin.solid import Solid, level_ring, loft, union
 from workers.assets.builtin.sweeps import prism
 from workers.assets.builtin.table_base import TOP, TableSize, make_base
 from workers.assets.builtin.textures import speckled, stone, wood
@@ -31,9 +31,7 @@ def _top(rng: np.random.Generator, plan: TableSize) -> Solid:
     )
     if plan.round_top:
         outline = squircle(48, 0) * np.array([0.5 * plan.width, 0.5 * plan.depth])
-        rings = [
-            np.concatenate([outline * (1 - 2 * inset / plan.depth), np.full((48, 1), z)], 1) for inset, z in profile
-        ]
+        rings = [level_ring(outline * (1 - 2 * inset / plan.depth), z) for inset, z in profile]
         ends = np.array([[0.0, 0.0, low], [0.0, 0.0, high]])
         return loft(np.stack(rings), ends[0], ends[1], [TOP] * 6, [0, 1, 2, 3, 3, 4])
     radius = edge + (rng.uniform(0.002, 0.02) if chance(rng, 0.6) else rng.uniform(0.03, 0.15))

@@ -8,7 +8,7 @@ import numpy as np
 from schemas.base import Array
 from workers.assets.builtin.curves import bezier, rounded_rectangle
 from workers.assets.builtin.draws import chance, pick
-from workers.assets.builtin.solid import Solid, circle, combine, lathe, loft
+from workers.assets.builtin.solid import Solid, circle, combine, lathe, level_ring, loft
 
 TOP, LEG, FRAME = 0, 1, 2
 """Surface numbers of a table."""
@@ -57,12 +57,8 @@ def _leg(
     legs = []
     for x, y in spots:
         away = np.array([math.copysign(splay, x), math.copysign(splay, y)])
-        foot = np.concatenate(
-            [outline * size * taper + [x, y] + away * plan.under, np.zeros((len(outline), 1))], axis=1
-        )
-        head = np.concatenate(
-            [outline * size + [x, y] - away * (top - plan.under), np.full((len(outline), 1), top)], axis=1
-        )
+        foot = level_ring(outline * size * taper + [x, y] + away * plan.under, 0.0)
+        head = level_ring(outline * size + [x, y] - away * (top - plan.under), top)
         ends = np.array([*(np.array([x, y]) + away * plan.under), 0.0]), np.array([x, y, top])
         legs.append(loft(np.stack([foot, head]), *ends, [LEG] * 3, [0, 1, 2]))
     return combine(legs)
@@ -80,7 +76,7 @@ def _beam(size: tuple[float, float, float], at: tuple[float, float, float], surf
     """A box of a size, centred at a point."""
     x, y, z = (0.5 * s for s in size)
     corners = np.array([[x, y], [-x, y], [-x, -y], [x, -y]]) + np.array(at[:2])
-    rings = [np.concatenate([corners, np.full((4, 1), at[2] + dz)], axis=1) for dz in (-z, z)]
+    rings = [level_ring(corners, at[2] + dz) for dz in (-z, z)]
     low, high = (np.array([at[0], at[1], at[2] + dz]) for dz in (-z, z))
     flat = loft(np.stack(rings), low, high, [surface] * 3, [0, 1, 2])
     side = np.concatenate([np.zeros(4), np.repeat([1, 2, 3, 4], 2), np.full(4, 5)]).astype(np.int64)
@@ -109,10 +105,7 @@ def _frame(size: tuple[float, float], wide: float, low: float, high: float) -> S
     """A rectangular frame of four bars, `wide` thick, between two heights."""
     square = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
     outer, inner = square * np.array(size), square * (np.array(size) - 2 * wide)
-    loops = [
-        np.concatenate([xy, np.full((4, 1), z)], 1)
-        for xy, z in ((inner, low), (outer, low), (outer, high), (inner, high))
-    ]
+    loops = [level_ring(xy, z) for xy, z in ((inner, low), (outer, low), (outer, high), (inner, high))]
     j = np.arange(4)
     faces, smooth = [], []
     for k in range(4):

@@ -28,12 +28,12 @@ def check_counts(path: Path, vertices: int, faces: int, limits: MeshLimits) -> N
 
 
 def may_be_too_large(data: bytes, limits: MeshLimits) -> bool:
-    """Whether a file is long enough to hold more than the caps allow; a shorter one needs no counting."""
+    """Whether a file is long enough to exceed the caps; a shorter one needs no counting."""
     return len(data) > LEAST_BYTES * min(limits.max_vertices, limits.max_faces)
 
 
 def declared_counts(kind: str, data: bytes) -> tuple[int, int]:
-    """How many vertices and faces a file says that it holds, read without parsing it; (0, 0) where it does not say."""
+    """Vertices and faces that a file declares, found without parsing it; (0, 0) where it declares none."""
     if kind == ".obj":
         return data.count(b"\nv "), data.count(b"\nf ")
     if kind == ".ply":
@@ -52,8 +52,8 @@ def declared_counts(kind: str, data: bytes) -> tuple[int, int]:
 class FolderResolver(Resolver):
     """Hands trimesh the material files and PNG or JPEG textures of one folder, and nothing else.
 
-    Names are relative to the mesh, may use either slash, and must stay below `root`. What is refused or missing is
-    told in `notes`, and the mesh goes without it.
+    Names are relative to the mesh, may use either slash, and must stay below `root`. A file that is refused or missing
+    leaves a note in `notes`, and the mesh is loaded without it.
     """
 
     def __init__(self, mesh: Path, root: Path, limits: MeshLimits) -> None:
@@ -76,7 +76,7 @@ class FolderResolver(Resolver):
         return data
 
     def find(self, name: str) -> Path | None:
-        """The file that a name means, if it lies below `root`: relative to the mesh, or beside it."""
+        """The file of a name, relative to the mesh or else beside it; None where there is none below `root`."""
         name = name.strip().replace("\\", "/")
         for candidate in (self.folder / name, self.folder / Path(name).name):
             try:
@@ -106,12 +106,12 @@ class FolderResolver(Resolver):
 
 
 def describe_error(error: Exception) -> str:
-    """Kind and message of an error without addresses in memory: what is said of a mesh goes into the dataset."""
+    """Kind and message of an error without addresses in memory, because notes on meshes are stored in the dataset."""
     return _ADDRESS.sub("", repr(error))
 
 
 def image_fault(data: bytes, limits: MeshLimits) -> str | None:
-    """Why these bytes may not be a texture, or None: a PNG or JPEG by its first bytes, of a size within the cap."""
+    """Why these bytes may not be a texture; None for a PNG or JPEG, by its first bytes, of a size within the cap."""
     kind = next((kind for magic, kind in _IMAGE_KINDS.items() if data.startswith(magic)), None)
     if kind is None:
         return "is not a PNG or JPEG file"

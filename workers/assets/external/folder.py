@@ -16,11 +16,11 @@ PYBULLET_MAP: Mapping[str, str] = {
     "table_square/table_square.urdf": TABLE,
     "random_urdfs/*/*.urdf": "box",
 }
-"""What of the meshes inside the pybullet_data package is one of our categories."""
+"""The category of each mesh inside the pybullet_data package that has one."""
 
 
 def locate_folder(name: str, job_folder: Path) -> Path:
-    """The folder of a source: relative to the job file, or the installed pybullet_data package's, without importing it."""
+    """The folder of a source: relative to the job file, or that of the installed package pybullet_data, not imported."""
     if name == PYBULLET_DATA and not (job_folder / name).is_dir():
         spec = importlib.util.find_spec(PYBULLET_DATA)
         if spec is None or not spec.submodule_search_locations:

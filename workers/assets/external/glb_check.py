@@ -1,4 +1,4 @@
-"""Pure: a GLB file from outside, checked against the caps before it is parsed."""
+"""Pure: checks a GLB file from outside against the caps before it is parsed."""
 
 import json
 import struct
@@ -11,7 +11,7 @@ from workers.assets.external.caps import FolderResolver, check_counts, describe_
 
 
 def check_glb(path: Path, data: bytes, resolver: FolderResolver) -> bytes:
-    """A GLB whose counts are within the caps, whose nodes form a tree, without the textures that may not be read."""
+    """The bytes of a GLB without the textures that are refused; MeshError where its counts or its node tree are."""
     try:
         magic, _, _, length, kind = struct.unpack_from("<4sIII4s", data)
         tree: dict[str, Any] = json.loads(data[20 : 20 + length])

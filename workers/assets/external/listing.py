@@ -45,7 +45,7 @@ class Listing:
 def read_listing(
     settings: ShapeNetSource | FolderSource, folder: Path, candidates: Mapping[str, Iterable[Path]], limits: MeshLimits
 ) -> Listing:
-    """Reads and hashes every candidate and all that it refers to; one that is refused is skipped and counted.
+    """Hashes every candidate and the files that it refers to; counts and skips those that are refused.
 
     Takes about two seconds for each gigabyte, where disks allow.
     """
@@ -85,7 +85,7 @@ def mesh_root(settings: ShapeNetSource | FolderSource, folder: Path, mesh: Path)
 
 
 def _instance_id(settings: ShapeNetSource | FolderSource, file: SourceFile) -> str:
-    """Synset and model; in a folder the path as one word, and eight digits of a digest of the file and the settings."""
+    """Synset and model in ShapeNetCore; else the path as one word and eight digits of a digest of file and settings."""
     if isinstance(settings, ShapeNetSource):
         return "-".join(Path(file.path).parts[:2])
     stem = str(Path(file.path).with_suffix(""))
@@ -126,14 +126,14 @@ def _environmental(reason: str, detail: str) -> MeshError:
 
 
 def describe_folder(folder: Path, most: int = 5) -> str:
-    """What a folder holds, for a message: its first names."""
+    """The first names in a folder, for a message."""
     names = sorted(path.name + ("/" if path.is_dir() else "") for path in folder.iterdir())
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return (", ".join(names[:most]) + more) if names else "nothing"
 
 
 def list_licences(folder: Path) -> list[Path]:
-    """The files below a folder whose name is a licence's."""
+    """The licence files below a folder."""
     return sorted(path for path in folder.rglob("*") if path.stem.lower() in ("license", "licence", "copying"))
 
 

@@ -15,12 +15,12 @@ from schemas.scene.shape import Material
 from workers.assets.external.caps import describe_error
 
 BLACK = 0.02
-"""A base colour darker than this under a texture is an exporter's leftover: the texture shows as it is."""
+"""Darkest base colour that multiplies a texture; below it the colour is an exporter's leftover and is ignored."""
 INVISIBLE = 0.01
-"""An alpha below this would hide the thing altogether: some exporters write opacity the wrong way round."""
+"""Smallest alpha that is believed; below it alpha is 1, because some exporters write opacity inverted."""
 WHITE = Material(base_color=(1.0, 1.0, 1.0, 1.0))
 DEFAULT = Material()
-"""The material of what comes without one; a part that has it can be told by identity."""
+"""The material of a mesh that has none; parts with it are recognised by identity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ def _colors(values: NDArray, linear: bool) -> NDArray[np.uint8]:
 
 
 def _attribute_colors(values: NDArray | None, count: int, linear: bool) -> NDArray[np.uint8] | None:
-    """Vertex colours that come beside a material, as stored: floats, or whole numbers that fill their type."""
+    """Vertex colours stored beside a material, as floats in [0, 1] or as integers that use the whole range of their type."""
     if values is None or np.shape(values) not in ((count, 3), (count, 4)):
         return None
     whole = np.issubdtype(values.dtype, np.integer)
@@ -111,7 +111,7 @@ def _material(source: object, textured: bool) -> tuple[Material, tuple[str, ...]
 
 
 def _opacity(source: SimpleMaterial, otherwise: float) -> float:
-    """The `d` of an MTL file; `Tr` is left out, because half of the exporters write it the wrong way round."""
+    """The `d` of an MTL file; `Tr` is ignored, because half of the exporters write it inverted."""
     try:
         return float(source.kwargs["d"][0])
     except (KeyError, IndexError, TypeError, ValueError):
@@ -119,7 +119,7 @@ def _opacity(source: SimpleMaterial, otherwise: float) -> float:
 
 
 def _texture(image: Image.Image | None, notes: list[str]) -> NDArray[np.uint8] | None:
-    """[h, w, 3 or 4] uint8, read-only; None with a note where the picture cannot be decoded."""
+    """[h, w, 3 or 4] uint8, read-only; None with a note where the image cannot be decoded."""
     if image is None:
         return None
     try:

@@ -18,17 +18,17 @@ from workers.assets.external.topology import (
     Bodies,
     Indices,
     Mask,
-    collapsed,
     find_bodies,
-    flips_for_consistency,
+    find_collapsed,
+    find_flips,
+    find_repeated,
     merge_points,
-    repeated,
     thin_volume,
 )
 from workers.geometry.frames import transform
 
 LARGEST_COORDINATE = 1e7
-"""Beyond this, in units of the file, products of coordinates lose what they mean."""
+"""Largest coordinate, in units of the file; products of larger ones lose precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class LoadedMesh:
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """One geometry as it stands in the scene: vertices [V, 3], faces [F, 3] int64, unit normals [V, 3] or None."""
+    """One geometry in the frame of the scene: vertices [V, 3], faces [F, 3] int64, unit normals [V, 3] or None."""
 
     name: str
     vertices: Array
@@ -51,7 +51,7 @@ class _Piece:
 
 
 def load_shape(path: Path, limits: MeshLimits, root: Path | None = None) -> LoadedMesh:
-    """A mesh file's shape: finite, in range, no doubled or empty faces, wound outwards where that can be told.
+    """A mesh file's shape: finite, in range, no doubled or empty faces, wound outwards where it is closed.
 
     Material files and textures are looked for below `root` (default: the mesh's own folder) and nowhere else; a
     missing or refused one leaves the plain base colour and a note. Raises MeshError with one of the reasons `missing`,
@@ -78,7 +78,7 @@ def transform_shape(shape: Shape, matrix: Pose) -> Shape:
 
 
 def _pieces(path: Path, scene: trimesh.Scene, limits: MeshLimits) -> tuple[list[_Piece], list[str]]:
-    """Every mesh of the scene where its node puts it."""
+    """Every mesh of the scene at the pose of each of its nodes, and notes."""
     shown = [(scene.graph[node], node) for node in scene.graph.nodes_geometry]
     meshes = [(matrix, scene.geometry[name]) for (matrix, name), _ in shown]
     meshes = [(matrix, mesh) for matrix, mesh in meshes if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
@@ -99,7 +99,7 @@ def _piece(path: Path, name: str, mesh: trimesh.Trimesh, matrix: Pose, visual: M
     faces = np.asarray(mesh.faces, dtype=np.int64)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshError("index_out_of_range", f"{path}: a face names vertex {faces.max()} of {len(vertices)}")
-    # Vertices that no face names may hold anything: only what is used counts.
+    # Only vertices that a face names are checked: others may hold anything.
     if not (np.isfinite(vertices[faces]).all() and np.isfinite(matrix).all()):
         raise MeshError("not_finite", f"{path} has a coordinate that is not a finite number")
     used = np.zeros(len(vertices), dtype=np.bool_)
@@ -118,8 +118,8 @@ def _piece(path: Path, name: str, mesh: trimesh.Trimesh, matrix: Pose, visual: M
 
 
 def _file_normals(mesh: trimesh.Trimesh, matrix: Pose) -> Array | None:
-    """The file's own shading normals [V, 3], unit, turned with the node; None where it has none that can be used."""
-    if "vertex_normals" not in mesh._cache.cache:  # what trimesh computes itself is no news
+    """The file's own unit shading normals [V, 3], rotated with the node; None where it has no usable ones."""
+    if "vertex_normals" not in mesh._cache.cache:  # trimesh would compute them
         return None
     normals = np.asarray(mesh.vertex_normals, dtype=np.float64)
     if normals.shape != mesh.vertices.shape or not np.isfinite(normals).all() or np.linalg.det(matrix[:3, :3]) == 0:
@@ -145,8 +145,8 @@ def clean_shape(path: Path, pieces: list[_Piece]) -> tuple[Shape, list[str]]:
     faces = np.concatenate([piece.faces + start for piece, start in zip(pieces, starts[:-1], strict=True)])
     owner = np.repeat(np.arange(len(pieces)), [len(piece.faces) for piece in pieces])
     point = merge_points(vertices)
-    kept = ~collapsed(point[faces])
-    kept[kept] = ~repeated(point[faces[kept]], oriented=True)
+    kept = ~find_collapsed(point[faces])
+    kept[kept] = ~find_repeated(point[faces[kept]], oriented=True)
     faces, owner = faces[kept], owner[kept]
     if not len(faces):
         raise MeshError("no_faces", f"{path} has only empty faces")
@@ -164,14 +164,14 @@ def clean_shape(path: Path, pieces: list[_Piece]) -> tuple[Shape, list[str]]:
 
 
 def _unify_winding(vertices: Array, faces: Indices, owner: Indices, point: Indices) -> tuple[Indices, Indices, Bodies]:
-    """Faces wound alike and outwards, without the second side of sheets; their owners; and their bodies."""
-    twins = repeated(point[faces], oriented=False)
+    """Faces wound consistently and outwards, without the second side of sheets; their owners; and their bodies."""
+    twins = find_repeated(point[faces], oriented=False)
     if twins.any():
         bodies = find_bodies(vertices, faces, point[faces])
         sheet = ~bodies.closed | (np.abs(bodies.volume) < thin_volume(vertices, faces))
         drop = twins & sheet[bodies.body]
         faces, owner = faces[~drop], owner[~drop]
-    faces = _flipped(faces, flips_for_consistency(point[faces]))
+    faces = _flipped(faces, find_flips(point[faces]))
     bodies = find_bodies(vertices, faces, point[faces])
     inwards = bodies.closed & (bodies.volume < 0) & ~_voids(vertices, faces, bodies)
     if inwards.any():
@@ -197,14 +197,14 @@ def _flipped(faces: Indices, flip: Mask) -> Indices:
 
 
 def _slivers(vertices: Array, faces: Indices) -> Mask:
-    """[F] bool: faces whose area vanishes beside the square of their longest side."""
+    """[F] bool: faces whose area is negligible compared with the square of their longest side."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     longest = np.maximum.reduce([((b - a) ** 2).sum(1), ((c - b) ** 2).sum(1), ((a - c) ** 2).sum(1)])
     return np.linalg.norm(np.cross(b - a, c - a), axis=1) <= 1e-12 * longest
 
 
 def _part(piece: _Piece, faces: Indices) -> Part:
-    """A part of the faces that are left, with only the vertices that they name."""
+    """A part with the remaining faces and the vertices that they name."""
     used, index = np.unique(faces, return_inverse=True)
     vertices, corners = piece.vertices[used], index.reshape(-1, 3)
     normals = None if piece.normals is None else _facing(vertices, corners, piece.normals[used])

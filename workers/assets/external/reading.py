@@ -14,7 +14,7 @@ from workers.assets.external.caps import FolderResolver, check_counts, declared_
 from workers.assets.external.glb_check import check_glb
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb")
-"""What trimesh reads without further libraries."""
+"""Formats that trimesh reads without further libraries."""
 
 _OBJ_COUNTED_BACK = re.compile(rb"^f[ \t][^\n]*-\d", re.MULTILINE)
 _MAP_KD = re.compile(rb"^[ \t]*map_Kd[ \t]+([^\r\n]+)", re.MULTILINE | re.IGNORECASE)
@@ -88,5 +88,5 @@ def _decode(names: Iterable[bytes]) -> list[str]:
 
 
 def _counts_back(data: bytes) -> bool:
-    """Whether an OBJ file has negative indices that mean something else than counted from the file's end."""
+    """Whether an OBJ file has negative indices that do not count from the end of the file."""
     return _OBJ_COUNTED_BACK.search(data) is not None and data.rfind(b"\nv ") > data.find(b"\nf ")

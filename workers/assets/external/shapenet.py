@@ -48,5 +48,5 @@ def find_models(
 
 
 def _find_mesh(model: Path) -> Path:
-    """Where the mesh of a model lies, or would lie if it had one."""
+    """The mesh of a model; a path that does not exist where it has none, so that it is counted as missing."""
     return next((model / name for name in _MESHES if (model / name).is_file()), model / _MESHES[-1])

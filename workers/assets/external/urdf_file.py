@@ -50,7 +50,7 @@ def mesh_names(robot: ElementTree.Element) -> list[str]:
 
 
 def find_mesh(name: str, urdf: Path, root: Path) -> Path:
-    """The file that a mesh name means, inside `root` only; MeshError `missing`."""
+    """The file of a mesh name inside `root`; MeshError `missing`."""
     bare = re.sub(r"^(package|file|model)://", "", name.strip().replace("\\", "/"))
     tail = bare.split("/", 1)[-1]
     for candidate in (urdf.parent / bare, root / bare, root / tail, urdf.parent / tail):
@@ -97,7 +97,7 @@ def _color(path: Path, material: ElementTree.Element) -> tuple[float, ...] | Non
 
 
 def _link_poses(path: Path, robot: ElementTree.Element) -> list[tuple[ElementTree.Element, Pose]]:
-    """Every link with its pose in the frame of its root, joints at zero; MeshError `unreadable` where joints go round."""
+    """Every link with its pose in the frame of its root, joints at zero; MeshError `unreadable` where joints form a loop."""
     joints: dict[str, tuple[str, Pose]] = {}
     for joint in robot.iterfind("joint"):
         parent, child = joint.find("parent"), joint.find("child")
