@@ -1,14 +1,12 @@
 """Pure: boxes with a lid seam: cartons, shoe boxes, gift boxes, printed packets, tins, wooden chests."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from workers.assets.builtin.draws import chance, pick
-from workers.assets.builtin.gift import BOTTOM, EXTRA, LID, OTHER, SIDE, TOP, draw_size, make_lidded, on_front, on_top
+from workers.assets.builtin.gift import BOTTOM, EXTRA, LID, OTHER, SIDE, TOP, draw_size, make_lidded, on_front
 from workers.assets.builtin.materials import metal, solid_color, textured
 from workers.assets.builtin.palette import BLACK, WHITE, Color, jitter, mix, pale, vivid, wood_colors
-from workers.assets.builtin.parts import Model, Surface
+from workers.assets.builtin.parts import Model, Surface, over_top
 from workers.assets.builtin.solid import difference, union
 from workers.assets.builtin.sweeps import bevelled_profile, prism, split_sides, straight_prism
 from workers.assets.builtin.textures import Texture, band_height, bands, blank, blend, label, noise, rgb, wood
@@ -16,15 +14,7 @@ from workers.assets.builtin.textures import Texture, band_height, bands, blank, 
 
 def make_box(rng: np.random.Generator) -> Model:
     """A closed box, 60 to 400 mm, of board, tinplate or wood."""
-    builders: tuple[Callable[[np.random.Generator], Model], ...] = (
-        _carton,
-        make_lidded,
-        make_lidded,
-        _packet,
-        _packet,
-        _tin,
-        _chest,
-    )
+    builders = (_carton, make_lidded, make_lidded, _packet, _packet, _tin, _chest)
     return pick(rng, builders)(rng)
 
 
@@ -55,7 +45,7 @@ def _carton(rng: np.random.Generator) -> Model:
     surfaces = (
         on_front("front", front, size, back=False),
         grain,
-        on_top("top", top, size, 0.7),
+        over_top("top", textured(top, 0.7), w, d),
         Surface("bottom", solid_color(board, 0.85)),
         on_front("back", front, size, back=True),
         Surface("slot", solid_color(mix(board, BLACK, 0.5), 0.9)),
@@ -136,7 +126,7 @@ def _chest(rng: np.random.Generator) -> Model:
     w, d, h = size
     lid, groove, boards = h * rng.uniform(0.2, 0.35), 0.0016, int(rng.integers(1, 4))
     b = 0.002
-    levels = [*np.linspace(0.0, h - lid, boards + 1)[1:]]
+    levels = np.linspace(0.0, h - lid, boards + 1)[1:]
     points = [[b, 0.0], [0.0, b]]
     for z in levels:
         deep = groove if z < levels[-1] else 1.6 * groove

@@ -1,7 +1,5 @@
 """Pure: drink cans, food tins, flat tins, spray cans and paint cans, with rims."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from schemas.base import Array
@@ -9,7 +7,7 @@ from workers.assets.builtin.curves import fillet
 from workers.assets.builtin.draws import chance, pick
 from workers.assets.builtin.materials import plastic, solid_color, steel, textured
 from workers.assets.builtin.palette import Color, ink_on, mix, pale, vivid
-from workers.assets.builtin.parts import Model, Surface
+from workers.assets.builtin.parts import Model, Surface, over_top
 from workers.assets.builtin.solid import lathe
 from workers.assets.builtin.textures import Texture, band_height, bands, blank, label, rgb
 
@@ -22,12 +20,7 @@ SEGMENTS = 48
 
 def make_can(rng: np.random.Generator) -> Model:
     """A closed can with rims, 35 to 200 mm high."""
-    builders: tuple[tuple[float, Callable[[np.random.Generator], Array]], ...] = (
-        (0.4, _drink),
-        (0.75, _food),
-        (0.88, _spray),
-        (1.0, _paint),
-    )
+    builders = ((0.4, _drink), (0.75, _food), (0.88, _spray), (1.0, _paint))
     kind = rng.random()
     build = next(build for share, build in builders if kind < share)
     outline = build(rng)
@@ -171,16 +164,8 @@ def _surfaces(
         )
     lid = Surface("lid", bare)
     if drink:
-        color: Color = bare.base_color[:3]
-        flat = (2 * lid_radius, 2 * lid_radius)
-        lid = Surface(
-            "lid",
-            textured(_opener(color), bare.roughness, 1.0),
-            "plane",
-            origin=(-lid_radius, -lid_radius, 0.0),
-            across=(flat[0], 0.0, 0.0),
-            up=(0.0, flat[1], 0.0),
-        )
+        opener = textured(_opener(bare.base_color[:3]), bare.roughness, 1.0)
+        lid = over_top("lid", opener, 2 * lid_radius, 2 * lid_radius)
     top = plastic(rng) if chance(rng, 0.8) else solid_color(mix(paper, (0.95, 0.95, 0.95), 0.5), 0.5)
     return (
         Surface("side", side, "cylinder" if mapping else "none", low=low, high=high),

@@ -7,10 +7,10 @@ from schemas.scene.shape import Material
 from workers.assets.builtin.draws import chance, pick
 from workers.assets.builtin.materials import solid_color, textured
 from workers.assets.builtin.palette import BLACK, WHITE, Color, ink_on, jitter, mix, pale, vivid
-from workers.assets.builtin.parts import Model, Surface
+from workers.assets.builtin.parts import Model, Surface, over_top
 from workers.assets.builtin.solid import Solid, circle, combine, lathe, union
 from workers.assets.builtin.sweeps import prism, straight_prism
-from workers.assets.builtin.textures import Texture, dots, label, upright_stripes
+from workers.assets.builtin.textures import dots, label, upright_stripes
 
 SIDE, LID, TOP, BOTTOM, EXTRA, OTHER = 0, 1, 2, 3, 4, 5
 
@@ -24,14 +24,6 @@ def draw_size(
     """Draws a size: width in metres, depth and height as shares of the width."""
     w = rng.uniform(*width)
     return w, w * rng.uniform(*depth), w * rng.uniform(*height)
-
-
-def on_top(name: str, picture: Texture, size: Size, roughness: float) -> Surface:
-    """A surface with one texture over the whole top."""
-    w, d, _ = size
-    return Surface(
-        name, textured(picture, roughness), "plane", origin=(-w / 2, -d / 2, 0.0), across=(w, 0, 0), up=(0, d, 0)
-    )
 
 
 def on_front(name: str, material: Material, size: Size, back: bool) -> Surface:
@@ -63,7 +55,7 @@ def make_lidded(rng: np.random.Generator) -> Model:
     if chance(rng, 0.5):
         body = union([body, *_ribbon(rng, size)])
     elif chance(rng, 0.7):
-        top = on_top("top", label(rng, cover, height=128, width=128, faces=1), size, roughness)
+        top = over_top("top", textured(label(rng, cover, height=128, width=128, faces=1), roughness), w, d)
     if chance(rng, 0.4):
         patterns = (
             dots(rng, color, mix(color, ink_on(rng, color), 0.7), 256),

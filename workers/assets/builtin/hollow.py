@@ -39,15 +39,9 @@ class Wall:
         step = np.array([self.radius_at(high) - self.radius_at(low), high - low])
         return np.array([step[1], -step[0]]) / float(np.sqrt(step[0] * step[0] + step[1] * step[1]))
 
-
-def handle_ends(wall: Wall, high: float, low: float) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Where a handle meets the wall at two heights: points (radius, height) amid the wall, and its outward normals."""
-    normals = wall.normal_at(high), wall.normal_at(low)
-    points = [
-        np.array([wall.radius_at(z), z]) - 0.5 * wall.thickness_m * normal
-        for z, normal in zip((high, low), normals, strict=True)
-    ]
-    return (points[0], points[1]), normals
+    def middle_at(self, z: float) -> Array:
+        """[2] float64: the point (radius, height) midway through the wall that lies behind the outside at a height."""
+        return np.array([self.radius_at(z), z]) - 0.5 * self.thickness_m * self.normal_at(z)
 
 
 def wall_around(hollow: Array, thickness_m: float, foot_radius: float, foot_width: float, recess: float) -> Wall:

@@ -8,7 +8,7 @@ from schemas.base import Array
 from schemas.scene.shape import Material
 from workers.assets.builtin.curves import bezier, fillet, spline, squircle
 from workers.assets.builtin.draws import chance, pick
-from workers.assets.builtin.hollow import OUTSIDE, Wall, handle_ends, wall_around, with_handles
+from workers.assets.builtin.hollow import OUTSIDE, Wall, wall_around, with_handles
 from workers.assets.builtin.materials import clear_glass, solid_color, textured
 from workers.assets.builtin.palette import BLACK, WHITE, Color, glaze_color, ink_on, jitter, mix, pale
 from workers.assets.builtin.parts import Model, Surface
@@ -110,7 +110,8 @@ def _ears(rng: np.random.Generator, wall: Wall) -> list[Solid]:
     height = float(wall.profile[:, 1].max())
     heights = height * rng.uniform(0.8, 0.86), height * rng.uniform(0.52, 0.62)
     half = min(0.055 * height, float(np.sqrt(0.6 * wall.thickness_m * wall.radius_at(heights[0]))))
-    (start, stop), out = handle_ends(wall, *heights)
+    start, stop = (wall.middle_at(z) for z in heights)
+    out = [wall.normal_at(z) for z in heights]
     reach = (heights[0] - heights[1]) * rng.uniform(0.6, 1.0)
     path = bezier(start, start + reach * out[0], stop + reach * out[1], stop, 11)
     section = circle(10) * np.array([half, min(0.6 * half, 0.8 * bend_radius(path, (out[0], -out[1])))])

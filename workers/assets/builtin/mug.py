@@ -5,7 +5,7 @@ import numpy as np
 from schemas.base import Array
 from workers.assets.builtin.curves import bezier, fillet, spline, squircle
 from workers.assets.builtin.draws import chance
-from workers.assets.builtin.hollow import OUTSIDE, Wall, handle_ends, wall_around, with_handles
+from workers.assets.builtin.hollow import OUTSIDE, Wall, wall_around, with_handles
 from workers.assets.builtin.materials import metal, solid_color, textured
 from workers.assets.builtin.palette import BLACK, WHITE, Color, glaze_color, ink_on, jitter, mix, pale, vivid
 from workers.assets.builtin.parts import Model, Surface, UvMapping
@@ -62,7 +62,8 @@ def _handle(rng: np.random.Generator, wall: Wall) -> Solid:
     # The end of the rod stays within the wall: half a chord of the wall's circle sinks by w^2 / 2r.
     half_width = min(half_width, float(np.sqrt(0.6 * wall.thickness_m * wall.radius_at(low))))
     slender = rng.uniform(0.5, 0.85)
-    (start, stop), out = handle_ends(wall, high, low)
+    start, stop = wall.middle_at(high), wall.middle_at(low)
+    out = wall.normal_at(high), wall.normal_at(low)
     reach = (high - low) * rng.uniform(0.5, 0.8)
     path = _path(rng, start, out[0], stop, out[1], max(reach, 0.022))
     half_depth = min(half_width * slender, 0.8 * bend_radius(path, (out[0], -out[1])))

@@ -43,6 +43,12 @@ class Model:
     surfaces: tuple[Surface, ...]
 
 
+def over_top(name: str, material: Material, width: float, depth: float) -> Surface:
+    """A surface whose texture lies once over a width x depth, metres, about the z axis, seen from above."""
+    origin = (-width / 2, -depth / 2, 0.0)
+    return Surface(name, material, "plane", origin=origin, across=(width, 0.0, 0.0), up=(0.0, depth, 0.0))
+
+
 _SIDES = (((1, 2), (0, 2), (0, 1)), ((1, 2), (0, 2), (1, 0)), ((2, 1), (2, 0), (0, 1)))
 """u and v for the axis that the grain runs along and the axis that a face looks along."""
 

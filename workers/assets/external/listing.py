@@ -139,9 +139,7 @@ def list_licences(folder: Path) -> list[Path]:
 
 def find_licence(path: Path, folder: Path, stated: str, licences: Collection[Path]) -> str:
     """The stated licence; where none is stated, the nearest licence file from the mesh's folder up to the source's."""
-    if stated == UNKNOWN:
-        for parent in path.parents:
-            for file in licences:
-                if file.parent == parent:
-                    return f"see {file.relative_to(folder).as_posix()}"
+    nearest = (file for parent in path.parents for file in licences if file.parent == parent)
+    if stated == UNKNOWN and (file := next(nearest, None)) is not None:
+        return f"see {file.relative_to(folder).as_posix()}"
     return stated

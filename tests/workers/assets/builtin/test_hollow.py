@@ -35,3 +35,7 @@ def test_a_vessel_stands_on_its_foot_ring_and_holds_what_its_hollow_says():
     assert np.hypot(ring[:, 0], ring[:, 1]).max() == pytest.approx(0.025)
     inside = wall.surface == INSIDE
     assert wall.profile[1:][inside][-1].tolist() == [0.0, 0.01]
+
+
+def test_the_middle_of_a_wall_lies_half_its_thickness_inside():
+    assert beaker().middle_at(0.06) == pytest.approx([0.042, 0.06], abs=1e-5)
