@@ -49,6 +49,18 @@ def declared_counts(kind: str, data: bytes) -> tuple[int, int]:
     return 0, data.count(b"endfacet")
 
 
+def find_inside(root: Path, *candidates: Path) -> Path | None:
+    """The first candidate that is a file below `root`, links followed; None where there is none."""
+    for candidate in candidates:
+        try:
+            path = candidate.resolve()
+            if path.is_relative_to(root) and path.is_file():
+                return path
+        except (OSError, ValueError, RuntimeError):
+            continue
+    return None
+
+
 class FolderResolver(Resolver):
     """Hands trimesh the material files and PNG or JPEG textures of one folder, and nothing else.
 
@@ -78,15 +90,7 @@ class FolderResolver(Resolver):
     def find(self, name: str) -> Path | None:
         """The file of a name, relative to the mesh or else beside it; None where there is none below `root`."""
         name = name.strip().replace("\\", "/")
-        for candidate in (self.folder / name, self.folder / Path(name).name):
-            try:
-                path = candidate.resolve()
-                inside = path.is_relative_to(self.root)
-            except (OSError, ValueError, RuntimeError):
-                continue
-            if inside and path.is_file():
-                return path
-        return None
+        return find_inside(self.root, self.folder / name, self.folder / Path(name).name)
 
     def _refuse(self, name: str, why: str) -> FileNotFoundError:
         self.notes.append(f"{name} {why}: plain base colour used")

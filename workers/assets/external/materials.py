@@ -14,9 +14,9 @@ from schemas.base import Array
 from schemas.scene.shape import Material
 from workers.assets.external.caps import describe_error
 
-BLACK = 0.02
+MIN_TINT = 0.02
 """Darkest base colour that multiplies a texture; below it the colour is an exporter's leftover and is ignored."""
-INVISIBLE = 0.01
+MIN_ALPHA = 0.01
 """Smallest alpha that is believed; below it alpha is 1, because some exporters write opacity inverted."""
 WHITE = Material(base_color=(1.0, 1.0, 1.0, 1.0))
 DEFAULT = Material()
@@ -100,10 +100,10 @@ def _material(source: object, textured: bool) -> tuple[Material, tuple[str, ...]
         roughness = (2.0 / (max(source.glossiness, 0.0) + 2.0)) ** 0.25
     else:
         return DEFAULT, ()
-    if color[3] < INVISIBLE:
+    if color[3] < MIN_ALPHA:
         color[3] = 1.0
         notes.append("an alpha of 0 was read as 1")
-    if texture is not None and color[:3].max() < BLACK:
+    if texture is not None and color[:3].max() < MIN_TINT:
         color[:3] = 1.0
     base = tuple(float(c) for c in np.clip(np.nan_to_num(color, nan=0.7), 0.0, 1.0))
     finite = [float(np.clip(np.nan_to_num(value, nan=0.6), 0.0, 1.0)) for value in (metallic, roughness)]

@@ -13,7 +13,7 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Material, Part, Shape
-from workers.assets.external.caps import check_counts
+from workers.assets.external.caps import check_counts, find_inside
 from workers.assets.external.materials import DEFAULT
 from workers.assets.external.mesh import LoadedMesh, load_shape, transform_shape
 from workers.geometry.frames import pose
@@ -53,14 +53,10 @@ def find_mesh(name: str, urdf: Path, root: Path) -> Path:
     """The file of a mesh name inside `root`; MeshError `missing`."""
     bare = re.sub(r"^(package|file|model)://", "", name.strip().replace("\\", "/"))
     tail = bare.split("/", 1)[-1]
-    for candidate in (urdf.parent / bare, root / bare, root / tail, urdf.parent / tail):
-        try:
-            path = candidate.resolve()
-            if path.is_relative_to(root.resolve()) and path.is_file():
-                return path
-        except (OSError, ValueError, RuntimeError):
-            continue
-    raise MeshError("missing", f"{urdf} names the mesh {name!r}, which is not inside {root}")
+    found = find_inside(root.resolve(), urdf.parent / bare, root / bare, root / tail, urdf.parent / tail)
+    if found is None:
+        raise MeshError("missing", f"{urdf} names the mesh {name!r}, which is not inside {root}")
+    return found
 
 
 def load_urdf(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
