@@ -10,12 +10,13 @@ import trimesh
 from PIL import Image
 
 from schemas.base import Array
-from schemas.job.assets import MeshLimits
+from schemas.job.assets import Assets, FolderSource, MeshLimits
 from schemas.scene.shape import Asset
 from tests.shapes import box
 from tests.workers.assets.oracles import textured_cube, write
+from workers.assets.external.listing import Entry, hash_files
 from workers.assets.external.mesh import load_shape
-from workers.assets.sources import Entry, Placement, SourceShape, Weights, hashed, placed_asset
+from workers.assets.external.placement import Placement, place_asset
 
 SIDE_M = 0.1
 
@@ -25,15 +26,9 @@ def enter(make_file: Callable[[Path], Path], scale: float = 1.0) -> Asset:
     with tempfile.TemporaryDirectory() as folder:
         path = make_file(Path(folder))
         loaded = load_shape(path, MeshLimits())
-        return placed_asset(
-            SourceShape(loaded.shape, loaded.notes),
-            Placement(np.eye(3), scale),
-            entry=Entry("outside", hashed([path], Path(folder)), "CC0-1.0"),
-            category="box",
-            source="urdf",
-            shareable=True,
-            weights=Weights(600.0, 3.0),
-        )
+        entry = Entry("outside", hash_files([path], Path(folder)), "CC0-1.0")
+        settings, assets = FolderSource(source="urdf", folder=".", copy_assets=True), Assets()
+        return place_asset(loaded, Placement(np.eye(3), scale), entry, "box", settings, assets)
 
 
 def obj(vertices: Array, faces: Array, more: str = "") -> Callable[[Path], Path]:

@@ -23,7 +23,8 @@ from schemas.scene.shape import Mesh
 from tests.physics.energy import watched, worst_of
 from tests.physics.room import G
 from tests.physics.settling import recheck, settle_single
-from workers.assets.catalogue import Catalogue, choose_object, choose_table, load_asset, open_catalogue
+from workers.assets.catalogue import Catalogue, open_catalogue
+from workers.assets.step import choose_object, choose_table, load_asset
 from workers.geometry.elevation import heights_at
 from workers.geometry.frames import transform
 from workers.plan.randomness import Stream, stream

@@ -1,4 +1,4 @@
-"""Which assets a job can choose from, and the one place that loads them."""
+"""The catalogue: every asset that a job can choose from."""
 
 import hashlib
 import json
@@ -6,25 +6,15 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job.assets import Assets, FolderSource, ProceduralSource, ShapeNetSource, SplitShares
-from schemas.scene.shape import Asset
-from workers.assets.builtin.make import VERSION, instance_id, make_asset
-from workers.assets.cache import AssetCache
-from workers.assets.external.folder import list_folder, load_folder_entry, locate_folder
-from workers.assets.external.shapenet import list_shapenet, load_shapenet
-from workers.assets.sources import TABLE, Entry, Listing, Weights
+from schemas.job.assets import Assets, ProceduralSource, SplitShares
+from workers.assets.builtin.make import VERSION
+from workers.assets.categories import TABLE
+from workers.assets.external.listing import Listing
+from workers.assets.sources import AnySource, count_instances, list_source, load_instance, name_instance
 
-AnySource = ProceduralSource | ShapeNetSource | FolderSource
-
-SELDOM_AGAIN = 10_000
-"""Of more instances than this hardly one comes again: keeping them fills a worker's memory and saves nothing."""
-CACHE_BYTES = 256 * 1024 * 1024
-"""How much memory the assets that a process keeps at hand may take."""
 PROBES = 3
-"""Meshes of a source and category that are tried when a catalogue is opened; if none can be read, it cannot be used."""
+"""Meshes of a source and category that are loaded to test it when a catalogue is opened; one must be usable."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +29,7 @@ class InstanceRef:
 
 @dataclass(frozen=True)
 class Catalogue:
-    """What a job can choose from. It pickles small and needs no files to choose, only to load.
+    """Every asset that a job can choose from. It pickles small; choosing needs no files, loading does.
 
     objects, tables: a listing for each source, None for a procedural one; skipped: how many instances were left out,
     by source folder and reason; digest: SHA-256 of everything that the choice and the shapes depend on.
@@ -53,31 +43,34 @@ class Catalogue:
 
     def offers(self, category: str) -> list[tuple[int, AnySource, int]]:
         """Number, settings and count of instances of every source that has this category."""
-        sources, listings = (
-            (self.assets.tables, self.tables) if category == TABLE else (self.assets.objects, self.objects)
-        )
         counted = [
-            (number, settings, _count(settings, listing, category))
-            for number, (settings, listing) in enumerate(zip(sources, listings, strict=True))
+            (number, settings, count_instances(settings, listing, category))
+            for number, (settings, listing) in enumerate(self._sources(category))
         ]
         return [offer for offer in counted if offer[2]]
 
+    def source(self, number: int, category: str) -> tuple[AnySource, Listing | None]:
+        """Settings and listing of a source, by its number among those of objects or of tables."""
+        return self._sources(category)[number]
 
-def _count(settings: AnySource, listing: Listing | None, category: str) -> int:
-    if isinstance(settings, ProceduralSource):
-        return settings.instances
-    return len(listing.entries.get(category, ())) if listing is not None else 0
+    def refer(self, number: int, category: str, index: int) -> InstanceRef:
+        """Instance `index` of a category in a source."""
+        return InstanceRef(number, category, index, name_instance(*self.source(number, category), category, index))
+
+    def _sources(self, category: str) -> list[tuple[AnySource, Listing | None]]:
+        if category == TABLE:
+            return list(zip(self.assets.tables, self.tables, strict=True))
+        return list(zip(self.assets.objects, self.objects, strict=True))
 
 
 def open_catalogue(assets: Assets, job_folder: Path, categories: Collection[str]) -> Catalogue:
-    """Looks into every source now; raises AssetSourceError where a folder or a category cannot be served.
+    """Lists every source; raises AssetSourceError where a folder cannot be used or no source has a category.
 
     Cost: every mesh and texture of the categories asked for is read to hash it, about two seconds a gigabyte where
     disks allow; nothing for procedural sources. Workers take the opened catalogue and read only what they load.
     """
-    listed: dict[str, Listing | None] = {}
-    objects = tuple(_listing(source, job_folder, categories, assets, listed) for source in assets.objects)
-    tables = tuple(_listing(source, job_folder, (TABLE,), assets, listed) for source in assets.tables)
+    objects = tuple(list_source(source, job_folder, categories, assets.limits) for source in assets.objects)
+    tables = tuple(list_source(source, job_folder, (TABLE,), assets.limits) for source in assets.tables)
     _refuse_ambiguous(assets)
     skipped = {str(x.folder): dict(x.skipped) for x in (*objects, *tables) if x is not None and x.skipped}
     digest = _digest(assets, objects, tables, categories)
@@ -87,29 +80,8 @@ def open_catalogue(assets: Assets, job_folder: Path, categories: Collection[str]
     return catalogue
 
 
-def _listing(
-    settings: AnySource,
-    job_folder: Path,
-    categories: Collection[str],
-    assets: Assets,
-    listed: dict[str, Listing | None],
-) -> Listing | None:
-    """The listing of one source; the same source twice is read once."""
-    key = f"{settings.model_dump_json()} {sorted(categories)}"
-    if key not in listed:
-        if isinstance(settings, ProceduralSource):
-            listed[key] = None
-        elif isinstance(settings, ShapeNetSource):
-            folder = (job_folder / Path(settings.folder).expanduser()).resolve()
-            listed[key] = list_shapenet(settings, folder, categories, assets.limits)
-        else:
-            folder = locate_folder(settings.folder, job_folder)
-            listed[key] = list_folder(settings, folder, categories, assets.limits)
-    return listed[key]
-
-
 def _refuse_ambiguous(assets: Assets) -> None:
-    """Two procedural sources of one seed and different sizes would give one id to two shapes."""
+    """AssetSourceError for two procedural sources of one seed and different sizes: they would give one id to two shapes."""
     sizes: dict[int, tuple[str, float]] = {}
     for source in assets.objects:
         if isinstance(source, ProceduralSource):
@@ -148,9 +120,8 @@ def _probe(catalogue: Catalogue, number: int, category: str, count: int) -> None
     """AssetSourceError where the first few meshes of a source are all refused."""
     errors = []
     for index in range(min(PROBES, count)):
-        ref = _ref(catalogue, number, category, index)
         try:
-            load_asset(catalogue, ref)
+            load_instance(*catalogue.source(number, category), category, index, catalogue.assets)
             return
         except MeshError as error:
             errors.append(str(error))
@@ -163,7 +134,7 @@ def _digest(
     """SHA-256 over the settings of every source and, for files, what was found: paths, sizes and digests."""
     record = []
     for settings, listing in zip((*assets.objects, *assets.tables), (*objects, *tables), strict=True):
-        # Where a folder lies is not what is in it: the same files elsewhere are the same catalogue.
+        # The folder's path is left out: the same files elsewhere are the same catalogue.
         plain = settings.model_dump(mode="json", exclude={"folder"})
         files = None
         if listing is not None:
@@ -172,70 +143,9 @@ def _digest(
                 for category, entries in listing.entries.items()
             }
         record.append({"settings": plain, "generator": VERSION if listing is None else None, "files": files})
-    whole = {"sources": record, "objects": len(objects), "categories": sorted(categories), "assets": _scalars(assets)}
+    scalars = assets.model_dump(mode="json", exclude={"objects", "tables"})
+    whole = {"sources": record, "objects": len(objects), "categories": sorted(categories), "assets": scalars}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
-
-
-def _scalars(assets: Assets) -> dict[str, object]:
-    return assets.model_dump(mode="json", exclude={"objects", "tables"})
-
-
-def choose_object(catalogue: Catalogue, category: str, rng: np.random.Generator) -> InstanceRef:
-    """An instance of the category: a source by weight among those that have it, then any of its instances alike."""
-    offers = catalogue.offers(category)
-    if not offers:
-        raise AssetSourceError(f"no source offers {category!r}")
-    share = float(rng.random()) * sum(settings.weight for _, settings, _ in offers)
-    chosen = offers[-1]
-    for offer in offers:
-        share -= offer[1].weight
-        if share < 0.0:
-            chosen = offer
-            break
-    return _ref(catalogue, chosen[0], category, int(rng.integers(chosen[2])))
-
-
-def choose_table(catalogue: Catalogue, rng: np.random.Generator) -> InstanceRef:
-    """A table, chosen as objects are."""
-    return choose_object(catalogue, TABLE, rng)
-
-
-def _ref(catalogue: Catalogue, number: int, category: str, index: int) -> InstanceRef:
-    settings, listing = _source(catalogue, number, category)
-    if isinstance(settings, ProceduralSource):
-        return InstanceRef(number, category, index, instance_id(category, settings.seed, index))
-    assert listing is not None
-    return InstanceRef(number, category, index, listing.entries[category][index].instance_id)
-
-
-def _source(catalogue: Catalogue, number: int, category: str) -> tuple[AnySource, Listing | None]:
-    if category == TABLE:
-        return catalogue.assets.tables[number], catalogue.tables[number]
-    return catalogue.assets.objects[number], catalogue.objects[number]
-
-
-def load_asset(catalogue: Catalogue, ref: InstanceRef) -> Asset:
-    """The asset, from this process's cache if it is there; MeshError where its mesh is refused."""
-    settings, _ = _source(catalogue, ref.source, ref.category)
-    if isinstance(settings, ProceduralSource) and settings.instances > SELDOM_AGAIN:
-        return _load(catalogue, ref)
-    return _cache.get((catalogue.digest, ref), lambda: _load(catalogue, ref))
-
-
-_cache = AssetCache(CACHE_BYTES)
-
-
-def _load(catalogue: Catalogue, ref: InstanceRef) -> Asset:
-    settings, listing = _source(catalogue, ref.source, ref.category)
-    assets = catalogue.assets
-    if isinstance(settings, ProceduralSource):
-        return make_asset(ref.category, settings, ref.index, assets.density_kg_m3)
-    assert listing is not None
-    entry: Entry = listing.entries[ref.category][ref.index]
-    weights = Weights(assets.density_kg_m3, assets.shell_kg_m2)
-    if isinstance(settings, ShapeNetSource):
-        return load_shapenet(settings, listing, entry, ref.category, assets.limits, weights)
-    return load_folder_entry(settings, listing, entry, ref.category, assets.limits, weights)
 
 
 def split_of(instance: str, shares: SplitShares) -> str:

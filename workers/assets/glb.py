@@ -1,8 +1,8 @@
 """Pure: an asset as one binary glTF 2.0 file, the same bytes for the same asset.
 
 Coordinates are written as they are, in the object frame: metres, **z up**, where glTF viewers expect y up. The file
-says so in `asset.extras`. Written by hand because it is short, and because an exporter that orders parts and
-compresses pictures as it likes cannot promise bytes; the tests read it back with trimesh.
+says so in `asset.extras`. Written by hand because it is short, and because other exporters do not promise the
+order of parts or the compression of images, hence no bytes; the tests read it back with trimesh.
 """
 
 import io
@@ -21,31 +21,31 @@ from workers.assets.external.materials import linear_from_srgb
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 PNG_LEVEL = 1
-"""Pictures are small and often written: more effort saves a third of their size and costs four times the time."""
+"""Textures are small and written often: the highest level saves a third of their size and costs four times the time."""
 
-EncodePicture = Callable[[NDArray[np.uint8]], bytes]
+EncodeImage = Callable[[NDArray[np.uint8]], bytes]
 """A PNG of [h, w, 3 or 4] uint8."""
 
 
 def encode_with_pillow(pixels: NDArray[np.uint8]) -> bytes:
-    """The PNG of a picture with or without alpha."""
+    """The PNG of an image with or without alpha."""
     stream = io.BytesIO()
     Image.fromarray(np.asarray(pixels)).save(stream, "PNG", compress_level=PNG_LEVEL)
     return stream.getvalue()
 
 
 class _Writer:
-    """Collects buffer views, accessors and pictures in the order in which they come."""
+    """Collects buffer views, accessors and images in the order of the calls."""
 
-    def __init__(self, encode_opaque: EncodePicture) -> None:
+    def __init__(self, encode_opaque: EncodeImage) -> None:
         self._encode_opaque = encode_opaque
         self.binary = bytearray()
         self.views: list[dict[str, Any]] = []
         self.accessors: list[dict[str, Any]] = []
         self.images: list[dict[str, Any]] = []
-        self._pictures: dict[int, int] = {}
+        self._numbers: dict[int, int] = {}
 
-    def view(self, data: bytes, target: int | None = None) -> int:
+    def add_view(self, data: bytes, target: int | None = None) -> int:
         """The number of a new buffer view on these bytes."""
         self.binary += b"\0" * (-len(self.binary) % 4)
         view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data)}
@@ -53,27 +53,27 @@ class _Writer:
         self.binary += data
         return len(self.views) - 1
 
-    def accessor(self, array: NDArray, kind: str, component: int, target: int = _ARRAY_BUFFER, **more: Any) -> int:
+    def add_accessor(self, array: NDArray, kind: str, component: int, target: int = _ARRAY_BUFFER, **more: Any) -> int:
         """The number of a new accessor on an array, one row an element."""
-        view = self.view(np.ascontiguousarray(array).tobytes(), target)
+        view = self.add_view(np.ascontiguousarray(array).tobytes(), target)
         self.accessors.append(
             {"bufferView": view, "componentType": component, "count": len(array), "type": kind} | more
         )
         return len(self.accessors) - 1
 
-    def picture(self, pixels: NDArray[np.uint8]) -> int:
+    def add_texture(self, pixels: NDArray[np.uint8]) -> int:
         """The number of a texture [h, w, 3 or 4]; parts that share the array share the texture."""
-        if id(pixels) not in self._pictures:
+        if id(pixels) not in self._numbers:
             png = self._encode_opaque(pixels) if pixels.shape[2] == 3 else encode_with_pillow(pixels)
-            self._pictures[id(pixels)] = len(self.images)
-            self.images.append({"bufferView": self.view(png), "mimeType": "image/png"})
-        return self._pictures[id(pixels)]
+            self._numbers[id(pixels)] = len(self.images)
+            self.images.append({"bufferView": self.add_view(png), "mimeType": "image/png"})
+        return self._numbers[id(pixels)]
 
 
-def asset_glb(asset: Asset, encode_opaque: EncodePicture = encode_with_pillow) -> bytes:
+def asset_glb(asset: Asset, encode_opaque: EncodeImage = encode_with_pillow) -> bytes:
     """The asset's shape with its materials: positions and normals float32, one primitive for each part.
 
-    `encode_opaque` makes the PNGs of pictures without alpha.
+    `encode_opaque` makes the PNGs of images without alpha.
     """
     writer = _Writer(encode_opaque)
     materials = [_material(writer, part, asset.watertight) for part in asset.shape.parts]
@@ -114,7 +114,7 @@ def _container(text: bytes, binary: bytes) -> bytes:
 
 
 def _material(writer: _Writer, part: Part, watertight: bool) -> dict[str, Any]:
-    """glTF's colour factors are linear, ours sRGB; pictures are sRGB in both."""
+    """glTF's colour factors are linear, ours sRGB; textures are sRGB in both."""
     material = part.material
     rgb = [float(c) for c in linear_from_srgb(np.array(material.base_color[:3]))]
     rough: dict[str, Any] = {
@@ -124,7 +124,7 @@ def _material(writer: _Writer, part: Part, watertight: bool) -> dict[str, Any]:
     }
     see_through = material.base_color[3] < 1.0
     if material.texture is not None and part.uv is not None:
-        rough["baseColorTexture"] = {"index": writer.picture(material.texture)}
+        rough["baseColorTexture"] = {"index": writer.add_texture(material.texture)}
         see_through |= material.texture.shape[2] == 4
     result: dict[str, Any] = {"name": part.name, "pbrMetallicRoughness": rough}
     return result | ({"alphaMode": "BLEND"} if see_through else {}) | ({} if watertight else {"doubleSided": True})
@@ -133,18 +133,18 @@ def _material(writer: _Writer, part: Part, watertight: bool) -> dict[str, Any]:
 def _primitive(writer: _Writer, part: Part, material: int) -> dict[str, Any]:
     positions = part.vertices.astype("<f4")
     bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
-    attributes = {"POSITION": writer.accessor(positions, "VEC3", _FLOAT, **bounds)}
+    attributes = {"POSITION": writer.add_accessor(positions, "VEC3", _FLOAT, **bounds)}
     if part.normals is not None:
-        attributes["NORMAL"] = writer.accessor(part.normals.astype("<f4"), "VEC3", _FLOAT)
+        attributes["NORMAL"] = writer.add_accessor(part.normals.astype("<f4"), "VEC3", _FLOAT)
     if part.uv is not None:
         flipped = np.stack([part.uv[:, 0], 1.0 - part.uv[:, 1]], axis=1)  # glTF's v runs down
-        attributes["TEXCOORD_0"] = writer.accessor(flipped.astype("<f4"), "VEC2", _FLOAT)
+        attributes["TEXCOORD_0"] = writer.add_accessor(flipped.astype("<f4"), "VEC2", _FLOAT)
     if part.colors is not None:
         color = part.colors / 255.0
         color[:, :3] = linear_from_srgb(color[:, :3])
         shorts = np.round(65535.0 * color).astype("<u2")
-        attributes["COLOR_0"] = writer.accessor(shorts, "VEC4", _USHORT, normalized=True)
+        attributes["COLOR_0"] = writer.add_accessor(shorts, "VEC4", _USHORT, normalized=True)
     small = len(part.vertices) <= 65535
     index = part.faces.ravel().astype("<u2" if small else "<u4")
-    indices = writer.accessor(index, "SCALAR", _USHORT if small else _UINT, _ELEMENT_BUFFER)
+    indices = writer.add_accessor(index, "SCALAR", _USHORT if small else _UINT, _ELEMENT_BUFFER)
     return {"attributes": attributes, "indices": indices, "material": material}

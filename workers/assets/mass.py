@@ -21,7 +21,7 @@ def mass_properties(shape: Shape, density_kg_m3: float, shell_kg_m2: float) -> M
 
 
 def solid_mass(vertices: Array, faces: np.ndarray, density_kg_m3: float) -> MassProperties:
-    """Of the volume inside a closed, outward-wound mesh, kilograms and metres.
+    """Mass properties of the volume inside a closed, outward-wound mesh, kilograms and metres.
 
     Sums signed tetrahedra from the middle of the bounding box to each triangle (a, b, c), with s = a + b + c:
     volume det/6, first moment det/24 s, second moment det/120 (a a^T + b b^T + c c^T + s s^T)
@@ -35,7 +35,7 @@ def solid_mass(vertices: Array, faces: np.ndarray, density_kg_m3: float) -> Mass
 
 
 def shell_mass(vertices: Array, faces: np.ndarray, shell_kg_m2: float) -> MassProperties:
-    """Of a thin shell of even surface density, kilograms and metres; both sides of a face count once.
+    """Mass properties of a thin shell of uniform surface density, kilograms and metres; both sides of a face count once.
 
     For a triangle (a, b, c) of area A, with s = a + b + c: first moment A/3 s, second moment
     A/12 (a a^T + b b^T + c c^T + s s^T), from the barycentric integrals of 1, u, u^2 and u v

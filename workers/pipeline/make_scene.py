@@ -15,7 +15,7 @@ from schemas.scene.plan import ScenePlan
 from schemas.scene.region import REGION_FLOOR, REGION_TABLE
 from schemas.scene.scene import Placed, PosedScene, Settled
 from schemas.scene.view import GBuffer, ObjectLabel, Pair, View
-from workers.assets.catalogue import choose_object, choose_table, load_asset
+from workers.assets.step import choose_object, choose_table, load_asset
 from workers.cameras.pivot_depth import object_distance
 from workers.cameras.placement import place_aligned_camera, place_mirror_camera
 from workers.geometry.pixels import measure_regions

@@ -13,7 +13,7 @@ from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.plan import ObjectStart, ScenePlan, Table
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.shape import Asset, Hull, Mesh
-from workers.assets.appearance.draw import draw_look
+from workers.assets.appearance.draw import draw_appearance
 from workers.geometry.camera import orbit_pose
 from workers.geometry.elevation import heights_at
 from workers.geometry.frames import (
@@ -54,7 +54,7 @@ def plan_scene(job: Job, scene_id: int, table_asset: Asset, *assets: Asset) -> S
     table = place_table(table_asset)
     rng = stream(job.seed, scene_id, Stream.CAMERA)
     centre = np.array([0.0, 0.0, table.top.height_m])
-    floor, appearance = draw_look(stream(job.seed, scene_id, Stream.APPEARANCE), job.render.tier)
+    floor, appearance = draw_appearance(stream(job.seed, scene_id, Stream.APPEARANCE), job.render.tier)
     objects: tuple[ObjectStart, ...] = ()
     for asset in assets:
         objects += (draw_start(job, scene_id, asset, table, objects),)

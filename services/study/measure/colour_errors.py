@@ -17,7 +17,7 @@ from schemas.scene.scene import Placed
 from services.study.measure.flip import flip_between
 from services.study.measure.patch_rays import cast_patch
 from services.study.measure.rays import Box
-from workers.assets.appearance.draw import draw_look
+from workers.assets.appearance.draw import draw_appearance
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene
 from workers.plan.randomness import Stream, stream
@@ -136,7 +136,7 @@ def crop_colour(rgb: NDArray[np.uint8], crop: Crop) -> NDArray[np.uint8]:
 def _in_studio(context: WorkerContext, scene: Scene) -> tuple[Sequence[Placed], Appearance]:
     """The scene's things and light as tier pathtraced draws them: flat scenes have another floor and other lights."""
     rng = stream(context.job.seed, scene.plan.scene_id, Stream.APPEARANCE)
-    floor, appearance = draw_look(rng, "pathtraced")
+    floor, appearance = draw_appearance(rng, "pathtraced")
     things = tuple(
         Placed(thing.region_id, floor, thing.T_world_shape) if thing.region_id == REGION_FLOOR else thing
         for thing in scene.posed.things

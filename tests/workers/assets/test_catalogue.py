@@ -12,7 +12,8 @@ from schemas.errors import AssetSourceError, MeshError
 from schemas.job.assets import Assets, FolderSource, ProceduralSource, ShapeNetSource, SplitShares
 from schemas.job.job import CATEGORIES
 from tests.workers.assets.oracles import CUBE, write
-from workers.assets.catalogue import choose_object, choose_table, load_asset, open_catalogue, split_of
+from workers.assets.catalogue import open_catalogue, split_of
+from workers.assets.step import choose_object, choose_table, load_asset
 
 BUILT_IN = ProceduralSource(source="procedural")
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -143,7 +144,7 @@ def test_an_opened_catalogue_travels_small_and_loads_the_same_asset_in_another_p
     assert len(data) < 5000
     write(tmp_path / "catalogue.pkl", data)
     code = (
-        "import pickle, sys; from workers.assets.catalogue import load_asset; "
+        "import pickle, sys; from workers.assets.step import load_asset; "
         "print(load_asset(*pickle.load(open(sys.argv[1], 'rb'))).sha256)"
     )
     command = [sys.executable, "-c", code, str(tmp_path / "catalogue.pkl")]
@@ -171,13 +172,3 @@ def test_instances_fall_into_splits_by_their_shares_and_stay_there():
         assert splits.count(name) == pytest.approx(expected, abs=330)
     assert split_of("mug-0-000123", shares) == split_of("mug-0-000123", shares)
     assert {split_of(name, SplitShares(train=0, val=0, test=1)) for name in ids[:100]} == {"test"}
-
-
-@pytest.mark.parametrize(("instances", "kept"), [(1_000_000, False), (100, True)])
-def test_shapes_of_which_hardly_one_comes_again_are_not_kept(tmp_path, instances, kept):
-    source = ProceduralSource(source="procedural", instances=instances)
-    catalogue = open_catalogue(Assets(objects=(source,), tables=(source,)), tmp_path, ("mug",))
-    ref = choose_object(catalogue, "mug", np.random.default_rng(1))
-    first, second = load_asset(catalogue, ref), load_asset(catalogue, ref)
-    assert (first is second) == kept
-    assert first.sha256 == second.sha256

@@ -11,7 +11,7 @@ from schemas.job.assets import ProceduralSource
 from schemas.scene.shape import Loft, Mesh
 from workers.assets.builtin.make import make_asset
 from workers.assets.builtin.solid import circle, difference, lathe, union
-from workers.assets.builtin.vessel import prism
+from workers.assets.builtin.sweeps import prism
 from workers.geometry.convexity import solid_of, weld
 from workers.geometry.lathe_decomposition import COARSE, parts_of_lofts
 from workers.geometry.nearest import nearest_on_mesh

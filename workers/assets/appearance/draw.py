@@ -1,4 +1,4 @@
-"""What only colour depends on, drawn from one stream: the floor's surface, the background and the light."""
+"""Draws the appearance of a scene from one stream: the floor's material, the background and the lights."""
 
 import math
 
@@ -8,23 +8,22 @@ from schemas.base import Array, frozen_array
 from schemas.job.render import Tier
 from schemas.scene.appearance import Appearance, Light
 from schemas.scene.shape import Material, Part, Shape
-from workers.assets.appearance.floors import draw_covering
+from workers.assets.appearance.floors import draw_floor_material
 
 FLOOR_HALF_M = 30.0
 """Half the floor's side. The lowest ray of an input camera (0.7 rad less half the field of view) meets the floor some
 11 m away, a corner ray at 13 m."""
 
 ALBEDO_IN_LIGHT = 0.95
-"""How much light a level white surface gets in the middle of a scene, key and rest together: just within the picture."""
+"""Light on a level white surface in the middle of a scene, from all lights together: just below what clips."""
 
 
-def draw_look(rng: np.random.Generator, tier: Tier) -> tuple[Shape, Appearance]:
-    """(the floor, the light and background) of a scene. The floor's geometry is the same whatever is drawn."""
+def draw_appearance(rng: np.random.Generator, tier: Tier) -> tuple[Shape, Appearance]:
+    """The floor, and the lights and background, of a scene. The floor's geometry never changes."""
     if tier == "flat":
         return _floor(_plain_material(rng)), _two_lights(rng)
-    covering = draw_covering(rng)
-    material = Material((*covering.color, 1.0), 0.0, covering.roughness, covering.picture)
-    return _floor(material, _laid(rng, covering.period_m)), _studio(rng)
+    material, period_m = draw_floor_material(rng)
+    return _floor(material, _floor_uv(rng, period_m)), _studio(rng)
 
 
 _CORNERS = frozen_array(
@@ -38,8 +37,8 @@ def _floor(material: Material, uv: Array | None = None) -> Shape:
     return Shape((Part("floor", _CORNERS, _FACES, material, uv=uv),))
 
 
-def _laid(rng: np.random.Generator, period_m: float) -> Array:
-    """uv [4, 2] of the floor's corners: its pattern is turned and shifted by chance."""
+def _floor_uv(rng: np.random.Generator, period_m: float) -> Array:
+    """uv [4, 2] of the floor's corners, at a random angle and offset."""
     angle, shift = rng.uniform(-math.pi, math.pi), rng.random(2)
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     return frozen_array(_CORNERS[:, :2] @ turn.T / period_m + shift)
@@ -66,7 +65,7 @@ def _two_lights(rng: np.random.Generator) -> Appearance:
 
 
 def _studio(rng: np.random.Generator) -> Appearance:
-    """A key light from 40 to 80 degrees above the horizon, none to two weak ones, a sky of another tint, a room around."""
+    """A key light 40 to 80 degrees above the horizon, up to two fill lights, and a sky and ground of other tints."""
     azimuth, elevation = rng.uniform(-math.pi, math.pi), rng.uniform(0.7, 1.4)
     key_share, warmth, total = rng.uniform(0.5, 0.72), rng.uniform(-0.06, 0.1), rng.uniform(0.8, 1.05)
     fills = int(rng.integers(0, 3))
@@ -88,7 +87,7 @@ def _studio(rng: np.random.Generator) -> Appearance:
 
 
 def _tint(level: float, warmth: float) -> tuple[float, float, float]:
-    """Linear RGB of this level in the middle, redder where warmth is positive and bluer where it is negative."""
+    """Linear RGB with this level of green, redder where warmth is positive and bluer where it is negative."""
     return (level * (1.0 + warmth), level, level * (1.0 - 1.5 * warmth))
 
 

@@ -1,8 +1,8 @@
-"""Floor coverings: a fixed collection of patterns, and what a scene makes of one of them.
+"""Floor materials: a fixed collection of repeating textures, each tinted by the scene.
 
-A pattern is a square picture [N, N, 3] uint8 sRGB that repeats. It holds shades alone, its lightest about white: the
-scene's colour multiplies it (`Material.base_color`), and the scene lays it at its own scale, angle and offset. So a
-process makes each picture once, and may hand the same array to a renderer again and again.
+A texture is a square [N, N, 3] uint8 sRGB that repeats. It holds shades alone, its lightest about white: the scene's
+colour multiplies it (`Material.base_color`), and the scene maps it at its own scale, angle and offset. So a process makes
+each texture once and hands the same array to the renderer again.
 """
 
 import functools
@@ -14,69 +14,62 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.scene.shape import Material
+
 TEXTURE_PX = 512
 PERIOD_M = (2.6, 4.2)
 """After how many metres a pattern repeats: more than a camera of the default orbit sees of the floor nearby."""
 
-Picture: TypeAlias = NDArray[np.uint8]
+Texture: TypeAlias = NDArray[np.uint8]
 Plane: TypeAlias = NDArray[np.float32]
 Color: TypeAlias = tuple[float, float, float]
 
 _SEED = 48_271
-"""Of the collection, which is the same in every dataset."""
+"""Seed of the collection, which is the same in every dataset."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """A picture [N, N, 3] uint8 sRGB, read-only, and the shade that its white stands for: more than 1 where it is lit."""
+    """A texture [N, N, 3] uint8 sRGB, read-only, and the shade that its white stands for."""
 
-    picture: Picture
+    texture: Texture
     white: float
 
 
-@dataclass(frozen=True, eq=False)
-class Covering:
-    """A floor's surface: its picture, its colour (sRGB, multiplies the picture), roughness, and period in metres."""
-
-    picture: Picture
-    color: Color
-    roughness: float
-    period_m: float
-
-
 @dataclass(frozen=True)
-class Kind:
-    """One kind of covering: how a pattern is drawn, how many the collection has, and colour and roughness of a floor."""
+class FloorKind:
+    """One kind of floor: how its shades are drawn, how many patterns the collection has, and its colour and roughness."""
 
-    paint: Callable[[np.random.Generator], Sequence[Plane]]
+    draw_shades: Callable[[np.random.Generator], Sequence[Plane]]
     patterns: int
     color: Callable[[np.random.Generator], NDArray[np.float64]]
     roughness: tuple[float, float]
 
 
-def draw_covering(rng: np.random.Generator) -> Covering:
-    """One of the patterns in a colour of its kind."""
-    number = int(rng.integers(len(COVERINGS)))
-    kind = COVERINGS[number]
-    pattern = pattern_of(number, int(rng.integers(kind.patterns)))
+def draw_floor_material(rng: np.random.Generator) -> tuple[Material, float]:
+    """One of the textures in a colour of its kind, and after how many metres it repeats."""
+    number = int(rng.integers(len(FLOOR_KINDS)))
+    kind = FLOOR_KINDS[number]
+    pattern = make_pattern(number, int(rng.integers(kind.patterns)))
     r, g, b = (float(c) for c in np.clip(pattern.white * kind.color(rng), 0.0, 1.0))
-    return Covering(pattern.picture, (r, g, b), float(rng.uniform(*kind.roughness)), float(rng.uniform(*PERIOD_M)))
+    material = Material((r, g, b, 1.0), roughness=rng.uniform(*kind.roughness), texture=pattern.texture)
+    return material, rng.uniform(*PERIOD_M)
 
 
-@functools.cache  # bounded: `Kind.patterns` of each kind, 768 KiB a picture
-def pattern_of(kind: int, number: int) -> Pattern:
-    """Pattern `number` of a kind of `COVERINGS`; every call gives the same array."""
+@functools.cache  # bounded: `FloorKind.patterns` of each kind, 768 KiB a texture
+def make_pattern(kind: int, number: int) -> Pattern:
+    """Pattern `number` of a kind of `FLOOR_KINDS`; every call gives the same array."""
     rng = np.random.default_rng(np.random.SeedSequence(_SEED, spawn_key=(kind, number)))
-    planes = COVERINGS[kind].paint(rng)
+    planes = FLOOR_KINDS[kind].draw_shades(rng)
     white = max(float(plane.max()) for plane in planes)
     shades = [np.rint(plane * np.float32(255.0 / white)).astype(np.uint8) for plane in planes]
-    picture = np.asarray(cv2.merge(shades if len(shades) == 3 else shades * 3), np.uint8)
-    picture.setflags(write=False)
-    return Pattern(picture, white)
+    texture = np.asarray(cv2.merge(shades if len(shades) == 3 else shades * 3), np.uint8)
+    texture.setflags(write=False)
+    return Pattern(texture, white)
 
 
 def _planks(rng: np.random.Generator) -> Sequence[Plane]:
-    """Boards of one width in rows, each row shifted, grain along them; some a little redder than others: R, G, B."""
+    """Planes R, G, B of boards of one width in shifted rows, with grain along them, some redder than others."""
     rows, length = int(rng.integers(16, 29)), int(rng.integers(2, 4))
     row, across = _cells(rows)
     shift = rng.random(rows)
@@ -92,7 +85,7 @@ def _planks(rng: np.random.Generator) -> Sequence[Plane]:
 
 
 def _tiles(rng: np.random.Generator) -> Sequence[Plane]:
-    """Square tiles with joints, each a little different; at times two shades in turn."""
+    """Square tiles with joints, each of a slightly different shade; some as a checkerboard."""
     count = int(rng.choice([6, 8, 10, 12, 16]))
     cell, at = _cells(count)
     tone = rng.uniform(0.94, 1.04, (count, count)).astype(np.float32)
@@ -111,7 +104,7 @@ def _concrete(rng: np.random.Generator) -> Sequence[Plane]:
 
 
 def _carpet(rng: np.random.Generator) -> Sequence[Plane]:
-    """Fine pile, a little lighter and darker where it was trodden on."""
+    """Fine pile, lighter and darker in worn patches."""
     return [np.float32(1.0) + _noise(rng, 256, 256, 0.08) + _noise(rng, 128, 128, 0.04) + _noise(rng, 8, 8, 0.03)]
 
 
@@ -120,8 +113,8 @@ def _plain(rng: np.random.Generator) -> Sequence[Plane]:
     return [np.float32(1.0) + _noise(rng, 8, 8, 0.02)]
 
 
-def _of(*colors: Color) -> Callable[[np.random.Generator], NDArray[np.float64]]:
-    """One of the colours, a little lighter or darker, redder or bluer."""
+def _one_of(*colors: Color) -> Callable[[np.random.Generator], NDArray[np.float64]]:
+    """Draws one of the colours, varied in lightness and warmth."""
     return lambda rng: (
         np.array(colors[int(rng.integers(len(colors)))])
         * rng.uniform(0.88, 1.12)
@@ -130,7 +123,7 @@ def _of(*colors: Color) -> Callable[[np.random.Generator], NDArray[np.float64]]:
 
 
 def _grey(low: float, high: float, warmth: float) -> Callable[[np.random.Generator], NDArray[np.float64]]:
-    """A grey from `low` to `high`, redder or bluer by at most `warmth`."""
+    """Draws a grey from `low` to `high`, redder or bluer by at most `warmth`."""
     return lambda rng: rng.uniform(low, high) + rng.uniform(-warmth, warmth) * _WARM
 
 
@@ -138,30 +131,30 @@ _WARM = np.array([1.0, 0.0, -1.0])
 _WOODS = ((0.66, 0.5, 0.34), (0.5, 0.36, 0.24), (0.74, 0.63, 0.48), (0.36, 0.27, 0.2), (0.62, 0.58, 0.52))
 _CLAYS = ((0.78, 0.76, 0.72), (0.6, 0.6, 0.6), (0.66, 0.45, 0.36), (0.82, 0.8, 0.74), (0.42, 0.46, 0.5))
 
-COVERINGS: Sequence[Kind] = (
-    Kind(_planks, 12, _of(*_WOODS), (0.8, 0.9)),
-    Kind(_tiles, 12, _of(*_CLAYS), (0.8, 0.9)),
-    Kind(_concrete, 6, _grey(0.4, 0.7, 0.03), (0.9, 0.9)),
-    Kind(_carpet, 6, lambda rng: rng.uniform(0.3, 0.54, 3), (1.0, 1.0)),
-    Kind(_plain, 4, _grey(0.35, 0.75, 0.08), (0.85, 0.85)),
+FLOOR_KINDS: Sequence[FloorKind] = (
+    FloorKind(_planks, 12, _one_of(*_WOODS), (0.8, 0.9)),
+    FloorKind(_tiles, 12, _one_of(*_CLAYS), (0.8, 0.9)),
+    FloorKind(_concrete, 6, _grey(0.4, 0.7, 0.03), (0.9, 0.9)),
+    FloorKind(_carpet, 6, lambda rng: rng.uniform(0.3, 0.54, 3), (1.0, 1.0)),
+    FloorKind(_plain, 4, _grey(0.35, 0.75, 0.08), (0.85, 0.85)),
 )
 
 
 def _cells(count: int) -> tuple[NDArray[np.int64], Plane]:
-    """For each of N pixels in a row: which of `count` cells it lies in, and where in it, in [0, 1)."""
+    """The cell of `count` that each of N pixels lies in, and its place in the cell, in [0, 1)."""
     at = np.arange(TEXTURE_PX) * count / TEXTURE_PX
     cell = at.astype(np.int64)
     return cell, (at - cell).astype(np.float32)
 
 
 def _noise(rng: np.random.Generator, across: int, down: int, size: float) -> Plane:
-    """[N, N] within about +- size: values on a lattice of across x down cells (powers of 2), smooth between, repeating."""
+    """[N, N] repeating value noise of about +- size, smooth on a lattice of across x down cells (powers of 2)."""
     lattice = (rng.random((across, down), dtype=np.float32) * np.float32(2.0) - np.float32(1.0)) * np.float32(size)
-    return _stretch(np.ascontiguousarray(_stretch(lattice).T))
+    return _interpolate(np.ascontiguousarray(_interpolate(lattice).T))
 
 
-def _stretch(lattice: Plane) -> Plane:
-    """Rows [C, K] to [N, K] by smoothstep between neighbours, around the end to the first; C divides N."""
+def _interpolate(lattice: Plane) -> Plane:
+    """Rows [C, K] interpolated to [N, K] by smoothstep, the last towards the first; C divides N."""
     count, width = lattice.shape
     t = np.arange(TEXTURE_PX // count, dtype=np.float32) * np.float32(count / TEXTURE_PX)
     share = (t * t * (np.float32(3.0) - np.float32(2.0) * t))[None, :, None]

@@ -5,25 +5,13 @@ import numpy as np
 from schemas.base import Array
 from schemas.scene.shape import Material
 from workers.assets.builtin.bottle_kinds import KINDS, Kind
-from workers.assets.builtin.curves import bezier, rounded, squircle
-from workers.assets.builtin.finish import Model, Surface
-from workers.assets.builtin.look import (
-    Color,
-    chance,
-    clear_glass,
-    glass_color,
-    mixed,
-    near,
-    pale,
-    pick,
-    plastic,
-    solid_color,
-    steel,
-    textured,
-    vivid,
-)
-from workers.assets.builtin.paint import band_height, bands, label
+from workers.assets.builtin.curves import bezier, fillet, squircle
+from workers.assets.builtin.draws import chance, pick
+from workers.assets.builtin.materials import clear_glass, plastic, solid_color, steel, textured
+from workers.assets.builtin.palette import Color, glass_color, jitter, mix, pale, vivid
+from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import circle, lathe
+from workers.assets.builtin.textures import band_height, bands, label
 
 BODY, LABEL, CAP = 0, 1, 2
 SEGMENTS = 48
@@ -31,15 +19,15 @@ SEGMENTS = 48
 
 def make_bottle(rng: np.random.Generator) -> Model:
     """A closed bottle, 80 to 330 mm high."""
-    kind = KINDS[int(rng.integers(len(KINDS)))]
-    height = float(rng.uniform(*kind.height_m))
-    radius = height * float(rng.uniform(*kind.radius))
-    body = height * float(rng.uniform(*kind.body))
-    shoulder = body + height * float(rng.uniform(*kind.shoulder))
-    neck = radius * float(rng.uniform(*kind.neck))
+    kind = pick(rng, KINDS)
+    height = rng.uniform(*kind.height_m)
+    radius = height * rng.uniform(*kind.radius)
+    body = height * rng.uniform(*kind.body)
+    shoulder = body + height * rng.uniform(*kind.shoulder)
+    neck = radius * rng.uniform(*kind.neck)
     corners, radii, surface = _outline(rng, kind, height, radius, (body, shoulder), neck)
-    profile, owner = rounded(corners, radii, 3)
-    squareness, depth = int(rng.choice(kind.sections)), float(rng.uniform(*kind.depth))
+    profile, owner = fillet(corners, radii, 3)
+    squareness, depth = int(rng.choice(kind.sections)), rng.uniform(*kind.depth)
     section = _sections(profile, body, shoulder, squareness, max(depth, 1.12 * neck / radius))
     solid = lathe(profile, surface[owner], SEGMENTS, section)
     return Model(solid, _surfaces(rng, kind, corners, surface))
@@ -48,18 +36,18 @@ def make_bottle(rng: np.random.Generator) -> Model:
 def _outline(
     rng: np.random.Generator, kind: Kind, height: float, radius: float, levels: tuple[float, float], neck: float
 ) -> tuple[Array, list[float], Array]:
-    """Corners [P, 2] of the profile, how far each is rounded, and the surface of each segment [P - 1]."""
+    """Corners [P, 2] of the profile, their fillet radii, and the surface number of each segment [P - 1]."""
     body, shoulder = levels
-    fillet = radius * float(rng.uniform(0.08, 0.22))
-    low, high = 0.12 * body + fillet, body * float(rng.uniform(0.86, 0.97))
+    foot = radius * rng.uniform(0.08, 0.22)
+    low, high = 0.12 * body + foot, body * rng.uniform(0.86, 0.97)
     base = np.array([[0.0, 0.03 * radius], [0.55 * radius, 0.03 * radius], [0.62 * radius, 0.0], [radius, 0.0]])
     side = _side(rng, kind, radius, low, high)
-    steep, flat = float(rng.uniform(0.45, 0.75)), float(rng.uniform(0.25, 0.5))
+    steep, flat = rng.uniform(0.45, 0.75), rng.uniform(0.25, 0.5)
     rise = shoulder - body
     arc = bezier([radius, body], [radius, body + steep * rise], [neck, shoulder - flat * rise], [neck, shoulder], 9)
     top, top_surface = _closure(rng, kind, height, radius, shoulder, neck)
     corners = np.concatenate([base, side, arc, top])
-    radii = [0.0, 0.0, 0.0, fillet, *[0.0] * (len(side) + len(arc)), *[0.0012] * (len(top) - 1), 0.0]
+    radii = [0.0, 0.0, 0.0, foot, *[0.0] * (len(side) + len(arc)), *[0.0012] * (len(top) - 1), 0.0]
     surface = np.full(len(corners) - 1, BODY)
     surface[len(base) : len(base) + len(side) - 1] = LABEL
     surface[len(corners) - len(top) :][-len(top_surface) :] = top_surface
@@ -67,10 +55,10 @@ def _outline(
 
 
 def _side(rng: np.random.Generator, kind: Kind, radius: float, low: float, high: float) -> Array:
-    """[S, 2]: the stretch of the side that carries the label or the grooves."""
+    """[S, 2]: the part of the side profile with the label or the grooves."""
     if not chance(rng, kind.ribs):
         return np.array([[radius, low], [radius, high]])
-    count, depth = int(rng.integers(3, 7)), radius * float(rng.uniform(0.03, 0.07))
+    count, depth = int(rng.integers(3, 7)), radius * rng.uniform(0.03, 0.07)
     points = []
     for z in np.linspace(low, high, count + 1)[:-1]:
         pitch = (high - low) / count
@@ -86,10 +74,10 @@ def _side(rng: np.random.Generator, kind: Kind, radius: float, low: float, high:
 def _closure(
     rng: np.random.Generator, kind: Kind, height: float, radius: float, shoulder: float, neck: float
 ) -> tuple[Array, list[int]]:
-    """The profile above the shoulder, ending on the axis, and the surface of its segments (the last ones)."""
+    """The profile above the shoulder, up to the axis, and the surface numbers of its last segments."""
     room = height - shoulder
     if kind.cap == "foil":
-        start, lip = shoulder + room * float(rng.uniform(0.15, 0.5)), height - 0.018 * height / 0.3
+        start, lip = shoulder + room * rng.uniform(0.15, 0.5), height - 0.018 * height / 0.3
         foil, ring = neck + 0.0004, neck * 1.12
         points = [
             [neck, start],
@@ -123,7 +111,7 @@ def _closure(
             [0.0, height],
         ]
         return np.array(points), [BODY, BODY, CAP, CAP, CAP]
-    ring = neck * 1.25 if kind.cap == "screw" else min(radius * float(rng.uniform(0.75, 0.96)), neck * 1.5)
+    ring = neck * 1.25 if kind.cap == "screw" else min(radius * rng.uniform(0.75, 0.96), neck * 1.5)
     if kind.cap == "screw":
         start = height - max(0.4 * room, 0.014)
         start = max(start, shoulder + 0.1 * room)
@@ -137,13 +125,13 @@ def _closure(
             [0.0, height],
         ]
         return np.array(points), [BODY, BODY, BODY, CAP, CAP, CAP]
-    start, taper = shoulder + 0.06 * room, float(rng.uniform(0.8, 1.0))
+    start, taper = shoulder + 0.06 * room, rng.uniform(0.8, 1.0)
     points = [[neck, start], [ring, start], [ring * taper, height], [0.0, height]]
     return np.array(points), [CAP, CAP, CAP]
 
 
 def _sections(profile: Array, body: float, shoulder: float, squareness: int, depth: float) -> Array | None:
-    """[P - 2, n, 2]: the body's section up to the shoulder, turning into a circle at the neck."""
+    """[P - 2, n, 2]: the body's section up to the shoulder, which becomes a circle at the neck."""
     if squareness == 0 and depth == 1.0:
         return None
     z = profile[1:-1, 1]
@@ -160,36 +148,36 @@ def _surfaces(rng: np.random.Generator, kind: Kind, corners: Array, surface: Arr
     on_label = np.flatnonzero(surface == LABEL)
     low, high = float(corners[on_label[0], 1]), float(corners[on_label[-1] + 1, 1])
     printed = body
-    wrap = chance(rng, 0.8)
-    if wrap:
+    mapping = chance(rng, 0.8)
+    if mapping:
         rows = band_height(low, high, float(corners[on_label[0], 0]))
         picture = label(rng, paper, rows) if chance(rng, 0.8) else bands(rng, [paper, vivid(rng), color])
-        printed = textured(picture, float(rng.uniform(0.4, 0.7)))
+        printed = textured(picture, rng.uniform(0.4, 0.7))
     return (
         Surface("body", body),
-        Surface("label", printed, "cylinder" if wrap else "none", low=low, high=high),
+        Surface("label", printed, "cylinder" if mapping else "none", low=low, high=high),
         Surface("cap", _cap_material(rng, kind)),
     )
 
 
 def _body_material(rng: np.random.Generator, kind: Kind) -> Material:
-    if kind.look == "glass":
-        return clear_glass(glass_color(rng), float(rng.uniform(0.08, 0.18)))
-    if kind.look == "clear":
+    if kind.material == "glass":
+        return clear_glass(glass_color(rng), rng.uniform(0.08, 0.18))
+    if kind.material == "clear":
         tint = pick(
             rng, ((0.72, 0.82, 0.85), (0.6, 0.74, 0.82), (0.66, 0.8, 0.66), (0.28, 0.12, 0.06), (0.78, 0.5, 0.16))
         )
-        return clear_glass(near(rng, tint, 0.04), float(rng.uniform(0.1, 0.25)))
-    if kind.look == "metal":
-        return steel(rng) if chance(rng, 0.3) else solid_color(near(rng, vivid(rng)), float(rng.uniform(0.35, 0.65)))
+        return clear_glass(jitter(rng, tint, 0.04), rng.uniform(0.1, 0.25))
+    if kind.material == "metal":
+        return steel(rng) if chance(rng, 0.3) else solid_color(jitter(rng, vivid(rng)), rng.uniform(0.35, 0.65))
     return plastic(rng)
 
 
 def _cap_material(rng: np.random.Generator, kind: Kind) -> Material:
     if kind.cap == "cork":
-        return solid_color(near(rng, (0.72, 0.56, 0.38)), 0.85)
+        return solid_color(jitter(rng, (0.72, 0.56, 0.38)), 0.85)
     if kind.cap == "crown":
         return steel(rng) if chance(rng, 0.5) else solid_color(vivid(rng), 0.35, metallic=0.4)
     if kind.cap == "foil":
-        return solid_color(mixed(vivid(rng), (0.1, 0.05, 0.05), 0.5), 0.4, metallic=0.3)
+        return solid_color(mix(vivid(rng), (0.1, 0.05, 0.05), 0.5), 0.4, metallic=0.3)
     return steel(rng) if chance(rng, 0.15) else plastic(rng)

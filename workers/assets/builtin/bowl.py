@@ -5,43 +5,32 @@ from dataclasses import replace
 import numpy as np
 
 from workers.assets.builtin.curves import bezier, squircle
-from workers.assets.builtin.finish import Model, Surface
-from workers.assets.builtin.look import (
-    BLACK,
-    WHITE,
-    chance,
-    glaze_color,
-    ink_on,
-    mixed,
-    near,
-    pale,
-    solid_color,
-    steel,
-    textured,
-    wood_colors,
-)
-from workers.assets.builtin.paint import band_height, bands, dots, speckled, upright_stripes, wood
+from workers.assets.builtin.draws import chance, pick
+from workers.assets.builtin.hollow import Wall, wall_around
+from workers.assets.builtin.materials import solid_color, steel, textured
+from workers.assets.builtin.palette import BLACK, WHITE, glaze_color, ink_on, jitter, mix, pale, wood_colors
+from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import circle, lathe
-from workers.assets.builtin.vessel import BASE, INSIDE, OUTSIDE, Wall, wall_around
+from workers.assets.builtin.textures import band_height, bands, dots, speckled, upright_stripes, wood
 
 
 def make_bowl(rng: np.random.Generator) -> Model:
     """A bowl, 110 to 300 mm across: of pottery, wood or steel, with a foot ring."""
-    radius = float(rng.uniform(0.055, 0.15))
-    thickness = float(rng.uniform(0.0035, 0.006))
-    depth = radius * float(rng.uniform(0.55, 1.05))
-    foot_height = float(rng.uniform(0.002, 0.008))
+    radius = rng.uniform(0.055, 0.15)
+    thickness = rng.uniform(0.0035, 0.006)
+    depth = radius * rng.uniform(0.55, 1.05)
+    foot_height = rng.uniform(0.002, 0.008)
     bottom = foot_height + thickness
-    flat, flare = float(rng.uniform(0.35, 0.75)), float(rng.uniform(0.75, 1.0))
+    flat, flare = rng.uniform(0.35, 0.75), rng.uniform(0.75, 1.0)
     hollow = bezier(
         [0.0, bottom],
         [radius * flat * 1.3, bottom],
-        [radius * flare, bottom + depth * float(rng.uniform(0.15, 0.55))],
+        [radius * flare, bottom + depth * rng.uniform(0.15, 0.55)],
         [radius, bottom + depth],
         15,
     )
-    foot = radius * float(rng.uniform(0.38, 0.55))
-    wall = wall_around(hollow, thickness, foot, float(rng.uniform(0.004, 0.007)), 0.7 * foot_height)
+    foot = radius * rng.uniform(0.38, 0.55)
+    wall = wall_around(hollow, thickness, foot, rng.uniform(0.004, 0.007), 0.7 * foot_height)
     section = None
     if chance(rng, 0.15):
         section = _towards_square(wall.profile, foot, radius)
@@ -59,36 +48,32 @@ def _surfaces(rng: np.random.Generator, wall: Wall) -> tuple[Surface, ...]:
     kind = rng.random()
     if kind < 0.12:
         metal = steel(rng)
-        looks = (Surface("outside", metal), Surface("inside", metal), Surface("base", metal))
-    elif kind < 0.32:
+        return Surface("outside", metal), Surface("inside", metal), Surface("base", metal)
+    if kind < 0.32:
         light, dark = wood_colors(rng)
-        timber = textured(wood(rng, light, dark, size=128), float(rng.uniform(0.45, 0.7)))
+        timber = textured(wood(rng, light, dark, size=128), rng.uniform(0.45, 0.7))
         # The grain runs along x through the whole block that the bowl was turned from: no seam anywhere.
         reach = float(wall.profile[:, 0].max())
-        block = Surface("block", timber, "plane", origin=(-reach, -reach, 0.0), across=(2 * reach, 0.0, 0.0))
-        block = replace(block, up=(0.0, 1.6 * reach, 1.2 * reach))
-        grain = [replace(block, name=name) for name in ("outside", "inside", "base")]
-        looks = (grain[0], grain[1], grain[2])
-    else:
-        looks = _pottery(rng, high, float(wall.profile[:, 0].max()))
-    order = {OUTSIDE: looks[0], INSIDE: looks[1], BASE: looks[2]}
-    return tuple(order[number] for number in sorted(order))
+        across, up = (2 * reach, 0.0, 0.0), (0.0, 1.6 * reach, 1.2 * reach)
+        block = Surface("block", timber, "plane", origin=(-reach, -reach, 0.0), across=across, up=up)
+        return tuple(replace(block, name=name) for name in ("outside", "inside", "base"))
+    return _pottery(rng, high, float(wall.profile[:, 0].max()))
 
 
 def _pottery(rng: np.random.Generator, high: float, radius: float) -> tuple[Surface, Surface, Surface]:
-    roughness = float(rng.uniform(0.15, 0.4) if chance(rng, 0.75) else rng.uniform(0.6, 0.85))
+    roughness = rng.uniform(0.15, 0.4) if chance(rng, 0.75) else rng.uniform(0.6, 0.85)
     ground = glaze_color(rng)
-    inside = ground if chance(rng, 0.45) else near(rng, WHITE, 0.03)
+    inside = ground if chance(rng, 0.45) else jitter(rng, WHITE, 0.03)
     outside, wrapped = solid_color(ground, roughness), False
     if chance(rng, 0.55):
         ink, rows = ink_on(rng, ground), band_height(0.0, 1.4 * high, 0.75 * radius)
         painters = (
-            lambda: bands(rng, [ground, mixed(ground, ink, 0.7), pale(rng)]),
-            lambda: upright_stripes(rng, [ground, ground, mixed(ground, ink, 0.6)]),
-            lambda: dots(rng, ground, mixed(ground, ink, 0.8), rows),
-            lambda: speckled(rng, ground, mixed(ground, BLACK, 0.6), float(rng.uniform(0.02, 0.07)), rows),
+            lambda: bands(rng, [ground, mix(ground, ink, 0.7), pale(rng)]),
+            lambda: upright_stripes(rng, [ground, ground, mix(ground, ink, 0.6)]),
+            lambda: dots(rng, ground, mix(ground, ink, 0.8), rows),
+            lambda: speckled(rng, ground, mix(ground, BLACK, 0.6), rng.uniform(0.02, 0.07), rows),
         )
-        outside, wrapped = textured(painters[int(rng.integers(4))](), roughness), True
+        outside, wrapped = textured(pick(rng, painters)(), roughness), True
     first = Surface("outside", outside, "cylinder" if wrapped else "none", low=0.0, high=high)
-    base = solid_color(mixed(ground, (0.75, 0.7, 0.62), 0.6), 0.8)
+    base = solid_color(mix(ground, (0.75, 0.7, 0.62), 0.6), 0.8)
     return first, Surface("inside", solid_color(inside, roughness)), Surface("base", base)

@@ -3,41 +3,43 @@
 import numpy as np
 
 from schemas.scene.shape import Material
-from workers.assets.builtin.curves import rounded
-from workers.assets.builtin.finish import Model, Surface
-from workers.assets.builtin.look import BLACK, Color, chance, mixed, near, pick, solid_color, steel, textured, vivid
-from workers.assets.builtin.paint import Picture, blend, noise
-from workers.assets.builtin.solid import Solid, lathe, loft, together, union_at
-from workers.assets.builtin.vessel import prism
+from workers.assets.builtin.curves import fillet
+from workers.assets.builtin.draws import chance, pick
+from workers.assets.builtin.materials import solid_color, steel, textured
+from workers.assets.builtin.palette import BLACK, Color, jitter, mix, vivid
+from workers.assets.builtin.parts import Model, Surface
+from workers.assets.builtin.solid import Solid, combine, lathe, loft, union_at
+from workers.assets.builtin.sweeps import prism, straight_prism
+from workers.assets.builtin.textures import Texture, blend, noise
 
 SKIN, SHELL, LENS, RING, GLASS, DIAL, DISPLAY, SHOE = 0, 1, 2, 3, 4, 5, 6, 7
 
 FORWARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Takes a solid turned about z to one that looks along -y."""
+"""Rotation that takes +z to -y, the direction of view."""
 
 
 def make_camera(rng: np.random.Generator) -> Model:
     """A camera on its flat base, looking along -y: a body with a grip, a lens, a viewfinder, dials, a display."""
     kind = int(rng.integers(3))
-    width = float(rng.uniform(*((0.12, 0.15), (0.115, 0.14), (0.09, 0.115))[kind]))
-    height = width * float(rng.uniform(*((0.6, 0.7), (0.54, 0.62), (0.54, 0.64))[kind]))
-    depth = width * float(rng.uniform(*((0.34, 0.44), (0.24, 0.32), (0.2, 0.28))[kind]))
+    width = rng.uniform(*((0.12, 0.15), (0.115, 0.14), (0.09, 0.115))[kind])
+    height = width * rng.uniform(*((0.6, 0.7), (0.54, 0.62), (0.54, 0.64))[kind])
+    depth = width * rng.uniform(*((0.34, 0.44), (0.24, 0.32), (0.2, 0.28))[kind])
     size = width, depth, height
     on_hump, on_body = _finder(rng, size, kind)
     lens = _lens(rng, size, kind)
     on_body += _controls(rng, size)
     if kind == 0 or chance(rng, 0.35):
         on_body.append(_grip(rng, size, kind))
-    # What stands on the body stands apart from all else on it, and is joined to it in one step.
-    layers = [_body(rng, size, kind)] + ([together(on_hump)] if on_hump else [])
+    # The solids on the body do not touch one another, so that one boolean joins them.
+    layers = [_body(rng, size, kind)] + ([combine(on_hump)] if on_hump else [])
     return Model(_joined(lens, on_body, layers, depth), _surfaces(rng, size, kind))
 
 
 def _body(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> Solid:
     """The body: a band of leather between a base plate and a top plate; round ends on rangefinders."""
     width, depth, height = size
-    radius = depth * (0.42 if kind == 1 and chance(rng, 0.6) else float(rng.uniform(0.15, 0.3)))
-    low, high = height * float(rng.uniform(0.1, 0.16)), height * float(rng.uniform(0.74, 0.84))
+    radius = depth * (0.42 if kind == 1 and chance(rng, 0.6) else rng.uniform(0.15, 0.3))
+    low, high = height * rng.uniform(0.1, 0.16), height * rng.uniform(0.74, 0.84)
     b, line = 0.0022, 0.0006
     profile = np.array(
         [
@@ -60,10 +62,10 @@ def _body(rng: np.random.Generator, size: tuple[float, float, float], kind: int)
 def _lens(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> Solid:
     """A lens of stepped barrels that ends in a sunken glass, its axis along -y."""
     width, depth, height = size
-    radius = height * float(rng.uniform(*((0.34, 0.4), (0.27, 0.36), (0.24, 0.34))[kind]))
-    length = radius * float(rng.uniform(*((1.0, 1.7), (0.6, 1.2), (0.35, 0.8))[kind]))
-    front = radius * float(rng.uniform(0.8, 1.0))
-    a, b = float(rng.uniform(0.25, 0.4)), float(rng.uniform(0.6, 0.8))
+    radius = height * rng.uniform(*((0.34, 0.4), (0.27, 0.36), (0.24, 0.34))[kind])
+    length = radius * rng.uniform(*((1.0, 1.7), (0.6, 1.2), (0.35, 0.8))[kind])
+    front = radius * rng.uniform(0.8, 1.0)
+    a, b = rng.uniform(0.25, 0.4), rng.uniform(0.6, 0.8)
     corners = np.array(
         [
             [0.0, -0.2 * depth],
@@ -84,17 +86,17 @@ def _lens(rng: np.random.Generator, size: tuple[float, float, float], kind: int)
     )
     radii = [0.0, 0.0, 0.0008, 0.0, 0.0, 0.0, 0.0008, 0.0, 0.001, 0.0, 0.0, 0.0, 0.05 * radius, 0.0]
     surface = np.array([LENS, LENS, LENS, RING, LENS, LENS, LENS, LENS, LENS, LENS, LENS, GLASS, GLASS])
-    profile, owner = rounded(corners, radii, 1)
+    profile, owner = fillet(corners, radii, 1)
     barrel = lathe(profile, surface[owner], 28)
-    across = width * float(rng.uniform(0.0, 0.08))
+    across = width * rng.uniform(0.0, 0.08)
     # The barrel stays above the base, so that the camera stands on its body, and below its upper plate.
-    level = max(0.5 * height * float(rng.uniform(0.92, 1.06)), radius + 0.0015)
+    level = max(0.5 * height * rng.uniform(0.92, 1.06), radius + 0.0015)
     level = min(level, height - 0.007 - radius)
     return barrel.placed(FORWARD, np.array([across, -0.5 * depth, level]))
 
 
 def _joined(lens: Solid, on_body: list[Solid], layers: list[Solid], depth: float) -> Solid:
-    """Everything as one. Of the lens only its first barrel, up to the first ring before the body, meets the body."""
+    """The union of all. Only the first barrel of the lens, up to the first ring before the body, meets the body."""
     along = lens.vertices[:, 1]
     first = along[along < -0.5 * depth].max()
     touched = (along >= first)[lens.faces].all(axis=1)
@@ -102,41 +104,25 @@ def _joined(lens: Solid, on_body: list[Solid], layers: list[Solid], depth: float
 
 
 def _finder(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> tuple[list[Solid], list[Solid]]:
-    """What stands on the viewfinder's hump, and what stands on the body: a reflex's hump, or a window in the front."""
+    """The solids on the viewfinder's hump, and those on the body: a reflex's hump, or a window in the front."""
     width, depth, height = size
     if kind == 0:
-        w, h = width * float(rng.uniform(0.28, 0.33)), height * float(rng.uniform(0.2, 0.3))
+        w, h = width * rng.uniform(0.28, 0.33), height * rng.uniform(0.2, 0.3)
         hump = _frustum((w, 0.95 * depth), (0.55 * w, 0.6 * depth), height - 0.004, height + h, SHELL)
-        shoe = prism(
-            np.array([[0.0, height + h - 0.001], [0.0, height + h + 0.0016]]),
-            (0.15 * width, 0.13 * width),
-            0.0008,
-            [SHOE] * 3,
-            1,
-        )
-        eye = prism(
-            np.array([[0.0, height + 0.2 * h], [0.0, height + 0.75 * h]]), (0.55 * w, 0.012), 0.002, [DIAL] * 3, 2
-        )
+        shoe = straight_prism((0.15 * width, 0.13 * width), height + h - 0.001, height + h + 0.0016, 0.0008, SHOE)
+        eye = straight_prism((0.55 * w, 0.012), height + 0.2 * h, height + 0.75 * h, 0.002, DIAL, 2)
         return [shoe, eye.moved(y=0.44 * depth)], [hump]
-    size_x, size_z = width * float(rng.uniform(0.09, 0.14)), height * float(rng.uniform(0.09, 0.12))
+    size_x, size_z = width * rng.uniform(0.09, 0.14), height * rng.uniform(0.09, 0.12)
     middle = height * 0.89 - 0.5 * size_z
-    window = prism(np.array([[0.0, middle], [0.0, middle + size_z]]), (size_x, 0.004), 0.0012, [GLASS] * 3, 2)
-    parts = [window.moved(x=width * float(rng.uniform(0.3, 0.38)), y=-0.5 * depth + 0.0008)]
+    window = straight_prism((size_x, 0.004), middle, middle + size_z, 0.0012, GLASS, 2)
+    parts = [window.moved(x=width * rng.uniform(0.3, 0.38), y=-0.5 * depth + 0.0008)]
     if chance(rng, 0.5):
-        parts.append(
-            prism(
-                np.array([[0.0, height - 0.001], [0.0, height + 0.0018]]),
-                (0.14 * width, 0.12 * width),
-                0.0008,
-                [SHOE] * 3,
-                1,
-            )
-        )
+        parts.append(straight_prism((0.14 * width, 0.12 * width), height - 0.001, height + 0.0018, 0.0008, SHOE))
     return [], parts
 
 
 def _frustum(low: tuple[float, float], high: tuple[float, float], bottom: float, top: float, surface: int) -> Solid:
-    """A box that narrows towards its top, its upper edges broken."""
+    """A box that narrows towards its top, with bevelled upper edges."""
     levels = (
         (low, bottom, 0.0),
         (low, bottom + 0.35 * (top - bottom), 0.0),
@@ -172,24 +158,24 @@ def _controls(rng: np.random.Generator, size: tuple[float, float, float]) -> lis
     if chance(rng, 0.5):
         spots.append((0.32, 0.065, 0.0045))
     for x, radius, rise in spots:
-        r = min(radius * width * float(rng.uniform(0.85, 1.1)), 0.3 * depth)
+        r = min(radius * width * rng.uniform(0.85, 1.1), 0.3 * depth)
         top = height + rise
         profile = np.array(
             [[0.0, height - 0.003], [r, height - 0.003], [r, top - 0.0006], [r - 0.0006, top], [0.0, top]]
         )
         solids.append(lathe(profile, [DIAL] * 4, 12).moved(x=x * width, y=0.05 * depth))
-    w, h = width * float(rng.uniform(0.48, 0.56)), height * float(rng.uniform(0.5, 0.58))
-    display = prism(np.array([[0.0, 0.18 * height], [0.0, 0.18 * height + h]]), (w, 0.006), 0.0012, [DISPLAY] * 3, 1)
+    w, h = width * rng.uniform(0.48, 0.56), height * rng.uniform(0.5, 0.58)
+    display = straight_prism((w, 0.006), 0.18 * height, 0.18 * height + h, 0.0012, DISPLAY)
     return [*solids, display.moved(x=0.08 * width, y=0.5 * depth - 0.0012)]
 
 
 def _grip(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> Solid:
-    """A round upright grip on the front of the side of -x."""
+    """A round upright grip on the front, at the -x side."""
     width, depth, height = size
-    grip_depth = depth * float(rng.uniform(0.8, 1.1) if kind == 0 else rng.uniform(0.3, 0.42))
-    w = width * float(rng.uniform(0.15, 0.18))
-    top = height * float(rng.uniform(0.86, 0.93))
-    # Its base lies just above the body's: the camera stands on its body, and no two planes coincide.
+    grip_depth = depth * (rng.uniform(0.8, 1.1) if kind == 0 else rng.uniform(0.3, 0.42))
+    w = width * rng.uniform(0.15, 0.18)
+    top = height * rng.uniform(0.86, 0.93)
+    # Its base lies just above the body's, so that the camera stands on its body and no two planes coincide.
     b = min(0.0016, 0.1 * grip_depth)
     profile = np.array([[b, 0.0012], [0.0, 0.0012 + b], [0.0, top - 2.5 * b], [b, top - 0.6 * b], [2.5 * b, top]])
     grip = prism(profile, (w, grip_depth), 0.45 * min(w, grip_depth), [SKIN] * 6, 5)
@@ -197,24 +183,24 @@ def _grip(rng: np.random.Generator, size: tuple[float, float, float], kind: int)
 
 
 def _surfaces(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> tuple[Surface, ...]:
-    dark: Color = near(rng, (0.1, 0.1, 0.105), 0.03)
+    dark: Color = jitter(rng, (0.1, 0.1, 0.105), 0.03)
     if kind == 0:
-        shell, skin = solid_color(dark, float(rng.uniform(0.5, 0.7))), dark
+        shell, skin = solid_color(dark, rng.uniform(0.5, 0.7)), dark
     else:
         plate = steel(rng) if chance(rng, 0.6) else solid_color(dark, 0.4)
-        colors = (dark, dark, (0.3, 0.17, 0.1), vivid(rng), mixed(vivid(rng), BLACK, 0.4))
+        colors = (dark, dark, (0.3, 0.17, 0.1), vivid(rng), mix(vivid(rng), BLACK, 0.4))
         shell, skin = plate, pick(rng, colors)
         if kind == 2 and chance(rng, 0.6):
-            paint = solid_color(vivid(rng) if chance(rng, 0.5) else near(rng, (0.75, 0.75, 0.76)), 0.4)
+            paint = solid_color(vivid(rng) if chance(rng, 0.5) else jitter(rng, (0.75, 0.75, 0.76)), 0.4)
             return _order(textured(_leather(rng, paint.base_color[:3], 0.06), 0.4), paint, rng)
     return _order(textured(_leather(rng, skin, 0.5), 0.75), shell, rng, max(size))
 
 
 def _order(skin: Material, shell: Material, rng: np.random.Generator, size: float = 0.1) -> tuple[Surface, ...]:
-    lens = solid_color(near(rng, (0.09, 0.09, 0.095), 0.03), 0.45) if chance(rng, 0.75) else steel(rng)
-    ring = pick(rng, (steel(rng), solid_color(near(rng, (0.75, 0.1, 0.1)), 0.4), steel(rng)))
+    lens = solid_color(jitter(rng, (0.09, 0.09, 0.095), 0.03), 0.45) if chance(rng, 0.75) else steel(rng)
+    ring = pick(rng, (steel(rng), solid_color(jitter(rng, (0.75, 0.1, 0.1)), 0.4), steel(rng)))
     return (
-        Surface("skin", skin, "grain", size=0.5 * size),
+        Surface("skin", skin, "box", size=0.5 * size),
         Surface("shell", shell),
         Surface("lens", lens),
         Surface("ring", ring),
@@ -225,6 +211,6 @@ def _order(skin: Material, shell: Material, rng: np.random.Generator, size: floa
     )
 
 
-def _leather(rng: np.random.Generator, color: Color, depth: float) -> Picture:
-    """Grained leather."""
-    return blend(mixed(color, BLACK, depth), mixed(color, (0.9, 0.9, 0.9), 0.15 * depth), noise(rng, 64, 64, 32, 32))
+def _leather(rng: np.random.Generator, color: Color, depth: float) -> Texture:
+    """A texture of grained leather."""
+    return blend(mix(color, BLACK, depth), mix(color, (0.9, 0.9, 0.9), 0.15 * depth), noise(rng, 64, 64, 32, 32))

@@ -33,8 +33,8 @@ def spline(points: Array, count: int) -> Array:
     return np.concatenate([curve.reshape(-1, points.shape[1]), points[-1:]])
 
 
-def rounded(points: Array, radii: Sequence[float], steps: int = 3) -> tuple[Array, Array]:
-    """A polyline [P, 2] with its inner corners replaced by quadratic arcs, and which segment each new segment is of.
+def fillet(points: Array, radii: Sequence[float] | Array, steps: int = 3) -> tuple[Array, Array]:
+    """A polyline [P, 2] with its inner corners replaced by quadratic arcs, and the old segment of each new segment.
 
     `radii` [P] is how far from each corner the arc begins (cut to 45 % of the shorter side; 0 keeps the corner). The
     first half of an arc belongs to the segment before it. Returns [Q, 2] float64 and [Q - 1] int64.
@@ -62,8 +62,8 @@ def rounded(points: Array, radii: Sequence[float], steps: int = 3) -> tuple[Arra
     return np.array(out), np.array(owner, dtype=np.int64)
 
 
-def outwards(curve: Array) -> Array:
-    """[P, 2] float64: unit normals to the right of a polyline [P, 2]: down along a floor walked outwards, out of a wall."""
+def outward_normals(curve: Array) -> Array:
+    """[P, 2] float64: unit normals to the right of a polyline [P, 2]: out of a wall that runs upwards."""
     step = np.empty_like(curve)
     step[1:-1] = curve[2:] - curve[:-2]
     step[0], step[-1] = curve[1] - curve[0], curve[-1] - curve[-2]
@@ -71,8 +71,8 @@ def outwards(curve: Array) -> Array:
     return np.stack([step[:, 1], -step[:, 0]], axis=1) / length[:, None]
 
 
-def half_turn_points(a: Array, b: Array, count: int) -> Array:
-    """[count, 2] float64: inner points of the half circle from a to b that passes to the right of the way there."""
+def half_circle_points(a: Array, b: Array, count: int) -> Array:
+    """[count, 2] float64: inner points of the half circle from a to b that lies to the right of the line from a to b."""
     middle, radius = 0.5 * (a + b), 0.5 * (b - a)
     side = np.array([radius[1], -radius[0]])
     table = circle(2 * (count + 1))[1 : count + 1]

@@ -6,26 +6,15 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.scene.shape import Material
-from workers.assets.builtin.curves import bezier, rounded, spline, squircle
-from workers.assets.builtin.finish import Model, Surface
-from workers.assets.builtin.look import (
-    BLACK,
-    WHITE,
-    Color,
-    chance,
-    clear_glass,
-    glaze_color,
-    ink_on,
-    mixed,
-    near,
-    pale,
-    pick,
-    solid_color,
-    textured,
-)
-from workers.assets.builtin.paint import band_height, bands, blank, dots, label, speckled, upright_stripes
+from workers.assets.builtin.curves import bezier, fillet, spline, squircle
+from workers.assets.builtin.draws import chance, pick
+from workers.assets.builtin.hollow import OUTSIDE, Wall, wall_around, with_handles
+from workers.assets.builtin.materials import clear_glass, solid_color, textured
+from workers.assets.builtin.palette import BLACK, WHITE, Color, glaze_color, ink_on, jitter, mix, pale
+from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import Solid, circle, lathe
-from workers.assets.builtin.vessel import BASE, INSIDE, OUTSIDE, Wall, bend_radius, rod, wall_around, with_handles
+from workers.assets.builtin.sweeps import bend_radius, rod
+from workers.assets.builtin.textures import band_height, bands, blank, dots, label, speckled, upright_stripes
 
 EAR = 3
 SEGMENTS = 40
@@ -46,12 +35,12 @@ def make_jar(rng: np.random.Generator) -> Model:
 
 def _glass_jar(rng: np.random.Generator) -> Wall:
     """A preserving jar: straight, a short shoulder, a neck with a thread and no lid."""
-    height = float(rng.uniform(0.08, 0.2))
-    radius = height * float(rng.uniform(0.28, 0.48))
-    thickness = float(rng.uniform(0.0028, 0.0042))
+    height = rng.uniform(0.08, 0.2)
+    radius = height * rng.uniform(0.28, 0.48)
+    thickness = rng.uniform(0.0028, 0.0042)
     bottom = thickness + 0.002
-    neck = radius * float(rng.uniform(0.76, 0.9))
-    shoulder = height * float(rng.uniform(0.72, 0.82))
+    neck = radius * rng.uniform(0.76, 0.9)
+    shoulder = height * rng.uniform(0.72, 0.82)
     # The bend into the neck is wider than the wall is thick, so that the wall's outside does not fold over.
     drop = max(0.9 * (radius - neck), 2.2 * thickness)
     arc = bezier(
@@ -62,7 +51,7 @@ def _glass_jar(rng: np.random.Generator) -> Wall:
         9,
     )
     corners = np.concatenate([[[0.0, bottom], [radius, bottom]], arc, [[neck, height]]])
-    hollow, _ = rounded(corners, [0.0, float(rng.uniform(0.006, 0.014)), *[0.0] * (len(corners) - 2)], 4)
+    hollow, _ = fillet(corners, [0.0, rng.uniform(0.006, 0.014), *[0.0] * (len(corners) - 2)], 4)
     wall = wall_around(hollow, thickness, 0.82 * radius, 0.006, 0.0015)
     return _with_thread(wall, height)
 
@@ -86,14 +75,14 @@ def _with_thread(wall: Wall, height: float) -> Wall:
 
 def _pot(rng: np.random.Generator) -> Wall:
     """A pot or vase: radii drawn at foot, belly, neck and lip."""
-    height = float(rng.uniform(0.12, 0.32))
-    belly = height * float(rng.uniform(0.26, 0.42))
-    thickness = float(rng.uniform(0.004, 0.007))
+    height = rng.uniform(0.12, 0.32)
+    belly = height * rng.uniform(0.26, 0.42)
+    thickness = rng.uniform(0.004, 0.007)
     bottom = thickness + 0.003
-    foot = belly * float(rng.uniform(0.5, 0.75))
-    neck = belly * float(rng.uniform(0.4, 0.8))
-    lip = neck * float(rng.uniform(1.05, 1.35))
-    at = float(rng.uniform(0.4, 0.62))
+    foot = belly * rng.uniform(0.5, 0.75)
+    neck = belly * rng.uniform(0.4, 0.8)
+    lip = neck * rng.uniform(1.05, 1.35)
+    at = rng.uniform(0.4, 0.62)
     points = np.array(
         [
             [foot, bottom],
@@ -105,7 +94,7 @@ def _pot(rng: np.random.Generator) -> Wall:
         ]
     )
     hollow = np.concatenate([[[0.0, bottom]], spline(points, 3)])
-    hollow, _ = rounded(hollow, [0.0, 0.006, *[0.0] * (len(hollow) - 2)], 3)
+    hollow, _ = fillet(hollow, [0.0, 0.006, *[0.0] * (len(hollow) - 2)], 3)
     return wall_around(hollow, thickness, 0.9 * foot, 0.006, 0.002)
 
 
@@ -119,12 +108,11 @@ def _soft_square(wall: Wall) -> Array:
 def _ears(rng: np.random.Generator, wall: Wall) -> list[Solid]:
     """Two ears, opposite one another, from the shoulder up to the neck."""
     height = float(wall.profile[:, 1].max())
-    heights = height * float(rng.uniform(0.8, 0.86)), height * float(rng.uniform(0.52, 0.62))
+    heights = height * rng.uniform(0.8, 0.86), height * rng.uniform(0.52, 0.62)
     half = min(0.055 * height, float(np.sqrt(0.6 * wall.thickness_m * wall.radius_at(heights[0]))))
-    ends = [np.array([wall.radius_at(z), z]) for z in heights]
+    start, stop = (wall.middle_at(z) for z in heights)
     out = [wall.normal_at(z) for z in heights]
-    start, stop = (end - 0.5 * wall.thickness_m * normal for end, normal in zip(ends, out, strict=True))
-    reach = (heights[0] - heights[1]) * float(rng.uniform(0.6, 1.0))
+    reach = (heights[0] - heights[1]) * rng.uniform(0.6, 1.0)
     path = bezier(start, start + reach * out[0], stop + reach * out[1], stop, 11)
     section = circle(10) * np.array([half, min(0.6 * half, 0.8 * bend_radius(path, (out[0], -out[1])))])
     ear = rod(path, section, EAR, (out[0], -out[1]))
@@ -136,22 +124,20 @@ def _surfaces(rng: np.random.Generator, wall: Wall, glass: bool) -> tuple[Surfac
     low, high = 0.0, float(wall.profile[:, 1].max())
     wrapped = False
     if glass:
-        tint = near(rng, pick(rng, ((0.74, 0.83, 0.83), (0.66, 0.76, 0.74), (0.32, 0.2, 0.1))), 0.04)
-        inside = base = clear_glass(tint, float(rng.uniform(0.08, 0.2)))
+        tint = jitter(rng, pick(rng, ((0.74, 0.83, 0.83), (0.66, 0.76, 0.74), (0.32, 0.2, 0.1))), 0.04)
+        inside = base = clear_glass(tint, rng.uniform(0.08, 0.2))
         outside, inside = inside, replace(inside, ior=1.0)
         if chance(rng, 0.6):
             outside = _on_glass(rng, tint, band_height(0.0, high, float(wall.outer[:, 0].max())))
             wrapped = True
     else:
         outside, inside, base, wrapped = _pottery(rng, band_height(0.0, high, float(wall.outer[:, 0].max())))
-    ground: Color = inside.base_color[:3]
-    table = {
-        OUTSIDE: Surface("outside", outside, "cylinder" if wrapped else "none", low=low, high=high),
-        INSIDE: Surface("inside", inside),
-        BASE: Surface("base", base),
-        EAR: Surface("ears", solid_color(ground, inside.roughness)),
-    }
-    return tuple(table[number] for number in sorted(table))
+    return (
+        Surface("outside", outside, "cylinder" if wrapped else "none", low=low, high=high),
+        Surface("inside", inside),
+        Surface("base", base),
+        Surface("ears", solid_color(inside.base_color[:3], inside.roughness)),
+    )
 
 
 def _on_glass(rng: np.random.Generator, tint: Color, rows: int) -> Material:
@@ -168,18 +154,18 @@ def _on_glass(rng: np.random.Generator, tint: Color, rows: int) -> Material:
 
 
 def _pottery(rng: np.random.Generator, rows: int) -> tuple[Material, Material, Material, bool]:
-    roughness = float(rng.uniform(0.15, 0.4) if chance(rng, 0.6) else rng.uniform(0.65, 0.9))
-    ground = near(rng, (0.68, 0.4, 0.27), 0.06) if chance(rng, 0.2) else glaze_color(rng)
+    roughness = rng.uniform(0.15, 0.4) if chance(rng, 0.6) else rng.uniform(0.65, 0.9)
+    ground = jitter(rng, (0.68, 0.4, 0.27), 0.06) if chance(rng, 0.2) else glaze_color(rng)
     plain = solid_color(ground, roughness)
-    base = solid_color(mixed(ground, (0.7, 0.6, 0.5), 0.6), 0.85)
+    base = solid_color(mix(ground, (0.7, 0.6, 0.5), 0.6), 0.85)
     if chance(rng, 0.4):
         return plain, plain, base, False
     ink = ink_on(rng, ground)
     painters = (
-        lambda: bands(rng, [ground, mixed(ground, ink, 0.7), pale(rng)]),
-        lambda: upright_stripes(rng, [ground, ground, mixed(ground, ink, 0.5)]),
-        lambda: dots(rng, ground, mixed(ground, ink, 0.7), rows),
-        lambda: speckled(rng, ground, mixed(ground, BLACK, 0.6), float(rng.uniform(0.02, 0.07)), rows),
+        lambda: bands(rng, [ground, mix(ground, ink, 0.7), pale(rng)]),
+        lambda: upright_stripes(rng, [ground, ground, mix(ground, ink, 0.5)]),
+        lambda: dots(rng, ground, mix(ground, ink, 0.7), rows),
+        lambda: speckled(rng, ground, mix(ground, BLACK, 0.6), rng.uniform(0.02, 0.07), rows),
         lambda: bands(rng, [ground, WHITE, ink]),
     )
-    return textured(painters[int(rng.integers(len(painters)))](), roughness), plain, base, True
+    return textured(pick(rng, painters)(), roughness), plain, base, True

@@ -1,4 +1,4 @@
-"""Pure: opened laptops."""
+"""Pure: open laptops."""
 
 import itertools
 import math
@@ -6,38 +6,27 @@ import math
 import numpy as np
 
 from schemas.base import Array
-from workers.assets.builtin.finish import Model, Surface
-from workers.assets.builtin.look import (
-    BLACK,
-    WHITE,
-    Color,
-    chance,
-    hsv,
-    lightness,
-    mixed,
-    near,
-    pick,
-    solid_color,
-    textured,
-    vivid,
-)
-from workers.assets.builtin.paint import Picture, blank, blend, noise, rgb, write_lines
-from workers.assets.builtin.solid import TRIG_DIGITS, Solid, difference, lathe, together, union
-from workers.assets.builtin.vessel import bevelled, prism
+from workers.assets.builtin.draws import chance, pick
+from workers.assets.builtin.materials import solid_color, textured
+from workers.assets.builtin.palette import BLACK, WHITE, Color, hsv, jitter, lightness, mix, vivid
+from workers.assets.builtin.parts import Model, Surface
+from workers.assets.builtin.solid import TRIG_DIGITS, Solid, combine, difference, lathe, union
+from workers.assets.builtin.sweeps import bevelled_profile, prism, straight_prism
+from workers.assets.builtin.textures import Texture, blank, blend, draw_small_print, noise, rgb
 
 CASE, LID, SCREEN, BEZEL, DECK, PAD = 0, 1, 2, 3, 4, 5
 DECK_WIDTH, DECK_DEPTH, DECK_MIDDLE = 0.86, 0.44, 0.12
-"""Of the keys' deck: shares of the laptop's width and depth, and how far behind the middle it lies."""
+"""The deck of keys: width and depth, and its offset behind the middle, as shares of the laptop's width and depth."""
 
 
 def make_laptop(rng: np.random.Generator) -> Model:
     """A laptop, 250 to 400 mm wide, its screen 95 to 130 degrees open, with keys and a touch pad."""
-    width = float(rng.uniform(0.25, 0.4))
-    depth = width * float(rng.uniform(0.64, 0.74))
-    thick = float(rng.uniform(0.011, 0.021))
-    lid_thick = thick * float(rng.uniform(0.32, 0.5))
-    radius = float(rng.uniform(0.004, 0.014))
-    angle = float(rng.uniform(math.radians(95.0), math.radians(130.0)))
+    width = rng.uniform(0.25, 0.4)
+    depth = width * rng.uniform(0.64, 0.74)
+    thick = rng.uniform(0.011, 0.021)
+    lid_thick = thick * rng.uniform(0.32, 0.5)
+    radius = rng.uniform(0.004, 0.014)
+    angle = rng.uniform(math.radians(95.0), math.radians(130.0))
     base = _base(rng, (width, depth), thick, radius)
     lid = _screen(rng, (width, depth), lid_thick, radius)
     # The screen lies closed on the base, turns about the hinge's axis and stands behind the keys.
@@ -45,30 +34,30 @@ def make_laptop(rng: np.random.Generator) -> Model:
     c, s = round(math.cos(angle), TRIG_DIGITS), round(math.sin(angle), TRIG_DIGITS)
     axes = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
     opened = lid.placed(axes, hinge)
-    barrel = _hinge(width * float(rng.uniform(0.55, 0.8)), 0.5 * thick, hinge)
+    barrel = _hinge(width * rng.uniform(0.55, 0.8), 0.5 * thick, hinge)
     return Model(union([base, opened, barrel]), _surfaces(rng, (width, depth), thick, hinge, axes))
 
 
 def _base(rng: np.random.Generator, size: tuple[float, float], thick: float, radius: float) -> Solid:
     """The lower half: a slab with a sunken deck for the keys and a sunken touch pad."""
     width, depth = size
-    slab = prism(bevelled(thick, 0.12 * thick), size, radius, [CASE] * 5, 4)
+    slab = prism(bevelled_profile(thick, 0.12 * thick), size, radius, [CASE] * 5, 4)
     well = _plate((DECK_WIDTH * width, DECK_DEPTH * depth), thick - 0.0012, thick + 0.01, DECK).moved(
         y=DECK_MIDDLE * depth
     )
-    pad_size = width * float(rng.uniform(0.28, 0.42)), depth * float(rng.uniform(0.26, 0.32))
+    pad_size = width * rng.uniform(0.28, 0.42), depth * rng.uniform(0.26, 0.32)
     pad = _plate(pad_size, thick - 0.0007, thick + 0.01, PAD).moved(y=-0.5 * depth + 0.05 * depth + 0.5 * pad_size[1])
-    return difference(slab, [together([well, pad])])
+    return difference(slab, [combine([well, pad])])
 
 
 def _plate(size: tuple[float, float], low: float, high: float, surface: int) -> Solid:
-    return prism(np.array([[0.0, low], [0.0, high]]), size, 0.0015, [surface] * 3, 2)
+    return straight_prism(size, low, high, 0.0015, surface, 2)
 
 
 def _screen(rng: np.random.Generator, size: tuple[float, float], thick: float, radius: float) -> Solid:
-    """The upper half as it lies closed, hinge along the x axis: the sunken screen looks down, its lid up."""
+    """The upper half, closed, hinge along the x axis: the sunken screen faces down, the lid up."""
     width, depth = size
-    border, sunk, b = float(rng.uniform(0.006, 0.015)), 0.0006, 0.2 * thick
+    border, sunk, b = rng.uniform(0.006, 0.015), 0.0006, 0.2 * thick
     profile = np.array([[border, sunk], [border, 0.0], [b, 0.0], [0.0, b], [0.0, thick - b], [b, thick]])
     slab = prism(profile, (width, depth), radius, [SCREEN, BEZEL, BEZEL, LID, LID, LID, LID], 4)
     return slab.moved(y=-0.5 * depth + 0.3 * thick)
@@ -94,19 +83,19 @@ def _surfaces(
         (0.12, 0.12, 0.13),
         (0.84, 0.78, 0.72),
     )
-    color: Color = near(rng, pick(rng, silver), 0.03) if chance(rng, 0.88) else mixed(vivid(rng), (0.5, 0.5, 0.5), 0.4)
+    color: Color = jitter(rng, pick(rng, silver), 0.03) if chance(rng, 0.88) else mix(vivid(rng), (0.5, 0.5, 0.5), 0.4)
     metallic = 0.8 if chance(rng, 0.6) else 0.0
-    case = solid_color(color, float(rng.uniform(0.35, 0.55)), metallic)
-    key = BLACK if chance(rng, 0.7) else mixed(color, WHITE, 0.5)
+    case = solid_color(color, rng.uniform(0.35, 0.55), metallic)
+    key = BLACK if chance(rng, 0.7) else mix(color, WHITE, 0.5)
     keys = Surface(
         "keys",
-        textured(_keyboard(rng, near(rng, key, 0.02), mixed(color, BLACK, 0.4 if key == BLACK else 0.2)), 0.6),
+        textured(_keyboard(rng, jitter(rng, key, 0.02), mix(color, BLACK, 0.4 if key == BLACK else 0.2)), 0.6),
         "plane",
         origin=(-0.5 * DECK_WIDTH * width, (DECK_MIDDLE - 0.5 * DECK_DEPTH) * depth, 0.0),
         across=(DECK_WIDTH * width, 0.0, 0.0),
         up=(0.0, DECK_DEPTH * depth, 0.0),
     )
-    bezel = case if chance(rng, 0.2) else solid_color(near(rng, BLACK, 0.02), 0.4)
+    bezel = case if chance(rng, 0.2) else solid_color(jitter(rng, BLACK, 0.02), 0.4)
     # The closed screen's picture: u along x, v from the hinge to the free edge, carried along by the turn.
     up = -depth * axes[1]
     origin = hinge - 0.5 * width * axes[0]
@@ -124,17 +113,17 @@ def _surfaces(
         screen,
         Surface("bezel", bezel),
         keys,
-        Surface("pad", solid_color(mixed(color, BLACK, 0.12), 0.3, 0.5 * metallic)),
+        Surface("pad", solid_color(mix(color, BLACK, 0.12), 0.3, 0.5 * metallic)),
     )
 
 
-def _keyboard(rng: np.random.Generator, key: Color, deck: Color) -> Picture:
+def _keyboard(rng: np.random.Generator, key: Color, deck: Color) -> Texture:
     """Rows of keys with a light edge above; the lowest row has the space bar."""
     height, width, rows = 80, 224, 5
     columns = int(rng.integers(12, 15))
     picture = blank(height, width, deck)
-    letter = rgb(mixed(key, WHITE if lightness(key) < 0.45 else BLACK, 0.6))
-    cap, edge = rgb(key), rgb(mixed(key, WHITE, 0.25))
+    letter = rgb(mix(key, WHITE if lightness(key) < 0.45 else BLACK, 0.6))
+    cap, edge = rgb(key), rgb(mix(key, WHITE, 0.25))
     pitch = height // rows
     for row in range(rows):
         top = (rows - 1 - row) * pitch
@@ -149,8 +138,8 @@ def _keyboard(rng: np.random.Generator, key: Color, deck: Color) -> Picture:
     return picture
 
 
-def _desktop(rng: np.random.Generator) -> Picture:
-    """What the screen shows: nothing, a landscape of colours, or windows of text."""
+def _desktop(rng: np.random.Generator) -> Texture:
+    """The picture on the screen: nothing, a landscape of colours, or windows of text."""
     height, width = 128, 192
     kind = rng.random()
     if kind < 0.25:
@@ -162,18 +151,18 @@ def _desktop(rng: np.random.Generator) -> Picture:
     )
     slope = np.broadcast_to(np.linspace(1.0, 0.0, height, dtype=np.float32)[:, None], (height, width))
     picture = blend(a, b, 0.5 * slope + 0.5 * noise(rng, height, width, 3, 4))
-    picture[-9:] = rgb(mixed(a, BLACK, 0.6))
+    picture[-9:] = rgb(mix(a, BLACK, 0.6))
     if kind > 0.6:
         for _ in range(int(rng.integers(1, 4))):
             _window(rng, picture)
     return picture
 
 
-def _window(rng: np.random.Generator, picture: Picture) -> None:
+def _window(rng: np.random.Generator, picture: Texture) -> None:
     height, width = picture.shape[:2]
     top, left = int(rng.integers(4, height // 2)), int(rng.integers(4, width // 2))
     bottom, right = min(top + int(rng.integers(35, 80)), height - 12), min(left + int(rng.integers(50, 110)), width - 4)
     paper = WHITE if chance(rng, 0.6) else (0.13, 0.14, 0.17)
     picture[top:bottom, left:right] = rgb(paper)
-    picture[top : top + 6, left:right] = rgb(mixed(paper, (0.5, 0.5, 0.55), 0.5))
-    write_lines(rng, picture, (top + 10, left + 5, bottom - 4, right - 5), mixed(paper, (0.5, 0.5, 0.5), 0.9))
+    picture[top : top + 6, left:right] = rgb(mix(paper, (0.5, 0.5, 0.55), 0.5))
+    draw_small_print(rng, picture, (top + 10, left + 5, bottom - 4, right - 5), mix(paper, (0.5, 0.5, 0.5), 0.9))

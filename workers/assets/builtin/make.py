@@ -1,32 +1,33 @@
-"""Pure: the built-in assets. Instance n of a category is the same for ever for one seed."""
+"""Pure: the built-in assets; the same instance for the same category, seed and index, in every version."""
 
 import hashlib
 from collections.abc import Callable
 
 import numpy as np
 
-from schemas.base import Array, frozen_array
+from schemas.base import frozen_array
 from schemas.job.assets import ProceduralSource
-from schemas.scene.shape import Asset, Loft, Shape
+from schemas.scene.shape import Asset, Shape
 from workers.assets.builtin.bottle import make_bottle
 from workers.assets.builtin.bowl import make_bowl
 from workers.assets.builtin.box import make_box
 from workers.assets.builtin.camera import make_camera
 from workers.assets.builtin.can import make_can
-from workers.assets.builtin.finish import Model, cut_into_parts
 from workers.assets.builtin.jar import make_jar
 from workers.assets.builtin.laptop import make_laptop
 from workers.assets.builtin.mug import make_mug
+from workers.assets.builtin.parts import Model, cut_into_parts
 from workers.assets.builtin.table import make_table
+from workers.assets.categories import TABLE
 from workers.assets.mass import solid_mass
+from workers.geometry.frames import pose
 
 VERSION = 2
-"""Goes into the catalogue's digest: raise it with every change that moves a vertex or a colour of any instance."""
+"""Part of the catalogue's digest: raise it with every change to a vertex or colour of any instance."""
 
 LICENCE = "CC0-1.0"
-TABLE = "table"
 
-FAMILIES: dict[str, tuple[int, Callable[[np.random.Generator], Model]]] = {
+GENERATORS: dict[str, tuple[int, Callable[[np.random.Generator], Model]]] = {
     "bottle": (0, make_bottle),
     "camera": (1, make_camera),
     "can": (2, make_can),
@@ -37,7 +38,7 @@ FAMILIES: dict[str, tuple[int, Callable[[np.random.Generator], Model]]] = {
     "box": (7, make_box),
     TABLE: (8, make_table),
 }
-"""The number of each category in the seed's spawn key, which never changes, and who makes it."""
+"""The number of each category in the seed's spawn key, which never changes, and its generator."""
 
 
 def instance_id(category: str, seed: int, index: int) -> str:
@@ -47,7 +48,7 @@ def instance_id(category: str, seed: int, index: int) -> str:
 
 def make_model(category: str, seed: int, index: int) -> Model:
     """Instance `index` of a category, in true metres; the same bits for the same arguments."""
-    number, make = FAMILIES[category]
+    number, make = GENERATORS[category]
     return make(np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, index))))
 
 
@@ -61,8 +62,6 @@ def make_asset(category: str, settings: ProceduralSource, index: int, density_kg
         scale = settings.diagonal_m / float(np.sqrt((extent * extent).sum()))
     shape = cut_into_parts(model.solid, model.surfaces, centre, scale)
     mass = solid_mass((model.solid.vertices - centre) * scale, model.solid.faces, density_kg_m3)
-    T_source_to_object = np.eye(4)
-    T_source_to_object[:3, 3] = -scale * centre
     return Asset(
         instance_id=instance_id(category, settings.seed, index),
         category=category,
@@ -72,18 +71,13 @@ def make_asset(category: str, settings: ProceduralSource, index: int, density_kg
         sha256=shape_digest(shape),
         shape=shape,
         mass=mass,
-        T_source_to_object=frozen_array(T_source_to_object),
+        T_source_to_object=frozen_array(pose(np.eye(3), -scale * centre)),
         scale=scale,
         watertight=True,
         volume_m3=mass.mass_kg / density_kg_m3,
         shareable=True,
-        lofts=_placed(model.solid.lofts, centre, scale),
+        lofts=model.solid.map_lofts(scale * np.eye(3), -scale * centre),
     )
-
-
-def _placed(lofts: tuple[Loft, ...] | None, centre: Array, scale: float) -> tuple[Loft, ...] | None:
-    """The lofts with their points at scale * (point - centre)."""
-    return None if lofts is None else tuple(loft.mapped(scale * np.eye(3), -scale * centre) for loft in lofts)
 
 
 def shape_digest(shape: Shape) -> str:
@@ -101,8 +95,8 @@ def shape_digest(shape: Shape) -> str:
             material.transmission_map,
         )
         shapes = [None if array is None else array.shape for array in arrays]
-        looks = (material.base_color, material.metallic, material.roughness, material.transmission, material.ior)
-        digest.update(repr((part.name, *looks, shapes)).encode())
+        scalars = (material.base_color, material.metallic, material.roughness, material.transmission, material.ior)
+        digest.update(repr((part.name, *scalars, shapes)).encode())
         for array in arrays:
             if array is not None:
                 digest.update(np.ascontiguousarray(array).data)

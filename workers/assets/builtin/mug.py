@@ -3,26 +3,15 @@
 import numpy as np
 
 from schemas.base import Array
-from workers.assets.builtin.curves import bezier, rounded, spline, squircle
-from workers.assets.builtin.finish import Model, Surface, Wrap
-from workers.assets.builtin.look import (
-    BLACK,
-    WHITE,
-    Color,
-    chance,
-    glaze_color,
-    ink_on,
-    metal,
-    mixed,
-    near,
-    pale,
-    solid_color,
-    textured,
-    vivid,
-)
-from workers.assets.builtin.paint import Picture, band_height, bands, dots, label, speckled, upright_stripes
+from workers.assets.builtin.curves import bezier, fillet, spline, squircle
+from workers.assets.builtin.draws import chance
+from workers.assets.builtin.hollow import OUTSIDE, Wall, wall_around, with_handles
+from workers.assets.builtin.materials import metal, solid_color, textured
+from workers.assets.builtin.palette import BLACK, WHITE, Color, glaze_color, ink_on, jitter, mix, pale, vivid
+from workers.assets.builtin.parts import Model, Surface, UvMapping
 from workers.assets.builtin.solid import Solid, lathe
-from workers.assets.builtin.vessel import BASE, INSIDE, OUTSIDE, Wall, bend_radius, rod, wall_around, with_handles
+from workers.assets.builtin.sweeps import bend_radius, rod
+from workers.assets.builtin.textures import Texture, band_height, bands, dots, label, speckled, upright_stripes
 
 HANDLE = 3
 
@@ -35,20 +24,20 @@ def make_mug(rng: np.random.Generator) -> Model:
 
 
 def _body(rng: np.random.Generator) -> Wall:
-    height = float(rng.uniform(0.055, 0.07) if chance(rng, 0.2) else rng.uniform(0.078, 0.115))
-    radius = min(height * float(rng.uniform(0.36, 0.52)), float(rng.uniform(0.042, 0.05)))
-    thickness = float(rng.uniform(0.003, 0.005))
-    bottom = thickness + float(rng.uniform(0.001, 0.004))
+    height = rng.uniform(0.055, 0.07) if chance(rng, 0.2) else rng.uniform(0.078, 0.115)
+    radius = min(height * rng.uniform(0.36, 0.52), rng.uniform(0.042, 0.05))
+    thickness = rng.uniform(0.003, 0.005)
+    bottom = thickness + rng.uniform(0.001, 0.004)
     kind = int(rng.integers(5))
     if kind <= 1:  # straight or tapered
-        taper = float(rng.uniform(0.7, 1.0))
+        taper = rng.uniform(0.7, 1.0)
         wall = np.array([[radius * taper, bottom], [radius, height]])
     elif kind == 2:  # bellied
-        belly = radius * float(rng.uniform(1.05, 1.2))
-        mouth = radius * float(rng.uniform(0.85, 1.0))
+        belly = radius * rng.uniform(1.05, 1.2)
+        mouth = radius * rng.uniform(0.85, 1.0)
         wall = spline(np.array([[radius * 0.85, bottom], [belly, 0.45 * height], [mouth, height]]), 4)
     elif kind == 3:  # bell
-        waist = radius * float(rng.uniform(0.72, 0.85))
+        waist = radius * rng.uniform(0.72, 0.85)
         wall = bezier([waist, bottom], [waist, 0.55 * height], [radius * 0.9, 0.8 * height], [radius * 1.03, height], 8)
     else:  # a cup that opens from a round bottom
         wall = bezier(
@@ -59,69 +48,66 @@ def _body(rng: np.random.Generator) -> Wall:
             9,
         )
     hollow = np.concatenate([[[0.0, bottom]], wall])
-    reach = float(rng.uniform(0.004, 0.014))
-    hollow, _ = rounded(hollow, [0.0, reach, *[0.0] * (len(hollow) - 2)], 3)
-    foot = wall[0, 0] * float(rng.uniform(0.72, 0.88))
-    return wall_around(hollow, thickness, foot, float(rng.uniform(0.003, 0.005)), float(rng.uniform(0.0008, 0.002)))
+    reach = rng.uniform(0.004, 0.014)
+    hollow, _ = fillet(hollow, [0.0, reach, *[0.0] * (len(hollow) - 2)], 3)
+    foot = wall[0, 0] * rng.uniform(0.72, 0.88)
+    return wall_around(hollow, thickness, foot, rng.uniform(0.003, 0.005), rng.uniform(0.0008, 0.002))
 
 
 def _handle(rng: np.random.Generator, wall: Wall) -> Solid:
     top, bottom = float(wall.outer[-1, 1]), float(wall.outer[1, 1])
     span = top - bottom
-    high, low = top - span * float(rng.uniform(0.1, 0.2)), bottom + span * float(rng.uniform(0.16, 0.3))
-    half_width = min(float(rng.uniform(0.005, 0.0095)), 0.12 * span)
+    high, low = top - span * rng.uniform(0.1, 0.2), bottom + span * rng.uniform(0.16, 0.3)
+    half_width = min(rng.uniform(0.005, 0.0095), 0.12 * span)
     # The end of the rod stays within the wall: half a chord of the wall's circle sinks by w^2 / 2r.
     half_width = min(half_width, float(np.sqrt(0.6 * wall.thickness_m * wall.radius_at(low))))
-    slender = float(rng.uniform(0.5, 0.85))
-    ends = [np.array([wall.radius_at(z), z]) for z in (high, low)]
-    out = [wall.normal_at(z) for z in (high, low)]
-    start, stop = (end - 0.5 * wall.thickness_m * normal for end, normal in zip(ends, out, strict=True))
-    reach = (high - low) * float(rng.uniform(0.5, 0.8))
+    slender = rng.uniform(0.5, 0.85)
+    start, stop = wall.middle_at(high), wall.middle_at(low)
+    out = wall.normal_at(high), wall.normal_at(low)
+    reach = (high - low) * rng.uniform(0.5, 0.8)
     path = _path(rng, start, out[0], stop, out[1], max(reach, 0.022))
     half_depth = min(half_width * slender, 0.8 * bend_radius(path, (out[0], -out[1])))
     along = 2.0 * np.linspace(0.0, 1.0, len(path)) - 1.0
-    thick_ends = 1.0 + float(rng.uniform(0.0, 0.25)) * (along * along) * (along * along)
+    thick_ends = 1.0 + rng.uniform(0.0, 0.25) * (along * along) * (along * along)
     section = squircle(12, int(rng.integers(2))) * np.array([half_width, half_depth]) / 1.25
     return rod(path, section, HANDLE, (out[0], -out[1]), thick_ends)
 
 
 def _path(rng: np.random.Generator, start: Array, out: Array, stop: Array, back: Array, reach: float) -> Array:
-    """[K, 2] of (x, z): from the upper end to the lower one; it leaves and meets the wall squarely."""
+    """[K, 2] of (x, z): from the upper end to the lower one; perpendicular to the wall at both."""
     kind = int(rng.integers(3))
     if kind == 0:  # a round C
         return bezier(start, start + 1.25 * reach * out, stop + 1.25 * reach * back, stop, 14)
     if kind == 1:  # an ear: wide above, narrow below
         return bezier(start, start + 1.6 * reach * out, stop + 0.7 * reach * back, stop, 14)
-    corners = np.array([start, start + reach * out, stop + reach * float(rng.uniform(0.8, 1.0)) * back, stop])
+    corners = np.array([start, start + reach * out, stop + reach * rng.uniform(0.8, 1.0) * back, stop])
     size = 0.42 * float(np.sqrt(((corners[1] - corners[2]) ** 2).sum()))
-    path, _ = rounded(corners, [0.0, size, size, 0.0], 5)
+    path, _ = fillet(corners, [0.0, size, size, 0.0], 5)
     return path
 
 
 def _surfaces(rng: np.random.Generator, wall: Wall) -> tuple[Surface, ...]:
     low, high = float(wall.outer[0, 1]), float(wall.profile[:, 1].max())
-    roughness = float(rng.uniform(0.15, 0.35) if chance(rng, 0.75) else rng.uniform(0.6, 0.85))
-    ground: Color = near(rng, WHITE, 0.03) if chance(rng, 0.35) else glaze_color(rng)
-    inside = ground if chance(rng, 0.5) else near(rng, WHITE, 0.03)
+    roughness = rng.uniform(0.15, 0.35) if chance(rng, 0.75) else rng.uniform(0.6, 0.85)
+    ground: Color = jitter(rng, WHITE, 0.03) if chance(rng, 0.35) else glaze_color(rng)
+    inside = ground if chance(rng, 0.5) else jitter(rng, WHITE, 0.03)
     body = solid_color(ground, roughness)
-    wrap: Wrap = "none"
+    mapping: UvMapping = "none"
     if chance(rng, 0.55):
         height = band_height(low, high, wall.radius_at(0.5 * high))
-        body, wrap = textured(_picture(rng, ground, height), roughness), "cylinder"
+        body, mapping = textured(_picture(rng, ground, height), roughness), "cylinder"
     grip = ground if chance(rng, 0.75) else vivid(rng)
     handle = metal(rng) if chance(rng, 0.06) else solid_color(grip, roughness)
-    base = solid_color(mixed(ground, (0.75, 0.7, 0.62), 0.6), 0.8)
-    outside = Surface("body", body, wrap, low=low, high=high)
-    table = {
-        OUTSIDE: outside,
-        INSIDE: Surface("inside", solid_color(inside, roughness)),
-        BASE: Surface("base", base),
-        HANDLE: Surface("handle", handle),
-    }
-    return tuple(table[number] for number in sorted(table))
+    base = solid_color(mix(ground, (0.75, 0.7, 0.62), 0.6), 0.8)
+    return (
+        Surface("body", body, mapping, low=low, high=high),
+        Surface("inside", solid_color(inside, roughness)),
+        Surface("base", base),
+        Surface("handle", handle),
+    )
 
 
-def _picture(rng: np.random.Generator, ground: Color, height: int) -> Picture:
+def _picture(rng: np.random.Generator, ground: Color, height: int) -> Texture:
     kind = int(rng.integers(5))
     if kind == 0:
         return bands(rng, [ground, ink_on(rng, ground), pale(rng)])
@@ -130,5 +116,5 @@ def _picture(rng: np.random.Generator, ground: Color, height: int) -> Picture:
     if kind == 2:
         return dots(rng, ground, ink_on(rng, ground), height)
     if kind == 3:
-        return upright_stripes(rng, [ground, ground, mixed(ground, ink_on(rng, ground), 0.7)])
-    return speckled(rng, ground, mixed(ground, BLACK, 0.6), float(rng.uniform(0.02, 0.07)), height)
+        return upright_stripes(rng, [ground, ground, mix(ground, ink_on(rng, ground), 0.7)])
+    return speckled(rng, ground, mix(ground, BLACK, 0.6), rng.uniform(0.02, 0.07), height)

@@ -1,7 +1,7 @@
-"""Pure: closed triangle solids, made by lofting rings and joined by manifold3d's exact booleans.
+"""Pure: closed triangle solids, lofted from rings and joined by manifold3d's exact booleans.
 
-Only +, -, *, / and square roots touch coordinates here and in `curves`: they give the same bits on every processor.
-Sines and cosines are rounded to `TRIG_DIGITS`, because C libraries and processors differ in the last bit of theirs.
+Coordinates here and in `curves` are computed by +, -, *, / and square roots alone, which give the same bits on every
+processor. Sines and cosines are rounded to `TRIG_DIGITS`, because C libraries and processors differ in their last bit.
 """
 
 import dataclasses
@@ -24,18 +24,18 @@ Mask = NDArray[np.bool_]
 SMOOTH_COSINE = 0.8
 """Neighbouring bands that turn by less than about 37 degrees are shaded as one smooth surface."""
 TRIG_DIGITS = 14
-"""A point of the unit circle is off by less than 1e-14 of its radius."""
+"""Decimals that sines and cosines are rounded to: an error below 1e-14 of the radius."""
 _FAN, _SURFACES = 63, 64
-"""More surfaces than any model has: a face's tag is smooth number * _SURFACES + surface number. _FAN is the surface of
-faces that only close a solid for a boolean."""
+"""_SURFACES: more surfaces than any model has; a face's tag is smoothing group * _SURFACES + surface number.
+_FAN: the surface number of faces that only close a solid for a boolean."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
     """A closed surface, counter-clockwise seen from outside.
 
-    vertices [V, 3] float64 metres; faces [F, 3] int64; surface [F] int64: which look a face has; smooth [F] int64:
-    faces of one number share shading normals where they meet. lofts: what it is the union of, None where that is not known.
+    vertices [V, 3] float64 metres; faces [F, 3] int64; surface [F] int64: surface number; smooth [F] int64:
+    smoothing group, whose faces share shading normals. lofts: the solid is their union; None where they are not known.
     """
 
     vertices: Array
@@ -46,20 +46,21 @@ class Solid:
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Solid":
         """The solid shifted, metres."""
-        return self.placed(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.array([x, y, z]))
+        return self.placed(np.eye(3), np.array([x, y, z]))
 
     def placed(self, axes: Array, origin: Array) -> "Solid":
         """The solid with its x, y, z along the rows of `axes` [3, 3] (a right-handed turn) and its origin at `origin`."""
         x, y, z = self.vertices[:, 0:1], self.vertices[:, 1:2], self.vertices[:, 2:3]
         placed = x * axes[0] + y * axes[1] + z * axes[2] + origin
-        return Solid(placed, self.faces, self.surface, self.smooth, self._mapped(axes, origin))
+        return dataclasses.replace(self, vertices=placed, lofts=self.map_lofts(axes, origin))
 
     def stretched(self, factors: Array) -> "Solid":
         """The solid with its x, y and z times the factors [3]."""
-        lofts = self._mapped(np.diag(factors), np.zeros(3))
-        return Solid(self.vertices * factors, self.faces, self.surface, self.smooth, lofts)
+        lofts = self.map_lofts(np.diag(factors), np.zeros(3))
+        return dataclasses.replace(self, vertices=self.vertices * factors, lofts=lofts)
 
-    def _mapped(self, matrix: Array, origin: Array) -> tuple[Loft, ...] | None:
+    def map_lofts(self, matrix: Array, origin: Array) -> tuple[Loft, ...] | None:
+        """The lofts with their x, y, z along the rows of `matrix` [3, 3] and their origin at `origin`; None if unknown."""
         return None if self.lofts is None else tuple(loft.mapped(matrix, origin) for loft in self.lofts)
 
 
@@ -75,6 +76,11 @@ def circle(count: int) -> Array:
     table = np.array(points)
     table.setflags(write=False)
     return table
+
+
+def level_ring(outline: Array, z: float) -> Array:
+    """[n, 3] float64: an outline [n, 2] at a height, metres."""
+    return np.concatenate([outline, np.full((len(outline), 1), z)], axis=1)
 
 
 @functools.cache
@@ -127,11 +133,11 @@ def lathe(profile: Array, surface: Sequence[int] | Indices, count: int = 48, sec
     level = np.broadcast_to(inner[:, 1][:, None, None], (len(inner), outline.shape[1], 1))
     rings = np.concatenate([outline * inner[:, 0][:, None, None], level], axis=2)
     start, end = np.array([0.0, 0.0, profile[0, 1]]), np.array([0.0, 0.0, profile[-1, 1]])
-    return loft(rings, start, end, surface, smooth_runs(profile), _profiles(profile, section))
+    return loft(rings, start, end, surface, smoothing_groups(profile), _profiles(profile, section))
 
 
 def _profiles(profile: Array, section: Array | None) -> Array:
-    """[K, P, 2] float64: the profile along the columns of a section that are the most unlike; one, where there is none."""
+    """[K, P, 2] float64: the profiles along the widest and narrowest columns of a section; one without a section."""
     if section is None:
         return profile[None]
     reach = np.sqrt(section[..., 0] * section[..., 0] + section[..., 1] * section[..., 1])  # [P - 2, n]
@@ -147,21 +153,21 @@ def _widened(profile: Array, factors: Array) -> Array:
     return wide
 
 
-def smooth_runs(profile: Array) -> Indices:
-    """[P - 1] int64: the number of the smooth run that each segment of a profile [P, 2] belongs to; flat ends stand alone."""
+def smoothing_groups(profile: Array) -> Indices:
+    """[P - 1] int64: the smoothing group of each segment of a profile [P, 2]; flat ends have one of their own."""
     step = np.diff(profile, axis=0)
     length = np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2)
     along = step / np.where(length == 0.0, 1.0, length)[:, None]
     cosine = along[1:, 0] * along[:-1, 0] + along[1:, 1] * along[:-1, 1]
     sharp = cosine < SMOOTH_COSINE
-    # A flat end is large beside its rounded rim, and would be shaded as if it were domed.
+    # A flat end is large beside its rounded rim: averaged normals would shade it as a dome.
     sharp[0] |= step[0, 1] == 0.0
     sharp[-1] |= step[-1, 1] == 0.0
     return np.concatenate([[0], np.cumsum(sharp)]).astype(np.int64)
 
 
-def together(solids: Sequence[Solid]) -> Solid:
-    """Solids that do not touch one another, as one: booleans take them in one step."""
+def combine(solids: Sequence[Solid]) -> Solid:
+    """Concatenates solids that do not touch one another, so that a boolean takes them in one step."""
     starts = np.cumsum([0, *(len(solid.vertices) for solid in solids[:-1])])
     smooths = np.cumsum([0, *(int(solid.smooth.max()) + 1 for solid in solids[:-1])])
     return Solid(
@@ -174,7 +180,7 @@ def together(solids: Sequence[Solid]) -> Solid:
 
 
 def _lofts_of(solids: Sequence[Solid]) -> tuple[Loft, ...] | None:
-    """Of all the solids, one after the other; None where one's are not known."""
+    """The lofts of all solids in order; None where those of one are not known."""
     found: list[Loft] = []
     for solid in solids:
         if solid.lofts is None:
@@ -184,18 +190,18 @@ def _lofts_of(solids: Sequence[Solid]) -> tuple[Loft, ...] | None:
 
 
 def union(solids: Sequence[Solid]) -> Solid:
-    """All the solids as one, without what lies inside; MeshError never: a bad solid is a bug and raises ValueError."""
+    """The union of the solids; ValueError where one is not closed, which is a bug of the caller's."""
     return _from_manifold(manifold3d.Manifold.batch_boolean(_tagged(solids), manifold3d.OpType.Add), _lofts_of(solids))
 
 
 def union_at(solid: Solid, touched: Mask, apex: Array, others: Sequence[Solid], beside: Sequence[Solid] = ()) -> Solid:
-    """The union of a solid and of others that meet it nowhere but in its faces `touched` [F].
+    """The union of a solid with others that meet it in its faces `touched` [F] alone.
 
-    What booleans cost grows with all faces that go in. So only these faces do, closed by fans from their border to
-    `apex`, a point on their inner side that sees them all; between the fans and them the others must find what the
-    whole solid has there. The fans are taken off again and the rest of the solid put back. `beside`: solids that meet
-    the others and not this one, and go in in the same step. Where another solid reaches through the fans, the whole
-    solid goes in: the same, but slower.
+    The cost of a boolean grows with the number of faces. So the boolean gets these faces alone, closed by fans from their
+    border to `apex`, an inner point that sees them all. Between the fans and the faces the others must meet what the whole
+    solid has there. Afterwards the fans are removed and the rest of the solid is put back. `beside`: solids that meet the
+    others but not this one, joined in the same step. Where another solid reaches through the fans, the boolean gets the
+    whole solid: the same result, but slower.
     """
     core = solid.faces[touched]
     a, b = core.ravel(), core[:, [1, 2, 0]].ravel()
@@ -206,13 +212,13 @@ def union_at(solid: Solid, touched: Mask, apex: Array, others: Sequence[Solid], 
     surface = np.concatenate([solid.surface[touched], np.full(len(fan), _FAN)])
     smooth = np.concatenate([solid.smooth[touched], np.zeros(len(fan), dtype=np.int64)])
     vertices = np.concatenate([solid.vertices, apex[None]])
-    joined = union([together([Solid(vertices[names], faces, surface, smooth), *beside]), *others])
+    joined = union([combine([Solid(vertices[names], faces, surface, smooth), *beside]), *others])
     place = {point: number for number, point in enumerate(map(tuple, joined.vertices.tolist()))}
     rim = np.unique(a[border])
     at = [place.get(point, -1) for point in map(tuple, solid.vertices[rim].tolist())]
     kept = joined.surface != _FAN
     if int((~kept).sum()) != len(fan) or -1 in at:
-        return union([together([solid, *beside]), *others])
+        return union([combine([solid, *beside]), *others])
     target = len(joined.vertices) + np.arange(size)
     target[rim] = at
     faces = np.concatenate([joined.faces[kept], target[solid.faces[~touched]]])
@@ -227,7 +233,7 @@ def union_at(solid: Solid, touched: Mask, apex: Array, others: Sequence[Solid], 
 
 
 def _renumbered(faces: Indices) -> tuple[Indices, Indices]:
-    """Faces into the vertices that they name alone, and the old number of each of these."""
+    """Faces renumbered into the vertices that they name, and the old numbers of these."""
     used = np.zeros(int(faces.max()) + 1, dtype=np.bool_)
     used[faces] = True
     return (np.cumsum(used) - 1)[faces], np.flatnonzero(used)
@@ -243,7 +249,7 @@ def difference(solid: Solid, cutters: Sequence[Solid]) -> Solid:
 
 
 def _tagged(solids: Sequence[Solid]) -> list[manifold3d.Manifold]:
-    """The solids in manifold3d, each face with its surface and a smooth number of its own solid's in its face id."""
+    """The solids in manifold3d; face ids hold the surface number and a smoothing group that is unique to the solid."""
     hold_to_one_thread()
     manifolds = []
     first = 0

@@ -1,34 +1,13 @@
 """Edge: a folder of URDFs or plain meshes, with a map from file patterns to categories."""
 
-import hashlib
 import importlib.util
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from schemas.errors import AssetSourceError, MeshError
-from schemas.job.assets import FolderSource, MeshLimits
-from schemas.job.job import CATEGORIES
-from schemas.scene.shape import Asset
-from workers.assets.external.mesh import load_shape
-from workers.assets.external.urdf_file import find_mesh, load_urdf, mesh_names, parse_urdf
-from workers.assets.sources import (
-    TABLE,
-    UNKNOWN,
-    UP_AXES,
-    Entry,
-    Listing,
-    Placement,
-    SourceShape,
-    Weights,
-    check_unchanged,
-    found_in,
-    hashed,
-    licence_files,
-    licence_of,
-    mesh_files,
-    placed_asset,
-    tally,
-)
+from schemas.errors import AssetSourceError
+from schemas.job.assets import FolderSource
+from workers.assets.categories import ASSET_CATEGORIES, TABLE
+from workers.assets.external.listing import describe_folder
 
 PYBULLET_DATA = "pybullet_data"
 PYBULLET_MAP: Mapping[str, str] = {
@@ -37,11 +16,11 @@ PYBULLET_MAP: Mapping[str, str] = {
     "table_square/table_square.urdf": TABLE,
     "random_urdfs/*/*.urdf": "box",
 }
-"""What of the meshes inside the pybullet_data package is one of our categories."""
+"""The category of each mesh inside the pybullet_data package that has one."""
 
 
 def locate_folder(name: str, job_folder: Path) -> Path:
-    """The folder of a source: relative to the job file, or the installed pybullet_data package's, without importing it."""
+    """The folder of a source: relative to the job file, or that of the installed package pybullet_data, not imported."""
     if name == PYBULLET_DATA and not (job_folder / name).is_dir():
         spec = importlib.util.find_spec(PYBULLET_DATA)
         if spec is None or not spec.submodule_search_locations:
@@ -50,29 +29,23 @@ def locate_folder(name: str, job_folder: Path) -> Path:
     return (job_folder / Path(name).expanduser()).resolve()
 
 
-def list_folder(settings: FolderSource, folder: Path, categories: Collection[str], limits: MeshLimits) -> Listing:
-    """Every file that the map names, for the categories asked for; AssetSourceError where map or folder cannot be used.
+def find_files(
+    settings: FolderSource, job_folder: Path, categories: Collection[str]
+) -> tuple[Path, dict[str, list[Path]]]:
+    """The source's folder, and every file that the map names by category, of the categories asked for.
 
-    Reads and hashes these files and all that they refer to.
+    Raises AssetSourceError where map or folder cannot be used.
     """
-    folder = folder.resolve()  # what lies in it is compared with its resolved path
-    category_map = _map_of(settings, folder)
-    entries: dict[str, list[Entry]] = {
-        category: [] for category in sorted(set(category_map.values()) & set(categories))
-    }
-    skipped = []
-    licences = licence_files(folder.rglob("*")) if settings.licence == UNKNOWN else []
-    for path, category in sorted(_matches(category_map, folder).items()):
-        if category not in entries:
-            continue
-        try:
-            entries[category].append(_entry(settings, folder, path, limits, licences))
-        except MeshError as error:
-            skipped.append(error.reason)
-    return Listing(folder, {category: tuple(found) for category, found in entries.items()}, tally(skipped))
+    folder = locate_folder(settings.folder, job_folder)
+    category_map = _read_map(settings, folder)
+    found: dict[str, list[Path]] = {category: [] for category in sorted(set(category_map.values()) & set(categories))}
+    for path, category in sorted(_match_files(category_map, folder).items()):
+        if category in found:
+            found[category].append(path)
+    return folder, found
 
 
-def _matches(category_map: Mapping[str, str], folder: Path) -> dict[Path, str]:
+def _match_files(category_map: Mapping[str, str], folder: Path) -> dict[Path, str]:
     """The category of every file inside the folder that a pattern finds; the first pattern wins."""
     matches: dict[Path, str] = {}
     for pattern, category in category_map.items():
@@ -86,7 +59,8 @@ def _matches(category_map: Mapping[str, str], folder: Path) -> dict[Path, str]:
     return matches
 
 
-def _map_of(settings: FolderSource, folder: Path) -> Mapping[str, str]:
+def _read_map(settings: FolderSource, folder: Path) -> Mapping[str, str]:
+    """The category by file pattern; AssetSourceError where there is none or it names another category."""
     if not folder.is_dir():
         raise AssetSourceError(
             f"{folder} is not a folder. Set `folder` of the urdf source to one, or to `{PYBULLET_DATA}`."
@@ -95,54 +69,10 @@ def _map_of(settings: FolderSource, folder: Path) -> Mapping[str, str]:
     if not category_map:
         raise AssetSourceError(
             f'{folder} needs a `category_map`, such as {{"mugs/*.obj": mug}}: nothing says what its files are. '
-            f"It has {found_in(folder)}."
+            f"It has {describe_folder(folder)}."
         )
     for pattern, category in category_map.items():
-        if category not in (*CATEGORIES, TABLE):
-            allowed = ", ".join((*CATEGORIES, TABLE))
+        if category not in ASSET_CATEGORIES:
+            allowed = ", ".join(ASSET_CATEGORIES)
             raise AssetSourceError(f"category_map: {pattern!r} is given {category!r}, which is none of {allowed}.")
     return category_map
-
-
-def _entry(settings: FolderSource, folder: Path, path: Path, limits: MeshLimits, licences: list[Path]) -> Entry:
-    paths = [path]
-    if path.suffix.lower() == ".urdf":
-        for name in mesh_names(parse_urdf(path)):
-            paths += mesh_files(find_mesh(name, path, folder), folder, limits)
-    else:
-        paths = mesh_files(path, folder, limits)
-    files = hashed(dict.fromkeys(paths), folder)
-    identity = _instance_id(settings, files[0].path, files[0].sha256)
-    return Entry(identity, files, licence_of(path, folder, settings.licence, licences))
-
-
-def _instance_id(settings: FolderSource, relative: str, sha256: str) -> str:
-    """The path as one word, and eight digits of a digest of the file and of the settings that shape it."""
-    word = "".join(
-        c if c.isascii() and (c.isalnum() or c in "-_.") else "-" for c in str(Path(relative).with_suffix(""))
-    )
-    how = (relative, sha256, settings.up, settings.scale, settings.diagonal_m)
-    return f"{word}-{hashlib.sha256(repr(how).encode()).hexdigest()[:8]}"
-
-
-def load_folder_entry(
-    settings: FolderSource, listing: Listing, entry: Entry, category: str, limits: MeshLimits, weights: Weights
-) -> Asset:
-    """One file, cleaned, z up, scaled; MeshError where it is refused or has changed."""
-    check_unchanged(listing.folder, entry)
-    path = listing.folder / entry.files[0].path
-    if path.suffix.lower() == ".urdf":
-        found = load_urdf(path, listing.folder, limits)
-    else:
-        loaded = load_shape(path, limits, root=listing.folder)
-        found = SourceShape(loaded.shape, loaded.notes)
-    diagonal = None if category == TABLE else settings.diagonal_m
-    return placed_asset(
-        found,
-        Placement(UP_AXES[settings.up], settings.scale, diagonal),
-        entry=entry,
-        category=category,
-        source="urdf",
-        shareable=settings.copy_assets,
-        weights=weights,
-    )

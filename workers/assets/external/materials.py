@@ -1,4 +1,4 @@
-"""Pure: what trimesh read of a surface's look, in the terms of schemas.scene.shape."""
+"""Pure: the materials, texture coordinates and colours that trimesh read, in the terms of schemas.scene.shape."""
 
 import warnings
 from dataclasses import dataclass
@@ -12,24 +12,25 @@ from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
 
 from schemas.base import Array
 from schemas.scene.shape import Material
-from workers.assets.external.reading import plain_words
+from workers.assets.external.caps import describe_error
 
-BLACK = 0.02
-"""A base colour darker than this under a texture is an exporter's leftover: the texture shows as it is."""
-INVISIBLE = 0.01
-"""An alpha below this would hide the thing altogether: some exporters write opacity the wrong way round."""
+MIN_TINT = 0.02
+"""Darkest base colour that multiplies a texture; below it the colour is an exporter's leftover and is ignored."""
+MIN_ALPHA = 0.01
+"""Smallest alpha that is believed; below it alpha is 1, because some exporters write opacity inverted."""
+WHITE = Material(base_color=(1.0, 1.0, 1.0, 1.0))
 DEFAULT = Material()
-"""The look of what comes without one; a part that has it can be told by identity."""
+"""The material of a mesh that has none; parts with it are recognised by identity."""
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """Material, uv [V, 2] or None, colors [V, 4] uint8 sRGB or None; `per_face` [F, 4] uint8 where faces are coloured."""
+class MeshVisual:
+    """Material, uv [V, 2] or None, colors [V, 4] uint8 sRGB or None, face_colors [F, 4] uint8 sRGB or None."""
 
     material: Material
     uv: Array | None = None
     colors: NDArray[np.uint8] | None = None
-    per_face: NDArray[np.uint8] | None = None
+    face_colors: NDArray[np.uint8] | None = None
 
 
 def srgb_from_linear(linear: Array) -> Array:
@@ -42,24 +43,20 @@ def linear_from_srgb(srgb: Array) -> Array:
     return np.where(srgb <= 0.04045, srgb / 12.92, np.power((srgb + 0.055) / 1.055, 2.4))
 
 
-def look_of(mesh: trimesh.Trimesh, linear: bool) -> tuple[Look, tuple[str, ...]]:
-    """The look of one trimesh geometry, and notes. `linear`: its colours are linear, as glTF's are."""
+def read_visual(mesh: trimesh.Trimesh, linear: bool) -> tuple[MeshVisual, tuple[str, ...]]:
+    """The material and colours of one trimesh geometry, and notes. `linear`: its colours are linear, as glTF's are."""
     visual: Any = mesh.visual
     if visual.kind == "texture":
         uv = getattr(visual, "uv", None)
         usable = uv is not None and np.shape(uv) == (len(mesh.vertices), 2) and bool(np.isfinite(uv).all())
         material, notes = _material(visual.material, textured=usable)
         colors = _attribute_colors(visual.vertex_attributes.get("color"), len(mesh.vertices), linear)
-        return Look(material, np.asarray(uv, dtype=np.float64) if usable else None, colors), notes
+        return MeshVisual(material, np.asarray(uv, dtype=np.float64) if usable else None, colors), notes
     if visual.kind == "vertex" and len(visual.vertex_colors) == len(mesh.vertices):
-        return Look(_white(), colors=_colors(visual.vertex_colors, linear)), ()
+        return MeshVisual(WHITE, colors=_colors(visual.vertex_colors, linear)), ()
     if visual.kind == "face" and len(visual.face_colors) == len(mesh.faces):
-        return Look(_white(), per_face=_colors(visual.face_colors, linear)), ()
-    return Look(DEFAULT), ()
-
-
-def _white() -> Material:
-    return Material(base_color=(1.0, 1.0, 1.0, 1.0))
+        return MeshVisual(WHITE, face_colors=_colors(visual.face_colors, linear)), ()
+    return MeshVisual(DEFAULT), ()
 
 
 def _colors(values: NDArray, linear: bool) -> NDArray[np.uint8]:
@@ -70,7 +67,7 @@ def _colors(values: NDArray, linear: bool) -> NDArray[np.uint8]:
 
 
 def _attribute_colors(values: NDArray | None, count: int, linear: bool) -> NDArray[np.uint8] | None:
-    """Vertex colours that come beside a material, as stored: floats, or whole numbers that fill their type."""
+    """Vertex colours stored beside a material, as floats in [0, 1] or as integers that use the whole range of their type."""
     if values is None or np.shape(values) not in ((count, 3), (count, 4)):
         return None
     whole = np.issubdtype(values.dtype, np.integer)
@@ -103,10 +100,10 @@ def _material(source: object, textured: bool) -> tuple[Material, tuple[str, ...]
         roughness = (2.0 / (max(source.glossiness, 0.0) + 2.0)) ** 0.25
     else:
         return DEFAULT, ()
-    if color[3] < INVISIBLE:
+    if color[3] < MIN_ALPHA:
         color[3] = 1.0
         notes.append("an alpha of 0 was read as 1")
-    if texture is not None and color[:3].max() < BLACK:
+    if texture is not None and color[:3].max() < MIN_TINT:
         color[:3] = 1.0
     base = tuple(float(c) for c in np.clip(np.nan_to_num(color, nan=0.7), 0.0, 1.0))
     finite = [float(np.clip(np.nan_to_num(value, nan=0.6), 0.0, 1.0)) for value in (metallic, roughness)]
@@ -114,7 +111,7 @@ def _material(source: object, textured: bool) -> tuple[Material, tuple[str, ...]
 
 
 def _opacity(source: SimpleMaterial, otherwise: float) -> float:
-    """The `d` of an MTL file; `Tr` is left out, because half of the exporters write it the wrong way round."""
+    """The `d` of an MTL file; `Tr` is ignored, because half of the exporters write it inverted."""
     try:
         return float(source.kwargs["d"][0])
     except (KeyError, IndexError, TypeError, ValueError):
@@ -122,7 +119,7 @@ def _opacity(source: SimpleMaterial, otherwise: float) -> float:
 
 
 def _texture(image: Image.Image | None, notes: list[str]) -> NDArray[np.uint8] | None:
-    """[h, w, 3 or 4] uint8, read-only; None with a note where the picture cannot be decoded."""
+    """[h, w, 3 or 4] uint8, read-only; None with a note where the image cannot be decoded."""
     if image is None:
         return None
     try:
@@ -131,7 +128,7 @@ def _texture(image: Image.Image | None, notes: list[str]) -> NDArray[np.uint8] |
             alpha = "A" in image.getbands() or "transparency" in image.info
             pixels = np.array(image.convert("RGBA" if alpha else "RGB"), dtype=np.uint8)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
-        notes.append(f"a texture cannot be decoded ({plain_words(error)}): plain base colour used")
+        notes.append(f"a texture cannot be decoded ({describe_error(error)}): plain base colour used")
         return None
     pixels.setflags(write=False)
     return pixels

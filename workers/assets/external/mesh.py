@@ -1,4 +1,4 @@
-"""The only door for meshes from outside: a file goes in, a clean shape comes out, or a MeshError says why not."""
+"""Loads a mesh file from outside as a clean shape, or raises a MeshError that says why not."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,46 +11,47 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part, Shape
-from workers.assets.external.materials import Look, look_of
-from workers.assets.external.reading import FolderResolver, check_counts, read_bytes, read_scene
+from workers.assets.external.caps import FolderResolver, check_counts
+from workers.assets.external.materials import MeshVisual, read_visual
+from workers.assets.external.reading import read_bytes, read_scene
 from workers.assets.external.topology import (
     Bodies,
     Indices,
     Mask,
-    collapsed,
     find_bodies,
-    flips_for_consistency,
+    find_collapsed,
+    find_flips,
+    find_repeated,
     merge_points,
-    repeated,
     thin_volume,
 )
+from workers.geometry.frames import transform
 
 LARGEST_COORDINATE = 1e7
-"""Beyond this, in units of the file, products of coordinates lose what they mean."""
+"""Largest coordinate, in units of the file; products of larger ones lose precision."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoadedMesh:
-    """A cleaned shape in the file's own frame and units; whether it is closed; what was mended or left out."""
+    """A cleaned shape in the file's own frame and units, and what of it was mended or left out."""
 
     shape: Shape
-    watertight: bool
     notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """One geometry as it stands in the scene: vertices [V, 3], faces [F, 3] int64, unit normals [V, 3] or None."""
+    """One geometry in the frame of the scene: vertices [V, 3], faces [F, 3] int64, unit normals [V, 3] or None."""
 
     name: str
     vertices: Array
     faces: Indices
     normals: Array | None
-    look: Look
+    visual: MeshVisual
 
 
 def load_shape(path: Path, limits: MeshLimits, root: Path | None = None) -> LoadedMesh:
-    """A stranger's mesh, made safe: finite, in range, no doubled or empty faces, wound outwards where that can be told.
+    """A mesh file's shape: finite, in range, no doubled or empty faces, wound outwards where it is closed.
 
     Material files and textures are looked for below `root` (default: the mesh's own folder) and nowhere else; a
     missing or refused one leaves the plain base colour and a note. Raises MeshError with one of the reasons `missing`,
@@ -59,31 +60,25 @@ def load_shape(path: Path, limits: MeshLimits, root: Path | None = None) -> Load
     resolver = FolderResolver(path, root or path.parent, limits)
     scene = read_scene(path, read_bytes(path, limits), resolver)
     pieces, notes = _pieces(path, scene, limits)
-    shape, watertight, mended = clean_shape(path, pieces)
-    return LoadedMesh(shape, watertight, tuple(dict.fromkeys([*resolver.notes, *notes, *mended])))
+    shape, mended = clean_shape(path, pieces)
+    return LoadedMesh(shape, tuple(dict.fromkeys([*resolver.notes, *notes, *mended])))
 
 
-def transform_shape(shape: Shape, linear: Array, offset: Array) -> Shape:
-    """The shape with every point x at linear @ x + offset ([3, 3], [3]); a mirroring turns the faces over as well."""
-    mirrored = float(np.linalg.det(linear)) < 0
-    inverse = np.linalg.inv(linear)
+def transform_shape(shape: Shape, matrix: Pose) -> Shape:
+    """The shape taken through an affine transform [4, 4]; a mirroring turns the faces over as well."""
+    mirrored = float(np.linalg.det(matrix[:3, :3])) < 0
+    inverse = np.linalg.inv(matrix[:3, :3])
     parts = []
     for part in shape.parts:
         normals = None if part.normals is None else frozen_array(_unit(part.normals @ inverse))
         faces = frozen_array(part.faces[:, ::-1], np.int32) if mirrored else part.faces
-        vertices = frozen_array(_apply(linear, part.vertices) + offset)
+        vertices = frozen_array(transform(matrix, part.vertices))
         parts.append(replace(part, vertices=vertices, faces=faces, normals=normals))
     return Shape(tuple(parts), shape.closed)
 
 
-def _apply(linear: Array, vertices: Array) -> Array:
-    """[N, 3]: sums of products, written out because a matrix product may add in another order on another machine."""
-    x, y, z = vertices[:, 0:1], vertices[:, 1:2], vertices[:, 2:3]
-    return x * linear[:, 0] + y * linear[:, 1] + z * linear[:, 2]
-
-
 def _pieces(path: Path, scene: trimesh.Scene, limits: MeshLimits) -> tuple[list[_Piece], list[str]]:
-    """Every mesh of the scene where its node puts it."""
+    """Every mesh of the scene at the pose of each of its nodes, and notes."""
     shown = [(scene.graph[node], node) for node in scene.graph.nodes_geometry]
     meshes = [(matrix, scene.geometry[name]) for (matrix, name), _ in shown]
     meshes = [(matrix, mesh) for matrix, mesh in meshes if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
@@ -91,40 +86,40 @@ def _pieces(path: Path, scene: trimesh.Scene, limits: MeshLimits) -> tuple[list[
     pieces: list[_Piece] = []
     notes: list[str] = []
     for number, (matrix, mesh) in enumerate(meshes):
-        look, why = look_of(mesh, linear=path.suffix.lower() == ".glb")
+        visual, why = read_visual(mesh, linear=path.suffix.lower() == ".glb")
         notes += why
-        pieces.append(_piece(path, f"part{number}", mesh, np.asarray(matrix, dtype=np.float64), look))
+        pieces.append(_piece(path, f"part{number}", mesh, np.asarray(matrix, dtype=np.float64), visual))
     if not pieces:
         raise MeshError("no_faces", f"{path} has no triangles")
     return pieces, notes
 
 
-def _piece(path: Path, name: str, mesh: trimesh.Trimesh, matrix: Pose, look: Look) -> _Piece:
+def _piece(path: Path, name: str, mesh: trimesh.Trimesh, matrix: Pose, visual: MeshVisual) -> _Piece:
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     faces = np.asarray(mesh.faces, dtype=np.int64)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshError("index_out_of_range", f"{path}: a face names vertex {faces.max()} of {len(vertices)}")
-    # Vertices that no face names may hold anything: only what is used counts.
+    # Only vertices that a face names are checked: others may hold anything.
     if not (np.isfinite(vertices[faces]).all() and np.isfinite(matrix).all()):
         raise MeshError("not_finite", f"{path} has a coordinate that is not a finite number")
     used = np.zeros(len(vertices), dtype=np.bool_)
     used[faces] = True
-    vertices = _apply(matrix[:3, :3], np.where(used[:, None], vertices, 0.0)) + matrix[:3, 3]
+    vertices = transform(matrix, np.where(used[:, None], vertices, 0.0))
     if (largest := float(np.abs(vertices[used]).max())) > LARGEST_COORDINATE:
         raise MeshError("not_finite", f"{path} has a coordinate of {largest:g}, over {LARGEST_COORDINATE:g}")
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]
     normals = _file_normals(mesh, matrix)
-    if look.per_face is not None:  # a colour for each face needs corners of its own
+    if visual.face_colors is not None:  # a colour for each face needs corners of its own
         vertices, normals = vertices[faces.ravel()], None if normals is None else normals[faces.ravel()]
-        look = replace(look, colors=np.repeat(look.per_face, 3, axis=0), per_face=None)
+        visual = replace(visual, colors=np.repeat(visual.face_colors, 3, axis=0), face_colors=None)
         faces = np.arange(3 * len(faces)).reshape(-1, 3)
-    return _Piece(name, vertices, faces, normals, look)
+    return _Piece(name, vertices, faces, normals, visual)
 
 
 def _file_normals(mesh: trimesh.Trimesh, matrix: Pose) -> Array | None:
-    """The file's own shading normals [V, 3], unit, turned with the node; None where it has none that can be used."""
-    if "vertex_normals" not in mesh._cache.cache:  # what trimesh computes itself is no news
+    """The file's own unit shading normals [V, 3], rotated with the node; None where it has no usable ones."""
+    if "vertex_normals" not in mesh._cache.cache:  # trimesh would compute them
         return None
     normals = np.asarray(mesh.vertex_normals, dtype=np.float64)
     if normals.shape != mesh.vertices.shape or not np.isfinite(normals).all() or np.linalg.det(matrix[:3, :3]) == 0:
@@ -138,24 +133,24 @@ def _unit(vectors: Array) -> Array:
     return vectors / np.where(length == 0, 1.0, length)
 
 
-def clean_shape(path: Path, pieces: list[_Piece]) -> tuple[Shape, bool, list[str]]:
-    """The pieces as one clean shape, whether it is watertight, and what was mended.
+def clean_shape(path: Path, pieces: list[_Piece]) -> tuple[Shape, list[str]]:
+    """The pieces as one clean shape, and what was mended.
 
-    Kept in mind: collapsed faces go; doubled faces go, but two faces back to back stay where two solids touch;
-    neighbours are made to agree; closed bodies face outwards (a closed body inside another that faces inwards is a
-    void and stays); slivers without area go unless they close a gap.
+    Drops collapsed and doubled faces, but keeps two faces back to back where two solids touch. Winds neighbours alike
+    and closed bodies outwards, but keeps a closed body that faces inwards inside another: it is a void. Drops slivers
+    without area unless they close a gap.
     """
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
     vertices = np.concatenate([piece.vertices for piece in pieces])
     faces = np.concatenate([piece.faces + start for piece, start in zip(pieces, starts[:-1], strict=True)])
     owner = np.repeat(np.arange(len(pieces)), [len(piece.faces) for piece in pieces])
     point = merge_points(vertices)
-    kept = ~collapsed(point[faces])
-    kept[kept] = ~repeated(point[faces[kept]], oriented=True)
+    kept = ~find_collapsed(point[faces])
+    kept[kept] = ~find_repeated(point[faces[kept]], oriented=True)
     faces, owner = faces[kept], owner[kept]
     if not len(faces):
         raise MeshError("no_faces", f"{path} has only empty faces")
-    faces, owner, bodies = _settle_winding(vertices, faces, owner, point)
+    faces, owner, bodies = _unify_winding(vertices, faces, owner, point)
     watertight = bool(bodies.closed.all()) and float(bodies.volume.sum()) > thin_volume(vertices, faces)
     if not watertight:
         solid = ~_slivers(vertices, faces)
@@ -165,22 +160,22 @@ def clean_shape(path: Path, pieces: list[_Piece]) -> tuple[Shape, bool, list[str
     notes = [f"{len(kept) - len(faces)} doubled or empty faces dropped"] if len(faces) < len(kept) else []
     parts = [_part(piece, faces[owner == k] - starts[k]) for k, piece in enumerate(pieces) if (owner == k).any()]
     closed = watertight and bool((bodies.volume > 0.0).all())
-    return Shape(tuple(parts), closed), watertight, notes
+    return Shape(tuple(parts), closed), notes
 
 
-def _settle_winding(vertices: Array, faces: Indices, owner: Indices, point: Indices) -> tuple[Indices, Indices, Bodies]:
-    """Faces wound alike and outwards, without the second side of sheets; their owners; and their bodies."""
-    twins = repeated(point[faces], oriented=False)
+def _unify_winding(vertices: Array, faces: Indices, owner: Indices, point: Indices) -> tuple[Indices, Indices, Bodies]:
+    """Faces wound consistently and outwards, without the second side of sheets; their owners; and their bodies."""
+    twins = find_repeated(point[faces], oriented=False)
     if twins.any():
         bodies = find_bodies(vertices, faces, point[faces])
         sheet = ~bodies.closed | (np.abs(bodies.volume) < thin_volume(vertices, faces))
         drop = twins & sheet[bodies.body]
         faces, owner = faces[~drop], owner[~drop]
-    faces = _turned(faces, flips_for_consistency(point[faces]))
+    faces = _flipped(faces, find_flips(point[faces]))
     bodies = find_bodies(vertices, faces, point[faces])
     inwards = bodies.closed & (bodies.volume < 0) & ~_voids(vertices, faces, bodies)
     if inwards.any():
-        faces = _turned(faces, inwards[bodies.body])
+        faces = _flipped(faces, inwards[bodies.body])
         bodies = Bodies(bodies.body, bodies.closed, np.where(inwards, -bodies.volume, bodies.volume))
     return faces, owner, bodies
 
@@ -197,19 +192,19 @@ def _voids(vertices: Array, faces: Indices, bodies: Bodies) -> Mask:
     return voids
 
 
-def _turned(faces: Indices, flip: Mask) -> Indices:
+def _flipped(faces: Indices, flip: Mask) -> Indices:
     return np.where(flip[:, None], faces[:, ::-1], faces)
 
 
 def _slivers(vertices: Array, faces: Indices) -> Mask:
-    """[F] bool: faces whose area vanishes beside the square of their longest side."""
+    """[F] bool: faces whose area is negligible compared with the square of their longest side."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     longest = np.maximum.reduce([((b - a) ** 2).sum(1), ((c - b) ** 2).sum(1), ((a - c) ** 2).sum(1)])
     return np.linalg.norm(np.cross(b - a, c - a), axis=1) <= 1e-12 * longest
 
 
 def _part(piece: _Piece, faces: Indices) -> Part:
-    """A part of the faces that are left, with only the vertices that they name."""
+    """A part with the remaining faces and the vertices that they name."""
     used, index = np.unique(faces, return_inverse=True)
     vertices, corners = piece.vertices[used], index.reshape(-1, 3)
     normals = None if piece.normals is None else _facing(vertices, corners, piece.normals[used])
@@ -217,10 +212,10 @@ def _part(piece: _Piece, faces: Indices) -> Part:
         name=piece.name,
         vertices=frozen_array(vertices),
         faces=frozen_array(corners, np.int32),
-        material=piece.look.material,
+        material=piece.visual.material,
         normals=None if normals is None else frozen_array(normals),
-        uv=None if piece.look.uv is None else frozen_array(piece.look.uv[used]),
-        colors=None if piece.look.colors is None else frozen_array(piece.look.colors[used], np.uint8),
+        uv=None if piece.visual.uv is None else frozen_array(piece.visual.uv[used]),
+        colors=None if piece.visual.colors is None else frozen_array(piece.visual.colors[used], np.uint8),
     )
 
 

@@ -1,4 +1,4 @@
-"""Pure: which corners of a triangle soup are one point, which faces belong together, and whether they close a volume."""
+"""Pure: merges the points of a triangle soup, winds its faces consistently, and finds its closed bodies."""
 
 from dataclasses import dataclass
 
@@ -10,9 +10,9 @@ from scipy.sparse.csgraph import connected_components
 from schemas.base import Array
 
 MERGE_RELATIVE = 1e-8
-"""Vertices nearer than about this share of the bounding box's diagonal are one point: the rounding of text files."""
+"""Vertices within this share of the bounding box's diagonal are one point, which allows for the rounding of text files."""
 THIN_RELATIVE = 1e-6
-"""A closed sheet whose volume is below this share of area times diagonal is two sides of one surface, not a solid."""
+"""A closed sheet whose volume is below this share of area times diagonal is a sheet with two sides, not a solid."""
 
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -42,14 +42,14 @@ def merge_points(vertices: Array) -> Indices:
     return np.asarray(np.unique(key, return_inverse=True)[1], dtype=np.int64)
 
 
-def collapsed(corners: Indices) -> Mask:
-    """[F] bool: faces [F, 3] with a corner named twice."""
+def find_collapsed(corners: Indices) -> Mask:
+    """[F] bool: which faces [F, 3] name a corner twice."""
     a, b, c = corners.T
     return (a == b) | (b == c) | (c == a)
 
 
-def repeated(corners: Indices, oriented: bool) -> Mask:
-    """[F] bool: faces [F, 3] that came before with the same corners; `oriented`: also seen from the same side."""
+def find_repeated(corners: Indices, oriented: bool) -> Mask:
+    """[F] bool: which faces [F, 3] repeat the corners of an earlier one; `oriented`: in the same winding as well."""
     if oriented:
         first = corners.argmin(axis=1)
         turned = (first[:, None] + np.arange(3)) % 3
@@ -84,10 +84,10 @@ def _edges(corners: Indices) -> _Edges:
     return _Edges(order // 3, (tail < head)[order], start, size)
 
 
-def flips_for_consistency(corners: Indices) -> Mask:
-    """[F] bool: which faces [F, 3] to turn over so that neighbours agree; the fewest of each surface.
+def find_flips(corners: Indices) -> Mask:
+    """[F] bool: which faces [F, 3] to flip so that neighbours are wound consistently; the fewest of each surface.
 
-    Each face stands twice in a graph, as it is and turned over; an edge of exactly two faces joins the copies that
+    Each face is in a graph twice, as it is and flipped; an edge of exactly two faces joins the copies that
     agree. A surface that can be oriented falls into two halves, one the reverse of the other. One that cannot
     (a Moebius strip) stays whole and is left as it is.
     """
@@ -122,7 +122,7 @@ def find_bodies(vertices: Array, faces: Indices, corners: Indices) -> Bodies:
 
 
 def is_solid(vertices: Array, faces: Indices) -> bool:
-    """Whether the faces [F, 3] are closed bodies, consistently wound, that together hold a volume."""
+    """Whether the faces [F, 3] are closed, consistently wound bodies that enclose a volume."""
     corners = merge_points(vertices)[faces]
     bodies = find_bodies(vertices, faces, corners)
     return bool(bodies.closed.all()) and float(bodies.volume.sum()) > thin_volume(vertices, faces)

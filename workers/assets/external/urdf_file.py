@@ -1,4 +1,4 @@
-"""Edge: the visible geometry of a URDF file, read with the standard library and without trusting it."""
+"""Edge: the visible geometry of a URDF file from outside, parsed with the standard library."""
 
 import math
 import re
@@ -13,10 +13,9 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Material, Part, Shape
+from workers.assets.external.caps import check_counts, find_inside
 from workers.assets.external.materials import DEFAULT
-from workers.assets.external.mesh import load_shape, transform_shape
-from workers.assets.external.reading import check_counts
-from workers.assets.sources import SourceShape
+from workers.assets.external.mesh import LoadedMesh, load_shape, transform_shape
 from workers.geometry.frames import pose
 
 _DECLARATION = re.compile(rb"^\s*<\?xml[^>]*\?>")
@@ -51,20 +50,16 @@ def mesh_names(robot: ElementTree.Element) -> list[str]:
 
 
 def find_mesh(name: str, urdf: Path, root: Path) -> Path:
-    """The file that a mesh name means, inside `root` only; MeshError `missing`."""
+    """The file of a mesh name inside `root`; MeshError `missing`."""
     bare = re.sub(r"^(package|file|model)://", "", name.strip().replace("\\", "/"))
     tail = bare.split("/", 1)[-1]
-    for candidate in (urdf.parent / bare, root / bare, root / tail, urdf.parent / tail):
-        try:
-            path = candidate.resolve()
-            if path.is_relative_to(root.resolve()) and path.is_file():
-                return path
-        except (OSError, ValueError, RuntimeError):
-            continue
-    raise MeshError("missing", f"{urdf} names the mesh {name!r}, which is not inside {root}")
+    found = find_inside(root.resolve(), urdf.parent / bare, root / bare, root / tail, urdf.parent / tail)
+    if found is None:
+        raise MeshError("missing", f"{urdf} names the mesh {name!r}, which is not inside {root}")
+    return found
 
 
-def load_urdf(path: Path, root: Path, limits: MeshLimits) -> SourceShape:
+def load_urdf(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
     """All visuals of all links, joints at zero, in the frame of the first root link, metres; MeshError as load_shape."""
     robot = parse_urdf(path)
     colors = {m.get("name", ""): _color(path, m) for m in robot.iterfind("material")}
@@ -72,21 +67,21 @@ def load_urdf(path: Path, root: Path, limits: MeshLimits) -> SourceShape:
     notes: list[str] = []
     for link, T_root_link in _link_poses(path, robot):
         for visual in link.iterfind("visual"):
-            shape, why = _visual(path, root, visual, limits)
-            notes += why
+            loaded = _load_visual(path, root, visual, limits)
+            notes += loaded.notes
             material = visual.find("material")
             color = None if material is None else _color(path, material) or colors.get(material.get("name", ""))
-            T = T_root_link @ _origin(path, visual)
-            parts += [_painted(part, color) for part in transform_shape(shape, T[:3, :3], T[:3, 3]).parts]
+            shape = transform_shape(loaded.shape, T_root_link @ _origin(path, visual))
+            parts += [_colored(part, color) for part in shape.parts]
             check_counts(path, sum(len(p.vertices) for p in parts), sum(len(p.faces) for p in parts), limits)
     if not parts:
         raise MeshError("no_faces", f"{path} has no visual geometry")
-    shape = Shape(tuple(replace(part, name=f"part{number}") for number, part in enumerate(parts)))
-    return SourceShape(shape, tuple(dict.fromkeys(notes)))
+    named = tuple(replace(part, name=f"part{number}") for number, part in enumerate(parts))
+    return LoadedMesh(Shape(named), tuple(dict.fromkeys(notes)))
 
 
-def _painted(part: Part, color: tuple[float, ...] | None) -> Part:
-    """A part that brought no look of its own takes the URDF's colour."""
+def _colored(part: Part, color: tuple[float, ...] | None) -> Part:
+    """The part in the URDF's colour, unless it has a material or colours of its own."""
     if color is None or part.material is not DEFAULT or part.colors is not None:
         return part
     return replace(part, material=Material(base_color=(color[0], color[1], color[2], color[3] or 1.0)))
@@ -98,7 +93,7 @@ def _color(path: Path, material: ElementTree.Element) -> tuple[float, ...] | Non
 
 
 def _link_poses(path: Path, robot: ElementTree.Element) -> list[tuple[ElementTree.Element, Pose]]:
-    """Every link with its pose in the frame of its root, joints at zero; MeshError `unreadable` where joints go round."""
+    """Every link with its pose in the frame of its root, joints at zero; MeshError `unreadable` where joints form a loop."""
     joints: dict[str, tuple[str, Pose]] = {}
     for joint in robot.iterfind("joint"):
         parent, child = joint.find("parent"), joint.find("child")
@@ -118,16 +113,16 @@ def _link_poses(path: Path, robot: ElementTree.Element) -> list[tuple[ElementTre
     return placed
 
 
-def _visual(path: Path, root: Path, visual: ElementTree.Element, limits: MeshLimits) -> tuple[Shape, tuple[str, ...]]:
-    """One visual's geometry in its own frame, and what of it was mended or left out."""
+def _load_visual(path: Path, root: Path, visual: ElementTree.Element, limits: MeshLimits) -> LoadedMesh:
+    """One visual's geometry in its own frame."""
     for kind in visual.iterfind("geometry/*"):
         if kind.tag == "mesh":
             loaded = load_shape(find_mesh(kind.get("filename", ""), path, root), limits, root=root)
             scale = _numbers(path, kind.get("scale", "1 1 1"), 3)
             if 0.0 in scale:
                 raise MeshError("no_size", f"{path} scales a mesh by {scale}")
-            return transform_shape(loaded.shape, np.diag(scale), np.zeros(3)), loaded.notes
-        return Shape((_primitive(path, kind),)), ()
+            return replace(loaded, shape=transform_shape(loaded.shape, np.diag([*scale, 1.0])))
+        return LoadedMesh(Shape((_primitive(path, kind),)), ())
     raise MeshError("unreadable", f"{path} has a visual without geometry")
 
 

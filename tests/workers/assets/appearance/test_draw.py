@@ -8,8 +8,7 @@ import pytest
 from schemas.job.job import Job
 from schemas.job.render import Render
 from tests.shapes import asset_of, box, table
-from workers.assets.appearance.draw import draw_look
-from workers.assets.appearance.floors import COVERINGS, PERIOD_M, TEXTURE_PX, draw_covering, pattern_of
+from workers.assets.appearance.draw import draw_appearance
 from workers.plan.effect import Facts
 from workers.plan.effects import plan_effects, write_receipt
 from workers.plan.randomness import Stream, stream
@@ -20,7 +19,7 @@ JOBS = {tier: Job.model_validate({"name": "t", "seed": 5, "render": {"tier": tie
 
 
 def look(scene: int, tier="raster"):
-    return draw_look(stream(5, scene, Stream.APPEARANCE), tier)
+    return draw_appearance(stream(5, scene, Stream.APPEARANCE), tier)
 
 
 def test_the_tier_changes_neither_poses_nor_cameras_nor_the_floors_geometry():
@@ -54,46 +53,6 @@ def test_scenes_are_neither_dark_nor_burnt_out():
         assert light.lights[0].direction[2] > math.sin(0.7) - 1e-9, "shadows stay within the floor's map"
         assert min(light.ambient + light.below + light.background) >= 0.0
     assert {len(look(scene)[1].lights) for scene in range(50)} == {1, 2, 3}
-
-
-@pytest.mark.parametrize("kind", range(len(COVERINGS)))
-def test_a_covering_goes_on_where_it_ends(kind):
-    """Across the seam neighbouring pixels differ no more than they do elsewhere."""
-    for number in range(COVERINGS[kind].patterns):
-        picture = pattern_of(kind, number).picture.astype(int)
-        assert picture.shape == (TEXTURE_PX, TEXTURE_PX, 3)
-        for axis in (0, 1):
-            steps = np.abs(np.diff(picture, axis=axis)).mean(axis=(1 - axis, 2))
-            seam = np.abs(np.take(picture, 0, axis) - np.take(picture, -1, axis)).mean()
-            assert seam <= steps.max() * 1.15, number
-
-
-def test_patterns_are_made_once_and_no_two_are_alike():
-    """A renderer keeps what it uploaded by the array's identity, and a process keeps no more than the collection."""
-    every = [(kind, n) for kind in range(len(COVERINGS)) for n in range(COVERINGS[kind].patterns)]
-    pictures = [pattern_of(*which).picture for which in every]
-    assert all(pattern_of(*which).picture is picture for which, picture in zip(every, pictures, strict=True))
-    assert len({picture.tobytes() for picture in pictures}) == len(every)
-    assert not any(picture.flags.writeable for picture in pictures)
-    assert sum(picture.nbytes for picture in pictures) < 32 * 1024 * 1024
-    drawn = [draw_covering(np.random.default_rng(seed)) for seed in range(600)]
-    assert {id(one.picture) for one in drawn} == {id(picture) for picture in pictures}
-
-
-def test_a_pattern_leaves_the_floor_the_colour_that_its_kind_drew():
-    """White stands for the lightest shade: colour times the picture's mean is the colour times the mean shade."""
-    for kind, covering in enumerate(COVERINGS):
-        pattern = pattern_of(kind, 0)
-        shade = covering.paint(np.random.default_rng(np.random.SeedSequence(48_271, spawn_key=(kind, 0))))
-        assert pattern.picture.max() == 255
-        assert pattern.picture.mean() / 255.0 * pattern.white == pytest.approx(float(np.mean(shade)), abs=0.002)
-
-
-def test_floors_differ_in_colour_scale_and_angle():
-    drawn = [draw_covering(np.random.default_rng(seed)) for seed in range(200)]
-    assert len({one.color for one in drawn}) == len({one.period_m for one in drawn}) == 200
-    assert all(PERIOD_M[0] <= one.period_m <= PERIOD_M[1] and 0.8 <= one.roughness <= 1.0 for one in drawn)
-    assert all(0.1 < c <= 1.0 for one in drawn for c in one.color)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.workers.assets.builtin.hollow import bottom_heights
+from tests.workers.assets.builtin.bottom_heights import bottom_heights
 from workers.assets.builtin.make import make_model
 
 

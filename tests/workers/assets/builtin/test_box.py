@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.workers.assets.oracles import welded
-from workers.assets.builtin.finish import cut_into_parts
 from workers.assets.builtin.make import make_model
+from workers.assets.builtin.parts import cut_into_parts
 
 
 @pytest.mark.parametrize("index", range(25))

@@ -8,9 +8,9 @@ from shapely.geometry import Polygon
 
 from workers.assets.builtin.curves import (
     bezier,
-    half_turn_points,
-    outwards,
-    rounded,
+    fillet,
+    half_circle_points,
+    outward_normals,
     rounded_rectangle,
     spline,
     squircle,
@@ -35,7 +35,7 @@ def test_a_spline_goes_through_its_points_and_a_straight_one_stays_straight():
 
 def test_a_rounded_corner_leaves_and_meets_its_sides_and_knows_them():
     corners = np.array([[0.0, 0], [1, 0], [1, 1]])
-    points, owner = rounded(corners, [0, 0.2, 0], 4)
+    points, owner = fillet(corners, [0, 0.2, 0], 4)
     assert points[1] == pytest.approx([0.8, 0])
     assert points[-2] == pytest.approx([1, 0.2])
     assert owner.tolist() == [0, 0, 0, 1, 1, 1]
@@ -44,19 +44,19 @@ def test_a_rounded_corner_leaves_and_meets_its_sides_and_knows_them():
 
 def test_a_corner_that_is_not_rounded_stays():
     corners = np.array([[0.0, 0], [1, 0], [1, 1]])
-    points, owner = rounded(corners, [0, 0, 0])
+    points, owner = fillet(corners, [0, 0, 0])
     assert points.tolist() == corners.tolist()
     assert owner.tolist() == [0, 1]
 
 
 def test_outwards_is_down_along_a_floor_and_out_of_a_wall():
-    normals = outwards(np.array([[0.0, 0], [1, 0], [2, 0]]))
+    normals = outward_normals(np.array([[0.0, 0], [1, 0], [2, 0]]))
     assert normals == pytest.approx(np.array([[0, -1]] * 3))
-    assert outwards(np.array([[1.0, 0], [1, 1], [1, 2]])) == pytest.approx(np.array([[1, 0]] * 3))
+    assert outward_normals(np.array([[1.0, 0], [1, 1], [1, 2]])) == pytest.approx(np.array([[1, 0]] * 3))
 
 
 def test_a_rim_is_a_half_circle_over_the_wall():
-    points = half_turn_points(np.array([2.0, 5.0]), np.array([1.0, 5.0]), 3)
+    points = half_circle_points(np.array([2.0, 5.0]), np.array([1.0, 5.0]), 3)
     assert points[1] == pytest.approx([1.5, 5.5])
     assert np.hypot(points[:, 0] - 1.5, points[:, 1] - 5.0) == pytest.approx(np.full(3, 0.5))
     assert points[0, 0] > points[2, 0]

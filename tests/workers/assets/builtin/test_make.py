@@ -13,7 +13,7 @@ import trimesh
 from schemas.job.assets import ProceduralSource
 from schemas.job.job import CATEGORIES
 from tests.workers.assets.oracles import faulty_rays, support_margin, welded
-from workers.assets.builtin.make import FAMILIES, instance_id, make_asset, make_model, shape_digest
+from workers.assets.builtin.make import GENERATORS, instance_id, make_asset, make_model, shape_digest
 
 SOURCE = ProceduralSource(source="procedural")
 METRIC = ProceduralSource(source="procedural", size="metric")
@@ -137,20 +137,20 @@ def test_the_same_instance_comes_again_from_another_process_with_another_hash_se
     code = (
         "from workers.assets.builtin.make import *;"
         "s = ProceduralSource(source='procedural');"
-        "print(' '.join(make_asset(c, s, 5, 600.0).sha256 for c in FAMILIES))"
+        "print(' '.join(make_asset(c, s, 5, 600.0).sha256 for c in GENERATORS))"
     )
     env = {**os.environ, "PYTHONHASHSEED": "77", "OMP_NUM_THREADS": "3"}
     out = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY, env=env
     )
-    assert out.stdout.split() == [asset(category, 5).sha256 for category in FAMILIES]
+    assert out.stdout.split() == [asset(category, 5).sha256 for category in GENERATORS]
 
 
 def test_shapes_have_the_same_bits_with_and_without_wide_vector_instructions():
     """Dispatch in numpy differs with AVX-512 and AVX2 off; coordinates do not."""
     code = (
         "from workers.assets.builtin.make import *;"
-        "print(' '.join(str(hash(make_model(c, 0, 5).solid.vertices.tobytes())) for c in FAMILIES))"
+        "print(' '.join(str(hash(make_model(c, 0, 5).solid.vertices.tobytes())) for c in GENERATORS))"
     )
     digests = []
     for off in ("", "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX2 FMA3"):

@@ -9,7 +9,7 @@ import trimesh
 
 from tests.workers.assets.oracles import faulty_rays
 from workers.assets.builtin import solid as solid_module
-from workers.assets.builtin.solid import Solid, circle, difference, lathe, smooth_runs, together, union, union_at
+from workers.assets.builtin.solid import Solid, circle, combine, difference, lathe, smoothing_groups, union, union_at
 
 
 def cylinder(radius=1.0, height=2.0, count=64, surface=0):
@@ -48,12 +48,12 @@ def test_a_section_turns_the_lathe_into_a_prism_of_that_section():
 
 
 def test_bands_that_bend_sharply_are_shaded_apart():
-    assert smooth_runs(np.array([[0, 0], [1, 0], [1, 1], [1.1, 2], [0, 2]])).tolist() == [0, 1, 1, 2]
+    assert smoothing_groups(np.array([[0, 0], [1, 0], [1, 1], [1.1, 2], [0, 2]])).tolist() == [0, 1, 1, 2]
 
 
 def test_a_flat_end_is_shaded_flat_however_soft_its_rim_is():
     soft = np.array([[0, 0], [1, 0], [1.1, 0.01], [1.2, 0.03], [1.2, 1], [1.1, 1.01], [0, 1.01]])
-    runs = smooth_runs(soft)
+    runs = smoothing_groups(soft)
     assert runs[0] != runs[1]
     assert runs[-1] != runs[-2]
 
@@ -77,14 +77,14 @@ def test_a_difference_gives_the_cut_the_cutters_surface():
 
 
 def test_solids_put_together_stay_apart_and_join_in_one_step():
-    legs = together([cylinder(0.1).moved(x=x) for x in (-0.5, 0.5)])
+    legs = combine([cylinder(0.1).moved(x=x) for x in (-0.5, 0.5)])
     joined = union([cylinder(1.0, 0.5).moved(z=1.8), legs])
     assert mesh_of(joined).volume == pytest.approx(prism_area(64) * (0.5 + 2 * 0.01 * 1.8), rel=1e-9)
     assert faulty_rays(joined.vertices, joined.faces, np.random.default_rng(0), 50) == 0
 
 
 def test_the_rays_of_the_tests_see_an_overlap_that_was_not_joined():
-    overlapping = together([cylinder(), cylinder().moved(x=0.5)])
+    overlapping = combine([cylinder(), cylinder().moved(x=0.5)])
     assert faulty_rays(overlapping.vertices, overlapping.faces, np.random.default_rng(0), 50) > 10
 
 

@@ -10,6 +10,8 @@ from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from tests.workers.assets.oracles import CUBE, shape_of, welded, write
 from workers.assets.external.mesh import load_shape, transform_shape
+from workers.assets.external.topology import is_solid
+from workers.geometry.frames import pose
 
 LIMITS = MeshLimits()
 SHARED = Path(__file__).resolve().parents[5] / "shared" / "data" / "meshes"
@@ -28,7 +30,7 @@ def refused(path, **limits):
 def test_a_cube_comes_in_as_twelve_faces_around_a_volume_of_one(tmp_path):
     loaded = load(write(tmp_path / "cube.obj", CUBE))
     assert len(loaded.shape.faces) == 12
-    assert loaded.watertight
+    assert is_solid(loaded.shape.vertices, loaded.shape.faces)
     assert welded(loaded.shape).volume == pytest.approx(1.0)
     assert loaded.notes == ()
 
@@ -38,7 +40,7 @@ def test_every_format_gives_the_same_geometry(tmp_path, suffix):
     mesh = trimesh.creation.icosphere(2, 0.1)
     mesh.export(tmp_path / f"ball.{suffix}")
     loaded = load(tmp_path / f"ball.{suffix}")
-    assert loaded.watertight
+    assert is_solid(loaded.shape.vertices, loaded.shape.faces)
     assert welded(loaded.shape).volume == pytest.approx(mesh.volume, rel=1e-5)
     assert len(loaded.shape.faces) == len(mesh.faces)
 
@@ -65,7 +67,7 @@ def test_faces_wound_every_which_way_come_out_facing_outwards(tmp_path):
     mesh = trimesh.Trimesh(mesh.vertices, np.where(wrong[:, None], mesh.faces[:, ::-1], mesh.faces), process=False)
     mesh.export(tmp_path / "ball.ply")
     loaded = load(tmp_path / "ball.ply")
-    assert loaded.watertight
+    assert is_solid(loaded.shape.vertices, loaded.shape.faces)
     assert welded(loaded.shape).volume == pytest.approx(trimesh.creation.icosphere(2).volume, rel=1e-6)
 
 
@@ -76,7 +78,7 @@ def test_a_body_that_is_inside_out_is_turned_but_a_void_stays_one(tmp_path):
     aside.invert()
     trimesh.util.concatenate([outer, void, aside]).export(tmp_path / "bodies.stl")
     loaded = load(tmp_path / "bodies.stl")
-    assert loaded.watertight
+    assert is_solid(loaded.shape.vertices, loaded.shape.faces)
     assert welded(loaded.shape).volume == pytest.approx(1.0 - 0.125 + 0.008, rel=1e-6)
 
 
@@ -87,7 +89,7 @@ def test_two_solids_that_touch_keep_both_of_the_faces_between_them(tmp_path):
     two.apply_transform(across)  # mirrored in the plane x = 0.5, so that the faces between them are the same triangles
     trimesh.util.concatenate([one, two]).export(tmp_path / "pair.stl")
     loaded = load(tmp_path / "pair.stl")
-    assert loaded.watertight
+    assert is_solid(loaded.shape.vertices, loaded.shape.faces)
     assert len(loaded.shape.faces) == 24
 
 
@@ -96,7 +98,7 @@ def test_a_sheet_drawn_from_both_sides_is_one_sheet(tmp_path):
         write(tmp_path / "sheet.obj", "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\nf 3 2 1\nf 4 3 1\n")
     )
     assert len(loaded.shape.faces) == 2
-    assert not loaded.watertight
+    assert not is_solid(loaded.shape.vertices, loaded.shape.faces)
 
 
 def test_every_geometry_of_a_scene_stands_where_its_node_puts_it_and_mirrored_ones_face_outwards(tmp_path):
@@ -107,7 +109,7 @@ def test_every_geometry_of_a_scene_stands_where_its_node_puts_it_and_mirrored_on
     scene.graph.update(frame_to="b", frame_from="world", matrix=mirror, geometry="g")
     write(tmp_path / "scene.glb", scene.export(file_type="glb"))
     loaded = load(tmp_path / "scene.glb")
-    assert loaded.watertight
+    assert is_solid(loaded.shape.vertices, loaded.shape.faces)
     assert welded(loaded.shape).volume == pytest.approx(12.0, rel=1e-6)
     assert loaded.shape.bounds == pytest.approx(np.array([[-5.5, -1, -1.5], [0.5, 1, 1.5]]))
 
@@ -179,7 +181,7 @@ def test_slivers_without_area_go_unless_they_close_a_gap(tmp_path):
     # The lower edge of the front has a point in its middle on one side only; a face without area joins the two.
     text = CUBE.replace("f 1 2 6 5", "v 0.5 0 0\nf 1 9 5\nf 9 2 6\nf 9 6 5\nf 1 2 9")
     closed = load(write(tmp_path / "closed.obj", text))
-    assert closed.watertight
+    assert is_solid(closed.shape.vertices, closed.shape.faces)
     assert welded(closed.shape).is_watertight
     sheet = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0.5 0 0\nf 1 2 3\nf 1 4 2\n"
     assert len(load(write(tmp_path / "sheet.obj", sheet)).shape.faces) == 1
@@ -200,7 +202,7 @@ def test_a_glb_that_shows_a_mesh_too_often_is_refused_unparsed(tmp_path, monkeyp
 
 def test_a_mirroring_transform_keeps_a_solid_the_right_way_out():
     shape = shape_of(trimesh.creation.box((1, 2, 3)))
-    mirrored = transform_shape(shape, np.diag([-1.0, 1.0, 2.0]), np.array([1.0, 0, 0]))
+    mirrored = transform_shape(shape, pose(np.diag([-1.0, 1.0, 2.0]), np.array([1.0, 0, 0])))
     assert welded(mirrored).volume == pytest.approx(12.0)
     assert mirrored.bounds == pytest.approx(np.array([[0.5, -1, -3], [1.5, 1, 3]]))
 
@@ -219,7 +221,7 @@ def test_shading_normals_of_the_file_follow_the_surface_and_point_outwards(tmp_p
 def test_a_scanned_thing_comes_in_closed_with_a_volume_that_its_own_collision_mesh_confirms(name):
     scanned = load_shape(SHARED / name / "textured.obj", LIMITS)
     coarse = load_shape(SHARED / name / "collision.obj", LIMITS)
-    assert scanned.watertight
+    assert is_solid(scanned.shape.vertices, scanned.shape.faces)
     hulls = [trimesh.Trimesh(x.shape.vertices, x.shape.faces).convex_hull.volume for x in (scanned, coarse)]
     assert hulls[0] == pytest.approx(hulls[1], rel=0.2)
     assert welded(scanned.shape).volume <= hulls[0]

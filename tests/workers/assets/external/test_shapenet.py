@@ -4,17 +4,18 @@ import numpy as np
 import pytest
 
 from schemas.errors import AssetSourceError
-from schemas.job.assets import MeshLimits, ShapeNetSource
+from schemas.job.assets import Assets, MeshLimits, ShapeNetSource
 from tests.workers.assets.oracles import CUBE, write
-from workers.assets.external.shapenet import SYNSETS, list_shapenet, load_shapenet
-from workers.assets.sources import Weights
+from workers.assets.external.placement import load_entry
+from workers.assets.external.shapenet import SYNSETS
+from workers.assets.sources import list_source
 
-LIMITS, WEIGHTS = MeshLimits(), Weights(600.0, 3.0)
+LIMITS, ASSETS = MeshLimits(), Assets(density_kg_m3=600.0, shell_kg_m2=3.0)
 TALL = CUBE.replace("v 0 1", "v 0 3").replace("v 1 1", "v 1 3")  # 1 x 3 x 1: +Y is up
 
 
 def settings(**more):
-    return ShapeNetSource(source="shapenet", folder="unused", **more)
+    return ShapeNetSource(source="shapenet", folder=".", **more)
 
 
 def version_2(root, category, model, text=TALL):
@@ -28,8 +29,8 @@ def version_1(root, category, model, text=TALL):
 @pytest.mark.parametrize("layout", [version_1, version_2])
 def test_both_layouts_are_read_and_y_becomes_z(tmp_path, layout):
     layout(tmp_path, "mug", "abc")
-    listing = list_shapenet(settings(), tmp_path, {"mug"}, LIMITS)
-    asset = load_shapenet(settings(), listing, listing.entries["mug"][0], "mug", LIMITS, WEIGHTS)
+    listing = list_source(settings(), tmp_path, {"mug"}, LIMITS)
+    asset = load_entry(settings(), listing.folder, listing.entries["mug"][0], "mug", ASSETS)
     assert asset.extents_m == pytest.approx([0.25, 0.25, 0.75])
     assert asset.instance_id == "03797390-abc"
     assert asset.watertight
@@ -42,17 +43,17 @@ def test_both_layouts_are_read_and_y_becomes_z(tmp_path, layout):
 
 def test_tables_have_their_own_scale_and_a_setting_replaces_both(tmp_path):
     version_2(tmp_path, "table", "t")
-    listing = list_shapenet(settings(), tmp_path, {"table"}, LIMITS)
+    listing = list_source(settings(), tmp_path, {"table"}, LIMITS)
     entry = listing.entries["table"][0]
-    assert load_shapenet(settings(), listing, entry, "table", LIMITS, WEIGHTS).scale == 1.5
-    assert load_shapenet(settings(scale=2.0), listing, entry, "table", LIMITS, WEIGHTS).scale == 2.0
+    assert load_entry(settings(), listing.folder, entry, "table", ASSETS).scale == 1.5
+    assert load_entry(settings(scale=2.0), listing.folder, entry, "table", ASSETS).scale == 2.0
 
 
 def test_models_without_a_usable_mesh_are_skipped_and_counted_by_reason(tmp_path):
     version_2(tmp_path, "mug", "good")
     version_2(tmp_path, "mug", "large", TALL * 3)
     (tmp_path / SYNSETS["mug"] / "empty").mkdir()
-    listing = list_shapenet(settings(), tmp_path, {"mug"}, MeshLimits(max_faces=17))
+    listing = list_source(settings(), tmp_path, {"mug"}, MeshLimits(max_faces=17))
     assert [entry.instance_id for entry in listing.entries["mug"]] == ["03797390-good"]
     assert listing.skipped == {"missing": 1, "too_large": 1}
 
@@ -61,17 +62,17 @@ def test_textures_of_version_2_lie_beside_the_models_folder(tmp_path):
     mesh = version_2(tmp_path, "mug", "abc", "mtllib model_normalized.mtl\n" + TALL)
     write(mesh.with_suffix(".mtl"), "newmtl a\nmap_Kd ../images/texture0.jpg\n")
     write(mesh.parent.parent / "images" / "texture0.jpg", b"jpg")
-    listing = list_shapenet(settings(), tmp_path, {"mug"}, LIMITS)
+    listing = list_source(settings(), tmp_path, {"mug"}, LIMITS)
     assert listing.entries["mug"][0].files[2].path.endswith("abc/images/texture0.jpg")
 
 
 def test_a_folder_that_is_not_shapenet_is_refused_with_what_it_holds(tmp_path):
     with pytest.raises(AssetSourceError, match="is not a folder"):
-        list_shapenet(settings(), tmp_path / "none", {"mug"}, LIMITS)
+        list_source(settings(), tmp_path / "none", {"mug"}, LIMITS)
     write(tmp_path / "readme.txt", "")
     with pytest.raises(AssetSourceError, match=r"none of the synset folders 03797390 \(mug\).*readme\.txt"):
-        list_shapenet(settings(), tmp_path, {"mug"}, LIMITS)
+        list_source(settings(), tmp_path, {"mug"}, LIMITS)
 
 
 def test_shapenet_has_no_box(tmp_path):
-    assert list_shapenet(settings(), tmp_path, {"box"}, LIMITS).entries == {}
+    assert list_source(settings(), tmp_path, {"box"}, LIMITS).entries == {}

@@ -5,12 +5,12 @@ import pytest
 import trimesh
 
 from workers.assets.external.topology import (
-    collapsed,
     find_bodies,
-    flips_for_consistency,
+    find_collapsed,
+    find_flips,
+    find_repeated,
     is_solid,
     merge_points,
-    repeated,
 )
 
 
@@ -27,9 +27,9 @@ def test_points_at_one_place_get_one_number_and_others_do_not():
 
 def test_a_collapsed_face_and_a_doubled_face_are_found():
     faces = np.array([[0, 1, 2], [1, 2, 0], [2, 1, 0], [3, 3, 1], [0, 1, 3]])
-    assert collapsed(faces).tolist() == [False, False, False, True, False]
-    assert repeated(faces, oriented=True).tolist() == [False, True, False, False, False]
-    assert repeated(faces, oriented=False).tolist() == [False, True, True, False, False]
+    assert find_collapsed(faces).tolist() == [False, False, False, True, False]
+    assert find_repeated(faces, oriented=True).tolist() == [False, True, False, False, False]
+    assert find_repeated(faces, oriented=False).tolist() == [False, True, True, False, False]
 
 
 @pytest.mark.parametrize("share", [0.1, 0.4])
@@ -37,7 +37,7 @@ def test_turning_the_faces_that_disagree_makes_a_sphere_consistent_with_the_fewe
     mesh = trimesh.creation.icosphere(3)
     wrong = np.random.default_rng(0).random(len(mesh.faces)) < share
     faces = np.where(wrong[:, None], mesh.faces[:, ::-1], mesh.faces)
-    assert flips_for_consistency(faces).tolist() == wrong.tolist()
+    assert find_flips(faces).tolist() == wrong.tolist()
 
 
 def test_a_moebius_strip_is_left_alone():
@@ -45,7 +45,7 @@ def test_a_moebius_strip_is_left_alone():
     lower, upper = np.arange(n), np.arange(n, 2 * n)
     nxt_lower, nxt_upper = np.append(lower[1:], upper[0]), np.append(upper[1:], lower[0])
     faces = np.concatenate([np.stack([lower, nxt_lower, nxt_upper], 1), np.stack([lower, nxt_upper, upper], 1)])
-    assert not flips_for_consistency(faces).any()
+    assert not find_flips(faces).any()
 
 
 def test_bodies_are_told_apart_with_the_volume_of_each():

@@ -25,7 +25,7 @@ def link(inside):
 
 
 def load(path, **limits):
-    return load_urdf(path, path.parent, MeshLimits(**limits)).shape
+    return load_urdf(path, MeshLimits(**limits), path.parent).shape
 
 
 def refused(path, **limits):

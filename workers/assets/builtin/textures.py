@@ -1,4 +1,4 @@
-"""Pure: small pictures [h, w, 3] uint8 sRGB, row 0 at the top: labels, wood, stone, cardboard, glazes."""
+"""Pure: small textures [h, w, 3] uint8 sRGB, row 0 at the top: labels, wood, stone, cardboard, glazes."""
 
 import math
 from collections.abc import Sequence
@@ -7,26 +7,27 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.assets.builtin.look import Color, chance, ink_on, mixed, vivid
+from workers.assets.builtin.draws import chance
+from workers.assets.builtin.palette import Color, ink_on, mix, vivid
 
-Picture = NDArray[np.uint8]
+Texture = NDArray[np.uint8]
 Plane = NDArray[np.float32]
 
 
 def rgb(color: Color) -> NDArray[np.uint8]:
-    """[3] uint8."""
+    """A colour as [3] uint8."""
     return np.array([round(255.0 * c) for c in color], dtype=np.uint8)
 
 
-def blank(height: int, width: int, color: Color) -> Picture:
-    """A picture of one colour."""
+def blank(height: int, width: int, color: Color) -> Texture:
+    """A texture of one colour."""
     picture = np.empty((height, width, 3), dtype=np.uint8)
     picture[:] = rgb(color)
     return picture
 
 
 def noise(rng: np.random.Generator, height: int, width: int, rows: int, columns: int) -> Plane:
-    """[height, width] float32 in [0, 1]: a random lattice of rows x columns, made smooth; it repeats in both directions."""
+    """[height, width] float32 in [0, 1]: value noise on a lattice of rows x columns; repeats in both directions."""
     lattice = rng.random((columns, rows), dtype=np.float32)
     return _stretched(np.ascontiguousarray(_stretched(lattice, width).T), height)
 
@@ -41,15 +42,15 @@ def _stretched(lattice: Plane, size: int) -> Plane:
     return step
 
 
-def blend(a: Color, b: Color, share: Plane) -> Picture:
-    """a where `share` [h, w] is 0, b where it is 1, in 64 steps."""
+def blend(a: Color, b: Color, share: Plane) -> Texture:
+    """Colour a where `share` [h, w] is 0, colour b where it is 1, in 64 steps."""
     t = np.minimum(np.arange(256) / 63.0, 1.0)[:, None, None]
     steps = np.round(255.0 * (np.array(a) * (1 - t) + np.array(b) * t)).astype(np.uint8)
     level = np.clip(share * np.float32(63.0) + np.float32(0.5), 0, 63).astype(np.uint8)
     return np.asarray(cv2.applyColorMap(level, steps), np.uint8)
 
 
-def wood(rng: np.random.Generator, light: Color, dark: Color, planks: int = 0, size: int = 256) -> Picture:
+def wood(rng: np.random.Generator, light: Color, dark: Color, planks: int = 0, size: int = 256) -> Texture:
     """[size, size / 2, 3]: grain along u; with `planks`, boards of slightly different tone with dark seams between them."""
     width = size // 2
     share = 0.6 * noise(rng, size, width, size // 3, 4) + 0.4 * noise(rng, size, width, 10, 2) - np.float32(0.08)
@@ -62,7 +63,7 @@ def wood(rng: np.random.Generator, light: Color, dark: Color, planks: int = 0, s
     return blend(light, dark, share)
 
 
-def stone(rng: np.random.Generator, a: Color, b: Color, size: int = 192) -> Picture:
+def stone(rng: np.random.Generator, a: Color, b: Color, size: int = 192) -> Texture:
     """Cloudy stone with veins."""
     cloud = 0.6 * noise(rng, size, size, 6, 6) + 0.4 * noise(rng, size, size, 20, 20)
     vein = np.abs(0.65 * noise(rng, size, size, 5, 4) + 0.35 * noise(rng, size, size, 17, 15) - np.float32(0.5))
@@ -71,20 +72,20 @@ def stone(rng: np.random.Generator, a: Color, b: Color, size: int = 192) -> Pict
 
 
 def band_height(low: float, high: float, radius: float, width: int = 256) -> int:
-    """Rows of a picture that is `width` pixels around, so that its pixels are square on a cylinder; 16 to 192."""
+    """Rows, 16 to 192, that make the pixels of a texture square on a cylinder that it surrounds with `width` columns."""
     return min(max(round(width * (high - low) / (2.0 * math.pi * radius)), 16), 192)
 
 
 def speckled(
     rng: np.random.Generator, ground: Color, spot: Color, share: float, height: int = 128, width: int = 256
-) -> Picture:
-    """A ground with small spots on this share of it."""
+) -> Texture:
+    """A ground with small spots on a share of its pixels."""
     picture = blank(height, width, ground)
     picture[rng.random((height, width), dtype=np.float32) < share] = rgb(spot)
     return picture
 
 
-def bands(rng: np.random.Generator, colors: Sequence[Color], height: int = 128) -> Picture:
+def bands(rng: np.random.Generator, colors: Sequence[Color], height: int = 128) -> Texture:
     """Horizontal stripes of random widths; the first colour covers the most."""
     picture = blank(height, 8, colors[0])
     at = 0
@@ -94,28 +95,28 @@ def bands(rng: np.random.Generator, colors: Sequence[Color], height: int = 128) 
     return picture
 
 
-def upright_stripes(rng: np.random.Generator, colors: Sequence[Color], width: int = 256) -> Picture:
+def upright_stripes(rng: np.random.Generator, colors: Sequence[Color], width: int = 256) -> Texture:
     """Vertical stripes that close around a vessel."""
     period = width // int(rng.integers(6, 17))
     stripe = (np.arange(width) % period) * len(colors) // period
     return np.broadcast_to(np.stack([rgb(c) for c in colors])[stripe], (8, width, 3)).copy()
 
 
-def dots(rng: np.random.Generator, ground: Color, spot: Color, height: int = 128, width: int = 256) -> Picture:
+def dots(rng: np.random.Generator, ground: Color, spot: Color, height: int = 128, width: int = 256) -> Texture:
     """A regular pattern of round spots, shifted in every other row."""
     pitch = width // int(rng.integers(8, 17))
     y, x = np.arange(height)[:, None], np.arange(width)[None]
     shift = np.where((y // pitch) % 2 == 1, pitch // 2, 0)
     dx, dy = (x + shift) % pitch - pitch / 2, y % pitch - pitch / 2
     picture = blank(height, width, ground)
-    picture[dx * dx + dy * dy < (pitch * float(rng.uniform(0.18, 0.36))) ** 2] = rgb(spot)
+    picture[dx * dx + dy * dy < (pitch * rng.uniform(0.18, 0.36)) ** 2] = rgb(spot)
     return picture
 
 
-def write_word(
-    rng: np.random.Generator, picture: Picture, top: int, left: int, letters: int, size: int, ink: Color
+def draw_word(
+    rng: np.random.Generator, picture: Texture, top: int, left: int, letters: int, size: int, ink: Color
 ) -> None:
-    """Draws letter-like signs of 3 x 5 squares into a picture, cut off at its border."""
+    """Draws letter-like signs of 3 x 5 squares into a texture, clipped at its border."""
     signs = rng.random((letters, 5, 2)) < 0.62
     signs[:, 0, 0] = signs[:, 4, 1] = True
     full = np.concatenate([signs, signs[:, ::-1, :1], np.zeros((letters, 5, 1), dtype=np.bool_)], axis=2)
@@ -124,7 +125,7 @@ def write_word(
     area[word[: area.shape[0], : area.shape[1]]] = rgb(ink)
 
 
-def write_lines(rng: np.random.Generator, picture: Picture, box: tuple[int, int, int, int], ink: Color) -> None:
+def draw_small_print(rng: np.random.Generator, picture: Texture, box: tuple[int, int, int, int], ink: Color) -> None:
     """Draws lines of small print into the box (top, left, bottom, right)."""
     top, left, bottom, right = box
     for y in range(top, bottom - 1, 4):
@@ -134,7 +135,9 @@ def write_lines(rng: np.random.Generator, picture: Picture, box: tuple[int, int,
         row[:, words & (np.arange(left, right) < ends)] = rgb(ink)
 
 
-def emblem(rng: np.random.Generator, picture: Picture, centre: tuple[float, float], size: float, color: Color) -> None:
+def draw_emblem(
+    rng: np.random.Generator, picture: Texture, centre: tuple[float, float], size: float, color: Color
+) -> None:
     """Draws a round, square, diamond or ring-shaped emblem about (row, column), `size` its radius in pixels."""
     height, width = picture.shape[:2]
     y, x = (np.arange(height) - centre[0])[:, None] / size, (np.arange(width) - centre[1])[None] / size
@@ -150,7 +153,7 @@ def emblem(rng: np.random.Generator, picture: Picture, centre: tuple[float, floa
     picture[inside] = rgb(color)
 
 
-def label(rng: np.random.Generator, paper: Color, height: int = 128, width: int = 256, faces: int = 2) -> Picture:
+def label(rng: np.random.Generator, paper: Color, height: int = 128, width: int = 256, faces: int = 2) -> Texture:
     """A printed label: emblem, brand and small print, `faces` times around."""
     ink, accent = ink_on(rng, paper), vivid(rng)
     picture = blank(height, width, paper)
@@ -159,16 +162,16 @@ def label(rng: np.random.Generator, paper: Color, height: int = 128, width: int 
         picture[:edge] = picture[-edge:] = rgb(accent)
     if chance(rng, 0.35):
         split = int(rng.uniform(0.3, 0.7) * height)
-        picture[split:] = rgb(mixed(paper, accent, 0.8))
+        picture[split:] = rgb(mix(paper, accent, 0.8))
     face = width // faces
     letters, size = int(rng.integers(4, 9)), int(rng.integers(3, 6))
     size = max(1, min(size, face // (4 * letters + 2), height // 14))
     top = int(rng.uniform(0.18, 0.5) * height)
-    emblem(
+    draw_emblem(
         rng, picture[:, :face], (rng.uniform(0.35, 0.65) * height, face / 2), rng.uniform(0.14, 0.3) * height, accent
     )
-    write_word(rng, picture[:, :face], top, (face - 4 * letters * size) // 2, letters, size, ink)
-    write_lines(rng, picture, (int(0.76 * height), face // 5, int(0.9 * height), face - face // 5), ink)
+    draw_word(rng, picture[:, :face], top, (face - 4 * letters * size) // 2, letters, size, ink)
+    draw_small_print(rng, picture, (int(0.76 * height), face // 5, int(0.9 * height), face - face // 5), ink)
     for k in range(1, faces):
         picture[:, k * face : (k + 1) * face] = picture[:, :face]
     return picture

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workers.assets.builtin import paint
+from workers.assets.builtin import textures
 
 A, B = (0.2, 0.4, 0.6), (0.9, 0.8, 0.1)
 
@@ -13,13 +13,13 @@ def rng():
 
 
 def test_a_colour_is_rounded_to_bytes_and_a_blend_ends_on_both_colours():
-    assert paint.rgb(A).tolist() == [51, 102, 153]
-    picture = paint.blend(A, B, np.array([[0.0, 1.0, -3.0, 9.0]], np.float32))
+    assert textures.rgb(A).tolist() == [51, 102, 153]
+    picture = textures.blend(A, B, np.array([[0.0, 1.0, -3.0, 9.0]], np.float32))
     assert picture[0].tolist() == [[51, 102, 153], [230, 204, 26], [51, 102, 153], [230, 204, 26]]
 
 
 def test_noise_is_smooth_within_its_bounds_and_repeats_in_both_directions():
-    plane = paint.noise(rng(), 64, 96, 4, 6)
+    plane = textures.noise(rng(), 64, 96, 4, 6)
     assert plane.shape == (64, 96)
     assert 0.0 <= plane.min() < 0.3 < 0.7 < plane.max() <= 1.0
     for axis in (0, 1):
@@ -30,14 +30,14 @@ def test_noise_is_smooth_within_its_bounds_and_repeats_in_both_directions():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: paint.wood(rng(), A, B, planks=4),
-        lambda: paint.stone(rng(), A, B),
-        lambda: paint.speckled(rng(), A, B, 0.1),
-        lambda: paint.bands(rng(), [A, B, A]),
-        lambda: paint.upright_stripes(rng(), [A, B]),
-        lambda: paint.dots(rng(), A, B),
-        lambda: paint.label(rng(), A, 40),
-        lambda: paint.label(rng(), A, 16, 256, 3),
+        lambda: textures.wood(rng(), A, B, planks=4),
+        lambda: textures.stone(rng(), A, B),
+        lambda: textures.speckled(rng(), A, B, 0.1),
+        lambda: textures.bands(rng(), [A, B, A]),
+        lambda: textures.upright_stripes(rng(), [A, B]),
+        lambda: textures.dots(rng(), A, B),
+        lambda: textures.label(rng(), A, 40),
+        lambda: textures.label(rng(), A, 16, 256, 3),
     ],
 )
 def test_every_picture_is_small_of_bytes_has_more_than_one_colour_and_comes_again(make):
@@ -50,16 +50,16 @@ def test_every_picture_is_small_of_bytes_has_more_than_one_colour_and_comes_agai
 
 
 def test_a_label_is_the_same_on_each_of_its_faces():
-    picture = paint.label(rng(), A, 64, 256, 2)
+    picture = textures.label(rng(), A, 64, 256, 2)
     assert (picture[:, :128] == picture[:, 128:]).all()
 
 
 def test_pixels_are_square_on_a_cylinder():
-    assert paint.band_height(0.0, 0.1, 0.1 / np.pi, 256) == 128
-    assert paint.band_height(0.0, 1e-6, 0.1) == 16
-    assert paint.band_height(0.0, 9.0, 0.1) == 192
+    assert textures.band_height(0.0, 0.1, 0.1 / np.pi, 256) == 128
+    assert textures.band_height(0.0, 1e-6, 0.1) == 16
+    assert textures.band_height(0.0, 9.0, 0.1) == 192
 
 
 def test_spots_cover_the_share_that_is_asked_for():
-    picture = paint.speckled(rng(), A, B, 0.2, 256, 256)
-    assert (picture == paint.rgb(B)).all(axis=2).mean() == pytest.approx(0.2, abs=0.01)
+    picture = textures.speckled(rng(), A, B, 0.2, 256, 256)
+    assert (picture == textures.rgb(B)).all(axis=2).mean() == pytest.approx(0.2, abs=0.01)

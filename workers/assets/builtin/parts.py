@@ -1,4 +1,4 @@
-"""Pure: a painted solid becomes the parts of a shape, with shading normals and texture coordinates."""
+"""Pure: cuts a solid into the parts of a shape, with shading normals and texture coordinates."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -11,21 +11,21 @@ from schemas.base import Array
 from schemas.scene.shape import Material, Part, Shape
 from workers.assets.builtin.solid import TRIG_DIGITS, Indices, Solid
 
-Wrap = Literal["none", "cylinder", "plane", "grain"]
+UvMapping = Literal["none", "cylinder", "plane", "box"]
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The look of some faces of a solid, and how its texture lies on them.
+    """The material of some faces of a solid, and how its texture is mapped onto them.
 
-    `wrap`: `cylinder` turns u once round the z axis and v from `low` to `high` in z; `plane` runs u along `across` and
-    v along `up` (vectors [3] from `origin` whose lengths are one texture); `grain` projects along the axis that the
-    face looks along, u along the axis `grain` wherever that is not the same one, one texture for `size` metres.
+    `mapping`: `cylinder` runs u once around the z axis and v from `low` to `high` in z; `plane` runs u along `across` and
+    v along `up` (vectors [3] from `origin` whose lengths are one texture); `box` projects along the axis that the face
+    normal is closest to, u along the axis `grain` wherever that is another one, one texture for `size` metres.
     """
 
     name: str
     material: Material
-    wrap: Wrap = "none"
+    mapping: UvMapping = "none"
     low: float = 0.0
     high: float = 1.0
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -37,10 +37,16 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What a family makes: a closed solid, true metres, z up, standing on its lowest plane; and its surfaces by number."""
+    """A built-in shape: a closed solid in metres, z up, standing on its lowest plane, and its surfaces by number."""
 
     solid: Solid
     surfaces: tuple[Surface, ...]
+
+
+def over_top(name: str, material: Material, width: float, depth: float) -> Surface:
+    """A surface whose texture lies once over a width x depth, metres, about the z axis, seen from above."""
+    origin = (-width / 2, -depth / 2, 0.0)
+    return Surface(name, material, "plane", origin=origin, across=(width, 0.0, 0.0), up=(0.0, depth, 0.0))
 
 
 _SIDES = (((1, 2), (0, 2), (0, 1)), ((1, 2), (0, 2), (1, 0)), ((2, 1), (2, 0), (0, 1)))
@@ -48,7 +54,7 @@ _SIDES = (((1, 2), (0, 2), (0, 1)), ((1, 2), (0, 2), (1, 0)), ((2, 1), (2, 0), (
 
 
 def cut_into_parts(solid: Solid, surfaces: Sequence[Surface], centre: Array, scale: float) -> Shape:
-    """The solid as one part for each surface, its points at scale * (point - centre).
+    """One part for each surface of the solid, its points at scale * (point - centre).
 
     Points on a border between parts are the same doubles in both, so that the parts together are watertight.
     """
@@ -85,7 +91,7 @@ def _part(surface: Surface, vertices: Array, faces: Indices, normals: Array, uv:
 
 
 def _dense(keys: Indices) -> tuple[Indices, Indices]:
-    """Keys [...] int64 renumbered 0, 1, 2, ... in their order, and the key that each number stands for."""
+    """Keys [...] int64 renumbered 0, 1, 2, ... in ascending order, and the key of each number."""
     flat = keys.ravel()
     seen = np.zeros(int(flat.max()) + 1, dtype=np.bool_)
     seen[flat] = True
@@ -94,11 +100,11 @@ def _dense(keys: Indices) -> tuple[Indices, Indices]:
 
 
 def _face_vectors(vertices: Array, faces: Indices) -> tuple[Array, Callable[[Indices, int], Array]]:
-    """Area vectors of the faces, twice their area long, axis by axis [3, F]; and what gives the shading normals.
+    """The faces' area vectors [3, F], twice their area long, and a function that gives shading normals.
 
     The function takes the faces [F, 3] as numbers of `count` points, and gives [count, 3]: for each point the unit mean
     of the normals of the faces around it. A face counts by its area vector over the squares of the two sides that meet
-    in the point, which is exact on spheres and does not mind how a rectangle is cut in two (Max, "Weights for computing
+    in the point, which is exact on spheres and independent of how a rectangle is cut in two (Max, "Weights for computing
     vertex normals from facet normals", 1999).
     """
     axes = np.ascontiguousarray(vertices.T)
@@ -119,17 +125,17 @@ def _face_vectors(vertices: Array, faces: Indices) -> tuple[Array, Callable[[Ind
 
 
 Coordinates = Callable[[Indices, Indices], Array]
-"""uv [N, 2] of points by number and variant (0, 1 or 2): a seam or an edge gives one point several places."""
+"""Function of point numbers and variants (0, 1 or 2) that gives uv [N, 2]: at a seam or an edge a point has several."""
 
 
 def _texture_variants(
     surface: Surface, vertices: Array, faces: Indices, across: Array
 ) -> tuple[Indices, Coordinates | None]:
-    """Which variant [F, 3] of its points each face uses, and the texture coordinates of a point's variants.
+    """The variant [F, 3] of its points that each face uses, and the texture coordinates of a point's variants.
 
     across [3, F]: the faces' area vectors.
     """
-    if surface.wrap == "cylinder":
+    if surface.mapping == "cylinder":
         turn = _turns(vertices, faces)
         beyond = turn[faces]
         wrapped = (beyond.max(axis=1) - beyond.min(axis=1) > 0.5)[:, None] & (beyond < 0.5)
@@ -137,14 +143,14 @@ def _texture_variants(
         return wrapped.astype(np.int64), lambda point, variant: np.stack(
             [turn[point] + variant, (vertices[point, 2] - surface.low) / reach], axis=1
         )
-    if surface.wrap == "plane":
+    if surface.mapping == "plane":
         axes = np.array([surface.across, surface.up])
         axes /= (axes * axes).sum(axis=1)[:, None]
         local = vertices - np.array(surface.origin)
         return np.zeros_like(faces), lambda point, variant: np.stack(
             [(local[point] * axis).sum(axis=1) for axis in axes], axis=1
         )
-    if surface.wrap == "grain":
+    if surface.mapping == "box":
         axis = np.abs(across).argmax(axis=0)
         low = vertices.min(axis=0)
         sides = np.array(_SIDES[surface.grain])
@@ -155,7 +161,7 @@ def _texture_variants(
 
 
 def _turns(vertices: Array, faces: Indices) -> Array:
-    """[V] float64: for the points that the faces name, the angle about the z axis in turns, in [0, 1)."""
+    """[V] float64: the angle about the z axis in turns, in [0, 1), of the points that the faces name; 0 for others."""
     turn = np.zeros(len(vertices))
     used = np.zeros(len(vertices), dtype=np.bool_)
     used[faces] = True
@@ -189,4 +195,4 @@ def turns_about_z(x: Array, y: Array) -> Array:
 
 
 _EIGHTHS = np.array([round(math.atan(k / 8.0), 15) for k in range(9)])
-"""[9] float64: the angles whose tangents are 0, 1/8, ... 1."""
+"""[9] float64: the angles with tangents 0, 1/8, ... 1."""

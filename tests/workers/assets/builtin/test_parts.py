@@ -7,9 +7,9 @@ import pytest
 
 from schemas.scene.shape import Material
 from tests.workers.assets.oracles import welded
-from workers.assets.builtin.finish import Surface, cut_into_parts, turns_about_z
+from workers.assets.builtin.parts import Surface, cut_into_parts, turns_about_z
 from workers.assets.builtin.solid import lathe, union
-from workers.assets.builtin.vessel import bevelled, prism
+from workers.assets.builtin.sweeps import bevelled_profile, prism
 
 PLAIN = Material()
 
@@ -62,8 +62,8 @@ def test_a_plane_is_laid_by_its_two_vectors():
 
 @pytest.mark.parametrize(("grain", "sides"), [(0, {0: 1, 1: 0, 2: 0}), (2, {0: 2, 1: 2, 2: 0})])
 def test_grain_runs_along_its_axis_on_every_side(grain, sides):
-    solid = prism(bevelled(0.3, 0.01), (0.4, 0.2), 0.01, [0] * 5)
-    part = cut_into_parts(solid, named("grain", size=0.4, grain=grain), np.zeros(3), 1.0).parts[0]
+    solid = prism(bevelled_profile(0.3, 0.01), (0.4, 0.2), 0.01, [0] * 5)
+    part = cut_into_parts(solid, named("box", size=0.4, grain=grain), np.zeros(3), 1.0).parts[0]
     corners = part.vertices[part.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     low = solid.vertices.min(axis=0)
@@ -75,7 +75,7 @@ def test_grain_runs_along_its_axis_on_every_side(grain, sides):
 
 def test_a_joined_solid_is_still_closed_after_cutting():
     joined = union([cylinder((0, 0, 0)), cylinder((1, 1, 1)).moved(x=0.05, z=0.1)])
-    shape = cut_into_parts(joined, named("grain", "cylinder"), np.array([0.1, 0.2, 0.3]), 3.3)
+    shape = cut_into_parts(joined, named("box", "cylinder"), np.array([0.1, 0.2, 0.3]), 3.3)
     assert welded(shape).is_watertight
     assert welded(shape).volume > 0
 

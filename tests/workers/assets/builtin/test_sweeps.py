@@ -1,52 +1,17 @@
-"""Walls, prisms and rods against volumes of the textbook."""
+"""Prisms and rods against volumes of the textbook."""
 
 import math
 
 import numpy as np
 import pytest
 import trimesh
-from shapely.geometry import Polygon
 
-from workers.assets.builtin.solid import circle, lathe
-from workers.assets.builtin.vessel import (
-    BASE,
-    INSIDE,
-    OUTSIDE,
-    bend_radius,
-    bevelled,
-    prism,
-    rod,
-    sides_apart,
-    wall_around,
-)
+from workers.assets.builtin.solid import circle
+from workers.assets.builtin.sweeps import bend_radius, bevelled_profile, prism, rod, split_sides
 
 
 def mesh_of(solid):
     return trimesh.Trimesh(solid.vertices, solid.faces, process=False)
-
-
-def beaker():
-    hollow = np.array([[0.0, 0.01], [0.03, 0.01], [0.04, 0.02], [0.04, 0.1]])
-    return wall_around(hollow, 0.004, 0.025, 0.004, 0.001)
-
-
-def test_a_wall_is_as_thick_as_it_says_and_its_profile_does_not_cross_itself():
-    wall = beaker()
-    assert Polygon(wall.profile).is_valid
-    assert wall.radius_at(0.099) == pytest.approx(0.044, abs=1e-5)
-    assert wall.normal_at(0.06) == pytest.approx([1, 0], abs=1e-2)
-    assert set(wall.surface) == {OUTSIDE, INSIDE, BASE}
-    assert mesh_of(lathe(wall.profile, wall.surface)).is_volume
-
-
-def test_a_vessel_stands_on_its_foot_ring_and_holds_what_its_hollow_says():
-    wall = beaker()
-    mesh = mesh_of(lathe(wall.profile, wall.surface, 256))
-    ring = mesh.vertices[mesh.vertices[:, 2] == 0.0]
-    assert np.hypot(ring[:, 0], ring[:, 1]).min() == pytest.approx(0.021)
-    assert np.hypot(ring[:, 0], ring[:, 1]).max() == pytest.approx(0.025)
-    inside = wall.surface == INSIDE
-    assert wall.profile[1:][inside][-1].tolist() == [0.0, 0.01]
 
 
 def test_a_prism_has_its_size_and_the_volume_of_a_box_without_its_corners():
@@ -57,7 +22,9 @@ def test_a_prism_has_its_size_and_the_volume_of_a_box_without_its_corners():
 
 
 def test_a_bevel_is_taken_off_both_edges():
-    assert bevelled(0.1, 0.01, 1.0).tolist() == pytest.approx(np.array([[0.01, 1], [0, 1.01], [0, 1.09], [0.01, 1.1]]))
+    assert bevelled_profile(0.1, 0.01, 1.0).tolist() == pytest.approx(
+        np.array([[0.01, 1], [0, 1.01], [0, 1.09], [0.01, 1.1]])
+    )
 
 
 def test_a_rod_bent_into_a_half_circle_has_the_volume_that_pappus_gives_it():
@@ -81,7 +48,7 @@ def test_a_prism_without_room_for_its_edges_is_a_bug_and_says_so():
 
 
 def test_the_sides_of_a_box_are_told_apart():
-    solid = sides_apart(prism(np.array([[0.0, 0.0], [0.0, 1.0]]), (2.0, 1.0), 0.01, [9, 0, 9]), 0, (1, 2, 3, 4))
+    solid = split_sides(prism(np.array([[0.0, 0.0], [0.0, 1.0]]), (2.0, 1.0), 0.01, [9, 0, 9]), 0, (1, 2, 3, 4))
     centres = solid.vertices[solid.faces].mean(axis=1)
     for number, (axis, sign) in {1: (1, -1), 2: (0, 1), 3: (1, 1), 4: (0, -1)}.items():
         assert (sign * centres[solid.surface == number][:, axis] > 0.4).all()

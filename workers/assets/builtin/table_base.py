@@ -1,21 +1,21 @@
-"""Pure: what a table top stands on: four legs, a pedestal, sleds, trestles or panels."""
+"""Pure: the bases of tables: four legs, a pedestal, sleds, trestles or panels."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from schemas.base import Array
 from workers.assets.builtin.curves import bezier, rounded_rectangle
-from workers.assets.builtin.look import chance
-from workers.assets.builtin.solid import Solid, circle, lathe, loft, together
+from workers.assets.builtin.draws import chance, pick
+from workers.assets.builtin.solid import Solid, circle, combine, lathe, level_ring, loft
 
 TOP, LEG, FRAME = 0, 1, 2
 """Surface numbers of a table."""
 
 
 @dataclass(frozen=True)
-class Plan:
+class TableSize:
     """Sizes of one table, metres: the top's width along x, depth along y and thickness, and its height."""
 
     width: float
@@ -30,87 +30,82 @@ class Plan:
         return self.height - self.thick
 
 
-def make_stand(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+def make_base(rng: np.random.Generator, plan: TableSize) -> list[Solid]:
     """One or two solids, standing at height 0, that reach into the table top from below."""
     stands = (
         (_pedestal, _legs, _panels)
         if plan.round_top
         else (_legs, _legs, _apron_legs, _apron_legs, _sled, _trestle, _panels)
     )
-    return stands[int(rng.integers(len(stands)))](rng, plan)
+    return pick(rng, stands)(rng, plan)
 
 
-def _leg_spots(plan: Plan, inset: float) -> list[tuple[float, float]]:
+def _leg_spots(plan: TableSize, inset: float) -> list[tuple[float, float]]:
     """Where four legs stand, under the corners or within the ellipse of a round top."""
     share = 0.62 if plan.round_top else 1.0
     x, y = 0.5 * plan.width * share - inset, 0.5 * plan.depth * share - inset
     return [(x, y), (-x, y), (-x, -y), (x, -y)]
 
 
-def _leg(rng: np.random.Generator, plan: Plan, spots: list[tuple[float, float]], splay: float, size: float) -> Solid:
-    """Four like legs, square or round, tapered, leaning outwards by `splay` (a slope)."""
-    is_round, taper = chance(rng, 0.5), float(rng.uniform(0.55, 1.0))
+def _leg(
+    rng: np.random.Generator, plan: TableSize, spots: list[tuple[float, float]], splay: float, size: float
+) -> Solid:
+    """Four equal legs, square or round, tapered, leaning outwards with the slope `splay`."""
+    is_round, taper = chance(rng, 0.5), rng.uniform(0.55, 1.0)
     outline = circle(12) * 0.5 if is_round else rounded_rectangle(1.0, 1.0, 0.08, 1)
     top = plan.under + 0.4 * plan.thick
     legs = []
     for x, y in spots:
         away = np.array([math.copysign(splay, x), math.copysign(splay, y)])
-        foot = np.concatenate(
-            [outline * size * taper + [x, y] + away * plan.under, np.zeros((len(outline), 1))], axis=1
-        )
-        head = np.concatenate(
-            [outline * size + [x, y] - away * (top - plan.under), np.full((len(outline), 1), top)], axis=1
-        )
+        foot = level_ring(outline * size * taper + [x, y] + away * plan.under, 0.0)
+        head = level_ring(outline * size + [x, y] - away * (top - plan.under), top)
         ends = np.array([*(np.array([x, y]) + away * plan.under), 0.0]), np.array([x, y, top])
         legs.append(loft(np.stack([foot, head]), *ends, [LEG] * 3, [0, 1, 2]))
-    return together(legs)
+    return combine(legs)
 
 
-def _legs(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+def _legs(rng: np.random.Generator, plan: TableSize) -> list[Solid]:
     """Legs straight into the top, upright or splayed."""
-    size = float(rng.uniform(0.03, 0.06))
-    splay = float(rng.uniform(0.04, 0.16)) if chance(rng, 0.5) else 0.0
+    size = rng.uniform(0.03, 0.06)
+    splay = rng.uniform(0.04, 0.16) if chance(rng, 0.5) else 0.0
     inset = 0.6 * size + 0.02 + (splay * plan.under if not plan.round_top else 0.0)
     return [_leg(rng, plan, _leg_spots(plan, inset), splay, size)]
 
 
 def _beam(size: tuple[float, float, float], at: tuple[float, float, float], surface: int) -> Solid:
-    """A box of a size with its middle at a point."""
+    """A box of a size, centred at a point."""
     x, y, z = (0.5 * s for s in size)
     corners = np.array([[x, y], [-x, y], [-x, -y], [x, -y]]) + np.array(at[:2])
-    rings = [np.concatenate([corners, np.full((4, 1), at[2] + dz)], axis=1) for dz in (-z, z)]
+    rings = [level_ring(corners, at[2] + dz) for dz in (-z, z)]
     low, high = (np.array([at[0], at[1], at[2] + dz]) for dz in (-z, z))
     flat = loft(np.stack(rings), low, high, [surface] * 3, [0, 1, 2])
     side = np.concatenate([np.zeros(4), np.repeat([1, 2, 3, 4], 2), np.full(4, 5)]).astype(np.int64)
-    return Solid(flat.vertices, flat.faces, flat.surface, side, flat.lofts)
+    return replace(flat, smooth=side)
 
 
-def _apron_legs(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+def _apron_legs(rng: np.random.Generator, plan: TableSize) -> list[Solid]:
     """Four upright legs joined by an apron, and often by a shelf or by stretchers."""
-    size = float(rng.uniform(0.045, 0.08))
-    spots = _leg_spots(plan, 0.5 * size + float(rng.uniform(0.012, 0.05)))
+    size = rng.uniform(0.045, 0.08)
+    spots = _leg_spots(plan, 0.5 * size + rng.uniform(0.012, 0.05))
     x, y = spots[0]
     legs = _leg(rng, plan, spots, 0.0, size)
-    deep, thin = float(rng.uniform(0.06, 0.11)), 0.4 * size
+    deep, thin = rng.uniform(0.06, 0.11), 0.4 * size
     middle = plan.under - 0.5 * deep + 0.3 * plan.thick
     solids = [_frame((2 * x + thin, 2 * y + thin), thin, middle - 0.5 * deep, middle + 0.5 * deep)]
     kind = rng.random()
-    low = plan.height * float(rng.uniform(0.15, 0.3))
+    low = plan.height * rng.uniform(0.15, 0.3)
     if kind < 0.35:
         solids.append(_beam((2 * x + 0.2 * thin, 2 * y + 0.2 * thin, 0.02), (0.0, 0.0, low), FRAME))
     elif kind < 0.6:
         solids.append(_frame((2 * x + thin, 2 * y + thin), thin, low - 0.5 * thin, low + 0.5 * thin))
-    return [legs, together(solids)]
+    return [legs, combine(solids)]
 
 
 def _frame(size: tuple[float, float], wide: float, low: float, high: float) -> Solid:
     """A rectangular frame of four bars, `wide` thick, between two heights."""
     square = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
     outer, inner = square * np.array(size), square * (np.array(size) - 2 * wide)
-    loops = [
-        np.concatenate([xy, np.full((4, 1), z)], 1)
-        for xy, z in ((inner, low), (outer, low), (outer, high), (inner, high))
-    ]
+    loops = [level_ring(xy, z) for xy, z in ((inner, low), (outer, low), (outer, high), (inner, high))]
     j = np.arange(4)
     faces, smooth = [], []
     for k in range(4):
@@ -121,11 +116,11 @@ def _frame(size: tuple[float, float], wide: float, low: float, high: float) -> S
     return Solid(np.concatenate(loops), np.concatenate(faces), number, np.concatenate(smooth))
 
 
-def _pedestal(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+def _pedestal(rng: np.random.Generator, plan: TableSize) -> list[Solid]:
     """One turned column on a round plate or on a wide bell."""
-    column, foot = float(rng.uniform(0.03, 0.07)), plan.depth * float(rng.uniform(0.27, 0.34))
+    column, foot = rng.uniform(0.03, 0.07), plan.depth * rng.uniform(0.27, 0.34)
     top = plan.under + 0.4 * plan.thick
-    plate = float(rng.uniform(0.012, 0.03))
+    plate = rng.uniform(0.012, 0.03)
     if chance(rng, 0.5):
         stem = np.array(
             [[foot, plate], [column * 1.1, plate + 0.02], [column, 0.4 * plan.under], [column, plan.under - 0.05]]
@@ -143,28 +138,28 @@ def _pedestal(rng: np.random.Generator, plan: Plan) -> list[Solid]:
     return [lathe(profile, [LEG] * (len(profile) - 1), 32)]
 
 
-def _sled(rng: np.random.Generator, plan: Plan) -> list[Solid]:
-    """Two frames of square loft, one at each end, sometimes joined below the top."""
-    loft = float(rng.uniform(0.03, 0.055))
-    x, y = 0.5 * plan.width - float(rng.uniform(0.05, 0.18)), 0.5 * plan.depth - float(rng.uniform(0.03, 0.08))
+def _sled(rng: np.random.Generator, plan: TableSize) -> list[Solid]:
+    """Two frames of square bars, one at each end, sometimes joined below the top."""
+    loft = rng.uniform(0.03, 0.055)
+    x, y = 0.5 * plan.width - rng.uniform(0.05, 0.18), 0.5 * plan.depth - rng.uniform(0.03, 0.08)
     top = plan.under + 0.4 * plan.thick
     upright = _frame((top, 2 * y), loft, -0.5 * loft, 0.5 * loft)
     # The frame lies flat about the origin; turned about y, its first axis stands up.
     stood = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     ends = [upright.placed(stood, np.array([side, 0.0, 0.5 * top])) for side in (-x, x)]
-    legs = together(ends)
-    legs = Solid(legs.vertices, legs.faces, np.full(len(legs.faces), LEG), legs.smooth, legs.lofts)
+    legs = combine(ends)
+    legs = replace(legs, surface=np.full(len(legs.faces), LEG))
     if not chance(rng, 0.5):
         return [legs]
     return [legs, _beam((2 * x, 0.8 * loft, 0.8 * loft), (0.0, 0.0, plan.under - 0.2 * loft), FRAME)]
 
 
-def _trestle(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+def _trestle(rng: np.random.Generator, plan: TableSize) -> list[Solid]:
     """A board on edge at each end with a wide foot, joined by a long rail."""
-    x = 0.5 * plan.width - float(rng.uniform(0.15, 0.25))
-    board, thick = plan.depth * float(rng.uniform(0.25, 0.5)), float(rng.uniform(0.03, 0.06))
+    x = 0.5 * plan.width - rng.uniform(0.15, 0.25)
+    board, thick = plan.depth * rng.uniform(0.25, 0.5), rng.uniform(0.03, 0.06)
     top, foot = plan.under + 0.4 * plan.thick, 0.78 * plan.depth
-    # An upright with a wide foot and a wide head, seen from its end: one outline, as thick as the board.
+    # The end view of an upright with a wide foot and a wide head.
     half = np.array(
         [
             [0.5 * foot, 0.0],
@@ -177,13 +172,13 @@ def _trestle(rng: np.random.Generator, plan: Plan) -> list[Solid]:
         ]
     )
     return [
-        together([_cheek(half, thick, side) for side in (-x, x)]),
-        _beam((2 * x + 0.1, 0.6 * thick, 0.09), (0.0, 0.0, plan.under * float(rng.uniform(0.3, 0.6))), FRAME),
+        combine([_cheek(half, thick, side) for side in (-x, x)]),
+        _beam((2 * x + 0.1, 0.6 * thick, 0.09), (0.0, 0.0, plan.under * rng.uniform(0.3, 0.6)), FRAME),
     ]
 
 
 def _cheek(half: Array, thick: float, at: float) -> Solid:
-    """An upright board in the plane x = at, from the half widths [K, 2] of (y, z) from its foot to its head."""
+    """An upright board in the plane x = at; half [K, 2]: its half width and height (y, z), from foot to head."""
     rings = []
     for y, z in half:
         rings.append(
@@ -194,16 +189,16 @@ def _cheek(half: Array, thick: float, at: float) -> Solid:
         np.array(rings), np.array([at, 0.0, 0.0]), np.array([at, 0.0, half[-1, 1]]), [LEG] * bands, range(bands)
     )
     corner = np.concatenate([np.zeros(4), np.tile(np.repeat(np.arange(4), 2), bands - 2), np.zeros(4)]).astype(np.int64)
-    return Solid(board.vertices, board.faces, board.surface, board.smooth * 4 + corner, board.lofts)
+    return replace(board, smooth=board.smooth * 4 + corner)
 
 
-def _panels(rng: np.random.Generator, plan: Plan) -> list[Solid]:
+def _panels(rng: np.random.Generator, plan: TableSize) -> list[Solid]:
     """Two panels that cross, or two ends like a bench's."""
-    thick, top = float(rng.uniform(0.02, 0.04)), plan.under + 0.4 * plan.thick
+    thick, top = rng.uniform(0.02, 0.04), plan.under + 0.4 * plan.thick
     reach = 0.62 if plan.round_top else 0.85
     x, y = reach * plan.width, reach * plan.depth
     if plan.round_top or chance(rng, 0.3):
         first = _beam((x, thick, top), (0.0, 0.0, 0.5 * top), LEG)
         return [first, _beam((thick, y, top), (0.0, 0.0, 0.5 * top), LEG)]
     ends = [_beam((thick, y, top), (side * 0.5 * x, 0.0, 0.5 * top), LEG) for side in (-1.0, 1.0)]
-    return [together(ends), _beam((x, thick, 0.25 * plan.height), (0.0, 0.0, 0.72 * plan.under), FRAME)]
+    return [combine(ends), _beam((x, thick, 0.25 * plan.height), (0.0, 0.0, 0.72 * plan.under), FRAME)]

@@ -1,0 +1,131 @@
+"""Edge: what a mesh from outside may hold and refer to: caps on counts, material files, PNG and JPEG textures."""
+
+import io
+import re
+import struct
+import warnings
+from pathlib import Path
+
+from PIL import Image
+from trimesh.resolvers import Resolver
+
+from schemas.errors import MeshError
+from schemas.job.assets import MeshLimits
+
+LEAST_BYTES = 8
+"""No format writes a vertex or a face in fewer: `v 0 0 0` and its line end."""
+
+_PLY_ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d+)", re.MULTILINE)
+_IMAGE_KINDS = {b"\x89PNG\r\n\x1a\n": "PNG", b"\xff\xd8\xff": "JPEG"}
+_ADDRESS = re.compile(r"\s*<[^<>]* at 0x[0-9a-fA-F]+>")
+
+
+def check_counts(path: Path, vertices: int, faces: int, limits: MeshLimits) -> None:
+    """MeshError `too_large` where a count is over its cap."""
+    for name, count, cap in (("vertices", vertices, limits.max_vertices), ("faces", faces, limits.max_faces)):
+        if count > cap:
+            raise MeshError("too_large", f"{path} has {count} {name}, over max_{name} = {cap}")
+
+
+def may_be_too_large(data: bytes, limits: MeshLimits) -> bool:
+    """Whether a file is long enough to exceed the caps; a shorter one needs no counting."""
+    return len(data) > LEAST_BYTES * min(limits.max_vertices, limits.max_faces)
+
+
+def declared_counts(kind: str, data: bytes) -> tuple[int, int]:
+    """Vertices and faces that a file declares, found without parsing it; (0, 0) where it declares none."""
+    if kind == ".obj":
+        return data.count(b"\nv "), data.count(b"\nf ")
+    if kind == ".ply":
+        counts = {name: int(count) for name, count in _PLY_ELEMENT.findall(data[: data.find(b"end_header")][:65536])}
+        if any(count > len(data) for count in counts.values()):
+            raise MeshError(
+                "unreadable", f"the PLY header promises {max(counts.values())} elements in {len(data)} bytes"
+            )
+        return counts.get(b"vertex", 0), counts.get(b"face", 0)
+    if kind == ".stl" and len(data) >= 84 and len(data) == 84 + 50 * struct.unpack_from("<I", data, 80)[0]:
+        faces = (len(data) - 84) // 50
+        return 3 * faces, faces
+    return 0, data.count(b"endfacet")
+
+
+def find_inside(root: Path, *candidates: Path) -> Path | None:
+    """The first candidate that is a file below `root`, links followed; None where there is none."""
+    for candidate in candidates:
+        try:
+            path = candidate.resolve()
+            if path.is_relative_to(root) and path.is_file():
+                return path
+        except (OSError, ValueError, RuntimeError):
+            continue
+    return None
+
+
+class FolderResolver(Resolver):
+    """Hands trimesh the material files and PNG or JPEG textures of one folder, and nothing else.
+
+    Names are relative to the mesh, may use either slash, and must stay below `root`. A file that is refused or missing
+    leaves a note in `notes`, and the mesh is loaded without it.
+    """
+
+    def __init__(self, mesh: Path, root: Path, limits: MeshLimits) -> None:
+        self.folder = mesh.parent
+        self.root = root.resolve()
+        self.limits = limits
+        self.notes: list[str] = []
+
+    def get(self, key: str) -> bytes:
+        """The bytes of a file; raises FileNotFoundError where it is missing or refused."""
+        name = str(key).strip().replace("\\", "/")
+        path = self.find(name)
+        if path is None:
+            raise self._refuse(name, "is missing")
+        if path.stat().st_size > self.limits.max_file_mb * 1e6:
+            raise self._refuse(name, f"is larger than max_file_mb = {self.limits.max_file_mb:g}")
+        data = path.read_bytes()
+        if path.suffix.lower() != ".mtl" and (why := image_fault(data, self.limits)) is not None:
+            raise self._refuse(name, why)
+        return data
+
+    def find(self, name: str) -> Path | None:
+        """The file of a name, relative to the mesh or else beside it; None where there is none below `root`."""
+        name = name.strip().replace("\\", "/")
+        return find_inside(self.root, self.folder / name, self.folder / Path(name).name)
+
+    def _refuse(self, name: str, why: str) -> FileNotFoundError:
+        self.notes.append(f"{name} {why}: plain base colour used")
+        return FileNotFoundError(name)
+
+    def write(self, name: str, data: object) -> None:
+        """Refused: reading never writes."""
+        raise PermissionError(name)
+
+    def namespaced(self, namespace: str) -> "FolderResolver":
+        """This resolver itself."""
+        return self
+
+    def keys(self) -> list[str]:
+        """Nothing is listed."""
+        return []
+
+
+def describe_error(error: Exception) -> str:
+    """Kind and message of an error without addresses in memory, because notes on meshes are stored in the dataset."""
+    return _ADDRESS.sub("", repr(error))
+
+
+def image_fault(data: bytes, limits: MeshLimits) -> str | None:
+    """Why these bytes may not be a texture; None for a PNG or JPEG, by its first bytes, of a size within the cap."""
+    kind = next((kind for magic, kind in _IMAGE_KINDS.items() if data.startswith(magic)), None)
+    if kind is None:
+        return "is not a PNG or JPEG file"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data), formats=(kind,)) as image:
+                largest = max(image.size)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
+        return f"cannot be opened ({describe_error(error)})"
+    return (
+        f"has {largest} px, over max_texture_px = {limits.max_texture_px}" if largest > limits.max_texture_px else None
+    )

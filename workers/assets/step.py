@@ -1,0 +1,67 @@
+"""The stage's entry: chooses a scene's objects and table from the catalogue and loads them."""
+
+import sys
+
+import numpy as np
+from cachetools import LRUCache
+
+from schemas.errors import AssetSourceError
+from schemas.job.assets import ProceduralSource
+from schemas.scene.shape import Asset
+from workers.assets.catalogue import Catalogue, InstanceRef
+from workers.assets.categories import TABLE
+from workers.assets.sources import load_instance
+
+MAX_CACHED_INSTANCES = 10_000
+"""Sources with more built-in instances are not cached: instances hardly ever repeat."""
+CACHE_BYTES = 256 * 1024 * 1024
+"""Memory that the cached assets of a process may take."""
+
+
+def choose_object(catalogue: Catalogue, category: str, rng: np.random.Generator) -> InstanceRef:
+    """An instance of the category: a source by weight among those that have it, then one of its instances uniformly."""
+    offers = catalogue.offers(category)
+    if not offers:
+        raise AssetSourceError(f"no source offers {category!r}")
+    share = rng.random() * sum(settings.weight for _, settings, _ in offers)
+    chosen = offers[-1]
+    for offer in offers:
+        share -= offer[1].weight
+        if share < 0.0:
+            chosen = offer
+            break
+    return catalogue.refer(chosen[0], category, int(rng.integers(chosen[2])))
+
+
+def choose_table(catalogue: Catalogue, rng: np.random.Generator) -> InstanceRef:
+    """A table, chosen as objects are."""
+    return choose_object(catalogue, TABLE, rng)
+
+
+def load_asset(catalogue: Catalogue, ref: InstanceRef) -> Asset:
+    """The asset, from this process's cache if it is there; MeshError where its mesh is refused."""
+    settings, listing = catalogue.source(ref.source, ref.category)
+    key = (catalogue.digest, ref)
+    if key in _cache:
+        return _cache[key]
+    asset = load_instance(settings, listing, ref.category, ref.index, catalogue.assets)
+    if not (isinstance(settings, ProceduralSource) and settings.instances > MAX_CACHED_INSTANCES):
+        _cache[key] = asset
+    return asset
+
+
+def asset_bytes(asset: Asset) -> int:
+    """Memory that an asset's arrays take."""
+    total = sys.getsizeof(asset)
+    for part in asset.shape.parts:
+        arrays = (part.vertices, part.faces, part.normals, part.uv, part.colors, part.material.texture)
+        total += sum(array.nbytes for array in arrays if array is not None)
+    return total
+
+
+def open_cache(capacity_bytes: int) -> LRUCache[tuple[str, InstanceRef], Asset]:
+    """An LRU cache of assets. An asset larger than the capacity counts as the capacity, so that one is always kept."""
+    return LRUCache(capacity_bytes, getsizeof=lambda asset: min(asset_bytes(asset), capacity_bytes))
+
+
+_cache = open_cache(CACHE_BYTES)
