@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.scene.camera import Camera
 from schemas.scene.region import REGION_FIRST_OBJECT
@@ -15,7 +16,7 @@ from workers.assets.catalogue import open_catalogue
 from workers.cameras.pivot_depth import front_distance
 from workers.cameras.placement import place_mirror_camera
 from workers.physics.step import settle_scene
-from workers.pipeline.context import WorkerContext, settings_digest
+from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import plan_with_assets, pose_scene
 from workers.plan.effect import Facts
 from workers.plan.effects import plan_effects
