@@ -1,8 +1,5 @@
 """The Arrow schemas of the six manifest tables, and which of their columns are a function of job and seed."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
 import pyarrow as pa
 
 SCHEMA_VERSION = 1
@@ -177,14 +174,3 @@ SORT_KEYS: dict[str, tuple[str, ...]] = {
     "timings": ("scene_id",),
 }
 """Each table's key: no two rows share it, and merged rows are in this order."""
-
-
-def worst_rest(bodies: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
-    """The columns of `scenes` that are the worst of its bodies': the most of each, and of the support margin the least."""
-    most = ("penetration_mm", "hover_gap_mm", "residual_speed_mm_s", "equilibrium_residual")
-    again = ("recheck_move_mm", "recheck_turn_deg")
-    return {
-        **{name: max(body[name] for body in bodies) for name in most},
-        **{name: max((body[name] for body in bodies if body[name] is not None), default=None) for name in again},
-        "support_margin_mm": min(body["support_margin_mm"] for body in bodies),
-    }

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from schemas.dataset.codec import Row, read_world_poses
 from schemas.dataset.layout import Content, image_path, patch_index, patch_path
 from schemas.scene.region import REGION_FIRST_OBJECT
-from services.read.dataset_reader import Row, StoredRange, file_reader, iter_stored, read_image
+from services.read.dataset_reader import StoredRange, file_reader, iter_stored, read_image
 from workers.store.opening import open_store
 from workers.store.store import Store
 
@@ -100,7 +101,7 @@ def _cells(read: Callable[[str], bytes], stored: StoredRange, scene: Row) -> lis
         cells.append(cell("depth", number, _paint_depth))
         cells.append(cell("segment", number, _paint_regions))
     cells.append(cell("RGBprojected", e))
-    regions = [body["region_id"] for body in scene["bodies"] or [{"region_id": REGION_FIRST_OBJECT}]]
+    regions = [region for region in read_world_poses(scene) if region >= REGION_FIRST_OBJECT]
     indices = [patch_index(region, len(regions)) for region in regions[:MOST_PATCHES]]
     patches = [patch_path(category, "RGB", number, index) for index in indices for number in (e, e + 1)]
     cells.append(_stack([read_image(read, path) for path in patches if path in listed]))

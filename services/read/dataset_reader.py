@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 from numpy.typing import NDArray
 
+from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.tables import DETERMINISTIC_TABLES
 from schemas.errors import CorruptError, InputError
@@ -15,8 +15,6 @@ from workers.store.commit import read_record
 from workers.store.images import decode_png
 from workers.store.store import Store
 from workers.store.tars import read_tar
-
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,13 @@ import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
+from schemas.dataset.codec import Row
 from schemas.dataset.layout import ASSETS, MANIFEST, stored_roles
 from schemas.errors import CorruptError
 from schemas.job.job import Job
 from services.job.record import require_job
 from services.merge.step import read_success
-from services.read.dataset_reader import Row, StoredRange, file_reader, iter_stored, read_image
+from services.read.dataset_reader import StoredRange, file_reader, iter_stored, read_image
 from workers.pipeline.allocator import keep_freed_memory
 from workers.pipeline.check_stored import check_stored_pair, check_stored_scene
 from workers.store.store import Store
