@@ -1,11 +1,12 @@
-"""What each command prints. Each takes the parsed arguments and returns an exit code."""
+"""Handlers of the commands: each takes the parsed options, prints, and returns the exit code."""
 
 import argparse
 import dataclasses
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from schemas.dataset.layout import JOB_FILE
 from schemas.errors import OutputError
@@ -13,7 +14,10 @@ from services.job.read import load_job
 
 if TYPE_CHECKING:
     from services.read.audit import Audit
+    from services.read.verify_independent import IndependentVerdict
     from workers.store.store import Store
+
+Found = TypeVar("Found")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -97,14 +101,10 @@ def verify(options: argparse.Namespace) -> int:
     """`verso verify`."""
     from services.job.record import require_job
     from services.read.verify import verify as read_back
-    from services.run.progress import ProgressLine
 
     store = _dataset(options.out)
-    line = ProgressLine(require_job(store).job.scenes, "verify")
-    try:
-        verdict = read_back(store, lambda now: line.show(now.scenes, len(now.faults)))
-    finally:
-        line.close()
+    scenes = require_job(store).job.scenes
+    verdict = _with_progress(scenes, "verify", lambda progress: read_back(store, progress))
     for fault in verdict.faults:
         print(fault)
     print(
@@ -112,26 +112,40 @@ def verify(options: argparse.Namespace) -> int:
         f"{verdict.pairs} pairs derived again: {len(verdict.faults) or 'nothing'} off"
     )
     answer, faults = dataclasses.asdict(verdict), list(verdict.faults)
-    if options.audit:
-        found = _audit(options, store)
-        faults += found.faults
-        answer["audit"] = dataclasses.asdict(found)
+    for name, check in (("independent", _verify_independently), ("audit", _audit)):
+        if count := getattr(options, name):
+            found = check(store, count)
+            faults += found.faults
+            answer[name] = dataclasses.asdict(found)
     _answer(options, {"ok": not faults, **answer})
     return 1 if faults else 0
 
 
-def _audit(options: argparse.Namespace, store: "Store") -> "Audit":
-    from services.read.audit import audit
-    from services.read.audit_words import describe_audit
-    from services.run.progress import ProgressLine
+def _verify_independently(store: "Store", count: int) -> "IndependentVerdict":
+    from services.read.verify_independent import describe_independent, verify_independently
 
-    line = ProgressLine(options.audit, "audit")
-    try:
-        found = audit(store, options.audit, lambda now: line.show(now.scenes, len(now.faults)))
-    finally:
-        line.close()
+    found = _with_progress(count, "independent", lambda progress: verify_independently(store, count, progress))
+    print("\n".join(describe_independent(found)))
+    return found
+
+
+def _audit(store: "Store", count: int) -> "Audit":
+    from services.read.audit import audit, describe_audit
+
+    found = _with_progress(count, "audit", lambda progress: audit(store, count, progress))
     print("\n".join(describe_audit(found)))
     return found
+
+
+def _with_progress(scenes: int, what: str, work: Callable[[Callable[[Any], None]], Found]) -> Found:
+    """The result of `work`, which reports how many scenes are done and what is off as it goes."""
+    from services.run.progress import ProgressLine
+
+    line = ProgressLine(scenes, what)
+    try:
+        return work(lambda now: line.show(now.scenes, len(now.faults)))
+    finally:
+        line.close()
 
 
 def query(options: argparse.Namespace) -> int:

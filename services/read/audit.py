@@ -6,10 +6,8 @@ Approximations: what is stored is released again with nothing left out (audit_mo
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-
-import numpy as np
 
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import ASSETS, FINGERPRINT_FILE
@@ -17,7 +15,7 @@ from schemas.errors import SceneError
 from schemas.scene.scene import SceneOutput
 from services.job.record import require_job
 from services.read.audit_motion import Motion, measure_motion
-from services.read.dataset_reader import StoredRange, find_scene, iter_stored
+from services.read.dataset_reader import StoredRange, choose_scenes, find_scene
 from services.read.replay import compare_files, compare_rows, open_context
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.fingerprint import take_fingerprint
@@ -66,20 +64,10 @@ def audit(store: Store, count: int, progress: Callable[[Audit], None]) -> Audit:
     for effect in EFFECTS:
         if effect.kind != "asked":
             found.effects[effect.name] = Tally(effect.kind)
-    made = [row["scene_id"] for stored in iter_stored(store) for row in stored.rows["scenes"]]
-    for scene_id in choose_evenly(made, count, record.job.seed):
+    for scene_id in choose_scenes(store, count, record.job.seed):
         _audit_scene(context, store, scene_id, found)
         progress(found)
     return found
-
-
-def choose_evenly(scenes: Sequence[int], count: int, seed: int) -> list[int]:
-    """`count` of the scenes, or all, evenly over their ids; the seed says from where on."""
-    ordered = sorted(scenes)
-    if count >= len(ordered):
-        return ordered
-    first = float(np.random.default_rng(seed).random())
-    return [ordered[int((i + first) * len(ordered) / count)] for i in range(count)]
 
 
 def _audit_scene(context: WorkerContext, store: Store, scene_id: int, found: Audit) -> None:
@@ -167,3 +155,25 @@ def _release(context: WorkerContext, scene: Scene, names: Sequence[str], found: 
 
 def _listed(names: Sequence[str] | frozenset[str]) -> str:
     return ", ".join(sorted(names)) or "nothing"
+
+
+def describe_audit(found: Audit) -> Iterator[str]:
+    """Every fault, the figures, and what was proven of each effect, line by line."""
+    yield from found.faults
+    against = (
+        "what is stored" if found.same_stack else "a plain scene made here, because another stack made what is stored"
+    )
+    yield (
+        f"audit of {found.scenes} scenes: {found.forced} no-ops forced, {found.files} files "
+        f"({found.bytes / 1e6:.1f} MB) compared to the byte with {against}"
+    )
+    motion = found.motion
+    yield (
+        f"  {found.released} released for 1 s with every effect: moved at most {motion.moved_mm:.4f} mm, turned at most "
+        f"{motion.turned_deg:.5f} degrees; {motion.pixels_changed} mask pixels changed, {motion.pixels_outside} of them "
+        "away from any silhouette"
+    )
+    for name, tally in found.effects.items():
+        if tally.skipped:
+            yield f"  {name} ({tally.kind}): left out in {tally.skipped} scenes, proven in {tally.proven}"
+    yield f"  {len(found.faults) or 'nothing'} off"

@@ -75,7 +75,7 @@ def _choose(store: Store, scenes: int, only: str | None) -> list[tuple[str, list
     """The first scenes of each category, by category."""
     chosen: dict[str, list[list[Picture]]] = {}
     for stored in iter_stored(store):
-        read = file_reader(store, stored)
+        read = file_reader(store.read, stored)
         for scene in stored.rows["scenes"]:
             category = scene["category"]
             if only not in (None, category):

@@ -78,7 +78,7 @@ def compare_files(store: Store, stored: StoredRange, output: SceneOutput, same_s
         f"{path}: only {'stored' if path in scene_files else 'made now'}"
         for path in sorted(made.keys() ^ scene_files.keys())
     ]
-    read = file_reader(store, stored)
+    read = file_reader(store.read, stored)
     for path in sorted(made.keys() & scene_files.keys()):
         if hashlib.sha256(made[path]).hexdigest() == scene_files[path]:
             continue

@@ -29,7 +29,7 @@ def export_scene(store: Store, scene_id: int, target: Path) -> int:
     Raises InputError where the scene was not made.
     """
     record, stored = require_job(store), find_scene(store, scene_id)
-    row = next((row for row in stored.rows["scenes"] if row["scene_id"] == scene_id), None)
+    row = stored.scene(scene_id)
     if row is None:
         reason = next((f["reason"] for f in stored.rows["failures"] if f["scene_id"] == scene_id), "unknown")
         raise InputError(f"scene {scene_id} was not made ({reason}): it has no geometry")
