@@ -1,4 +1,4 @@
-"""The branch of the job file that says where objects and tables come from."""
+"""The `assets` branch of a job: where objects and tables come from."""
 
 import math
 from typing import Annotated, Literal

@@ -11,7 +11,7 @@ Focal = Annotated[float, Field(ge=1e-3, le=1e6)]
 Principal = Annotated[float, Field(ge=-1e6, le=1e6)]
 Reach = Annotated[float, Field(gt=0, le=1e3)]
 Offset = Annotated[float, Field(ge=-1e3, le=1e3)]
-"""Far beyond any camera, and what its numbers can be without overflow in float32 on the GPU."""
+"""Bounds far beyond any camera, within which float32 on the GPU does not overflow."""
 
 
 class Orbit(Frozen):

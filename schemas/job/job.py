@@ -1,7 +1,6 @@
 """The job file: one tree of frozen models, parsed once. A step gets its own branch and no other.
 
-Every key has a default except `name`; `extra = forbid` everywhere, so a misspelt key is an error and not a silence.
-Keys under `run`, and `scenes`, do not change what a scene is: they are outside its settings digest.
+Every key but `name` has a default, and an unknown key is an error.
 """
 
 from typing import Annotated, Literal

@@ -14,8 +14,8 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
     "balanced": {"physics.step_hz": 960, "render.tier": "raster", "render.samples": 1},
     "exact": {"physics.step_hz": 1920, "render.tier": "raster", "render.samples": 4},
 }
-"""By name, the same dotted keys in each: how hard is tried, and never what is stored (image size, units, how d_z is read).
-`balanced` is what the keys' own defaults say."""
+"""Values by preset and dotted key; all presets set the same keys. They set effort, and never what is stored (image size,
+units, how d_z is read). `balanced` equals the keys' own defaults."""
 
 
 def with_preset(tree: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What a real sensor does to an image: the `sensor` branch of a job, every effect off unless it is asked for."""
+"""The `sensor` branch of a job: effects of a real sensor on images, each off by default."""
 
 from typing import Annotated, Literal
 

@@ -8,8 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from schemas.dataset.layout import JOB_FILE
-from schemas.errors import OutputError
 from services.job.read import load_job
 
 if TYPE_CHECKING:
@@ -58,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _changes(options: argparse.Namespace) -> list[str]:
-    """The options that stand for a key of the job, then --set."""
+    """`key=value` of the options that set a key of the job, then those of --set."""
     named = {
         "scenes": options.scenes,
         "first_scene": options.first_scene,
@@ -163,15 +161,15 @@ def replay(options: argparse.Namespace) -> int:
     """`verso replay`."""
     from services.read.replay import replay_scene
 
-    came = replay_scene(_dataset(options.out), options.scene)
-    for difference in came.differences:
+    result = replay_scene(_dataset(options.out), options.scene)
+    for difference in result.differences:
         print(difference)
-    how = "to the byte" if came.same_stack else "within tolerances, because this stack is not the one that made it"
+    how = "to the byte" if result.same_stack else "within tolerances, because this stack is not the one that made it"
     print(
-        f"scene {options.scene}: {came.compared} files and tables compared {how}: {len(came.differences) or 'none'} differ"
+        f"scene {options.scene}: {result.compared} files and tables compared {how}: {len(result.differences) or 'none'} differ"
     )
-    _answer(options, {"ok": not came.differences, **dataclasses.asdict(came)})
-    return 1 if came.differences else 0
+    _answer(options, {"ok": not result.differences, **dataclasses.asdict(result)})
+    return 1 if result.differences else 0
 
 
 def scene(options: argparse.Namespace) -> int:
@@ -185,10 +183,8 @@ def scene(options: argparse.Namespace) -> int:
 
 
 def _dataset(out: str) -> "Store":
-    """The store of a folder that must be there."""
+    """The store of an output folder. Raises OutputError where it is none."""
+    from services.job.record import require_dataset
     from workers.store.opening import open_store
 
-    store = open_store(out)
-    if store.size(JOB_FILE) is None:
-        raise OutputError(f"{out} holds no {JOB_FILE}: it is not an output folder of `verso run`")
-    return store
+    return require_dataset(open_store(out))

@@ -11,7 +11,7 @@ from services.cli.parser import build_parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns 0 where it is complete, 1 where something is missing or wrong, 2 for wrong input."""
+    """Run one command; returns 0 if complete, 1 if something is missing or wrong, 2 for wrong input."""
     if argv is None:
         enter_stack_environment()
     arguments = list(sys.argv[1:] if argv is None else argv)

@@ -1,4 +1,4 @@
-"""From a job file to a `Job`: every fault is told by file, key, value and what is allowed."""
+"""Reads a job file into a `Job`. An error names the file, the key, its value and what is allowed."""
 
 import difflib
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from services.job.reference import allowed_keys
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """A safe YAML loader that refuses a key written twice, which YAML's own would drop in silence."""
+    """A safe YAML loader that refuses a key written twice, where YAML's own keeps the last."""
 
 
 def _mapping(loader: _StrictLoader, node: yaml.MappingNode) -> dict[Any, Any]:
@@ -39,7 +39,7 @@ def load_job(path: Path, changes: Sequence[str] = ()) -> Job:
 
 
 def read_tree(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
-    """The keys that a job file has, with `path.to.key=value` changes and without defaults. Raises JobError."""
+    """The keys of a job file with `path.to.key=value` changes, without defaults. Raises JobError."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
@@ -75,7 +75,7 @@ def change_key(tree: dict[str, Any], change: str) -> None:
 
 
 def validate_job(tree: dict[str, Any], name: str) -> Job:
-    """A `Job` from parsed keys. Raises JobError with a line for each fault."""
+    """A `Job` from parsed keys. Raises JobError with one line for each fault."""
     version = tree.get("verso", 1)
     if isinstance(version, int) and version > 1:
         raise JobError(
@@ -85,7 +85,7 @@ def validate_job(tree: dict[str, Any], name: str) -> Job:
         return Job.model_validate(tree)
     except ValidationError as error:
         faults = error.errors()
-        # A fault inside an item of a list makes the list itself seem too short: that line would only confuse.
+        # An invalid item of a list makes the list itself count as too short: that line would confuse.
         told = [fault for fault in faults if fault["type"] != "too_short" or len(faults) == 1]
         raise JobError("\n".join(f"{name}: {describe_fault(fault)}" for fault in told)) from error
 

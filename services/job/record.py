@@ -1,4 +1,4 @@
-"""OUT/job.yaml: which job a folder belongs to. A different job is refused, naming the keys."""
+"""OUT/job.yaml: the job that an output folder belongs to. Another job is refused, naming the keys."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from services.job.read import validate_job
 from workers.store.store import Store
 
 OWN = {MANIFEST, STAGING, LOCK_FILE, LOG_FOLDER}
-"""What a run makes before it writes the job: a run that was stopped there may go on."""
+"""What a run makes before it writes the job file: a folder with only these is no foreign one."""
 
 HEADER = """\
 # The job as it was run, every default filled in. Written by the first run on this folder; `verso run` on the same
@@ -35,7 +35,7 @@ class JobRecord:
 
 
 def record_job(job: Job, catalogue_digest: str, folder: Path) -> JobRecord:
-    """The record of a job over assets with this digest."""
+    """The record of a job with the digest of its asset catalogue; `folder` is the job file's."""
     return JobRecord(job, job_digest(job, catalogue_digest), catalogue_digest, str(folder.resolve()))
 
 
@@ -51,7 +51,7 @@ def encode_job(record: JobRecord) -> bytes:
 
 
 def read_job(store: Store) -> JobRecord | None:
-    """The job that a folder belongs to, None where it belongs to none. Raises CorruptError."""
+    """The job that a folder belongs to, None where it has none. Raises CorruptError."""
     try:
         text = store.read(JOB_FILE).decode()
     except FileNotFoundError:
@@ -64,16 +64,22 @@ def read_job(store: Store) -> JobRecord | None:
         raise CorruptError(f"{store.name}/{JOB_FILE} is not a job that `verso run` wrote: {error!r}") from error
 
 
+def require_dataset(store: Store) -> Store:
+    """The store itself. Raises OutputError where it holds no dataset."""
+    if store.size(JOB_FILE) is None:
+        raise OutputError(f"{store.name} holds no {JOB_FILE}: it is not an output folder of `verso run`")
+    return store
+
+
 def require_job(store: Store) -> JobRecord:
     """The job that a folder belongs to. Raises OutputError where it is no dataset."""
-    record = read_job(store)
-    if record is None:
-        raise OutputError(f"{store.name} holds no {JOB_FILE}: it is not an output folder of `verso run`")
+    record = read_job(require_dataset(store))
+    assert record is not None
     return record
 
 
 def refuse_foreign(store: Store) -> None:
-    """Raises OutputError where a folder holds things, but no job: somebody's files are not to be mixed with a dataset."""
+    """Raises OutputError where a folder holds files and no job: a dataset is not mixed with other files."""
     if store.size(JOB_FILE) is None:
         foreign = sorted(set(store.children("")) - OWN)
         if foreign:

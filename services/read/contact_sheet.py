@@ -1,4 +1,4 @@
-"""Contact sheets: a page of what a dataset holds, for a person to look at.
+"""Contact sheets: one page with images of a dataset's scenes.
 
 python -m services.read.contact_sheet OUT FILE.jpg [SCENES [CATEGORY]]
 """
@@ -47,10 +47,10 @@ MORE_COLORS = np.array(
 """Further objects, in turn."""
 
 DEPTH_STRETCH = (2.0, 98.0)
-"""Percentiles of a depth image that are drawn as its nearest and its farthest colour."""
+"""Percentiles of depth that get the nearest and the farthest colour."""
 
 MOST_PATCHES = 4
-"""Objects whose patches are drawn."""
+"""Largest number of objects whose patches are drawn."""
 
 Picture = NDArray[np.uint8]
 
@@ -86,7 +86,7 @@ def _choose(store: Store, scenes: int, only: str | None) -> list[tuple[str, list
 
 
 def _cells(read: Callable[[str], bytes], stored: StoredRange, scene: Row) -> list[Picture]:
-    """The pictures of one scene's first pair."""
+    """The cells of one scene's first pair."""
     views = [row for row in stored.rows["views"] if row["scene_id"] == scene["scene_id"]]
     e, category = min(row["parent_id"] for row in views), scene["category"]
     listed = {file["path"] for row in views for file in row["files"]}
@@ -109,7 +109,7 @@ def _cells(read: Callable[[str], bytes], stored: StoredRange, scene: Row) -> lis
 
 
 def _empty() -> Picture:
-    """Where there is no image."""
+    """The cell of an image that does not exist."""
     return np.full((CELL[1], CELL[0], 3), 245, np.uint8)
 
 
@@ -118,7 +118,7 @@ def _fit(picture: NDArray) -> Picture:
 
 
 def _stack(patches: list[NDArray]) -> Picture:
-    """Patches pixel for pixel, two one over the other in the middle of a cell; more of them side by side, made smaller."""
+    """Up to two patches above each other at their own size; more of them side by side, shrunk to the cell."""
     cell = _empty()
     columns = (len(patches) + 1) // 2
     for number, patch in enumerate(patches):
@@ -133,7 +133,7 @@ def _stack(patches: list[NDArray]) -> Picture:
 
 
 def _paint_depth(depth: NDArray) -> Picture:
-    """Near warm, far cold, none black."""
+    """Near is warm, far is cold, no depth is black."""
     known = depth > 0
     if not known.any():
         return np.zeros((*depth.shape, 3), np.uint8)

@@ -1,4 +1,4 @@
-"""What is written of a scene: encoded files, and one row or more in each manifest table. Pure."""
+"""The output of a scene: encoded files, and its rows in each manifest table. Pure."""
 
 import hashlib
 
@@ -19,9 +19,12 @@ from workers.pipeline.make_scene import Scene, Stopwatch
 from workers.plan.effects import write_receipt
 from workers.store.images import encode_png
 
+ASSET_COLUMNS = ("instance_id", "category", "source", "licence", "path", "sha256", "volume_m3", "watertight", "scale")
+"""Columns of `assets` that are fields of an asset."""
+
 
 def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> SceneOutput:
-    """Everything that a finished scene leaves behind, but its timings."""
+    """Files and rows of a finished scene, without its timings."""
     files: Files = []
     views: list[Row] = []
     with watch.stage("encode"):
@@ -48,7 +51,7 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
 
 
 def scene_row(context: WorkerContext, scene: Scene) -> Row:
-    """The row of `scenes`: its own columns are the first object's, and of the figures the worst of all objects."""
+    """The row of `scenes`: names of the first object, and the worst figures of all objects."""
     ran, skipped = write_receipt(scene.effects, scene.called)
     bodies = [body_columns(start, rest) for start, rest in zip(scene.plan.objects, scene.settled, strict=True)]
     return {
@@ -115,24 +118,16 @@ def object_rows(scene: Scene, view: View, job: Job) -> list[Row]:
 def asset_row(asset: Asset, job: Job) -> Row:
     """The row of `assets`."""
     return {
-        "instance_id": asset.instance_id,
-        "category": asset.category,
-        "source": asset.source,
-        "licence": asset.licence,
-        "path": asset.path,
-        "sha256": asset.sha256,
+        **{name: getattr(asset, name) for name in ASSET_COLUMNS},
         "extents_m": [float(x) for x in asset.extents_m],
-        "volume_m3": asset.volume_m3,
-        "watertight": asset.watertight,
         "T_source_to_object": matrix_column(asset.T_source_to_object),
-        "scale": asset.scale,
         "split": split_of(asset.instance_id, job.assets.split),
         "notes": list(asset.notes),
     }
 
 
 def failed_scene(scene_id: int, category: str, error: SceneError, attempts: int = 1) -> SceneOutput:
-    """A scene that cannot be made: no files, one row in `failures`."""
+    """The output of a scene that cannot be made: no files, one row in `failures`."""
     row: Row = {
         "scene_id": scene_id,
         "category": category,
@@ -146,7 +141,7 @@ def failed_scene(scene_id: int, category: str, error: SceneError, attempts: int 
 
 
 def timing_row(scene_id: int, category: str, watch: Stopwatch) -> Row:
-    """The row of `timings`: the only one that is not a function of job and seed."""
+    """The row of `timings`, which alone is no function of job and seed."""
     stages, effects = (
         [{"name": name, "seconds": seconds} for name, seconds in one.items()] for one in (watch.seconds, watch.effects)
     )
