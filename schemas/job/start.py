@@ -36,12 +36,12 @@ class Start(Frozen):
     pose: Literal["upright", "tumbled", "placed"] = "upright"
     """upright: uniform yaw; tumbled: uniform rotation; placed: set down at rest, no drop unless it would tip."""
     offset_m: Interval = Range(-0.25, 0.25)
-    """Along x and along y from the centre of the table top."""
+    """Offset from the centre of the table top, along x and along y."""
     arrange: Literal["spread", "pile"] = "spread"
-    """Of several objects. spread: each has a place of its own on the table; pile: they fall onto one another."""
+    """Arrangement of several objects. spread: each has its own place on the table; pile: they fall onto one another."""
     pile_offset_m: Interval = Range(-0.03, 0.03)
-    """Of a pile: along x and along y from the first object, for each of the others."""
+    """Offset of each further object of a pile from the first, along x and along y."""
     clearance_m: Interval = Range(0.005, 0.05)
     """Height of the lowest point above the table, or above what is below it in a pile, at the start of a drop."""
     max_redraws: NonNegativeInt = 20
-    """How often a position with no table under the centre of mass, or with no room beside the others, is drawn again."""
+    """Largest number of redraws of a position with no table under the centre of mass or no room beside other objects."""
