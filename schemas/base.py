@@ -1,4 +1,4 @@
-"""The base of every configuration model, and the small value types that they share."""
+"""The base of every configuration model, and the value types that they share."""
 
 from typing import Annotated, NamedTuple
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 Array = NDArray[np.float64]
-"""Any float64 array; the shape stands in the docstring that uses it."""
+"""A float64 array; the docstring that uses it gives the shape."""
 
 Pose = NDArray[np.float64]
 """[4, 4] float64 rigid transform, metres; `T_a_b` takes coordinates in frame b to coordinates in frame a."""
@@ -50,7 +50,7 @@ NonNegativeInt = Annotated[int, Field(ge=0)]
 
 
 def frozen_array(values: object, dtype: type = np.float64) -> NDArray:
-    """A read-only copy of `values`: what frozen dataclasses hold, so that no step can change another's data."""
+    """A read-only copy of `values`, for frozen dataclasses: no step can change another's data."""
     array: NDArray = np.array(values, dtype=dtype)
     array.setflags(write=False)
     return array

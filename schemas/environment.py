@@ -1,9 +1,8 @@
-"""The environment variables that a process must have for its bytes to be the same everywhere.
+"""The environment variables that make a process's bytes the same everywhere.
 
-numpy, OpenBLAS, Mesa and Python's own hashing read these variables once, while they load; setting them later does
-nothing. services/cli/environment.py restarts a command that finds another environment, before anything heavy is imported.
-deploy/Dockerfile repeats the table as ENV lines, because there it must also hold for what is started without this
-project's commands (`ray start`); a test keeps the two alike.
+numpy, OpenBLAS, Mesa and Python's hashing read them once, while they load. services/cli/environment.py restarts a command
+that has others, before anything heavy is imported. deploy/Dockerfile repeats the table as ENV lines for processes that
+are started without this project's commands (`ray start`); a test compares the two.
 """
 
 from collections.abc import Mapping
@@ -12,10 +11,10 @@ from typing import Final
 
 STACK_ENVIRONMENT: Final[Mapping[str, str]] = MappingProxyType(
     {
-        # numpy's exp and arctan give other bits with AVX-512. These are the groups that numpy 2.4 can switch at run
-        # time and has no use for below AVX-512; it is silent about those the machine lacks, and warns about others.
+        # numpy's exp and arctan give other bits with AVX-512. These are the groups above AVX2 that numpy 2.4 switches at
+        # run time; it ignores those that the machine lacks, and warns about unknown ones.
         "NPY_DISABLE_CPU_FEATURES": "X86_V4,AVX512_ICL,AVX512_SPR",
-        # llvmpipe otherwise takes the widest vectors it finds, and its interpolation rounds differently with them.
+        # llvmpipe takes the widest vectors it finds otherwise, and its interpolation rounds differently with them.
         "LP_NATIVE_VECTOR_WIDTH": "256",
         # llvmpipe renders on the caller's thread: one worker, one core.
         "LP_NUM_THREADS": "0",
@@ -23,19 +22,19 @@ STACK_ENVIRONMENT: Final[Mapping[str, str]] = MappingProxyType(
         "PYGLET_HEADLESS": "1",
         "PYOPENGL_PLATFORM": "egl",
         "RAY_USAGE_STATS_ENABLED": "0",
-        # Parallelism is by scene. Threads inside a scene only fight over the cores, and change the order of sums.
+        # Parallelism is by scene: threads inside a scene compete for cores and change the order of sums.
         "OMP_NUM_THREADS": "1",
         "OPENBLAS_NUM_THREADS": "1",
-        # The order of a set of strings must not differ from one process to the next.
+        # The order of a set of strings must be the same in every process.
         "PYTHONHASHSEED": "0",
     }
 )
 
-# OpenBLAS picks its kernels by processor: inverses, SVDs and products of 50 x 50 differ in the last bits between its
-# AVX-512 and its AVX2 kernels. It does not check what it is told, so a processor without AVX2 must not be told this.
+# OpenBLAS picks kernels by processor; inverses, SVDs and products of 50 x 50 differ in the last bits between its AVX-512
+# and AVX2 kernels. It does not check the variable, which must not be set on a processor without AVX2.
 WITH_AVX2: Final[Mapping[str, str]] = MappingProxyType({"OPENBLAS_CORETYPE": "Haswell"})
 
-# A user who compares stacks sets this to 1 and keeps the environment as it is.
+# Set to 1, the environment stays as it is: for comparing stacks.
 KEEP: Final = "VERSO_KEEP_ENV"
 
 

@@ -1,4 +1,4 @@
-"""Every error that the project raises on purpose.
+"""The tree of errors that the project raises.
 
     VersoError
     +-- InputError          the command line, the job file or an asset folder is wrong        exit 2
@@ -27,13 +27,13 @@ FailureKind = Literal["intrinsic", "environmental"]
 
 
 class VersoError(Exception):
-    """The root: a failure that has a clear message for the user."""
+    """The root: a failure with a clear message for the user."""
 
     exit_code = 1
 
 
 class InputError(VersoError):
-    """What the user gave is wrong; nothing was started."""
+    """Wrong input; nothing was started."""
 
     exit_code = 2
 
@@ -43,7 +43,7 @@ class JobError(InputError):
 
 
 class AssetSourceError(InputError):
-    """A source of assets with nothing usable in it."""
+    """An asset source with nothing usable in it."""
 
 
 class OutputError(InputError):
@@ -67,11 +67,11 @@ class CorruptError(RunError):
 
 
 class FingerprintError(RunError):
-    """A worker whose stack makes other bytes than the one that began the dataset."""
+    """A worker whose stack makes other bytes than the dataset's."""
 
 
 class SceneError(VersoError):
-    """This scene cannot be made. It becomes a row in `failures`; `reason` is a short stable word, `detail` a sentence."""
+    """A scene that cannot be made: a row in `failures`; `reason` is a short stable word, `detail` a sentence."""
 
     stage = "scene"
     kind: FailureKind = "intrinsic"

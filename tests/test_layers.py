@@ -11,10 +11,14 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = (
     *("schemas", *(f"schemas/{name}" for name in ("dataset", "job", "scene"))),
     *("services", *(f"services/{name}" for name in ("bench", "cli", "job", "merge", "read", "run", "study"))),
+    "services/read/independent",
     *("workers", "workers/assets", "workers/cameras", "workers/geometry", "workers/labels", "workers/physics"),
     *("workers/pipeline", "workers/plan", "workers/render", "workers/render/raster", "workers/sensor", "workers/store"),
 )
-FILES = ("schemas/base.py", "schemas/environment.py", "schemas/errors.py")
+FILES = (
+    *("schemas/base.py", "schemas/environment.py", "schemas/errors.py"),
+    *("services/read/dataset_reader.py", "services/read/verify.py"),
+)
 
 
 def lint(project: Path, imports: dict[str, str]) -> subprocess.CompletedProcess[str]:
@@ -44,6 +48,9 @@ def lint(project: Path, imports: dict[str, str]) -> subprocess.CompletedProcess[
         ("workers/plan/step.py", "workers.pipeline.thing", "stages do not know one another"),
         ("workers/geometry/hull.py", "subprocess", "geometry is pure"),
         ("services/merge/step.py", "services.run.thing", "services: commands"),
+        ("services/read/independent/pair.py", "workers.geometry.thing", "the independent derivation"),
+        ("services/read/independent/pair.py", "schemas.dataset.thing", "the independent derivation"),
+        ("services/read/independent/step.py", "services.read.verify", "the independent derivation"),
         ("schemas/scene/scene.py", "trimesh", "schemas load nothing heavy"),
         ("workers/pipeline/run_shard.py", "ray", "workers never import Ray"),
         ("services/cli/main.py", "ray", "Ray is known"),

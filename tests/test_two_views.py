@@ -21,12 +21,13 @@ import trimesh
 
 from schemas.base import Counts
 from schemas.errors import SceneError
+from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.scene.scene import PosedScene
 from schemas.scene.view import Pair
 from services.job.read import load_job
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.context import WorkerContext, settings_digest
+from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Stopwatch, make_scene
 from workers.render.raster.gbuffer import shared_renderer
 

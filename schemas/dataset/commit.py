@@ -1,4 +1,4 @@
-"""What a commit is: the record that a range is done, and the terms that every commit of a dataset shares."""
+"""A commit: the record that a range of scenes is done, and the terms that all commits of a dataset share."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -9,27 +9,27 @@ from schemas.base import Frozen, NonNegativeInt, PositiveInt
 from schemas.errors import FailureKind
 
 Outcome = Literal["made", "intrinsic", "environmental"]
-"""How a scene ended: made, or the kind of its failure."""
+"""The outcome of a scene: made, or the kind of its failure."""
 
 
 class Span(Frozen):
-    """The scenes of one commit: all of [start, stop), or, in a retry, those of `scenes` alone."""
+    """The scenes of one commit: all of [start, stop), or those of `scenes` in a retry."""
 
     start: NonNegativeInt
     stop: PositiveInt
     retry: NonNegativeInt = 0
-    """0 for the range itself; k for the k-th later try of its environmental failures."""
+    """0 for the range itself, k for the k-th retry of its environmental failures."""
     scenes: tuple[int, ...] = ()
     """The scenes of a retry, in order; empty for a whole range."""
 
     @property
     def scene_ids(self) -> tuple[int, ...]:
-        """Every scene that this commit must hold, in order."""
+        """Every scene of this commit, in order."""
         return self.scenes if self.retry else tuple(range(self.start, self.stop))
 
 
 class CommitTerms(Frozen):
-    """What all commits of a dataset have in common; stored in every record."""
+    """The settings that all commits of a dataset share; stored in every record."""
 
     job_digest: str
     fingerprint: str
@@ -37,7 +37,7 @@ class CommitTerms(Frozen):
     fingerprint_mode: Literal["strict", "record"] = "strict"
     layout: Literal["files", "tar"] = "files"
     first_scene: NonNegativeInt = 0
-    """With `range_size` the grid on which ranges lie."""
+    """Start of the first range; ranges lie on a grid of `range_size`."""
     range_size: PositiveInt = 16
 
 
@@ -57,10 +57,9 @@ class TableEntry(Frozen):
 
 
 class SceneMark(Frozen):
-    """How a scene ended, with the digest of its rows in every table that is a function of job and seed (but assets).
+    """The outcome of a scene, and the digest of its rows in every deterministic table but assets.
 
-    The rows of `views` name the digest of every image, so two attempts at a scene made the same bytes if and only if
-    their marks are equal.
+    Rows of `views` hold the digest of every image: two attempts made the same bytes if and only if their marks are equal.
     """
 
     scene_id: NonNegativeInt
@@ -69,9 +68,9 @@ class SceneMark(Frozen):
 
 
 class CommitRecord(Frozen):
-    """`manifest/_commits/<start>.json`: the decision that one attempt, and no other, is this range.
+    """`manifest/_commits/<start>.json`: the decision which attempt is this range.
 
-    Keys that a later minor version added are ignored; a later `schema_version` is refused by the reader.
+    Unknown keys, of a later minor version, are ignored; the reader refuses a later `schema_version`.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
@@ -89,7 +88,7 @@ class CommitRecord(Frozen):
 
 @dataclass(frozen=True)
 class CommitResult:
-    """What came of an attempt: whether it won, the record that stands, and, where the loser made other bytes, how."""
+    """The result of an attempt: whether it won, the record that is valid, and how the bytes of a loser differ."""
 
     won: bool
     record: CommitRecord
@@ -98,7 +97,7 @@ class CommitResult:
 
 @dataclass(frozen=True)
 class CommitSummary:
-    """The part of a record that planning needs: a million scenes' worth fits in memory."""
+    """The part of a record that planning needs; small enough for a million scenes in memory."""
 
     start: int
     stop: int

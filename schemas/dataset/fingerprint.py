@@ -1,4 +1,4 @@
-"""What a stack is, told by what it makes."""
+"""The fingerprint of a stack of software and hardware: versions, and the bytes that it makes."""
 
 import hashlib
 
@@ -6,11 +6,11 @@ from schemas.base import Frozen
 
 
 class Fingerprint(Frozen):
-    """A stack of software and hardware: two with the same digest make the same bytes.
+    """A stack; two with the same digest make the same bytes.
 
-    `canary` is the SHA-256 of a small scene, made from plan to encoded files; `code` that of the project's own source;
-    `libraries` are the versions of what makes bytes; `simd` is the widest instruction set numpy may use; `renderer`
-    is what GL calls itself.
+    `canary` is the SHA-256 of a small scene, made from plan to encoded files; `code` that of the project's source;
+    `libraries` holds the versions of libraries that make bytes; `simd` is the widest instruction set that numpy may use;
+    `renderer` is GL's name of itself.
     """
 
     canary: str
@@ -21,11 +21,11 @@ class Fingerprint(Frozen):
 
     @property
     def digest(self) -> str:
-        """SHA-256, hex, of all of it."""
+        """SHA-256, hex, of all fields."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
     def differences(self, other: "Fingerprint") -> list[str]:
-        """One line for each thing that differs, `name: mine, theirs`."""
+        """One line for each difference, `name: mine, theirs`."""
         mine, theirs = self.model_dump(), other.model_dump()
         lines = [
             f"{key}: {mine[key]}, {theirs[key]}" for key in mine if key != "libraries" and mine[key] != theirs[key]

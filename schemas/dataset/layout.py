@@ -1,4 +1,4 @@
-"""Every name and key in the output folder, in one place (dataset.md section 1, contract.md "Output folder")."""
+"""Names of all files in the output folder, and which views and images a job stores (dataset.md section 1)."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -17,7 +17,7 @@ MANIFEST = "manifest"
 COMMITS = "manifest/_commits"
 RANGES = "manifest/_ranges"
 FINGERPRINT_FILE = "manifest/_fingerprint.json"
-"""The stack that the first worker had; a job with `fingerprint: strict` refuses every other."""
+"""The first worker's stack; a job with `fingerprint: strict` refuses every other."""
 ASSETS = "assets"
 CAM_POSES = "camPoses.csv"
 CAMERAS = "cameras.csv"
@@ -29,12 +29,12 @@ Content = Literal[
 ]
 
 PixelKind = Literal["rgb", "depth", "region"]
-"""Which of a view's arrays an image shows."""
+"""The array of a view that an image holds."""
 
 
 @dataclass(frozen=True)
 class Image:
-    """One of the images of a pair: its content word, which camera sees it, and what its pixels are."""
+    """One image of a pair: its content word, the role of its camera, and the kind of its pixels."""
 
     content: Content
     role: Role
@@ -58,7 +58,7 @@ IMAGES: tuple[Image, ...] = (
 
 
 def stored_roles(job: Job) -> tuple[Role, ...]:
-    """The views of each pair that the job asks for, in the order of `ROLES`."""
+    """Roles of the views that the job asks for, in the order of `ROLES`."""
     off = {
         "aligned": not job.cameras.depth.enabled,
         "mirror": not job.cameras.mirror.enabled,
@@ -73,7 +73,7 @@ def stored_images(role: Role, job: Job) -> tuple[Image, ...]:
 
 
 def patch_index(region_id: int, objects: int) -> int | None:
-    """Which object a patch's name tells: k for region 3 + k, None in a scene that has one object only."""
+    """The object's number in a patch's name: k for region 3 + k, None in a scene with one object."""
     return None if objects == 1 else region_id - REGION_FIRST_OBJECT
 
 
@@ -83,7 +83,7 @@ def input_pose_id(scene_id: int, pair: int, pairs_per_scene: int) -> int:
 
 
 def file_pose_id(role: Role, parent_id: int) -> int:
-    """The id in a file's name: the input pose's, but the mirror's own for what the mirror camera renders."""
+    """The id in a file's name: the mirror pose's for the mirror view, else the input pose's."""
     return parent_id + 1 if role == "mirror" else parent_id
 
 
@@ -104,20 +104,20 @@ def asset_path(category: str, instance_id: str) -> str:
 
 
 def range_key(start: int) -> str:
-    """Ten digits, so that names sort like numbers."""
+    """Ten digits: names sort like numbers."""
     return f"{start:010d}"
 
 
 def commit_path(start: int, retry: int = 0) -> str:
-    """The record that a range is done; `retry` numbers the later tries of its environmental failures."""
+    """The commit record of a range; `retry` numbers the retries of its environmental failures."""
     return f"{COMMITS}/{range_key(start)}{f'.retry-{retry}' if retry else ''}.json"
 
 
 def range_table_path(start: int, table: str, retry: int = 0) -> str:
-    """Rows of one range, one file a table."""
+    """The file with one table's rows of one range."""
     return f"{RANGES}/{range_key(start)}{f'.retry-{retry}' if retry else ''}/{table}.parquet"
 
 
 def staging_path(start: int, attempt: str) -> str:
-    """The only place that an attempt writes."""
+    """The folder that an attempt writes to."""
     return f"{STAGING}/{range_key(start)}/{attempt}"

@@ -1,4 +1,4 @@
-"""What crosses Ray: an order to make ranges, and the small report that comes back. Never an image."""
+"""Messages that cross Ray: the order to make a shard, and the report of it. Never an image."""
 
 from typing import Literal
 
@@ -8,11 +8,11 @@ from schemas.dataset.fingerprint import Fingerprint
 from schemas.job.job import Job
 
 Reason = Literal["killed", "time", "memory"]
-"""What a worker died of."""
+"""The cause of a worker's death."""
 
 
 class Blame(Frozen):
-    """A scene that killed its worker as often as is allowed: it is not tried again, but recorded."""
+    """A scene that killed its worker `max_attempts` times: it is recorded and not tried again."""
 
     scene_id: int
     reason: Reason
@@ -21,7 +21,7 @@ class Blame(Frozen):
 
 
 class ShardOrder(Frozen):
-    """What a worker needs to make one shard: everything, and nothing that is large."""
+    """Everything that a worker needs to make one shard."""
 
     out: str
     job: Job
@@ -30,11 +30,11 @@ class ShardOrder(Frozen):
     spans: tuple[Span, ...]
     blamed: tuple[Blame, ...] = ()
     label: str = ""
-    """Goes into the names of attempts, so that the coordinator knows its own."""
+    """Part of the attempts' names: the coordinator recognises its own."""
 
 
 class SpanReport(Frozen):
-    """What came of one range."""
+    """The result of one range."""
 
     start: int
     stop: int
@@ -47,13 +47,13 @@ class SpanReport(Frozen):
 
 
 class ShardReport(Frozen):
-    """What came of one shard: ranges in order, and how long each stage took."""
+    """The result of one shard: its ranges in order, and the seconds of each stage."""
 
     spans: tuple[SpanReport, ...]
     seconds: dict[str, float]
     wall_s: float
     cpu_s: float
-    """Of the processor, in this process."""
+    """Processor time of this process."""
     fingerprint: Fingerprint
     host: str
     pid: int

@@ -1,7 +1,4 @@
-"""The Arrow schemas of the six manifest tables, and which of their columns are a function of job and seed."""
-
-from collections.abc import Mapping, Sequence
-from typing import Any
+"""The Arrow schemas and the keys of the six manifest tables."""
 
 import pyarrow as pa
 
@@ -9,7 +6,7 @@ SCHEMA_VERSION = 1
 
 TABLES = ("scenes", "views", "objects", "assets", "failures", "timings")
 DETERMINISTIC_TABLES = ("scenes", "views", "objects", "assets", "failures")
-"""All but timings: their canonical rows go into the dataset digest."""
+"""Tables that are a function of job and seed: their canonical rows are in the dataset digest."""
 
 _matrix = pa.list_(pa.field("item", pa.float64(), nullable=False), 16)
 """Row-major 4 x 4."""
@@ -36,9 +33,9 @@ _body = pa.struct(
         pa.field("equilibrium_residual", pa.float64(), False),
     ]
 )
-"""One object of a scene. The columns beside are the first object's, and of the figures the worst of all objects."""
+"""One object of a scene; the columns of `scenes` itself follow from these (codec.columns_of_bodies)."""
 _agreement = pa.struct([pa.field("median_mm", pa.float64(), False), pa.field("share", pa.float64(), False)])
-"""Input depth carried into the mirror view against mirror depth: median difference, and share within the bound."""
+"""Input depth carried into the mirror view, compared with mirror depth: median difference, share within the bound."""
 _seconds = pa.struct([pa.field("name", pa.string(), False), pa.field("seconds", pa.float64(), False)])
 
 
@@ -176,15 +173,4 @@ SORT_KEYS: dict[str, tuple[str, ...]] = {
     "failures": ("scene_id",),
     "timings": ("scene_id",),
 }
-"""Each table's key: no two rows share it, and merged rows are in this order."""
-
-
-def worst_rest(bodies: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
-    """The columns of `scenes` that are the worst of its bodies': the most of each, and of the support margin the least."""
-    most = ("penetration_mm", "hover_gap_mm", "residual_speed_mm_s", "equilibrium_residual")
-    again = ("recheck_move_mm", "recheck_turn_deg")
-    return {
-        **{name: max(body[name] for body in bodies) for name in most},
-        **{name: max((body[name] for body in bodies if body[name] is not None), default=None) for name in again},
-        "support_margin_mm": min(body["support_margin_mm"] for body in bodies),
-    }
+"""The key of each table: unique, and the order of merged rows."""

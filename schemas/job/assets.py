@@ -1,4 +1,4 @@
-"""The branch of the job file that says where objects and tables come from."""
+"""The `assets` branch of a job: where objects and tables come from."""
 
 import math
 from typing import Annotated, Literal
@@ -18,9 +18,9 @@ class ProceduralSource(Frozen):
     seed: NonNegativeInt = 0
     """Seed of the shapes; instance n of a category is the same in every dataset with this seed."""
     instances: PositiveInt = 1_000_000
-    """How many distinct instances of each category there are to choose from."""
+    """Number of distinct instances of each category."""
     size: Literal["article", "metric"] = "article"
-    """`article`: bounding-box diagonal `diagonal_m`; `metric`: the size such a thing really has. Tables are metric."""
+    """`article`: bounding-box diagonal `diagonal_m`; `metric`: the true size of such an object. Tables are metric."""
     diagonal_m: Positive = 0.25
     """Bounding-box diagonal of every object where `size` is `article`."""
 
@@ -37,7 +37,7 @@ class ShapeNetSource(Frozen):
     scale: Positive | None = None
     """Multiplies the normalised units; default 0.25 for objects and 1.5 for tables, as in the article."""
     licence: str = "ShapeNet terms of use: non-commercial research"
-    """What the `assets` table says of these shapes."""
+    """Licence of these shapes, for the `assets` table."""
     copy_assets: bool = False
     """Whether the cleaned shapes may be written into the dataset."""
 
@@ -61,7 +61,7 @@ class FolderSource(Frozen):
     diagonal_m: Positive | None = None
     """Resize every object to this bounding-box diagonal; None keeps its own size."""
     licence: str = "unknown"
-    """What the `assets` table says of these shapes."""
+    """Licence of these shapes, for the `assets` table."""
     copy_assets: bool = False
     """Whether the cleaned shapes may be written into the dataset."""
 
@@ -112,6 +112,6 @@ class Assets(Frozen):
     limits: MeshLimits = MeshLimits()
     """Caps on meshes from outside."""
     density_kg_m3: Positive = 600.0
-    """Of a watertight solid."""
+    """Density of a watertight solid."""
     shell_kg_m2: Positive = 3.0
-    """Surface density of a mesh that is not watertight, which is weighed as a thin shell."""
+    """Surface density of a mesh that is not watertight: its mass is that of a thin shell."""

@@ -11,7 +11,7 @@ Focal = Annotated[float, Field(ge=1e-3, le=1e6)]
 Principal = Annotated[float, Field(ge=-1e6, le=1e6)]
 Reach = Annotated[float, Field(gt=0, le=1e3)]
 Offset = Annotated[float, Field(ge=-1e3, le=1e3)]
-"""Far beyond any camera, and what its numbers can be without overflow in float32 on the GPU."""
+"""Bounds far beyond any camera, within which float32 on the GPU does not overflow."""
 
 
 class Orbit(Frozen):
@@ -57,11 +57,11 @@ class Mirror(Frozen):
     enabled: bool = True
     """Whether there are mirror views; without them camPoses.csv has one row a pair, with an even id."""
     T_z_m: Reach = 1.3
-    """Distance of the mirror camera from the point that it looks at."""
+    """Distance of the mirror camera from its pivot, the point it looks at."""
     pivot_depth: Literal["percentile", "median", "nearest"] = "percentile"
-    """How d_z, the distance to the object's front surface, is read from the object's stored input depth."""
+    """Estimator of d_z, the distance to the object's front surface, from the object's stored input depth."""
     percentile: Annotated[float, Field(ge=0, le=100)] = 2.0
-    """Of the object's depth pixels, for `pivot_depth: percentile`."""
+    """Percentile of the object's depth pixels, for `pivot_depth: percentile`."""
 
 
 class Cameras(Frozen):

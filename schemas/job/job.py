@@ -1,7 +1,6 @@
 """The job file: one tree of frozen models, parsed once. A step gets its own branch and no other.
 
-Every key has a default except `name`; `extra = forbid` everywhere, so a misspelt key is an error and not a silence.
-Keys under `run`, and `scenes`, do not change what a scene is: they are outside its settings digest.
+Every key but `name` has a default, and an unknown key is an error.
 """
 
 from typing import Annotated, Literal
@@ -31,33 +30,33 @@ class Job(Frozen):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
     """Names the dataset; the default output folder is data/<name>."""
     preset: PresetName = "balanced"
-    """What keys that are not given are: `fast` and `exact` trade errors for time as docs/tradeoff has measured."""
+    """Defaults of keys that are not given: `fast` and `exact` trade errors for time as measured in docs/tradeoff."""
     seed: NonNegativeInt = 0
-    """Seed of everything that is drawn in a scene."""
+    """Seed of all that is random in a scene."""
     scenes: PositiveInt = 64
-    """How many scenes; more than before extends a dataset."""
+    """Number of scenes; more than before extends a dataset."""
     first_scene: NonNegativeInt = 0
     """Id of the first scene."""
     pairs_per_scene: Annotated[int, Field(ge=1, le=1000)] = 1
     """Input and mirror poses of each scene."""
     objects_per_scene: ObjectCount = ONE_OBJECT
-    """How many objects lie on the table; a range is drawn from, each number alike. The scene's category is the first's."""
+    """Number of objects on the table; from a range each number is equally likely. The scene's category is the first object's."""
     categories: dict[Category, Positive] = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)
-    """Weights; a list of names means equal weights."""
+    """Weights of the categories; a list of names means equal weights."""
     assets: Assets = Assets()
     """Where shapes come from."""
     start: Start = Start()
     """How an object begins."""
     physics: Physics = Physics()
-    """How it comes to rest."""
+    """How objects come to rest."""
     cameras: Cameras = Cameras()
-    """Who looks at it."""
+    """Every camera of a pair."""
     images: Images = Images()
-    """What is stored."""
+    """Encodings, patches and projection."""
     render: Render = Render()
-    """How RGB looks."""
+    """How RGB is made."""
     sensor: SensorEffects = SensorEffects()
-    """What the sensors add to exact images; nothing by default."""
+    """Effects of real sensors on exact images; none by default."""
     check: Check = Check()
     """What is checked before a scene is committed."""
     output: Output = Output()

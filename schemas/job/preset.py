@@ -2,7 +2,10 @@
 
 import copy
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, Literal
+
+from schemas.job.keys import set_key
 
 PresetName = Literal["fast", "balanced", "exact"]
 
@@ -11,22 +14,18 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
     "balanced": {"physics.step_hz": 960, "render.tier": "raster", "render.samples": 1},
     "exact": {"physics.step_hz": 1920, "render.tier": "raster", "render.samples": 4},
 }
-"""By name, the same dotted keys in each: how hard is tried, and never what is stored (image size, units, how d_z is read).
-`balanced` is what the keys' own defaults say."""
+"""Values by preset and dotted key; all presets set the same keys. They set effort, and never what is stored (image size,
+units, how d_z is read). `balanced` equals the keys' own defaults."""
 
 
 def with_preset(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Keys of a job with those of its preset where it does not give them itself; unknown presets are left to validation.
+    """A copy of a job's keys, with those of its preset where the job does not give them.
 
-    A branch that is not a mapping (a model, or something wrong) is the user's as a whole.
+    An unknown preset is left to validation; a branch that is no mapping is left as it is.
     """
     filled = copy.deepcopy(dict(tree))
-    chosen = PRESETS.get(filled.get("preset", "balanced"), {}) if isinstance(filled.get("preset", ""), str) else {}
+    chosen = next((keys for name, keys in PRESETS.items() if name == filled.get("preset", "balanced")), {})
     for path, value in chosen.items():
-        *parents, last = path.split(".")
-        place: Any = filled
-        for key in parents:
-            place = place.setdefault(key, {}) if isinstance(place, dict) else None
-        if isinstance(place, dict):
-            place.setdefault(last, value)
+        with suppress(ValueError):
+            set_key(filled, path, value, keep=True)
     return filled

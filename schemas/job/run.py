@@ -23,7 +23,7 @@ class Output(Frozen):
 
 
 class Run(Frozen):
-    """How the work is driven. None of these keys changes a byte of the dataset."""
+    """Workers, shards, ranges and limits. None of these keys changes a byte of the dataset."""
 
     workers: PositiveInt | None = None
     """None: the cores that this container may use, or the cluster's."""
@@ -38,6 +38,6 @@ class Run(Frozen):
     scene_timeout_s: Positive = 120.0
     """A worker that takes longer over one scene is killed."""
     device: Literal["any", "gpu"] = "any"
-    """What may draw: `gpu` refuses workers on which OpenGL runs in software, on the CPU."""
+    """Allowed renderers: `gpu` refuses workers where OpenGL runs in software, on the CPU."""
     fingerprint: Literal["strict", "record"] = "strict"
     """`strict` refuses workers whose stack makes other bytes; `record` allows them and stores which made what."""

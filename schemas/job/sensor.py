@@ -1,4 +1,4 @@
-"""What a real sensor does to an image: the `sensor` branch of a job, every effect off unless it is asked for."""
+"""The `sensor` branch of a job: effects of a real sensor on images, each off by default."""
 
 from typing import Annotated, Literal
 
@@ -35,11 +35,11 @@ class DepthNoise(Frozen):
     offset_share: Annotated[float, Field(gt=-1, lt=1)] = 0.0
     """Systematic error as a share of the distance; the specification bounds it by 0.001."""
     lateral_px: NonNegative = 0.4
-    """Standard deviation, pixels, of the place that a pixel near a depth edge looks at instead of its own [assumed]."""
+    """Standard deviation, pixels, of the shift of a pixel's sample near a depth edge [assumed]."""
     edge_step_m: Positive = 0.03
-    """Depth that bends by more from one pixel to the next has an edge there [assumed]."""
+    """Smallest second difference of 1/depth, times depth squared, metres, that counts as an edge [assumed]."""
     edge_px: Annotated[int, Field(ge=1, le=8)] = 1
-    """How far from an edge, in pixels, its effects reach [assumed]."""
+    """Reach of an edge's effects, pixels [assumed]."""
     flying_share: Share = 0.3
     """Share of the pixels at an edge whose depth is a mixture of the surfaces before and behind [assumed]."""
     edge_dropout: Share = 0.2

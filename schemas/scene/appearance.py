@@ -15,10 +15,10 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """What only RGB depends on, beside the floor's surface, which is in its `Placed` shape; linear RGB radiance.
+    """Lights and background; linear RGB radiance. The floor's surface is part of its shape.
 
-    `ambient` comes from everywhere in the flat tier, from above in the raster tier, where `below` comes from below. The
-    first light is the key light: in the raster tier it throws shadows.
+    `ambient` comes from all directions in the flat tier; in the raster tier it comes from above, and `below` from below.
+    The first light is the key light: it casts shadows in the raster tier.
     """
 
     ambient: tuple[float, float, float]

@@ -1,4 +1,4 @@
-"""Cameras: intrinsics and a pose in the optical frame (x right, y down, z forward)."""
+"""A camera: intrinsics and a pose in the optical frame (x right, y down, z forward)."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -1,4 +1,4 @@
-"""The plan of a scene: everything that is drawn before anything moves."""
+"""The plan of a scene: all that is random, drawn before anything moves."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,10 @@ from schemas.scene.shape import Asset, Hull, Mesh, Shape
 
 @dataclass(frozen=True, eq=False)
 class TableTop:
-    """The level that objects stand on, in the frame of the mesh that it was found in.
+    """The level that objects stand on, in its mesh's frame.
 
-    height_m; centre [2]: the middle of the level's bounding box; outline [N, 2] float64: its convex hull,
-    counter-clockwise; convex: whether the level fills that hull and nothing of the mesh rises above it.
+    centre [2]: middle of the level's bounding box; outline [N, 2] float64: its convex hull, counter-clockwise; convex:
+    whether the level fills that hull and nothing of the mesh rises above it.
     """
 
     height_m: float
@@ -24,7 +24,7 @@ class TableTop:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A table where it stands: `T_world_table` [4, 4], and its mesh and top in world coordinates."""
+    """A table with its pose `T_world_table` [4, 4], and its mesh and top in world coordinates."""
 
     asset: Asset
     T_world_table: Pose
@@ -34,7 +34,7 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class ObjectStart:
-    """Where one object begins: `T_world_obj` [4, 4] at release; `redraws` positions were thrown away before it.
+    """The start of one object: its pose `T_world_obj` [4, 4] at release, and the number of positions rejected before it.
 
     `hull` is the convex hull of the asset's shape, in the object frame.
     """
@@ -45,12 +45,12 @@ class ObjectStart:
     T_world_obj: Pose
     redraws: int
     placed: bool
-    """True where it was set down in a stable pose and needs no drop."""
+    """Whether it was set down in a stable pose and needs no drop."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScenePlan:
-    """Everything random about a scene, drawn before anything moves."""
+    """The plan of one scene."""
 
     scene_id: int
     category: str

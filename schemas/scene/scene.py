@@ -8,18 +8,18 @@ from schemas.scene.appearance import Appearance
 from schemas.scene.shape import Shape
 
 SupportedBy = Literal["flat_top", "mesh", "placed"]
-"""What an object was dropped on: the table's flat top alone, its whole mesh, or nothing, where it was set down at rest."""
+"""The support of a drop: the table's flat top alone, its whole mesh, or none where the object was set down at rest."""
 
 
 @dataclass(frozen=True, eq=False)
 class Settled:
-    """One object at rest, with how well it rests.
+    """One object at rest, with the quality of its rest.
 
-    penetration_mm and hover_gap_mm are measured between the meshes after the correction; support_margin_mm is how far
-    the centre of mass projects inside the hull of the contact points; equilibrium_residual is the share of its weight that
-    contact forces cannot balance (0 on level ground with a margin above 0); residual_speed_mm_s is the speed at which the
-    object's farthest point drifted over the last window, before the correction; recheck_move_mm and
-    recheck_turn_deg are how far it moved and turned when released again (None where it was not re-released).
+    penetration_mm and hover_gap_mm: between the meshes, after the correction; support_margin_mm: distance of the projected
+    centre of mass inside the hull of the contact points; equilibrium_residual: share of the weight that contact forces
+    cannot balance (0 on level ground with a margin above 0); residual_speed_mm_s: drift of the farthest point over the
+    last window, before the correction; recheck_move_mm and recheck_turn_deg: motion when released again (None where it
+    was not).
     """
 
     T_world_obj: Pose
@@ -36,7 +36,7 @@ class Settled:
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """One thing to draw: a shape, where it stands, and the region id that its pixels get."""
+    """One thing to draw: a shape, its pose, and the region id of its pixels."""
 
     region_id: int
     shape: Shape

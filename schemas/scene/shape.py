@@ -1,4 +1,4 @@
-"""Shapes in memory: parts with materials, and what is known of an asset. Arrays are read-only."""
+"""Shapes: meshes, parts with materials, mass, and assets. Arrays are read-only."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from schemas.base import Array, Pose
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Bare triangles: vertices [V, 3] float64 metres, faces [F, 3] int32."""
+    """Triangles: vertices [V, 3] float64 metres, faces [F, 3] int32."""
 
     vertices: Array
     faces: NDArray[np.int32]
@@ -30,9 +30,9 @@ class Material:
 
     `base_color` is sRGB with straight alpha, each in [0, 1]; it multiplies the texture and the vertex colours.
     `texture` is [h, w, 3 or 4] uint8 sRGB, row 0 at the top; uv (0, 0) is its lower left corner (OpenGL, trimesh).
-    `transmission` is the share of what is not mirrored that crosses the surface as through glass, for the path-traced tier
-    alone; `transmission_map` [h, w] uint8 multiplies it, and `ior` is the index of refraction. A surface that transmits is a
-    thin sheet there; an `ior` of 1 lets all light pass, as on the second side of a wall whose first stands for both.
+    `transmission` is the share of light not mirrored that crosses the surface as through glass, in the path-traced tier
+    alone; `transmission_map` [h, w] uint8 multiplies it, and `ior` is the index of refraction. A transmitting surface is a
+    thin sheet; an `ior` of 1 lets all light pass, for the second side of a wall whose first side stands for both.
     """
 
     base_color: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
@@ -63,9 +63,9 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """The parts of one rigid thing, all in one frame.
+    """The parts of one rigid body, all in one frame.
 
-    `closed`: together they are closed bodies, wound outwards, so that from outside no back of a face is seen.
+    `closed`: together they bound closed bodies, wound outwards: no back of a face is visible from outside.
     """
 
     parts: tuple[Part, ...]
@@ -98,12 +98,12 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Loft:
-    """A body whose making is known, from which its convex parts follow (`workers.geometry.lathe_decomposition`).
+    """A body of stacked rings, whose convex parts follow from them (`workers.geometry.lathe_decomposition`).
 
-    rings [L, n, 3] metres, each convex and counter-clockwise seen from the end; ends [2, 3]: the points that close it by
-    fans. profiles [K, L + 2, 2]: radius and height of the first end, of every ring and of the last end, where all rings have
-    one axis and are level on it; they may then turn inwards and back. K such, where the columns of the rings differ, of the
-    most unlike columns. None where rings lie askew, each beyond the one before. What `cutters` hold is not in it.
+    rings [L, n, 3] metres, each convex and counter-clockwise seen from the end; ends [2, 3]: apexes of the fans that close
+    it. profiles [K, L + 2, 2]: radius and height of the first end, every ring and the last end, where all rings are level
+    on one axis; a profile may turn inwards and back. K profiles of the most unlike columns where columns differ. None
+    where rings are askew, each beyond the one before. The volume of `cutters` is excluded.
     """
 
     rings: Array
@@ -112,7 +112,7 @@ class Loft:
     cutters: tuple["Loft", ...] = ()
 
     def mapped(self, axes: Array, origin: Array) -> "Loft":
-        """The loft with its x, y, z along the rows of `axes` [3, 3], of any length and no mirror, and its origin at `origin`."""
+        """The loft with x, y, z along the rows of `axes` [3, 3] (any length, no mirror) and its origin at `origin`."""
         rings, ends = (
             p[..., 0:1] * axes[0] + p[..., 1:2] * axes[1] + p[..., 2:3] * axes[2] + origin
             for p in (self.rings, self.ends)
@@ -124,10 +124,10 @@ class Loft:
 
 @dataclass(frozen=True, eq=False)
 class MassProperties:
-    """Of the true mesh, not of its collision shape.
+    """Mass properties of the true mesh, not of its collision shape.
 
-    mass_kg; com [3] metres in the object frame; inertia [3, 3] kg m^2 about the centre of mass, object axes.
-    `solid` tells a watertight solid from a mesh treated as a thin shell.
+    com [3] metres, object frame; inertia [3, 3] kg m^2 about the centre of mass, object axes; `solid`: watertight, else
+    treated as a thin shell.
     """
 
     mass_kg: float
@@ -138,14 +138,13 @@ class MassProperties:
 
 @dataclass(frozen=True, eq=False)
 class Asset:
-    """A shape that is ready for a scene: cleaned, metric, in the object frame (dataset.md section 1).
+    """A shape ready for a scene: cleaned, metric, in the object frame (dataset.md section 1).
 
-    `source` names where it comes from (`procedural`, `shapenet`, `urdf`), `path` the file within that source or None,
-    `sha256` the digest of the source file, or of the generated arrays where there is none. `T_source_to_object` takes
-    the source's coordinates, *after* multiplying them by `scale`, to the object frame. `shareable` says whether the
-    cleaned mesh may be written into the dataset. `volume_m3` is None where the mesh is not watertight.
-    `notes` says what of the source was mended or left out, such as a texture that is missing. `lofts`: what the shape is the
-    union of, object frame, where that is known.
+    `source`: `procedural`, `shapenet` or `urdf`; `path`: the file within that source or None; `sha256`: digest of the
+    source file, or of the generated arrays. `T_source_to_object` takes the source's coordinates, multiplied by `scale`, to
+    the object frame. `shareable`: whether the cleaned mesh may be written into the dataset. `volume_m3` is None where the
+    mesh is not watertight. `notes`: what was repaired or left out. `lofts`: the union that the shape is, object frame,
+    where known.
     """
 
     instance_id: str

@@ -1,4 +1,4 @@
-"""What cameras see of a scene: raw buffers, stored views with their labels, and pairs of views."""
+"""Views of a scene: raw buffers, stored views with their labels, and pairs of views."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from schemas.scene.camera import Camera, Role
 
 @dataclass(frozen=True, eq=False)
 class GBuffer:
-    """What one camera sees at the centre of every pixel.
+    """One camera's colour, depth and region at the centre of every pixel.
 
     rgb [H, W, 3] uint8 sRGB; depth_m [H, W] float32, z along the optical axis, 0 where nothing was hit (not yet
     clipped to the stored range); region [H, W] uint8.
@@ -24,10 +24,10 @@ class GBuffer:
 
 @dataclass(frozen=True, eq=False)
 class ObjectLabel:
-    """What one view says of one region.
+    """One region in one view.
 
-    `T_cam_obj` [4, 4], the pixel (u, v) of the object's origin or (-1, -1), the bounding box and count of its pixels,
-    and the share of its own unoccluded pixels (also outside the frame) that is seen.
+    `T_cam_obj` [4, 4]; the pixel (u, v) of the object's origin or (-1, -1); the bounding box and count of its pixels;
+    `visible_fraction` of its own unoccluded pixels, which count also outside the frame.
     """
 
     region_id: int
@@ -76,11 +76,11 @@ class Agreement:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """An input pose and its mirror pose with all their views; None is what the job has switched off.
+    """An input pose and its mirror pose with all their views; None where the job switches a view off.
 
-    filled_share: of the mirror image's pixels, those that the projection fills; hidden_share: of the filled ones,
-    those that show a surface behind what the mirror camera sees. `agreement` is of the stored images;
-    `exact_agreement` of what they were before the sensors' effects, and the same where there are none.
+    filled_share: share of the mirror image's pixels that the projection fills; hidden_share: share of the filled ones that
+    show a surface behind what the mirror camera sees. `agreement` is of the stored images, `exact_agreement` of the images
+    before the sensors' effects.
     """
 
     d_z_m: float
@@ -95,5 +95,5 @@ class Pair:
 
     @property
     def views(self) -> tuple[View, ...]:
-        """Those that there are, in the order of `ROLES`."""
+        """The views that exist, in the order of `ROLES`."""
         return tuple(view for view in (self.input, self.aligned, self.mirror, self.projected) if view is not None)

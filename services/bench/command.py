@@ -16,7 +16,7 @@ from services.bench.measure import bench_folder, measure
 from services.bench.others import other_systems
 from services.bench.report import describe, summarise
 from services.bench.traced import measure_traced
-from services.job.read import load_job, set_key, validate_job
+from services.job.read import change_key, load_job, validate_job
 from workers.store.mounts import file_system_of
 
 
@@ -51,7 +51,7 @@ def _job(options: argparse.Namespace) -> tuple[Job, Path]:
     if options.job is None:
         tree: dict[str, Any] = {"name": "bench"}
         for change in options.changes:
-            set_key(tree, change)
+            change_key(tree, change)
         job, folder = validate_job(tree, "the default job"), Path()
     else:
         job, folder = load_job(options.job, options.changes), options.job.parent

@@ -14,6 +14,7 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.errors import RunError, SceneError
+from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.scene.effects import EffectPlan
 from services.bench.machine import describe_machine, pinned
@@ -21,7 +22,7 @@ from services.bench.ratios import Spread
 from workers.assets.catalogue import open_catalogue
 from workers.physics.effects import called_for
 from workers.physics.step import settle_scene
-from workers.pipeline.context import WorkerContext, settings_digest
+from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import plan_with_assets
 from workers.plan.effect import Facts
 from workers.plan.effects import PHYSICS_EFFECTS, plan_effects

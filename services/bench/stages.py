@@ -7,11 +7,12 @@ from pathlib import Path
 from schemas.dataset.commit import CommitRecord, CommitTerms, Span
 from schemas.dataset.shard import ShardOrder
 from schemas.errors import RunError, SceneError
+from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from services.bench.ratios import Lap
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.pipeline.allocator import keep_freed_memory
-from workers.pipeline.context import WorkerContext, settings_digest
+from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene, Stopwatch, make_scene
 from workers.pipeline.run_shard import run_span
 from workers.render.raster.context import require_device

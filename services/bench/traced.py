@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import MachineError, RunError, SceneError
+from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.job.render import Render
 from services.bench.cycles import CyclesProcess, cycles_process, hand_over, trace_lap
 from services.bench.machine import describe_machine, pinned
 from services.bench.ratios import Lap, Spread, by_processor, slope_ratio
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.context import WorkerContext, settings_digest
+from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene, Stopwatch, make_scene
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.step import require_tier

@@ -1,19 +1,21 @@
-"""What each command prints. Each takes the parsed arguments and returns an exit code."""
+"""Handlers of the commands: each takes the parsed options, prints, and returns the exit code."""
 
 import argparse
 import dataclasses
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from schemas.dataset.layout import JOB_FILE
-from schemas.errors import OutputError
 from services.job.read import load_job
 
 if TYPE_CHECKING:
     from services.read.audit import Audit
+    from services.read.verify_independent import IndependentVerdict
     from workers.store.store import Store
+
+Found = TypeVar("Found")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -54,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _changes(options: argparse.Namespace) -> list[str]:
-    """The options that stand for a key of the job, then --set."""
+    """`key=value` of the options that set a key of the job, then those of --set."""
     named = {
         "scenes": options.scenes,
         "first_scene": options.first_scene,
@@ -97,14 +99,10 @@ def verify(options: argparse.Namespace) -> int:
     """`verso verify`."""
     from services.job.record import require_job
     from services.read.verify import verify as read_back
-    from services.run.progress import ProgressLine
 
     store = _dataset(options.out)
-    line = ProgressLine(require_job(store).job.scenes, "verify")
-    try:
-        verdict = read_back(store, lambda now: line.show(now.scenes, len(now.faults)))
-    finally:
-        line.close()
+    scenes = require_job(store).job.scenes
+    verdict = _with_progress(scenes, "verify", lambda progress: read_back(store, progress))
     for fault in verdict.faults:
         print(fault)
     print(
@@ -112,26 +110,40 @@ def verify(options: argparse.Namespace) -> int:
         f"{verdict.pairs} pairs derived again: {len(verdict.faults) or 'nothing'} off"
     )
     answer, faults = dataclasses.asdict(verdict), list(verdict.faults)
-    if options.audit:
-        found = _audit(options, store)
-        faults += found.faults
-        answer["audit"] = dataclasses.asdict(found)
+    for name, check in (("independent", _verify_independently), ("audit", _audit)):
+        if count := getattr(options, name):
+            found = check(store, count)
+            faults += found.faults
+            answer[name] = dataclasses.asdict(found)
     _answer(options, {"ok": not faults, **answer})
     return 1 if faults else 0
 
 
-def _audit(options: argparse.Namespace, store: "Store") -> "Audit":
-    from services.read.audit import audit
-    from services.read.audit_words import describe_audit
-    from services.run.progress import ProgressLine
+def _verify_independently(store: "Store", count: int) -> "IndependentVerdict":
+    from services.read.verify_independent import describe_independent, verify_independently
 
-    line = ProgressLine(options.audit, "audit")
-    try:
-        found = audit(store, options.audit, lambda now: line.show(now.scenes, len(now.faults)))
-    finally:
-        line.close()
+    found = _with_progress(count, "independent", lambda progress: verify_independently(store, count, progress))
+    print("\n".join(describe_independent(found)))
+    return found
+
+
+def _audit(store: "Store", count: int) -> "Audit":
+    from services.read.audit import audit, describe_audit
+
+    found = _with_progress(count, "audit", lambda progress: audit(store, count, progress))
     print("\n".join(describe_audit(found)))
     return found
+
+
+def _with_progress(scenes: int, what: str, work: Callable[[Callable[[Any], None]], Found]) -> Found:
+    """The result of `work`, which reports how many scenes are done and what is off as it goes."""
+    from services.run.progress import ProgressLine
+
+    line = ProgressLine(scenes, what)
+    try:
+        return work(lambda now: line.show(now.scenes, len(now.faults)))
+    finally:
+        line.close()
 
 
 def query(options: argparse.Namespace) -> int:
@@ -149,15 +161,15 @@ def replay(options: argparse.Namespace) -> int:
     """`verso replay`."""
     from services.read.replay import replay_scene
 
-    came = replay_scene(_dataset(options.out), options.scene)
-    for difference in came.differences:
+    result = replay_scene(_dataset(options.out), options.scene)
+    for difference in result.differences:
         print(difference)
-    how = "to the byte" if came.same_stack else "within tolerances, because this stack is not the one that made it"
+    how = "to the byte" if result.same_stack else "within tolerances, because this stack is not the one that made it"
     print(
-        f"scene {options.scene}: {came.compared} files and tables compared {how}: {len(came.differences) or 'none'} differ"
+        f"scene {options.scene}: {result.compared} files and tables compared {how}: {len(result.differences) or 'none'} differ"
     )
-    _answer(options, {"ok": not came.differences, **dataclasses.asdict(came)})
-    return 1 if came.differences else 0
+    _answer(options, {"ok": not result.differences, **dataclasses.asdict(result)})
+    return 1 if result.differences else 0
 
 
 def scene(options: argparse.Namespace) -> int:
@@ -171,10 +183,8 @@ def scene(options: argparse.Namespace) -> int:
 
 
 def _dataset(out: str) -> "Store":
-    """The store of a folder that must be there."""
+    """The store of an output folder. Raises OutputError where it is none."""
+    from services.job.record import require_dataset
     from workers.store.opening import open_store
 
-    store = open_store(out)
-    if store.size(JOB_FILE) is None:
-        raise OutputError(f"{out} holds no {JOB_FILE}: it is not an output folder of `verso run`")
-    return store
+    return require_dataset(open_store(out))

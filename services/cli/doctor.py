@@ -15,7 +15,7 @@ from schemas.errors import MachineError, VersoError
 from services.run.cores import usable_cores
 
 SCENE_BYTES = 3_500_000
-"""About what a scene with one pair takes on disk; `verso query` on a dataset of yours tells the true figure."""
+"""Approximate size on disk of a scene with one pair."""
 
 LEAST_SHM_BYTES = 200 * 2**20
 """Ray's object store wants this much shared memory."""
@@ -23,7 +23,7 @@ LEAST_SHM_BYTES = 200 * 2**20
 
 @dataclass(frozen=True)
 class Finding:
-    """One line: what was looked at, whether it will do, what was found, and the remedy where it will not."""
+    """One line of the answer: what was examined, whether it suffices, what was found, and the remedy where it does not."""
 
     what: str
     ok: bool
@@ -32,8 +32,8 @@ class Finding:
 
 
 def main(options: argparse.Namespace) -> int:
-    """Look at everything and print it; 1 where something is missing."""
-    findings = [look() for look in (_python, _cores, _memory, _disk, _shared_memory, _ray, _renderer, _stack)]
+    """Examine everything and print it; returns 1 where something is missing."""
+    findings = [examine() for examine in (_python, _cores, _memory, _disk, _shared_memory, _ray, _renderer, _stack)]
     width = max(len(finding.what) for finding in findings)
     for finding in findings:
         print(f"{'ok     ' if finding.ok else 'MISSING'}  {finding.what:{width}}  {finding.found}")

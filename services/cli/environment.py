@@ -1,4 +1,4 @@
-"""Edge: restarts a command in the environment that its bytes depend on (schemas/environment.py)."""
+"""Edge: restarts a command in the environment variables that its bytes depend on (schemas/environment.py)."""
 
 import os
 import sys
@@ -8,7 +8,7 @@ from schemas.environment import settings_to_change
 
 
 def processor_flags(cpuinfo: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
-    """The features of this machine's first core as Linux names them; empty where it does not say."""
+    """Feature flags of this machine's first core, from Linux; empty where it does not list them."""
     try:
         with cpuinfo.open() as lines:
             first = next((line for line in lines if line.startswith("flags")), "")
@@ -18,9 +18,9 @@ def processor_flags(cpuinfo: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
 
 
 def enter_stack_environment() -> None:
-    """Return at once if the environment is the stack's; else run this same command line again in it.
+    """Replace this process by the same command line in the stack's environment; return at once where it has that already.
 
-    For a command's own start only: the process is replaced, with the same interpreter, options and arguments.
+    Only for the start of a command.
     """
     changes = settings_to_change(os.environ, processor_flags())
     if changes:

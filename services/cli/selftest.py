@@ -1,4 +1,4 @@
-"""`verso test`: lint, types, layer rules and tests, and at the end what was skipped and why."""
+"""`verso test`: runs lint, types, layer rules and tests, and lists what was skipped and why."""
 
 import argparse
 import importlib.util
@@ -18,7 +18,7 @@ from services.run.cores import usable_cores
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 
-# A test process may hold a GL context, a PyBullet world and a Ray: about 1 GB. Beyond this many nothing is gained.
+# A test process holds a GL context, a PyBullet world and a Ray: about 1 GB. More processes gain nothing.
 MAX_PROCESSES: Final = 8
 
 PYTEST_FOUND_NO_TEST: Final = 5
@@ -26,7 +26,7 @@ PYTEST_FOUND_NO_TEST: Final = 5
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was run: its name, whether it passed, how long it took, and a remark for the summary."""
+    """The result of one tool: its name, whether it passed, its time, and a remark for the summary."""
 
     name: str
     passed: bool
@@ -36,7 +36,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Tally:
-    """What pytest wrote down: how many tests ended how, and the reasons of those it skipped."""
+    """Counts of tests by outcome, and of skipped tests by reason."""
 
     passed: int
     failed: int
@@ -44,7 +44,7 @@ class Tally:
 
     @classmethod
     def read(cls, junit: Path) -> "Tally":
-        """Read a JUnit file; all zero where pytest died before it wrote one."""
+        """Counts from a JUnit file; zeros where pytest died before it wrote one."""
         try:
             cases = list(ElementTree.parse(junit).iter("testcase"))
         except (OSError, ElementTree.ParseError):
@@ -55,9 +55,9 @@ class Tally:
 
 
 def main(args: list[str]) -> int:
-    """Run what `verso test ARGS` asks for; 0 if all of it passed, 1 if not, 2 if it cannot be run as asked."""
+    """Run `verso test ARGS`; returns 0 if all passed, 1 if not, 2 if it cannot be run as asked."""
     asked = _parser().parse_args(args)
-    if reason := _why_not_here() or _why_not_these(asked.paths):
+    if reason := _missing_tools() or _missing_paths(asked.paths):
         print(f"verso test: {reason}", file=sys.stderr)
         return 2
     checks = [] if asked.paths else [_run_check(name, command) for name, command in _static_checks().items()]
@@ -92,7 +92,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _why_not_here() -> str:
+def _missing_tools() -> str:
     if not (ROOT / "tests").is_dir():
         return "the tests are not part of the installed package; run ./verso test in a checkout"
     if importlib.util.find_spec("pytest") is None:
@@ -100,7 +100,7 @@ def _why_not_here() -> str:
     return ""
 
 
-def _why_not_these(paths: Sequence[str]) -> str:
+def _missing_paths(paths: Sequence[str]) -> str:
     gone = [path for path in paths if not Path(path.split("::")[0]).exists()]
     return f"no such file or folder: {', '.join(gone)}" if gone else ""
 
@@ -116,7 +116,7 @@ def _static_checks() -> dict[str, list[str]]:
 
 def _pytest_command(asked: argparse.Namespace, junit: Path) -> list[str]:
     command = [sys.executable, "-m", "pytest", f"--scope={asked.scope}", f"--junitxml={junit}"]
-    # One file stays in one process: tests of a file share what is dear to start, such as a Ray.
+    # One file stays in one process: its tests share what is slow to start, such as a Ray.
     one_file = len(asked.paths) == 1 and Path(asked.paths[0].split("::")[0]).is_file()
     processes = min(usable_cores(), MAX_PROCESSES)
     if processes > 1 and not one_file:

@@ -1,4 +1,4 @@
-"""From a job file to a `Job`: every fault is told by file, key, value and what is allowed."""
+"""Reads a job file into a `Job`. An error names the file, the key, its value and what is allowed."""
 
 import difflib
 from collections.abc import Sequence
@@ -10,11 +10,12 @@ from pydantic import ValidationError
 
 from schemas.errors import JobError
 from schemas.job.job import Job
+from schemas.job.keys import set_key
 from services.job.reference import allowed_keys
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """A safe YAML loader that refuses a key written twice, which YAML's own would drop in silence."""
+    """A safe YAML loader that refuses a key written twice, where YAML's own keeps the last."""
 
 
 def _mapping(loader: _StrictLoader, node: yaml.MappingNode) -> dict[Any, Any]:
@@ -38,7 +39,7 @@ def load_job(path: Path, changes: Sequence[str] = ()) -> Job:
 
 
 def read_tree(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
-    """The keys that a job file has, with `path.to.key=value` changes and without defaults. Raises JobError."""
+    """The keys of a job file with `path.to.key=value` changes, without defaults. Raises JobError."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
@@ -56,47 +57,25 @@ def read_tree(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
             f"{path}: holds {type(tree).__name__ if tree is not None else 'nothing'}, and must hold keys and values"
         )
     for change in changes:
-        set_key(tree, change)
+        change_key(tree, change)
     return tree
 
 
-def set_key(tree: dict[str, Any], change: str) -> None:
-    """Apply one `path.to.key=value`; the value is read as YAML. Raises JobError."""
+def change_key(tree: dict[str, Any], change: str) -> None:
+    """Apply one `path.to.key=value` in place; the value is read as YAML. Raises JobError."""
     path, equals, text = change.partition("=")
     if not equals or not path:
         raise JobError(f"--set {change}: write it as path.to.key=value, for example --set physics.step_hz=480")
     try:
-        value = yaml.load(text, Loader=_StrictLoader)
+        set_key(tree, path, yaml.load(text, Loader=_StrictLoader))
     except yaml.YAMLError as error:
         raise JobError(f"--set {change}: the value is not YAML: {' '.join(str(error).split())}") from error
-    *parents, last = path.split(".")
-    place: Any = tree
-    for key in parents:
-        place = place.setdefault(key, {}) if isinstance(place, dict) else _item(place, key, change)
-        if place is None:
-            raise JobError(f"--set {change}: there is nothing at '{key}' to set a key of")
-    if isinstance(place, list):
-        place[_index(place, last, change)] = value
-    elif isinstance(place, dict):
-        place[last] = value
-    else:
-        raise JobError(f"--set {change}: '{'.'.join(parents)}' is {place!r} and has no keys")
-
-
-def _index(place: list[Any], key: str, change: str) -> int:
-    if not key.isdigit() or int(key) >= len(place):
-        raise JobError(f"--set {change}: '{key}' must be a position from 0 to {len(place) - 1}")
-    return int(key)
-
-
-def _item(place: Any, key: str, change: str) -> Any:
-    if not isinstance(place, list):
-        raise JobError(f"--set {change}: {place!r} has no key '{key}'")
-    return place[_index(place, key, change)]
+    except ValueError as error:
+        raise JobError(f"--set {change}: {error}") from error
 
 
 def validate_job(tree: dict[str, Any], name: str) -> Job:
-    """A `Job` from parsed keys. Raises JobError with a line for each fault."""
+    """A `Job` from parsed keys. Raises JobError with one line for each fault."""
     version = tree.get("verso", 1)
     if isinstance(version, int) and version > 1:
         raise JobError(
@@ -106,7 +85,7 @@ def validate_job(tree: dict[str, Any], name: str) -> Job:
         return Job.model_validate(tree)
     except ValidationError as error:
         faults = error.errors()
-        # A fault inside an item of a list makes the list itself seem too short: that line would only confuse.
+        # An invalid item of a list makes the list itself count as too short: that line would confuse.
         told = [fault for fault in faults if fault["type"] != "too_short" or len(faults) == 1]
         raise JobError("\n".join(f"{name}: {describe_fault(fault)}" for fault in told)) from error
 

@@ -1,25 +1,20 @@
-"""OUT/job.yaml: which job a folder belongs to. A different job is refused, naming the keys."""
+"""OUT/job.yaml: the job that an output folder belongs to. Another job is refused, naming the keys."""
 
 import dataclasses
-import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 from schemas.dataset.layout import JOB_FILE, LOCK_FILE, LOG_FOLDER, MANIFEST, STAGING
 from schemas.errors import CorruptError, OutputError
+from schemas.job.identity import compare_jobs, job_digest
 from schemas.job.job import Job
 from services.job.read import validate_job
 from workers.store.store import Store
 
-FREE_KEYS = ("scenes", "run")
-"""Keys that may change from one run on a folder to the next: more scenes, and how the work is driven."""
-
 OWN = {MANIFEST, STAGING, LOCK_FILE, LOG_FOLDER}
-"""What a run makes before it writes the job: a run that was stopped there may go on."""
+"""What a run makes before it writes the job file: a folder with only these is no foreign one."""
 
 HEADER = """\
 # The job as it was run, every default filled in. Written by the first run on this folder; `verso run` on the same
@@ -40,9 +35,8 @@ class JobRecord:
 
 
 def record_job(job: Job, catalogue_digest: str, folder: Path) -> JobRecord:
-    """The record of a job over assets with this digest."""
-    text = json.dumps([_identity(job), catalogue_digest], sort_keys=True, separators=(",", ":"))
-    return JobRecord(job, hashlib.sha256(text.encode()).hexdigest(), catalogue_digest, str(folder.resolve()))
+    """The record of a job with the digest of its asset catalogue; `folder` is the job file's."""
+    return JobRecord(job, job_digest(job, catalogue_digest), catalogue_digest, str(folder.resolve()))
 
 
 def encode_job(record: JobRecord) -> bytes:
@@ -57,7 +51,7 @@ def encode_job(record: JobRecord) -> bytes:
 
 
 def read_job(store: Store) -> JobRecord | None:
-    """The job that a folder belongs to, None where it belongs to none. Raises CorruptError."""
+    """The job that a folder belongs to, None where it has none. Raises CorruptError."""
     try:
         text = store.read(JOB_FILE).decode()
     except FileNotFoundError:
@@ -70,16 +64,22 @@ def read_job(store: Store) -> JobRecord | None:
         raise CorruptError(f"{store.name}/{JOB_FILE} is not a job that `verso run` wrote: {error!r}") from error
 
 
+def require_dataset(store: Store) -> Store:
+    """The store itself. Raises OutputError where it holds no dataset."""
+    if store.size(JOB_FILE) is None:
+        raise OutputError(f"{store.name} holds no {JOB_FILE}: it is not an output folder of `verso run`")
+    return store
+
+
 def require_job(store: Store) -> JobRecord:
     """The job that a folder belongs to. Raises OutputError where it is no dataset."""
-    record = read_job(store)
-    if record is None:
-        raise OutputError(f"{store.name} holds no {JOB_FILE}: it is not an output folder of `verso run`")
+    record = read_job(require_dataset(store))
+    assert record is not None
     return record
 
 
 def refuse_foreign(store: Store) -> None:
-    """Raises OutputError where a folder holds things, but no job: somebody's files are not to be mixed with a dataset."""
+    """Raises OutputError where a folder holds files and no job: a dataset is not mixed with other files."""
     if store.size(JOB_FILE) is None:
         foreign = sorted(set(store.children("")) - OWN)
         if foreign:
@@ -94,10 +94,7 @@ def adopt(store: Store, new: JobRecord) -> JobRecord:
     old = read_job(store)
     if old is None:
         return new
-    differing = [
-        f"  {key}: {before} there, {after} here"
-        for key, before, after in _differences(_identity(old.job), _identity(new.job))
-    ]
+    differing = [f"  {key}: {before} there, {after} here" for key, before, after in compare_jobs(old.job, new.job)]
     if old.catalogue != new.catalogue and not differing:
         differing.append("  the files of the asset folders (their digest changed)")
     if differing:
@@ -108,22 +105,3 @@ def adopt(store: Store, new: JobRecord) -> JobRecord:
         )
     run = new.job.run.model_copy(update={"range_size": old.job.run.range_size})
     return dataclasses.replace(new, job=new.job.model_copy(update={"run": run}))
-
-
-def _identity(job: Job) -> dict[str, Any]:
-    """What must stay as it is. Not where the asset folders lie: their files' digest is in the catalogue's."""
-    identity = job.model_dump(mode="json", exclude=set(FREE_KEYS))
-    for source in (*identity["assets"]["objects"], *identity["assets"]["tables"]):
-        source.pop("folder", None)
-    return identity
-
-
-def _differences(a: Any, b: Any, path: str = "") -> list[tuple[str, Any, Any]]:
-    if isinstance(a, dict) and isinstance(b, dict):
-        keys = [*a, *(key for key in b if key not in a)]
-        return [
-            line
-            for key in keys
-            for line in _differences(a.get(key, "absent"), b.get(key, "absent"), f"{path}.{key}" if path else key)
-        ]
-    return [] if a == b else [(path, a, b)]

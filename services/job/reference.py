@@ -1,4 +1,4 @@
-"""docs/job.md: every key of a job file with its type, default and meaning, written from the models themselves."""
+"""Writes docs/job.md: every key of a job file with its type, default and meaning, from the models."""
 
 import re
 import types
@@ -17,7 +17,7 @@ from schemas.job.start import MOST_OBJECTS
 HEADER = """\
 # Keys of a job file
 
-Written from `schemas/job/job.py` by `python -m services.job.reference`; a test holds the two together. Every key but `name` has a
+Written from `schemas/job/` by `python -m services.job.reference`; a test holds the two together. Every key but `name` has a
 default. A key that is not in this list is refused, and so is a value that is not allowed. Any key can be changed on the
 command line: `--set physics.step_hz=480`.
 
@@ -27,7 +27,7 @@ command line: `--set physics.step_hz=480`.
 
 
 def list_keys(model: type[BaseModel] = Job, prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """(path, field) of every key, depth first; the kinds of a source share the place of their list with a `[kind]`."""
+    """(path, field) of every key, depth first; keys of a source have its kind in brackets after the list's name."""
     for name, field in model.model_fields.items():
         path = f"{prefix}{name}"
         yield path, field
@@ -47,14 +47,14 @@ def _branches(annotation: Any) -> Iterator[tuple[str, type[BaseModel]]]:
 
 
 def allowed_keys(path: Sequence[str]) -> list[str]:
-    """Names of the keys that may stand where a path's last part stands; positions in lists are part of the path."""
+    """Names of the keys that are siblings of a path's last part; the path may hold positions in lists."""
     parent = ".".join(part for part in path[:-1] if not part.isdigit())
     plain = (re.sub(r"\[\w+\]", "", key).rpartition(".") for key, _ in list_keys())
     return sorted({name for above, _, name in plain if above == parent})
 
 
 def describe_allowed(field: FieldInfo) -> str:
-    """The values that a field takes, in a few words."""
+    """The type and bounds of a field in a few words."""
     words = [_name(field.annotation)]
     for bound in field.metadata:
         for kind, sign in ((Ge, ">="), (Gt, ">"), (Le, "<="), (Lt, "<")):

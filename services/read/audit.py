@@ -1,15 +1,13 @@
-"""`verso verify --audit N`: that what a scene's plan of effects left out did not matter, proven on N scenes.
+"""`verso verify --audit N`: proves on N scenes that the effects which their plans left out did not matter.
 
-Exact no-ops: the scene is made again with all that were left out forced, and every byte must be what is stored.
-Approximations: what is stored is released again with nothing left out (audit_motion.py).
+Exact no-ops: the scene is made again with them forced, and every byte must equal what is stored.
+Approximations: the scene at rest is released again with every effect of physics on (audit_motion.py).
 """
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-
-import numpy as np
 
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import ASSETS, FINGERPRINT_FILE
@@ -17,7 +15,7 @@ from schemas.errors import SceneError
 from schemas.scene.scene import SceneOutput
 from services.job.record import require_job
 from services.read.audit_motion import Motion, measure_motion
-from services.read.dataset_reader import StoredRange, find_scene, iter_stored
+from services.read.dataset_reader import StoredRange, choose_scenes, find_scene
 from services.read.replay import compare_files, compare_rows, open_context
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.fingerprint import take_fingerprint
@@ -27,12 +25,12 @@ from workers.plan.effects import EFFECTS, names_of_kind
 from workers.store.store import Store
 
 RECEIPT = frozenset({"effects", "skipped"})
-"""Columns that say what was forced, and so differ."""
+"""Columns that name the effects that ran: forcing changes them."""
 
 
 @dataclass
 class Tally:
-    """Of one effect: how many of the audited scenes left it out, and in how many that was proven not to matter."""
+    """One effect: the audited scenes that left it out, and those where that was proven not to matter."""
 
     kind: str
     skipped: int = 0
@@ -41,7 +39,7 @@ class Tally:
 
 @dataclass
 class Audit:
-    """What was made again, what came of it, and what is off, a sentence each."""
+    """Counts of what was made again, the largest motion, and the faults, a sentence each."""
 
     same_stack: bool
     scenes: int = 0
@@ -52,13 +50,13 @@ class Audit:
     released: int = 0
     """Scenes released again."""
     motion: Motion = field(default_factory=Motion)
-    """The worst of all scenes, and its pixels over all of them."""
+    """Largest motion of any scene, and changed pixels of all."""
     effects: dict[str, Tally] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
 
 
 def audit(store: Store, count: int, progress: Callable[[Audit], None]) -> Audit:
-    """Audit so many of the dataset's scenes. Raises OutputError where the folder is no dataset."""
+    """Audit `count` scenes. Raises OutputError where the folder is no dataset."""
     record = require_job(store)
     context = open_context(record)
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
@@ -66,25 +64,16 @@ def audit(store: Store, count: int, progress: Callable[[Audit], None]) -> Audit:
     for effect in EFFECTS:
         if effect.kind != "asked":
             found.effects[effect.name] = Tally(effect.kind)
-    made = [row["scene_id"] for stored in iter_stored(store) for row in stored.rows["scenes"]]
-    for scene_id in choose_evenly(made, count, record.job.seed):
+    for scene_id in choose_scenes(store, count, record.job.seed):
         _audit_scene(context, store, scene_id, found)
         progress(found)
     return found
 
 
-def choose_evenly(scenes: Sequence[int], count: int, seed: int) -> list[int]:
-    """`count` of the scenes, or all, evenly over their ids; the seed says from where on."""
-    ordered = sorted(scenes)
-    if count >= len(ordered):
-        return ordered
-    first = float(np.random.default_rng(seed).random())
-    return [ordered[int((i + first) * len(ordered) / count)] for i in range(count)]
-
-
 def _audit_scene(context: WorkerContext, store: Store, scene_id: int, found: Audit) -> None:
     stored = find_scene(store, scene_id)
-    row = next(row for row in stored.rows["scenes"] if row["scene_id"] == scene_id)
+    row = stored.scene(scene_id)
+    assert row is not None
     left_out = {one["effect"] for one in row["skipped"]}
     for name in left_out & set(found.effects):
         found.effects[name].skipped += 1
@@ -101,7 +90,7 @@ def _audit_scene(context: WorkerContext, store: Store, scene_id: int, found: Aud
 def _force_no_ops(
     context: WorkerContext, where: tuple[Store, StoredRange], scene_id: int, no_ops: frozenset[str], found: Audit
 ) -> Scene | None:
-    """The scene made with these forced; None, and the fault, where that cannot be."""
+    """The scene with no-ops forced; None, and a fault, where it cannot be made."""
     try:
         scene, output = make_forced(context, scene_id, no_ops)
     except SceneError as error:
@@ -121,10 +110,10 @@ def _force_no_ops(
         found.faults.append(f"scene {scene_id}: made again with nothing forced, it differs: {again[0]}")
         return scene
     for name in sorted(no_ops):
-        alone = _differences(where, plain, make_forced(context, scene_id, frozenset({name}))[1])
-        if alone:
+        changed = _differences(where, plain, make_forced(context, scene_id, frozenset({name}))[1])
+        if changed:
             found.faults.append(
-                f"scene {scene_id}, {name}: forced, it changes {len(alone)} files or tables: {alone[0]}"
+                f"scene {scene_id}, {name}: forced, it changes {len(changed)} files or tables: {changed[0]}"
             )
         else:
             found.effects[name].proven += 1
@@ -132,14 +121,14 @@ def _force_no_ops(
 
 
 def make_forced(context: WorkerContext, scene_id: int, forced: frozenset[str]) -> tuple[Scene, SceneOutput]:
-    """A scene made again with effects forced, and what is written of it. Raises SceneError."""
-    watch, context = Stopwatch(), dataclasses.replace(context, forced=forced)
-    scene = make_scene(context, scene_id, watch)
-    return scene, record_scene(context, scene, watch)
+    """A scene made again with effects forced, and its output. Raises SceneError."""
+    stopwatch, context = Stopwatch(), dataclasses.replace(context, forced=forced)
+    scene = make_scene(context, scene_id, stopwatch)
+    return scene, record_scene(context, scene, stopwatch)
 
 
 def _differences(where: tuple[Store, StoredRange], plain: SceneOutput | None, output: SceneOutput) -> list[str]:
-    """Against what is stored, or against the scene made here without anything forced where another stack stored it."""
+    """Differences from what is stored, or from the plain scene made here where another stack made what is stored."""
     if plain is not None:
         before, now = dict(plain.files), dict(output.files)
         return [f"{path}: is not the same" for path in sorted({*before, *now}) if before.get(path) != now.get(path)]
@@ -154,16 +143,40 @@ def _differences(where: tuple[Store, StoredRange], plain: SceneOutput | None, ou
 
 
 def _release(context: WorkerContext, scene: Scene, names: Sequence[str], found: Audit) -> None:
-    """Release what came to rest with nothing left out, and see what moves."""
+    """Release the scene at rest with every effect of physics on, and measure the motion."""
     motion = measure_motion(context, scene)
     found.released += 1
-    found.motion = found.motion.worse(motion)
-    off = motion.off()
-    found.faults += [f"scene {scene.plan.scene_id}, {_listed(names)}: released with every effect, {one}" for one in off]
-    if not off:
+    found.motion = found.motion.join(motion)
+    excess = motion.describe_excess()
+    found.faults += [
+        f"scene {scene.plan.scene_id}, {_listed(names)}: released with every effect, {one}" for one in excess
+    ]
+    if not excess:
         for name in names:
             found.effects[name].proven += 1
 
 
 def _listed(names: Sequence[str] | frozenset[str]) -> str:
     return ", ".join(sorted(names)) or "nothing"
+
+
+def describe_audit(found: Audit) -> Iterator[str]:
+    """Every fault, the figures, and what was proven of each effect, line by line."""
+    yield from found.faults
+    against = (
+        "what is stored" if found.same_stack else "a plain scene made here, because another stack made what is stored"
+    )
+    yield (
+        f"audit of {found.scenes} scenes: {found.forced} no-ops forced, {found.files} files "
+        f"({found.bytes / 1e6:.1f} MB) compared to the byte with {against}"
+    )
+    motion = found.motion
+    yield (
+        f"  {found.released} released for 1 s with every effect: moved at most {motion.moved_mm:.4f} mm, turned at most "
+        f"{motion.turned_deg:.5f} degrees; {motion.pixels_changed} mask pixels changed, {motion.pixels_outside} of them "
+        "away from any silhouette"
+    )
+    for name, tally in found.effects.items():
+        if tally.skipped:
+            yield f"  {name} ({tally.kind}): left out in {tally.skipped} scenes, proven in {tally.proven}"
+    yield f"  {len(found.faults) or 'nothing'} off"

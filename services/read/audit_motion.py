@@ -1,4 +1,4 @@
-"""The settled state of a scene released again with no effect of physics left out: how far it moves, and what masks make of it."""
+"""Motion of a settled scene that is released again with every effect of physics on, and the mask pixels that it changes."""
 
 import dataclasses
 import math
@@ -26,23 +26,23 @@ RELEASE_S = 1.0
 
 MOST_MM = 0.05
 MOST_DEG = 0.01
-"""How far an object may move: what a mask shows of it is a few pixels."""
+"""Largest motion of an object: a few pixels of a mask at most."""
 
 EDGE_PX = 1.0 / 128.0
-"""The rasteriser keeps vertices to 1/256 px, in either of two pictures."""
+"""Rounding of vertices by the rasteriser: 1/256 px in each of two images."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """How far objects moved, and the mask pixels that changed: in all, and farther from a silhouette than it explains."""
+    """Largest motion of an object, changed mask pixels, and those too far from a silhouette to be explained by the motion."""
 
     moved_mm: float = 0.0
     turned_deg: float = 0.0
     pixels_changed: int = 0
     pixels_outside: int = 0
 
-    def worse(self, other: "Motion") -> "Motion":
-        """The larger of both motions, and the pixels of both."""
+    def join(self, other: "Motion") -> "Motion":
+        """The larger motion and the sum of pixels of two."""
         return Motion(
             max(self.moved_mm, other.moved_mm),
             max(self.turned_deg, other.turned_deg),
@@ -50,8 +50,8 @@ class Motion:
             self.pixels_outside + other.pixels_outside,
         )
 
-    def off(self) -> list[str]:
-        """What is beyond its bound, a phrase each."""
+    def describe_excess(self) -> list[str]:
+        """Values beyond their bounds, a phrase each."""
         found = []
         if not self.moved_mm <= MOST_MM:
             found.append(f"it moved {self.moved_mm:.4f} mm, the bound is {MOST_MM} mm")
@@ -63,28 +63,28 @@ class Motion:
 
 
 def measure_motion(context: WorkerContext, scene: Scene) -> Motion:
-    """Release the scene for `RELEASE_S` and look at it again."""
+    """Release the scene for `RELEASE_S` and draw its masks again."""
     facts = Facts(context.job, scene.plan, scene.raycast_checked)
     effects = plan_effects(facts, names_of_kind("approximation"))
     poses = release_again(scene.plan, scene.settled, context.job.physics, effects, RELEASE_S)
     found = Motion()
     for start, rest, pose in zip(scene.plan.objects, scene.settled, poses, strict=True):
-        found = found.worse(move_between(start.asset.shape, rest.T_world_obj, pose))
+        found = found.join(move_between(start.asset.shape, rest.T_world_obj, pose))
     after = dataclasses.replace(scene.posed, things=moved_things(scene, poses))
     for view in (view for pair in scene.pairs for view in pair.views if view.region is not None):
         changed, outside = compare_masks(context.renderer, scene.posed, after, view)
-        found = found.worse(Motion(pixels_changed=changed, pixels_outside=outside))
+        found = found.join(Motion(pixels_changed=changed, pixels_outside=outside))
     return found
 
 
 def move_between(shape: Shape, before: Pose, after: Pose) -> Motion:
-    """How far the farthest point of a shape moves between two poses [4, 4], and by what angle it turns."""
+    """Largest motion of a shape's points, and its turn, between two poses [4, 4]."""
     moved_m, turned_rad = moved_between(shape.vertices, before, after)
     return Motion(moved_m * 1e3, math.degrees(turned_rad))
 
 
 def moved_things(scene: Scene, poses: Sequence[Pose]) -> tuple[Placed, ...]:
-    """The things of a scene with its objects at these poses."""
+    """The things of a scene with its objects at other poses."""
     at = {start.region_id: pose for start, pose in zip(scene.plan.objects, poses, strict=True)}
     return tuple(
         dataclasses.replace(thing, T_world_shape=at[thing.region_id]) if thing.region_id in at else thing
@@ -93,7 +93,7 @@ def moved_things(scene: Scene, poses: Sequence[Pose]) -> tuple[Placed, ...]:
 
 
 def compare_masks(renderer: Renderer, before: PosedScene, after: PosedScene, view: View) -> tuple[int, int]:
-    """(mask pixels that changed, those farther from a silhouette than the motion's projection and `EDGE_PX`)."""
+    """(changed mask pixels, those farther from a silhouette than the motion in the image plus `EDGE_PX`)."""
     region = renderer.draw(after.things, after.appearance, view.camera).region
     changed = np.argwhere(region != view.region)
     if not len(changed):
@@ -104,7 +104,7 @@ def compare_masks(renderer: Renderer, before: PosedScene, after: PosedScene, vie
 
 
 def shift_px(before: Placed, after: Placed, camera: Camera) -> float:
-    """The largest way, pixels, that a vertex in front of the camera goes in the picture."""
+    """Largest motion in the image, pixels, of a vertex in front of the camera."""
     if before is after:
         return 0.0
     ends = [transform(invert(camera.T_world_cam) @ one.T_world_shape, one.shape.vertices) for one in (before, after)]

@@ -1,4 +1,4 @@
-"""Contact sheets: a page of what a dataset holds, for a person to look at.
+"""Contact sheets: one page with images of a dataset's scenes.
 
 python -m services.read.contact_sheet OUT FILE.jpg [SCENES [CATEGORY]]
 """
@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from schemas.dataset.codec import Row, read_world_poses
 from schemas.dataset.layout import Content, image_path, patch_index, patch_path
 from schemas.scene.region import REGION_FIRST_OBJECT
-from services.read.dataset_reader import Row, StoredRange, file_reader, iter_stored, read_image
+from services.read.dataset_reader import StoredRange, file_reader, iter_stored, read_image
 from workers.store.opening import open_store
 from workers.store.store import Store
 
@@ -46,10 +47,10 @@ MORE_COLORS = np.array(
 """Further objects, in turn."""
 
 DEPTH_STRETCH = (2.0, 98.0)
-"""Percentiles of a depth image that are drawn as its nearest and its farthest colour."""
+"""Percentiles of depth that get the nearest and the farthest colour."""
 
 MOST_PATCHES = 4
-"""Objects whose patches are drawn."""
+"""Largest number of objects whose patches are drawn."""
 
 Picture = NDArray[np.uint8]
 
@@ -74,7 +75,7 @@ def _choose(store: Store, scenes: int, only: str | None) -> list[tuple[str, list
     """The first scenes of each category, by category."""
     chosen: dict[str, list[list[Picture]]] = {}
     for stored in iter_stored(store):
-        read = file_reader(store, stored)
+        read = file_reader(store.read, stored)
         for scene in stored.rows["scenes"]:
             category = scene["category"]
             if only not in (None, category):
@@ -85,7 +86,7 @@ def _choose(store: Store, scenes: int, only: str | None) -> list[tuple[str, list
 
 
 def _cells(read: Callable[[str], bytes], stored: StoredRange, scene: Row) -> list[Picture]:
-    """The pictures of one scene's first pair."""
+    """The cells of one scene's first pair."""
     views = [row for row in stored.rows["views"] if row["scene_id"] == scene["scene_id"]]
     e, category = min(row["parent_id"] for row in views), scene["category"]
     listed = {file["path"] for row in views for file in row["files"]}
@@ -100,7 +101,7 @@ def _cells(read: Callable[[str], bytes], stored: StoredRange, scene: Row) -> lis
         cells.append(cell("depth", number, _paint_depth))
         cells.append(cell("segment", number, _paint_regions))
     cells.append(cell("RGBprojected", e))
-    regions = [body["region_id"] for body in scene["bodies"] or [{"region_id": REGION_FIRST_OBJECT}]]
+    regions = [region for region in read_world_poses(scene) if region >= REGION_FIRST_OBJECT]
     indices = [patch_index(region, len(regions)) for region in regions[:MOST_PATCHES]]
     patches = [patch_path(category, "RGB", number, index) for index in indices for number in (e, e + 1)]
     cells.append(_stack([read_image(read, path) for path in patches if path in listed]))
@@ -108,7 +109,7 @@ def _cells(read: Callable[[str], bytes], stored: StoredRange, scene: Row) -> lis
 
 
 def _empty() -> Picture:
-    """Where there is no image."""
+    """The cell of an image that does not exist."""
     return np.full((CELL[1], CELL[0], 3), 245, np.uint8)
 
 
@@ -117,7 +118,7 @@ def _fit(picture: NDArray) -> Picture:
 
 
 def _stack(patches: list[NDArray]) -> Picture:
-    """Patches pixel for pixel, two one over the other in the middle of a cell; more of them side by side, made smaller."""
+    """Up to two patches above each other at their own size; more of them side by side, shrunk to the cell."""
     cell = _empty()
     columns = (len(patches) + 1) // 2
     for number, patch in enumerate(patches):
@@ -132,7 +133,7 @@ def _stack(patches: list[NDArray]) -> Picture:
 
 
 def _paint_depth(depth: NDArray) -> Picture:
-    """Near warm, far cold, none black."""
+    """Near is warm, far is cold, no depth is black."""
     known = depth > 0
     if not known.any():
         return np.zeros((*depth.shape, 3), np.uint8)

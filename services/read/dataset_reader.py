@@ -1,11 +1,12 @@
-"""Reading a dataset scene by scene: rows and images as they are stored, finished or not."""
+"""Stored rows and images of a dataset, range by range or scene by scene, finished or not."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
+from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.tables import DETERMINISTIC_TABLES
 from schemas.errors import CorruptError, InputError
@@ -16,17 +17,31 @@ from workers.store.images import decode_png
 from workers.store.store import Store
 from workers.store.tars import read_tar
 
-Row = dict[str, Any]
+ReadFile = Callable[[str], bytes]
+"""Returns a file's bytes by its path below the output folder."""
 
 
 @dataclass(frozen=True)
 class StoredRange:
-    """One committed range with its retries laid over: rows by table, in order, and the records they came from."""
+    """A committed range: its records, and its rows by table in order, with those of retries in place of the first try's."""
 
     start: int
     stop: int
     records: tuple[CommitRecord, ...]
     rows: dict[str, list[Row]]
+
+    def scene(self, scene_id: int) -> Row | None:
+        """The row of `scenes`, None for a scene that failed."""
+        return next((row for row in self.rows["scenes"] if row["scene_id"] == scene_id), None)
+
+    def pairs(self, scene_id: int) -> Iterator[tuple[dict[str, Row], list[Row]]]:
+        """(rows of `views` by role, rows of `objects`) of each pair of a scene, by pose id."""
+        views = [row for row in self.rows["views"] if row["scene_id"] == scene_id]
+        objects = [row for row in self.rows["objects"] if row["scene_id"] == scene_id]
+        for parent in sorted({row["parent_id"] for row in views}):
+            pair = {row["role"]: row for row in views if row["parent_id"] == parent}
+            ids = {row["pose_id"] for row in pair.values()}
+            yield pair, [row for row in objects if row["pose_id"] in ids]
 
 
 def iter_stored(store: Store) -> Iterator[StoredRange]:
@@ -47,6 +62,22 @@ def read_stored(store: Store, start: int, commits: int) -> StoredRange:
     return StoredRange(start, records[0].span.stop, tuple(records), rows)
 
 
+def choose_scenes(store: Store, count: int, seed: int) -> list[int]:
+    """`count` of the scenes that were made, or all of them, evenly over their ids."""
+    return choose_evenly(
+        [row["scene_id"] for stored in iter_stored(store) for row in stored.rows["scenes"]], count, seed
+    )
+
+
+def choose_evenly(scenes: Sequence[int], count: int, seed: int) -> list[int]:
+    """`count` of the scenes, or all of them, evenly over their ids; the seed sets the first."""
+    ordered = sorted(scenes)
+    if count >= len(ordered):
+        return ordered
+    first = float(np.random.default_rng(seed).random())
+    return [ordered[int((i + first) * len(ordered) / count)] for i in range(count)]
+
+
 def find_scene(store: Store, scene_id: int) -> StoredRange:
     """The range that holds a scene. Raises InputError where it is not committed."""
     for group in ranges_with_retries(list_commits(store)):
@@ -55,19 +86,26 @@ def find_scene(store: Store, scene_id: int) -> StoredRange:
     raise InputError(f"scene {scene_id} is not in {store.name}: `verso status {store.name}` tells which scenes are")
 
 
-def file_reader(store: Store, stored: StoredRange) -> Callable[[str], bytes]:
-    """Reads files of a range by path, whether they lie by themselves or in tars (each tar is read once).
+def file_reader(read: ReadFile, stored: StoredRange) -> ReadFile:
+    """Reads files of a range by path, from their own place or from a tar (each tar is read once).
 
-    What it returns raises CorruptError where a file is missing.
+    `read` is the store's. What comes back raises CorruptError where a file is missing.
     """
+
+    def read_committed(path: str) -> bytes:
+        try:
+            return read(path)
+        except FileNotFoundError as error:
+            raise CorruptError(f"{path} is committed and missing: restore it from a copy") from error
+
     if stored.records[0].terms.layout == "files":
-        return lambda path: _read(store, path)
+        return read_committed
     members: dict[str, bytes] = {}
     for record in stored.records:
         for entry in record.files:
             if entry.path.endswith(".tar"):
                 category = entry.path.partition("/")[0]
-                members.update(read_tar(category, _read(store, entry.path), entry.path))
+                members.update(read_tar(category, read_committed(entry.path), entry.path))
 
     def read_packed(path: str) -> bytes:
         if path not in members:
@@ -77,14 +115,7 @@ def file_reader(store: Store, stored: StoredRange) -> Callable[[str], bytes]:
     return read_packed
 
 
-def _read(store: Store, path: str) -> bytes:
-    try:
-        return store.read(path)
-    except FileNotFoundError as error:
-        raise CorruptError(f"{path} is committed and missing: restore it from a copy") from error
-
-
-def read_image(read: Callable[[str], bytes], path: str) -> NDArray:
+def read_image(read: ReadFile, path: str) -> NDArray:
     """An image by its path. Raises CorruptError where it is missing or no PNG."""
     try:
         return decode_png(read(path), path)

@@ -1,4 +1,4 @@
-"""SQL over the manifests of a dataset, finished or being made. It reads nothing else and writes nothing."""
+"""`verso query`: SQL over the manifests of a dataset, finished or being made. Reads nothing else and writes nothing."""
 
 import urllib.parse
 import warnings
@@ -39,11 +39,11 @@ _FORMAT = ds.ParquetFileFormat(
 
 
 def query(store: Store, sql: str) -> pa.Table:
-    """The answer to one question over the tables scenes, views, objects, assets, failures and timings.
+    """The result of one SQL query over the tables scenes, views, objects, assets, failures and timings.
 
-    A finished dataset is read from its merged tables, another one through its commits: only what is committed counts,
-    and a retry's rows replace the first. Raises InputError with the database's own line where the SQL is wrong,
-    OutputError where there is no dataset, CorruptError where a file is damaged.
+    A finished dataset is read from its merged tables, an unfinished one through its commits, where a retry's rows replace
+    the first try's. Raises InputError with the database's message where the SQL is wrong, OutputError where there is no
+    dataset, CorruptError where a file is damaged.
     """
     with duckdb.connect(":memory:", config=dict(_LOCKED)) as connection:
         _register(connection, store)
@@ -62,7 +62,7 @@ def query(store: Store, sql: str) -> pa.Table:
 
 
 def _register(connection: duckdb.DuckDBPyConnection, store: Store) -> None:
-    """Makes the six views."""
+    """Make a view of each table."""
     done = read_success(store)
     committed = _Committed(store) if done is None else None
     for table in TABLES:
@@ -76,7 +76,7 @@ def _register(connection: duckdb.DuckDBPyConnection, store: Store) -> None:
 
 
 def _merged(store: Store, keys: Sequence[str], table: str) -> list[Rows]:
-    """The merged table: read as it is asked from a disk, in whole from elsewhere."""
+    """The merged table: read lazily from a disk, as a whole from an object store."""
     folder = f"{MANIFEST}/{table}"
     keys = [key for key in keys if key.startswith(f"{folder}/")]
     if isinstance(store, LocalStore):
@@ -97,7 +97,7 @@ def _with_category(table: str, key: str, data: bytes) -> pa.Table:
 
 
 class _Committed:
-    """What is committed at this moment: files that are in place, and rows in memory where there is more to a range."""
+    """Committed rows: files in place, and rows in memory for ranges that are not published or have retries."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -106,7 +106,7 @@ class _Committed:
         names = commit_names(store)
         if not names:
             raise OutputError(f"{store.name} holds no dataset that can be asked: there is nothing in {COMMITS} yet")
-        # Looked at after the commits: a range without staging is published for good.
+        # Listed after the commits: a committed range without staging is published.
         staged = set(store.children(STAGING))
         for start, group in groupby(names, key=lambda name: name[0]):
             retries = [retry for _, retry, _ in group]
@@ -117,7 +117,7 @@ class _Committed:
                 self._other.append(records)
 
     def parts(self, table: str) -> list[Rows]:
-        """The rows of one table, in as many pieces as there are ways to read them."""
+        """The rows of one table: those in memory, and those in files."""
         rows = [range_rows(self._store, records, table) for records in self._other]
         parts: list[Rows] = [pa.concat_tables([SCHEMAS[table].empty_table(), *rows])]
         if self._plain and isinstance(self._store, LocalStore):

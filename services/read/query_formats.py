@@ -1,4 +1,4 @@
-"""An answer as a table for people, or as CSV, JSON or Parquet for programs."""
+"""Query results as a table for people, or as CSV, JSON or Parquet for programs."""
 
 import csv
 import io
@@ -11,11 +11,11 @@ import pyarrow.parquet as pq
 Format = Literal["table", "csv", "parquet", "json"]
 
 _WIDEST_CELL = 60
-"""Longer cells are cut in the table for people; the other formats give all of them."""
+"""Characters; longer cells are cut in the table for people alone."""
 
 
 def format_rows(rows: pa.Table, style: Format) -> bytes:
-    """The rows in one of the four formats. Lists and structs stand as JSON in a cell; JSON is one array of objects."""
+    """The rows in one of four formats. A list or struct is JSON in its cell; the JSON format is one array of objects."""
     if style == "parquet":
         sink = io.BytesIO()
         pq.write_table(rows, sink, compression="zstd")

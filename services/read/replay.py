@@ -1,4 +1,4 @@
-"""`verso replay` and `verso scene`: one scene made again from its job, and held against what is stored."""
+"""`verso replay`: makes one scene again from its job and compares it with what is stored."""
 
 import hashlib
 from dataclasses import dataclass
@@ -23,27 +23,27 @@ from workers.store.manifest import table_of_rows
 from workers.store.store import Store
 
 DEPTH_UNITS = 2
-"""On another stack a stored depth may round the other way, and a rest pose may differ in its last bits."""
+"""Tolerance of depth on another stack: depth may round the other way, and a rest pose may differ in its last bits."""
 
 PIXEL_SHARE = 0.002
-"""On another stack this share of an image's pixels may differ by more: silhouettes that fall to the other side."""
+"""Tolerated share of pixels that differ by more on another stack: pixels at silhouettes."""
 
 RGB_STEPS = 3
-"""On another stack a colour may differ by this many of its 255 steps."""
+"""Tolerance of a colour on another stack, of 255 steps."""
 
 
 @dataclass(frozen=True)
 class Replay:
-    """What came of making a scene again."""
+    """The result of making a scene again."""
 
     same_stack: bool
     compared: int
-    """Files and tables held against each other."""
+    """Number of files and tables that were compared."""
     differences: tuple[str, ...]
 
 
 def replay_scene(store: Store, scene_id: int) -> Replay:
-    """Make one scene again and compare every file and row: to the byte on the same stack, within tolerances on another."""
+    """Make one scene again and compare its files and rows: to the byte on the same stack, within tolerances on another."""
     record, stored = require_job(store), find_scene(store, scene_id)
     context = open_context(record)
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
@@ -56,7 +56,7 @@ def replay_scene(store: Store, scene_id: int) -> Replay:
 
 
 def open_context(record: JobRecord) -> WorkerContext:
-    """What is needed to make a stored job's scenes here. Raises MachineError where the assets are others than they were."""
+    """The context that makes a stored job's scenes here. Raises MachineError where the assets have changed."""
     catalogue = open_catalogue(record.job.assets, Path(record.folder), tuple(record.job.categories))
     if catalogue.digest != record.catalogue:
         raise MachineError(
@@ -66,7 +66,7 @@ def open_context(record: JobRecord) -> WorkerContext:
 
 
 def compare_files(store: Store, stored: StoredRange, output: SceneOutput, same_stack: bool) -> list[str]:
-    """How a scene's images, made now, differ from the stored ones: a sentence each."""
+    """Differences of a scene's new images from the stored ones, a sentence each."""
     scene_files = {
         file["path"]: file["sha256"]
         for view in stored.rows["views"]
@@ -78,36 +78,29 @@ def compare_files(store: Store, stored: StoredRange, output: SceneOutput, same_s
         f"{path}: only {'stored' if path in scene_files else 'made now'}"
         for path in sorted(made.keys() ^ scene_files.keys())
     ]
-    read = file_reader(store, stored)
+    read = file_reader(store.read, stored)
     for path in sorted(made.keys() & scene_files.keys()):
         if hashlib.sha256(made[path]).hexdigest() == scene_files[path]:
             continue
-        difference = _compare_pixels(read(path), made[path])
-        if same_stack or not difference.within:
-            differences.append(f"{path}: {difference.words}")
+        within, how = _compare_pixels(read(path), made[path])
+        if same_stack or not within:
+            differences.append(f"{path}: {how}")
     return differences
 
 
-@dataclass(frozen=True)
-class _PixelDifference:
-    within: bool
-    words: str
-
-
-def _compare_pixels(before: bytes, now: bytes) -> _PixelDifference:
+def _compare_pixels(before: bytes, now: bytes) -> tuple[bool, str]:
+    """(whether two images agree within the tolerances of another stack, how they differ)."""
     a, b = decode_png(before), decode_png(now)
     if a.shape != b.shape or a.dtype != b.dtype:
-        return _PixelDifference(False, f"was {a.dtype} {a.shape}, is {b.dtype} {b.shape}")
+        return False, f"was {a.dtype} {a.shape}, is {b.dtype} {b.shape}"
     gap = np.abs(a.astype(np.int64) - b.astype(np.int64))
     allowed = DEPTH_UNITS if a.dtype == np.uint16 else RGB_STEPS if a.ndim == 3 else 0
     share = float((gap > allowed).mean())
-    return _PixelDifference(
-        share <= PIXEL_SHARE, f"{share:.4%} of its values differ by more than {allowed}, at most {gap.max()}"
-    )
+    return share <= PIXEL_SHARE, f"{share:.4%} of its values differ by more than {allowed}, at most {gap.max()}"
 
 
-def compare_rows(stored: StoredRange, output: SceneOutput, but: frozenset[str] = frozenset()) -> list[str]:
-    """How a scene's rows, made now, differ from the stored ones, `but` for these columns: a sentence each."""
+def compare_rows(stored: StoredRange, output: SceneOutput, ignored: frozenset[str] = frozenset()) -> list[str]:
+    """Differences of a scene's new rows from the stored ones in all columns but `ignored`, a sentence each."""
     differences = []
     for table in DETERMINISTIC_TABLES:
         made = output.rows.get(table, [])
@@ -117,7 +110,7 @@ def compare_rows(stored: StoredRange, output: SceneOutput, but: frozenset[str] =
         else:
             before = [row for row in stored.rows[table] if row["scene_id"] == output.scene_id]
         now = table_of_rows(table, made).to_pylist()
-        before, now = ([{k: v for k, v in row.items() if k not in but} for row in rows] for rows in (before, now))
+        before, now = ([{k: v for k, v in row.items() if k not in ignored} for row in rows] for rows in (before, now))
         if sorted(map(repr, before)) != sorted(map(repr, now)):
             columns = sorted(
                 {key for a, b in zip(before, now, strict=False) for key in a if repr(a[key]) != repr(b.get(key))}

@@ -1,6 +1,6 @@
-"""`verso scene`: the posed geometry of one stored scene as one GLB."""
+"""`verso scene`: the posed geometry of one stored scene as a GLB file."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +10,13 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from schemas.base import Pose
+from schemas.dataset.codec import read_world_poses
 from schemas.errors import InputError
 from schemas.scene.plan import ScenePlan
+from schemas.scene.region import REGION_TABLE
 from schemas.scene.shape import Part, Shape
 from services.job.record import require_job
-from services.read.dataset_reader import Row, find_scene
+from services.read.dataset_reader import find_scene
 from services.read.replay import open_context
 from workers.pipeline.make_scene import plan_with_assets
 from workers.store.store import Store
@@ -27,16 +29,16 @@ def export_scene(store: Store, scene_id: int, target: Path) -> int:
     Raises InputError where the scene was not made.
     """
     record, stored = require_job(store), find_scene(store, scene_id)
-    row = next((row for row in stored.rows["scenes"] if row["scene_id"] == scene_id), None)
+    row = stored.scene(scene_id)
     if row is None:
         reason = next((f["reason"] for f in stored.rows["failures"] if f["scene_id"] == scene_id), "unknown")
         raise InputError(f"scene {scene_id} was not made ({reason}): it has no geometry")
-    plan = plan_with_assets(open_context(record), scene_id)
+    plan, T_world = plan_with_assets(open_context(record), scene_id), read_world_poses(row)
     scene = trimesh.Scene()
     for name, shape, T in (
         ("floor", plan.floor, np.eye(4)),
-        (f"table {plan.table.asset.instance_id}", plan.table.asset.shape, np.reshape(row["T_world_table"], (4, 4))),
-        *_objects(plan, row),
+        (f"table {plan.table.asset.instance_id}", plan.table.asset.shape, T_world[REGION_TABLE]),
+        *_objects(plan, T_world),
     ):
         for number, part in enumerate(shape.parts):
             label = f"{name}/{number}-{part.name}"
@@ -47,13 +49,12 @@ def export_scene(store: Store, scene_id: int, target: Path) -> int:
     return len(data)
 
 
-def _objects(plan: ScenePlan, row: Row) -> Iterator[tuple[str, Shape, Pose]]:
-    """Name, shape and pose of every object; of several, names end in their region ids, as two may be of one instance."""
-    bodies = row["bodies"] or [{"T_world_obj": row["T_world_obj"]}]
-    for start, body in zip(plan.objects, bodies, strict=True):
-        region = f" {start.region_id}" if len(bodies) > 1 else ""
+def _objects(plan: ScenePlan, T_world: Mapping[int, Pose]) -> Iterator[tuple[str, Shape, Pose]]:
+    """(name, shape, pose) of every object; with several, names end in region ids, because two may be of one instance."""
+    for start in plan.objects:
+        region = f" {start.region_id}" if len(plan.objects) > 1 else ""
         name = f"{start.asset.category} {start.asset.instance_id}{region}"
-        yield name, start.asset.shape, np.reshape(body["T_world_obj"], (4, 4))
+        yield name, start.asset.shape, T_world[start.region_id]
 
 
 def _mesh(part: Part) -> trimesh.Trimesh:

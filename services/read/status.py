@@ -1,4 +1,4 @@
-"""How far a dataset is, read from its commits alone; nothing is written."""
+"""`verso status`: progress of a dataset, from its commits alone; nothing is written."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -14,27 +14,27 @@ from workers.store.commit import commit_names, read_record
 from workers.store.store import Store
 
 RATE_COMMITS = 64
-"""The rate is that of so many of the latest commits: long enough to be steady, short enough to be of now."""
+"""Number of latest commits that the rate is computed from."""
 
 
 @dataclass(frozen=True)
 class Running:
-    """An attempt at a range that is not committed: at work, or left behind by a worker that died."""
+    """An attempt at a range without a commit: running, or left behind by a worker that died."""
 
     start: int
     attempt: str
     scene_id: int | None
-    """The scene it is at; None between scenes."""
+    """The scene in progress; None between scenes."""
 
 
 @dataclass(frozen=True)
 class Status:
-    """How far a dataset is."""
+    """Progress of a dataset."""
 
     asked: int
     made: int
     failed: dict[str, int]
-    """Failures that stand, by `kind: reason`."""
+    """Failures not yet made good by a retry, by `kind: reason`."""
     missing: int
     scenes_per_s: float | None
     """Of the latest commits; None before there are two."""
@@ -46,7 +46,7 @@ class Status:
 
 
 def read_status(store: Store, first_scene: int, stop_scene: int) -> Status:
-    """How far the scenes [first_scene, stop_scene) are.
+    """Progress of the scenes [first_scene, stop_scene).
 
     Raises OutputError where there is no dataset, CorruptError for a damaged record.
     """

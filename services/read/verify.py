@@ -1,15 +1,16 @@
-"""`verso verify`: every file against its checksum, every label against what it follows from."""
+"""`verso verify`: every file against its checksum, and every label against a derivation from the stored images."""
 
 import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
+from schemas.dataset.codec import Row
 from schemas.dataset.layout import ASSETS, MANIFEST, stored_roles
 from schemas.errors import CorruptError
 from schemas.job.job import Job
 from services.job.record import require_job
 from services.merge.step import read_success
-from services.read.dataset_reader import Row, StoredRange, file_reader, iter_stored, read_image
+from services.read.dataset_reader import ReadFile, StoredRange, file_reader, iter_stored, read_image
 from workers.pipeline.allocator import keep_freed_memory
 from workers.pipeline.check_stored import check_stored_pair, check_stored_scene
 from workers.store.store import Store
@@ -17,7 +18,7 @@ from workers.store.store import Store
 
 @dataclass
 class Verdict:
-    """What was read, and what is off, a sentence each."""
+    """Counts of what was read, and the faults, a sentence each."""
 
     files: int = 0
     bytes: int = 0
@@ -33,8 +34,9 @@ def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
     verdict = Verdict()
     known: set[str] = set()
     for stored in _ranges(store, verdict):
-        _check_files(store, stored, verdict, known)
-        _check_scenes(store, stored, record.job, verdict)
+        digests: dict[str, str] = {}
+        faults = _check_scenes(_hashing_reader(store, digests, verdict), stored, record.job, verdict)
+        verdict.faults += [*_check_files(store, stored, digests, known, verdict), *faults]
         progress(verdict)
     _check_merged(store, verdict)
     _find_strays(store, known, verdict)
@@ -48,75 +50,86 @@ def _ranges(store: Store, verdict: Verdict) -> Iterator[StoredRange]:
         verdict.faults.append(str(error))
 
 
-def _check_files(store: Store, stored: StoredRange, verdict: Verdict, known: set[str]) -> None:
-    """Every file that the range's records name, against its size and SHA-256."""
-    for record in stored.records:
-        for entry in record.files:
-            if entry.path in known and entry.path.startswith(f"{ASSETS}/"):
-                continue
-            known.add(entry.path)
-            try:
-                data = store.read(entry.path)
-            except FileNotFoundError:
-                verdict.faults.append(f"{entry.path}: is committed and missing")
-                continue
-            verdict.files += 1
-            verdict.bytes += len(data)
-            if hashlib.sha256(data).hexdigest() != entry.sha256:
-                verdict.faults.append(f"{entry.path}: does not match the SHA-256 in its commit")
+def _hashing_reader(store: Store, digests: dict[str, str], verdict: Verdict) -> ReadFile:
+    """Reads files of the store, counts them, and keeps the SHA-256 of each: every file is read and hashed once."""
+
+    def read(path: str) -> bytes:
+        data = store.read(path)
+        digests[path] = hashlib.sha256(data).hexdigest()
+        verdict.files += 1
+        verdict.bytes += len(data)
+        return data
+
+    return read
 
 
-def _check_scenes(store: Store, stored: StoredRange, job: Job, verdict: Verdict) -> None:
-    """Counts, and every pair's labels derived again."""
-    read = file_reader(store, stored)
+def _check_files(
+    store: Store, stored: StoredRange, digests: dict[str, str], known: set[str], verdict: Verdict
+) -> list[str]:
+    """Files of the range's records that are missing or differ from their SHA-256. Reads those without a digest yet."""
+    faults, read = [], _hashing_reader(store, digests, verdict)
+    for entry in (entry for record in stored.records for entry in record.files):
+        if entry.path in known and entry.path.startswith(f"{ASSETS}/"):
+            continue
+        known.add(entry.path)
+        try:
+            if entry.path not in digests:
+                read(entry.path)
+        except FileNotFoundError:
+            faults.append(f"{entry.path}: is committed and missing")
+            continue
+        if digests[entry.path] != entry.sha256:
+            faults.append(f"{entry.path}: does not match the SHA-256 in its commit")
+    return faults
+
+
+def _check_scenes(read_file: ReadFile, stored: StoredRange, job: Job, verdict: Verdict) -> list[str]:
+    """Count the range's scenes, and derive every pair's labels again."""
     made = {row["scene_id"]: row for row in stored.rows["scenes"]}
-    failed = [row["scene_id"] for row in stored.rows["failures"]]
-    if sorted([*made, *failed]) != list(range(stored.start, stored.stop)):
-        verdict.faults.append(f"scenes {stored.start} to {stored.stop - 1}: some are missing, or both made and failed")
-    verdict.scenes += len(made) + len(failed)
-    for scene_id, scene in made.items():
-        verdict.faults += check_stored_scene(scene)
-        views = [row for row in stored.rows["views"] if row["scene_id"] == scene_id]
-        objects = [row for row in stored.rows["objects"] if row["scene_id"] == scene_id]
-        for parent in sorted({row["parent_id"] for row in views}):
-            pair = {row["role"]: row for row in views if row["parent_id"] == parent}
-            verdict.faults += _check_pair(job, read, (scene, pair, objects))
-            verdict.pairs += 1
-
-
-def _check_pair(job: Job, read: Callable[[str], bytes], rows: tuple[Row, dict[str, Row], list[Row]]) -> list[str]:
-    scene, pair, objects = rows
-    roles = stored_roles(job)
-    if set(pair) != set(roles):
-        return [f"scene {scene['scene_id']}: has views {sorted(pair)}, and must have {sorted(roles)}"]
-    own = {row["pose_id"] for row in pair.values()}
+    ended = sorted([*made, *(row["scene_id"] for row in stored.rows["failures"])])
+    verdict.scenes += len(ended)
+    faults = []
+    if ended != list(range(stored.start, stored.stop)):
+        faults.append(f"scenes {stored.start} to {stored.stop - 1}: some are missing, or both made and failed")
     try:
-        return check_stored_pair(
-            job, pair, [row for row in objects if row["pose_id"] in own], scene, lambda path: read_image(read, path)
-        )
+        read = file_reader(read_file, stored)
+    except CorruptError as error:
+        return [*faults, str(error)]
+    for scene_id, scene in made.items():
+        faults += check_stored_scene(scene)
+        for views, objects in stored.pairs(scene_id):
+            faults += _check_pair(job, read, (scene, views, objects))
+            verdict.pairs += 1
+    return faults
+
+
+def _check_pair(job: Job, read: ReadFile, rows: tuple[Row, dict[str, Row], list[Row]]) -> list[str]:
+    scene, views, objects = rows
+    roles = stored_roles(job)
+    if set(views) != set(roles):
+        return [f"scene {scene['scene_id']}: has views {sorted(views)}, and must have {sorted(roles)}"]
+    try:
+        return check_stored_pair(job, views, objects, scene, lambda path: read_image(read, path))
     except (CorruptError, ValueError) as error:
         return [str(error)]
 
 
 def _check_merged(store: Store, verdict: Verdict) -> None:
-    """The merged files against `_SUCCESS`."""
-    success = read_success(store)
-    if success is None:
-        return
-    for path, file in success["files"].items():
+    """Compare the merged files with `_SUCCESS`."""
+    digests: dict[str, str] = {}
+    read = _hashing_reader(store, digests, verdict)
+    for path, file in (read_success(store) or {"files": {}})["files"].items():
         try:
-            data = store.read(path)
+            read(path)
         except FileNotFoundError:
             verdict.faults.append(f"{path}: is merged and missing")
             continue
-        verdict.files += 1
-        verdict.bytes += len(data)
-        if hashlib.sha256(data).hexdigest() != file["sha256"]:
+        if digests[path] != file["sha256"]:
             verdict.faults.append(f"{path}: does not match the SHA-256 in _SUCCESS")
 
 
 def _find_strays(store: Store, known: set[str], verdict: Verdict) -> None:
-    """Images that no commit names."""
+    """Find images that no commit names."""
     for folder in store.children(""):
         if folder.startswith(("_", ".")) or folder in (MANIFEST, ASSETS):
             continue

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from schemas.errors import InputError
 from schemas.job.cameras import Sensor as Pinhole
 from schemas.job.job import Job
+from schemas.job.keys import set_key
 from schemas.job.preset import PRESETS
 from services.job.read import describe_fault
 from services.study.model import Changes, Group, Knob, Setting, Value
@@ -237,14 +238,7 @@ def job_tree_with(changes: Changes, tree: Mapping[str, Any] | None = None) -> di
     """
     made: dict[str, Any] = _copied(tree or {})
     for path, value in changes.items():
-        *parents, last = path.split(".")
-        place = made
-        for key in parents:
-            below = place.setdefault(key, {})
-            if not isinstance(below, dict):
-                raise ValueError(f"{path}: '{key}' is {below!r} and has no keys")
-            place = below
-        place[last] = _copied(value)
+        set_key(made, path, _copied(value))
     return made
 
 

@@ -11,13 +11,14 @@ from unittest import mock
 import numpy as np
 
 import workers.pipeline.make_scene
+from schemas.job.identity import settings_digest
 from schemas.job.job import Category, Job
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ScenePlan
 from schemas.scene.shape import Part, Shape
 from services.job.read import validate_job
 from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.pipeline.context import WorkerContext, settings_digest
+from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene, Stopwatch, make_scene, plan_with_assets
 from workers.pipeline.rows import record_scene
 from workers.plan.effect import Facts

@@ -27,5 +27,5 @@ def test_the_heavy_modules_are_found_by_this_test_where_they_are_loaded():
 
 
 def test_the_command_line_explains_itself_without_loading_what_it_drives():
-    code = "from services.cli.main import build_parser\nbuild_parser().format_help()"
+    code = "import services.cli.main\nfrom services.cli.parser import build_parser\nbuild_parser().format_help()"
     assert loaded_after(code).isdisjoint({*HEAVY, "numpy", "pyarrow", "pydantic"})

@@ -1,25 +1,24 @@
-"""Patches derived again from what is stored: the full images, the rows and the job."""
+"""Check of stored patches: each is a crop of its image, and exists where the job and the labels call for it."""
 
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.dataset.codec import Row
 from schemas.dataset.layout import PixelKind, file_pose_id, image_path, patch_index, patch_path, stored_images
 from schemas.job.job import Job
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.view import View
 from workers.labels.derive import crop_box
 
-Row = Mapping[str, Any]
 ReadImage = Callable[[str], NDArray]
 
 
 def check_patches(view: View, labelled: View, job: Job, read: ReadImage, row: Row) -> list[str]:
-    """Patches are crops of the images, and are there exactly where the crop stays inside and the object is seen.
+    """Patches that are not the crop of their image, and files that are missing or too many, a sentence each.
 
-    `labelled` is the view whose labels say where objects are: the mirror's for a projected view, else the view itself.
+    `labelled` is the view that holds the labels: the mirror view for a projected one, else the view itself.
     """
     pixels: dict[PixelKind, NDArray | None] = {"rgb": view.rgb, "depth": view.depth, "region": view.region}
     listed = {file["path"] for file in row["files"]}
@@ -41,7 +40,7 @@ def check_patches(view: View, labelled: View, job: Job, read: ReadImage, row: Ro
 
 
 def _boxes(labelled: View, job: Job) -> Iterator[tuple[int | None, tuple[slice, slice]]]:
-    """The number in a patch's name, and its crop, for every object that has one."""
+    """(number in the patch's name, crop) of every object that has a patch."""
     labels = [label for label in labelled.labels if label.region_id >= REGION_FIRST_OBJECT]
     for label in labels:
         box = crop_box(label, labelled.camera, job.images.patch)

@@ -1,16 +1,12 @@
 """What a worker process holds while it makes scenes: the job, its assets, the renderer."""
 
-import hashlib
-import json
 from dataclasses import dataclass
 
+from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.allocator import keep_freed_memory
 from workers.render.raster.gbuffer import Renderer, shared_renderer
-
-OUTSIDE_SETTINGS = {"name", "scenes", "first_scene", "run", "output", "verso", "preset"}
-"""Keys of a job that do not change what a scene is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,19 +25,3 @@ def open_worker(job: Job, catalogue: Catalogue) -> WorkerContext:
     """This process made ready to make the job's scenes: its allocator, its renderer."""
     keep_freed_memory()
     return WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
-
-
-def settings_digest(job: Job, catalogue_digest: str) -> str:
-    """SHA-256, hex, of everything that decides what a scene is: settings and assets, not how many or how driven.
-
-    Where an asset folder lies is left out: the same files elsewhere are the same assets. So are effects that are off, as
-    they decide nothing.
-    """
-    settings = job.model_dump(mode="json", exclude=OUTSIDE_SETTINGS)
-    settings["sensor"] = {name: effect for name, effect in settings["sensor"].items() if effect is not None}
-    if not settings["sensor"]:
-        del settings["sensor"]
-    for source in (*settings["assets"]["objects"], *settings["assets"]["tables"]):
-        source.pop("folder", None)
-    text = json.dumps([settings, catalogue_digest], sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from schemas.dataset.fingerprint import Fingerprint
+from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.job.render import Tier
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.context import WorkerContext, settings_digest
+from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Stopwatch, make_scene
 from workers.pipeline.rows import record_scene
 from workers.render.raster.gbuffer import Renderer

@@ -1,17 +1,13 @@
-"""What is written of a scene: encoded files, and one row or more in each manifest table. Pure."""
+"""The output of a scene: encoded files, and its rows in each manifest table. Pure."""
 
 import hashlib
-from typing import Any
 
-from schemas.base import Pose
+from schemas.dataset.codec import Row, body_columns, camera_columns, columns_of_bodies, label_columns, matrix_column
 from schemas.dataset.layout import asset_path
-from schemas.dataset.tables import worst_rest
 from schemas.errors import SceneError
 from schemas.job.job import Job
-from schemas.scene.camera import Camera
-from schemas.scene.plan import ObjectStart
 from schemas.scene.region import REGION_FIRST_OBJECT
-from schemas.scene.scene import SceneOutput, Settled
+from schemas.scene.scene import SceneOutput
 from schemas.scene.shape import Asset
 from schemas.scene.view import Pair, View
 from workers.assets.catalogue import split_of
@@ -23,11 +19,12 @@ from workers.pipeline.make_scene import Scene, Stopwatch
 from workers.plan.effects import write_receipt
 from workers.store.images import encode_png
 
-Row = dict[str, Any]
+ASSET_COLUMNS = ("instance_id", "category", "source", "licence", "path", "sha256", "volume_m3", "watertight", "scale")
+"""Columns of `assets` that are fields of an asset."""
 
 
 def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> SceneOutput:
-    """Everything that a finished scene leaves behind, but its timings."""
+    """Files and rows of a finished scene, without its timings."""
     files: Files = []
     views: list[Row] = []
     with watch.stage("encode"):
@@ -53,54 +50,22 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
     return SceneOutput(scene.plan.scene_id, tuple(files), rows)
 
 
-def matrix(T: Pose) -> list[float]:
-    """16 doubles, row-major."""
-    return [float(x) for x in T.ravel()]
-
-
 def scene_row(context: WorkerContext, scene: Scene) -> Row:
-    """The row of `scenes`: its own columns are the first object's, and of the figures the worst of all objects."""
-    start, rest = scene.plan.objects[0], scene.settled[0]
+    """The row of `scenes`: names of the first object, and the worst figures of all objects."""
     ran, skipped = write_receipt(scene.effects, scene.called)
-    bodies = [body_row(start, rest) for start, rest in zip(scene.plan.objects, scene.settled, strict=True)]
+    bodies = [body_columns(start, rest) for start, rest in zip(scene.plan.objects, scene.settled, strict=True)]
     return {
         "scene_id": scene.plan.scene_id,
-        "category": scene.plan.category,
-        "instance_id": start.asset.instance_id,
-        "source": start.asset.source,
         "table_id": scene.plan.table.asset.instance_id,
-        "object_scale": start.asset.scale,
-        "T_world_obj": matrix(rest.T_world_obj),
-        "T_world_table": matrix(scene.plan.table.T_world_table),
+        "T_world_table": matrix_column(scene.plan.table.T_world_table),
         "pose": context.job.start.pose,
-        "redraws": start.redraws,
         "effects": ran,
         "skipped": skipped,
-        **worst_rest(bodies),
+        **columns_of_bodies(bodies),
         "settle_s": max(rest.settle_s for rest in scene.settled),
         "raycast_checked": scene.raycast_checked,
         "settings_digest": context.settings_digest,
         "bodies": bodies,
-    }
-
-
-def body_row(start: ObjectStart, rest: Settled) -> Row:
-    """One object of a scene, an item of `scenes.bodies`."""
-    return {
-        "region_id": start.region_id,
-        "category": start.asset.category,
-        "instance_id": start.asset.instance_id,
-        "source": start.asset.source,
-        "object_scale": start.asset.scale,
-        "T_world_obj": matrix(rest.T_world_obj),
-        "redraws": start.redraws,
-        "penetration_mm": rest.penetration_mm,
-        "hover_gap_mm": rest.hover_gap_mm,
-        "support_margin_mm": rest.support_margin_mm,
-        "residual_speed_mm_s": rest.residual_speed_mm_s,
-        "recheck_move_mm": rest.recheck_move_mm,
-        "recheck_turn_deg": rest.recheck_turn_deg,
-        "equilibrium_residual": rest.equilibrium_residual,
     }
 
 
@@ -116,6 +81,8 @@ def view_row(scene: Scene, pair: Pair, view: View, files: Files, job: Job) -> Ro
         "scene_id": scene.plan.scene_id,
         "category": scene.plan.category,
         **camera_columns(view.camera),
+        "inclination_rad": inclination(view.camera.T_world_cam),
+        "yaw_rad": yaw(view.camera.T_world_cam),
         "depth_units_per_m": job.images.depth_units_per_m,
         "d_z_m": pair.d_z_m,
         "files": [
@@ -132,40 +99,14 @@ def view_row(scene: Scene, pair: Pair, view: View, files: Files, job: Job) -> Ro
     }
 
 
-def camera_columns(camera: Camera) -> Row:
-    """The columns that describe a camera, in both pixel conventions."""
-    k = camera.intrinsics
-    return {
-        "T_world_cam": matrix(camera.T_world_cam),
-        "inclination_rad": inclination(camera.T_world_cam),
-        "yaw_rad": yaw(camera.T_world_cam),
-        "width": k.width,
-        "height": k.height,
-        "fx": k.fx,
-        "fy": k.fy,
-        "cx": k.cx,
-        "cy": k.cy,
-        "cx_opencv": k.cx_opencv,
-        "cy_opencv": k.cy_opencv,
-    }
-
-
 def object_rows(scene: Scene, view: View, job: Job) -> list[Row]:
     """The rows of `objects`, key (pose_id, role, region_id); the table has one too."""
     return [
         {
             "pose_id": view.pose_id,
             "role": view.role,
-            "region_id": label.region_id,
             "scene_id": scene.plan.scene_id,
-            "category": label.category,
-            "instance_id": label.instance_id,
-            "u": label.u,
-            "v": label.v,
-            "T_cam_obj": matrix(label.T_cam_obj),
-            "bbox_xywh": list(label.bbox_xywh),
-            "pixels": label.pixels,
-            "visible_fraction": label.visible_fraction,
+            **label_columns(label),
             "patch_object_fraction": None
             if label.region_id < REGION_FIRST_OBJECT
             else patch_object_fraction(view, label, job.images.patch),
@@ -177,24 +118,16 @@ def object_rows(scene: Scene, view: View, job: Job) -> list[Row]:
 def asset_row(asset: Asset, job: Job) -> Row:
     """The row of `assets`."""
     return {
-        "instance_id": asset.instance_id,
-        "category": asset.category,
-        "source": asset.source,
-        "licence": asset.licence,
-        "path": asset.path,
-        "sha256": asset.sha256,
+        **{name: getattr(asset, name) for name in ASSET_COLUMNS},
         "extents_m": [float(x) for x in asset.extents_m],
-        "volume_m3": asset.volume_m3,
-        "watertight": asset.watertight,
-        "T_source_to_object": matrix(asset.T_source_to_object),
-        "scale": asset.scale,
+        "T_source_to_object": matrix_column(asset.T_source_to_object),
         "split": split_of(asset.instance_id, job.assets.split),
         "notes": list(asset.notes),
     }
 
 
 def failed_scene(scene_id: int, category: str, error: SceneError, attempts: int = 1) -> SceneOutput:
-    """A scene that cannot be made: no files, one row in `failures`."""
+    """The output of a scene that cannot be made: no files, one row in `failures`."""
     row: Row = {
         "scene_id": scene_id,
         "category": category,
@@ -208,7 +141,7 @@ def failed_scene(scene_id: int, category: str, error: SceneError, attempts: int 
 
 
 def timing_row(scene_id: int, category: str, watch: Stopwatch) -> Row:
-    """The row of `timings`: the only one that is not a function of job and seed."""
+    """The row of `timings`, which alone is no function of job and seed."""
     stages, effects = (
         [{"name": name, "seconds": seconds} for name, seconds in one.items()] for one in (watch.seconds, watch.effects)
     )

@@ -6,7 +6,7 @@ its three tests (tests/effects/): a scene that needs it, one that does not, and 
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from operator import attrgetter
 
 import numpy as np
 
@@ -71,10 +71,7 @@ def _switch(key: str) -> Reason:
     """An effect that a key of the job switches on and off."""
 
     def why(facts: Facts) -> str | None:
-        branch: Any = facts.job
-        for name in key.split("."):
-            branch = getattr(branch, name)
-        return None if branch else f"{key} is false"
+        return None if attrgetter(key)(facts.job) else f"{key} is false"
 
     return why
 

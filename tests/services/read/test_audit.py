@@ -21,9 +21,8 @@ from services.cli.main import main
 from services.job.read import validate_job
 from services.job.record import encode_job, record_job
 from services.read import audit_motion
-from services.read.audit import Audit, audit, choose_evenly
+from services.read.audit import Audit, audit, describe_audit
 from services.read.audit_motion import Motion, compare_masks, move_between, shift_px
-from services.read.audit_words import describe_audit
 from tests.effects.scenes import SMALL, merged
 from tests.shapes import box, shape_of
 from tests.workers.render.random_scenes import APPEARANCE, floor
@@ -165,16 +164,6 @@ def test_the_command_exits_1_and_lists_what_is_off(made, capsys):
     assert any(line.startswith("audit of 2 scenes: 4 no-ops forced") for line in lines)
     with released(0.0):
         assert main(["verify", made.name, "--audit", "1"]) == 0
-
-
-def test_scenes_are_chosen_evenly_and_by_seed():
-    ids = list(range(100, 300))
-    chosen = choose_evenly(ids, 8, 5)
-    assert len(set(chosen)) == 8
-    assert set(np.diff(chosen)) == {25}
-    assert chosen == choose_evenly(ids[::-1], 8, 5) != choose_evenly(ids, 8, 6)
-    assert choose_evenly(ids, 500, 5) == ids
-    assert choose_evenly([], 3, 5) == []
 
 
 def test_a_turn_and_a_shift_are_measured_exactly_however_small():

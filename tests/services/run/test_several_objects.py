@@ -12,9 +12,9 @@ import pytest
 import trimesh
 
 import services.read.verify
+from schemas.dataset.codec import Row
 from services.job.read import validate_job
 from services.read.contact_sheet import draw_sheet
-from services.read.dataset_reader import Row
 from services.read.query import query
 from services.read.replay import replay_scene
 from services.read.scene_export import export_scene

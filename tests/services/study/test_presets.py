@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
+from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.job.preset import PRESETS
 from services.study.knobs import apply
 from services.study.model import Figure, Row, Setting
 from services.study.preset_front import SLACK, better_than, preset_row, rivals
 from services.study.report.tables import read_study
-from workers.pipeline.context import settings_digest
 
 EVIDENCE = Path(__file__).resolve().parents[3] / "docs" / "tradeoff"
 

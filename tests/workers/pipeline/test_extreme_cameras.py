@@ -12,11 +12,12 @@ from schemas.dataset.commit import CommitTerms, Span
 from schemas.dataset.layout import FINGERPRINT_FILE, IMAGES, commit_path
 from schemas.dataset.shard import ShardOrder
 from schemas.errors import JobError, MachineError
+from schemas.job.identity import settings_digest
 from schemas.scene.region import REGION_FIRST_OBJECT
 from services.job.read import validate_job
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.frames import invert, transform
-from workers.pipeline.context import WorkerContext, settings_digest
+from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Stopwatch, make_scene
 from workers.pipeline.run_shard import run_shard
 from workers.render.raster.gbuffer import shared_renderer

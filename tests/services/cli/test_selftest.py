@@ -35,7 +35,7 @@ def test_fails_before_it_measures(record_figure):
 def project(tmp_path, monkeypatch):
     """A small project with this project's conftest, which `selftest` takes for its own."""
     (tmp_path / "tests").mkdir()
-    shutil.copy(Path(__file__).with_name("conftest.py"), tmp_path / "tests")
+    shutil.copy(selftest.ROOT / "tests" / "conftest.py", tmp_path / "tests")
     (tmp_path / "pyproject.toml").write_text('[tool.pytest.ini_options]\nmarkers = ["slow: slow"]\naddopts = "-ra"\n')
     (tmp_path / "schemas").symlink_to(selftest.ROOT / "schemas")
     (tmp_path / "services").symlink_to(selftest.ROOT / "services")

@@ -1,0 +1,95 @@
+"""Columns of the manifest tables from the models of a scene, and the models back from a row."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from schemas.base import Pose, frozen_array
+from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.plan import ObjectStart
+from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
+from schemas.scene.scene import Settled
+from schemas.scene.view import ObjectLabel
+
+Row = dict[str, Any]
+
+LARGEST = ("penetration_mm", "hover_gap_mm", "residual_speed_mm_s", "equilibrium_residual")
+"""Columns of `scenes` that are the largest of its bodies'."""
+LARGEST_KNOWN = ("recheck_move_mm", "recheck_turn_deg")
+"""The same, where a body that was not released again has none."""
+SMALLEST = ("support_margin_mm",)
+FIRST = ("category", "instance_id", "source", "object_scale", "T_world_obj", "redraws")
+"""Columns of `scenes` that are those of its first body."""
+
+_LABEL = ("region_id", "category", "instance_id", "u", "v", "pixels", "visible_fraction")
+
+
+def matrix_column(T: Pose) -> list[float]:
+    """16 doubles, row-major."""
+    return [float(x) for x in T.ravel()]
+
+
+def read_matrix(values: Sequence[float]) -> Pose:
+    """[4, 4] float64, read-only."""
+    return frozen_array(np.reshape(values, (4, 4)))
+
+
+def camera_columns(camera: Camera) -> Row:
+    """The pose and the intrinsics of a camera, the principal point in both pixel conventions."""
+    k = camera.intrinsics
+    both = {**k.model_dump(), "cx_opencv": k.cx_opencv, "cy_opencv": k.cy_opencv}
+    return {"T_world_cam": matrix_column(camera.T_world_cam), **both}
+
+
+def read_camera(row: Mapping[str, Any]) -> Camera:
+    """The camera of a row of `views`."""
+    return Camera(Intrinsics(**{name: row[name] for name in Intrinsics.model_fields}), read_matrix(row["T_world_cam"]))
+
+
+def label_columns(label: ObjectLabel) -> Row:
+    """The columns of `objects` that a label holds."""
+    plain = {name: getattr(label, name) for name in _LABEL}
+    return {**plain, "T_cam_obj": matrix_column(label.T_cam_obj), "bbox_xywh": list(label.bbox_xywh)}
+
+
+def read_label(row: Mapping[str, Any]) -> ObjectLabel:
+    """The label of a row of `objects`."""
+    plain = {name: row[name] for name in _LABEL}
+    return ObjectLabel(**plain, T_cam_obj=read_matrix(row["T_cam_obj"]), bbox_xywh=tuple(row["bbox_xywh"]))
+
+
+def body_columns(start: ObjectStart, rest: Settled) -> Row:
+    """One object of a scene: an item of `scenes.bodies`."""
+    return {
+        "region_id": start.region_id,
+        "category": start.asset.category,
+        "instance_id": start.asset.instance_id,
+        "source": start.asset.source,
+        "object_scale": start.asset.scale,
+        "T_world_obj": matrix_column(rest.T_world_obj),
+        "redraws": start.redraws,
+        **{name: getattr(rest, name) for name in (*LARGEST, *LARGEST_KNOWN, *SMALLEST)},
+    }
+
+
+def columns_of_bodies(bodies: Sequence[Mapping[str, Any]]) -> Row:
+    """The columns of `scenes` that follow from its bodies: those of the first, and of the figures the worst of all."""
+    return {
+        **{name: bodies[0][name] for name in FIRST},
+        **{name: max(body[name] for body in bodies) for name in LARGEST},
+        **{
+            name: max((body[name] for body in bodies if body[name] is not None), default=None) for name in LARGEST_KNOWN
+        },
+        **{name: min(body[name] for body in bodies) for name in SMALLEST},
+    }
+
+
+def read_world_poses(scene: Mapping[str, Any]) -> dict[int, Pose]:
+    """[4, 4] pose of the table and of every object in the world, by region id in order.
+
+    A scene that was stored before there were bodies has one object.
+    """
+    bodies = scene["bodies"] or [{"region_id": REGION_FIRST_OBJECT, "T_world_obj": scene["T_world_obj"]}]
+    objects = {body["region_id"]: read_matrix(body["T_world_obj"]) for body in bodies}
+    return {REGION_TABLE: read_matrix(scene["T_world_table"]), **objects}

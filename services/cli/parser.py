@@ -1,0 +1,200 @@
+"""The commands and their options, as one table. Handlers are named and not imported, so that `--help` loads nothing heavy."""
+
+import argparse
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Every command and option; `options.handler` names the function of a command as `module:function`."""
+    parser = argparse.ArgumentParser(
+        prog="verso",
+        description="View-dependent RGB-D datasets for reconstructing objects from a single view.",
+        epilog="`verso COMMAND --help` explains a command and gives an example.",
+    )
+    parser.add_argument("--version", action="version", version=_version())
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for name, entry in COMMANDS.items():
+        command = commands.add_parser(
+            name,
+            help=entry.what,
+            description=entry.what[0].upper() + entry.what[1:] + ".",
+            epilog=f"example: verso {name} {entry.example}".rstrip(),
+        )
+        for names, settings in (JSON, *entry.options):
+            command.add_argument(*names, **settings)
+        command.set_defaults(handler=entry.handler or f"services.cli.commands:{name}")
+    return parser
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return f"verso {version('verso-data')}"
+    except PackageNotFoundError:
+        return "verso (a checkout that is not installed)"
+
+
+def read_index(text: str) -> int:
+    """A whole number from 0 up. Raises argparse.ArgumentTypeError."""
+    if not text.isdigit():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 up")
+    return int(text)
+
+
+def read_count(text: str) -> int:
+    """A whole number from 1 up. Raises argparse.ArgumentTypeError."""
+    if not read_index(text):
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number from 1 up")
+    return int(text)
+
+
+Option = tuple[tuple[str, ...], dict[str, Any]]
+
+
+def option(*names: str, **settings: Any) -> Option:
+    """An argument of `add_argument`."""
+    return names, settings
+
+
+def number(name: str, text: str, default: int | None = None) -> Option:
+    """An option that takes a whole number from 1 up."""
+    return option(name, type=read_count, metavar="N", default=default, help=text)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command: what it does, arguments of an example, options, and its handler `module:function` (default: commands.py)."""
+
+    what: str
+    example: str
+    options: tuple[Option, ...] = ()
+    handler: str = ""
+
+
+JSON = option("--json", action="store_true", help="print one JSON object as the last line of standard output")
+JOB = option("job", type=Path, metavar="JOB.yaml")
+OUT = option("out", metavar="OUT")
+SCENE = option("scene", type=read_index, metavar="SCENE")
+SET = option("--set", action="append", default=[], metavar="KEY=VALUE", dest="changes", help="change a key of the job")
+
+COMMANDS: dict[str, Command] = {
+    "run": Command(
+        "make a dataset, or go on where it stopped",
+        "deploy/jobs/tabletop.yaml --scenes 128 --set start.pose=tumbled",
+        (
+            JOB,
+            option("--out", metavar="DIR", help="output folder (default: data/<job name>)"),
+            number("--scenes", "how many scenes; more than before extends the dataset"),
+            option("--first-scene", type=read_index, metavar="N", help="id of the first scene"),
+            number("--workers", "default: the cores this container may use, or the cluster's"),
+            number("--shard-size", "scenes in a Ray task, rounded up to whole ranges"),
+            option(
+                "--address", metavar="HOST:PORT", help="a Ray cluster that runs already (default: a private Ray here)"
+            ),
+            SET,
+            option("--dry-run", action="store_true", help="check everything and say what would be done"),
+            option(
+                "--retry-failed", action="store_true", help="try scenes again that failed for environmental reasons"
+            ),
+        ),
+    ),
+    "status": Command("scenes done, failed and missing; rate; what is running", "data/tabletop", (OUT,)),
+    "verify": Command(
+        "read every file back and derive the labels again",
+        "data/tabletop --independent 16",
+        (
+            OUT,
+            number(
+                "--audit",
+                "also make N scenes again with the effects that were left out, to prove that they did not matter",
+            ),
+            number(
+                "--independent",
+                "also derive the labels of N scenes from the article's definitions, by code that shares nothing with what "
+                "made them",
+            ),
+        ),
+    ),
+    "query": Command(
+        "SQL over the manifests, also while the job runs",
+        'data/tabletop "select category, count(*) from scenes group by category"',
+        (
+            OUT,
+            option("sql", metavar="SQL"),
+            option("--format", choices=("table", "csv", "parquet", "json"), default="table"),
+        ),
+    ),
+    "replay": Command(
+        "make one scene again and compare it with what is stored",
+        "data/tabletop 17",
+        (OUT, SCENE),
+    ),
+    "scene": Command(
+        "write the posed geometry of one scene",
+        "data/tabletop 17 --glb scene17.glb",
+        (OUT, SCENE, option("--glb", type=Path, required=True, metavar="FILE")),
+    ),
+    "test": Command(
+        "lint, types, layer rules and tests",
+        "tests/hard_cases --figures f.json",
+        (option("anything", nargs="*"),),
+        "services.cli.selftest:main",
+    ),
+    "bench": Command(
+        "time by stage on one core, beside the script that people write today and the least that is possible",
+        "deploy/jobs/tabletop.yaml --scenes 64 --memory 2000 --workers 2",
+        (
+            option("job", type=Path, metavar="JOB.yaml", nargs="?", help="default: a job of built-in shapes"),
+            number("--scenes", "how many scenes each side makes", 48),
+            option(
+                "--folder",
+                type=Path,
+                metavar="DIR",
+                default=Path("data"),
+                help="on the disk to measure (default: data)",
+            ),
+            number("--memory", "also watch one worker's memory over N scenes"),
+            number("--workers", "also compare N workers with one, beside N plain processes"),
+            number("--scaling-scenes", "how many scenes that comparison makes", 512),
+            SET,
+            option(
+                "--pathtraced",
+                nargs="?",
+                const=sys.executable,
+                metavar="PYTHON",
+                help="time the path-traced tier instead, beside Blender's Cycles where PYTHON (default: this one) has bpy",
+            ),
+            number(
+                "--effects",
+                "time settling instead: N scenes by their plan of effects, and with every effect of physics forced",
+            ),
+        ),
+        "services.bench.command:main",
+    ),
+    "tradeoff": Command(
+        "what accuracy costs in time, measured on the job's own scenes",
+        "deploy/jobs/tabletop.yaml --out data/tradeoff --target penetration_mm=0.1,depth_mm=0.5",
+        (
+            JOB,
+            option("--out", type=Path, required=True, metavar="DIR", help="goes on there where it stopped"),
+            option(
+                "--target",
+                metavar="ERROR=MOST,...",
+                help="write DIR/job.yaml: the job with the cheapest setting that keeps these errors",
+            ),
+            option("--knobs", metavar="NAME,...", help="default: all that are known"),
+            number("--scenes", "scenes with images (default: 48)", 48),
+            number("--physics-scenes", "scenes that only come to rest (default: 500)", 500),
+            number("--laps", "rounds of timing (default: 3)", 3),
+            number("--workers", "default: the cores this container may use"),
+            SET,
+        ),
+        "services.study.command:main",
+    ),
+    "doctor": Command("what this machine has, and what is missing", "", (), "services.cli.doctor:main"),
+}
+"""In the order of `verso --help`. `verso test` is parsed by its own handler: it is here for the list."""

@@ -1,0 +1,86 @@
+"""A copy of the launcher with an interpreter and package tools that only log what they are asked to do."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+LOCKS = ("requirements.lock", "requirements-pathtraced.lock", "requirements-dev.lock")
+
+# Answers the launcher's probe, makes a `.venv` that links back to itself, and logs every call of pip.
+# Files named after what should go wrong, in the folder $FAULTS, make it go wrong.
+FAKE_PYTHON = r"""#!/bin/bash
+log() { echo "$*" >>"$FAULTS/log"; }
+case "$*" in
+  "-V") echo "Python 3.12.9" ;;
+  "-I -") cat >/dev/null; [ -e "$FAULTS/wrong-version" ] && exit 1; readlink -f "$0" ;;
+  "-I -c import ensurepip, venv") [ ! -e "$FAULTS/no-ensurepip" ] ;;
+  "-I -m venv "*) log "venv"; mkdir -p "${!#}/bin"; ln -s "$(readlink -f "$0")" "${!#}/bin/python"; echo "chatter" ;;
+  "-I -m pip --version") ;;
+  "-I -m pip "*) log "$@"; echo "chatter"
+     [ -e "$FAULTS/pip-fails" ] && exit 1
+     [ -e "$FAULTS/pip-hangs" ] && { touch "$FAULTS/hanging"; sleep 60; }
+     [ -e "$FAULTS/pip-is-slow" ] && sleep 0.5; true ;;
+  "-P -m services.cli.main"*) printf '%s|' "${@:4}" "path=${PYTHONPATH-}" "in=$PWD"
+     [ ! -e "$FAULTS/exit" ] || exit "$(cat "$FAULTS/exit")" ;;
+  *) echo "unexpected: $*" >&2; exit 99 ;;
+esac
+"""
+
+FAKES = {
+    "python3.11": FAKE_PYTHON,
+    "python3": FAKE_PYTHON,
+    "dpkg-query": '#!/bin/bash\n[ -e "$FAULTS/no-$4" ] || echo "install ok installed"\n',
+    "apt-get": '#!/bin/bash\necho "apt-get ${@: -3}" >>"$FAULTS/log"; [ ! -e "$FAULTS/apt-fails" ]\n',
+    "id": '#!/bin/bash\n[ -e "$FAULTS/not-root" ] && echo 1000 || echo 0\n',
+    "sudo": "#!/bin/bash\nexit 1\n",
+}
+
+
+class Checkout:
+    """A copy of the launcher and its files, and the fakes it will find on the path."""
+
+    def __init__(self, folder: Path) -> None:
+        self.root, self.faults, self.bin = folder / "check out", folder / "faults", folder / "bin"
+        for made in (self.root, self.faults, self.bin):
+            made.mkdir()
+        shutil.copy(ROOT / "verso", self.root)
+        for name in (*LOCKS, "pyproject.toml"):
+            (self.root / name).write_text(f"contents of {name}\n")
+        for name, script in FAKES.items():
+            (self.bin / name).write_text(script)
+            (self.bin / name).chmod(0o755)
+        self.venv = self.root / ".venv"
+
+    def start(self, *args: str, launcher: Path | None = None, cwd: Path | None = None) -> subprocess.Popen[str]:
+        environ = {"PATH": f"{self.bin}:/usr/bin:/bin", "FAULTS": str(self.faults), "PYTHONPATH": "/opt/ros"}
+        command = [str(launcher or self.root / "verso"), *args]
+        pipe = subprocess.PIPE
+        return subprocess.Popen(
+            command, env=environ, cwd=cwd or self.faults, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+        )
+
+    def run(self, *args: str, launcher: Path | None = None, cwd: Path | None = None) -> tuple[int, str, str]:
+        process = self.start(*args, launcher=launcher, cwd=cwd)
+        out, err = process.communicate(timeout=60)
+        return process.returncode, out, err
+
+    def fault(self, name: str) -> Path:
+        file = self.faults / name
+        file.touch()
+        return file
+
+    def calls(self) -> list[str]:
+        """What was asked of pip, venv and apt-get since the last time."""
+        log = self.faults / "log"
+        lines = log.read_text().splitlines() if log.exists() else []
+        log.unlink(missing_ok=True)
+        return [line.replace("-I -m pip install --quiet --no-deps ", "pip ") for line in lines]
+
+
+def locked(name: str, root: Path, *options: str) -> str:
+    return " ".join(["pip --only-binary :all: --require-hashes", *options, f"-r {root}/{name}"])
+
+
+def project(root: Path) -> str:
+    return f"pip --no-index --no-build-isolation --config-settings editable_mode=compat --editable {root}"
