@@ -22,7 +22,7 @@ SCENES = 320
 
 MERGE = """
 import json, resource, sys, time
-from services import external_sort, merge_tables
+from services.merge import external_sort, tables as merge_tables
 from services.merge.step import merge
 from workers.store.local import LocalStore
 merge_tables.ROWS_PER_GROUP, merge_tables.ROWS_PER_BLOCK, external_sort.LIMIT_BYTES = json.loads(sys.argv[5])

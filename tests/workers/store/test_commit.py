@@ -5,12 +5,12 @@ import pytest
 from schemas.dataset.layout import STAGING, commit_path
 from schemas.errors import CommitConflict, CorruptError, OutputError
 from tests.made_up_scenes import attempt_at, made_scene, terms
+from tests.stored_images import iter_records
 from workers.store.commit import (
     check_published,
     commit_names,
     decode_record,
     encode_record,
-    iter_records,
     publish,
     read_committed,
     read_record,

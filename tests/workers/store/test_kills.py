@@ -13,7 +13,8 @@ from services.merge.step import merge
 from services.run.range_planner import committed_ranges, list_commits, plan_ranges
 from tests.disk_faults import Killed, disk, lose_power
 from tests.made_up_scenes import attempt_at, small_scene, terms
-from workers.store.commit import check_published, iter_records, publish
+from tests.stored_images import iter_records
+from workers.store.commit import check_published, publish
 from workers.store.local import LocalStore
 from workers.store.sweep import sweep
 

@@ -5,12 +5,12 @@ import threading
 
 import pytest
 
+from schemas.dataset.layout import TEMPORARY
 from schemas.errors import MachineError, OutputError
 from workers.store import durable, probe
 from workers.store.local import LocalStore
 from workers.store.mounts import file_system_of
 from workers.store.opening import open_store
-from workers.store.store import TEMPORARY
 from workers.store.sweep import sweep
 
 
@@ -188,7 +188,7 @@ def test_names_in_many_folders_are_flushed_by_one_syncfs(tmp_path, monkeypatch):
 def test_without_syncfs_every_folder_up_to_the_output_folder_is_flushed(tmp_path, monkeypatch):
     store, flushed = LocalStore(tmp_path), []
     monkeypatch.setattr(durable, "_trusts_syncfs", lambda folder: False)
-    monkeypatch.setattr(durable, "sync_folder", lambda path: flushed.append(path))
+    monkeypatch.setattr(durable, "sync_path", lambda path: flushed.append(path))
     store.sync_folders_of(many_names())
     below = {tmp_path / f"c{number}" for number in range(4)}
     assert set(flushed) == {tmp_path, *below, *(folder / "patches" for folder in below)}
@@ -196,10 +196,8 @@ def test_without_syncfs_every_folder_up_to_the_output_folder_is_flushed(tmp_path
 
 
 def test_an_old_kernel_or_an_unknown_file_system_is_not_trusted_with_syncfs(tmp_path, monkeypatch):
-    monkeypatch.setattr(durable, "_known_devices", {})
     monkeypatch.setattr(durable, "file_system_of", lambda folder: "fuse.something")
     assert not durable._trusts_syncfs(tmp_path)
-    monkeypatch.setattr(durable, "_known_devices", {})
     monkeypatch.setattr(durable, "file_system_of", lambda folder: "ext4")
     monkeypatch.setattr(durable, "_kernel", lambda: (4, 18))
     assert not durable._trusts_syncfs(tmp_path)

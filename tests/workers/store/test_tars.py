@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.dataset.layout import IMAGES, image_path, patch_path
+from schemas.dataset.layout import IMAGES, image_path, patch_path, tar_path
 from schemas.errors import CorruptError
 from tests.made_up_scenes import attempt_at, made_scene, scene, terms
+from tests.stored_images import read_images
 from workers.store.local import LocalStore
-from workers.store.packing import read_images
-from workers.store.tars import member_of, path_of, read_tar, tar_path
+from workers.store.tars import member_of, path_of, read_tar
 
 pytestmark = pytest.mark.usefixtures("unflushed")
 
