@@ -1,5 +1,6 @@
 """What a commit is: the record that a range is done, and the terms that every commit of a dataset shares."""
 
+import hashlib
 from dataclasses import dataclass
 from typing import Literal
 
@@ -47,6 +48,11 @@ class FileEntry(Frozen):
     path: str
     bytes: NonNegativeInt
     sha256: str
+
+
+def describe_file(path: str, data: bytes) -> FileEntry:
+    """The entry of a file with these bytes."""
+    return FileEntry(path=path, bytes=len(data), sha256=hashlib.sha256(data).hexdigest())
 
 
 class TableEntry(Frozen):

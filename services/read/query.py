@@ -15,9 +15,9 @@ from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import COMMITS, MANIFEST, STAGING, range_name, range_table_path
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError, InputError, OutputError
-from services.merge.committed_rows import range_rows
 from services.merge.step import read_success
 from workers.store.commit import commit_names, read_record
+from workers.store.committed_rows import range_rows
 from workers.store.store import Store
 
 _LOCKED = {

@@ -1,29 +1,25 @@
-"""What is committed, and which scenes are still to be made, as ranges that can never overlap."""
+"""Planning of the ranges that are still to be made, such that ranges never overlap."""
 
 from collections.abc import Iterable, Sequence
 
 from schemas.dataset.commit import CommitSummary, Span
 from schemas.errors import OutputError
-from services.merge.committed_rows import check_retries
-from workers.store.commit import commit_names, read_summary
-from workers.store.store import Store
 
 
 def plan_ranges(
     first_scene: int, stop_scene: int, range_size: int, committed: Iterable[tuple[int, int]]
 ) -> list[tuple[int, int]]:
-    """The ranges [start, stop) that are missing, in order. `committed` may be out of date: planners never conflict.
+    """The missing ranges [start, stop), in order. `committed` may be out of date: planners never conflict.
 
     Grid lines lie at first_scene + k * range_size. No range crosses one. Within a cell, the only starts that are ever
-    planned are the cell's own line and the stop of a committed range; a range ends at the next line, or at stop_scene
-    where that comes first.
+    planned are the cell's own line and the stop of a committed range. A range ends at the next line or at stop_scene,
+    whichever comes first.
 
-    Why ranges cannot overlap, whatever planners with old views and other values of stop_scene do: a record is put only
-    if absent, so one start has one range for ever. Take the committed ranges of a cell. The first can only begin at the
-    line (no stop existed before it), and each later one begins where one of them stops. One start has one range, so
-    they form a single chain, each beginning where the one before ends. A chain has no overlap, and no range leaves its
-    cell, so cells do not overlap either. An old view lacks the end of a chain: it plans a start that is taken, and
-    loses the put.
+    Ranges cannot overlap, even if planners have old views and other values of stop_scene: a record is put only if
+    absent, so one start has one range for ever. In a cell, the first committed range can only begin at the line (no stop
+    existed before it), and each later one begins where one of them stops. So they form a single chain without overlap,
+    and no range leaves its cell. An old view lacks the end of a chain: it plans a start that is taken, and loses the
+    put.
 
     Raises OutputError where scenes outside [first_scene, stop_scene) are committed: fewer scenes than committed is
     refused; and where committed ranges do not lie on this grid.
@@ -50,17 +46,6 @@ def plan_retries(summaries: Sequence[CommitSummary]) -> list[Span]:
         if scenes:
             spans.append(Span(start=group[0].start, stop=group[0].stop, retry=group[-1].retry + 1, scenes=scenes))
     return spans
-
-
-def list_commits(store: Store) -> list[CommitSummary]:
-    """Every committed range in order, each followed by its retries.
-
-    Raises CorruptError for a damaged or missing record, OutputError for one of a newer version.
-    """
-    summaries = [read_summary(store, start, retry) for start, retry, _ in commit_names(store)]
-    for group in ranges_with_retries(summaries):
-        check_retries(group[0].start, [one.retry for one in group])
-    return summaries
 
 
 def committed_ranges(summaries: Iterable[CommitSummary]) -> list[tuple[int, int]]:

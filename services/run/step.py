@@ -19,11 +19,11 @@ from services.run.coordinator import Limits, Tally, run_spans
 from services.run.cores import usable_cores
 from services.run.lock import hold_lock
 from services.run.progress import ProgressLine, event_log, log_event
-from services.run.range_planner import committed_ranges, list_commits, plan_ranges, plan_retries
+from services.run.range_planner import committed_ranges, plan_ranges, plan_retries
 from services.run.ray_cluster import Slots, cluster_ray, private_ray
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.render.step import require_tier
-from workers.store.local import LocalStore
+from workers.store.committed_rows import list_commits
 from workers.store.opening import open_store
 from workers.store.store import Store
 from workers.store.sweep import sweep
@@ -101,7 +101,7 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
 
 
 def _logging(store: Store) -> contextlib.AbstractContextManager[None]:
-    return event_log(store.root) if isinstance(store, LocalStore) else contextlib.nullcontext()
+    return event_log(store.root) if store.root is not None else contextlib.nullcontext()
 
 
 def _missing_spans(store: Store, job: Job, retry_failed: bool) -> list[Span]:

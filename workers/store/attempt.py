@@ -1,7 +1,6 @@
 """One attempt at a range: files go to staging at once, rows stay in memory until the commit."""
 
 import contextlib
-import hashlib
 import json
 import os
 import re
@@ -11,7 +10,16 @@ from collections.abc import Iterator, Mapping
 
 import pyarrow as pa
 
-from schemas.dataset.commit import CommitRecord, CommitResult, CommitTerms, FileEntry, SceneMark, Span, TableEntry
+from schemas.dataset.commit import (
+    CommitRecord,
+    CommitResult,
+    CommitTerms,
+    FileEntry,
+    SceneMark,
+    Span,
+    TableEntry,
+    describe_file,
+)
 from schemas.dataset.layout import FENCED, commit_path, range_table_path, staging_path
 from schemas.dataset.tables import SCHEMA_VERSION, SCHEMAS, TABLES
 from schemas.errors import OutputError, RunError
@@ -100,7 +108,7 @@ class Attempt:
         if unknown := output.rows.keys() - tables.keys():
             raise ValueError(f"scene {output.scene_id} has rows for unknown tables: {', '.join(sorted(unknown))}")
         outcome = outcome_of(output)
-        entries = {path: FileEntry(path=path, bytes=len(data), sha256=_sha256(data)) for path, data in output.files}
+        entries = {path: describe_file(path, data) for path, data in output.files}
         check_files(output, entries)
         for path in self._files.keys() & entries.keys():
             if self._files[path] != entries[path]:
@@ -145,7 +153,7 @@ class Attempt:
             path = range_table_path(self.span.start, table, self.span.retry)
             with self._skip_if_swept():
                 self._store.write_staged(self._staging, path, data)
-            files[path] = FileEntry(path=path, bytes=len(data), sha256=_sha256(data))
+            files[path] = describe_file(path, data)
             tables[table] = TableEntry(rows=rows.num_rows, digest=rows_digest(table, rows))
         with self._skip_if_swept():
             files |= {entry.path: entry for entry in self._packing.finish(self._files)}
@@ -191,7 +199,3 @@ class Attempt:
             yield
         except FileNotFoundError:
             self.fenced = True
-
-
-def _sha256(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()

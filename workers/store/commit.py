@@ -56,6 +56,13 @@ def commit_names(store: Store) -> list[tuple[int, int, str]]:
     return sorted(found)
 
 
+def commits_digest(store: Store) -> str:
+    """A digest that tells one set of commits from another: a record never changes, so keys and sizes are enough."""
+    return hashlib.sha256(
+        "".join(f"{key} {store.size(key)}\n" for _, _, key in commit_names(store)).encode()
+    ).hexdigest()
+
+
 def read_record(store: Store, start: int, retry: int = 0) -> CommitRecord | None:
     """The record of a range, or None where it is not committed. Raises as `decode_record`."""
     key = commit_path(start, retry)

@@ -231,7 +231,8 @@ def test_scenes_whose_pose_ids_collide_are_refused(tmp_path):
 def test_a_dataset_extended_twice_has_the_digest_of_one_made_at_once(merged, tmp_path):
     store = LocalStore(tmp_path)
     store.prepare()
-    from services.run.range_planner import committed_ranges, list_commits, plan_ranges
+    from services.run.range_planner import committed_ranges, plan_ranges
+    from workers.store.committed_rows import list_commits
 
     for stop in (9, 10, STOP):
         for start, end in plan_ranges(FIRST, stop, 4, committed_ranges(list_commits(store))):

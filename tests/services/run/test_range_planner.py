@@ -4,8 +4,9 @@ from hypothesis import strategies as st
 
 from schemas.dataset.commit import CommitSummary
 from schemas.errors import CorruptError, OutputError
-from services.run.range_planner import committed_ranges, effective_failures, list_commits, plan_ranges, plan_retries
+from services.run.range_planner import committed_ranges, effective_failures, plan_ranges, plan_retries
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene
+from workers.store.committed_rows import list_commits
 from workers.store.local import LocalStore
 
 pytestmark = pytest.mark.usefixtures("unflushed")

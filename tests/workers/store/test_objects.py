@@ -12,13 +12,14 @@ from services.merge.step import merge, read_success
 from services.read.query import query
 from services.read.status import read_status
 from services.run.lock import Beat, hold_lock, read_holder
-from services.run.range_planner import committed_ranges, list_commits, plan_ranges
+from services.run.range_planner import committed_ranges, plan_ranges
 from tests.made_up_scenes import attempt_at, made_scene, scene, small_scene, terms
 from tests.s3_server import Bucket, s3_server
 from tests.stored_images import iter_records, read_images
 from workers.store import objects
 from workers.store.attempt import attempts_at, begin_attempt, blamed_scene
 from workers.store.commit import check_published, publish, read_record
+from workers.store.committed_rows import list_commits
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 from workers.store.opening import open_store
