@@ -56,7 +56,8 @@ def merge(store: Store, first_scene: int, stop_scene: int) -> MergeResult:
             for records in iter_ranges(store, first_scene, stop_scene):
                 for record in records:
                     check_published(store, record)
-                merging.add_range(records, {table: range_rows(store, records, table) for table in TABLES})
+                rows = {table: range_rows(store, records, table) for table in TABLES}
+                merging.add_range(records, rows)
             success, files = merging.finish()
         _install(store, files)
     if commits_digest(store) != commits:

@@ -1,4 +1,4 @@
-"""How many cores this process may use: a container's share of a machine, not the machine."""
+"""The number of cores that this process may use: a container's share of the machine."""
 
 import math
 import os

@@ -1,9 +1,21 @@
 """Planning of the ranges that are still to be made, such that ranges never overlap."""
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 
 from schemas.dataset.commit import CommitSummary, Span
 from schemas.errors import OutputError
+from schemas.job.job import Job
+
+MAX_SHARD = 64
+"""Scenes in a shard of a large job: seconds of work for each millisecond that Ray takes to hand it out."""
+
+
+def plan_spans(job: Job, commits: Sequence[CommitSummary], retry_failed: bool) -> list[Span]:
+    """The missing ranges, and with `retry_failed` the scenes to try again. Raises as `plan_ranges`."""
+    ranges = plan_ranges(job.first_scene, job.stop_scene, job.run.range_size, committed_ranges(commits))
+    spans = [Span(start=start, stop=stop) for start, stop in ranges]
+    return spans + plan_retries(commits) if retry_failed else spans
 
 
 def plan_ranges(
@@ -39,13 +51,30 @@ def plan_ranges(
 
 
 def plan_retries(summaries: Sequence[CommitSummary]) -> list[Span]:
-    """One span for each range that still has environmental failures, holding those scenes alone."""
+    """One span for each range that still has environmental failures, with those scenes alone."""
     spans = []
     for group in ranges_with_retries(summaries):
         scenes = tuple(scene for scene, kind in effective_failures(group) if kind == "environmental")
         if scenes:
             spans.append(Span(start=group[0].start, stop=group[0].stop, retry=group[-1].retry + 1, scenes=scenes))
     return spans
+
+
+def choose_shard_size(scenes: int, slots: int) -> int:
+    """Scenes in a shard: enough that Ray costs little, few enough that every slot has at least two shards."""
+    return min(MAX_SHARD, math.ceil(scenes / (2 * slots)))
+
+
+def group_shards(spans: Sequence[Span], shard_size: int) -> Iterator[tuple[Span, ...]]:
+    """Whole ranges in order, grouped until they hold at least `shard_size` scenes. Made one at a time, on demand."""
+    shard: list[Span] = []
+    for span in spans:
+        shard.append(span)
+        if sum(len(one.scene_ids) for one in shard) >= shard_size:
+            yield tuple(shard)
+            shard = []
+    if shard:
+        yield tuple(shard)
 
 
 def committed_ranges(summaries: Iterable[CommitSummary]) -> list[tuple[int, int]]:
