@@ -22,7 +22,6 @@ from workers.store.commit import check_published, publish, read_record
 from workers.store.committed_rows import list_commits
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
-from workers.store.opening import open_store
 from workers.store.sweep import sweep
 
 pytestmark = pytest.mark.usefixtures("unflushed")
@@ -242,19 +241,6 @@ def test_a_store_that_stops_answering_is_told_by_name(monkeypatch):
     monkeypatch.setattr(obstore, "put", fails)
     with pytest.raises(MachineError, match=r"^mug/a in memory://mine: no route to host$"):
         store.write_whole("mug/a", b"")
-
-
-@pytest.mark.parametrize("url", ["s3://", "ftp://host/x", "az://c/x"])
-def test_a_url_that_names_no_store_is_an_error_of_the_command_line(url):
-    with pytest.raises(OutputError, match="is not an object store that can be opened"):
-        open_store(url)
-
-
-def test_a_url_that_names_a_store_is_opened_with_its_prefix():
-    store = open_store("s3://bucket/a/dataset")
-    assert isinstance(store, ObjectStore)
-    assert store.name == "s3://bucket/a/dataset"
-    assert store._bucket.prefix == "a/dataset"
 
 
 def test_a_probe_that_is_swept_by_a_coordinator_at_work_is_made_again(monkeypatch):
