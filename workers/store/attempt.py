@@ -88,7 +88,7 @@ class Attempt:
         self._staging = staging_path(span.start, name)
         self._files: dict[str, FileEntry] = {}
         self._rows: dict[str, list[pa.Table]] = {table: [SCHEMAS[table].empty_table()] for table in TABLES}
-        self._scenes: dict[int, SceneMark] = {}
+        self._scenes: list[SceneMark] = []
         self._packing = Packing(store, self._staging, span, tar=terms.layout == "tar")
 
     def begin_scene(self, scene_id: int) -> None:
@@ -118,9 +118,8 @@ class Attempt:
         self._files |= entries
         for table, rows in tables.items():
             self._rows[table].append(rows)
-        self._scenes[output.scene_id] = SceneMark(
-            scene_id=output.scene_id, outcome=outcome, digest=scene_digest(output.rows)
-        )
+        digest = scene_digest(output.rows)
+        self._scenes.append(SceneMark(scene_id=output.scene_id, outcome=outcome, digest=digest))
 
     def commit(self) -> CommitResult:
         """Decides the range and, where this attempt wins, publishes it; a loser's folder is removed.
@@ -164,7 +163,7 @@ class Attempt:
             terms=self._terms,
             files=tuple(files[path] for path in sorted(files)),
             tables=tables,
-            scenes=tuple(self._scenes[scene_id] for scene_id in self.span.scene_ids),
+            scenes=tuple(self._scenes),
         )
 
     def _put(self, record: CommitRecord) -> bool:

@@ -3,7 +3,7 @@
 import ctypes
 import os
 from collections.abc import Iterable
-from functools import cache
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from workers.store.mounts import file_system_of
@@ -14,8 +14,8 @@ _SYNCFS_TYPES = frozenset({"ext2", "ext3", "ext4", "xfs", "btrfs", "f2fs", "zfs"
 _SYNCFS_REPORTS_ERRORS = (5, 8)
 """The first Linux whose syncfs(2) reports a failed write."""
 
-_WRITE_BACK = 2
-"""SYNC_FILE_RANGE_WRITE: begin writing, do not wait."""
+_AT_ONCE = 8
+"""Files that are flushed at once where each needs an fsync."""
 
 FEW_FOLDERS = 3
 """Up to this many folders are flushed one by one; for more, one syncfs is less work where it can be trusted."""
@@ -24,13 +24,18 @@ FEW_FOLDERS = 3
 def sync_tree(folder: Path) -> None:
     """Returns when every file and folder below `folder`, and its own name, are on the disk.
 
-    Uses one syncfs where it can be trusted (300 files of 60 kB on ext4: 12 ms, against 73 ms for an fsync each).
-    Otherwise begins write-back for all files before waiting for each (30 ms).
+    Uses one syncfs where it can be trusted, otherwise an fsync for each file, several at once. 300 files of 60 kB on ext4
+    take 12 ms by syncfs, 42 ms by fsync at once and 94 ms one by one.
     """
     if _trusts_syncfs(folder):
         _syncfs(folder)
     else:
-        _sync_each(folder)
+        parents, _, names = zip(*os.walk(folder, topdown=False), strict=True)
+        files = [Path(parent) / name for parent, inside in zip(parents, names, strict=True) for name in inside]
+        with ThreadPoolExecutor(_AT_ONCE) as pool:
+            list(pool.map(sync_path, files))
+        for parent in parents:
+            sync_path(Path(parent))
     sync_path(folder.parent)
 
 
@@ -52,25 +57,11 @@ def sync_path(path: Path) -> None:
         os.close(descriptor)
 
 
-def _sync_each(folder: Path) -> None:
-    files = [Path(parent) / name for parent, _, names in os.walk(folder) for name in names]
-    for path in files:
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            _libc().sync_file_range(descriptor, ctypes.c_int64(0), ctypes.c_int64(0), _WRITE_BACK)
-        finally:
-            os.close(descriptor)
-    for path in files:
-        sync_path(path)
-    for parent, _, _ in os.walk(folder, topdown=False):
-        sync_path(Path(parent))
-
-
 def _syncfs(folder: Path) -> None:
     """Writes back the whole file system of `folder`. Raises OSError where writing failed."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
-        if _libc().syncfs(descriptor) != 0:
+        if ctypes.CDLL(None, use_errno=True).syncfs(descriptor) != 0:
             number = ctypes.get_errno()
             raise OSError(number, os.strerror(number), str(folder))
     finally:
@@ -81,11 +72,5 @@ def _trusts_syncfs(folder: Path) -> bool:
     return _kernel() >= _SYNCFS_REPORTS_ERRORS and file_system_of(folder) in _SYNCFS_TYPES
 
 
-@cache
-def _libc() -> ctypes.CDLL:
-    return ctypes.CDLL(None, use_errno=True)
-
-
-@cache
 def _kernel() -> tuple[int, ...]:
     return tuple(int(part) for part in os.uname().release.split("-")[0].split(".")[:2])

@@ -5,7 +5,6 @@ other key appears whole, in one step: by `put_if_absent`, `write_whole`, `rename
 """
 
 import contextlib
-from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, NamedTuple, Protocol, TypeVar
@@ -50,11 +49,9 @@ class Store(Protocol):
     tar_only: bool
     """True where a file for each image would be too many."""
 
-    @abstractmethod
     def prepare(self) -> None:
         """Makes the output folder and proves `put_if_absent`. Raises OutputError naming the place and a remedy."""
 
-    @abstractmethod
     def open_staging(self, staging: str) -> None:
         """Makes the folder of an attempt, the only place that the attempt writes."""
 
@@ -63,7 +60,6 @@ class Store(Protocol):
         with self.stream_staged(staging, path) as file:
             file.write(data)
 
-    @abstractmethod
     def stream_staged(self, staging: str, path: str) -> contextlib.AbstractContextManager[IO[bytes]]:
         """A writable file at `staging/path`, stored when the context ends without an error. Raises as `write_staged`."""
 
@@ -71,7 +67,6 @@ class Store(Protocol):
         """Returns when everything under `staging` survives a loss of power. By default, writes are durable at once."""
         return
 
-    @abstractmethod
     def put_if_absent(self, key: str, data: bytes, staging: str | None = None) -> bool:
         """Stores `data` whole and durably at `key` unless something is there; False where something else is.
 
@@ -79,11 +74,9 @@ class Store(Protocol):
         store may miss a sweep at the same moment.
         """
 
-    @abstractmethod
     def write_whole(self, key: str, data: bytes, durable: bool = True) -> None:
         """Puts `data` at `key` in one step, replacing what was there."""
 
-    @abstractmethod
     def rename(self, source: str, target: str) -> None:
         """Moves a file, replacing the target in one step. Raises FileNotFoundError where the source is gone."""
 
@@ -91,38 +84,30 @@ class Store(Protocol):
         """Returns when the names `keys` survive a loss of power. By default, names are durable at once."""
         return
 
-    @abstractmethod
     def fence(self, staging: str) -> str | None:
         """Takes an attempt's folder out of the attempt's reach for good: `fenced_key`, None where there is no folder.
 
         On a disk, a fenced attempt can neither write nor commit.
         """
 
-    @abstractmethod
     def read(self, key: str) -> bytes:
         """The bytes at `key`. Raises FileNotFoundError."""
 
-    @abstractmethod
     def size(self, key: str) -> int | None:
         """Bytes of the file at `key`, None where there is none."""
 
-    @abstractmethod
     def modified(self, key: str) -> float | None:
         """When the file at `key` was written, seconds since 1970 by the place's clock; None where there is none."""
 
-    @abstractmethod
     def files(self, prefix: str) -> Iterator[Entry]:
         """Every file at any depth below the folder `prefix`, in the order of the keys' parts."""
 
-    @abstractmethod
     def children(self, prefix: str) -> list[str]:
         """Names of the folders directly below `prefix`, sorted."""
 
-    @abstractmethod
     def remove(self, key: str) -> None:
         """Removes a file, if there is one."""
 
-    @abstractmethod
     def remove_tree(self, prefix: str) -> None:
         """Removes a folder with its contents, if there is one."""
 
@@ -130,10 +115,8 @@ class Store(Protocol):
         """Removes a folder if it is empty. By default there are no folders."""
         return
 
-    @abstractmethod
     def scratch(self, name: str) -> contextlib.AbstractContextManager[Path]:
         """An empty folder on a local disk whose files `install` can move into place; removed afterwards."""
 
-    @abstractmethod
     def install(self, local: Path, key: str) -> None:
         """Moves a finished local file to `key` in one step, durably, replacing what was there."""
