@@ -109,8 +109,6 @@ class CommitSummary:
     start: int
     stop: int
     retry: int
-    attempt: str
-    fingerprint: str
     made: int
     failed: tuple[tuple[int, FailureKind], ...]
     """(scene id, kind), in order."""

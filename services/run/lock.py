@@ -27,6 +27,9 @@ class Beat:
     patience: int = 5
 
 
+DEFAULT_BEAT = Beat()
+
+
 @dataclass(frozen=True)
 class Holder:
     """The process that holds the lock.
@@ -44,13 +47,12 @@ class Holder:
 
 
 @contextlib.contextmanager
-def hold_lock(store: Store, beat: Beat | None = None) -> Iterator[None]:
+def hold_lock(store: Store, beat: Beat = DEFAULT_BEAT) -> Iterator[None]:
     """Holds the lock of an output folder while the context lasts.
 
     A dead holder on this machine is replaced at once, one elsewhere after `patience` periods without a heartbeat.
     Raises RunError naming a holder that lives.
     """
-    beat = beat or Beat()
     mine = Holder(uuid.uuid4().hex, socket.gethostname(), os.getpid(), _machine(), _born(os.getpid()) or "")
     while not store.put_if_absent(LOCK_FILE, _encode(mine)):
         gone = _find_gone(store, beat)

@@ -89,17 +89,13 @@ def cluster_ray(address: str, workers: int | None) -> Iterator[Slots]:
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise MachineError(f"--address {address}: {error}") from error
         try:
-            yield _cluster_slots(address, workers)
+            cores = int(ray.cluster_resources().get("CPU", 0))
+            if cores < 1:
+                raise MachineError(f"--address {address}: the cluster has no CPU to run on")
+            # Any free core would start a waiting shard, so none may wait where there are fewer workers than cores.
+            yield Slots(workers, workers) if workers and workers < cores else Slots(cores, PREFETCH * cores)
         finally:
             ray.shutdown()
-
-
-def _cluster_slots(address: str, workers: int | None) -> Slots:
-    cores = int(ray.cluster_resources().get("CPU", 0))
-    if cores < 1:
-        raise MachineError(f"--address {address}: the cluster has no CPU to run on")
-    # Any free core would start a waiting shard, so none may wait where there are fewer workers than cores.
-    return Slots(workers, workers) if workers and workers < cores else Slots(cores, PREFETCH * cores)
 
 
 def _stdout_to_stderr() -> contextlib.AbstractContextManager[object]:

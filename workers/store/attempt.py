@@ -169,13 +169,11 @@ class Attempt:
     def _put(self, record: CommitRecord) -> bool:
         """Puts the record if absent; True where it is now this attempt's."""
         key = commit_path(self.span.start, self.span.retry)
-        if self.fenced or self._store.size(key) is not None:
-            return False
-        won = False
         with self._skip_if_swept():
-            self._store.make_durable(self._staging)
-            won = self._store.put_if_absent(key, encode_record(record), self._staging)
-        return won
+            if not self.fenced and self._store.size(key) is None:
+                self._store.make_durable(self._staging)
+                return self._store.put_if_absent(key, encode_record(record), self._staging)
+        return False
 
     def _concede(self, mine: CommitRecord) -> CommitResult:
         winner = read_record(self._store, self.span.start, self.span.retry)

@@ -91,15 +91,11 @@ class LocalStore(Store):
         with self._explained("the output folder"):
             sync_folders(self.root, {str(above) for folder in folders for above in (folder, *folder.parents)})
 
-    def fence(self, staging: str) -> str | None:
+    def fence(self, staging: str) -> None:
         """Renames an attempt's folder: from then on the attempt cannot write, nor link a record."""
-        fenced = fenced_key(staging)
-        try:
-            os.rename(self.path(staging), self.path(fenced))
-        except FileNotFoundError:
-            return fenced if self.path(fenced).is_dir() else None
-        sync_path(self.path(fenced).parent)
-        return fenced
+        with contextlib.suppress(FileNotFoundError):
+            os.rename(self.path(staging), self.path(fenced_key(staging)))
+            sync_path(self.path(staging).parent)
 
     def read(self, key: str) -> bytes:
         """The bytes at `key`."""

@@ -17,7 +17,7 @@ from obstore.store import from_url
 
 from schemas.dataset.layout import PROBE_PREFIX, TEMPORARY
 from schemas.errors import MachineError, OutputError
-from workers.store.store import Entry, Store, fenced_key
+from workers.store.store import Entry, Store
 
 _PROBES = 3
 """Attempts at a probe: a coordinator that already works here may sweep it away between its two puts."""
@@ -115,12 +115,9 @@ class ObjectStore(Store):
             obstore.copy(self._bucket, source, target)
         self.remove(source)
 
-    def fence(self, staging: str) -> str | None:
+    def fence(self, staging: str) -> None:
         """Removes the mark without which an attempt does not commit. Its objects stay where they are."""
-        if self.size(f"{staging}/{_BEGUN}") is None:
-            return None
         self.remove(f"{staging}/{_BEGUN}")
-        return fenced_key(staging)
 
     def read(self, key: str) -> bytes:
         """The bytes at `key`."""

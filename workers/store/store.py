@@ -84,8 +84,8 @@ class Store(Protocol):
         """Returns when the names `keys` survive a loss of power. By default, names are durable at once."""
         return
 
-    def fence(self, staging: str) -> str | None:
-        """Takes an attempt's folder out of the attempt's reach for good: `fenced_key`, None where there is no folder.
+    def fence(self, staging: str) -> None:
+        """Takes an attempt's folder, if there is one, out of the attempt's reach for good (to `fenced_key` on a disk).
 
         On a disk, a fenced attempt can neither write nor commit.
         """

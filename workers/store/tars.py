@@ -9,29 +9,33 @@ import io
 import re
 import tarfile
 from collections.abc import Iterator
+from typing import cast
 
-from schemas.dataset.layout import IMAGES
+from schemas.dataset.layout import IMAGES, Content, image_path, patch_path
 from schemas.errors import CorruptError
 
 _PATH = re.compile(
     r"(?P<category>[^/]+)/(?P<patch>patches/)?(?P<content>[A-Za-z]+)(?P<pose>\d{5,})(?:obj(?P<object>\d+))?\.png"
 )
-_MEMBER = re.compile(r"(?P<pose>\d{5,})\.(?P<content>[A-Za-z]+)(?P<patch>\.patch)?(?:\.obj(?P<object>\d+))?\.png")
+_MEMBER = re.compile(
+    r"(?P<pose>\d{5}|[1-9]\d{5,})\.(?P<content>[A-Za-z]+)(?P<patch>\.patch)?(?:\.obj(?P<object>0|[1-9]\d*))?\.png"
+)
 _CONTENTS: list[str] = list(dict.fromkeys(image.content for image in IMAGES))
 
 
 def member_of(path: str) -> tuple[str, str]:
     """(category, member name) of an image. Raises ValueError where the path is not an image's."""
     found = _match(_PATH, path)
-    suffix = "" if found["object"] is None else f".obj{found['object']}"
-    return found["category"], f"{found['pose']}.{found['content']}{'.patch' if found['patch'] else ''}{suffix}.png"
+    index = "" if found["object"] is None else f".obj{found['object']}"
+    return found["category"], f"{found['pose']}.{found['content']}{'.patch' if found['patch'] else ''}{index}.png"
 
 
 def path_of(category: str, member: str) -> str:
     """The path of the image that a member holds. Raises ValueError where the name is not a member's."""
     found = _match(_MEMBER, member)
-    suffix = "" if found["object"] is None else f"obj{found['object']}"
-    return f"{category}/{'patches/' if found['patch'] else ''}{found['content']}{found['pose']}{suffix}.png"
+    index = None if found["object"] is None else int(found["object"])
+    name, pose_id = cast(Content, found["content"]), int(found["pose"])
+    return patch_path(category, name, pose_id, index) if found["patch"] else image_path(category, name, pose_id)
 
 
 def member_order(path: str) -> tuple[int, int, bool, int]:

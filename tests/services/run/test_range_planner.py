@@ -89,7 +89,7 @@ def test_planners_with_old_views_and_other_ends_never_overlap_and_cover_all_in_t
 
 
 def summary(start, retry=0, failed=(), scenes=()):
-    return CommitSummary(start, start + 4, retry, "a", "f", 4 - len(failed), tuple(failed), tuple(scenes))
+    return CommitSummary(start, start + 4, retry, 4 - len(failed), tuple(failed), tuple(scenes))
 
 
 def test_only_environmental_failures_that_still_stand_are_tried_again():

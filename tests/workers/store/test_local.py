@@ -59,7 +59,8 @@ def test_a_temporary_file_that_is_swept_away_is_written_again(store, monkeypatch
 def test_a_swept_attempt_can_neither_write_nor_put(store):
     store.open_staging("_staging/0/a")
     store.write_staged("_staging/0/a", "mug/x.png", b"x")
-    assert store.fence("_staging/0/a") == "_staging/0/a.fenced"
+    store.fence("_staging/0/nobody")
+    store.fence("_staging/0/a")
     for path in ("y.png", "mug/y.png", "deep/er/y.png"):
         with pytest.raises(FileNotFoundError):
             store.write_staged("_staging/0/a", path, b"y")
@@ -67,7 +68,6 @@ def test_a_swept_attempt_can_neither_write_nor_put(store):
         store.put_if_absent("manifest/_commits/a.json", b"record", "_staging/0/a")
     assert store.children("_staging/0") == ["a.fenced"]
     assert store.size("manifest/_commits/a.json") is None
-    assert store.fence("_staging/0/nobody") is None
 
 
 def test_files_are_listed_with_sizes_in_order_and_folders_one_level_deep(store):
