@@ -75,11 +75,10 @@ def describe_sources(catalogue: Catalogue) -> list[str]:
     for what, sources in (("objects", catalogue.assets.objects), ("tables", catalogue.assets.tables)):
         for source in sources:
             if isinstance(source, ProceduralSource):
-                lines.append(f"{what}, weight {source.weight:g}: made from seed {source.seed}, licence CC0-1.0")
+                origin = f"made from seed {source.seed}, licence CC0-1.0"
             else:
-                lines.append(
-                    f"{what}, weight {source.weight:g}: {source.source} folder {source.folder}, licence {source.licence}"
-                )
+                origin = f"{source.source} folder {source.folder}, licence {source.licence}"
+            lines.append(f"{what}, weight {source.weight:g}: {origin}")
     return lines + describe_left_out(catalogue)
 
 

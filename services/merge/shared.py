@@ -7,6 +7,7 @@ import contextlib
 import json
 import sqlite3
 from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 
 import pyarrow as pa
@@ -28,7 +29,10 @@ CREATE TABLE assets (instance_id TEXT, row TEXT, PRIMARY KEY (instance_id, row))
 CREATE TABLE files (path TEXT, sha256 TEXT, times INTEGER, PRIMARY KEY (path, sha256)) WITHOUT ROWID;
 BEGIN;
 """
-"""No journal and no flush: who merges again begins with a new file."""
+"""No journal and no flush: another merge begins with a new file."""
+
+_ADD_ASSET = "INSERT INTO assets VALUES (?, ?) ON CONFLICT DO NOTHING"
+_ADD_FILE = "INSERT INTO files VALUES (?, ?, 1) ON CONFLICT DO UPDATE SET times = times + 1"
 
 
 class SharedRows:
@@ -44,7 +48,7 @@ class SharedRows:
 
     def add_assets(self, rows: pa.Table) -> None:
         """Takes rows of `assets`."""
-        self._insert("assets VALUES (?, ?)", ((row["instance_id"], json.dumps(row)) for row in rows.to_pylist()))
+        self._insert(_ADD_ASSET, ((row["instance_id"], json.dumps(row)) for row in rows.to_pylist()))
 
     def add_images(self, views: pa.Table) -> None:
         """Takes the files that rows of `views` name."""
@@ -55,22 +59,19 @@ class SharedRows:
 
     def add_files(self, files: Iterable[tuple[str, str]]) -> None:
         """Takes (path, SHA-256) of files."""
-        self._insert("files VALUES (?, ?, 1)", files)
+        self._insert(_ADD_FILE, files)
 
     def assets(self, mixed: bool) -> Iterator[pa.Table]:
         """The rows of `assets`, each instance once, by instance id.
 
         Raises CommitConflict where two differ, unless stacks are `mixed`: then always the same one is taken.
         """
-        waiting: list[dict[str, object]] = []
-        for instance_id, row, count in self._select("instance_id, min(row), count(*) FROM assets"):
-            if count > 1 and not mixed:
-                raise CommitConflict(f"the asset {instance_id} is described differently by two ranges of one stack")
-            waiting.append(json.loads(row))
-            if len(waiting) == _ROWS_PER_BATCH:
-                yield pa.Table.from_pylist(waiting, schema=SCHEMAS["assets"])
-                waiting = []
-        yield pa.Table.from_pylist(waiting, schema=SCHEMAS["assets"])
+        selected = self._select("instance_id, min(row), count(*) FROM assets")
+        while batch := list(islice(selected, _ROWS_PER_BATCH)):
+            for instance_id, _, count in batch:
+                if count > 1 and not mixed:
+                    raise CommitConflict(f"the asset {instance_id} is described differently by two ranges of one stack")
+            yield pa.Table.from_pylist([json.loads(row) for _, row, _ in batch], schema=SCHEMAS["assets"])
 
     def files(self, mixed: bool) -> Iterator[tuple[str, str]]:
         """(path, SHA-256) of every file, sorted by the UTF-8 bytes of the path, shared shapes once.
@@ -89,10 +90,9 @@ class SharedRows:
         """Closes the file."""
         self._db.close()
 
-    def _insert(self, target: str, rows: Iterable[tuple[str, str]]) -> None:
-        again = "UPDATE SET times = times + 1" if target.startswith("files") else "NOTHING"
+    def _insert(self, statement: str, rows: Iterable[tuple[str, str]]) -> None:
         with _explained():
-            self._db.executemany(f"INSERT INTO {target} ON CONFLICT DO {again}", rows)
+            self._db.executemany(statement, rows)
 
     def _select(self, what: str) -> Iterator[tuple]:
         """Rows by the first column, which is read in the order of the primary key: nothing is sorted in memory."""

@@ -104,7 +104,7 @@ class _Merging:
             if table != "assets":
                 self._tables[table].add(rows[table])
         self._scenes.update(made=rows["scenes"].num_rows, **Counter(rows["failures"].column("kind").to_pylist()))
-        ids = rows["scenes"].column("scene_id").to_pylist() + rows["failures"].column("scene_id").to_pylist()
+        ids = [scene_id for table in ("scenes", "failures") for scene_id in rows[table].column("scene_id").to_pylist()]
         if sorted(ids) != list(records[0].span.scene_ids):
             raise CorruptError(f"the rows of the range from scene {records[0].span.start} do not hold each scene once")
 

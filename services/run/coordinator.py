@@ -78,9 +78,7 @@ class Work:
     catalogue: Catalogue
 
 
-@ray.remote(num_cpus=1, max_retries=0)
-def _run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
-    return run_shard(order, catalogue)
+_run_shard = ray.remote(num_cpus=1, max_retries=0)(run_shard)
 
 
 def run_spans(work: Work, shards: Iterator[tuple[Span, ...]], limits: Limits, progress: Progress, tally: Tally) -> None:

@@ -102,8 +102,7 @@ def _find_gone(store: Store, beat: Beat) -> Holder | None:
     if not _is_on_this_machine(first):
         for _ in range(beat.patience):
             time.sleep(beat.period_s)
-            now = read_holder(store)
-            if now != first:
+            if (now := read_holder(store)) != first:
                 break
         else:
             return first

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
 
 from schemas.dataset.commit import CommitSummary, Span
 from schemas.errors import OutputError
@@ -84,10 +85,8 @@ def committed_ranges(summaries: Iterable[CommitSummary]) -> list[tuple[int, int]
 
 def ranges_with_retries(summaries: Iterable[CommitSummary]) -> list[list[CommitSummary]]:
     """The commits of each range: itself, then its retries in order."""
-    groups: dict[int, list[CommitSummary]] = {}
-    for one in summaries:
-        groups.setdefault(one.start, []).append(one)
-    return [sorted(groups[start], key=lambda one: one.retry) for start in sorted(groups)]
+    ordered = sorted(summaries, key=lambda one: (one.start, one.retry))
+    return [list(group) for _, group in groupby(ordered, key=lambda one: one.start)]
 
 
 def effective_failures(group: Sequence[CommitSummary]) -> list[tuple[int, str]]:

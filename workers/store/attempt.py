@@ -128,9 +128,8 @@ class Attempt:
         has committed the range.
         """
         if missing := self.span.scene_ids[len(self._scenes) :]:
-            raise ValueError(
-                f"the range from {self.span.start} lacks scenes {list(missing[:5])}: it cannot be committed"
-            )
+            first = list(missing[:5])
+            raise ValueError(f"the range from {self.span.start} lacks scenes {first}: it cannot be committed")
         self._note({})
         record = self._finish()
         if not self._put(record):

@@ -58,9 +58,8 @@ def commit_names(store: Store) -> list[tuple[int, int, str]]:
 
 def commits_digest(store: Store) -> str:
     """A digest that tells one set of commits from another: a record never changes, so keys and sizes are enough."""
-    return hashlib.sha256(
-        "".join(f"{key} {store.size(key)}\n" for _, _, key in commit_names(store)).encode()
-    ).hexdigest()
+    lines = [f"{key} {store.size(key)}\n" for _, _, key in commit_names(store)]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def read_record(store: Store, start: int, retry: int = 0) -> CommitRecord | None:

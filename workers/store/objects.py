@@ -137,10 +137,9 @@ class ObjectStore(Store):
     def files(self, prefix: str) -> Iterator[Entry]:
         """Every object below `prefix`."""
         with self._explained(prefix):
-            found = [
-                Entry(meta["path"], meta["size"]) for batch in obstore.list(self._bucket, prefix) for meta in batch
-            ]
-        yield from sorted(found, key=lambda entry: entry.key.split("/"))
+            found = obstore.list(self._bucket, prefix).collect()
+        entries = (Entry(meta["path"], meta["size"]) for meta in found)
+        yield from sorted(entries, key=lambda entry: entry.key.split("/"))
 
     def children(self, prefix: str) -> list[str]:
         """Common prefixes of keys, directly below `prefix`."""
