@@ -1,5 +1,7 @@
 """Names of all files in the output folder, and which views and images a job stores (dataset.md section 1)."""
 
+import re
+import urllib.parse
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,6 +15,13 @@ SUCCESS_FILE = "_SUCCESS"
 LOCK_FILE = "_lock.json"
 LOG_FOLDER = "_logs"
 STAGING = "_staging"
+FENCED = ".fenced"
+"""Ends the name of an attempt's folder that was taken out of the attempt's reach."""
+TEMPORARY = f"{STAGING}/_tmp"
+"""Files on their way to their final names; one that a killed process left is swept."""
+LOCK_CLAIMS = f"{STAGING}/_lock"
+PROBE_PREFIX = ".probe-"
+"""Begins names that a killed probe may leave in `TEMPORARY` and beside the commits; they are swept."""
 MANIFEST = "manifest"
 COMMITS = "manifest/_commits"
 RANGES = "manifest/_ranges"
@@ -103,21 +112,48 @@ def asset_path(category: str, instance_id: str) -> str:
     return f"{ASSETS}/{category}/{instance_id}.glb"
 
 
-def range_key(start: int) -> str:
-    """Ten digits: names sort like numbers."""
-    return f"{start:010d}"
+def is_shape(path: str) -> bool:
+    """True for a file that several ranges may make, with the same bytes."""
+    return path.startswith(f"{ASSETS}/")
+
+
+def range_name(start: int, retry: int = 0) -> str:
+    """`0000000016`, for a retry `0000000016.retry-2`. Ten digits, so that names sort like numbers."""
+    return f"{start:010d}{f'.retry-{retry}' if retry else ''}"
 
 
 def commit_path(start: int, retry: int = 0) -> str:
-    """The commit record of a range; `retry` numbers the retries of its environmental failures."""
-    return f"{COMMITS}/{range_key(start)}{f'.retry-{retry}' if retry else ''}.json"
+    """The record that a range is done; `retry` numbers the later tries of its environmental failures."""
+    return f"{COMMITS}/{range_name(start, retry)}.json"
+
+
+def parse_commit_path(key: str) -> tuple[int, int] | None:
+    """(start, retry) of a commit record's key, None where it is no such key."""
+    match = re.fullmatch(rf"{COMMITS}/(\d+)(?:\.retry-(\d+))?\.json", key)
+    found = (int(match[1]), int(match[2] or 0)) if match else None
+    return found if found and commit_path(*found) == key else None
 
 
 def range_table_path(start: int, table: str, retry: int = 0) -> str:
-    """The file with one table's rows of one range."""
-    return f"{RANGES}/{range_key(start)}{f'.retry-{retry}' if retry else ''}/{table}.parquet"
+    """Rows of one range, one file a table."""
+    return f"{RANGES}/{range_name(start, retry)}/{table}.parquet"
+
+
+def tar_path(category: str, start: int, retry: int = 0) -> str:
+    """`mug/0000000016.tar`: the images of one category that one commit holds."""
+    return f"{category}/{range_name(start, retry)}.tar"
+
+
+def merged_table_path(table: str, category: str, number: int) -> str:
+    """`manifest/views/category=mug/part-00000.parquet`: a hive partition that pyarrow finds."""
+    return f"{MANIFEST}/{table}/category={urllib.parse.quote(category, safe='')}/part-{number:05d}.parquet"
 
 
 def staging_path(start: int, attempt: str) -> str:
-    """The folder that an attempt writes to."""
-    return f"{STAGING}/{range_key(start)}/{attempt}"
+    """The only place that an attempt writes."""
+    return f"{STAGING}/{range_name(start)}/{attempt}"
+
+
+def scratch_path(name: str) -> str:
+    """Where a step of this name keeps files while it works."""
+    return f"{STAGING}/_{name}"

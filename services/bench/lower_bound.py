@@ -10,7 +10,7 @@ from services.bench.encoders import Encoder, kind_of
 from services.bench.ratios import Lap
 from workers.pipeline.make_scene import Scene
 from workers.render.raster.gbuffer import FLAT, Renderer
-from workers.store.durable import sync_folder, sync_tree
+from workers.store.durable import sync_path, sync_tree
 from workers.store.images import Pixels, decode_png
 
 
@@ -81,5 +81,5 @@ def write_durably(files: Mapping[str, bytes], folder: Path) -> int:
             written += file.write(data)
     sync_tree(staging)
     os.rename(staging, folder)
-    sync_folder(folder.parent)
+    sync_path(folder.parent)
     return written

@@ -11,9 +11,9 @@ from schemas.job.job import Job
 from services.bench.bare import bare_processes
 from services.bench.ratios import Lap, Spread, by_processor, idle_share
 from services.bench.stages import bench_order
-from services.run.coordinator import Limits, Tally, run_spans
+from services.run.coordinator import Limits, Tally, Work, run_spans
+from services.run.range_planner import MAX_SHARD, group_shards
 from services.run.ray_cluster import PREFETCH, private_ray
-from services.run.step import USUAL_SHARD, group_shards
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.store.local import LocalStore
 
@@ -63,7 +63,7 @@ class Scaling:
 
 
 def measure_scaling(
-    job: Job, job_folder: Path, folder: Path, workers: int, scenes: int, rounds: int = 3, shard: int = USUAL_SHARD
+    job: Job, job_folder: Path, folder: Path, workers: int, scenes: int, rounds: int = 3, shard: int = MAX_SHARD
 ) -> Scaling:
     """One worker, all workers, one process, all processes, and again; always the same scenes, into new folders.
 
@@ -114,13 +114,14 @@ class _RayDrive:
     def run(self, name: str, slots: int, count: int, shard_size: int) -> tuple[Lap, float]:
         """A lap of so many scenes, and the share of the slots' time in which no shard ran."""
         out, size, first = self.folder / name, self.job.run.range_size, self.job.first_scene
-        LocalStore(out).prepare()
+        store = LocalStore(out)
+        store.prepare()
         spans = [Span(start=s, stop=min(s + size, first + count)) for s in range(first, first + count, size)]
         tally = Tally(asked=count)
         # A shard that waits could be started by the other slot: one at a time where one is to work.
         limits = Limits(PREFETCH * slots if slots == self.workers else slots, 1, count)
         begun = time.perf_counter()
-        work = (bench_order(self.job, out), self.catalogue)
+        work = Work(store, bench_order(self.job, out), self.catalogue)
         run_spans(work, group_shards(spans, shard_size), limits, _quiet, tally)
         seconds = time.perf_counter() - begun
         idle = idle_share(tally.shard_wall_s, slots, seconds)

@@ -1,4 +1,4 @@
-"""OUT/DATASET.md: what a dataset is, what made it, and whose shapes are in it."""
+"""OUT/DATASET.md: the contents of a dataset, the stack that made it, and the sources of its shapes."""
 
 from schemas.base import Counts
 from schemas.dataset.fingerprint import Fingerprint
@@ -16,7 +16,7 @@ ARTICLE = (
 
 
 def write_card(store: Store, record: JobRecord, catalogue: Catalogue, merged: MergeResult) -> None:
-    """Write DATASET.md."""
+    """Writes DATASET.md."""
     fingerprint = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
     store.write_whole(README_FILE, describe_dataset(record, catalogue, merged, fingerprint).encode())
 
@@ -70,21 +70,20 @@ def _count(count: Counts) -> str:
 
 
 def describe_sources(catalogue: Catalogue) -> list[str]:
-    """One line for each source of objects and of tables, with its licence and what was left out."""
+    """One line for each source of objects and of tables with its licence, and those of `describe_left_out`."""
     lines = []
     for what, sources in (("objects", catalogue.assets.objects), ("tables", catalogue.assets.tables)):
         for source in sources:
             if isinstance(source, ProceduralSource):
-                lines.append(f"{what}, weight {source.weight:g}: made from seed {source.seed}, licence CC0-1.0")
+                origin = f"made from seed {source.seed}, licence CC0-1.0"
             else:
-                lines.append(
-                    f"{what}, weight {source.weight:g}: {source.source} folder {source.folder}, licence {source.licence}"
-                )
+                origin = f"{source.source} folder {source.folder}, licence {source.licence}"
+            lines.append(f"{what}, weight {source.weight:g}: {origin}")
     return lines + describe_left_out(catalogue)
 
 
 def describe_left_out(catalogue: Catalogue) -> list[str]:
-    """One line for each folder of which something was left out: how many, and why."""
+    """One line for each folder with files that were left out: how many, and why."""
     return [
         f"left out of {folder}: {', '.join(f'{count} {reason}' for reason, count in reasons.items())}"
         for folder, reasons in catalogue.skipped.items()

@@ -1,4 +1,4 @@
-"""The dataset digest: one number for all that a job and a seed determine."""
+"""The dataset digest: one digest of everything that a job and a seed determine."""
 
 import hashlib
 from collections.abc import Iterable, Mapping
@@ -11,8 +11,8 @@ def dataset_digest(tables: Mapping[str, str], files: Iterable[tuple[str, str]]) 
 
     The tables are scenes, views, objects, assets and failures, by their canonical rows (workers/store/canonical.py);
     the files are images, shapes and merged files. They must come sorted by the UTF-8 bytes of their paths, each path
-    once; raises ValueError otherwise. In layout `tar` an image goes by the path that it would have as a file of its
-    own, so the digest does not depend on the layout.
+    once; raises ValueError otherwise. In layout `tar` an image has the path that it would have as a file of its own, so
+    the digest does not depend on the layout.
     """
     total = hashlib.sha256(b"verso dataset 1\n")
     for table in DETERMINISTIC_TABLES:

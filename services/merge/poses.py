@@ -1,4 +1,4 @@
-"""camPoses.csv, cameras.csv and objects.dat: the article's own tables, written line by line (dataset.md section 1)."""
+"""The article's own tables camPoses.csv, cameras.csv and objects.dat, written line by line (dataset.md section 1)."""
 
 import re
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from schemas.dataset.layout import CAM_POSES, CAMERAS, OBJECTS
 from schemas.scene.camera import ROLES
 
 POSE_ROLES = ("input", "mirror")
-"""The roles that have a row in camPoses.csv; aligned and projected cameras stand in cameras.csv alone."""
+"""The roles that have a row in camPoses.csv; aligned and projected cameras are in cameras.csv alone."""
 
 _ELEMENTS = [f"T{row}{column}" for row in range(4) for column in range(4)]
 _CAMERA_COLUMNS = [
@@ -22,7 +22,7 @@ _UNSAFE = re.compile(r"[%\s\x00-\x1f\x7f]")
 
 
 class PoseFiles:
-    """The three files in `folder`, open for writing; rows must come in order, whole ranges at a time."""
+    """The three files in `folder`, open for writing; takes whole ranges in order."""
 
     def __init__(self, folder: Path) -> None:
         self._paths = {name: folder / name for name in (CAM_POSES, CAMERAS, OBJECTS)}
@@ -65,9 +65,9 @@ def camera_lines(views: pa.Table) -> Iterator[str]:
 
 
 def object_lines(objects: pa.Table) -> Iterator[str]:
-    """`pose_id category instance region u v T00 ... T33` for what input and mirror cameras see.
+    """`pose_id category instance region u v T00 ... T33` for everything that input and mirror cameras see.
 
-    White space and `%` in names are written as in a URL (`my%20mug`), so that every line has 22 words.
+    White space and `%` in names are written as in a URL (`my%20mug`), so every line has 22 words.
     """
     columns = ["pose_id", "category", "instance_id", "region_id", "u", "v", "T_cam_obj"]
     rows = objects.select(columns).filter(_is_pose(objects))
@@ -77,7 +77,7 @@ def object_lines(objects: pa.Table) -> Iterator[str]:
 
 
 def escaped(name: str) -> str:
-    """A name as one word; `urllib.parse.unquote` gives it back."""
+    """A name as one word; `urllib.parse.unquote` reverses it."""
     return _UNSAFE.sub(lambda found: "".join(f"%{byte:02X}" for byte in found[0].encode()), name)
 
 

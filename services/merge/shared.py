@@ -1,90 +1,111 @@
-"""What ranges share: rows of assets once each, and the sorted list of all files with their digests."""
+"""What ranges share, collected in an SQLite file: rows of assets, and all files with their digests, in sorted order.
 
+SQLite keeps the rows sorted by the UTF-8 bytes of their key, on disk, with a cache of a fixed size.
+"""
+
+import contextlib
 import json
-from collections.abc import Iterator
-from itertools import groupby
+import sqlite3
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.compute as pc
 
-from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import ASSETS
+from schemas.dataset.layout import is_shape
 from schemas.dataset.tables import SCHEMAS
-from schemas.errors import CommitConflict, CorruptError
-from services.merge.external_sort import ExternalSort
+from schemas.errors import CommitConflict, CorruptError, MachineError
+
+CACHE_KIB = 16 << 10
+"""Memory for SQLite's cache."""
 
 _ROWS_PER_BATCH = 4_096
 
+_SETUP = """
+PRAGMA journal_mode = OFF;
+PRAGMA synchronous = OFF;
+CREATE TABLE assets (instance_id TEXT, row TEXT, PRIMARY KEY (instance_id, row)) WITHOUT ROWID;
+CREATE TABLE files (path TEXT, sha256 TEXT, times INTEGER, PRIMARY KEY (path, sha256)) WITHOUT ROWID;
+BEGIN;
+"""
+"""No journal and no flush: another merge begins with a new file."""
 
-class AssetRows:
-    """The rows of `assets` of all ranges, each instance once, by instance id."""
-
-    def __init__(self, folder: Path) -> None:
-        self._sorted = ExternalSort(folder, "assets")
-
-    def add(self, rows: pa.Table) -> None:
-        """Takes the rows of a range, in any order."""
-        for row in rows.to_pylist():
-            self._sorted.add(row["instance_id"].encode(), json.dumps(row).encode())
-
-    def batches(self, mixed: bool) -> Iterator[pa.Table]:
-        """All rows in order.
-
-        Raises CommitConflict where two differ, unless stacks are `mixed`: then one of them is taken, always the same.
-        """
-        waiting: list[dict[str, object]] = []
-        for instance_id, group in groupby(self._sorted, key=lambda pair: pair[0]):
-            different = sorted({value for _, value in group})
-            if len(different) > 1 and not mixed:
-                raise CommitConflict(
-                    f"the asset {instance_id.decode()} is described differently by two ranges of one stack"
-                )
-            waiting.append(json.loads(different[0]))
-            if len(waiting) == _ROWS_PER_BATCH:
-                yield pa.Table.from_pylist(waiting, schema=SCHEMAS["assets"])
-                waiting = []
-        yield pa.Table.from_pylist(waiting, schema=SCHEMAS["assets"])
+_ADD_ASSET = "INSERT INTO assets VALUES (?, ?) ON CONFLICT DO NOTHING"
+_ADD_FILE = "INSERT INTO files VALUES (?, ?, 1) ON CONFLICT DO UPDATE SET times = times + 1"
 
 
-class FileList:
-    """(path, SHA-256) of every image, shape and merged file, sorted by the UTF-8 bytes of the path."""
+class SharedRows:
+    """Takes assets and files range by range, in any order, and gives them back sorted."""
 
     def __init__(self, folder: Path) -> None:
-        self._sorted = ExternalSort(folder, "files")
+        # No other process opens the file, and file locks may be missing on a network drive.
+        uri = f"{(folder / 'shared.sqlite').absolute().as_uri()}?nolock=1"
+        self._db = sqlite3.connect(uri, uri=True, isolation_level=None)
+        self._db.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
+        self._db.executescript(_SETUP)
         self.images = 0
+
+    def add_assets(self, rows: pa.Table) -> None:
+        """Takes rows of `assets`."""
+        self._insert(_ADD_ASSET, ((row["instance_id"], json.dumps(row)) for row in rows.to_pylist()))
 
     def add_images(self, views: pa.Table) -> None:
         """Takes the files that rows of `views` name."""
-        if not views.num_rows:
-            return
-        files = pa.concat_arrays(views.column("files").chunks).flatten()
-        for path, sha256 in zip(files.field("path").to_pylist(), files.field("sha256").to_pylist(), strict=True):
-            self._sorted.add(path.encode(), sha256.encode())
+        files = pc.list_flatten(views.column("files"))
+        columns = (pc.struct_field(files, name).to_pylist() for name in ("path", "sha256"))
+        self.add_files(zip(*columns, strict=True))
         self.images += len(files)
 
-    def add_shapes(self, record: CommitRecord) -> None:
-        """Takes the shapes that a range wrote, or wrote again."""
-        for entry in record.files:
-            if entry.path.startswith(f"{ASSETS}/"):
-                self._sorted.add(entry.path.encode(), entry.sha256.encode())
+    def add_files(self, files: Iterable[tuple[str, str]]) -> None:
+        """Takes (path, SHA-256) of files."""
+        self._insert(_ADD_FILE, files)
 
-    def add(self, path: str, sha256: str) -> None:
-        """Takes one file."""
-        self._sorted.add(path.encode(), sha256.encode())
+    def assets(self, mixed: bool) -> Iterator[pa.Table]:
+        """The rows of `assets`, each instance once, by instance id.
 
-    def pairs(self, mixed: bool) -> Iterator[tuple[str, str]]:
-        """All files in order, shared shapes once.
+        Raises CommitConflict where two differ, unless stacks are `mixed`: then always the same one is taken.
+        """
+        selected = self._select("instance_id, min(row), count(*) FROM assets")
+        while batch := list(islice(selected, _ROWS_PER_BATCH)):
+            for instance_id, _, count in batch:
+                if count > 1 and not mixed:
+                    raise CommitConflict(f"the asset {instance_id} is described differently by two ranges of one stack")
+            yield pa.Table.from_pylist([json.loads(row) for _, row, _ in batch], schema=SCHEMAS["assets"])
+
+    def files(self, mixed: bool) -> Iterator[tuple[str, str]]:
+        """(path, SHA-256) of every file, sorted by the UTF-8 bytes of the path, shared shapes once.
 
         Raises CorruptError where an image is named twice, CommitConflict where one shape has two digests, unless stacks
         are `mixed`: then the smaller one counts.
         """
-        for name, group in groupby(self._sorted, key=lambda pair: pair[0]):
-            path = name.decode()
-            digests = [value for _, value in group]
-            if len(digests) > 1 and not path.startswith(f"{ASSETS}/"):
+        for path, low, high, times in self._select("path, min(sha256), max(sha256), sum(times) FROM files"):
+            if times > 1 and not is_shape(path):
                 raise CorruptError(f"{path} belongs to two views: the ranges do not join")
-            if digests[0] != digests[-1] and not mixed:
-                raise CommitConflict(
-                    f"{path} was made with two digests by one stack: {digests[0].decode()}, {digests[-1].decode()}"
-                )
-            yield path, digests[0].decode()
+            if low != high and not mixed:
+                raise CommitConflict(f"{path} was made with two digests by one stack: {low}, {high}")
+            yield path, low
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._db.close()
+
+    def _insert(self, statement: str, rows: Iterable[tuple[str, str]]) -> None:
+        with _explained():
+            self._db.executemany(statement, rows)
+
+    def _select(self, what: str) -> Iterator[tuple]:
+        """Rows by the first column, which is read in the order of the primary key: nothing is sorted in memory."""
+        with _explained():
+            yield from self._db.execute(f"SELECT {what} GROUP BY 1 ORDER BY 1")
+
+
+@contextlib.contextmanager
+def _explained() -> Iterator[None]:
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise MachineError(
+            f"the merge could not keep its list of files on the disk: {error}; "
+            "free some space and start again, nothing finished is lost"
+        ) from error

@@ -1,14 +1,12 @@
 """The merged manifest tables: rows in order, split by category, in files of about 100,000 rows."""
 
-import urllib.parse
-from collections.abc import Mapping
 from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from schemas.dataset.layout import MANIFEST
+from schemas.dataset.layout import merged_table_path
 from schemas.dataset.tables import SCHEMAS, SORT_KEYS
 from schemas.errors import CorruptError
 from workers.store.canonical import TableDigest
@@ -16,13 +14,13 @@ from workers.store.manifest import PARQUET_OPTIONS
 
 ROWS_PER_FILE = 100_000
 ROWS_PER_GROUP = 8_192
-"""Of a Parquet row group; also how many rows of one category wait in memory."""
+"""Rows of a Parquet row group; also how many rows of one category wait in memory."""
 ROWS_PER_BLOCK = 2_048
-"""Rows are checked, digested and split in blocks: small enough to hold, large enough to be fast."""
+"""Rows are checked, digested and split in blocks of this size: small enough for memory, large enough to be fast."""
 
 
 class MergedTable:
-    """Writes one table below `folder` as hive partitions, and digests its rows on the way."""
+    """Writes one table below `folder` as hive partitions, and digests its rows."""
 
     def __init__(self, table: str, folder: Path) -> None:
         self.table = table
@@ -30,14 +28,12 @@ class MergedTable:
         self._folder = folder
         self._parts: dict[str, _Parts] = {}
         self._block: list[pa.Table] = []
-        self._block_rows = 0
         self._last_key: tuple[object, ...] | None = None
 
     def add(self, rows: pa.Table) -> None:
         """Takes the next rows, sorted by key. Raises CorruptError where a key is repeated or out of order."""
         self._block.append(rows)
-        self._block_rows += rows.num_rows
-        if self._block_rows >= ROWS_PER_BLOCK:
+        if sum(part.num_rows for part in self._block) >= ROWS_PER_BLOCK:
             self._flush()
 
     def finish(self, categories: list[str]) -> dict[str, Path]:
@@ -53,16 +49,14 @@ class MergedTable:
             parts.close()
 
     @property
-    def categories(self) -> list[str]:
-        """Those that have rows so far, sorted."""
+    def categories(self) -> set[str]:
+        """Those that have rows so far."""
         self._flush()
-        return sorted(self._parts)
+        return set(self._parts)
 
     def _flush(self) -> None:
-        if not self._block_rows:
-            return
-        rows = pa.concat_tables(self._block).combine_chunks()
-        self._block, self._block_rows = [], 0
+        rows = pa.concat_tables([SCHEMAS[self.table].empty_table(), *self._block]).combine_chunks()
+        self._block = []
         self._check_order(rows)
         self.digest.update(rows)
         column = rows.column("category")
@@ -89,37 +83,38 @@ class _Parts:
     """The files of one category of one table."""
 
     def __init__(self, table: str, category: str, folder: Path) -> None:
-        value = urllib.parse.quote(category, safe="")
-        self._key = f"{MANIFEST}/{table}/category={value}"
-        self._folder = folder / self._key
-        self._folder.mkdir(parents=True)
+        self._table = table
+        self._category = category
+        self._folder = folder
         schema = SCHEMAS[table]
         self._schema = schema.remove(schema.get_field_index("category"))
-        self._waiting: list[pa.Table] = []
-        self._waiting_rows = 0
+        self._waiting = self._schema.empty_table()
         self._file: pq.ParquetWriter | None = None
         self._file_rows = 0
         self._files: dict[str, Path] = {}
 
     def write(self, rows: pa.Table) -> None:
         """Takes the next rows."""
-        rows = rows.drop_columns("category")
-        self._waiting.append(rows)
-        self._waiting_rows += rows.num_rows
-        if self._waiting_rows >= ROWS_PER_GROUP:
+        self._waiting = pa.concat_tables([self._waiting, rows.drop_columns("category")])
+        if self._waiting.num_rows >= ROWS_PER_GROUP:
             self._flush()
 
-    def finish(self) -> Mapping[str, Path]:
+    def finish(self) -> dict[str, Path]:
         """Closes the last file; the files by key."""
-        if self._waiting_rows or not self._files:
+        if self._waiting.num_rows or not self._files:
             self._flush()
         self.close()
         return self._files
 
+    def close(self) -> None:
+        """Closes the open file."""
+        if self._file is not None:
+            self._file.close()
+            self._file, self._file_rows = None, 0
+
     def _flush(self) -> None:
-        rows = pa.concat_tables(self._waiting).combine_chunks()
-        self._waiting, self._waiting_rows = [], 0
-        while True:
+        rows, self._waiting = self._waiting.combine_chunks(), self._schema.empty_table()
+        while rows.num_rows or not self._files:
             writer = self._open()
             piece = rows.slice(0, ROWS_PER_FILE - self._file_rows)
             writer.write_table(piece, row_group_size=ROWS_PER_GROUP)
@@ -127,19 +122,11 @@ class _Parts:
             rows = rows.slice(piece.num_rows)
             if self._file_rows >= ROWS_PER_FILE:
                 self.close()
-            if not rows.num_rows:
-                return
 
     def _open(self) -> pq.ParquetWriter:
         if self._file is None:
-            name = f"part-{len(self._files):05d}.parquet"
-            path = self._folder / name
-            self._file = pq.ParquetWriter(path, self._schema, **PARQUET_OPTIONS)
-            self._files[f"{self._key}/{name}"] = path
+            key = merged_table_path(self._table, self._category, len(self._files))
+            self._files[key] = self._folder / key
+            self._files[key].parent.mkdir(parents=True, exist_ok=True)
+            self._file = pq.ParquetWriter(self._files[key], self._schema, **PARQUET_OPTIONS)
         return self._file
-
-    def close(self) -> None:
-        """Closes the file that is open."""
-        if self._file is not None:
-            self._file.close()
-            self._file, self._file_rows = None, 0

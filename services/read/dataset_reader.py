@@ -10,9 +10,9 @@ from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.tables import DETERMINISTIC_TABLES
 from schemas.errors import CorruptError, InputError
-from services.merge.committed_rows import range_rows
-from services.run.range_planner import list_commits, ranges_with_retries
+from services.run.range_planner import ranges_with_retries
 from workers.store.commit import read_record
+from workers.store.committed_rows import list_commits, range_rows
 from workers.store.images import decode_png
 from workers.store.store import Store
 from workers.store.tars import read_tar

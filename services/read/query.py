@@ -12,13 +12,12 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import COMMITS, MANIFEST, STAGING, range_key, range_table_path
+from schemas.dataset.layout import COMMITS, MANIFEST, STAGING, range_name, range_table_path
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError, InputError, OutputError
-from services.merge.committed_rows import range_rows
 from services.merge.step import read_success
 from workers.store.commit import commit_names, read_record
-from workers.store.local import LocalStore
+from workers.store.committed_rows import range_rows
 from workers.store.store import Store
 
 _LOCKED = {
@@ -79,10 +78,10 @@ def _merged(store: Store, keys: Sequence[str], table: str) -> list[Rows]:
     """The merged table: read lazily from a disk, as a whole from an object store."""
     folder = f"{MANIFEST}/{table}"
     keys = [key for key in keys if key.startswith(f"{folder}/")]
-    if isinstance(store, LocalStore):
+    if store.root is not None:
         partitioning = ds.partitioning(pa.schema([("category", pa.string())]), flavor="hive")
-        paths = [str(store.path(key)) for key in keys]
-        base = str(store.path(folder))
+        paths = [str(store.root / key) for key in keys]
+        base = str(store.root / folder)
         return [
             ds.dataset(paths, SCHEMAS[table], _FORMAT, partitioning=partitioning, partition_base_dir=base),
         ]
@@ -110,7 +109,7 @@ class _Committed:
         staged = set(store.children(STAGING))
         for start, group in groupby(names, key=lambda name: name[0]):
             retries = [retry for _, retry, _ in group]
-            if isinstance(store, LocalStore) and retries == [0] and range_key(start) not in staged:
+            if store.root is not None and retries == [0] and range_name(start) not in staged:
                 self._plain.append(start)
             else:
                 records = [record for retry in retries if (record := read_record(store, start, retry)) is not None]
@@ -120,7 +119,7 @@ class _Committed:
         """The rows of one table: those in memory, and those in files."""
         rows = [range_rows(self._store, records, table) for records in self._other]
         parts: list[Rows] = [pa.concat_tables([SCHEMAS[table].empty_table(), *rows])]
-        if self._plain and isinstance(self._store, LocalStore):
-            paths = [str(self._store.path(range_table_path(start, table))) for start in self._plain]
+        if self._plain and self._store.root is not None:
+            paths = [str(self._store.root / range_table_path(start, table)) for start in self._plain]
             parts.append(ds.dataset(paths, SCHEMAS[table], _FORMAT))
         return parts

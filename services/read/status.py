@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 from schemas.dataset.layout import COMMITS, STAGING, commit_path
 from schemas.errors import OutputError
-from services.merge.committed_rows import range_rows
 from services.merge.step import read_success
 from services.run.lock import Holder, read_holder
-from services.run.range_planner import effective_failures, list_commits, ranges_with_retries
+from services.run.range_planner import effective_failures, ranges_with_retries
 from workers.store.attempt import attempts_at, blamed_scene, retry_of_attempt
 from workers.store.commit import commit_names, read_record
+from workers.store.committed_rows import list_commits, range_rows
 from workers.store.store import Store
 
 RATE_COMMITS = 64

@@ -1,4 +1,4 @@
-"""Drives shards through Ray: a bounded number in flight, every report looked at, attempts counted here and nowhere else."""
+"""The coordinator: gives shards to Ray, a limited number at a time, reads every report and counts the attempts."""
 
 import logging
 import uuid
@@ -18,33 +18,29 @@ from workers.assets.catalogue import Catalogue
 from workers.pipeline.run_shard import TIMED_OUT, run_shard
 from workers.store.attempt import attempts_at, blamed_scene
 from workers.store.commit import read_summary
-from workers.store.opening import open_store
 from workers.store.store import Store
 
 POLL_S = 0.5
-"""How long one wait for reports lasts: Ctrl-C is seen at least this often."""
+"""Time of one wait for reports: Ctrl-C is seen at least this often."""
 
 EXPLANATIONS: dict[Reason, str] = {
     "time": "the scene took longer than run.scene_timeout_s each time: raise it, then run with --retry-failed",
     "memory": "the worker ran out of memory each time: use fewer workers, then run with --retry-failed",
     "killed": "the worker was killed or crashed in this scene each time: see OUT/_logs, then run with --retry-failed",
 }
-"""What an environmental failure says."""
+"""The stored detail of an environmental failure."""
 
 Progress = Callable[["Tally"], None]
 
 
 @dataclass
 class Tally:
-    """What has come of a run so far; changed by the coordinator alone."""
+    """The results of a run so far; changed by the coordinator alone."""
 
     asked: int
     made: int = 0
     failed: Counter[str] = field(default_factory=Counter)
-    lost_workers: Counter[str] = field(default_factory=Counter)
-    seconds: Counter[str] = field(default_factory=Counter)
     conflicts: list[str] = field(default_factory=list)
-    shards: int = 0
     shard_wall_s: float = 0.0
     shard_cpu_s: float = 0.0
 
@@ -54,11 +50,9 @@ class Tally:
         return self.made + self.failed.total()
 
     def add(self, report: ShardReport) -> None:
-        """Count one shard's report in."""
-        self.shards += 1
+        """Counts one shard's report."""
         self.shard_wall_s += report.wall_s
         self.shard_cpu_s += report.cpu_s
-        self.seconds.update(report.seconds)
         for span in report.spans:
             if span.conflict:
                 self.conflicts.append(span.conflict)
@@ -75,49 +69,49 @@ class Limits:
     failures: int
 
 
-@ray.remote(num_cpus=1, max_retries=0)
-def _run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
-    return run_shard(order, catalogue)
+@dataclass(frozen=True)
+class Work:
+    """The same for every shard: the store, the pattern of its order, and the catalogue of its assets."""
+
+    store: Store
+    order: ShardOrder
+    catalogue: Catalogue
 
 
-def run_spans(
-    work: tuple[ShardOrder, Catalogue],
-    shards: Iterator[tuple[Span, ...]],
-    limits: Limits,
-    progress: Progress,
-    tally: Tally,
-) -> None:
-    """Make every range of every shard. `work` is the pattern of each shard's order, and the catalogue of its assets.
+_run_shard = ray.remote(num_cpus=1, max_retries=0)(run_shard)
+
+
+def run_spans(work: Work, shards: Iterator[tuple[Span, ...]], limits: Limits, progress: Progress, tally: Tally) -> None:
+    """Makes every range of every shard.
 
     Raises CommitConflict where two attempts made other bytes, RunError where a worker cannot be kept alive or too many
-    scenes fail. On KeyboardInterrupt what is committed stays, and what runs is ended.
+    scenes fail. On KeyboardInterrupt, committed ranges stay and running shards are ended.
     """
-    drive = _Drive(work, limits, open_store(work[0].out), tally)
+    coordinator = _Coordinator(work, limits, tally)
     try:
-        drive.run(shards, progress)
+        coordinator.run(shards, progress)
     except BaseException:
-        drive.cancel()
+        coordinator.cancel()
         raise
 
 
-class _Drive:
-    """The loop's state: what waits, what runs, and how often each range was lost."""
+class _Coordinator:
+    """The state of the loop: the shards that run, those to run again, and how often workers died."""
 
-    def __init__(self, work: tuple[ShardOrder, Catalogue], limits: Limits, store: Store, tally: Tally) -> None:
-        self._pattern = work[0]
-        self._catalogue = ray.put(work[1])
+    def __init__(self, work: Work, limits: Limits, tally: Tally) -> None:
+        self._store = work.store
+        self._order = work.order.model_copy(update={"label": uuid.uuid4().hex[:8]})
+        self._catalogue = ray.put(work.catalogue)
         self._limits = limits
-        self._store = store
         self._tally = tally
-        self._label = uuid.uuid4().hex[:8]
         self._again: deque[tuple[Span, ...]] = deque()
         self._running: dict[ray.ObjectRef, tuple[Span, ...]] = {}
-        self._losses: Counter[int] = Counter()
-        self._deaths: Counter[int] = Counter()
+        self._deaths: Counter[tuple[str, int]] = Counter()
+        """By ("scene", id), or ("range", start) where no scene was begun."""
         self._blamed: dict[int, Blame] = {}
 
     def run(self, shards: Iterator[tuple[Span, ...]], progress: Progress) -> None:
-        """Until nothing waits and nothing runs."""
+        """Gives out shards and collects reports until nothing is left."""
         while True:
             while len(self._running) < self._limits.in_flight:
                 spans = self._again.popleft() if self._again else next(shards, None)
@@ -132,15 +126,15 @@ class _Drive:
             progress(self._tally)
 
     def cancel(self) -> None:
-        """End what runs; what is not committed is made again by the next run."""
+        """Ends running shards; what is not committed is made again by the next run."""
         for ref in self._running:
             ray.cancel(ref, force=True)
         if self._running:
             ray.wait(list(self._running), num_returns=len(self._running), timeout=5.0)
 
     def _submit(self, spans: tuple[Span, ...]) -> None:
-        inside = [self._blamed[scene] for span in spans for scene in span.scene_ids if scene in self._blamed]
-        order = self._pattern.model_copy(update={"spans": spans, "blamed": tuple(inside), "label": self._label})
+        blamed = tuple(self._blamed[scene] for span in spans for scene in span.scene_ids if scene in self._blamed)
+        order = self._order.model_copy(update={"spans": spans, "blamed": blamed})
         self._running[_run_shard.remote(order, self._catalogue)] = spans
 
     def _collect(self, ref: "ray.ObjectRef", spans: tuple[Span, ...]) -> None:
@@ -151,7 +145,7 @@ class _Drive:
                 raise error.cause from error
             raise RunError(f"a worker raised an error that is a bug:\n{error}") from error
         except RayError as error:
-            self._lose(spans, error)
+            self._handle_death(spans, error)
             return
         self._tally.add(report)
         for span in report.spans:
@@ -167,8 +161,8 @@ class _Drive:
                 'run.max_failure_share allows: see `verso query OUT "select * from failures"`'
             )
 
-    def _lose(self, spans: tuple[Span, ...], error: RayError) -> None:
-        """A worker died: count in what it had committed, find what it died of, and give out the rest range by range."""
+    def _handle_death(self, spans: tuple[Span, ...], error: RayError) -> None:
+        """Counts the ranges that a dead worker committed, then gives out the others again, one by one."""
         left = list(spans)
         while left and self._store.size(commit_path(left[0].start, left[0].retry)) is not None:
             summary = read_summary(self._store, left[0].start, left[0].retry)
@@ -176,33 +170,31 @@ class _Drive:
             self._tally.failed.update(kind for _, kind in summary.failed)
             left.pop(0)
         if left:
-            self._blame(left[0], error)
+            self._count_death(left[0], error)
         self._again.extend((span,) for span in left)
 
-    def _blame(self, span: Span, error: RayError) -> None:
-        """Count a death against the scene it happened in; RunError where workers die before they begin a scene."""
-        scene, timed_out = self._evidence(span)
+    def _count_death(self, span: Span, error: RayError) -> None:
+        """Counts a death against the scene in progress. Raises RunError where workers die before they begin a scene."""
+        scene, timed_out = self._find_evidence(span)
         reason: Reason = "time" if timed_out else "memory" if isinstance(error, OutOfMemoryError) else "killed"
-        self._tally.lost_workers[reason] += 1
-        told = " ".join(str(error).split())[:300]
-        log_event("worker lost", logging.WARNING, range=span.start, scene=scene, reason=reason, error=told)
-        if scene is None:
-            self._losses[span.start] += 1
-            if self._losses[span.start] >= self._limits.attempts:
-                raise RunError(
-                    f"the worker for the scenes from {span.start} died {self._losses[span.start]} times before it began one "
-                    f"({told}): see `verso doctor`"
-                )
+        message = " ".join(str(error).split())[:300]
+        log_event("worker lost", logging.WARNING, range=span.start, scene=scene, reason=reason, error=message)
+        key = ("range", span.start) if scene is None else ("scene", scene)
+        self._deaths[key] += 1
+        deaths = self._deaths[key]
+        if deaths < self._limits.attempts:
             return
-        self._deaths[scene] += 1
-        if self._deaths[scene] >= self._limits.attempts:
-            detail = EXPLANATIONS[reason]
-            self._blamed[scene] = Blame(scene_id=scene, reason=reason, detail=detail, attempts=self._deaths[scene])
+        if scene is None:
+            raise RunError(
+                f"the worker for the scenes from {span.start} died {deaths} times before it began one "
+                f"({message}): see `verso doctor`"
+            )
+        self._blamed[scene] = Blame(scene_id=scene, reason=reason, detail=EXPLANATIONS[reason], attempts=deaths)
 
-    def _evidence(self, span: Span) -> tuple[int | None, bool]:
-        """The scene that an attempt of ours was in when its worker died, and whether its time had run out."""
+    def _find_evidence(self, span: Span) -> tuple[int | None, bool]:
+        """The scene in progress when a worker of this run died, and whether its time was up; removes its attempt."""
         for name in attempts_at(self._store, span.start):
-            if self._label not in name:
+            if self._order.label not in name:
                 continue
             scene = blamed_scene(self._store, span.start, name)
             timed_out = bool(self._store.size(f"{staging_path(span.start, name)}/{TIMED_OUT}"))

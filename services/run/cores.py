@@ -1,4 +1,4 @@
-"""How many cores this process may use: a container's share of a machine, not the machine."""
+"""The number of cores that this process may use: a container's share of the machine."""
 
 import math
 import os
@@ -6,9 +6,9 @@ from pathlib import Path
 
 
 def usable_cores(proc: Path = Path("/proc/self/cgroup"), cgroups: Path = Path("/sys/fs/cgroup")) -> int:
-    """At least 1: the smaller of the cores it may be scheduled on and its control groups' quota, rounded up.
+    """The smaller of the cores it may be scheduled on and its control groups' quota, at least 1.
 
-    Rounded up, because a quota of 1.5 cores is wasted by one worker and only shared by two.
+    A quota is rounded up: one worker would waste half a core of 1.5, two share them.
     """
     cores = len(os.sched_getaffinity(0))
     quota = min((_quota(folder) for folder in _control_groups(proc, cgroups)), default=math.inf)
@@ -16,7 +16,7 @@ def usable_cores(proc: Path = Path("/proc/self/cgroup"), cgroups: Path = Path("/
 
 
 def _control_groups(proc: Path, cgroups: Path) -> list[Path]:
-    """The folders whose limits bind this process: its own group and all above it, in either version's layout."""
+    """The folders whose limits apply to this process: its own group and all above it, in either version's layout."""
     try:
         lines = proc.read_text().splitlines()
     except OSError:
@@ -34,7 +34,7 @@ def _control_groups(proc: Path, cgroups: Path) -> list[Path]:
 
 
 def _quota(folder: Path) -> float:
-    """Cores granted by one control group: version 2's `cpu.max`, version 1's pair of files; inf where unlimited."""
+    """Cores that one control group grants, by version 2's `cpu.max` or version 1's pair of files; inf where unlimited."""
     try:
         if (both := folder / "cpu.max").exists():
             granted, period = both.read_text().split()

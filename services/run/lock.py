@@ -1,6 +1,6 @@
-"""One coordinator at a time: an advisory lock with a heartbeat, judged by observed change and never by clocks.
+"""An advisory lock: one coordinator at a time. Its heartbeat is judged by observed change, never by clocks.
 
-It spares two coordinators the same work. What is committed stays right without it.
+It saves two coordinators from doing the same work. Commits are correct without it.
 """
 
 import contextlib
@@ -11,28 +11,31 @@ import threading
 import time
 import uuid
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from schemas.dataset.layout import LOCK_FILE, STAGING
+from schemas.dataset.layout import LOCK_CLAIMS, LOCK_FILE
 from schemas.errors import RunError
 from workers.store.store import Store
 
 
 @dataclass(frozen=True)
 class Beat:
-    """How often a holder shows that it lives, and for how many of those periods silence is borne."""
+    """The period of the heartbeat, and how many periods without a change mean that the holder is gone."""
 
     period_s: float = 2.0
     patience: int = 5
 
 
+DEFAULT_BEAT = Beat()
+
+
 @dataclass(frozen=True)
 class Holder:
-    """Whoever holds the lock.
+    """The process that holds the lock.
 
-    `machine` tells one boot and one process namespace from another; `born` is the start of the process in the machine's
-    own ticks, so that a process id that was given out again is not mistaken for it.
+    `machine` identifies one boot and one process namespace; `born` is the start of the process in the machine's own
+    ticks, because process ids are used again.
     """
 
     token: str
@@ -43,59 +46,34 @@ class Holder:
     beat: int = 0
 
 
-class Lock:
-    """A lock that is held; `lost` turns true if somebody took it over, because this process was silent for too long."""
-
-    def __init__(self, store: Store, holder: Holder, period_s: float) -> None:
-        self.lost = False
-        self._store = store
-        self._holder = holder
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._beat, args=(period_s,), name="lock heartbeat", daemon=True)
-        self._thread.start()
-
-    def release(self) -> None:
-        """Ends the heartbeat and takes the lock file away, if it is still ours."""
-        self._ended.set()
-        self._thread.join()
-        current = read_holder(self._store)
-        if current is not None and current.token == self._holder.token:
-            self._store.remove(LOCK_FILE)
-
-    def _beat(self, period_s: float) -> None:
-        count = 0
-        while not self._ended.wait(period_s):
-            count += 1
-            with contextlib.suppress(Exception):  # a full disk must not end the run: the lock is only advice
-                current = read_holder(self._store)
-                if current is not None and current.token != self._holder.token:
-                    self.lost = True
-                    return
-                self._store.write_whole(LOCK_FILE, _encode(self._holder, count), durable=False)
-
-
 @contextlib.contextmanager
-def hold_lock(store: Store, wait: bool = False, beat: Beat | None = None) -> Iterator[Lock]:
+def hold_lock(store: Store, beat: Beat = DEFAULT_BEAT) -> Iterator[None]:
     """Holds the lock of an output folder while the context lasts.
 
-    A holder on this machine that is dead is replaced at once, one elsewhere after `patience` periods without a sign of
-    life. Raises RunError naming a holder that lives, unless `wait` asks to wait until it is done.
+    A dead holder on this machine is replaced at once, one elsewhere after `patience` periods without a heartbeat.
+    Raises RunError naming a holder that lives.
     """
-    beat = beat or Beat()
-    mine = _myself()
+    mine = Holder(uuid.uuid4().hex, socket.gethostname(), os.getpid(), _machine(), _born(os.getpid()) or "")
     while not store.put_if_absent(LOCK_FILE, _encode(mine)):
-        silent = _watch(store, beat, wait)
-        if silent is not None and _take_over(store, silent, mine, beat.period_s):
+        gone = _find_gone(store, beat)
+        if gone is not None and _take_over(store, gone, mine, beat.period_s):
             break
-    lock = Lock(store, mine, beat.period_s)
+    ended = threading.Event()
+    heartbeat = threading.Thread(
+        target=_show_life, args=(store, mine, beat.period_s, ended), name="lock heartbeat", daemon=True
+    )
+    heartbeat.start()
     try:
-        yield lock
+        yield
     finally:
-        lock.release()
+        ended.set()
+        heartbeat.join()
+        if _is_held_by(store, mine):
+            store.remove(LOCK_FILE)
 
 
 def read_holder(store: Store) -> Holder | None:
-    """Who holds the lock, None where nobody does. A lock file that cannot be read names `unknown`."""
+    """The holder of the lock, None where it is free. A lock file that cannot be read names `unknown`."""
     try:
         data = store.read(LOCK_FILE)
     except FileNotFoundError:
@@ -106,46 +84,49 @@ def read_holder(store: Store) -> Holder | None:
         return Holder(token=f"unreadable {data[:40]!r}", host="unknown", pid=0, machine="", born="")
 
 
-def _watch(store: Store, beat: Beat, wait: bool) -> Holder | None:
-    """The holder if it is dead or fell silent, None if the lock was given back.
+def _show_life(store: Store, mine: Holder, period_s: float, ended: threading.Event) -> None:
+    """Writes the lock file anew in each period, until another process took the lock over."""
+    while not ended.wait(period_s):
+        mine = replace(mine, beat=mine.beat + 1)
+        with contextlib.suppress(Exception):  # a full disk must not end the run: the lock is only advice
+            if not _is_held_by(store, mine):
+                return
+            store.write_whole(LOCK_FILE, _encode(mine), durable=False)
 
-    Raises RunError where it lives and `wait` is false.
-    """
-    first = read_holder(store)
-    silent = 0
-    while first is not None:
-        if _is_dead(first):
+
+def _find_gone(store: Store, beat: Beat) -> Holder | None:
+    """The holder if it is dead or shows no life, None if the lock is free. Raises RunError where it lives."""
+    first = now = read_holder(store)
+    if first is None or _is_dead(first):
+        return first
+    if not _is_on_this_machine(first):
+        for _ in range(beat.patience):
+            time.sleep(beat.period_s)
+            if (now := read_holder(store)) != first:
+                break
+        else:
             return first
-        if not wait and _is_on_this_machine(first):
-            raise RunError(_refusal(store, first))
-        time.sleep(beat.period_s)
-        now = read_holder(store)
-        if now is None:
-            return None
-        if now == first:
-            silent += 1
-            if silent >= beat.patience:
-                return first
-            continue
-        if not wait:
-            raise RunError(_refusal(store, now))
-        first, silent = now, 0
-    return None
+    if now is None:
+        return None
+    raise RunError(
+        f"{store.name} is in use by process {now.pid} on {now.host}: wait until it ends or stop it, "
+        "then start again; `verso status` shows how far it is"
+    )
 
 
-def _take_over(store: Store, silent: Holder, mine: Holder, period_s: float) -> bool:
-    """Replaces a silent holder; False where another was faster.
+def _take_over(store: Store, gone: Holder, mine: Holder, period_s: float) -> bool:
+    """Replaces a holder that is gone; False where another was faster.
 
     One contender for each holder gets the claim, and it looks again before it writes.
     """
-    claim = f"{STAGING}/_lock/{uuid.uuid5(uuid.NAMESPACE_OID, silent.token).hex}"
+    claim = f"{LOCK_CLAIMS}/{uuid.uuid5(uuid.NAMESPACE_OID, gone.token).hex}"
     if not store.put_if_absent(claim, _encode(mine)):
         time.sleep(period_s)
-        if read_holder(store) == silent:  # whoever claimed it died in here
+        if read_holder(store) == gone:  # the process with the claim died before it wrote
             store.remove(claim)
         return False
     try:
-        if read_holder(store) != silent:
+        if read_holder(store) != gone:
             return False
         store.write_whole(LOCK_FILE, _encode(mine))
         return True
@@ -153,20 +134,13 @@ def _take_over(store: Store, silent: Holder, mine: Holder, period_s: float) -> b
         store.remove(claim)
 
 
-def _refusal(store: Store, holder: Holder) -> str:
-    return (
-        f"{store.name} is in use by process {holder.pid} on {holder.host}: wait until it ends or stop it, "
-        "then start again; `verso status` shows how far it is"
-    )
+def _is_held_by(store: Store, holder: Holder) -> bool:
+    current = read_holder(store)
+    return current is not None and current.token == holder.token
 
 
-def _encode(holder: Holder, beat: int = 0) -> bytes:
-    return json.dumps({**asdict(holder), "beat": beat}).encode()
-
-
-def _myself() -> Holder:
-    pid = os.getpid()
-    return Holder(uuid.uuid4().hex, socket.gethostname(), pid, _machine(), _born(pid) or "")
+def _encode(holder: Holder) -> bytes:
+    return json.dumps(asdict(holder)).encode()
 
 
 def _machine() -> str:
@@ -179,7 +153,7 @@ def _machine() -> str:
 
 
 def _born(pid: int) -> str | None:
-    """When a process of this machine began, in ticks since boot; None where there is none of that id."""
+    """The start of a process of this machine, in ticks since boot; None where there is no such process."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:

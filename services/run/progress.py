@@ -1,4 +1,4 @@
-"""How long work shows that it goes on: a bar on a terminal, one line a minute elsewhere; one JSON line an event in _logs."""
+"""Progress of long work: a bar on a terminal, one line a minute elsewhere, and one JSON line an event in OUT/_logs."""
 
 import json
 import logging
@@ -23,45 +23,48 @@ _events.propagate = False
 
 
 class ProgressLine:
-    """Scenes, or other units, done out of those asked, on standard error."""
+    """Shows on standard error how many scenes, or other units, are done out of those asked."""
 
     def __init__(self, asked: int, what: str, unit: str = "scene") -> None:
         self._asked = asked
         self._what = what
         self._unit = unit
         self._bar = tqdm(total=asked, unit=unit, desc=what, file=sys.stderr) if sys.stderr.isatty() else None
-        self._begun = self._told = time.monotonic()
+        self._begun = self._shown = time.monotonic()
 
     def expect(self, asked: int) -> None:
-        """More is to be done than was known at first."""
+        """Sets the number to be done, where more is known than at first."""
         self._asked = asked
         if self._bar is not None:
             self._bar.total = asked
 
     def show(self, done: int, failed: int | None = None) -> None:
-        """Tell how far it is; `failed` where that is counted."""
+        """Shows the number done, and `failed` where failures are counted."""
         if self._bar is not None:
             self._bar.n = done
             self._bar.set_postfix({} if failed is None else {"failed": failed}, refresh=True)
             return
         now = time.monotonic()
-        if now - self._told >= LINE_EVERY_S:
-            self._told = now
-            rate, told = done / (now - self._begun), "" if failed is None else f"{failed} failed, "
+        if now - self._shown >= LINE_EVERY_S:
+            self._shown = now
+            rate, failures = done / (now - self._begun), "" if failed is None else f"{failed} failed, "
             print(
-                f"{self._what}: {done} of {self._asked} {self._unit}s, {told}{rate:.1f} {self._unit}s/s",
+                f"{self._what}: {done} of {self._asked} {self._unit}s, {failures}{rate:.1f} {self._unit}s/s",
                 file=sys.stderr,
             )
 
     def close(self) -> None:
-        """Leave the terminal tidy."""
+        """Ends the bar."""
         if self._bar is not None:
             self._bar.close()
 
 
 @contextmanager
-def event_log(out: Path) -> Iterator[None]:
-    """Within the block `log_event` writes to OUT/_logs/verso.jsonl, rotated."""
+def event_log(out: Path | None) -> Iterator[None]:
+    """Within the block `log_event` writes to OUT/_logs/verso.jsonl, rotated; nowhere without an `out` on a disk."""
+    if out is None:
+        yield
+        return
     folder = out / LOG_FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     handler = logging.handlers.RotatingFileHandler(
@@ -77,7 +80,7 @@ def event_log(out: Path) -> Iterator[None]:
 
 
 def log_event(event: str, level: int = logging.INFO, **fields: Any) -> None:
-    """One event as a JSON line: job, range, scene and attempt where they apply."""
+    """Writes one event as a JSON line: job, range, scene and attempt where they apply."""
     if not _events.handlers:
         return
     stamp = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())

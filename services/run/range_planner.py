@@ -1,29 +1,38 @@
-"""What is committed, and which scenes are still to be made, as ranges that can never overlap."""
+"""Planning of the ranges that are still to be made, such that ranges never overlap."""
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
 
 from schemas.dataset.commit import CommitSummary, Span
 from schemas.errors import OutputError
-from services.merge.committed_rows import check_retries
-from workers.store.commit import commit_names, read_summary
-from workers.store.store import Store
+from schemas.job.job import Job
+
+MAX_SHARD = 64
+"""Scenes in a shard of a large job: seconds of work for each millisecond that Ray takes to hand it out."""
+
+
+def plan_spans(job: Job, commits: Sequence[CommitSummary], retry_failed: bool) -> list[Span]:
+    """The missing ranges, and with `retry_failed` the scenes to try again. Raises as `plan_ranges`."""
+    ranges = plan_ranges(job.first_scene, job.stop_scene, job.run.range_size, committed_ranges(commits))
+    spans = [Span(start=start, stop=stop) for start, stop in ranges]
+    return spans + plan_retries(commits) if retry_failed else spans
 
 
 def plan_ranges(
     first_scene: int, stop_scene: int, range_size: int, committed: Iterable[tuple[int, int]]
 ) -> list[tuple[int, int]]:
-    """The ranges [start, stop) that are missing, in order. `committed` may be out of date: planners never conflict.
+    """The missing ranges [start, stop), in order. `committed` may be out of date: planners never conflict.
 
     Grid lines lie at first_scene + k * range_size. No range crosses one. Within a cell, the only starts that are ever
-    planned are the cell's own line and the stop of a committed range; a range ends at the next line, or at stop_scene
-    where that comes first.
+    planned are the cell's own line and the stop of a committed range. A range ends at the next line or at stop_scene,
+    whichever comes first.
 
-    Why ranges cannot overlap, whatever planners with old views and other values of stop_scene do: a record is put only
-    if absent, so one start has one range for ever. Take the committed ranges of a cell. The first can only begin at the
-    line (no stop existed before it), and each later one begins where one of them stops. One start has one range, so
-    they form a single chain, each beginning where the one before ends. A chain has no overlap, and no range leaves its
-    cell, so cells do not overlap either. An old view lacks the end of a chain: it plans a start that is taken, and
-    loses the put.
+    Ranges cannot overlap, even if planners have old views and other values of stop_scene: a record is put only if
+    absent, so one start has one range for ever. In a cell, the first committed range can only begin at the line (no stop
+    existed before it), and each later one begins where one of them stops. So they form a single chain without overlap,
+    and no range leaves its cell. An old view lacks the end of a chain: it plans a start that is taken, and loses the
+    put.
 
     Raises OutputError where scenes outside [first_scene, stop_scene) are committed: fewer scenes than committed is
     refused; and where committed ranges do not lie on this grid.
@@ -43,7 +52,7 @@ def plan_ranges(
 
 
 def plan_retries(summaries: Sequence[CommitSummary]) -> list[Span]:
-    """One span for each range that still has environmental failures, holding those scenes alone."""
+    """One span for each range that still has environmental failures, with those scenes alone."""
     spans = []
     for group in ranges_with_retries(summaries):
         scenes = tuple(scene for scene, kind in effective_failures(group) if kind == "environmental")
@@ -52,15 +61,21 @@ def plan_retries(summaries: Sequence[CommitSummary]) -> list[Span]:
     return spans
 
 
-def list_commits(store: Store) -> list[CommitSummary]:
-    """Every committed range in order, each followed by its retries.
+def choose_shard_size(scenes: int, slots: int) -> int:
+    """Scenes in a shard: enough that Ray costs little, few enough that every slot has at least two shards."""
+    return min(MAX_SHARD, math.ceil(scenes / (2 * slots)))
 
-    Raises CorruptError for a damaged or missing record, OutputError for one of a newer version.
-    """
-    summaries = [read_summary(store, start, retry) for start, retry, _ in commit_names(store)]
-    for group in ranges_with_retries(summaries):
-        check_retries(group[0].start, [one.retry for one in group])
-    return summaries
+
+def group_shards(spans: Sequence[Span], shard_size: int) -> Iterator[tuple[Span, ...]]:
+    """Whole ranges in order, grouped until they hold at least `shard_size` scenes. Made one at a time, on demand."""
+    shard: list[Span] = []
+    for span in spans:
+        shard.append(span)
+        if sum(len(one.scene_ids) for one in shard) >= shard_size:
+            yield tuple(shard)
+            shard = []
+    if shard:
+        yield tuple(shard)
 
 
 def committed_ranges(summaries: Iterable[CommitSummary]) -> list[tuple[int, int]]:
@@ -70,10 +85,8 @@ def committed_ranges(summaries: Iterable[CommitSummary]) -> list[tuple[int, int]
 
 def ranges_with_retries(summaries: Iterable[CommitSummary]) -> list[list[CommitSummary]]:
     """The commits of each range: itself, then its retries in order."""
-    groups: dict[int, list[CommitSummary]] = {}
-    for one in summaries:
-        groups.setdefault(one.start, []).append(one)
-    return [sorted(groups[start], key=lambda one: one.retry) for start in sorted(groups)]
+    ordered = sorted(summaries, key=lambda one: (one.start, one.retry))
+    return [list(group) for _, group in groupby(ordered, key=lambda one: one.start)]
 
 
 def effective_failures(group: Sequence[CommitSummary]) -> list[tuple[int, str]]:

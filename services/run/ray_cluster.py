@@ -1,4 +1,4 @@
-"""Where the work runs: a private Ray on this machine, or a cluster that is already there."""
+"""The Ray that runs the work: a private one on this machine, or a running cluster."""
 
 import contextlib
 import os
@@ -13,36 +13,41 @@ from pathlib import Path
 import ray
 
 from schemas.errors import MachineError
+from services.run.cores import usable_cores
 
 OBJECT_STORE_BYTES = 128 * 2**20
 """Images never cross Ray, so its shared memory can be small."""
 
-ANSWER_S = 10.0
-"""How long a cluster's head may take to accept a connection."""
-
+CONNECT_S = 10.0
+"""Time for a cluster's head to accept a connection."""
 
 PREFETCH = 2
-"""Shards given to Ray for each slot: one that runs and one that waits, so that no slot idles between two."""
+"""Shards given to Ray for each slot: one that runs and one that waits, so that no slot is idle between two."""
 
 
 @dataclass(frozen=True)
 class Slots:
-    """How many shards run at once, and how many may be given to Ray at once."""
+    """The number of shards that run at once, and that may be given to Ray at once."""
 
     running: int
     in_flight: int
 
 
+def open_ray(address: str | None, workers: int | None) -> contextlib.AbstractContextManager[Slots]:
+    """The cluster at `address`, or a private Ray, by default with a worker for each usable core."""
+    return private_ray(workers or usable_cores()) if address is None else cluster_ray(address, workers)
+
+
 @contextlib.contextmanager
 def private_ray(workers: int) -> Iterator[Slots]:
-    """A Ray of our own with `workers` slots, gone when the block ends.
+    """A private Ray with `workers` slots, shut down when the block ends.
 
-    Never joins a Ray that happens to run on this machine, reaches out to nobody and opens no dashboard.
+    Never joins another Ray on this machine, contacts no other host and opens no dashboard.
     """
-    # A token that an earlier Ray left in the home folder would be asked of our own workers.
+    # Otherwise Ray asks its own workers for a token that an earlier Ray left in the home folder.
     os.environ["RAY_AUTH_MODE"] = "disabled"  # noqa: TID251 - Ray reads this setting nowhere else
-    with _quiet_stdout(), tempfile.TemporaryDirectory(prefix="vr", ignore_cleanup_errors=True) as folder:
-        with _project_first():
+    with _stdout_to_stderr(), tempfile.TemporaryDirectory(prefix="vr", ignore_cleanup_errors=True) as folder:
+        with _in_project_folder():
             ray.init(
                 address="local",
                 num_cpus=workers,
@@ -54,14 +59,16 @@ def private_ray(workers: int) -> Iterator[Slots]:
                 _plasma_directory=_object_store_folder(folder),
                 _node_ip_address="127.0.0.1",
             )
-        with _shut_down():
+        try:
             yield Slots(workers, PREFETCH * workers)
+        finally:
+            ray.shutdown()
 
 
 def _object_store_folder(temporary: str) -> str:
-    """Shared memory where there is enough of it.
+    """Shared memory where there is enough of it, otherwise the temporary folder.
 
-    A container often has 64 MiB, and Ray then warns of slow storage, which is of no matter to reports of a kilobyte.
+    A container often has 64 MiB only. Ray then warns of slow storage, which does not matter for reports of a kilobyte.
     """
     shared = Path("/dev/shm")
     roomy = shared.exists() and shutil.disk_usage(shared).free > 2 * OBJECT_STORE_BYTES
@@ -70,47 +77,37 @@ def _object_store_folder(temporary: str) -> str:
 
 @contextlib.contextmanager
 def cluster_ray(address: str, workers: int | None) -> Iterator[Slots]:
-    """A cluster that runs already: as many slots as it has cores, or `workers` where that is less.
+    """A running cluster: as many slots as it has cores, or `workers` where that is less.
 
-    Raises MachineError where nobody answers at the address.
+    Raises MachineError where no Ray answers at the address.
     """
-    _probe(address)
-    with _quiet_stdout():
+    _check_reachable(address)
+    with _stdout_to_stderr():
         try:
-            with _project_first():
+            with _in_project_folder():
                 ray.init(address=address, log_to_driver=False, configure_logging=False)
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise MachineError(f"--address {address}: {error}") from error
-        with _shut_down():
-            yield _cluster_slots(address, workers)
+        try:
+            cores = int(ray.cluster_resources().get("CPU", 0))
+            if cores < 1:
+                raise MachineError(f"--address {address}: the cluster has no CPU to run on")
+            # Any free core would start a waiting shard, so none may wait where there are fewer workers than cores.
+            yield Slots(workers, workers) if workers and workers < cores else Slots(cores, PREFETCH * cores)
+        finally:
+            ray.shutdown()
 
 
-def _cluster_slots(address: str, workers: int | None) -> Slots:
-    cores = int(ray.cluster_resources().get("CPU", 0))
-    if cores < 1:
-        raise MachineError(f"--address {address}: the cluster has no CPU to run on")
-    # A shard that waits could be started by any free core, so fewer workers than cores means none that waits.
-    return Slots(workers, workers) if workers and workers < cores else Slots(cores, PREFETCH * cores)
-
-
-@contextlib.contextmanager
-def _shut_down() -> Iterator[None]:
-    try:
-        yield
-    finally:
-        ray.shutdown()
-
-
-def _quiet_stdout() -> contextlib.AbstractContextManager[object]:
-    """Ray tells of dead workers on the driver's standard output, which belongs to the command's answer."""
+def _stdout_to_stderr() -> contextlib.AbstractContextManager[object]:
+    """Keeps Ray's messages about dead workers off standard output, which is for the command's answer."""
     return contextlib.redirect_stdout(sys.stderr)
 
 
 @contextlib.contextmanager
-def _project_first() -> Iterator[None]:
-    """Ray puts the folder that its driver stands in first on its workers' search path: let that be ours.
+def _in_project_folder() -> Iterator[None]:
+    """Changes to the project's folder, which Ray then puts first on its workers' search path.
 
-    The packages have generic names; a `services` folder where the user happens to stand must not be found instead.
+    The packages have generic names: a `services` folder in the user's working folder must not be found instead.
     """
     before = Path.cwd()
     os.chdir(Path(__file__).resolve().parents[2])
@@ -120,7 +117,7 @@ def _project_first() -> Iterator[None]:
         os.chdir(before)
 
 
-def _probe(address: str) -> None:
+def _check_reachable(address: str) -> None:
     """Raises MachineError unless something accepts a connection; Ray itself would wait for a minute."""
     if address == "auto":
         return
@@ -131,7 +128,7 @@ def _probe(address: str) -> None:
             f"--address {address}: write it as HOST:PORT, as `ray start` prints it (port 6379 by default)"
         )
     try:
-        socket.create_connection((host, int(port)), timeout=ANSWER_S).close()
+        socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
     except OSError as error:
         raise MachineError(
             f"--address {address}: no Ray answers there ({error.strerror or error}); start one with `ray start --head`, or "

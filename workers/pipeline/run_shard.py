@@ -29,7 +29,6 @@ from workers.render.raster.context import require_device
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.step import require_tier
 from workers.store.attempt import Attempt, begin_attempt
-from workers.store.local import LocalStore
 from workers.store.opening import open_store
 from workers.store.store import Store
 
@@ -135,10 +134,10 @@ def _join_stack(store: Store, mine: Fingerprint, order: ShardOrder) -> None:
 @contextmanager
 def _traceback_file(store: Store, attempt: Attempt) -> Iterator[IO[str]]:
     """Where a hung worker leaves its traceback: in the attempt's folder, so that the coordinator can tell."""
-    if not isinstance(store, LocalStore) or attempt.fenced:
+    if store.root is None or attempt.fenced:
         yield sys.stderr
         return
-    path = store.path(f"{staging_path(attempt.span.start, attempt.name)}/{TIMED_OUT}")
+    path = store.root / staging_path(attempt.span.start, attempt.name) / TIMED_OUT
     with open(path, "w", encoding="utf-8") as file:
         yield file
 

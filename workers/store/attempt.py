@@ -1,7 +1,6 @@
-"""One try at a range: files go to staging at once, rows gather in memory, and the commit decides."""
+"""One attempt at a range: files go to staging at once, rows stay in memory until the commit."""
 
 import contextlib
-import hashlib
 import json
 import os
 import re
@@ -11,20 +10,29 @@ from collections.abc import Iterator, Mapping
 
 import pyarrow as pa
 
-from schemas.dataset.commit import CommitRecord, CommitResult, CommitTerms, FileEntry, SceneMark, Span, TableEntry
-from schemas.dataset.layout import commit_path, range_table_path, staging_path
+from schemas.dataset.commit import (
+    CommitRecord,
+    CommitResult,
+    CommitTerms,
+    FileEntry,
+    SceneMark,
+    Span,
+    TableEntry,
+    describe_file,
+)
+from schemas.dataset.layout import FENCED, commit_path, range_table_path, staging_path
 from schemas.dataset.tables import SCHEMA_VERSION, SCHEMAS, TABLES
 from schemas.errors import OutputError, RunError
 from schemas.scene.scene import SceneOutput
 from workers.store.canonical import rows_digest
 from workers.store.commit import compare_records, encode_record, publish, read_record
 from workers.store.manifest import encode_table, sorted_rows, table_of_rows
-from workers.store.packing import FilePacking, Packing, TarPacking
+from workers.store.packing import Packing
 from workers.store.scene_rows import check_files, distinct_assets, outcome_of, scene_digest
 from workers.store.store import Store
 
 CURRENT = "_current"
-"""In an attempt's folder: which scene it is working on, for whoever finds the worker dead."""
+"""A file in an attempt's folder that names the scene in progress, in case the worker dies."""
 
 _NAME = re.compile(r"r(\d+)-.+")
 
@@ -32,8 +40,8 @@ _NAME = re.compile(r"r(\d+)-.+")
 def begin_attempt(store: Store, span: Span, terms: CommitTerms, label: str = "") -> "Attempt":
     """A new attempt at `span` with a folder of its own.
 
-    `label` goes into its name, so that whoever started it can recognise it. Raises OutputError where the store cannot
-    hold the layout.
+    `label` becomes part of its name, by which the coordinator knows its own attempts. Raises OutputError where the store
+    cannot hold the layout.
     """
     if store.tar_only and terms.layout != "tar":
         raise OutputError(
@@ -52,13 +60,13 @@ def retry_of_attempt(name: str) -> int | None:
 
 
 def attempts_at(store: Store, start: int) -> list[str]:
-    """Names of the attempts that have a folder for the range at `start`, fenced ones left out."""
+    """Names of the attempts that have a folder for the range at `start`, except fenced ones."""
     names = store.children(staging_path(start, "")[:-1])
-    return [name for name in names if retry_of_attempt(name) is not None and not name.endswith(".fenced")]
+    return [name for name in names if retry_of_attempt(name) is not None and not name.endswith(FENCED)]
 
 
 def blamed_scene(store: Store, start: int, attempt: str) -> int | None:
-    """The scene that an attempt was working on when it last said so; None where it was between scenes or is gone."""
+    """The scene that an attempt last noted as in progress; None where it was between scenes or is gone."""
     try:
         current = json.loads(store.read(f"{staging_path(start, attempt)}/{CURRENT}"))
     except (FileNotFoundError, ValueError):
@@ -68,31 +76,30 @@ def blamed_scene(store: Store, start: int, attempt: str) -> int | None:
 
 
 class Attempt:
-    """A try at one range. Nothing outside its own folder changes before `commit`."""
+    """An attempt at one range. Nothing outside its own folder changes before `commit`."""
 
     def __init__(self, store: Store, span: Span, terms: CommitTerms, name: str) -> None:
         self.name = name
         self.span = span
         self.fenced = False
-        """True once the folder was swept away: the attempt can still compare, and no longer win."""
+        """True once the folder was swept: the attempt can still be compared, but no longer win."""
         self._store = store
         self._terms = terms
         self._staging = staging_path(span.start, name)
         self._files: dict[str, FileEntry] = {}
         self._rows: dict[str, list[pa.Table]] = {table: [SCHEMAS[table].empty_table()] for table in TABLES}
-        self._scenes: dict[int, SceneMark] = {}
-        packing = TarPacking if terms.layout == "tar" else FilePacking
-        self._packing: Packing = packing(store, self._staging, span)
+        self._scenes: list[SceneMark] = []
+        self._packing = Packing(store, self._staging, span, tar=terms.layout == "tar")
 
     def begin_scene(self, scene_id: int) -> None:
-        """Notes the scene being worked on, so that it can be blamed should the worker die in it."""
+        """Notes the scene in progress, which is blamed if the worker dies."""
         self._note({"scene_id": scene_id})
 
     def add_scene(self, output: SceneOutput) -> None:
         """Writes a scene's files and keeps its rows.
 
-        Raises ValueError where the output breaks the schema, names files that its rows do not (or the other way round),
-        is neither made nor failed, or is not the next of the range.
+        Raises ValueError where the output breaks the schema, its rows and files disagree, it is neither made nor failed,
+        or it is not the next scene of the range.
         """
         awaited = self.span.scene_ids[len(self._scenes) :][:1]
         if (output.scene_id,) != awaited:
@@ -101,53 +108,52 @@ class Attempt:
         if unknown := output.rows.keys() - tables.keys():
             raise ValueError(f"scene {output.scene_id} has rows for unknown tables: {', '.join(sorted(unknown))}")
         outcome = outcome_of(output)
-        entries = {path: FileEntry(path=path, bytes=len(data), sha256=_sha256(data)) for path, data in output.files}
+        entries = {path: describe_file(path, data) for path, data in output.files}
         check_files(output, entries)
         for path in self._files.keys() & entries.keys():
             if self._files[path] != entries[path]:
                 raise ValueError(f"{path} was written twice with different bytes")
-        with self._while_ours():
+        with self._skip_if_swept():
             self._packing.add({path: data for path, data in output.files if path not in self._files})
         self._files |= entries
         for table, rows in tables.items():
             self._rows[table].append(rows)
-        self._scenes[output.scene_id] = SceneMark(
-            scene_id=output.scene_id, outcome=outcome, digest=scene_digest(output.rows)
-        )
+        digest = scene_digest(output.rows)
+        self._scenes.append(SceneMark(scene_id=output.scene_id, outcome=outcome, digest=digest))
 
     def commit(self) -> CommitResult:
-        """Decides the range and, where this attempt wins, publishes it; a loser's folder is dropped.
+        """Decides the range and, where this attempt wins, publishes it; a loser's folder is removed.
 
         Raises ValueError where a scene of the range is missing, RunError where the attempt was swept although nobody
         has committed the range.
         """
-        missing = [scene_id for scene_id in self.span.scene_ids if scene_id not in self._scenes]
-        if missing:
-            raise ValueError(f"the range from {self.span.start} lacks scenes {missing[:5]}: it cannot be committed")
+        if missing := self.span.scene_ids[len(self._scenes) :]:
+            first = list(missing[:5])
+            raise ValueError(f"the range from {self.span.start} lacks scenes {first}: it cannot be committed")
         self._note({})
         record = self._finish()
         if not self._put(record):
-            return self._lose(record)
+            return self._concede(record)
         publish(self._store, record)
         return CommitResult(won=True, record=record)
 
     def abandon(self) -> None:
-        """Drops the attempt's folder."""
+        """Removes the attempt's folder."""
         self._packing.close()
         self._store.remove_tree(self._staging)
 
     def _finish(self) -> CommitRecord:
-        """The record of this attempt, with all that it names written."""
+        """The record of this attempt, after the last of its files is written."""
         tables, files = {}, {}
         for table in TABLES:
             rows = sorted_rows(table, distinct_assets(table, pa.concat_tables(self._rows[table]).combine_chunks()))
             data = encode_table(rows)
             path = range_table_path(self.span.start, table, self.span.retry)
-            with self._while_ours():
+            with self._skip_if_swept():
                 self._store.write_staged(self._staging, path, data)
-            files[path] = FileEntry(path=path, bytes=len(data), sha256=_sha256(data))
+            files[path] = describe_file(path, data)
             tables[table] = TableEntry(rows=rows.num_rows, digest=rows_digest(table, rows))
-        with self._while_ours():
+        with self._skip_if_swept():
             files |= {entry.path: entry for entry in self._packing.finish(self._files)}
         return CommitRecord(
             schema_version=SCHEMA_VERSION,
@@ -156,21 +162,19 @@ class Attempt:
             terms=self._terms,
             files=tuple(files[path] for path in sorted(files)),
             tables=tables,
-            scenes=tuple(self._scenes[scene_id] for scene_id in self.span.scene_ids),
+            scenes=tuple(self._scenes),
         )
 
     def _put(self, record: CommitRecord) -> bool:
-        """Whether this attempt's record now stands."""
+        """Puts the record if absent; True where it is now this attempt's."""
         key = commit_path(self.span.start, self.span.retry)
-        if self.fenced or self._store.size(key) is not None:
-            return False
-        won = False
-        with self._while_ours():
-            self._store.make_durable(self._staging)
-            won = self._store.put_if_absent(key, encode_record(record), self._staging)
-        return won
+        with self._skip_if_swept():
+            if not self.fenced and self._store.size(key) is None:
+                self._store.make_durable(self._staging)
+                return self._store.put_if_absent(key, encode_record(record), self._staging)
+        return False
 
-    def _lose(self, mine: CommitRecord) -> CommitResult:
+    def _concede(self, mine: CommitRecord) -> CommitResult:
         winner = read_record(self._store, self.span.start, self.span.retry)
         self.abandon()
         if winner is None:
@@ -181,17 +185,13 @@ class Attempt:
         return CommitResult(won=False, record=winner, conflict=compare_records(mine, winner))
 
     def _note(self, current: Mapping[str, object]) -> None:
-        with self._while_ours():
+        with self._skip_if_swept():
             self._store.write_staged(self._staging, CURRENT, json.dumps(current).encode())
 
     @contextlib.contextmanager
-    def _while_ours(self) -> Iterator[None]:
-        """Skips a write to a folder that was swept away."""
+    def _skip_if_swept(self) -> Iterator[None]:
+        """Skips a write to a folder that was swept."""
         try:
             yield
         except FileNotFoundError:
             self.fenced = True
-
-
-def _sha256(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()

@@ -1,15 +1,13 @@
 """The canonical bytes of table rows: the same rows in the same order give the same digest, however they are stored.
 
-Each column is a few streams, hashed as they come: which values are there (one byte each), lengths of strings and lists,
-and the values themselves (doubles as IEEE-754 little-endian, so -0.0 is not 0.0; integers as 8 bytes little-endian;
-booleans as one byte; strings as UTF-8). A missing value counts as absent and as zero or empty; what lies below an
-absent list is no part of the stream. A column's digest is the hash of its streams' digests, a table's digest the hash
-of its name, its number of rows and its columns in the order of the schema. How rows were cut into batches is no part
-of it.
+Each column is hashed as a few streams: which values are present (one byte each), lengths of strings and lists, and the
+values themselves (doubles as IEEE-754 little-endian, so -0.0 is not 0.0; integers as 8 bytes little-endian; booleans as
+one byte; strings as UTF-8). A missing value counts as absent and as zero or empty; items below an absent list are left
+out. A column's digest is the hash of its streams' digests, a table's digest the hash of its name, its number of rows
+and its columns in the order of the schema. It does not depend on how rows were cut into batches.
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -22,7 +20,7 @@ _PRIMITIVES: dict[pa.DataType, tuple[str, float | bool]] = {
     pa.int64(): ("<i8", 0),
     pa.bool_(): ("|u1", False),
 }
-"""How a value is written, and what stands where there is none."""
+"""How a value is written, and what replaces a missing one."""
 
 
 class _Stream:
@@ -57,7 +55,7 @@ class _Stream:
             )
 
     def digest(self) -> bytes:
-        """[32] bytes: of everything so far."""
+        """[32] bytes: of all values so far."""
         streams = [stream.digest() for stream in (self._present, self._lengths, self._values)]
         return hashlib.sha256(b"".join([*streams, *(child.digest() for child in self._children)])).digest()
 
@@ -93,12 +91,6 @@ def rows_digest(table: str, rows: pa.Table) -> str:
     return digest.hexdigest()
 
 
-def joint_digest(parts: Mapping[str, str] | Sequence[tuple[str, str]]) -> str:
-    """64 hex characters: one digest of several named ones, in the order given."""
-    pairs = parts.items() if isinstance(parts, Mapping) else parts
-    return hashlib.sha256("".join(f"{name}\n{digest}\n" for name, digest in pairs).encode()).hexdigest()
-
-
 def _is_list(kind: pa.DataType) -> bool:
     return bool(pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind))
 
@@ -110,7 +102,7 @@ def _child_types(kind: pa.DataType) -> list[pa.DataType]:
 
 
 def _tag(kind: pa.DataType) -> str:
-    """A name of a type that does not change with Arrow's version."""
+    """A type's name that does not change with Arrow's version."""
     if pa.types.is_struct(kind):
         return "{" + ",".join(f"{kind.field(i).name}:{_tag(kind.field(i).type)}" for i in range(kind.num_fields)) + "}"
     if _is_list(kind):

@@ -1,30 +1,27 @@
-"""Decide, then publish: records are put if absent, and what a record names is then renamed into place by anyone.
+"""Deciding, then publishing: a commit record is put if absent, and any process may then rename its files into place.
 
 The record is the only decision. It is linked from the attempt's own folder, so an attempt whose folder was swept cannot
-commit any more. Publishing is a roll-forward: it can be done by any process, at any time, any number of times.
+commit any more. Publishing may be repeated by any process, at any time, any number of times.
 """
 
 import contextlib
 import hashlib
 import json
-import re
-from collections.abc import Iterator
 
 from pydantic import ValidationError
 
 from schemas.dataset.commit import CommitRecord, CommitSummary, FileEntry
-from schemas.dataset.layout import ASSETS, COMMITS, commit_path, staging_path
+from schemas.dataset.layout import COMMITS, commit_path, is_shape, parse_commit_path, staging_path
 from schemas.dataset.tables import SCHEMA_VERSION
 from schemas.errors import CommitConflict, CorruptError, OutputError
 from workers.store.store import Store, fenced_key
 
-_NAME = re.compile(r"(\d{10,})(?:\.retry-(\d+))?\.json")
 _SEAL = b',"seal":"'
 """The last key of a record: the SHA-256 of all bytes before it."""
 
 
 def encode_record(record: CommitRecord) -> bytes:
-    """Canonical JSON with a seal, so that a damaged record is found."""
+    """Canonical JSON with a seal that reveals damage."""
     body = json.dumps(record.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False)
     head = body[:-1].encode()
     return head + _SEAL + hashlib.sha256(head).hexdigest().encode() + b'"}\n'
@@ -49,15 +46,20 @@ def commit_names(store: Store) -> list[tuple[int, int, str]]:
     Raises CorruptError naming a file that does not belong there.
     """
     found = []
-    for entry in store.files(COMMITS):
-        name = entry.key.rpartition("/")[2]
-        if name.startswith("."):
+    for key, _ in store.files(COMMITS):
+        if key.rpartition("/")[2].startswith("."):
             continue
-        match = _NAME.fullmatch(name)
-        if match is None or commit_path(int(match[1]), int(match[2] or 0)) != entry.key:
-            raise CorruptError(f"{entry.key} in {store.name} is not a commit of this program: move it away")
-        found.append((int(match[1]), int(match[2] or 0), entry.key))
+        name = parse_commit_path(key)
+        if name is None:
+            raise CorruptError(f"{key} in {store.name} is not a commit of this program: move it away")
+        found.append((*name, key))
     return sorted(found)
+
+
+def commits_digest(store: Store) -> str:
+    """A digest that tells one set of commits from another: a record never changes, so keys and sizes are enough."""
+    lines = [f"{key} {store.size(key)}\n" for _, _, key in commit_names(store)]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def read_record(store: Store, start: int, retry: int = 0) -> CommitRecord | None:
@@ -68,66 +70,67 @@ def read_record(store: Store, start: int, retry: int = 0) -> CommitRecord | None
     except FileNotFoundError:
         return None
     record = decode_record(data, key)
-    if (record.span.start, record.span.retry) != (start, retry):
-        raise CorruptError(
-            f"{key} holds the record of another range: {commit_path(record.span.start, record.span.retry)}"
-        )
+    _check_range(key, record.span.start, record.span.retry)
     return record
 
 
-def iter_records(store: Store) -> Iterator[CommitRecord]:
-    """Every record, one at a time, each range followed by its retries."""
-    for start, retry, key in commit_names(store):
-        record = read_record(store, start, retry)
-        if record is None:
-            raise CorruptError(f"{key} vanished while it was read")
-        yield record
-
-
 def read_summary(store: Store, start: int, retry: int = 0) -> CommitSummary:
-    """What planning needs of a record, without its list of files. Raises as `decode_record`."""
+    """The part of a record that planning needs, without its list of files. Raises as `decode_record`."""
     key = commit_path(start, retry)
     raw = _unsealed(store.read(key), key)
     try:
         span, scenes = raw["span"], raw["scenes"]
-        if (span["start"], span["retry"]) != (start, retry):
-            raise CorruptError(f"{key} holds the record of another range")
+        _check_range(key, span["start"], span["retry"])
         failed = tuple((scene["scene_id"], scene["outcome"]) for scene in scenes if scene["outcome"] != "made")
         return CommitSummary(
             start=start,
             stop=span["stop"],
             retry=retry,
-            attempt=raw["attempt"],
-            fingerprint=raw["terms"]["fingerprint"],
             made=len(scenes) - len(failed),
             failed=failed,
             scenes=tuple(span["scenes"]),
         )
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise CorruptError(f"{key} is not a commit record: {error!r}") from error
 
 
 def publish(store: Store, record: CommitRecord) -> None:
-    """Moves what the record names from its staging to its final place, then drops the staging. Idempotent.
+    """Moves the record's files from staging to their final places, then removes the staging. Idempotent.
 
     Raises CorruptError naming a file that is nowhere or has the wrong size, CommitConflict where a shape that ranges
     share was published with another size by the same stack.
     """
-    staging = staging_path(record.span.start, record.attempt)
     for entry in record.files:
-        final = store.size(entry.path) if _is_shared(entry.path) else None
-        if final is not None:
-            if final != entry.bytes and record.terms.fingerprint_mode == "strict":
-                raise CommitConflict(
-                    f"{entry.path} has {final} bytes, and {entry.bytes} in the range from scene {record.span.start}, "
-                    f"made by {record.terms.fingerprint}: two attempts at one shape differ"
-                )
-            continue
-        if not _move(store, staging, entry.path, entry.bytes):
-            _check_final(store, entry)
+        final = store.size(entry.path) if is_shape(entry.path) else None
+        if final is None:
+            if not _move(store, record, entry):
+                _check_final(store, entry)
+        elif final != entry.bytes and record.terms.fingerprint_mode == "strict":
+            raise CommitConflict(
+                f"{entry.path} has {final} bytes, and {entry.bytes} in the range from scene {record.span.start}, "
+                f"made by {record.terms.fingerprint}: two attempts at one shape differ"
+            )
     store.sync_folders_of(entry.path for entry in record.files)
-    store.remove_tree(staging)
-    store.remove_tree(fenced_key(staging))
+    for folder in _staging_folders(record):
+        store.remove_tree(folder)
+
+
+def read_committed(store: Store, record: CommitRecord, path: str) -> bytes:
+    """The bytes of one of the record's files, published or not yet. Raises CorruptError naming one that is missing."""
+    staged = [f"{folder}/{path}" for folder in _staging_folders(record)]
+    for key in (path, *staged, path):  # it may move from staging to its final place meanwhile
+        with contextlib.suppress(FileNotFoundError):
+            return store.read(key)
+    raise CorruptError(f"{path} is committed and missing: restore it from a copy")
+
+
+def check_published(store: Store, record: CommitRecord) -> None:
+    """Raises CorruptError naming a file of the record that is not in its final place with its size.
+
+    A shape that a mix of stacks shares keeps the size of whichever was first.
+    """
+    for entry in record.files:
+        _check_final(store, entry, record.terms.fingerprint_mode == "strict" or not is_shape(entry.path))
 
 
 def compare_records(mine: CommitRecord, winner: CommitRecord) -> str | None:
@@ -137,26 +140,25 @@ def compare_records(mine: CommitRecord, winner: CommitRecord) -> str | None:
     """
     theirs = {scene.scene_id: scene for scene in winner.scenes}
     different = [
-        scene.scene_id
+        f"scene {scene.scene_id}"
         for scene in mine.scenes
         if (other := theirs.get(scene.scene_id)) is not None
         and "environmental" not in (scene.outcome, other.outcome)
         and (scene.outcome, scene.digest) != (other.outcome, other.digest)
     ]
-    shapes = {entry.path: entry.sha256 for entry in winner.files if _is_shared(entry.path)}
-    paths = [entry.path for entry in mine.files if shapes.get(entry.path, entry.sha256) != entry.sha256]
-    if not different and not paths:
+    shapes = {entry.path: entry.sha256 for entry in winner.files if is_shape(entry.path)}
+    different += [entry.path for entry in mine.files if shapes.get(entry.path, entry.sha256) != entry.sha256]
+    if not different:
         return None
-    what = [f"scene {scene_id}" for scene_id in different] + paths
     return (
-        f"two attempts made other bytes at {', '.join(what[:5])}{' and more' if len(what) > 5 else ''}: "
+        f"two attempts made other bytes at {', '.join(different[:5])}{' and more' if len(different) > 5 else ''}: "
         f"{winner.attempt} (committed) on fingerprint {winner.terms.fingerprint}, "
         f"{mine.attempt} on fingerprint {mine.terms.fingerprint}"
     )
 
 
 def _unsealed(data: bytes, name: str) -> dict:
-    """The JSON object of a record whose seal is whole and whose version is not newer than ours."""
+    """The JSON object of a record whose seal is whole and whose version is not newer than this program's."""
     head, mark, seal = data.rpartition(_SEAL)
     try:
         raw = json.loads(data)
@@ -176,44 +178,30 @@ def _unsealed(data: bytes, name: str) -> dict:
     return raw
 
 
-def _move(store: Store, staging: str, path: str, size: int) -> bool:
+def _check_range(key: str, start: int, retry: int) -> None:
+    if commit_path(start, retry) != key:
+        raise CorruptError(f"{key} holds the record of another range: {commit_path(start, retry)}")
+
+
+def _staging_folders(record: CommitRecord) -> tuple[str, str]:
+    """Where the winner's files may lie before they are published: its folder, or that folder fenced."""
+    staging = staging_path(record.span.start, record.attempt)
+    return staging, fenced_key(staging)
+
+
+def _move(store: Store, record: CommitRecord, entry: FileEntry) -> bool:
     """Renames one file into place; False where it is not staged (any more)."""
-    for folder in (staging, fenced_key(staging)):
-        source = f"{folder}/{path}"
+    for folder in _staging_folders(record):
+        source = f"{folder}/{entry.path}"
         staged = store.size(source)
         if staged is None:
             continue
-        if staged != size:
-            raise CorruptError(f"{source} has {staged} bytes, and its commit says {size}")
-        try:
-            store.rename(source, path)
-        except FileNotFoundError:
-            continue
-        return True
-    return False
-
-
-def read_committed(store: Store, record: CommitRecord, path: str) -> bytes:
-    """The bytes of one of the record's files, published or not yet. Raises CorruptError naming one that is missing."""
-    staging = staging_path(record.span.start, record.attempt)
-    for key in (
-        path,
-        f"{staging}/{path}",
-        f"{fenced_key(staging)}/{path}",
-        path,
-    ):  # it moves from staging to the end of this list
+        if staged != entry.bytes:
+            raise CorruptError(f"{source} has {staged} bytes, and its commit says {entry.bytes}")
         with contextlib.suppress(FileNotFoundError):
-            return store.read(key)
-    raise CorruptError(f"{path} is committed and missing: restore it from a copy")
-
-
-def check_published(store: Store, record: CommitRecord) -> None:
-    """Raises CorruptError naming a file of the record that is not in its final place with its size.
-
-    A shape that a mix of stacks shares keeps the size of whichever was first.
-    """
-    for entry in record.files:
-        _check_final(store, entry, record.terms.fingerprint_mode == "strict" or not _is_shared(entry.path))
+            store.rename(source, entry.path)
+            return True
+    return False
 
 
 def _check_final(store: Store, entry: FileEntry, exact: bool = True) -> None:
@@ -222,8 +210,3 @@ def _check_final(store: Store, entry: FileEntry, exact: bool = True) -> None:
         raise CorruptError(f"{entry.path} is named by a commit and is neither staged nor published")
     if final != entry.bytes and exact:
         raise CorruptError(f"{entry.path} has {final} bytes, and its commit says {entry.bytes}")
-
-
-def _is_shared(path: str) -> bool:
-    """Whether several ranges may make this file, with the same bytes."""
-    return path.startswith(f"{ASSETS}/")

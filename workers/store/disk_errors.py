@@ -1,4 +1,4 @@
-"""What a disk may answer that a user can mend, and how to say it."""
+"""Errors of a disk that a user can mend, explained."""
 
 import contextlib
 import errno
@@ -16,7 +16,7 @@ _REMEDIES = {
 
 
 @contextlib.contextmanager
-def told_plainly(what: str) -> Iterator[None]:
+def explain_disk_errors(what: str) -> Iterator[None]:
     """Turns an OSError that a user can mend into a MachineError: `what` happened, why, and what to do."""
     try:
         yield

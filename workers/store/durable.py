@@ -1,9 +1,9 @@
-"""Making files on a local disk survive a loss of power."""
+"""Flushing of files and folders on a local disk, so that they survive a loss of power."""
 
 import ctypes
 import os
 from collections.abc import Iterable
-from functools import cache
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from workers.store.mounts import file_system_of
@@ -14,98 +14,63 @@ _SYNCFS_TYPES = frozenset({"ext2", "ext3", "ext4", "xfs", "btrfs", "f2fs", "zfs"
 _SYNCFS_REPORTS_ERRORS = (5, 8)
 """The first Linux whose syncfs(2) reports a failed write."""
 
-_WRITE_BACK = 2
-"""SYNC_FILE_RANGE_WRITE: begin writing, do not wait."""
+_AT_ONCE = 8
+"""Files that are flushed at once where each needs an fsync."""
+
+FEW_FOLDERS = 3
+"""Up to this many folders are flushed one by one; for more, one syncfs is less work where it can be trusted."""
 
 
 def sync_tree(folder: Path) -> None:
     """Returns when every file and folder below `folder`, and its own name, are on the disk.
 
-    One syncfs where that can be trusted (for 300 files of 60 kB on ext4: 12 ms, against 73 ms for an fsync each),
-    otherwise write-back is begun for all files before each is waited for (30 ms).
+    Uses one syncfs where it can be trusted, otherwise an fsync for each file, several at once. 300 files of 60 kB on ext4
+    take 12 ms by syncfs, 42 ms by fsync at once and 94 ms one by one.
     """
-    if not _trusts_syncfs(folder) or not _syncfs(folder):
-        _sync_each(folder)
-    sync_folder(folder.parent)
-
-
-def sync_file(path: Path) -> None:
-    """Returns when the file's bytes are on the disk."""
-    _sync_path(path, os.O_RDONLY)
-
-
-def sync_folder(path: Path) -> None:
-    """Returns when the names in a folder are on the disk."""
-    _sync_path(path, os.O_RDONLY | os.O_DIRECTORY)
-
-
-FEW_FOLDERS = 3
-"""So many folders are flushed one by one; for more, where that can be trusted, one syncfs is less work."""
+    if _trusts_syncfs(folder):
+        _syncfs(folder)
+    else:
+        parents, _, names = zip(*os.walk(folder, topdown=False), strict=True)
+        files = [Path(parent) / name for parent, inside in zip(parents, names, strict=True) for name in inside]
+        with ThreadPoolExecutor(_AT_ONCE) as pool:
+            list(pool.map(sync_path, files))
+        for parent in parents:
+            sync_path(Path(parent))
+    sync_path(folder.parent)
 
 
 def sync_folders(root: Path, folders: Iterable[str]) -> None:
     """Returns when the names in `folders`, paths below `root`, are on the disk; deeper ones first."""
     ordered = sorted(folders, reverse=True)
-    if len(ordered) > FEW_FOLDERS and _trusts_syncfs(root) and _syncfs(root):
-        return
+    if len(ordered) > FEW_FOLDERS and _trusts_syncfs(root):
+        return _syncfs(root)
     for folder in ordered:
-        sync_folder(root / folder)
+        sync_path(root / folder)
 
 
-def _sync_path(path: Path, flags: int) -> None:
-    descriptor = os.open(path, flags)
+def sync_path(path: Path) -> None:
+    """Returns when a file's bytes, or the names in a folder, are on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
 
 
-def _sync_each(folder: Path) -> None:
-    files = [Path(parent) / name for parent, _, names in os.walk(folder) for name in names]
-    for path in files:
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            _libc().sync_file_range(descriptor, ctypes.c_int64(0), ctypes.c_int64(0), _WRITE_BACK)
-        finally:
-            os.close(descriptor)
-    for path in files:
-        sync_file(path)
-    for parent, _, _ in os.walk(folder, topdown=False):
-        sync_folder(Path(parent))
-
-
-def _syncfs(folder: Path) -> bool:
-    """Whether the whole file system of `folder` was written back. Raises OSError where writing failed."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+def _syncfs(folder: Path) -> None:
+    """Writes back the whole file system of `folder`. Raises OSError where writing failed."""
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        if _libc().syncfs(descriptor) == 0:
-            return True
-        number = ctypes.get_errno()
+        if ctypes.CDLL(None, use_errno=True).syncfs(descriptor) != 0:
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number), str(folder))
     finally:
         os.close(descriptor)
-    raise OSError(number, os.strerror(number), str(folder))
-
-
-@cache
-def _libc() -> ctypes.CDLL:
-    return ctypes.CDLL(None, use_errno=True)
-
-
-@cache
-def _kernel() -> tuple[int, ...]:
-    return tuple(int(part) for part in os.uname().release.split("-")[0].split(".")[:2])
 
 
 def _trusts_syncfs(folder: Path) -> bool:
-    return (
-        _kernel() >= _SYNCFS_REPORTS_ERRORS and _file_system_of_device(os.stat(folder).st_dev, folder) in _SYNCFS_TYPES
-    )
+    return _kernel() >= _SYNCFS_REPORTS_ERRORS and file_system_of(folder) in _SYNCFS_TYPES
 
 
-_known_devices: dict[int, str] = {}
-
-
-def _file_system_of_device(device: int, folder: Path) -> str:
-    if device not in _known_devices:
-        _known_devices[device] = file_system_of(folder)
-    return _known_devices[device]
+def _kernel() -> tuple[int, ...]:
+    return tuple(int(part) for part in os.uname().release.split("-")[0].split(".")[:2])

@@ -1,4 +1,4 @@
-"""Images as PNG bytes and back: lossless, and the same bytes for the same pixels."""
+"""PNG encoding and decoding: lossless, and the same bytes for the same pixels."""
 
 import struct
 from typing import cast
@@ -20,7 +20,7 @@ FAST_LEVEL = 1
 """The level of `png_level` that asks for speed."""
 
 _NONE, _SUB = 0, 1
-"""PNG filters of a row: as it is, and the difference from the pixel to the left."""
+"""PNG filters of a row: unchanged values, and differences from the pixel to the left."""
 
 
 def encode_png(pixels: Pixels, level: int = FAST_LEVEL) -> bytes:
@@ -38,12 +38,12 @@ def encode_png(pixels: Pixels, level: int = FAST_LEVEL) -> bytes:
 
 
 def _encode_fast(pixels: NDArray) -> bytes:
-    """By zlib-ng, which takes half to a quarter of the time of OpenCV's encoder.
+    """PNG bytes by zlib-ng, in half to a quarter of the time of OpenCV's encoder.
 
     640 x 480, one core, rendered images, against the best settings of OpenCV: textured RGB 5.4 ms and 228 KiB (8.4 ms, 231
     KiB), projected RGB 3.0 ms and 143 KiB (4.8, 143), depth 0.33 ms and 14 KiB (1.1, 12), region ids 0.13 ms and 6 KiB
-    (0.46, 4). ISA-L takes half of that again, but once in some thousand images its level 1 makes other bytes of the same
-    pixels, by what is left in its memory.
+    (0.46, 4). ISA-L takes half of that, but once in some thousand images its level 1 makes other bytes from the same
+    pixels, depending on leftovers in its memory.
     """
     height, width = pixels.shape[:2]
     head = struct.pack(">IIBBBBB", width, height, 8 * pixels.itemsize, 2 if pixels.ndim == 3 else 0, 0, 0, 0)
@@ -52,7 +52,7 @@ def _encode_fast(pixels: NDArray) -> bytes:
 
 
 def _filter_rows(pixels: NDArray) -> NDArray[np.uint8]:
-    """[H, 1 + row bytes]: each row behind the number of its PNG filter, `sub` for colour with shades and else `none`."""
+    """[H, 1 + row bytes]: each row after the number of its PNG filter: `sub` for shaded colour, otherwise `none`."""
     samples = pixels.byteswap() if pixels.itemsize == 2 else pixels
     row_bytes = samples.view(np.uint8).reshape(len(pixels), -1)
     rows = np.empty((len(pixels), 1 + row_bytes.shape[1]), np.uint8)
@@ -72,7 +72,7 @@ def _chunk(kind: bytes, data: bytes) -> tuple[bytes, bytes, bytes]:
 
 
 def _encode_small(pixels: NDArray, level: int) -> bytes:
-    # OpenCV takes BGR, and turns channels round thirty times as fast as numpy copies them in reverse.
+    # OpenCV takes BGR, and reverses channels thirty times as fast as numpy.
     turned = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
     done, data = cv2.imencode(".png", turned, [cv2.IMWRITE_PNG_COMPRESSION, level])
     if not done:
@@ -81,7 +81,7 @@ def _encode_small(pixels: NDArray, level: int) -> bytes:
 
 
 def decode_png(data: bytes, name: str = "an image") -> Pixels:
-    """[H, W, 3] uint8 RGB, [H, W] uint8 or [H, W] uint16: what `encode_png` was given.
+    """[H, W, 3] uint8 RGB, [H, W] uint8 or [H, W] uint16: the pixels that `encode_png` took.
 
     Raises CorruptError naming a file that is torn, altered or no PNG.
     """
@@ -93,7 +93,7 @@ def decode_png(data: bytes, name: str = "an image") -> Pixels:
 
 
 def _check_chunks(data: bytes, name: str) -> None:
-    """Raises CorruptError unless every chunk is whole: OpenCV fills what it cannot read with zeros and a warning."""
+    """Raises CorruptError unless every chunk is whole: OpenCV only warns of a damaged one, and fills it with zeros."""
     position, kind = len(_SIGNATURE), b""
     if not data.startswith(_SIGNATURE):
         raise CorruptError(f"{name} is not a PNG file")
@@ -106,6 +106,6 @@ def _check_chunks(data: bytes, name: str) -> None:
 
 
 def _is_flat(pixels: Pixels) -> bool:
-    """Whether most values equal the one to their left, in a sixteenth of the rows: 0.7 to 1 as rendered, 0.1 with noise."""
+    """True where most values equal the one to their left, in a sixteenth of the rows. 0.7 to 1 do as rendered, 0.1 with noise."""
     rows = pixels[::16]
     return bool(2 * np.count_nonzero(rows[:, 1:] == rows[:, :-1]) >= rows[:, 1:].size)

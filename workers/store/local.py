@@ -1,50 +1,42 @@
-"""A dataset on a file system that has hard links."""
+"""A dataset in a folder of a file system that has hard links."""
 
 import contextlib
-import errno
 import os
 import shutil
 import uuid
-from collections.abc import Iterable, Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path, PurePosixPath
 from typing import IO
 
-from schemas.dataset.layout import COMMITS, RANGES, STAGING
+from schemas.dataset.layout import COMMITS, RANGES, TEMPORARY, scratch_path
 from schemas.errors import OutputError
-from workers.store.disk_errors import told_plainly
-from workers.store.durable import sync_file, sync_folder, sync_folders, sync_tree
+from workers.store.disk_errors import explain_disk_errors
+from workers.store.durable import sync_folders, sync_path, sync_tree
 from workers.store.probe import probe_folder
-from workers.store.store import TEMPORARY, Entry, fenced_key
-
-_VANISHED_TRIES = 3
-"""A temporary file may be swept by another coordinator between two of our steps; it is then written again."""
+from workers.store.store import Entry, Store, fenced_key, retry_if_swept
 
 
-class LocalStore:
-    """A folder on a file system that has hard links."""
+class LocalStore(Store):
+    """A folder; what each operation promises stands in `Store`."""
 
+    root: Path
     tar_only = False
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
         self.root = Path(root)
         self.name = str(root)
-        self._prefix = os.path.join(self.root, "")
 
     def path(self, key: str) -> Path:
         """Where `key` lies on disk."""
         return self.root / key
 
-    def _at(self, key: str) -> str:
-        """As `path`, without the cost of a Path: a scene has two dozen files."""
-        return self._prefix + key
-
     def prepare(self) -> None:
-        """Makes the folder and proves the primitive (see `Store`)."""
+        """Makes the folders and probes the file system."""
         try:
             for folder in (COMMITS, RANGES, TEMPORARY):
                 os.makedirs(self.path(folder), exist_ok=True)
-                sync_folder(self.path(folder).parent)
-            sync_folder(self.root)
+                sync_path(self.path(folder).parent)
+            sync_path(self.root)
         except OSError as error:
             raise OutputError(
                 f"{self.name} cannot be written: {error.strerror or error}; choose another --out"
@@ -53,122 +45,75 @@ class LocalStore:
 
     def open_staging(self, staging: str) -> None:
         """Makes the folder of an attempt."""
-        for last in range(_VANISHED_TRIES):
-            with self._told(staging), _unless(FileNotFoundError, last < _VANISHED_TRIES - 1):
-                os.makedirs(self.path(staging))
-                return
-
-    def write_staged(self, staging: str, path: str, data: bytes) -> None:
-        """Writes a file of an attempt (see `Store`)."""
-        with self.stream_staged(staging, path) as file:
-            file.write(data)
+        with self._explained(staging):
+            retry_if_swept(lambda: os.makedirs(self.path(staging)))
 
     @contextlib.contextmanager
     def stream_staged(self, staging: str, path: str) -> Iterator[IO[bytes]]:
-        """A writable file of an attempt (see `Store`)."""
-        key = f"{staging}/{path}"
-        target = self._at(key)
-        with self._told(key):
+        """A file below the attempt's folder, whose subfolders are made as needed."""
+        target = self.path(f"{staging}/{path}")
+        with self._explained(f"{staging}/{path}"):
             try:
                 file = open(target, "wb")  # noqa: SIM115 - closed below, on every path
             except FileNotFoundError:
-                _make_folders(self.path(staging), Path(path).parent)
+                for folder in list(reversed(PurePosixPath(path).parents))[1:]:  # never the attempt's own
+                    with contextlib.suppress(FileExistsError):
+                        os.mkdir(self.path(staging) / folder)
                 file = open(target, "wb")  # noqa: SIM115
             with file:
                 yield file
 
     def make_durable(self, staging: str) -> None:
-        """Flushes an attempt (see `Store`)."""
-        with self._told(staging):
+        """Flushes an attempt."""
+        with self._explained(staging):
             sync_tree(self.path(staging))
 
     def put_if_absent(self, key: str, data: bytes, staging: str | None = None) -> bool:
-        """Links a finished temporary file to `key`: the one step that refuses a second writer (see `Store`)."""
-        target = self.path(key)
-        if target.exists():
-            return False
-        for last in range(_VANISHED_TRIES):
-            with self._told(key), self._temporary(data, staging) as temporary:
-                try:
-                    os.link(temporary, target)
-                except FileExistsError:
-                    # Over NFS a link whose first answer was lost is refused although it is ours.
-                    return os.path.samefile(temporary, target)
-                except FileNotFoundError:
-                    swept = not temporary.exists()
-                    if (swept and staging is not None) or last == _VANISHED_TRIES - 1:
-                        raise
-                    os.makedirs(target.parent, exist_ok=True)
-                    continue
-                sync_folder(target.parent)
-                return True
-        raise AssertionError("unreachable")
+        """Links a finished temporary file to `key`: the one step that refuses a second writer."""
+        return not self.path(key).exists() and self._place(os.link, key, data, staging)
 
     def write_whole(self, key: str, data: bytes, durable: bool = True) -> None:
-        """Renames a finished temporary file to `key` (see `Store`)."""
-        for last in range(_VANISHED_TRIES):
-            with self._told(key), self._temporary(data, None, durable) as temporary:
-                try:
-                    os.replace(temporary, self.path(key))
-                except FileNotFoundError:
-                    if last == _VANISHED_TRIES - 1:
-                        raise
-                    os.makedirs(self.path(key).parent, exist_ok=True)
-                    continue
-                if durable:
-                    sync_folder(self.path(key).parent)
-                return
+        """Renames a finished temporary file to `key`."""
+        self._place(os.replace, key, data, durable=durable)
 
     def rename(self, source: str, target: str) -> None:
-        """Moves a file (see `Store`)."""
-        with self._told(target):
+        """Moves a file; makes the target's folder where it is missing."""
+        with self._explained(target):
             try:
-                os.replace(self._at(source), self._at(target))
+                os.replace(self.path(source), self.path(target))
             except FileNotFoundError:
                 os.makedirs(self.path(target).parent, exist_ok=True)
-                os.replace(self._at(source), self._at(target))
+                os.replace(self.path(source), self.path(target))
 
     def sync_folders_of(self, keys: Iterable[str]) -> None:
         """Flushes the folders that hold `keys`, up to the output folder."""
-        folders = {key.rpartition("/")[0] for key in keys}
-        with self._told("the output folder"):
-            sync_folders(self.root, {parent for folder in folders for parent in (folder, *_parents(folder))})
+        folders = {PurePosixPath(key.rpartition("/")[0]) for key in keys}
+        with self._explained("the output folder"):
+            sync_folders(self.root, {str(above) for folder in folders for above in (folder, *folder.parents)})
 
-    def fence(self, staging: str) -> str | None:
-        """Renames an attempt's folder: from then on it cannot write, nor link a record (see `Store`)."""
-        fenced = fenced_key(staging)
-        try:
-            os.rename(self.path(staging), self.path(fenced))
-        except FileNotFoundError:
-            return fenced if self.path(fenced).is_dir() else None
-        sync_folder(self.path(fenced).parent)
-        return fenced
+    def fence(self, staging: str) -> None:
+        """Renames an attempt's folder: from then on the attempt cannot write, nor link a record."""
+        with contextlib.suppress(FileNotFoundError):
+            os.rename(self.path(staging), self.path(fenced_key(staging)))
+            sync_path(self.path(staging).parent)
 
     def read(self, key: str) -> bytes:
-        """The bytes at `key` (see `Store`)."""
+        """The bytes at `key`."""
         return self.path(key).read_bytes()
 
     def size(self, key: str) -> int | None:
         """Bytes at `key`, or None."""
-        try:
-            return os.stat(self._at(key)).st_size
-        except (FileNotFoundError, NotADirectoryError):
-            return None
+        found = self._stat(key)
+        return found.st_size if found else None
 
     def modified(self, key: str) -> float | None:
         """Modification time at `key`, or None."""
-        try:
-            return os.stat(self._at(key)).st_mtime
-        except (FileNotFoundError, NotADirectoryError):
-            return None
+        found = self._stat(key)
+        return found.st_mtime if found else None
 
     def files(self, prefix: str) -> Iterator[Entry]:
-        """Every file below `prefix` (see `Store`); one that vanishes meanwhile is left out."""
-        try:
-            found = sorted(os.scandir(self.path(prefix)), key=lambda entry: entry.name)
-        except (FileNotFoundError, NotADirectoryError):
-            return
-        for entry in found:
+        """Every file below `prefix`; one that vanishes meanwhile is left out."""
+        for entry in self._scan(prefix):
             key = f"{prefix}/{entry.name}"
             if entry.is_dir(follow_symlinks=False):
                 yield from self.files(key)
@@ -177,19 +122,16 @@ class LocalStore:
 
     def children(self, prefix: str) -> list[str]:
         """Folders directly below `prefix`."""
-        try:
-            return sorted(entry.name for entry in os.scandir(self.path(prefix)) if entry.is_dir(follow_symlinks=False))
-        except (FileNotFoundError, NotADirectoryError):
-            return []
+        return [entry.name for entry in self._scan(prefix) if entry.is_dir(follow_symlinks=False)]
 
     def remove(self, key: str) -> None:
         """Removes a file."""
-        with self._told(key), contextlib.suppress(FileNotFoundError):
+        with self._explained(key), contextlib.suppress(FileNotFoundError):
             os.unlink(self.path(key))
 
     def remove_tree(self, prefix: str) -> None:
         """Removes a folder; two processes may do so at once."""
-        with self._told(prefix):
+        with self._explained(prefix):
             shutil.rmtree(self.path(prefix), onerror=_ignore_missing)
 
     def remove_empty(self, prefix: str) -> None:
@@ -199,9 +141,10 @@ class LocalStore:
 
     @contextlib.contextmanager
     def scratch(self, name: str) -> Iterator[Path]:
-        """A folder under `_staging/`, on the same file system as its files' final names."""
-        key = f"{STAGING}/_{name}/{uuid.uuid4().hex}"
-        with self._told(key):
+        """A folder under `_staging/`, on the file system of its files' final names; an earlier one of the name goes."""
+        key = f"{scratch_path(name)}/{uuid.uuid4().hex}"
+        self.remove_tree(scratch_path(name))
+        with self._explained(key):
             os.makedirs(self.path(key))
         try:
             yield self.path(key)
@@ -210,56 +153,66 @@ class LocalStore:
 
     def install(self, local: Path, key: str) -> None:
         """Flushes a file and renames it to `key`."""
-        with self._told(key):
-            sync_file(local)
+        with self._explained(key):
+            sync_path(local)
             os.makedirs(self.path(key).parent, exist_ok=True)
             os.replace(local, self.path(key))
-            sync_folder(self.path(key).parent)
+            sync_path(self.path(key).parent)
 
-    @contextlib.contextmanager
-    def _temporary(self, data: bytes, staging: str | None, durable: bool = True) -> Iterator[Path]:
-        """A finished file beside its final place's file system, gone when the context ends."""
-        folder = self.path(staging or TEMPORARY)
-        if staging is None:
-            os.makedirs(folder, exist_ok=True)
-        temporary = folder / f".{uuid.uuid4().hex}"
-        try:
-            with open(temporary, "xb") as file:
-                file.write(data)
-                file.flush()
+    def _place(
+        self, name_it: Callable, key: str, data: bytes, staging: str | None = None, durable: bool = True
+    ) -> bool:
+        """Writes a temporary file and gives it the name `key` by `name_it`, os.link or os.replace.
+
+        False where another file has the name. Raises FileNotFoundError where `staging` was swept.
+        """
+        target = self.path(key)
+
+        def place_once() -> bool:
+            with _temporary_file(self.path(staging or TEMPORARY), data, durable) as temporary:
+                try:
+                    name_it(temporary, target)
+                except FileExistsError:
+                    # Over NFS a link whose first answer was lost is refused although it is ours.
+                    return os.path.samefile(temporary, target)
                 if durable:
-                    os.fsync(file.fileno())
-            yield temporary
-        finally:
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(temporary)
+                    sync_path(target.parent)
+            return True
 
-    def _told(self, key: str) -> contextlib.AbstractContextManager[None]:
-        return told_plainly(f"{key} in {self.name} could not be written")
+        with self._explained(key):
+            for folder in {target.parent} if staging else {target.parent, self.path(TEMPORARY)}:
+                os.makedirs(folder, exist_ok=True)
+            return retry_if_swept(place_once)
+
+    def _stat(self, key: str) -> os.stat_result | None:
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            return os.stat(self.path(key))
+        return None
+
+    def _scan(self, prefix: str) -> list[os.DirEntry[str]]:
+        """What is directly below a folder, by name; nothing where there is no folder."""
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            return sorted(os.scandir(self.path(prefix)), key=lambda entry: entry.name)
+        return []
+
+    def _explained(self, key: str) -> contextlib.AbstractContextManager[None]:
+        return explain_disk_errors(f"{key} in {self.name} could not be written")
 
 
-def _unless(error: type[BaseException], suppressed: bool) -> contextlib.AbstractContextManager[None]:
-    return contextlib.suppress(error) if suppressed else contextlib.nullcontext()
-
-
-def _parents(folder: str) -> list[str]:
-    """Every folder above `folder`, relative like it, down to the empty name."""
-    found = []
-    while folder:
-        folder = folder.rpartition("/")[0]
-        found.append(folder)
-    return found
-
-
-def _make_folders(root: Path, below: Path) -> None:
-    """Makes the folders `below` in `root`, but never `root` itself. Raises FileNotFoundError where that is gone."""
-    if not below.parts:
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(root))
-    folder = root
-    for part in below.parts:
-        folder = folder / part
-        with contextlib.suppress(FileExistsError):
-            os.mkdir(folder)
+@contextlib.contextmanager
+def _temporary_file(folder: Path, data: bytes, durable: bool) -> Iterator[Path]:
+    """A finished file in `folder`, gone when the context ends. Raises FileNotFoundError where there is no folder."""
+    temporary = folder / f".{uuid.uuid4().hex}"
+    try:
+        with open(temporary, "xb") as file:
+            file.write(data)
+            file.flush()
+            if durable:
+                os.fsync(file.fileno())
+        yield temporary
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(temporary)
 
 
 def _ignore_missing(function: object, path: str, raised: tuple[type[BaseException], BaseException, object]) -> None:

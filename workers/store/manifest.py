@@ -1,7 +1,8 @@
-"""The tables of one range: rows checked against their schema, sorted by key, as Parquet bytes and back."""
+"""The tables of one range: checked against their schema, sorted by key, encoded as Parquet and decoded."""
 
 import io
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 import pyarrow as pa
@@ -11,7 +12,7 @@ from schemas.dataset.tables import SCHEMAS, SORT_KEYS
 from schemas.errors import CorruptError
 
 PARQUET_OPTIONS = {"compression": "zstd", "write_page_checksum": True}
-"""Every Parquet file of a dataset: a flipped bit is found when the page is read."""
+"""For every Parquet file of a dataset: a flipped bit is found when the page is read."""
 
 
 def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
@@ -42,16 +43,11 @@ def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
 
 def sorted_rows(table: str, rows: pa.Table) -> pa.Table:
     """Rows in the order of the table's key. Raises ValueError where two rows share a key."""
-    keys = SORT_KEYS[table]
-    if rows.num_rows < 2:
-        return rows
-    result = rows.sort_by([(key, "ascending") for key in keys])
-    columns = [result.column(key).to_pylist() for key in keys]
-    previous: tuple[object, ...] | None = None
-    for key in zip(*columns, strict=True):
-        if key == previous:
-            raise ValueError(f"{table}: two rows have the key {', '.join(keys)} = {', '.join(map(str, key))}")
-        previous = key
+    names = SORT_KEYS[table]
+    result = rows.sort_by([(name, "ascending") for name in names])
+    for key, following in pairwise(zip(*(result.column(name).to_pylist() for name in names), strict=True)):
+        if key == following:
+            raise ValueError(f"{table}: two rows have the key {', '.join(names)} = {', '.join(map(str, key))}")
     return result
 
 
@@ -75,9 +71,9 @@ def decode_table(table: str, data: bytes, name: str) -> pa.Table:
 
 
 def conform(table: str, rows: pa.Table, name: str) -> pa.Table:
-    """Rows with exactly today's schema of `table`. Raises CorruptError where a column cannot be had.
+    """Rows with exactly today's schema of `table`. Raises CorruptError where a required column is missing.
 
-    A schema only ever grows: rows that lack a column and have one that is unknown have a name that was damaged.
+    A schema only grows. So rows that lack a column and have an unknown one have a damaged column name.
     """
     schema = SCHEMAS[table]
     if rows.schema.equals(schema):

@@ -1,4 +1,4 @@
-"""Which file system a folder lies on."""
+"""The type of the file system that a folder lies on."""
 
 import os
 import re
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def file_system_of(folder: str | Path) -> str:
-    """The type of the file system that holds `folder` (`ext4`, `nfs4` ...), `unknown` where Linux does not say."""
+    """The type (`ext4`, `nfs4` ...) of the file system that holds `folder`, `unknown` where Linux does not say."""
     try:
         lines = Path("/proc/self/mountinfo").read_text(encoding="utf-8", errors="surrogateescape").splitlines()
     except OSError:

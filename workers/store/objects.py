@@ -1,13 +1,13 @@
 """A dataset in an object store: records by conditional put, everything else by plain puts, copies and deletes.
 
-An object appears whole or not at all, and a put that has returned is durable. What a disk can do and this cannot: take
-a folder away from an attempt in one step. So an attempt here is only swept when its worker is known to be dead.
+An object appears whole or not at all, and a put that has returned is durable. Unlike a disk, a store cannot take a
+folder away from an attempt in one step, so an attempt is only swept when its worker is known to be dead.
 """
 
 import contextlib
 import tempfile
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
@@ -15,14 +15,15 @@ import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError, NotSupportedError
 from obstore.store import from_url
 
+from schemas.dataset.layout import PROBE_PREFIX, TEMPORARY
 from schemas.errors import MachineError, OutputError
-from workers.store.store import PROBE_PREFIX, TEMPORARY, Entry, fenced_key
+from workers.store.store import Entry, Store
 
 _PROBES = 3
-"""A coordinator that already works here may sweep a probe away between its two puts."""
+"""Attempts at a probe: a coordinator that already works here may sweep it away between its two puts."""
 
 _BEGUN = "_begun"
-"""In an attempt's folder from its beginning until it is swept."""
+"""A mark in an attempt's folder from its beginning until it is swept."""
 
 
 def open_object_store(url: str) -> "ObjectStore":
@@ -36,9 +37,10 @@ def open_object_store(url: str) -> "ObjectStore":
         raise OutputError(f"{url} is not an object store that can be opened: {_first_line(error)}") from error
 
 
-class ObjectStore:
-    """A bucket, or a prefix in one."""
+class ObjectStore(Store):
+    """A bucket, or a prefix in one; what each operation promises stands in `Store`."""
 
+    root = None
     tar_only = True
 
     def __init__(self, bucket: obstore.store.ObjectStore, name: str) -> None:
@@ -46,15 +48,18 @@ class ObjectStore:
         self.name = name
 
     def prepare(self) -> None:
-        """Proves that a put can be refused where something is (see `Store`)."""
+        """Proves that a put is refused where something is."""
         try:
             refused = any(self._refuses_a_second_put() for _ in range(_PROBES))
-        except (NotSupportedError, NotImplementedError) as error:
-            raise OutputError(self._unfit()) from error
+        except (NotSupportedError, NotImplementedError):
+            refused = False
         except (BaseError, OSError) as error:
             raise OutputError(f"{self.name} cannot be written: {_first_line(error)}") from error
         if not refused:
-            raise OutputError(self._unfit())
+            raise OutputError(
+                f"{self.name} does not refuse a second put where the first must stand: two workers could commit one range. "
+                f"Use a store with conditional puts (S3, Google Cloud Storage, Azure, MinIO) or a folder"
+            )
 
     def _refuses_a_second_put(self) -> bool:
         key = f"{TEMPORARY}/{PROBE_PREFIX}{uuid.uuid4().hex}"
@@ -69,34 +74,31 @@ class ObjectStore:
 
     def open_staging(self, staging: str) -> None:
         """Marks the attempt as begun."""
-        self._put(f"{staging}/{_BEGUN}", b"")
+        self.write_whole(f"{staging}/{_BEGUN}", b"")
 
     def write_staged(self, staging: str, path: str, data: bytes) -> None:
         """Puts an object of an attempt."""
-        self._put(f"{staging}/{path}", data)
+        self.write_whole(f"{staging}/{path}", data)
 
     @contextlib.contextmanager
     def stream_staged(self, staging: str, path: str) -> Iterator[IO[bytes]]:
-        """A temporary file on the local disk, put as one object in the end (see `Store`)."""
+        """A temporary file on the local disk, put as one object in the end."""
         with tempfile.TemporaryFile() as file:
             yield file
             file.seek(0)
-            with self._told(path):
+            with self._explained(path):
                 obstore.put(self._bucket, f"{staging}/{path}", file)
 
-    def make_durable(self, staging: str) -> None:
-        """Nothing is left to do: puts are durable."""
-
     def put_if_absent(self, key: str, data: bytes, staging: str | None = None) -> bool:
-        """Puts on the condition that nothing is there (see `Store`).
+        """Puts on the condition that nothing is there.
 
-        A put whose answer was lost is sent again underneath and then refused: what is there tells whether it is ours,
+        A put whose answer was lost is sent again by obstore and then refused: what is there tells whether it is ours,
         because no two callers ever put the same bytes at one key.
         """
         if staging is not None and self.size(f"{staging}/{_BEGUN}") is None:
             raise FileNotFoundError(f"{staging} was swept")
         try:
-            with self._told(key):
+            with self._explained(key):
                 obstore.put(self._bucket, key, data, mode="create")
         except AlreadyExistsError:
             return self.read(key) == data
@@ -104,62 +106,50 @@ class ObjectStore:
 
     def write_whole(self, key: str, data: bytes, durable: bool = True) -> None:
         """Puts an object over what was there."""
-        self._put(key, data)
+        with self._explained(key):
+            obstore.put(self._bucket, key, data)
 
     def rename(self, source: str, target: str) -> None:
-        """Copies, then deletes: a kill in between leaves both, and doing it again mends it."""
-        with self._told(target):
+        """Copies, then deletes: a kill in between leaves both, and a second call deletes the first."""
+        with self._explained(target):
             obstore.copy(self._bucket, source, target)
         self.remove(source)
 
-    def sync_folders_of(self, keys: Iterable[str]) -> None:
-        """Nothing is left to do: puts are durable."""
-
-    def fence(self, staging: str) -> str | None:
-        """Takes away the mark without which an attempt does not commit. Its objects stay where they are."""
-        if self.size(f"{staging}/{_BEGUN}") is None:
-            return None
+    def fence(self, staging: str) -> None:
+        """Removes the mark without which an attempt does not commit. Its objects stay where they are."""
         self.remove(f"{staging}/{_BEGUN}")
-        return fenced_key(staging)
 
     def read(self, key: str) -> bytes:
-        """The bytes at `key` (see `Store`)."""
-        with self._told(key):
+        """The bytes at `key`."""
+        with self._explained(key):
             return bytes(obstore.get(self._bucket, key).bytes())
 
     def size(self, key: str) -> int | None:
         """Bytes at `key`, or None."""
-        try:
-            with self._told(key):
-                return obstore.head(self._bucket, key)["size"]
-        except FileNotFoundError:
-            return None
+        head = self._head(key)
+        return head["size"] if head else None
 
     def modified(self, key: str) -> float | None:
         """When the object was put, or None."""
-        try:
-            with self._told(key):
-                return obstore.head(self._bucket, key)["last_modified"].timestamp()
-        except FileNotFoundError:
-            return None
+        head = self._head(key)
+        return head["last_modified"].timestamp() if head else None
 
     def files(self, prefix: str) -> Iterator[Entry]:
-        """Every object below `prefix`, in the order of their keys' parts."""
-        with self._told(prefix):
-            found = [
-                Entry(meta["path"], meta["size"]) for batch in obstore.list(self._bucket, prefix) for meta in batch
-            ]
-        yield from sorted(found, key=lambda entry: entry.key.split("/"))
+        """Every object below `prefix`."""
+        with self._explained(prefix):
+            found = obstore.list(self._bucket, prefix).collect()
+        entries = (Entry(meta["path"], meta["size"]) for meta in found)
+        yield from sorted(entries, key=lambda entry: entry.key.split("/"))
 
     def children(self, prefix: str) -> list[str]:
-        """What stands for folders directly below `prefix`."""
-        with self._told(prefix):
+        """Common prefixes of keys, directly below `prefix`."""
+        with self._explained(prefix):
             found = obstore.list_with_delimiter(self._bucket, prefix)["common_prefixes"]
         return sorted(path.rpartition("/")[2] for path in found)
 
     def remove(self, key: str) -> None:
         """Deletes an object."""
-        with self._told(key), contextlib.suppress(FileNotFoundError):
+        with self._explained(key), contextlib.suppress(FileNotFoundError):
             obstore.delete(self._bucket, key)
 
     def remove_tree(self, prefix: str) -> None:
@@ -167,9 +157,6 @@ class ObjectStore:
         self.remove(f"{prefix}/{_BEGUN}")
         for entry in self.files(prefix):
             self.remove(entry.key)
-
-    def remove_empty(self, prefix: str) -> None:
-        """There are no folders to remove."""
 
     @contextlib.contextmanager
     def scratch(self, name: str) -> Iterator[Path]:
@@ -179,22 +166,17 @@ class ObjectStore:
 
     def install(self, local: Path, key: str) -> None:
         """Puts a local file, in parts where it is large."""
-        with self._told(key):
+        with self._explained(key):
             obstore.put(self._bucket, key, local)
 
-    def _put(self, key: str, data: bytes) -> None:
-        with self._told(key):
-            obstore.put(self._bucket, key, data)
-
-    def _unfit(self) -> str:
-        return (
-            f"{self.name} does not refuse a second put where the first must stand: two workers could commit one range. "
-            f"Use a store with conditional puts (S3, Google Cloud Storage, Azure, MinIO) or a folder"
-        )
+    def _head(self, key: str) -> "obstore.ObjectMeta | None":
+        with contextlib.suppress(FileNotFoundError), self._explained(key):
+            return obstore.head(self._bucket, key)
+        return None
 
     @contextlib.contextmanager
-    def _told(self, key: str) -> Iterator[None]:
-        """Turns a store that does not answer into an error that says so."""
+    def _explained(self, key: str) -> Iterator[None]:
+        """Turns an error of the store into a MachineError that names it; a refused conditional put stays as it is."""
         try:
             yield
         except AlreadyExistsError:

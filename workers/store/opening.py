@@ -1,4 +1,4 @@
-"""From what a user writes after --out to the store it means."""
+"""The store that a user's --out means."""
 
 import re
 
@@ -9,9 +9,9 @@ _URL = re.compile(r"[a-z][a-z0-9+.-]+://")
 
 
 def open_store(out: str) -> Store:
-    """A folder, or an object store where `out` is a URL such as s3://bucket/path. Nothing is read or written yet.
+    """An object store where `out` is a URL such as s3://bucket/path, otherwise a folder. Reads and writes nothing yet.
 
-    Raises OutputError for a URL of a kind that is not known.
+    Raises OutputError for a URL of an unknown kind.
     """
     if not _URL.match(out):
         return LocalStore(out)

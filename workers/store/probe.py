@@ -1,44 +1,40 @@
-"""Proof, before any work, that a file system can do what commits stand on."""
+"""A check, before any work, that a file system can do what commits rely on."""
 
 import contextlib
 import os
 import uuid
 from pathlib import Path
 
-from schemas.dataset.layout import COMMITS
+from schemas.dataset.layout import COMMITS, PROBE_PREFIX, TEMPORARY
 from schemas.errors import OutputError
-from workers.store.durable import sync_file, sync_folder
+from workers.store.durable import sync_path
 from workers.store.mounts import file_system_of
-from workers.store.store import PROBE_PREFIX, TEMPORARY
-
-_TRIES = 3
-"""A coordinator that already works here may sweep the probe's files away: they are then written again."""
+from workers.store.store import retry_if_swept
 
 
 def probe_folder(root: Path) -> None:
     """Returns where linking refuses a second name, renaming replaces and syncing works under `root`.
 
-    Raises OutputError naming what failed, the type of the file system and a remedy.
+    Raises OutputError naming the step that failed, the type of the file system and a remedy.
     """
-    for last in range(_TRIES):
-        with contextlib.suppress(*([FileNotFoundError] if last < _TRIES - 1 else [])):
-            return _probe_once(root)
+    retry_if_swept(lambda: _probe_once(root))
 
 
 def _probe_once(root: Path) -> None:
-    token = uuid.uuid4().hex
-    source = root / TEMPORARY / f"{PROBE_PREFIX}{token}"
-    target = root / COMMITS / f"{PROBE_PREFIX}{token}"
+    name = f"{PROBE_PREFIX}{uuid.uuid4().hex}"
+    source, target = root / TEMPORARY / name, root / COMMITS / name
     step = "writing a file"
     try:
         source.write_bytes(b"probe")
         step = "fsync"
-        sync_file(source)
+        sync_path(source)
         step = "a hard link"
         os.link(source, target)
-        sync_folder(target.parent)
+        sync_path(target.parent)
         step = "refusing a second hard link to one name"
-        _must_refuse(source, target)
+        with contextlib.suppress(FileExistsError):
+            os.link(source, target)
+            raise OSError("a second link was accepted")
         step = "rename"
         os.unlink(target)
         os.replace(source, target)
@@ -56,11 +52,3 @@ def _probe_once(root: Path) -> None:
         for path in (source, target):
             with contextlib.suppress(OSError):
                 os.unlink(path)
-
-
-def _must_refuse(source: Path, target: Path) -> None:
-    try:
-        os.link(source, target)
-    except FileExistsError:
-        return
-    raise OSError("a second link was accepted")

@@ -1,4 +1,4 @@
-"""What the rows and files of one scene must say before an attempt takes them."""
+"""Checks of one scene's rows and files before an attempt accepts them."""
 
 import hashlib
 import json
@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from schemas.dataset.commit import FileEntry, Outcome
-from schemas.dataset.layout import ASSETS
+from schemas.dataset.layout import is_shape
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SORT_KEYS
 from schemas.scene.scene import SceneOutput
 
@@ -18,7 +18,7 @@ _UNSAFE = re.compile(r"[\x00-\x1f\x7f\\]")
 
 
 def outcome_of(output: SceneOutput) -> Outcome:
-    """How the scene ended. Raises ValueError unless its rows say exactly one thing, about this scene only."""
+    """How the scene ended. Raises ValueError unless its rows give exactly one outcome, of this scene alone."""
     scene_id, tables = output.scene_id, output.rows
     for table, rows in tables.items():
         if any(row.get("scene_id", scene_id) != scene_id for row in rows):
@@ -46,18 +46,18 @@ def check_files(output: SceneOutput, entries: Mapping[str, FileEntry]) -> None:
         if _UNSAFE.search(path) or any(part in ("", ".", "..") for part in path.split("/")) or path[0] in "_.":
             raise ValueError(f"{path!r} is not a path that a scene may write")
     views = cast(Sequence[Mapping[str, Any]], output.rows.get("views", ()))
-    told = [(file["path"], file["bytes"], file["sha256"]) for view in views for file in view["files"]]
-    images = {(path, entry.bytes, entry.sha256) for path, entry in entries.items() if not path.startswith(f"{ASSETS}/")}
-    if len(told) != len(images) or set(told) != images:
-        paths = {path for path, _, _ in told}.symmetric_difference(path for path, _, _ in images)
+    listed = [(file["path"], file["bytes"], file["sha256"]) for view in views for file in view["files"]]
+    images = {(path, entry.bytes, entry.sha256) for path, entry in entries.items() if not is_shape(path)}
+    if len(listed) != len(images) or set(listed) != images:
+        paths = {path for path, _, _ in listed}.symmetric_difference(path for path, _, _ in images)
         wrong = sorted(paths) or ["sizes, digests or repetitions"]
         raise ValueError(f"scene {output.scene_id}: files and the rows of views disagree about {', '.join(wrong[:5])}")
 
 
 def distinct_assets(table: str, rows: pa.Table) -> pa.Table:
-    """Rows of `assets` once each, where scenes share them; other tables as they are.
+    """Rows of `assets` without repetitions, which scenes that share a shape make; other tables as they are.
 
-    Two rows of one asset that differ stay, and are refused as a repeated key.
+    Two different rows of one asset stay, and are refused later as a repeated key.
     """
     if table != "assets" or rows.num_rows < 2:
         return rows
@@ -68,9 +68,9 @@ def distinct_assets(table: str, rows: pa.Table) -> pa.Table:
 
 
 def scene_digest(rows: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
-    """64 hex characters: of all that job and seed determine in a scene's rows, but for its assets.
+    """64 hex characters: the digest of a scene's rows in the deterministic tables, except `assets`.
 
-    SHA-256 of canonical JSON, in which a double has the shortest digits that give it back: it is only ever held against
+    SHA-256 of canonical JSON, in which a double has the shortest digits that give it back. It is only compared with
     another attempt at the same scene, and costs a tenth of the columns' digest.
     """
     tables = {
@@ -83,5 +83,5 @@ def scene_digest(rows: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
 
 
 def _plain(number: np.generic) -> Any:
-    """A number of numpy's as Python's."""
+    """A numpy number as a Python number."""
     return number.item()

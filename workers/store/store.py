@@ -1,26 +1,35 @@
-"""Where a dataset lives: the few operations that the commit protocol stands on.
+"""The operations on a dataset's place that the commit protocol is built on, for a disk and for an object store.
 
-A key is a path below the output folder with `/` between its parts. Everything unfinished lies under `_staging/`; the
-only other place where a key appears is by `put_if_absent`, `write_whole`, `rename` or `install`: whole, in one step.
+A key is a path below the output folder with `/` between its parts. Everything unfinished lies under `_staging/`. Every
+other key appears whole, in one step: by `put_if_absent`, `write_whole`, `rename` or `install`.
 """
 
 import contextlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import IO, NamedTuple, Protocol
+from typing import IO, NamedTuple, Protocol, TypeVar
 
-from schemas.dataset.layout import STAGING
+from schemas.dataset.layout import FENCED
 
-TEMPORARY = f"{STAGING}/_tmp"
-"""Files on their way to `put_if_absent` and `write_whole`; one that a killed process left is swept."""
+T = TypeVar("T")
 
-PROBE_PREFIX = ".probe-"
-"""Names that a killed probe may leave in `_tmp` and beside the commits; they are swept."""
+_TRIES = 3
 
 
 def fenced_key(staging: str) -> str:
-    """Where the folder of a fenced attempt lies."""
-    return f"{staging}.fenced"
+    """The key of a fenced attempt's folder."""
+    return f"{staging}{FENCED}"
+
+
+def retry_if_swept(step: Callable[[], T]) -> T:
+    """The result of `step`, called up to three times: another coordinator may sweep its temporary file in between.
+
+    Raises FileNotFoundError where the last call does.
+    """
+    for _ in range(_TRIES - 1):
+        with contextlib.suppress(FileNotFoundError):
+            return step()
+    return step()
 
 
 class Entry(NamedTuple):
@@ -31,33 +40,38 @@ class Entry(NamedTuple):
 
 
 class Store(Protocol):
-    """What a place must offer to hold a dataset. Every write raises MachineError where the place is full or broken."""
+    """A place that holds a dataset. Every write raises MachineError where the place is full or broken."""
 
     name: str
     """The place, as a user writes it."""
+    root: Path | None
+    """The output folder on a disk of this machine, None for an object store."""
     tar_only: bool
-    """True where a file of its own for each image would be too many."""
+    """True where a file for each image would be too many."""
 
     def prepare(self) -> None:
-        """Makes the output folder and proves the primitive. Raises OutputError naming the place and a remedy."""
+        """Makes the output folder and proves `put_if_absent`. Raises OutputError naming the place and a remedy."""
 
     def open_staging(self, staging: str) -> None:
-        """Makes the folder of an attempt, the only place that it writes."""
+        """Makes the folder of an attempt, the only place that the attempt writes."""
 
     def write_staged(self, staging: str, path: str, data: bytes) -> None:
         """Writes `staging/path`. Raises FileNotFoundError where the folder was swept: it is never made anew."""
+        with self.stream_staged(staging, path) as file:
+            file.write(data)
 
     def stream_staged(self, staging: str, path: str) -> contextlib.AbstractContextManager[IO[bytes]]:
-        """A writable file at `staging/path`, stored when the context ends without an error; as `write_staged`."""
+        """A writable file at `staging/path`, stored when the context ends without an error. Raises as `write_staged`."""
 
     def make_durable(self, staging: str) -> None:
-        """Returns when all that was written under `staging` survives a loss of power."""
+        """Returns when everything under `staging` survives a loss of power. By default, writes are durable at once."""
+        return
 
     def put_if_absent(self, key: str, data: bytes, staging: str | None = None) -> bool:
         """Stores `data` whole and durably at `key` unless something is there; False where something else is.
 
-        With `staging`, raises FileNotFoundError if that folder was swept first. A disk is always right about that; an
-        object store may miss a sweep that happens in the same moment.
+        With `staging`, raises FileNotFoundError if that folder was swept first. A disk always detects that; an object
+        store may miss a sweep at the same moment.
         """
 
     def write_whole(self, key: str, data: bytes, durable: bool = True) -> None:
@@ -67,12 +81,13 @@ class Store(Protocol):
         """Moves a file, replacing the target in one step. Raises FileNotFoundError where the source is gone."""
 
     def sync_folders_of(self, keys: Iterable[str]) -> None:
-        """Returns when the names `keys` survive a loss of power."""
+        """Returns when the names `keys` survive a loss of power. By default, names are durable at once."""
+        return
 
-    def fence(self, staging: str) -> str | None:
-        """Moves an attempt's folder, once and for all, to `fenced_key`, out of its reach; None where there was nothing.
+    def fence(self, staging: str) -> None:
+        """Takes an attempt's folder, if there is one, out of the attempt's reach for good (to `fenced_key` on a disk).
 
-        On a disk, an attempt that is fenced can neither write nor commit.
+        On a disk, a fenced attempt can neither write nor commit.
         """
 
     def read(self, key: str) -> bytes:
@@ -85,22 +100,23 @@ class Store(Protocol):
         """When the file at `key` was written, seconds since 1970 by the place's clock; None where there is none."""
 
     def files(self, prefix: str) -> Iterator[Entry]:
-        """Every file at any depth below the folder `prefix`, in the order of their keys' parts."""
+        """Every file at any depth below the folder `prefix`, in the order of the keys' parts."""
 
     def children(self, prefix: str) -> list[str]:
         """Names of the folders directly below `prefix`, sorted."""
 
     def remove(self, key: str) -> None:
-        """Removes a file; nothing happens where there is none."""
+        """Removes a file, if there is one."""
 
     def remove_tree(self, prefix: str) -> None:
-        """Removes a folder with all in it; nothing happens where there is none."""
+        """Removes a folder with its contents, if there is one."""
 
     def remove_empty(self, prefix: str) -> None:
-        """Removes a folder if nothing is in it."""
+        """Removes a folder if it is empty. By default there are no folders."""
+        return
 
     def scratch(self, name: str) -> contextlib.AbstractContextManager[Path]:
-        """An empty folder on a local disk, removed afterwards, whose files `install` can move into place."""
+        """An empty folder on a local disk whose files `install` can move into place; removed afterwards."""
 
     def install(self, local: Path, key: str) -> None:
         """Moves a finished local file to `key` in one step, durably, replacing what was there."""

@@ -22,10 +22,10 @@ SCENES = 320
 
 MERGE = """
 import json, resource, sys, time
-from services.merge import external_sort, tables
+from services.merge import shared, tables
 from services.merge.step import merge
 from workers.store.local import LocalStore
-tables.ROWS_PER_GROUP, tables.ROWS_PER_BLOCK, external_sort.LIMIT_BYTES = json.loads(sys.argv[5])
+tables.ROWS_PER_GROUP, tables.ROWS_PER_BLOCK, shared.CACHE_KIB = json.loads(sys.argv[5])
 warm, root, scenes = LocalStore(sys.argv[1]), LocalStore(sys.argv[2]), int(sys.argv[3])
 merge(warm, 0, int(sys.argv[4]))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -103,14 +103,14 @@ def measure(folder, ranges: int, limits: list[int]) -> dict:
 
 def test_what_a_merge_holds_in_memory_is_what_its_limits_say(tmp_path):
     """Limits of a tenth show it with a tenth of the rows: without them, these rows and files take over 100 MiB."""
-    figures = measure(tmp_path, 16, [512, 512, 2 << 20])
+    figures = measure(tmp_path, 16, [512, 512, 2 << 10])
     assert sum(figures["rows"].values()) == 16 * (SCENES * 14 + 10)
     assert figures["grown_kib"] / 1024 < 40
 
 
 @pytest.mark.slow
 def test_merging_a_million_rows_takes_little_more_memory_than_few(tmp_path, record_figure):
-    figures = measure(tmp_path, 224, [8_192, 2_048, 32 << 20])
+    figures = measure(tmp_path, 224, [8_192, 2_048, 16 << 10])
     rows = sum(figures["rows"].values())
     assert rows == 224 * (SCENES * 14 + 10)
     record_figure("merge_rows_per_s", "passed", rows / figures["seconds"])

@@ -2,10 +2,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.dataset.commit import CommitSummary
+from schemas.dataset.commit import CommitSummary, Span
 from schemas.errors import CorruptError, OutputError
-from services.run.range_planner import committed_ranges, effective_failures, list_commits, plan_ranges, plan_retries
+from services.run.range_planner import (
+    choose_shard_size,
+    committed_ranges,
+    effective_failures,
+    group_shards,
+    plan_ranges,
+    plan_retries,
+)
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene
+from workers.store.committed_rows import list_commits
 from workers.store.local import LocalStore
 
 pytestmark = pytest.mark.usefixtures("unflushed")
@@ -81,7 +89,7 @@ def test_planners_with_old_views_and_other_ends_never_overlap_and_cover_all_in_t
 
 
 def summary(start, retry=0, failed=(), scenes=()):
-    return CommitSummary(start, start + 4, retry, "a", "f", 4 - len(failed), tuple(failed), tuple(scenes))
+    return CommitSummary(start, start + 4, retry, 4 - len(failed), tuple(failed), tuple(scenes))
 
 
 def test_only_environmental_failures_that_still_stand_are_tried_again():
@@ -115,3 +123,17 @@ def test_commits_are_listed_with_their_retries_and_a_missing_retry_is_told(tmp_p
     (tmp_path / "manifest/_commits/0000000000.json").unlink()
     with pytest.raises(CorruptError, match=r"retries \[1\] of the range from scene 0"):
         list_commits(store)
+
+
+@pytest.mark.parametrize(("size", "grouped"), [(1, [1, 1, 1, 1]), (4, [1, 1, 1, 1]), (5, [2, 2]), (100, [4])])
+def test_a_shard_is_whole_ranges_in_order(size, grouped):
+    spans = [Span(start=start, stop=min(start + 4, 14)) for start in range(0, 14, 4)]
+    shards = list(group_shards(spans, size))
+    assert [len(shard) for shard in shards] == grouped
+    assert [span for shard in shards for span in shard] == spans
+
+
+def test_every_slot_has_two_shards_and_none_is_too_large():
+    assert choose_shard_size(24, 2) == 6
+    assert choose_shard_size(1, 2) == 1
+    assert choose_shard_size(10**6, 2) == 64

@@ -2,13 +2,7 @@
 
 import contextlib
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,6 +19,7 @@ from services.read.replay import replay_scene
 from services.read.verify import verify
 from services.run.ray_cluster import Slots, private_ray
 from services.run.step import RunRequest, run_job
+from tests.killed_runs import deadly_scene, interrupt_at_first_commit, processes_of
 from workers.store.images import decode_png
 from workers.store.local import LocalStore
 
@@ -257,30 +252,6 @@ def test_a_scene_that_kills_its_worker_becomes_a_row_and_the_rest_is_made(made, 
     assert faults_of(out) == ""
 
 
-@contextlib.contextmanager
-def deadly_scene(out: Path, scene_id: int) -> Iterator[list[int]]:
-    """While this lasts, whichever process begins the scene is killed; yields the pids."""
-    killed: list[int] = []
-    over = threading.Event()
-
-    def watch() -> None:
-        while not over.wait(0.002):
-            with contextlib.suppress(OSError, ValueError):  # folders come and go while we look
-                for note in out.glob("_staging/*/*/_current"):
-                    pid = int(note.parent.name.split("-")[-2])
-                    if pid not in killed and json.loads(note.read_text()).get("scene_id") == scene_id:
-                        os.kill(pid, signal.SIGKILL)
-                        killed.append(pid)
-
-    watcher = threading.Thread(target=watch)
-    watcher.start()
-    try:
-        yield killed
-    finally:
-        over.set()
-        watcher.join()
-
-
 def test_an_interrupted_run_says_so_leaves_no_process_and_goes_on_where_it_stopped(cluster, tmp_path):
     """Ctrl-C in a terminal: the whole process group gets SIGINT. Of 200 scenes most are still to be made then."""
     changes = {"scenes": 200, "run": {"range_size": 4}}
@@ -294,32 +265,6 @@ def test_an_interrupted_run_says_so_leaves_no_process_and_goes_on_where_it_stopp
     assert 1 <= kept < 50
     assert not processes_of(run.pid)
     assert make(out, **changes) == make(tmp_path / "whole", **changes)
-
-
-def interrupt_at_first_commit(job: Path, out: Path) -> tuple[subprocess.Popen[str], str]:
-    """A run on one worker that gets SIGINT, it and all its processes, when it has committed something; what it said."""
-    command = [sys.executable, "-m", "services.cli.main", "run", str(job), "--out", str(out), "--shard-size", "4"]
-    run = subprocess.Popen(
-        [*command, "--workers", "1"], cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
-    deadline = time.monotonic() + 120
-    while not list(out.glob("manifest/_commits/*.json")) and run.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.005)
-    if run.poll() is None:
-        os.killpg(run.pid, signal.SIGINT)
-    _, told = run.communicate(timeout=60)
-    return run, told
-
-
-def processes_of(session: int) -> list[str]:
-    """Command lines of what still runs in a session."""
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            after_name = stat.read_text().rpartition(")")[2].split()
-            if int(after_name[3]) == session and after_name[0] != "Z":
-                found.append((stat.parent / "cmdline").read_text())
-    return found
 
 
 def test_too_many_failures_stop_the_run_early_and_lose_nothing(cluster, tmp_path):

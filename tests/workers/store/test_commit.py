@@ -5,19 +5,18 @@ import pytest
 from schemas.dataset.layout import STAGING, commit_path
 from schemas.errors import CommitConflict, CorruptError, OutputError
 from tests.made_up_scenes import attempt_at, made_scene, terms
+from tests.stored_images import iter_records
 from workers.store.commit import (
     check_published,
     commit_names,
     decode_record,
     encode_record,
-    iter_records,
     publish,
     read_committed,
     read_record,
     read_summary,
 )
 from workers.store.local import LocalStore
-from workers.store.sweep import sweep
 
 pytestmark = pytest.mark.usefixtures("unflushed")
 
@@ -46,10 +45,9 @@ def test_a_record_reads_back_as_it_was_and_always_has_the_same_bytes(store):
 
 
 def test_a_summary_says_what_the_record_says(store):
-    record = attempt_at(store, 4, 8).commit().record  # scene 5 fails
+    attempt_at(store, 4, 8).commit()  # scene 5 fails
     summary = read_summary(store, 4)
     assert (summary.start, summary.stop, summary.retry) == (4, 8, 0)
-    assert (summary.attempt, summary.fingerprint) == (record.attempt, record.terms.fingerprint)
     assert (summary.made, summary.failed) == (3, ((5, "intrinsic"),))
 
 
@@ -190,34 +188,3 @@ def test_where_stacks_are_mixed_the_first_shape_stays(store):
     attempt_at(store, 12, 24, mixed, another_shape).commit()
     after = {entry.key: entry.bytes for entry in store.files("assets")}
     assert before.items() <= after.items()
-
-
-def test_sweeping_publishes_winners_drops_losers_and_leaves_the_undecided(store, undecided):
-    lost = attempt_at(store, 0, 4)
-    open_range = attempt_at(store, 4, 8)
-    dead = attempt_at(store, 8, 12)
-    assert sweep(store, fenced=[(8, dead.name)]) == [lost.name, dead.name]
-    check_published(store, undecided)
-    assert {entry.key.split("/")[2] for entry in store.files(STAGING)} == {open_range.name}
-    assert open_range.commit().won
-
-
-def test_a_retry_of_a_committed_range_is_not_swept_as_its_loser(store):
-    attempt_at(store, 0, 4).commit()
-    retry = attempt_at(store, 0, 4, retry=1, scenes=(2,))
-    assert sweep(store) == []
-    assert retry.commit().won
-
-
-def test_sweeping_leaves_what_is_not_ours_and_says_so(store):
-    store.write_whole(f"{STAGING}/0000000000/mine/notes.txt", b"")
-    with pytest.raises(CorruptError, match=f"{STAGING}/0000000000/mine is not an attempt"):
-        sweep(store)
-
-
-def test_temporary_files_of_the_dead_are_swept(store):
-    store.write_whole("manifest/_commits/.probe-1", b"")
-    store.write_whole(f"{STAGING}/_tmp/.x", b"")
-    sweep(store)
-    assert not list(store.files("manifest/_commits"))
-    assert not list(store.files(STAGING))

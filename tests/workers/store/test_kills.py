@@ -10,10 +10,12 @@ import pytest
 from schemas.dataset.layout import STAGING
 from schemas.errors import RunError
 from services.merge.step import merge
-from services.run.range_planner import committed_ranges, list_commits, plan_ranges
+from services.run.range_planner import committed_ranges, plan_ranges
 from tests.disk_faults import Killed, disk, lose_power
 from tests.made_up_scenes import attempt_at, small_scene, terms
-from workers.store.commit import check_published, iter_records, publish
+from tests.stored_images import iter_records
+from workers.store.commit import check_published, publish
+from workers.store.committed_rows import list_commits
 from workers.store.local import LocalStore
 from workers.store.sweep import sweep
 

@@ -12,16 +12,16 @@ from services.merge.step import merge, read_success
 from services.read.query import query
 from services.read.status import read_status
 from services.run.lock import Beat, hold_lock, read_holder
-from services.run.range_planner import committed_ranges, list_commits, plan_ranges
+from services.run.range_planner import committed_ranges, plan_ranges
 from tests.made_up_scenes import attempt_at, made_scene, scene, small_scene, terms
 from tests.s3_server import Bucket, s3_server
+from tests.stored_images import iter_records, read_images
 from workers.store import objects
 from workers.store.attempt import attempts_at, begin_attempt, blamed_scene
-from workers.store.commit import check_published, iter_records, publish, read_record
+from workers.store.commit import check_published, publish, read_record
+from workers.store.committed_rows import list_commits
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
-from workers.store.opening import open_store
-from workers.store.packing import read_images
 from workers.store.sweep import sweep
 
 pytestmark = pytest.mark.usefixtures("unflushed")
@@ -241,19 +241,6 @@ def test_a_store_that_stops_answering_is_told_by_name(monkeypatch):
     monkeypatch.setattr(obstore, "put", fails)
     with pytest.raises(MachineError, match=r"^mug/a in memory://mine: no route to host$"):
         store.write_whole("mug/a", b"")
-
-
-@pytest.mark.parametrize("url", ["s3://", "ftp://host/x", "az://c/x"])
-def test_a_url_that_names_no_store_is_an_error_of_the_command_line(url):
-    with pytest.raises(OutputError, match="is not an object store that can be opened"):
-        open_store(url)
-
-
-def test_a_url_that_names_a_store_is_opened_with_its_prefix():
-    store = open_store("s3://bucket/a/dataset")
-    assert isinstance(store, ObjectStore)
-    assert store.name == "s3://bucket/a/dataset"
-    assert store._bucket.prefix == "a/dataset"
 
 
 def test_a_probe_that_is_swept_by_a_coordinator_at_work_is_made_again(monkeypatch):

@@ -1,4 +1,4 @@
-"""Reading what is committed: whole ranges in order, and their rows with retries laid over."""
+"""Reading of committed ranges in order, and of their rows; a retry's rows replace the first ones."""
 
 import hashlib
 from collections.abc import Iterator, Sequence
@@ -7,17 +7,17 @@ from itertools import groupby
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from schemas.dataset.commit import CommitRecord
+from schemas.dataset.commit import CommitRecord, CommitSummary
 from schemas.dataset.layout import COMMITS, range_table_path
 from schemas.dataset.tables import SORT_KEYS
 from schemas.errors import CorruptError, RunError
-from workers.store.commit import commit_names, read_committed, read_record
+from workers.store.commit import commit_names, read_committed, read_record, read_summary
 from workers.store.manifest import decode_table
 from workers.store.store import Store
 
 
 def iter_ranges(store: Store, first_scene: int, stop_scene: int) -> Iterator[list[CommitRecord]]:
-    """The records of each range, itself and then its retries, in order: exactly the scenes [first_scene, stop_scene).
+    """The records of each range, followed by its retries, in order: exactly the scenes [first_scene, stop_scene).
 
     Raises RunError naming scenes that nobody committed, or that are committed beyond the end.
     """
@@ -28,7 +28,7 @@ def iter_ranges(store: Store, first_scene: int, stop_scene: int) -> Iterator[lis
                 _gap(awaited, min(start, stop_scene)) if start > awaited else _beyond(start, first_scene, stop_scene)
             )
         records = [record for _, retry, _ in names if (record := read_record(store, start, retry)) is not None]
-        check_retries(start, [record.span.retry for record in records])
+        _check_retries(start, [record.span.retry for record in records])
         awaited = records[0].span.stop
         if awaited > stop_scene:
             raise RunError(_beyond(awaited - 1, first_scene, stop_scene))
@@ -37,11 +37,23 @@ def iter_ranges(store: Store, first_scene: int, stop_scene: int) -> Iterator[lis
         raise RunError(_gap(awaited, stop_scene))
 
 
+def list_commits(store: Store) -> list[CommitSummary]:
+    """Every committed range in order, each followed by its retries.
+
+    Raises CorruptError for a damaged or missing record, OutputError for one of a newer version.
+    """
+    summaries = []
+    for start, names in groupby(commit_names(store), key=lambda name: name[0]):
+        summaries += (group := [read_summary(store, start, retry) for _, retry, _ in names])
+        _check_retries(start, [one.retry for one in group])
+    return summaries
+
+
 def range_rows(store: Store, records: Sequence[CommitRecord], table: str) -> pa.Table:
     """The rows of one range, sorted by key; a retry's rows replace those of the scenes that it tried again.
 
-    Of `assets`, the rows of all records, repetitions among them. Raises CorruptError naming a file that does not match
-    its commit.
+    Rows of `assets` come from all records and may be repeated. Raises CorruptError naming a file that does not match its
+    commit.
     """
     parts = [read_range_table(store, record, table) for record in records]
     if len(parts) == 1:
@@ -66,7 +78,7 @@ def read_range_table(store: Store, record: CommitRecord, table: str) -> pa.Table
     return decode_table(table, data, path)
 
 
-def check_retries(start: int, retries: list[int]) -> None:
+def _check_retries(start: int, retries: list[int]) -> None:
     """Raises CorruptError where a retry of a range is missing."""
     if retries != list(range(len(retries))):
         raise CorruptError(

@@ -1,0 +1,13 @@
+"""Fixtures that tests in this folder may ask for."""
+
+import pytest
+
+from services.merge.step import merge
+from tests.made_up_datasets import FIRST, STOP, dataset_at
+
+
+@pytest.fixture(scope="module")
+def merged(tmp_path_factory):
+    """A merged dataset, and what merging said."""
+    store = dataset_at(tmp_path_factory.mktemp("merged"))
+    return store, merge(store, FIRST, STOP)
