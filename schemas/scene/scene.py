@@ -1,5 +1,6 @@
 """What the steps of a scene hand to one another: frozen, arrays read-only, units and frames in the names."""
 
+import hashlib
 from dataclasses import dataclass
 from typing import Literal
 
@@ -226,13 +227,27 @@ class Pair:
         return tuple(view for view in (self.input, self.aligned, self.mirror, self.projected) if view is not None)
 
 
+@dataclass(frozen=True)
+class EncodedFile:
+    """A file of a scene: its path below the output folder, its bytes, and their SHA-256, hex."""
+
+    path: str
+    data: bytes
+    sha256: str
+
+
+def encoded_file(path: str, data: bytes) -> EncodedFile:
+    """The file with its digest: the one place where it is computed of bytes that were just encoded."""
+    return EncodedFile(path, data, hashlib.sha256(data).hexdigest())
+
+
 @dataclass(frozen=True, eq=False)
 class SceneOutput:
-    """All that a scene leaves behind: encoded files by path below the output folder, and rows by manifest table.
+    """All that a scene leaves behind: encoded files, and rows by manifest table.
 
     A scene that cannot be made has no files and one row in `failures`.
     """
 
     scene_id: int
-    files: tuple[tuple[str, bytes], ...]
+    files: tuple[EncodedFile, ...]
     rows: dict[str, list[dict[str, object]]]

@@ -15,9 +15,11 @@ from workers.cameras.pivot_depth import front_distance
 from workers.cameras.placement import place_mirror_camera
 from workers.physics.step import settle_scene
 from workers.pipeline.context import WorkerContext, settings_digest
-from workers.pipeline.make_scene import plan_with_assets, pose_scene
+from workers.pipeline.make_scene import pose_scene
 from workers.plan.effect import Facts
 from workers.plan.effects import plan_effects
+from workers.plan.randomness import SceneChance
+from workers.plan.step import plan_scene
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.step import draw_view
 
@@ -50,7 +52,7 @@ def _posed(job: Job, number: int) -> tuple[PosedScene, Camera]:
     """A scene at rest, and a camera at its mirror pose that sees the object alone, enlarged."""
     catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
     context = WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
-    plan = plan_with_assets(context, number)
+    plan = plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, number))
     rest = settle_scene(plan, job.physics, plan_effects(Facts(job, plan, False)))
     posed = pose_scene(plan, rest.settled)
     seen = shared_renderer().draw(posed.things, posed.appearance, plan.input_cameras[0])

@@ -22,7 +22,8 @@ from workers.physics.effects import called_for
 from workers.physics.settle_group import release_together
 from workers.physics.settle_single import UNBALANCED
 from workers.physics.step import moved_by, settle_scene
-from workers.plan.step import plan_scene
+from workers.plan.randomness import SceneChance
+from workers.plan.step import draw_scene
 
 PHYSICS = Job(name="t").physics
 FINEST, WATCHED_S = 16, 1.0
@@ -37,7 +38,7 @@ def ending(case: GroupCase) -> tuple[Settled, ...] | SceneError:
     """What production comes to: every rest pose, or why there is none."""
     group = asked_for(case)
     ran = tuple(sorted(called_for(group.starts, group.table, PHYSICS)))
-    plan = plan_scene(Job(name="t"), 0, group.table.asset, group.starts[0].asset)
+    plan = draw_scene(Job(name="t"), SceneChance(0, 0), group.table.asset, group.starts[0].asset)
     plan = dataclasses.replace(plan, table=group.table, objects=group.starts)
     try:
         return settle_scene(plan, PHYSICS, EffectPlan(ran, {})).settled

@@ -10,15 +10,17 @@ from schemas.dataset.layout import file_pose_id, image_path, stored_images
 from schemas.dataset.tables import worst_rest
 from schemas.job.job import Job
 from schemas.scene.camera import Camera, Intrinsics, Role
+from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import REGION_FIRST_OBJECT, REGION_TABLE, ObjectLabel, View
 from workers.cameras.pivot_depth import object_distance
 from workers.cameras.placement import place_aligned_camera, place_mirror_camera
 from workers.geometry.camera import image_coordinates
 from workers.geometry.frames import invert
 from workers.geometry.pixels import measure_regions
-from workers.labels.derive import compare_views, derive_projected, projection_shares
+from workers.labels.agreement import compare_views
+from workers.labels.patches import patch_object_fraction
+from workers.labels.projected_view import derive_projected, projection_shares
 from workers.pipeline.check_stored_patches import ReadImage, Row, check_patches
-from workers.pipeline.image_files import patch_object_fraction
 
 SAME = 1e-12
 """Poses and distances that are computed again from the same doubles agree to rounding."""
@@ -67,7 +69,7 @@ def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], sc
     if "mirror" in stored:
         faults += _check_agreement(job, stored, views)
     if "projected" in stored:
-        faults += _check_projection(job, stored, views)
+        faults += _check_projection(job, stored, views, EffectPlan(tuple(scene["effects"]), {}))
     return faults
 
 
@@ -220,7 +222,7 @@ def _check_cameras(job: Job, stored: Mapping[str, View], views: Mapping[str, Row
 def _check_agreement(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> list[str]:
     """The agreement of the two views."""
     mirror = stored["mirror"]
-    agreement = compare_views(job, stored["input"], mirror)
+    agreement = compare_views(stored["input"], mirror, job.images, job.check.mirror_agreement_mm)
     told = views["mirror"]["mirror_agreement"]
     found = None if agreement.median_mm is None else (agreement.median_mm, agreement.share)
     if (told is None) != (found is None) or (
@@ -230,11 +232,11 @@ def _check_agreement(job: Job, stored: Mapping[str, View], views: Mapping[str, R
     return []
 
 
-def _check_projection(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> list[str]:
-    """The projected images to the byte, and their shares."""
+def _check_projection(job: Job, stored: Mapping[str, View], views: Mapping[str, Row], effects: EffectPlan) -> list[str]:
+    """The projected images to the byte, and their shares; `effects` are those that the scene's receipt names."""
     first, mirror, projected = stored["input"], stored["mirror"], stored["projected"]
     where, faults = f"pose {projected.pose_id} (projected)", []
-    rgb, depth = derive_projected(first, mirror.camera, job.images, job.sensor.distortion)
+    rgb, depth = derive_projected(first, mirror.camera, job.images, job.sensor.distortion, effects)
     same_rgb = rgb is None or (projected.rgb is not None and np.array_equal(rgb, projected.rgb))
     if not same_rgb or not np.array_equal(depth, projected.depth):
         faults.append(f"{where}: the stored input depth projects to other images")

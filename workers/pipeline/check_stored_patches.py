@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from schemas.dataset.layout import PixelKind, file_pose_id, image_path, patch_index, patch_path, stored_images
 from schemas.job.job import Job
 from schemas.scene.scene import REGION_FIRST_OBJECT, View
-from workers.labels.derive import crop_box
+from workers.labels.patches import crop_box
 
 Row = Mapping[str, Any]
 ReadImage = Callable[[str], NDArray]

@@ -23,6 +23,8 @@ class WorkerContext:
     settings_digest: str
     forced: frozenset[str] = frozenset()
     """Effects that run also where a scene does not call for them: no switches of the job. For the audit."""
+    withdrawn: frozenset[str] = frozenset()
+    """Effects that do not run even where a scene calls for them. For tests."""
 
 
 def open_worker(job: Job, catalogue: Catalogue) -> WorkerContext:

@@ -3,6 +3,7 @@
 import hashlib
 from functools import cache
 from importlib.metadata import version
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,9 @@ from schemas.dataset.fingerprint import Fingerprint
 from schemas.job.job import Job, Tier
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import WorkerContext, settings_digest
-from workers.pipeline.make_scene import Stopwatch, make_scene
+from workers.pipeline.make_scene import make_scene
 from workers.pipeline.rows import record_scene
+from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.gbuffer import Renderer
 
 CANARY = Job(name="canary", seed=7, scenes=1)
@@ -62,12 +64,12 @@ def canary_digest(renderer: Renderer) -> str:
     """SHA-256, hex, of the canary scene's files and rows."""
     catalogue = open_catalogue(CANARY.assets, Path(), tuple(CANARY.categories))
     context = WorkerContext(CANARY, catalogue, renderer, settings_digest(CANARY, catalogue.digest))
-    watch = Stopwatch()
-    output = record_scene(context, make_scene(context, CANARY_SCENE, watch), watch)
+    stopwatch = Stopwatch()
+    output = record_scene(context, make_scene(context, CANARY_SCENE, stopwatch), stopwatch)
     digest = hashlib.sha256()
-    for path, data in sorted(output.files):
-        digest.update(path.encode())
-        digest.update(hashlib.sha256(data).digest())
+    for file in sorted(output.files, key=attrgetter("path")):
+        digest.update(file.path.encode())
+        digest.update(bytes.fromhex(file.sha256))
     digest.update(repr(sorted(output.rows.items())).encode())
     return digest.hexdigest()
 

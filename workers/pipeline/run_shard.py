@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from typing import IO
 
@@ -21,8 +22,10 @@ from schemas.scene.scene import SceneOutput
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.context import WorkerContext, open_worker
 from workers.pipeline.fingerprint import take_fingerprint
-from workers.pipeline.make_scene import Stopwatch, make_scene
+from workers.pipeline.make_scene import make_scene
 from workers.pipeline.rows import failed_scene, record_scene, timing_row
+from workers.pipeline.stopwatch import Stopwatch
+from workers.plan.randomness import SceneChance
 from workers.plan.step import choose_category
 from workers.render.raster.context import require_device
 from workers.render.raster.gbuffer import shared_renderer
@@ -98,20 +101,21 @@ def run_span(context: WorkerContext, store: Store, order: ShardOrder, span: Span
 def record_blame(job: Job, blame: Blame) -> SceneOutput:
     """The row of a scene that is not tried again: it is not begun either, so that nobody is killed in it."""
     error = BlamedScene(blame.reason, blame.detail)
-    return failed_scene(blame.scene_id, choose_category(job, blame.scene_id), error, blame.attempts)
+    return failed_scene(
+        blame.scene_id, choose_category(job, SceneChance(job.seed, blame.scene_id)), error, blame.attempts
+    )
 
 
 def run_scene(context: WorkerContext, scene_id: int, total: Stopwatch) -> SceneOutput:
-    """One scene, made or told why not."""
-    category = choose_category(context.job, scene_id)
-    watch = Stopwatch()
+    """One scene: made, or a row that says why not."""
+    category = choose_category(context.job, SceneChance(context.job.seed, scene_id))
+    stopwatch = Stopwatch()
     try:
-        output = record_scene(context, make_scene(context, scene_id, watch), watch)
+        output = record_scene(context, make_scene(context, scene_id, stopwatch), stopwatch)
     except SceneError as error:
         output = failed_scene(scene_id, category, error)
-    for stage, seconds in watch.seconds.items():
-        total.seconds[stage] = total.seconds.get(stage, 0.0) + seconds
-    return SceneOutput(scene_id, output.files, {**output.rows, "timings": [timing_row(scene_id, category, watch)]})
+    total.add(stopwatch)
+    return replace(output, rows={**output.rows, "timings": [timing_row(scene_id, category, stopwatch)]})
 
 
 @cache

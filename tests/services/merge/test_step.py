@@ -17,7 +17,7 @@ from schemas.errors import CommitConflict, CorruptError, RunError
 from services.merge import tables as merge_tables
 from services.merge.poses import escaped, object_lines
 from services.merge.step import merge, read_success, reopen
-from tests.made_up_scenes import attempt_at, failed_scene, fails, made_scene, scene, terms
+from tests.made_up_scenes import attempt_at, failed_scene, fails, made_scene, scene, terms, with_shapes
 from workers.store.local import LocalStore
 from workers.store.manifest import table_of_rows
 
@@ -169,7 +169,7 @@ def test_success_names_the_digest_of_every_merged_file(merged):
 def test_the_digest_is_what_its_definition_says(merged):
     store, result = merged
     success = json.loads((store.root / "_SUCCESS").read_text())
-    files = {path: data for i in range(FIRST, STOP) for path, data in scene(i).files}
+    files = {file.path: file.data for i in range(FIRST, STOP) for file in scene(i).files}
     files |= {name: (store.root / name).read_bytes() for name in ("camPoses.csv", "cameras.csv", "objects.dat")}
     text = "verso dataset 1\n" + "".join(f"{table} {success['tables'][table]}\n" for table in TABLES[:5])
     for name in sorted(files, key=str.encode):
@@ -272,10 +272,7 @@ def changed_row(scene_id):
 
 
 def changed_shape(scene_id):
-    output = scene(scene_id)
-    return dataclasses.replace(
-        output, files=tuple((p, d[::-1] if p.startswith("assets/") else d) for p, d in output.files)
-    )
+    return with_shapes(scene(scene_id), lambda data: data[::-1])
 
 
 def changed_failure(scene_id):
@@ -338,7 +335,7 @@ def test_a_gap_is_refused_and_nothing_is_merged(tmp_path):
 
 def test_an_image_that_is_missing_or_cut_is_told_by_name(tmp_path):
     store = dataset_at(tmp_path, 0, 8)
-    image = next(path for path, _ in made_scene(1).files)
+    image = made_scene(1).files[0].path
     store.write_whole(image, b"cut")
     with pytest.raises(CorruptError, match=f"{image} has 3 bytes"):
         merge(store, 0, 8)
@@ -354,9 +351,7 @@ def own_description(scene_id):
 
 
 def own_shape(scene_id):
-    output = made_scene(scene_id)
-    turned = tuple((p, d[::-1] if p.startswith("assets/") and scene_id >= 4 else d) for p, d in output.files)
-    return dataclasses.replace(output, files=turned)
+    return with_shapes(made_scene(scene_id), lambda data: data[::-1] if scene_id >= 4 else data)
 
 
 @pytest.mark.parametrize("make", [own_description, own_shape])

@@ -20,7 +20,8 @@ from workers.physics.settle_group import settle_together
 from workers.physics.settle_single import settle_alone
 from workers.physics.step import LEFT_ROOM, LEFT_TOP, Rest, settle_scene
 from workers.physics.table_top import place_table
-from workers.plan.step import plan_scene
+from workers.plan.randomness import SceneChance
+from workers.plan.step import draw_scene
 
 PHYSICS = Job(name="t").physics
 TABLE = place_table(table())
@@ -40,7 +41,7 @@ def heights_of(rest: tuple[Settled, ...]) -> list[float]:
 
 def scene(starts: list[ObjectStart], physics=PHYSICS) -> Rest:
     """With what the scene calls for from its start."""
-    plan = plan_scene(Job(name="t"), 0, table(), starts[0].asset)
+    plan = draw_scene(Job(name="t"), SceneChance(0, 0), table(), starts[0].asset)
     plan = dataclasses.replace(plan, table=TABLE, objects=tuple(starts))
     return settle_scene(plan, physics, EffectPlan(tuple(sorted(called_for(starts, TABLE, physics))), {}))
 

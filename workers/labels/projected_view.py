@@ -1,0 +1,71 @@
+"""The projected view: the stored input cloud as the mirror camera sees it. Pure."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.job.job import Images
+from schemas.job.sensor import Distortion
+from schemas.scene.camera import Camera
+from schemas.scene.effects import EffectPlan
+from schemas.scene.scene import View
+from workers.geometry.distortion import distort
+from workers.geometry.normals import facing_cosine
+from workers.geometry.pixels import count_filled, take_colours
+from workers.geometry.projection import Projected, forward_project, in_frame
+from workers.geometry.stored_depth import quantise_depth
+
+HIDDEN_M = 0.01
+"""A projected point this far behind what the mirror camera sees is hidden."""
+
+
+def derive_projected(
+    source: View, mirror: Camera, images: Images, lens: Distortion | None, effects: EffectPlan
+) -> tuple[NDArray[np.uint8] | None, NDArray[np.uint16]]:
+    """RGB [H, W, 3] uint8 and depth [H, W] uint16 of the stored input cloud seen from the mirror camera; holes 0.
+
+    RGB is None where the source has none. `lens` is the one that the source's RGB was drawn through.
+    """
+    projected = carry_depth(source, mirror, images, effects)
+    depth = quantise_depth(projected.depth_m, images)
+    if source.rgb is None:
+        return None, depth
+    if lens is None or not effects.runs("sensor_distortion"):
+        return take_colours(source.rgb, projected.source), depth
+    rgb = np.zeros((*depth.shape, 3), np.uint8)
+    filled = projected.source >= 0
+    rgb[filled] = colours_behind(lens, source.rgb, source.camera, projected.source[filled])
+    return rgb, depth
+
+
+def colours_behind(
+    lens: Distortion, rgb: NDArray[np.uint8], camera: Camera, pixels: NDArray[np.integer]
+) -> NDArray[np.uint8]:
+    """[N, 3] uint8: colours of depth pixels (flat indices) in RGB [H, W, 3] that was drawn through a lens.
+
+    Each is the colour of the RGB pixel that the depth pixel's centre is drawn in, black outside the image.
+    """
+    k = camera.intrinsics
+    rows, columns = np.divmod(pixels, k.width)
+    u, v = distort(columns + 0.5, rows + 0.5, lens, k)
+    inside = in_frame(u, v, k)
+    colours = np.zeros((len(pixels), 3), np.uint8)
+    colours[inside] = rgb[np.floor(v[inside]).astype(np.int64), np.floor(u[inside]).astype(np.int64)]
+    return colours
+
+
+def carry_depth(source: View, target: Camera, images: Images, effects: EffectPlan) -> Projected:
+    """The stored input cloud in another camera, with splat and hidden-point removal where the plan has them."""
+    depth, units = source.depth, images.depth_units_per_m
+    if effects.runs("hidden_point_removal") and source.region is not None:
+        # A point whose surface faces away from the new camera is the back of something nearer to it.
+        everywhere = np.arange(depth.size)
+        facing = facing_cosine(depth, source.region, everywhere, source.camera, target.position, units)
+        depth = np.where(np.nan_to_num(facing, nan=-1.0).reshape(depth.shape) > 0.0, depth, np.uint16(0))
+    splat = images.projection.splat if effects.runs("splat") else 1
+    return forward_project(depth, source.camera, target, splat, units)
+
+
+def projection_shares(projected: NDArray[np.uint16], mirror: NDArray[np.uint16], images: Images) -> tuple[float, float]:
+    """Share of pixels that the projection fills, and of those the share that lies behind what the mirror camera sees."""
+    filled, hidden = count_filled(projected, mirror, HIDDEN_M * images.depth_units_per_m)
+    return filled / projected.size, hidden / max(1, filled)
