@@ -141,7 +141,7 @@ BROKEN = {
         "rows of another scene in views",
     ),
     "a file that no row names": (
-        changed(made_scene(0), files=(*made_scene(0).files, ("mug/RGB99999.png", b"x"))),
+        changed(made_scene(0), files=(*made_scene(0).files, encoded_file("mug/RGB99999.png", b"x"))),
         "disagree about mug/RGB99999.png",
     ),
     "a row that names no file": (changed(made_scene(0), files=made_scene(0).files[1:]), "disagree about"),
