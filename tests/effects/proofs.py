@@ -59,7 +59,7 @@ def only_with(present: Callable[[Made], Any]) -> Difference:
 
 def sees(region: int) -> Difference:
     """A region has pixels in the input view."""
-    return only_with(lambda made: region in np.unique(made.scene.pairs[0].input.region))
+    return only_with(lambda made: region in set(np.asarray(made.scene.pairs[0].input.region).flat))
 
 
 def rests(shown: Outcome, gone: Outcome) -> bool:

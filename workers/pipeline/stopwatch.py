@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 
 
@@ -16,32 +16,26 @@ class Stopwatch:
     seconds: dict[str, float] = field(default_factory=dict)
     effects: dict[str, float] = field(default_factory=dict)
 
+    def stage(self, name: str, effect: str | None = None) -> AbstractContextManager[None]:
+        """Adds the time of a block to the stage, and to the effect that the block is the work of."""
+        return self._time((self.seconds, name), (self.effects, effect))
+
+    def effect(self, name: str) -> AbstractContextManager[None]:
+        """Adds the time of a block, which has stages of its own, to the effect."""
+        return self._time((self.effects, name))
+
     @contextmanager
-    def stage(self, name: str, effect: str | None = None) -> Iterator[None]:
-        """Adds the time of the block to the stage, and to the effect that the block is the work of."""
+    def _time(self, *entries: tuple[dict[str, float], str | None]) -> Iterator[None]:
         begun = time.perf_counter()
         try:
             yield
         finally:
             elapsed = time.perf_counter() - begun
-            self._add(self.seconds, name, elapsed)
-            if effect is not None:
-                self._add(self.effects, effect, elapsed)
-
-    @contextmanager
-    def effect(self, name: str) -> Iterator[None]:
-        """Adds the time of the block, which has stages of its own, to the effect."""
-        begun = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._add(self.effects, name, time.perf_counter() - begun)
+            for clock, name in entries:
+                if name is not None:
+                    clock[name] = clock.get(name, 0.0) + elapsed
 
     def add(self, other: "Stopwatch") -> None:
         """Adds the stages of another stopwatch."""
         for name, seconds in other.seconds.items():
-            self._add(self.seconds, name, seconds)
-
-    @staticmethod
-    def _add(clock: dict[str, float], name: str, seconds: float) -> None:
-        clock[name] = clock.get(name, 0.0) + seconds
+            self.seconds[name] = self.seconds.get(name, 0.0) + seconds

@@ -6,7 +6,7 @@ give it its two scenes (tests/effects/cases.py) and its proof (tests/effects/pro
 """
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
@@ -27,7 +27,10 @@ from workers.plan.randomness import SceneChance, Stream
 
 def plan_effects(facts: Facts, forced: frozenset[str] = frozenset()) -> EffectPlan:
     """Which effects this scene calls for; those `forced` run in any case. Raises ValueError where one cannot be forced."""
-    _require_forcible(forced)
+    if unknown := forced - {effect.name for effect in EFFECTS}:
+        raise ValueError(f"no effects of these names: {', '.join(sorted(unknown))}")
+    if asked := forced & names_of_kind("asked"):
+        raise ValueError(f"switches of the job, which cannot be forced: {', '.join(sorted(asked))}")
     reasons = {effect.name: effect.skipped_because(facts) for effect in EFFECTS}
     skipped = {name: why for name, why in reasons.items() if why is not None and name not in forced}
     return EffectPlan(tuple(name for name in reasons if name not in skipped), skipped, forced)
@@ -53,20 +56,12 @@ def names_of_kind(kind: str) -> frozenset[str]:
     return frozenset(effect.name for effect in EFFECTS if effect.kind == kind)
 
 
-def _require_forcible(forced: frozenset[str]) -> None:
-    names, asked = {effect.name for effect in EFFECTS}, names_of_kind("asked")
-    if forced - names:
-        raise ValueError(f"no effects of these names: {', '.join(sorted(forced - names))}")
-    if forced & asked:
-        raise ValueError(f"switches of the job, which cannot be forced: {', '.join(sorted(forced & asked))}")
-
-
 # ------------------------------------------------------------------------------------------- switches of the job
 
 
-def _stored(part: Role | PixelKind) -> Reason:
-    """An effect that makes a view, or the colour of every view."""
-    return lambda facts: None if is_stored(part, facts.job) else f"{SWITCHES[part]} is false"
+def _where(wanted: Callable[[Facts], object], why_not: str) -> Reason:
+    """An effect of the scenes for which `wanted` holds."""
+    return lambda facts: None if wanted(facts) else why_not
 
 
 def _first_of(*reasons: Reason) -> Reason:
@@ -74,26 +69,14 @@ def _first_of(*reasons: Reason) -> Reason:
     return lambda facts: next((why for reason in reasons if (why := reason(facts)) is not None), None)
 
 
-def _splat(facts: Facts) -> str | None:
-    return "images.projection.splat is 1" if facts.job.images.projection.splat == 1 else None
-
-
-def _hidden_points(facts: Facts) -> str | None:
-    asked = facts.job.images.projection.hidden_point_removal
-    return None if asked else "images.projection.hidden_point_removal is off"
-
-
-def _samples(facts: Facts) -> str | None:
-    return "render.samples is 1" if facts.job.render.samples == 1 else None
-
-
-def _raycast(facts: Facts) -> str | None:
-    return None if facts.raycast_checked else "not in the share check.raycast_share"
+def _stored(part: Role | PixelKind) -> Reason:
+    """An effect that makes a view, or the colour of every view."""
+    return _where(lambda facts: is_stored(part, facts.job), f"{SWITCHES[part]} is false")
 
 
 def _sensor(name: str) -> Reason:
     """A sensor effect, which runs in every scene where the job asks for it."""
-    return lambda facts: f"sensor.{name} is off" if getattr(facts.job.sensor, name) is None else None
+    return _where(lambda facts: getattr(facts.job.sensor, name) is not None, f"sensor.{name} is off")
 
 
 def _tier(*tiers: Tier) -> Reason:
@@ -105,6 +88,14 @@ def _tier(*tiers: Tier) -> Reason:
     return _first_of(_stored("rgb"), skipped_because)
 
 
+_PROJECTION = _stored("projected")
+_SPLAT = _where(lambda facts: facts.job.images.projection.splat > 1, "images.projection.splat is 1")
+_HIDDEN_POINTS = _where(
+    lambda facts: facts.job.images.projection.hidden_point_removal, "images.projection.hidden_point_removal is off"
+)
+_SAMPLES = _where(lambda facts: facts.job.render.samples > 1, "render.samples is 1")
+_RAYCAST = _where(lambda facts: facts.raycast_checked, "not in the share check.raycast_share")
+
 # ------------------------------------------------------------------------------------------- exact no-ops
 
 
@@ -114,14 +105,14 @@ def _parts(facts: Facts) -> Iterator[Part]:
         yield from shape.parts
 
 
-def _textures(facts: Facts) -> str | None:
-    textured = any(part.uv is not None and part.material.texture is not None for part in _parts(facts))
-    return None if textured else "no surface has a texture"
-
-
-def _transparency(facts: Facts) -> str | None:
-    holes = any(part.uv is not None and has_holes(part.material.texture) for part in _parts(facts))
-    return None if holes else "no texture has clear texels"
+_TEXTURES = _where(
+    lambda facts: any(part.uv is not None and part.material.texture is not None for part in _parts(facts)),
+    "no surface has a texture",
+)
+_HOLES = _where(
+    lambda facts: any(part.uv is not None and has_holes(part.material.texture) for part in _parts(facts)),
+    "no texture has clear texels",
+)
 
 
 def _floor(facts: Facts) -> str | None:
@@ -149,8 +140,9 @@ def _views(facts: Facts) -> Iterator[tuple[Camera, ...]]:
         yield tuple(place_mirror_camera(camera, d_z, job.cameras.mirror) for d_z in job.images.depth_range_m)
 
 
-def _exact_agreement(facts: Facts) -> str | None:
-    return "stored depth is exact: sensor.depth_noise is off" if facts.job.sensor.depth_noise is None else None
+_NOISY_DEPTH = _where(
+    lambda facts: facts.job.sensor.depth_noise is not None, "stored depth is exact: sensor.depth_noise is off"
+)
 
 
 # ------------------------------------------------------------------------------------------- the table
@@ -167,36 +159,34 @@ def _of_physics(name: str) -> Effect:
 
 PHYSICS_EFFECTS: tuple[Effect, ...] = tuple(_of_physics(name) for name in PREDICATES)
 
-_PROJECTION = _stored("projected")
-
 EFFECTS: tuple[Effect, ...] = (
     *PHYSICS_EFFECTS,
     Effect("depth_camera", "asked", _stored("aligned"), "a third view", "render"),
     Effect("mirror", "asked", _stored("mirror"), "a second view", "render"),
     Effect("projection", "asked", _PROJECTION, "the input's cloud in the mirror camera", "projection"),
-    Effect("splat", "asked", _first_of(_PROJECTION, _splat), "several pixels a point", "projection"),
-    Effect("hidden_point_removal", "asked", _first_of(_PROJECTION, _hidden_points), "a normal a point", "projection"),
+    Effect("splat", "asked", _first_of(_PROJECTION, _SPLAT), "several pixels a point", "projection"),
+    Effect("hidden_point_removal", "asked", _first_of(_PROJECTION, _HIDDEN_POINTS), "a normal a point", "projection"),
     Effect("rgb", "asked", _stored("rgb"), "colour in every view", "render"),
     Effect("shadows", "asked", _tier("raster", "pathtraced"), "one shadow map a scene", "render"),
     Effect("ambient_occlusion", "asked", _tier("raster"), "two level maps a scene", "render"),
     Effect("antialiasing", "asked", _tier("raster", "pathtraced"), "1 to 2 ms a view", "render"),
-    Effect("samples", "asked", _first_of(_tier("raster"), _samples), "three more draws of edges", "render"),
+    Effect("samples", "asked", _first_of(_tier("raster"), _SAMPLES), "three more draws of edges", "render"),
     Effect("global_illumination", "asked", _tier("pathtraced"), "seconds a view", "render"),
     Effect("glass", "asked", _tier("pathtraced"), "longer paths", "render"),
     *(
         Effect(f"sensor_{name}", "asked", _sensor(name), "an image pass", "sensor")
         for name in SensorEffects.model_fields
     ),
-    Effect("raycast_check", "asked", _raycast, "every view cast by rays: 0.2 s", "raycast"),
-    Effect("release_again", "asked", _raycast, "a second of simulation", "recheck"),
+    Effect("raycast_check", "asked", _RAYCAST, "every view cast by rays: 0.2 s", "raycast"),
+    Effect("release_again", "asked", _RAYCAST, "a second of simulation", "recheck"),
     Effect("floor", "no_op", _floor, "a draw in each view", "render"),
     Effect("table", "no_op", _table, "a draw in each view", "render"),
-    Effect("textures", "no_op", _first_of(_stored("rgb"), _textures), "a look-up for each fragment", "render"),
+    Effect("textures", "no_op", _first_of(_stored("rgb"), _TEXTURES), "a look-up for each fragment", "render"),
     # Tier flat has no such pass that could be forced, and the path tracer has it in its materials.
     Effect(
         "transparency",
         "no_op",
-        _first_of(_tier("raster", "pathtraced"), _transparency),
+        _first_of(_tier("raster", "pathtraced"), _HOLES),
         "two more draws a view",
         "render",
     ),
@@ -204,7 +194,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         "exact_agreement",
         "no_op",
-        _first_of(_stored("mirror"), _exact_agreement),
+        _first_of(_stored("mirror"), _NOISY_DEPTH),
         "the two views compared once more",
         "check",
     ),
