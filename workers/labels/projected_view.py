@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from schemas.job.job import Images
 from schemas.job.sensor import Distortion
-from schemas.scene.camera import Camera
+from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import View
 from workers.geometry.distortion import distort
@@ -27,30 +27,23 @@ def derive_projected(
     """
     projected = carry_depth(source, mirror, images, effects)
     depth = quantise_depth(projected.depth_m, images)
+    pixels: NDArray[np.integer] = projected.source
     if source.rgb is None:
         return None, depth
-    if lens is None or not effects.runs("sensor_distortion"):
-        return take_colours(source.rgb, projected.source), depth
-    rgb = np.zeros((*depth.shape, 3), np.uint8)
-    filled = projected.source >= 0
-    rgb[filled] = colours_behind(lens, source.rgb, source.camera, projected.source[filled])
-    return rgb, depth
+    if lens is not None and effects.runs("sensor_distortion"):
+        pixels = pixels_behind(lens, pixels, source.camera.intrinsics)
+    return take_colours(source.rgb, pixels), depth
 
 
-def colours_behind(
-    lens: Distortion, rgb: NDArray[np.uint8], camera: Camera, pixels: NDArray[np.integer]
-) -> NDArray[np.uint8]:
-    """[N, 3] uint8: colours of depth pixels (flat indices) in RGB [H, W, 3] that was drawn through a lens.
+def pixels_behind(lens: Distortion, pixels: NDArray[np.integer], k: Intrinsics) -> NDArray[np.int64]:
+    """Flat indices of the RGB pixels, drawn through a lens, that the centres of depth pixels (flat indices) fall in.
 
-    Each is the colour of the RGB pixel that the depth pixel's centre is drawn in, black outside the image.
+    -1 where it falls outside the image, and for -1.
     """
-    k = camera.intrinsics
     rows, columns = np.divmod(pixels, k.width)
     u, v = distort(columns + 0.5, rows + 0.5, lens, k)
-    inside = in_frame(u, v, k)
-    colours = np.zeros((len(pixels), 3), np.uint8)
-    colours[inside] = rgb[np.floor(v[inside]).astype(np.int64), np.floor(u[inside]).astype(np.int64)]
-    return colours
+    inside = (pixels >= 0) & in_frame(u, v, k)
+    return np.where(inside, np.floor(v) * k.width + np.floor(u), -1).astype(np.int64)
 
 
 def carry_depth(source: View, target: Camera, images: Images, effects: EffectPlan) -> Projected:

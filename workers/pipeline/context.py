@@ -1,4 +1,4 @@
-"""What a worker process holds while it makes scenes: the job, its assets, the renderer."""
+"""The context of a worker process: the job, its assets, the renderer."""
 
 import hashlib
 import json
@@ -15,7 +15,7 @@ OUTSIDE_SETTINGS = {"name", "scenes", "first_scene", "run", "output", "verso", "
 
 @dataclass(frozen=True, eq=False)
 class WorkerContext:
-    """One for each process: the renderer has the process's one GL context."""
+    """What a process holds while it makes scenes; one for each process, as the renderer has its one GL context."""
 
     job: Job
     catalogue: Catalogue
@@ -28,16 +28,16 @@ class WorkerContext:
 
 
 def open_worker(job: Job, catalogue: Catalogue) -> WorkerContext:
-    """This process made ready to make the job's scenes: its allocator, its renderer."""
+    """Prepare this process, its allocator and its renderer, for the job's scenes."""
     keep_freed_memory()
     return WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
 
 
 def settings_digest(job: Job, catalogue_digest: str) -> str:
-    """SHA-256, hex, of everything that decides what a scene is: settings and assets, not how many or how driven.
+    """SHA-256, hex, of the settings and assets that decide what a scene is.
 
-    Where an asset folder lies is left out: the same files elsewhere are the same assets. So are effects that are off, as
-    they decide nothing.
+    Without the paths of asset folders, as the same files elsewhere are the same assets, and without sensor effects that
+    are off.
     """
     settings = job.model_dump(mode="json", exclude=OUTSIDE_SETTINGS)
     settings["sensor"] = {name: effect for name, effect in settings["sensor"].items() if effect is not None}

@@ -36,7 +36,7 @@ from workers.store.opening import open_store
 from workers.store.store import Store
 
 TIMED_OUT = "_timed_out"
-"""In an attempt's folder: where a worker that hung in a scene left its traceback."""
+"""The file in an attempt's folder that holds the traceback of a worker that hung in a scene."""
 
 
 class BlamedScene(SceneError):
@@ -47,7 +47,7 @@ class BlamedScene(SceneError):
 
 
 def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
-    """Make and commit every range of the order. What a scene cannot be is a row; anything else propagates."""
+    """Make and commit every range of the order. A scene that cannot be made is a row; any other error propagates."""
     begun, cpu = time.perf_counter(), time.process_time()
     require_tier(order.job.render)
     context = open_worker(order.job, catalogue)
@@ -99,7 +99,7 @@ def run_span(context: WorkerContext, store: Store, order: ShardOrder, span: Span
 
 
 def record_blame(job: Job, blame: Blame) -> SceneOutput:
-    """The row of a scene that is not tried again: it is not begun either, so that nobody is killed in it."""
+    """The row of a scene that is not tried again: it is not begun, so that no worker dies in it."""
     error = BlamedScene(blame.reason, blame.detail)
     return failed_scene(
         blame.scene_id, choose_category(job, SceneChance(job.seed, blame.scene_id)), error, blame.attempts
@@ -137,7 +137,7 @@ def _join_stack(store: Store, mine: Fingerprint, order: ShardOrder) -> None:
 
 @contextmanager
 def _traceback_file(store: Store, attempt: Attempt) -> Iterator[IO[str]]:
-    """Where a hung worker leaves its traceback: in the attempt's folder, so that the coordinator can tell."""
+    """The file for a hung worker's traceback, in the attempt's folder, where the coordinator looks."""
     if not isinstance(store, LocalStore) or attempt.fenced:
         yield sys.stderr
         return
@@ -150,8 +150,7 @@ def _traceback_file(store: Store, attempt: Attempt) -> Iterator[IO[str]]:
 def _time_limit(seconds: float, tracebacks: IO[str]) -> Iterator[None]:
     """Kills this process if the block takes longer.
 
-    PyBullet and GL hold the interpreter's lock while they work, so only a watchdog in C can end a worker that hangs
-    there.
+    PyBullet and GL hold the interpreter's lock while they work: only a watchdog in C can end a worker that hangs there.
     """
     faulthandler.dump_traceback_later(seconds, exit=True, file=tracebacks)
     try:
