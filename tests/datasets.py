@@ -12,8 +12,8 @@ from services.read.verify import verify
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import open_worker
 from workers.pipeline.fingerprint import take_fingerprint
-from workers.pipeline.make_scene import Stopwatch
 from workers.pipeline.run_shard import run_scene
+from workers.pipeline.stopwatch import Stopwatch
 from workers.store.attempt import begin_attempt
 from workers.store.local import LocalStore
 

@@ -1,12 +1,14 @@
 """Scenes whose files and rows are made up: what the store is tested with, quick and deterministic."""
 
+import dataclasses
 import hashlib
+from collections.abc import Callable
 
 import numpy as np
 
 from schemas.dataset.commit import CommitTerms, Span
 from schemas.dataset.layout import IMAGES, asset_path, file_pose_id, image_path, input_pose_id, patch_path
-from schemas.scene.scene import SceneOutput
+from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
 from workers.store.attempt import Attempt, begin_attempt
 from workers.store.store import Store
 
@@ -31,8 +33,16 @@ def matrix_of(*keys: int) -> list[float]:
     return [*numbers_of(*keys).normal(size=12).tolist(), -0.0, 0.0, 0.0, 1.0]
 
 
-def file_row(path: str, data: bytes) -> dict[str, object]:
-    return {"path": path, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+def file_row(file: EncodedFile) -> dict[str, object]:
+    return {"path": file.path, "bytes": len(file.data), "sha256": file.sha256}
+
+
+def with_shapes(output: SceneOutput, change: Callable[[bytes], bytes]) -> SceneOutput:
+    """The scene with other bytes in its shapes."""
+    files = (
+        encoded_file(file.path, change(file.data)) if file.path.startswith("assets/") else file for file in output.files
+    )
+    return dataclasses.replace(output, files=tuple(files))
 
 
 def category_of(scene_id: int) -> str:
@@ -43,17 +53,17 @@ def made_scene(scene_id: int, salt: str = "", images=IMAGES, shapes: bool = True
     """A scene that went well; `salt` changes its images, as another stack would; fewer `images` make it smaller."""
     category = category_of(scene_id)
     pose_id = input_pose_id(scene_id, 0, 1)
-    files: list[tuple[str, bytes]] = []
+    files: list[EncodedFile] = []
     by_role: dict[str, list[dict[str, object]]] = {}
     for image in images:
         for name in (image_path, patch_path):
             path = name(category, image.content, file_pose_id(image.role, pose_id))
-            data = bytes_of(path + salt, 100 + scene_id % 7)
-            files.append((path, data))
-            by_role.setdefault(image.role, []).append(file_row(path, data))
+            file = encoded_file(path, bytes_of(path + salt, 100 + scene_id % 7))
+            files.append(file)
+            by_role.setdefault(image.role, []).append(file_row(file))
     instance, table = f"{category}-{scene_id % 3}", "table-0"
     if shapes:
-        files.append((asset_path(category, instance), bytes_of(instance, 300)))
+        files.append(encoded_file(asset_path(category, instance), bytes_of(instance, 300)))
     views = [_view(scene_id, category, pose_id, role, rows) for role, rows in by_role.items()]
     objects = [
         _object(view, region, *thing)

@@ -15,7 +15,8 @@ from workers.assets.builtin.solid import circle, lathe
 from workers.assets.catalogue import open_catalogue
 from workers.assets.glb import asset_glb
 from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import Stopwatch, make_scene
+from workers.pipeline.make_scene import make_scene
+from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.gbuffer import shared_renderer
 
 FACETS = 1000

@@ -28,7 +28,8 @@ from schemas.scene.view import Pair
 from services.job.read import load_job
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import Stopwatch, make_scene
+from workers.pipeline.make_scene import make_scene
+from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.gbuffer import shared_renderer
 
 JOB = load_job(Path(__file__).resolve().parents[1] / "deploy" / "jobs" / "tabletop.yaml")

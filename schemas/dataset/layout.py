@@ -3,6 +3,7 @@
 import re
 import urllib.parse
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Literal
 
 from schemas.job.job import Job
@@ -66,19 +67,28 @@ IMAGES: tuple[Image, ...] = (
 """(a)-(k) of the article's figure 1; each also has a patch of every object, (l)-(u)."""
 
 
+SWITCHES: dict[Role | PixelKind, str] = {
+    "aligned": "cameras.depth.enabled",
+    "mirror": "cameras.mirror.enabled",
+    "projected": "images.projection.enabled",
+    "rgb": "render.rgb",
+}
+"""The key of the job that switches a view, or the colour of every view, on and off. What is not here is always stored."""
+
+
+def is_stored(part: Role | PixelKind, job: Job) -> bool:
+    """Whether the job asks for a view, or for a kind of image of every view."""
+    return part not in SWITCHES or attrgetter(SWITCHES[part])(job)
+
+
 def stored_roles(job: Job) -> tuple[Role, ...]:
-    """Roles of the views that the job asks for, in the order of `ROLES`."""
-    off = {
-        "aligned": not job.cameras.depth.enabled,
-        "mirror": not job.cameras.mirror.enabled,
-        "projected": not job.images.projection.enabled,
-    }
-    return tuple(role for role in ROLES if not off.get(role, False))
+    """The views of each pair that the job asks for, in the order of `ROLES`."""
+    return tuple(role for role in ROLES if is_stored(role, job))
 
 
 def stored_images(role: Role, job: Job) -> tuple[Image, ...]:
     """The images of one view that the job asks for."""
-    return tuple(image for image in IMAGES if image.role == role and (image.pixels != "rgb" or job.render.rgb))
+    return tuple(image for image in IMAGES if image.role == role and is_stored(image.pixels, job))
 
 
 def patch_index(region_id: int, objects: int) -> int | None:

@@ -1,7 +1,7 @@
 """Which effects a scene runs: what the plan decides, and what every step asks."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 EffectKind = Literal["asked", "no_op", "approximation"]
@@ -23,3 +23,12 @@ class EffectPlan:
     def runs(self, name: str) -> bool:
         """Whether the effect is to run."""
         return name in self.ran
+
+    def without(self, *names: str) -> "EffectPlan":
+        """The plan with these effects taken out, whether the scene calls for them or not; for tests and the audit."""
+        return replace(
+            self,
+            ran=tuple(name for name in self.ran if name not in names),
+            skipped={**self.skipped, **{name: "withdrawn" for name in self.ran if name in names}},
+            forced=self.forced.difference(names),
+        )

@@ -1,5 +1,6 @@
 """A scene from rest to output: settled objects, posed geometry, and all that is written of it."""
 
+import hashlib
 from dataclasses import dataclass
 from typing import Literal
 
@@ -52,12 +53,26 @@ class PosedScene:
 
 
 @dataclass(frozen=True, eq=False)
+class EncodedFile:
+    """A file of a scene: its path below the output folder, its bytes, and their SHA-256, hex."""
+
+    path: str
+    data: bytes
+    sha256: str
+
+
+def encoded_file(path: str, data: bytes) -> EncodedFile:
+    """The file with its digest: the one place where it is computed of bytes that were just encoded."""
+    return EncodedFile(path, data, hashlib.sha256(data).hexdigest())
+
+
+@dataclass(frozen=True, eq=False)
 class SceneOutput:
-    """All that a scene leaves behind: encoded files by path below the output folder, and rows by manifest table.
+    """All that a scene leaves behind: encoded files, and rows by manifest table.
 
     A scene that cannot be made has no files and one row in `failures`.
     """
 
     scene_id: int
-    files: tuple[tuple[str, bytes], ...]
+    files: tuple[EncodedFile, ...]
     rows: dict[str, list[dict[str, object]]]

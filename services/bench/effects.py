@@ -23,9 +23,10 @@ from workers.assets.catalogue import open_catalogue
 from workers.physics.effects import called_for
 from workers.physics.step import settle_scene
 from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import plan_with_assets
 from workers.plan.effect import Facts
 from workers.plan.effects import PHYSICS_EFFECTS, plan_effects
+from workers.plan.randomness import SceneChance
+from workers.plan.step import plan_scene
 from workers.render.raster.gbuffer import shared_renderer
 
 ROUNDS = 3
@@ -79,7 +80,13 @@ def _draw(context: WorkerContext, count: int) -> list[Facts]:
     drawn = []
     for scene_id in range(context.job.first_scene, context.job.first_scene + count):
         try:
-            drawn.append(Facts(context.job, plan_with_assets(context, scene_id), raycast_checked=False))
+            drawn.append(
+                Facts(
+                    context.job,
+                    plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id)),
+                    raycast_checked=False,
+                )
+            )
         except SceneError:
             continue
     return drawn

@@ -55,7 +55,7 @@ def _pair(pair: Pair, job: Job) -> dict[str, object]:
     cameras = {view.role: _matrix(view.camera.T_world_cam) for view in pair.views if view.role != "projected"}
     images = []
     for view in pair.views:
-        for path, kind, box in image_boxes(view, pair, job):
+        for path, kind, box in image_boxes(view, pair, job.images.patch):
             crop = None if box is None else [box[0].start, box[0].stop, box[1].start, box[1].stop]
             images.append({"path": path, "view": view.role, "pixels": kind, "crop": crop})
     return {"cameras": cameras, "images": images}

@@ -13,8 +13,9 @@ from services.bench.ratios import Lap
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.pipeline.allocator import keep_freed_memory
 from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import Scene, Stopwatch, make_scene
+from workers.pipeline.make_scene import Scene, make_scene
 from workers.pipeline.run_shard import run_span
+from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.context import require_device
 from workers.render.raster.gbuffer import shared_renderer
 from workers.store.commit import read_record

@@ -16,7 +16,8 @@ from services.bench.machine import describe_machine, pinned
 from services.bench.ratios import Lap, Spread, by_processor, slope_ratio
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import Scene, Stopwatch, make_scene
+from workers.pipeline.make_scene import Scene, make_scene
+from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.step import require_tier
 

@@ -5,7 +5,6 @@ Approximations: the scene at rest is released again with every effect of physics
 """
 
 import dataclasses
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -19,8 +18,9 @@ from services.read.dataset_reader import StoredRange, choose_scenes, find_scene
 from services.read.replay import compare_files, compare_rows, open_context
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.fingerprint import take_fingerprint
-from workers.pipeline.make_scene import Scene, Stopwatch, make_scene
+from workers.pipeline.make_scene import Scene, make_scene
 from workers.pipeline.rows import record_scene
+from workers.pipeline.stopwatch import Stopwatch
 from workers.plan.effects import EFFECTS, names_of_kind
 from workers.store.store import Store
 
@@ -98,7 +98,7 @@ def _force_no_ops(
         return None
     found.forced += len(no_ops)
     found.files += len(output.files)
-    found.bytes += sum(len(data) for _, data in output.files)
+    found.bytes += sum(len(file.data) for file in output.files)
     plain = None if found.same_stack else make_forced(context, scene_id, frozenset())[1]
     differences = _differences(where, plain, output)
     if not differences:
@@ -130,14 +130,14 @@ def make_forced(context: WorkerContext, scene_id: int, forced: frozenset[str]) -
 def _differences(where: tuple[Store, StoredRange], plain: SceneOutput | None, output: SceneOutput) -> list[str]:
     """Differences from what is stored, or from the plain scene made here where another stack made what is stored."""
     if plain is not None:
-        before, now = dict(plain.files), dict(output.files)
+        before, now = ({file.path: file.sha256 for file in one.files} for one in (plain, output))
         return [f"{path}: is not the same" for path in sorted({*before, *now}) if before.get(path) != now.get(path)]
     store, stored = where
     committed = {entry.path: entry.sha256 for record in stored.records for entry in record.files}
-    assets = [(path, data) for path, data in output.files if path.startswith(f"{ASSETS}/") and path in committed]
+    assets = [file for file in output.files if file.path.startswith(f"{ASSETS}/") and file.path in committed]
     return [
         *compare_files(store, stored, output, True),
-        *(f"{path}: is not the same" for path, data in assets if hashlib.sha256(data).hexdigest() != committed[path]),
+        *(f"{file.path}: is not the same" for file in assets if file.sha256 != committed[file.path]),
         *compare_rows(stored, output, RECEIPT),
     ]
 

@@ -1,6 +1,5 @@
 """`verso replay`: makes one scene again from its job and compares it with what is stored."""
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,8 +15,8 @@ from services.read.dataset_reader import StoredRange, file_reader, find_scene
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import WorkerContext, open_worker
 from workers.pipeline.fingerprint import take_fingerprint
-from workers.pipeline.make_scene import Stopwatch
 from workers.pipeline.run_shard import run_scene
+from workers.pipeline.stopwatch import Stopwatch
 from workers.store.images import decode_png
 from workers.store.manifest import table_of_rows
 from workers.store.store import Store
@@ -73,16 +72,16 @@ def compare_files(store: Store, stored: StoredRange, output: SceneOutput, same_s
         if view["scene_id"] == output.scene_id
         for file in view["files"]
     }
-    made = {path: data for path, data in output.files if not path.startswith("assets/")}
+    made = {file.path: file for file in output.files if not file.path.startswith("assets/")}
     differences = [
         f"{path}: only {'stored' if path in scene_files else 'made now'}"
         for path in sorted(made.keys() ^ scene_files.keys())
     ]
     read = file_reader(store.read, stored)
     for path in sorted(made.keys() & scene_files.keys()):
-        if hashlib.sha256(made[path]).hexdigest() == scene_files[path]:
+        if made[path].sha256 == scene_files[path]:
             continue
-        within, how = _compare_pixels(read(path), made[path])
+        within, how = _compare_pixels(read(path), made[path].data)
         if same_stack or not within:
             differences.append(f"{path}: {how}")
     return differences

@@ -18,7 +18,8 @@ from schemas.scene.shape import Part, Shape
 from services.job.record import require_job
 from services.read.dataset_reader import find_scene
 from services.read.replay import open_context
-from workers.pipeline.make_scene import plan_with_assets
+from workers.plan.randomness import SceneChance
+from workers.plan.step import plan_scene
 from workers.store.store import Store
 
 
@@ -33,7 +34,9 @@ def export_scene(store: Store, scene_id: int, target: Path) -> int:
     if row is None:
         reason = next((f["reason"] for f in stored.rows["failures"] if f["scene_id"] == scene_id), "unknown")
         raise InputError(f"scene {scene_id} was not made ({reason}): it has no geometry")
-    plan, T_world = plan_with_assets(open_context(record), scene_id), read_world_poses(row)
+    context = open_context(record)
+    plan = plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
+    T_world = read_world_poses(row)
     scene = trimesh.Scene()
     for name, shape, T in (
         ("floor", plan.floor, np.eye(4)),

@@ -33,12 +33,6 @@ def facts_with(*cases: Drop) -> Facts:
     return dataclasses.replace(_drawn(), plan=plan)
 
 
-def without(effects: EffectPlan, *names: str) -> EffectPlan:
-    """The plan with effects left out, whether called for or not."""
-    left_out = dict.fromkeys(names, "left out by a test")
-    return EffectPlan(tuple(name for name in effects.ran if name not in names), {**effects.skipped, **left_out})
-
-
 def settled(facts: Facts, effects: EffectPlan | None = None) -> Rest:
     """The scene at rest, by its own plan or another. Raises SettleError."""
     return settle_scene(facts.plan, facts.job.physics, plan_effects(facts) if effects is None else effects)

@@ -1,7 +1,6 @@
 """Scenes to try effects on: a job's changes, and what is done to the scene that is drawn."""
 
-import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -13,16 +12,18 @@ import numpy as np
 import workers.pipeline.make_scene
 from schemas.job.identity import settings_digest
 from schemas.job.job import Category, Job
-from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ScenePlan
 from schemas.scene.shape import Part, Shape
 from services.job.read import validate_job
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import Scene, Stopwatch, make_scene, plan_with_assets
+from workers.pipeline.make_scene import Scene, make_scene
 from workers.pipeline.rows import record_scene
+from workers.pipeline.stopwatch import Stopwatch
 from workers.plan.effect import Facts
-from workers.plan.effects import is_raycast_scene, plan_effects
+from workers.plan.effects import is_raycast_scene
+from workers.plan.randomness import SceneChance
+from workers.plan.step import plan_scene
 from workers.render.raster.gbuffer import shared_renderer
 
 SMALL: dict[str, Any] = {
@@ -69,7 +70,7 @@ class Made:
     files: dict[str, str]
     rows: dict[str, list[dict[str, object]]]
     scene: Scene
-    watch: Stopwatch
+    stopwatch: Stopwatch
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -88,44 +89,34 @@ def _catalogue(categories: tuple[Category, ...]) -> Catalogue:
     return open_catalogue(Job(name="c").assets, Path(), categories)
 
 
-def context_of(job: Job, forced: frozenset[str] = frozenset()) -> WorkerContext:
+def context_of(job: Job, forced: Iterable[str] = (), withdrawn: Iterable[str] = ()) -> WorkerContext:
     catalogue = _catalogue(tuple(job.categories))
-    return WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest), forced)
+    digest = settings_digest(job, catalogue.digest)
+    return WorkerContext(job, catalogue, shared_renderer(), digest, frozenset(forced), frozenset(withdrawn))
 
 
 def facts_of(setting: Setting) -> Facts:
     """What the plan of effects is made from."""
-    job = setting.job
-    plan = setting.edit(plan_with_assets(context_of(job), setting.scene_id))
-    return Facts(job, plan, is_raycast_scene(job, setting.scene_id))
+    job, chance = setting.job, SceneChance(setting.job.seed, setting.scene_id)
+    plan = setting.edit(plan_scene(job, context_of(job).catalogue, chance))
+    return Facts(job, plan, is_raycast_scene(job.check, chance))
 
 
-def make(setting: Setting, forced: str | None = None, left_out: str | None = None) -> Made:
-    """The scene made, with one effect forced, or left out although it may be called for. Raises SceneError."""
-    context = context_of(setting.job, frozenset({forced} if forced else ()))
+def make(setting: Setting, forced: Iterable[str] = (), withdrawn: Iterable[str] = ()) -> Made:
+    """The scene made, with effects forced, or taken out of its plan although it calls for them. Raises SceneError."""
+    context, stopwatch = context_of(setting.job, forced, withdrawn), Stopwatch()
 
-    def draw(context: WorkerContext, scene_id: int) -> ScenePlan:
-        return setting.edit(plan_with_assets(context, scene_id))
+    def draw(job: Job, catalogue: Catalogue, chance: SceneChance) -> ScenePlan:
+        return setting.edit(plan_scene(job, catalogue, chance))
 
-    def leave_out(facts: Facts, forced: frozenset[str]) -> EffectPlan:
-        plan = plan_effects(facts, forced)
-        if left_out is None:
-            return plan
-        ran = tuple(name for name in plan.ran if name != left_out)
-        return EffectPlan(ran, {**plan.skipped, left_out: "left out by a test"}, forced)
-
-    watch = Stopwatch()
-    with (
-        mock.patch.object(workers.pipeline.make_scene, "plan_with_assets", draw),
-        mock.patch.object(workers.pipeline.make_scene, "plan_effects", leave_out),
-    ):
-        scene = make_scene(context, setting.scene_id, watch)
-    output = record_scene(context, scene, watch)
+    with mock.patch.object(workers.pipeline.make_scene, "plan_scene", draw):
+        scene = make_scene(context, setting.scene_id, stopwatch)
+    output = record_scene(context, scene, stopwatch)
     rows = {
         table: [{key: value for key, value in row.items() if key not in RECEIPT} for row in some]
         for table, some in output.rows.items()
     }
-    return Made({path: hashlib.sha256(data).hexdigest() for path, data in output.files}, rows, scene, watch)
+    return Made({file.path: file.sha256 for file in output.files}, rows, scene, stopwatch)
 
 
 def without_textures(plan: ScenePlan) -> ScenePlan:

@@ -10,7 +10,7 @@ import trimesh
 from schemas.errors import SettleError
 from schemas.scene.plan import ObjectStart
 from tests.effects.physics_cases import PHYSICS
-from tests.effects.physics_scenes import drop_on, facts_with, is_still, moved_from, moved_when_forced, settled, without
+from tests.effects.physics_scenes import drop_on, facts_with, is_still, moved_from, moved_when_forced, settled
 from tests.effects.scenes import Setting, facts_of
 from tests.hard_cases.bodies import built_in, cube, mug_on_peg, over_edge, rod
 from tests.hard_cases.drops import EDGE_M, X, Y, drop, level, lowered, ring, turn
@@ -57,7 +57,7 @@ def test_without_dynamics_an_object_hangs_in_the_air_by_its_clearance():
     assert air_mm > 10 * GAP_MM
     assert settled(facts).settled[0].hover_gap_mm <= GAP_MM
     with pytest.raises(SettleError, match="unsupported"):
-        settled(facts, without(plan_effects(facts), "dynamics"))
+        settled(facts, plan_effects(facts).without("dynamics"))
 
 
 def test_without_the_tables_mesh_a_box_stands_on_air_beyond_the_edge():
@@ -86,7 +86,7 @@ def test_without_object_contacts_the_cubes_of_a_stack_overlap_by_their_size():
     facts = _stack()
     plan, physics, effects = facts.plan, facts.job.physics, plan_effects(facts)
     assert effects.runs("object_contacts")
-    alone = without(effects, "object_contacts").ran
+    alone = effects.without("object_contacts").ran
     through = [settle_single(start, plan.table, physics, alone).T_world_obj for start in plan.objects]
     stacked = [rest.T_world_obj for rest in settled(facts).settled]
     gaps = [
@@ -99,7 +99,7 @@ def test_without_object_contacts_the_cubes_of_a_stack_overlap_by_their_size():
 
 def test_contacts_that_the_plan_left_out_are_called_for_once_an_object_leaves_its_room():
     facts = _stack()
-    rest = settled(facts, without(plan_effects(facts), "object_contacts"))
+    rest = settled(facts, plan_effects(facts).without("object_contacts"))
     assert "object_contacts" in rest.called
     heights = [_com(start, one.T_world_obj)[2] for start, one in zip(facts.plan.objects, rest.settled, strict=True)]
     assert heights[1] - heights[0] == pytest.approx(0.1, abs=2e-4)
@@ -115,7 +115,7 @@ def test_without_decomposition_a_mug_cannot_hang_by_its_handle():
     assert _com(facts.plan.objects[0], T)[2] < facts.plan.table.top.height_m
     assert max(hanging.hover_gap_mm, hanging.penetration_mm) <= GAP_MM
     with pytest.raises(SettleError) as caught:
-        settled(facts, without(effects, "decomposition"))
+        settled(facts, effects.without("decomposition"))
     assert caught.value.reason == "left_table"
 
 
@@ -129,7 +129,7 @@ def test_without_fine_steps_what_is_small_falls_through_a_thin_table():
         facts.plan.table.top.height_m + 0.0025, abs=1e-4
     )
     with pytest.raises(SettleError) as caught:
-        settled(facts, without(effects, "fine_step"))
+        settled(facts, effects.without("fine_step"))
     assert caught.value.reason in ("left_table", "not_at_rest")
 
 
@@ -148,7 +148,7 @@ def test_without_rolling_friction_what_is_dropped_on_its_side_rolls_on_past_the_
     assert effects.runs("rolling_friction")
     assert settled(facts).settled[0].settle_s < facts.job.physics.max_settle_s
     with pytest.raises(SettleError, match="not_at_rest"):
-        settled(facts, without(effects, "rolling_friction"))
+        settled(facts, effects.without("rolling_friction"))
 
 
 # ------------------------------------------------------------------------------------------- where it is not

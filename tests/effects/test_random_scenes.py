@@ -166,7 +166,7 @@ def test_forcing_what_a_random_scene_left_out_changes_no_byte(wanted, record_fig
         except SceneError:
             continue
         for name in sorted(names_of_kind("no_op") & plain.scene.effects.skipped.keys()):
-            again = make(setting, forced=name)
+            again = make(setting, forced={name})
             forced[name] += 1
             if (plain.files, plain.rows) != (again.files, again.rows):
                 changed.append((number, name))

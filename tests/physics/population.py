@@ -24,10 +24,9 @@ from tests.physics.energy import watched, worst_of
 from tests.physics.room import G
 from tests.physics.settling import recheck, settle_single
 from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.assets.step import choose_object, choose_table, load_asset
 from workers.geometry.elevation import heights_at
 from workers.geometry.frames import transform
-from workers.plan.randomness import Stream, stream
+from workers.plan.randomness import SceneChance
 from workers.plan.step import choose_category, plan_scene
 
 GAP_MM, MOVE_MM, TURN_DEG = 0.1, 0.1, 0.1
@@ -51,10 +50,7 @@ class Outcome:
 
 def draw(job: Job, catalogue: Catalogue, scene_id: int) -> ScenePlan:
     """The scene as the job draws it."""
-    category = choose_category(job, scene_id)
-    asset = load_asset(catalogue, choose_object(catalogue, category, stream(job.seed, scene_id, Stream.OBJECT)))
-    table = load_asset(catalogue, choose_table(catalogue, stream(job.seed, scene_id, Stream.TABLE)))
-    return plan_scene(job, scene_id, table, asset)
+    return plan_scene(job, catalogue, SceneChance(job.seed, scene_id))
 
 
 def fell_through(points: Array, table: Table) -> bool:
@@ -72,7 +68,7 @@ def above(mesh: Mesh, table: Mesh) -> float:
 
 def try_scene(job: Job, catalogue: Catalogue, scene_id: int, again: bool) -> Outcome:
     """Settle one scene and measure it; released again where `again`."""
-    category = choose_category(job, scene_id)
+    category = choose_category(job, SceneChance(job.seed, scene_id))
     try:
         plan = draw(job, catalogue, scene_id)
         start = plan.objects[0]

@@ -12,14 +12,15 @@ from schemas.scene.scene import Settled
 from tests.shapes import asset_of, box, table
 from workers.physics.effects import called_for, called_for_with
 from workers.physics.step import RECHECK_S, moved_by, release_again, settle_scene
-from workers.plan.step import plan_scene
+from workers.plan.randomness import SceneChance
+from workers.plan.step import draw_scene
 
 PHYSICS = Job(name="t").physics
 
 
 @cache
 def _drawn() -> ScenePlan:
-    return plan_scene(Job(name="t"), 0, table(), asset_of(box(0.1, 0.1, 0.1)))
+    return draw_scene(Job(name="t"), SceneChance(0, 0), table(), asset_of(box(0.1, 0.1, 0.1)))
 
 
 def scene_of(starts: Sequence[ObjectStart], on: Table) -> ScenePlan:

@@ -22,6 +22,7 @@ from tests.shapes import asset_of, box, table
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
 from workers.physics.table_top import place_table
+from workers.plan.randomness import SceneChance
 from workers.plan.step import draw_start
 
 TABLE = place_table(table())
@@ -41,7 +42,7 @@ def asset_for(category: str, index: int) -> Asset:
 def worst_rise(category: str, start: str, seed: int, refine: int = 1) -> Rise:
     asset = asset_for(category, seed)
     job = Job.model_validate({"name": "t", "seed": seed, "start": {"pose": start}})
-    drawn = draw_start(job, seed, asset, TABLE)
+    drawn = draw_start(job.start, SceneChance(job.seed, seed), asset, TABLE)
     with watched([asset]) as falls, suppress(SettleError):  # that it rests is another test's
         settle_single(
             drawn,
@@ -109,7 +110,7 @@ SPINS = [
 def test_what_spins_when_it_is_let_go_gains_no_energy(category, spin, record_figure):
     """The energy that is set free is the spin's too."""
     asset = asset_for(category, 0)
-    start = draw_start(Job(name="t"), 0, asset, TABLE)
+    start = draw_start(Job(name="t").start, SceneChance(0, 0), asset, TABLE)
     with watched([asset], spin) as falls, suppress(SettleError):  # some leave the table, and some spin for too long
         settle_single(start, TABLE, physics(max_settle_s=1.0))
     rise = worst_of(falls(), asset.mass.mass_kg * G)

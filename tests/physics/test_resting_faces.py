@@ -23,6 +23,7 @@ from workers.geometry.frames import pose, rotation_between, transform
 from workers.geometry.hull import convex_hull
 from workers.physics.rest_pose import DOWN, SAME_PLANE_M, support_margin
 from workers.physics.table_top import place_table
+from workers.plan.randomness import SceneChance
 from workers.plan.step import draw_start
 
 TABLE = place_table(table())
@@ -118,7 +119,7 @@ def drop_many(asset: Asset, settings: Physics, first: int, drops: int) -> Array:
     normals = np.array([normal for normal, _ in predict_shares(asset).values()])
     counts = np.zeros(len(normals))
     for number in range(first, first + drops):
-        rest = settle_single(draw_start(job, number, asset, TABLE), TABLE, settings)
+        rest = settle_single(draw_start(job.start, SceneChance(job.seed, number), asset, TABLE), TABLE, settings)
         alike = normals @ (rest.T_world_obj[:3, :3].T @ DOWN)
         assert alike.max() > 1 - 1e-6  # it stands on a face that can be stood on
         counts[np.argmax(alike)] += 1

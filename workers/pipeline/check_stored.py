@@ -9,6 +9,7 @@ from schemas.dataset.codec import Row, columns_of_bodies, read_camera, read_labe
 from schemas.dataset.layout import file_pose_id, image_path, stored_images
 from schemas.job.job import Job
 from schemas.scene.camera import Role
+from schemas.scene.effects import EffectPlan
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.view import View
 from workers.cameras.pivot_depth import object_distance
@@ -16,9 +17,10 @@ from workers.cameras.placement import place_aligned_camera, place_mirror_camera
 from workers.geometry.camera import image_coordinates
 from workers.geometry.frames import invert
 from workers.geometry.pixels import measure_regions
-from workers.labels.derive import compare_views, derive_projected, projection_shares
+from workers.labels.agreement import compare_views
+from workers.labels.patches import patch_object_fraction
+from workers.labels.projected_view import derive_projected, projection_shares
 from workers.pipeline.check_stored_patches import ReadImage, check_patches
-from workers.pipeline.image_files import patch_object_fraction
 
 ROUNDING = 1e-12
 """Largest difference of poses and distances that are computed again from the same doubles."""
@@ -61,7 +63,7 @@ def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], sc
     if "mirror" in stored:
         faults += _check_agreement(job, stored, views)
     if "projected" in stored:
-        faults += _check_projection(job, stored, views)
+        faults += _check_projection(job, stored, views, EffectPlan(tuple(scene["effects"]), {}))
     return faults
 
 
@@ -173,7 +175,7 @@ def _check_cameras(job: Job, stored: Mapping[str, View], views: Mapping[str, Row
 def _check_agreement(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> list[str]:
     """Compare the agreement of the two views."""
     mirror = stored["mirror"]
-    agreement = compare_views(job, stored["input"], mirror)
+    agreement = compare_views(stored["input"], mirror, job.images, job.check.mirror_agreement_mm)
     told = views["mirror"]["mirror_agreement"]
     found = None if agreement.median_mm is None else (agreement.median_mm, agreement.share)
     if (told is None) != (found is None) or (found and _differs(np.array(found), [told["median_mm"], told["share"]])):
@@ -181,11 +183,11 @@ def _check_agreement(job: Job, stored: Mapping[str, View], views: Mapping[str, R
     return []
 
 
-def _check_projection(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> list[str]:
-    """Compare the projected images to the byte, and their shares."""
+def _check_projection(job: Job, stored: Mapping[str, View], views: Mapping[str, Row], effects: EffectPlan) -> list[str]:
+    """The projected images to the byte, and their shares; `effects` are those that the scene's receipt names."""
     first, mirror, projected = stored["input"], stored["mirror"], stored["projected"]
     where, faults = f"pose {projected.pose_id} (projected)", []
-    rgb, depth = derive_projected(first, mirror.camera, job.images, job.sensor.distortion)
+    rgb, depth = derive_projected(first, mirror.camera, job.images, job.sensor.distortion, effects)
     same_rgb = rgb is None or (projected.rgb is not None and np.array_equal(rgb, projected.rgb))
     if not same_rgb or not np.array_equal(depth, projected.depth):
         faults.append(f"{where}: the stored input depth projects to other images")

@@ -10,7 +10,7 @@ from schemas.dataset.layout import PixelKind, file_pose_id, image_path, patch_in
 from schemas.job.job import Job
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.view import View
-from workers.labels.derive import crop_box
+from workers.labels.patches import crop_box
 
 ReadImage = Callable[[str], NDArray]
 

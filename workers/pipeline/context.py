@@ -1,4 +1,4 @@
-"""What a worker process holds while it makes scenes: the job, its assets, the renderer."""
+"""The context of a worker process: the job, its assets, the renderer."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from workers.render.raster.gbuffer import Renderer, shared_renderer
 
 @dataclass(frozen=True, eq=False)
 class WorkerContext:
-    """One for each process: the renderer has the process's one GL context."""
+    """What a process holds while it makes scenes; one for each process, as the renderer has its one GL context."""
 
     job: Job
     catalogue: Catalogue
@@ -19,9 +19,11 @@ class WorkerContext:
     settings_digest: str
     forced: frozenset[str] = frozenset()
     """Effects that run also where a scene does not call for them: no switches of the job. For the audit."""
+    withdrawn: frozenset[str] = frozenset()
+    """Effects that do not run even where a scene calls for them. For tests."""
 
 
 def open_worker(job: Job, catalogue: Catalogue) -> WorkerContext:
-    """This process made ready to make the job's scenes: its allocator, its renderer."""
+    """Prepare this process, its allocator and its renderer, for the job's scenes."""
     keep_freed_memory()
     return WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))

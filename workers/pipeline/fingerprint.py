@@ -1,8 +1,9 @@
-"""The canary scene: one small scene made from plan to encoded files, whose digest tells stacks apart."""
+"""The fingerprint of a stack: the digest of one small scene, versions of libraries, and the code."""
 
 import hashlib
 from functools import cache
 from importlib.metadata import version
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,13 @@ from schemas.job.job import Job
 from schemas.job.render import Tier
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import Stopwatch, make_scene
+from workers.pipeline.make_scene import make_scene
 from workers.pipeline.rows import record_scene
+from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.gbuffer import Renderer
 
 CANARY = Job(name="canary", seed=7, scenes=1)
-"""Never changed without a new schema version: a new canary makes every stored fingerprint foreign."""
+"""Changed with the schema version only: a new canary makes every stored fingerprint foreign."""
 
 CANARY_SCENE = 3
 
@@ -37,13 +39,13 @@ LIBRARIES = (
     "trimesh",
     "zlib-ng",
 )
-"""What has a hand in the bytes."""
+"""Libraries that the bytes depend on."""
 
 TIER_LIBRARIES: dict[Tier, tuple[str, ...]] = {"pathtraced": ("mitsuba", "drjit")}
-"""What has a hand in the bytes of one tier alone, which the canary scene is not drawn in."""
+"""Libraries that the bytes of one tier depend on; the canary scene is not drawn in it."""
 
 SOURCE_PACKAGES = ("schemas", "workers")
-"""What of the project has a hand in the bytes: not the services that drive it."""
+"""Packages of the project that the bytes depend on: not the services that drive it."""
 
 
 def take_fingerprint(renderer: Renderer, tier: Tier) -> Fingerprint:
@@ -64,19 +66,19 @@ def canary_digest(renderer: Renderer) -> str:
     """SHA-256, hex, of the canary scene's files and rows."""
     catalogue = open_catalogue(CANARY.assets, Path(), tuple(CANARY.categories))
     context = WorkerContext(CANARY, catalogue, renderer, settings_digest(CANARY, catalogue.digest))
-    watch = Stopwatch()
-    output = record_scene(context, make_scene(context, CANARY_SCENE, watch), watch)
+    stopwatch = Stopwatch()
+    output = record_scene(context, make_scene(context, CANARY_SCENE, stopwatch), stopwatch)
     digest = hashlib.sha256()
-    for path, data in sorted(output.files):
-        digest.update(path.encode())
-        digest.update(hashlib.sha256(data).digest())
+    for file in sorted(output.files, key=attrgetter("path")):
+        digest.update(file.path.encode())
+        digest.update(bytes.fromhex(file.sha256))
     digest.update(repr(sorted(output.rows.items())).encode())
     return digest.hexdigest()
 
 
 @cache
 def code_digest() -> str:
-    """SHA-256, hex, of the source files that have a hand in the bytes, by path."""
+    """SHA-256, hex, of the source files that the bytes depend on, by path."""
     root = Path(__file__).resolve().parents[2]
     digest = hashlib.sha256()
     for path in sorted(path for package in SOURCE_PACKAGES for path in (root / package).rglob("*.py")):

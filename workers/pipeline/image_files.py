@@ -1,61 +1,53 @@
-"""Which images a view leaves, under which names, and their bytes. Pure."""
+"""The images that a view leaves, their names, and their bytes. Pure."""
 
 from collections.abc import Iterator
 
-import numpy as np
 from numpy.typing import NDArray
 
-from schemas.dataset.layout import PixelKind, file_pose_id, image_path, patch_index, patch_path, stored_images
-from schemas.job.images import Patch
-from schemas.job.job import Job
+from schemas.dataset.layout import IMAGES, PixelKind, image_path, patch_index, patch_path
+from schemas.job.images import Images, Patch
 from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.scene import EncodedFile, encoded_file
 from schemas.scene.view import ObjectLabel, Pair, View
-from workers.labels.derive import crop_box
+from workers.labels.patches import crop_box
 from workers.store.images import encode_png
 
-Files = list[tuple[str, bytes]]
+Box = tuple[slice, slice]
 
 
-def encode_view(view: View, pair: Pair, job: Job) -> Files:
-    """The view's images and their patches as PNG, by path."""
-    files: Files = []
-    for path, kind, box in image_boxes(view, pair, job):
-        pixels = _pixels(view, kind)
-        part = pixels if box is None else np.ascontiguousarray(pixels[box])
-        files.append((path, encode_png(part, job.images.png_level)))
-    return files
+def encode_view(view: View, pair: Pair, images: Images) -> tuple[EncodedFile, ...]:
+    """The view's images and their patches as PNG."""
+    files = []
+    for path, kind, box in image_boxes(view, pair, images.patch):
+        pixels = view_pixels(view, kind)
+        assert pixels is not None
+        files.append(encoded_file(path, encode_png(pixels if box is None else pixels[box], images.png_level)))
+    return tuple(files)
 
 
-def image_boxes(view: View, pair: Pair, job: Job) -> Iterator[tuple[str, PixelKind, tuple[slice, slice] | None]]:
-    """Path, kind of pixels and crop (rows, columns; None for all) of each image of the view and of its patches."""
+def image_boxes(view: View, pair: Pair, patch: Patch) -> Iterator[tuple[str, PixelKind, Box | None]]:
+    """Path, kind of pixels and crop (rows, columns; None for all) of each image that the view holds and of its patches."""
     objects = object_labels(view, pair)
-    category, number = objects[0].category, file_pose_id(view.role, view.parent_id)
-    for image in stored_images(view.role, job):
-        yield image_path(category, image.content, number), image.pixels, None
+    category = objects[0].category
+    for image in IMAGES:
+        if image.role != view.role or view_pixels(view, image.pixels) is None:
+            continue
+        yield image_path(category, image.content, view.pose_id), image.pixels, None
         for label in objects:
-            box = crop_box(label, view.camera, job.images.patch)
+            box = crop_box(label, view.camera, patch)
             if box is not None:
                 index = patch_index(label.region_id, len(objects))
-                yield patch_path(category, image.content, number, index), image.pixels, box
+                yield patch_path(category, image.content, view.pose_id, index), image.pixels, box
 
 
-def _pixels(view: View, kind: PixelKind) -> NDArray:
-    images: dict[str, NDArray | None] = {"rgb": view.rgb, "depth": view.depth, "region": view.region}
-    pixels = images[kind]
-    assert pixels is not None
-    return pixels
+def view_pixels(view: View, kind: PixelKind) -> NDArray | None:
+    """The array that images of a kind show; None where the view has none."""
+    images: dict[PixelKind, NDArray | None] = {"rgb": view.rgb, "depth": view.depth, "region": view.region}
+    return images[kind]
 
 
 def object_labels(view: View, pair: Pair) -> list[ObjectLabel]:
     """Labels of the objects alone, by region id; a projected view is seen by the mirror camera and has its labels."""
-    seen = pair.mirror if view.role == "projected" else view
-    assert seen is not None
-    return [label for label in seen.labels if label.region_id >= REGION_FIRST_OBJECT]
-
-
-def patch_object_fraction(view: View, label: ObjectLabel, patch: Patch) -> float | None:
-    """Share of an object's patch that is the object; None where the patch was left out."""
-    box = crop_box(label, view.camera, patch)
-    if box is None or view.region is None:
-        return None
-    return float((view.region[box] == label.region_id).mean())
+    labelled = pair.mirror if view.role == "projected" else view
+    assert labelled is not None
+    return [label for label in labelled.labels if label.region_id >= REGION_FIRST_OBJECT]

@@ -1,21 +1,23 @@
 """The output of a scene: encoded files, and its rows in each manifest table. Pure."""
 
-import hashlib
+from collections.abc import Sequence
 
 from schemas.dataset.codec import Row, body_columns, camera_columns, columns_of_bodies, label_columns, matrix_column
 from schemas.dataset.layout import asset_path
 from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.scene.region import REGION_FIRST_OBJECT
-from schemas.scene.scene import SceneOutput
+from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
 from schemas.scene.shape import Asset
 from schemas.scene.view import Pair, View
 from workers.assets.catalogue import split_of
 from workers.assets.glb import asset_glb
 from workers.geometry.camera import inclination, yaw
+from workers.labels.patches import patch_object_fraction
 from workers.pipeline.context import WorkerContext
-from workers.pipeline.image_files import Files, encode_view, object_labels, patch_object_fraction
-from workers.pipeline.make_scene import Scene, Stopwatch
+from workers.pipeline.image_files import encode_view, object_labels
+from workers.pipeline.make_scene import Scene
+from workers.pipeline.stopwatch import Stopwatch
 from workers.plan.effects import write_receipt
 from workers.store.images import encode_png
 
@@ -25,19 +27,20 @@ ASSET_COLUMNS = ("instance_id", "category", "source", "licence", "path", "sha256
 
 def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> SceneOutput:
     """Files and rows of a finished scene, without its timings."""
-    files: Files = []
+    files: list[EncodedFile] = []
     views: list[Row] = []
     with watch.stage("encode"):
         for pair in scene.pairs:
             for view in pair.views:
-                own = encode_view(view, pair, context.job)
+                own = encode_view(view, pair, context.job.images)
                 files += own
                 views.append(view_row(scene, pair, view, own, context.job))
         every = (scene.plan.table.asset, *(start.asset for start in scene.plan.objects))
         assets = list({asset.instance_id: asset for asset in every}.values())
         for asset in assets:
             if asset.shareable:
-                files.append((asset_path(asset.category, asset.instance_id), asset_glb(asset, encode_png)))
+                path = asset_path(asset.category, asset.instance_id)
+                files.append(encoded_file(path, asset_glb(asset, encode_png)))
     rows = {
         "scenes": [scene_row(context, scene)],
         "views": views,
@@ -69,7 +72,7 @@ def scene_row(context: WorkerContext, scene: Scene) -> Row:
     }
 
 
-def view_row(scene: Scene, pair: Pair, view: View, files: Files, job: Job) -> Row:
+def view_row(scene: Scene, pair: Pair, view: View, files: Sequence[EncodedFile], job: Job) -> Row:
     """The row of `views`, key (pose_id, role)."""
     labels = object_labels(view, pair)
     projected = view.role == "projected"
@@ -85,9 +88,7 @@ def view_row(scene: Scene, pair: Pair, view: View, files: Files, job: Job) -> Ro
         "yaw_rad": yaw(view.camera.T_world_cam),
         "depth_units_per_m": job.images.depth_units_per_m,
         "d_z_m": pair.d_z_m,
-        "files": [
-            {"path": path, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()} for path, data in files
-        ],
+        "files": [{"path": file.path, "bytes": len(file.data), "sha256": file.sha256} for file in files],
         "object_pixels": None if projected else sum(label.pixels for label in labels),
         "visible_fraction": None if projected else labels[0].visible_fraction,
         "mirror_agreement": None

@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from typing import IO
 
@@ -22,8 +23,10 @@ from schemas.scene.scene import SceneOutput
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.context import WorkerContext, open_worker
 from workers.pipeline.fingerprint import take_fingerprint
-from workers.pipeline.make_scene import Stopwatch, make_scene
+from workers.pipeline.make_scene import make_scene
 from workers.pipeline.rows import failed_scene, record_scene, timing_row
+from workers.pipeline.stopwatch import Stopwatch
+from workers.plan.randomness import SceneChance
 from workers.plan.step import choose_category
 from workers.render.raster.context import require_device
 from workers.render.raster.gbuffer import shared_renderer
@@ -33,7 +36,7 @@ from workers.store.opening import open_store
 from workers.store.store import Store
 
 TIMED_OUT = "_timed_out"
-"""In an attempt's folder: where a worker that hung in a scene left its traceback."""
+"""The file in an attempt's folder that holds the traceback of a worker that hung in a scene."""
 
 
 class BlamedScene(SceneError):
@@ -44,7 +47,7 @@ class BlamedScene(SceneError):
 
 
 def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
-    """Make and commit every range of the order. What a scene cannot be is a row; anything else propagates."""
+    """Make and commit every range of the order. A scene that cannot be made is a row; any other error propagates."""
     begun, cpu = time.perf_counter(), time.process_time()
     require_tier(order.job.render)
     context = open_worker(order.job, catalogue)
@@ -96,22 +99,23 @@ def run_span(context: WorkerContext, store: Store, order: ShardOrder, span: Span
 
 
 def record_blame(job: Job, blame: Blame) -> SceneOutput:
-    """The row of a scene that is not tried again: it is not begun either, so that nobody is killed in it."""
+    """The row of a scene that is not tried again: it is not begun, so that no worker dies in it."""
     error = BlamedScene(blame.reason, blame.detail)
-    return failed_scene(blame.scene_id, choose_category(job, blame.scene_id), error, blame.attempts)
+    return failed_scene(
+        blame.scene_id, choose_category(job, SceneChance(job.seed, blame.scene_id)), error, blame.attempts
+    )
 
 
 def run_scene(context: WorkerContext, scene_id: int, total: Stopwatch) -> SceneOutput:
-    """One scene, made or told why not."""
-    category = choose_category(context.job, scene_id)
-    watch = Stopwatch()
+    """One scene: made, or a row that says why not."""
+    category = choose_category(context.job, SceneChance(context.job.seed, scene_id))
+    stopwatch = Stopwatch()
     try:
-        output = record_scene(context, make_scene(context, scene_id, watch), watch)
+        output = record_scene(context, make_scene(context, scene_id, stopwatch), stopwatch)
     except SceneError as error:
         output = failed_scene(scene_id, category, error)
-    for stage, seconds in watch.seconds.items():
-        total.seconds[stage] = total.seconds.get(stage, 0.0) + seconds
-    return SceneOutput(scene_id, output.files, {**output.rows, "timings": [timing_row(scene_id, category, watch)]})
+    total.add(stopwatch)
+    return replace(output, rows={**output.rows, "timings": [timing_row(scene_id, category, stopwatch)]})
 
 
 @cache
@@ -133,7 +137,7 @@ def _join_stack(store: Store, mine: Fingerprint, order: ShardOrder) -> None:
 
 @contextmanager
 def _traceback_file(store: Store, attempt: Attempt) -> Iterator[IO[str]]:
-    """Where a hung worker leaves its traceback: in the attempt's folder, so that the coordinator can tell."""
+    """The file for a hung worker's traceback, in the attempt's folder, where the coordinator looks."""
     if store.root is None or attempt.fenced:
         yield sys.stderr
         return
@@ -146,8 +150,7 @@ def _traceback_file(store: Store, attempt: Attempt) -> Iterator[IO[str]]:
 def _time_limit(seconds: float, tracebacks: IO[str]) -> Iterator[None]:
     """Kills this process if the block takes longer.
 
-    PyBullet and GL hold the interpreter's lock while they work, so only a watchdog in C can end a worker that hangs
-    there.
+    PyBullet and GL hold the interpreter's lock while they work: only a watchdog in C can end a worker that hangs there.
     """
     faulthandler.dump_traceback_later(seconds, exit=True, file=tracebacks)
     try:

@@ -12,10 +12,10 @@ from workers.geometry.frames import transform
 APART_M = 0.001
 """Columns nearer to each other than this count as touching."""
 
-_HALF_TURN = [math.pi * step / 90 for step in range(90)]
-ACROSS = frozen_array([[math.cos(angle), math.sin(angle)] for angle in _HALF_TURN])
-"""[90, 2] the directions in which a gap is looked for. Two footprints of 0.2 m that lie apart by more than 4 mm have
-one among them, as none is further than 1 degree from the best."""
+_ANGLES = math.pi * np.arange(90) / 90
+AXES = frozen_array(np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1))
+"""[90, 2] the horizontal axes that are tried for a separating plane. None is further than 1 degree from the best one, so
+that two footprints of 0.2 m that are more than 4 mm apart are found to be so."""
 
 
 def points_of(start: ObjectStart) -> Array:
@@ -24,12 +24,12 @@ def points_of(start: ObjectStart) -> Array:
 
 
 def columns_apart(points: Array, others: Array) -> bool:
-    """Whether a vertical plane stands between two clouds [N, 3], at least `APART_M` of air wide.
+    """Whether a vertical plane separates two clouds [N, 3] by at least `APART_M` of air.
 
-    Sufficient for two bodies that fall straight down not to meet, and no more is asked: by the theorem of the separating
-    axis, applied to `ACROSS`, clouds that almost touch may count as touching.
+    Two bodies that fall straight down then do not meet. The theorem of the separating axis, applied to `AXES` alone:
+    clouds that almost touch may count as touching.
     """
-    mine, theirs = points[:, :2] @ ACROSS.T, others[:, :2] @ ACROSS.T
+    mine, theirs = points[:, :2] @ AXES.T, others[:, :2] @ AXES.T
     gap = np.maximum(theirs.min(axis=0) - mine.max(axis=0), mine.min(axis=0) - theirs.max(axis=0))
     return bool(gap.max() >= APART_M)
 
@@ -40,6 +40,6 @@ def has_room(points: Array, earlier: Sequence[ObjectStart]) -> bool:
 
 
 def rise_above(points: Array, earlier: Sequence[ObjectStart]) -> float:
-    """Metres by which a cloud [N, 3] must be lifted so that its lowest point is level with the top of all earlier objects."""
+    """Metres by which a cloud [N, 3] must be lifted for its lowest point to be level with the top of all earlier objects."""
     top = max(float(points_of(other)[:, 2].max()) for other in earlier)
     return max(0.0, top - float(points[:, 2].min()))

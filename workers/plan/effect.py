@@ -1,4 +1,4 @@
-"""What an effect is, and what a scene's plan says of all of them. Pure."""
+"""What an effect is, and what its predicate looks at. Pure."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,15 +17,16 @@ class Facts:
     raycast_checked: bool
 
 
+Reason = Callable[[Facts], str | None]
+"""Why a scene does not call for an effect; None where it does."""
+
+
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """`skipped_because(facts)` is None where the scene calls for the effect, else the reason why it does not.
-
-    `cost` says in a few words what it costs where it runs, and `stage` names the stopwatch entry its time is counted in.
-    """
+    """An entry of the table of effects: its predicate, its cost in a few words, and the stage its time is counted in."""
 
     name: str
     kind: EffectKind
-    skipped_because: Callable[[Facts], str | None]
+    skipped_because: Reason
     cost: str
     stage: str

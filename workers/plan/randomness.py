@@ -1,5 +1,6 @@
-"""Named streams of random numbers: one for each step, append-only, so that adding a camera never moves an object."""
+"""Named streams of random numbers: one for each step of a scene, append-only, so that adding a camera moves no object."""
 
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -23,14 +24,21 @@ class Stream(IntEnum):
     COUNT = 12
 
 
-def stream(seed: int, scene_id: int, name: Stream, *within: int) -> np.random.Generator:
-    """The generator of one step of one scene: a function of the dataset's seed, the scene and the step alone.
+@dataclass(frozen=True)
+class SceneChance:
+    """The random numbers of one scene: a function of the dataset's seed and the scene's id alone."""
 
-    `within` names a part of a step that must not depend on how many parts there are: (pair, role) for a view's noise.
-    """
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(scene_id, int(name), *within)))
+    seed: int
+    scene_id: int
 
+    def stream(self, name: Stream, *within: int) -> np.random.Generator:
+        """The generator of one step.
 
-def of_object(number: int) -> tuple[int, ...]:
-    """What `within` is for an object by its number: the first object's streams are those of a scene that has only one."""
-    return (number,) if number else ()
+        `within` names a part of a step that must not depend on how many parts there are: (pair, role) for a view's noise.
+        """
+        key = (self.scene_id, int(name), *within)
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
+
+    def object_stream(self, name: Stream, number: int) -> np.random.Generator:
+        """The generator of one step for an object by its number: the first object's is that of a scene with only one."""
+        return self.stream(name, *([number] if number else []))

@@ -1,4 +1,4 @@
-"""All randomness of a scene, drawn before anything moves."""
+"""The draw of a scene: assets, starts, cameras and look, all before anything moves."""
 
 import math
 
@@ -14,52 +14,58 @@ from schemas.scene.plan import ObjectStart, ScenePlan, Table
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.shape import Asset, Hull, Mesh
 from workers.assets.appearance.draw import draw_appearance
+from workers.assets.catalogue import Catalogue
+from workers.assets.step import choose_object, choose_table, load_asset
 from workers.geometry.camera import orbit_pose
 from workers.geometry.elevation import heights_at
-from workers.geometry.frames import (
-    UP,
-    pose,
-    rotation_about,
-    transform,
-    translation,
-    uniform_rotation,
-)
+from workers.geometry.frames import UP, pose, rotation_about, transform, translation, uniform_rotation
 from workers.geometry.hull import convex_hull
 from workers.physics.rest_pose import find_contacts_xy, support_margin
 from workers.physics.table_top import place_table, support_height
 from workers.plan.arrange import has_room, rise_above
-from workers.plan.randomness import Stream, of_object, stream
+from workers.plan.randomness import SceneChance, Stream
 
 RECESS_M = 0.05
 """Table this far below its top still counts as table under an object: a tray's bottom does, a lower shelf does not."""
 
 
-def count_objects(job: Job, scene_id: int) -> int:
+def plan_scene(job: Job, catalogue: Catalogue, chance: SceneChance) -> ScenePlan:
+    """Everything about a scene that chance decides. Raises MeshError where an asset is unfit, StartError as `draw_scene`."""
+    assets = []
+    for number in range(count_objects(job, chance)):
+        category = choose_category(job, chance, number)
+        ref = choose_object(catalogue, category, chance.object_stream(Stream.OBJECT, number))
+        assets.append(load_asset(catalogue, ref))
+    table = load_asset(catalogue, choose_table(catalogue, chance.stream(Stream.TABLE)))
+    return draw_scene(job, chance, table, *assets)
+
+
+def count_objects(job: Job, chance: SceneChance) -> int:
     """How many objects the scene has."""
     low, high = job.objects_per_scene
-    return int(stream(job.seed, scene_id, Stream.COUNT).integers(low, high + 1))
+    return int(chance.stream(Stream.COUNT).integers(low, high + 1))
 
 
-def choose_category(job: Job, scene_id: int, number: int = 0) -> str:
+def choose_category(job: Job, chance: SceneChance, number: int = 0) -> str:
     """The category of an object by its number, by the job's weights; the first one's is the scene's."""
     names = sorted(job.categories)
     weights = np.array([job.categories[name] for name in names])
     edges = np.cumsum(weights) / weights.sum()
-    draw = stream(job.seed, scene_id, Stream.CATEGORY, *of_object(number)).random()
+    draw = chance.object_stream(Stream.CATEGORY, number).random()
     return names[min(int(np.searchsorted(edges, draw, side="right")), len(names) - 1)]
 
 
-def plan_scene(job: Job, scene_id: int, table_asset: Asset, *assets: Asset) -> ScenePlan:
-    """Everything about the scene that chance decides, for one asset or more. Raises StartError where no start is valid."""
+def draw_scene(job: Job, chance: SceneChance, table_asset: Asset, *assets: Asset) -> ScenePlan:
+    """Starts, cameras and look of a scene with these assets. Raises StartError where no start is valid."""
     table = place_table(table_asset)
-    rng = stream(job.seed, scene_id, Stream.CAMERA)
+    rng = chance.stream(Stream.CAMERA)
     centre = np.array([0.0, 0.0, table.top.height_m])
-    floor, appearance = draw_appearance(stream(job.seed, scene_id, Stream.APPEARANCE), job.render.tier)
+    floor, appearance = draw_appearance(chance.stream(Stream.APPEARANCE), job.render.tier)
     objects: tuple[ObjectStart, ...] = ()
     for asset in assets:
-        objects += (draw_start(job, scene_id, asset, table, objects),)
+        objects += (draw_start(job.start, chance, asset, table, objects),)
     return ScenePlan(
-        scene_id=scene_id,
+        scene_id=chance.scene_id,
         category=assets[0].category,
         table=table,
         floor=floor,
@@ -70,21 +76,21 @@ def plan_scene(job: Job, scene_id: int, table_asset: Asset, *assets: Asset) -> S
 
 
 def draw_start(
-    job: Job, scene_id: int, asset: Asset, table: Table, earlier: tuple[ObjectStart, ...] = ()
+    spec: Start, chance: SceneChance, asset: Asset, table: Table, earlier: tuple[ObjectStart, ...] = ()
 ) -> ObjectStart:
-    """Position, rotation and clearance of one object.
+    """Position, rotation and clearance of one object. Raises StartError where no position is valid.
 
     A position with no table under the centre of mass, or in the column of an earlier object, is redrawn. In a pile an
     object begins above all earlier ones, about the place of the first.
     """
-    spec, own, piled = job.start, of_object(len(earlier)), bool(earlier) and job.start.arrange == "pile"
+    number, piled = len(earlier), bool(earlier) and spec.arrange == "pile"
     middle, reach = (earlier[0].T_world_obj[:2, 3], spec.pile_offset_m) if piled else (np.zeros(2), spec.offset_m)
-    rng = stream(job.seed, scene_id, Stream.START, *own)
+    rng = chance.object_stream(Stream.START, number)
+    redraw_rng = chance.object_stream(Stream.REDRAW, number)
     xy = middle + rng.uniform(reach.low, reach.high, size=2)
     yaw = rng.uniform(-math.pi, math.pi)
     clearance = rng.uniform(spec.clearance_m.low, spec.clearance_m.high)
     R = uniform_rotation(rng) if spec.pose == "tumbled" else rotation_about(UP, yaw)
-    again = stream(job.seed, scene_id, Stream.REDRAW, *own)
     hull = convex_hull(asset.shape.vertices)
     over_table = False
     for redraws in range(spec.max_redraws + 1):
@@ -97,9 +103,9 @@ def draw_start(
                 lift = rise_above(points, earlier) if piled else 0.0
                 placed = spec.pose == "placed" and not piled and stands_on(rested, hull, asset.mass.com, table.mesh)
                 T = rested if placed else translation(0.0, 0.0, lift + clearance) @ rested
-                return ObjectStart(asset, hull, REGION_FIRST_OBJECT + len(earlier), frozen_array(T), redraws, placed)
-        xy = middle + again.uniform(reach.low, reach.high, size=2)
-    raise _no_start(spec, len(earlier) + 1, over_table)
+                return ObjectStart(asset, hull, REGION_FIRST_OBJECT + number, frozen_array(T), redraws, placed)
+        xy = middle + redraw_rng.uniform(reach.low, reach.high, size=2)
+    raise _no_start(spec, number + 1, over_table)
 
 
 def _no_start(spec: Start, number: int, over_table: bool) -> StartError:
@@ -119,7 +125,7 @@ def _no_start(spec: Start, number: int, over_table: bool) -> StartError:
 
 
 def set_down(T_world_obj: Pose, hull: Hull, table: Mesh) -> Pose:
-    """The pose moved along z until its lowest point is level with the highest of what is below it."""
+    """The pose moved along z until its lowest point is level with the highest point of the table below it."""
     points = transform(T_world_obj, hull.vertices)
     return translation(0.0, 0.0, support_height(points[:, :2], table) - points[:, 2].min()) @ T_world_obj
 

@@ -108,13 +108,15 @@ class Attempt:
         if unknown := output.rows.keys() - tables.keys():
             raise ValueError(f"scene {output.scene_id} has rows for unknown tables: {', '.join(sorted(unknown))}")
         outcome = outcome_of(output)
-        entries = {path: describe_file(path, data) for path, data in output.files}
+        entries = {
+            file.path: FileEntry(path=file.path, bytes=len(file.data), sha256=file.sha256) for file in output.files
+        }
         check_files(output, entries)
         for path in self._files.keys() & entries.keys():
             if self._files[path] != entries[path]:
                 raise ValueError(f"{path} was written twice with different bytes")
         with self._skip_if_swept():
-            self._packing.add({path: data for path, data in output.files if path not in self._files})
+            self._packing.add({file.path: file.data for file in output.files if file.path not in self._files})
         self._files |= entries
         for table, rows in tables.items():
             self._rows[table].append(rows)

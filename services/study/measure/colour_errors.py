@@ -20,7 +20,7 @@ from services.study.measure.rays import Box
 from workers.assets.appearance.draw import draw_appearance
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene
-from workers.plan.randomness import Stream, stream
+from workers.plan.randomness import SceneChance, Stream
 from workers.render.step import draw_view, require_tier
 
 WIDTH, HEIGHT = 640, 480
@@ -135,7 +135,7 @@ def crop_colour(rgb: NDArray[np.uint8], crop: Crop) -> NDArray[np.uint8]:
 
 def _in_studio(context: WorkerContext, scene: Scene) -> tuple[Sequence[Placed], Appearance]:
     """The scene's things and light as tier pathtraced draws them: flat scenes have another floor and other lights."""
-    rng = stream(context.job.seed, scene.plan.scene_id, Stream.APPEARANCE)
+    rng = SceneChance(context.job.seed, scene.plan.scene_id).stream(Stream.APPEARANCE)
     floor, appearance = draw_appearance(rng, "pathtraced")
     things = tuple(
         Placed(thing.region_id, floor, thing.T_world_shape) if thing.region_id == REGION_FLOOR else thing

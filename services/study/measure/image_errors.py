@@ -55,7 +55,7 @@ def measure_images(context: WorkerContext, scene: Scene, truth: Truth) -> dict[s
       `mirror_pose` sets the mirror camera T_z_m away from the point d_z ahead of the input camera, and turns it by the input
       pose alone. So it stands off by just this, along the input camera's optical axis, and is not turned.
     - agreement_mm: the stored input depth carried into the mirror view against the stored mirror depth, the median
-      (workers/labels/derive.py), the largest of all pairs; no ray is in it.
+      (workers/labels/agreement.py), the largest of all pairs; no ray is in it.
     - unfilled_share: of the mirror view's object pixels by ray whose point the input camera sees too, the share that the
       projected depth leaves empty.
     - hidden_share: of the projected depth's filled pixels, of objects and all else, evenly over the image: the share that

@@ -17,7 +17,8 @@ from services.study.measure.settling import context_for
 from services.study.measure.truth import truth_of
 from services.study.model import Setting
 from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import Scene, Stopwatch, make_scene
+from workers.pipeline.make_scene import Scene, make_scene
+from workers.pipeline.stopwatch import Stopwatch
 
 CONVERGED_PATHS = 256
 """Two truths with other seeds differ by 0.012 to 0.02 in FLIP, a tenth of what tiers do."""

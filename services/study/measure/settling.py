@@ -17,9 +17,10 @@ from services.study.model import Setting
 from workers.geometry.frames import moved_between, transform
 from workers.physics.step import Rest, moved_by, recheck_scene, settle_scene
 from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import plan_with_assets
 from workers.plan.effect import Facts
 from workers.plan.effects import plan_effects
+from workers.plan.randomness import SceneChance
+from workers.plan.step import plan_scene
 
 AGREE_MM = 0.05
 """Two finer settings that end nearer than this agree, and a pose has an error."""
@@ -47,7 +48,7 @@ def measure_settling(
     truth; with `released` moved_mm and turned_deg. A scene that cannot even be drawn has no answers.
     """
     try:
-        plan = plan_with_assets(context, scene_id)
+        plan = plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
     except SceneError:
         return {}
     truths = [_settle(context.job, plan, reference) for reference in REFERENCES[: 2 if posed else 1]]

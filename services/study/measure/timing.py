@@ -14,10 +14,12 @@ from services.study.measure.settling import context_for
 from services.study.model import Setting
 from workers.physics.step import settle_scene
 from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import Stopwatch, plan_with_assets
 from workers.pipeline.run_shard import run_scene
+from workers.pipeline.stopwatch import Stopwatch
 from workers.plan.effect import Facts
 from workers.plan.effects import plan_effects
+from workers.plan.randomness import SceneChance
+from workers.plan.step import plan_scene
 
 WARM_SCENES = 4
 
@@ -45,7 +47,7 @@ def time_scene(
         took = time.process_time() - began
         if output.files:
             answer["whole"][setting.name] = took
-            answer["bytes"][setting.name] = sum(len(data) for _, data in output.files)
+            answer["bytes"][setting.name] = sum(len(file.data) for file in output.files)
     for setting in _shuffled(settling, order):
         took_or_none = _settle_s(context_for(context, setting), scene_id)
         if took_or_none is not None:
@@ -68,7 +70,7 @@ def warm_up(context: WorkerContext, settings: Sequence[Setting], scene_id: int) 
 def _settle_s(context: WorkerContext, scene_id: int) -> float | None:
     """Seconds for choosing the effects and settling; None where it does not come to rest."""
     try:
-        plan = plan_with_assets(context, scene_id)
+        plan = plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
         began = time.process_time()
         effects = plan_effects(Facts(context.job, plan, raycast_checked=False))
         settle_scene(plan, context.job.physics, effects)

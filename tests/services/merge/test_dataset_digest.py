@@ -11,7 +11,7 @@ import pytest
 from schemas.dataset.tables import TABLES
 from services.merge.step import merge, read_success
 from tests.made_up_datasets import FIRST, STOP, dataset_at
-from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene
+from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene, with_shapes
 from workers.store.local import LocalStore
 
 pytestmark = pytest.mark.usefixtures("unflushed")
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("unflushed")
 def test_the_digest_is_what_its_definition_says(merged):
     store, result = merged
     success = json.loads((store.root / "_SUCCESS").read_text())
-    files = {path: data for i in range(FIRST, STOP) for path, data in scene(i).files}
+    files = {file.path: file.data for i in range(FIRST, STOP) for file in scene(i).files}
     files |= {name: (store.root / name).read_bytes() for name in ("camPoses.csv", "cameras.csv", "objects.dat")}
     text = "verso dataset 1\n" + "".join(f"{table} {success['tables'][table]}\n" for table in TABLES[:5])
     for name in sorted(files, key=str.encode):
@@ -89,10 +89,7 @@ def changed_row(scene_id):
 
 
 def changed_shape(scene_id):
-    output = scene(scene_id)
-    return dataclasses.replace(
-        output, files=tuple((p, d[::-1] if p.startswith("assets/") else d) for p, d in output.files)
-    )
+    return with_shapes(scene(scene_id), lambda data: data[::-1])
 
 
 def changed_failure(scene_id):

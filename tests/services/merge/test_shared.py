@@ -46,7 +46,7 @@ def test_the_images_of_views_are_counted_and_listed(shared):
     output = made_scene(3)
     shared.add_images(pa.Table.from_pylist(output.rows["views"], schema=SCHEMAS["views"]))
     shared.add_images(SCHEMAS["views"].empty_table())
-    images = [path for path, _ in output.files if not path.startswith("assets/")]
+    images = [file.path for file in output.files if not file.path.startswith("assets/")]
     assert shared.images == len(images)
     assert [path for path, _ in shared.files(mixed=False)] == sorted(images)
 

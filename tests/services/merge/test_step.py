@@ -8,7 +8,7 @@ from schemas.dataset.layout import STAGING
 from schemas.errors import CommitConflict, CorruptError, RunError
 from services.merge.step import merge, read_success, reopen
 from tests.made_up_datasets import FIRST, STOP, dataset_at
-from tests.made_up_scenes import attempt_at, made_scene, terms
+from tests.made_up_scenes import attempt_at, made_scene, terms, with_shapes
 from workers.store.local import LocalStore
 
 pytestmark = pytest.mark.usefixtures("unflushed")
@@ -77,7 +77,7 @@ def test_a_gap_is_refused_and_nothing_is_merged(tmp_path):
 
 def test_an_image_that_is_missing_or_cut_is_told_by_name(tmp_path):
     store = dataset_at(tmp_path, 0, 8)
-    image = next(path for path, _ in made_scene(1).files)
+    image = made_scene(1).files[0].path
     store.write_whole(image, b"cut")
     with pytest.raises(CorruptError, match=f"{image} has 3 bytes"):
         merge(store, 0, 8)
@@ -93,9 +93,7 @@ def own_description(scene_id):
 
 
 def own_shape(scene_id):
-    output = made_scene(scene_id)
-    turned = tuple((p, d[::-1] if p.startswith("assets/") and scene_id >= 4 else d) for p, d in output.files)
-    return dataclasses.replace(output, files=turned)
+    return with_shapes(made_scene(scene_id), lambda data: data[::-1] if scene_id >= 4 else data)
 
 
 @pytest.mark.parametrize("make", [own_description, own_shape])

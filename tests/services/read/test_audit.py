@@ -9,7 +9,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
-import workers.pipeline.make_scene
+import workers.pipeline.make_pair
 import workers.plan.effects
 from schemas.dataset.commit import Span
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
@@ -127,7 +127,7 @@ def test_an_effect_that_was_left_out_wrongly_is_found_and_named(tmp_path):
 def test_a_scene_that_is_not_made_the_same_again_blames_no_effect(tmp_path):
     store = dataset(tmp_path / "other")
     with mock.patch.object(
-        workers.pipeline.make_scene, "quantise_depth", lambda depth, images: (depth * 4999).astype(np.uint16)
+        workers.pipeline.make_pair, "quantise_depth", lambda depth, images: (depth * 4999).astype(np.uint16)
     ):
         write_fingerprint(store, {})
         found = run_audit(store, 1)

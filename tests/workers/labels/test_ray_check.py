@@ -20,8 +20,8 @@ from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.geometry.raycast import cast_view, edge_distance_px
 from workers.labels.ray_check import check_against_rays, check_pair
 from workers.pipeline.make_scene import pose_scene
-from workers.plan.effects import is_raycast_scene
-from workers.plan.step import plan_scene
+from workers.plan.randomness import SceneChance
+from workers.plan.step import draw_scene
 
 STORED = Range(0.2, 8.0)
 CAMERA = Camera(
@@ -32,9 +32,8 @@ CAMERA = Camera(
 
 @pytest.fixture(scope="module")
 def scene() -> PosedScene:
-    plan = plan_scene(
-        Job.model_validate({"name": "t", "start": {"offset_m": [0, 0]}}), 0, table(), asset_of(box(0.2, 0.2, 0.25))
-    )
+    job = Job.model_validate({"name": "t", "start": {"offset_m": [0, 0]}})
+    plan = draw_scene(job, SceneChance(0, 0), table(), asset_of(box(0.2, 0.2, 0.25)))
     return pose_scene(plan, (settle_single(plan.objects[0], plan.table, Job(name="t").physics),))
 
 
@@ -123,15 +122,6 @@ def test_where_two_things_cut_through_one_another_either_may_be_shown_within_a_t
     buffer = GBuffer(np.zeros((120, 160, 3), np.uint8), depth, region)
     with contextlib.nullcontext() if passes else pytest.raises(LabelError, match="4 in the mask and 3 by ray"):
         check_against_rays(dataclasses.replace(scene, things=things), CAMERA, buffer, STORED)
-
-
-def test_the_share_of_checked_scenes_is_the_jobs_and_a_function_of_the_scene():
-    job = Job.model_validate({"name": "t", "check": {"raycast_share": 0.1}})
-    chosen = [is_raycast_scene(job, scene) for scene in range(3000)]
-    assert abs(np.mean(chosen) - 0.1) < 4 * np.sqrt(0.09 / 3000)
-    assert chosen[:50] == [is_raycast_scene(job, scene) for scene in range(50)]
-    everything = Job.model_validate({"name": "t", "check": {"raycast_share": 1}})
-    assert all(is_raycast_scene(everything, scene) for scene in range(50))
 
 
 class PairLike:

@@ -24,7 +24,8 @@ from workers.geometry.hull import convex_hull
 from workers.physics.fall import fall
 from workers.physics.step import RECHECK_S, release_again
 from workers.physics.table_top import place_table
-from workers.plan.step import draw_start, plan_scene
+from workers.plan.randomness import SceneChance
+from workers.plan.step import draw_scene, draw_start
 
 PHYSICS = Job(name="t").physics
 TABLE = place_table(table())
@@ -66,7 +67,7 @@ def test_a_box_dropped_on_its_edge_ends_on_a_face():
 def test_tumbled_cylinders_rest_on_a_face_with_their_centre_above_it_and_do_not_move_again(seed):
     asset = asset_of(trimesh.creation.cylinder(0.04, 0.2))
     job = Job.model_validate({"name": "t", "seed": seed, "start": {"pose": "tumbled"}})
-    plan = plan_scene(job, seed, table(), asset)
+    plan = draw_scene(job, SceneChance(job.seed, seed), table(), asset)
     rest = settle_single(plan.objects[0], plan.table, PHYSICS)
     assert rest.penetration_mm < 1e-9
     assert rest.hover_gap_mm < 1e-9
@@ -78,7 +79,7 @@ def test_tumbled_cylinders_rest_on_a_face_with_their_centre_above_it_and_do_not_
 def test_a_bottle_that_rolling_friction_held_on_an_edge_rolls_onto_a_face_and_not_for_ever(scene_id):
     asset = make_asset("bottle", ProceduralSource(source="procedural"), 822319, 600.0)
     job = Job.model_validate({"name": "t", "seed": 2024, "start": {"pose": "tumbled"}})
-    start = draw_start(job, scene_id, asset, TABLE)
+    start = draw_start(job.start, SceneChance(job.seed, scene_id), asset, TABLE)
     rest = settle_single(start, TABLE, PHYSICS)
     assert rest.support == "flat_top"
     assert rest.support_margin_mm > 0.0
@@ -106,7 +107,7 @@ def test_what_is_let_go_again_is_watched_to_the_end_however_still_it_stands(monk
 
     monkeypatch.setattr("workers.physics.release.fall", told)
     recheck(start, rest, TABLE, PHYSICS)
-    plan = plan_scene(Job(name="t"), 0, table(), start.asset)
+    plan = draw_scene(Job(name="t"), SceneChance(0, 0), table(), start.asset)
     plan = dataclasses.replace(plan, objects=(start,), table=TABLE)
     release_again(plan, [rest], PHYSICS, EffectPlan(("dynamics", "fine_step"), {}), 0.5)
     assert [each.seconds for each in watched] == pytest.approx([RECHECK_S, 0.5], abs=1e-3)
@@ -114,7 +115,9 @@ def test_what_is_let_go_again_is_watched_to_the_end_however_still_it_stands(monk
 
 def test_the_same_start_gives_the_same_bits():
     asset = asset_of(trimesh.creation.icosphere(subdivisions=1, radius=0.06))
-    plan = plan_scene(Job.model_validate({"name": "t", "start": {"pose": "tumbled"}}), 4, table(), asset)
+    plan = draw_scene(
+        Job.model_validate({"name": "t", "start": {"pose": "tumbled"}}), SceneChance(0, 4), table(), asset
+    )
     first, second = (settle_single(plan.objects[0], plan.table, PHYSICS) for _ in range(2))
     assert np.array_equal(first.T_world_obj, second.T_world_obj)
     assert first.settle_s == second.settle_s

@@ -18,8 +18,9 @@ from services.job.read import validate_job
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.frames import invert, transform
 from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import Stopwatch, make_scene
+from workers.pipeline.make_scene import make_scene
 from workers.pipeline.run_shard import run_shard
+from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.gbuffer import shared_renderer
 from workers.store.commit import read_record
 from workers.store.images import decode_png

@@ -11,8 +11,9 @@ from services.job.read import validate_job
 from tests.datasets import SMALL, overlaid
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import open_worker
-from workers.pipeline.make_scene import Stopwatch, make_scene
+from workers.pipeline.make_scene import make_scene
 from workers.pipeline.rows import failed_scene, record_scene, timing_row
+from workers.pipeline.stopwatch import Stopwatch
 from workers.store.manifest import table_of_rows
 
 
@@ -36,7 +37,7 @@ def test_rows_have_the_tables_columns_and_types(recorded):
 def test_a_views_files_are_those_that_are_written_with_their_digests(recorded):
     _, output = recorded
     listed = {file["path"]: file for row in output.rows["views"] for file in row["files"]}
-    images = {path: data for path, data in output.files if path.endswith(".png")}
+    images = {file.path: file.data for file in output.files if file.path.endswith(".png")}
     assert listed.keys() == images.keys()
     for path, data in images.items():
         assert (listed[path]["bytes"], listed[path]["sha256"]) == (len(data), hashlib.sha256(data).hexdigest())

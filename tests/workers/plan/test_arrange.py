@@ -15,7 +15,8 @@ from schemas.scene.shape import Asset
 from tests.shapes import asset_of, box, table
 from workers.geometry.frames import transform
 from workers.plan.arrange import APART_M, columns_apart
-from workers.plan.step import choose_category, count_objects, plan_scene
+from workers.plan.randomness import SceneChance
+from workers.plan.step import choose_category, count_objects, draw_scene
 
 TABLE = table()
 SMALL = asset_of(box(0.08, 0.05, 0.1), category="box")
@@ -25,7 +26,7 @@ BIG = asset_of(box(0.2, 0.12, 0.1), category="mug")
 
 def plan(scene: int, *assets: Asset, **start) -> ScenePlan:
     job = Job.model_validate({"name": "t", "seed": 5, "objects_per_scene": len(assets), "start": start})
-    return plan_scene(job, scene, TABLE, *assets)
+    return draw_scene(job, SceneChance(job.seed, scene), TABLE, *assets)
 
 
 def mesh_of(start: ObjectStart) -> trimesh.Trimesh:
@@ -86,15 +87,15 @@ def test_every_object_has_chances_of_its_own():
     starts = plan(3, SMALL, SMALL, SMALL).objects
     assert len({start.T_world_obj.tobytes() for start in starts}) == 3
     job = Job.model_validate({"name": "t", "seed": 5, "objects_per_scene": 20})
-    assert len({choose_category(job, 0, number) for number in range(20)}) > 4
+    assert len({choose_category(job, SceneChance(5, 0), number) for number in range(20)}) > 4
 
 
 def test_counts_are_drawn_alike_from_their_range():
     job = Job.model_validate({"name": "t", "seed": 5, "objects_per_scene": [2, 5]})
-    counts = [count_objects(job, scene) for scene in range(1000)]
+    counts = [count_objects(job, SceneChance(5, scene)) for scene in range(1000)]
     assert set(counts) == {2, 3, 4, 5}
     assert all(abs(counts.count(n) - 250) < 4 * math.sqrt(1000 * 0.25 * 0.75) for n in (2, 3, 4, 5))
-    assert {count_objects(Job(name="t"), scene) for scene in range(50)} == {1}
+    assert {count_objects(Job(name="t"), SceneChance(0, scene)) for scene in range(50)} == {1}
 
 
 def test_a_place_that_is_taken_is_drawn_again_and_counted():

@@ -10,8 +10,8 @@ from schemas.job.job import Job
 from tests.shapes import asset_of, box, table
 from workers.geometry.camera import inclination, yaw
 from workers.geometry.frames import transform
-from workers.plan.randomness import Stream, stream
-from workers.plan.step import choose_category, plan_scene
+from workers.plan.randomness import SceneChance
+from workers.plan.step import choose_category, draw_scene
 
 BOX = asset_of(box(0.1, 0.08, 0.2))
 TABLE = table()
@@ -21,38 +21,23 @@ def job(**changes) -> Job:
     return Job.model_validate({"name": "t", "seed": 5, **changes})
 
 
-def test_a_stream_is_a_function_of_seed_scene_and_step():
-    draw = stream(5, 7, Stream.CAMERA).random(4)
-    assert np.array_equal(draw, stream(5, 7, Stream.CAMERA).random(4))
-    for other in (stream(6, 7, Stream.CAMERA), stream(5, 8, Stream.CAMERA), stream(5, 7, Stream.START)):
-        assert not np.array_equal(draw, other.random(4))
-
-
-def test_stream_numbers_are_never_reused():
-    """Append-only: renumbering a stream changes every dataset that was ever made."""
-    assert {one.name: int(one) for one in Stream} == {
-        "CATEGORY": 0, "OBJECT": 1, "TABLE": 2, "START": 3, "REDRAW": 4, "CAMERA": 5, "APPEARANCE": 6,
-        "RAYCAST_CHECK": 7, "SENSOR_DEPTH": 8, "SENSOR_RGB": 9, "SENSOR_EXPOSURE": 10, "PATHS": 11, "COUNT": 12,
-    }  # fmt: skip
-
-
 def test_categories_come_with_their_weights():
     weighted = job(categories={"mug": 3.0, "bowl": 1.0})
-    draws = [choose_category(weighted, scene) for scene in range(2000)]
+    draws = [choose_category(weighted, SceneChance(5, scene)) for scene in range(2000)]
     share = draws.count("mug") / len(draws)
     assert set(draws) == {"mug", "bowl"}
     assert abs(share - 0.75) < 4 * math.sqrt(0.75 * 0.25 / 2000)
 
 
 def test_more_pairs_move_neither_the_object_nor_the_earlier_cameras():
-    one, three = (plan_scene(job(pairs_per_scene=n), 3, TABLE, BOX) for n in (1, 3))
+    one, three = (draw_scene(job(pairs_per_scene=n), SceneChance(5, 3), TABLE, BOX) for n in (1, 3))
     assert np.array_equal(one.objects[0].T_world_obj, three.objects[0].T_world_obj)
     assert np.array_equal(one.input_cameras[0].T_world_cam, three.input_cameras[0].T_world_cam)
     assert len({camera.T_world_cam.tobytes() for camera in three.input_cameras}) == 3
 
 
 def test_starts_and_cameras_fill_their_ranges_and_never_leave_them():
-    plans = [plan_scene(job(), scene, TABLE, BOX) for scene in range(300)]
+    plans = [draw_scene(job(), SceneChance(5, scene), TABLE, BOX) for scene in range(300)]
     height = plans[0].table.top.height_m
     starts = np.stack([plan.objects[0].T_world_obj for plan in plans])
     lowest = np.array([transform(T, BOX.shape.vertices)[:, 2].min() for T in starts]) - height
@@ -74,28 +59,29 @@ def test_starts_and_cameras_fill_their_ranges_and_never_leave_them():
 
 
 def test_upright_objects_stand_and_tumbled_ones_do_not():
-    upright = plan_scene(job(), 1, TABLE, BOX).objects[0].T_world_obj
+    upright = draw_scene(job(), SceneChance(5, 1), TABLE, BOX).objects[0].T_world_obj
     assert upright[2, 2] == 1.0
     tumbled = [
-        plan_scene(job(start={"pose": "tumbled"}), s, TABLE, BOX).objects[0].T_world_obj[2, 2] for s in range(200)
+        draw_scene(job(start={"pose": "tumbled"}), SceneChance(5, s), TABLE, BOX).objects[0].T_world_obj[2, 2]
+        for s in range(200)
     ]
     assert abs(np.mean(tumbled)) < 4 / math.sqrt(3 * 200)
 
 
 def test_a_placed_object_touches_the_table_and_needs_no_drop():
-    start = plan_scene(job(start={"pose": "placed"}), 2, TABLE, BOX).objects[0]
+    start = draw_scene(job(start={"pose": "placed"}), SceneChance(5, 2), TABLE, BOX).objects[0]
     assert start.placed
     assert transform(start.T_world_obj, BOX.shape.vertices)[:, 2].min() == pytest.approx(0.7, abs=1e-12)
 
 
 def test_a_placed_object_that_would_tip_is_dropped_instead():
     leaning = asset_of(box(0.05, 0.05, 0.02, (0, 0, -0.1)), box(0.04, 0.04, 0.18, (0.06, 0, 0)))
-    assert not plan_scene(job(start={"pose": "placed"}), 2, TABLE, leaning).objects[0].placed
+    assert not draw_scene(job(start={"pose": "placed"}), SceneChance(5, 2), TABLE, leaning).objects[0].placed
 
 
 def test_a_position_off_the_table_is_redrawn_and_counted():
     small = table(side_m=0.3)
-    starts = [plan_scene(job(), scene, small, BOX).objects[0] for scene in range(60)]
+    starts = [draw_scene(job(), SceneChance(5, scene), small, BOX).objects[0] for scene in range(60)]
     assert all(np.abs(start.T_world_obj[:2, 3]).max() <= 0.15 for start in starts)
     redraws = [start.redraws for start in starts]
     # A square of half the side of the range is hit with probability 0.36.
@@ -104,5 +90,5 @@ def test_a_position_off_the_table_is_redrawn_and_counted():
 
 def test_no_position_over_the_table_is_a_failure_with_its_reason():
     with pytest.raises(StartError, match="offset_m") as caught:
-        plan_scene(job(start={"offset_m": [0.9, 1.0]}), 0, TABLE, BOX)
+        draw_scene(job(start={"offset_m": [0.9, 1.0]}), SceneChance(5, 0), TABLE, BOX)
     assert caught.value.reason == "no_table_below"

@@ -7,8 +7,8 @@ from schemas.dataset.commit import Span
 from schemas.dataset.layout import STAGING, commit_path, range_table_path
 from schemas.dataset.tables import TABLES
 from schemas.errors import RunError
-from schemas.scene.scene import SceneOutput
-from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene, terms
+from schemas.scene.scene import SceneOutput, encoded_file
+from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene, terms, with_shapes
 from workers.store.attempt import attempts_at, begin_attempt, blamed_scene, retry_of_attempt
 from workers.store.commit import read_record
 from workers.store.local import LocalStore
@@ -32,8 +32,8 @@ def test_a_winner_publishes_every_file_and_leaves_no_staging(store, tmp_path):
     result = attempt_at(store, 0, 4).commit()
     assert result.won
     for scene_id in range(4):
-        for path, data in scene(scene_id).files:
-            assert (tmp_path / path).read_bytes() == data
+        for file in scene(scene_id).files:
+            assert (tmp_path / file.path).read_bytes() == file.data
     assert sorted(entry.key for entry in store.files(STAGING)) == []
     assert read_record(store, 0) == result.record
 
@@ -141,12 +141,12 @@ BROKEN = {
         "rows of another scene in views",
     ),
     "a file that no row names": (
-        changed(made_scene(0), files=(*made_scene(0).files, ("mug/RGB99999.png", b"x"))),
+        changed(made_scene(0), files=(*made_scene(0).files, encoded_file("mug/RGB99999.png", b"x"))),
         "disagree about mug/RGB99999.png",
     ),
     "a row that names no file": (changed(made_scene(0), files=made_scene(0).files[1:]), "disagree about"),
     "other bytes than its row says": (
-        changed(made_scene(0), files=((made_scene(0).files[0][0], b"other"), *made_scene(0).files[1:])),
+        changed(made_scene(0), files=(encoded_file(made_scene(0).files[0].path, b"other"), *made_scene(0).files[1:])),
         "sizes, digests",
     ),
     "a path twice": (changed(made_scene(0), files=(*made_scene(0).files, made_scene(0).files[0])), "path twice"),
@@ -182,7 +182,7 @@ def test_a_scene_is_refused_that_has(store, what):
 def test_a_scene_cannot_write_outside_its_place(store, path):
     attempt = begin_attempt(store, Span(start=0, stop=2), terms())
     with pytest.raises(ValueError, match="is not a path that a scene may write"):
-        attempt.add_scene(changed(made_scene(0), files=((path, b"x"),)))
+        attempt.add_scene(changed(made_scene(0), files=(encoded_file(path, b"x"),)))
     assert {path.name for path in store.root.iterdir()} == {"manifest", STAGING}
 
 
@@ -201,11 +201,11 @@ def test_a_shape_that_two_scenes_share_is_written_once_and_must_be_the_same(stor
     assert len(shapes) == len(set(shapes)) < 4 + 1
     other = begin_attempt(store, Span(start=4, stop=8), terms())
     first, again = made_scene(4), made_scene(5)
-    shape = next(path for path, _ in first.files if path.startswith("assets/"))
+    shape = next(file.path for file in first.files if file.path.startswith("assets/"))
     other.add_scene(first)
-    files = [(path, data) for path, data in again.files if not path.startswith("assets/")]
+    files = [file for file in again.files if not file.path.startswith("assets/")]
     with pytest.raises(ValueError, match="written twice with different bytes"):
-        other.add_scene(changed(again, files=(*files, (shape, b"other"))))
+        other.add_scene(changed(again, files=(*files, encoded_file(shape, b"other"))))
 
 
 def test_one_asset_described_in_two_ways_within_a_range_is_refused(store):
@@ -246,9 +246,7 @@ def test_a_loser_with_another_shape_says_so(store):
     attempt_at(store, 0, 2).commit()
 
     def other_shape(scene_id):
-        output = made_scene(scene_id)
-        files = tuple((path, data + b"!" * path.startswith("assets/")) for path, data in output.files)
-        return changed(output, files=files)
+        return with_shapes(made_scene(scene_id), lambda data: data + b"!")
 
     assert "assets/" in attempt_at(store, 0, 2, make=other_shape).commit().conflict
 

@@ -4,7 +4,7 @@ import pytest
 
 from schemas.dataset.layout import STAGING, commit_path
 from schemas.errors import CommitConflict, CorruptError, OutputError
-from tests.made_up_scenes import attempt_at, made_scene, terms
+from tests.made_up_scenes import attempt_at, made_scene, terms, with_shapes
 from tests.stored_images import iter_records
 from workers.store.commit import (
     check_published,
@@ -167,9 +167,7 @@ def test_a_published_file_of_the_wrong_size_is_told_by_name(store, undecided):
 
 
 def another_shape(scene_id: int):
-    output = made_scene(scene_id)
-    files = tuple((path, data + b"!" * path.startswith("assets/")) for path, data in output.files)
-    return type(output)(scene_id, files, output.rows)
+    return with_shapes(made_scene(scene_id), lambda data: data + b"!")
 
 
 def test_a_shape_that_another_range_published_stays_and_one_of_another_size_is_a_conflict(store):

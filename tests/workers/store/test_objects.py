@@ -65,7 +65,9 @@ def test_a_dataset_there_has_the_digest_of_one_on_a_disk_and_answers_questions(s
     assert query(store, "select scene_id from scenes order by 1").column(0).to_pylist() == made
     status = read_status(store, 0, STOP)
     assert (status.made, status.failed, status.missing) == (9, {"intrinsic: left_table": 1}, 0)
-    images = {path: data for i in range(STOP) for path, data in scene(i).files if not path.startswith("assets/")}
+    images = {
+        file.path: file.data for i in range(STOP) for file in scene(i).files if not file.path.startswith("assets/")
+    }
     assert {p: d for record in iter_records(store) for p, d in read_images(store, record)} == images
     before = sorted(store.files(""))
     assert make_all(store) == read_success(store)["digest"]

@@ -15,7 +15,7 @@ import workers.cameras.placement
 import workers.geometry.camera
 import workers.geometry.pixels
 import workers.geometry.projection
-import workers.labels.derive
+import workers.labels.patches
 import workers.render.step
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.scene.camera import Camera, Intrinsics
@@ -175,7 +175,7 @@ def rounded_image_coordinates(plant: Plant, _: Any) -> None:
 
 
 def patch_a_pixel_too_far_left(plant: Plant, _: Any) -> None:
-    original = workers.labels.derive.crop_box
+    original = workers.labels.patches.crop_box
 
     def planted(*arguments):
         box = original(*arguments)

@@ -22,7 +22,8 @@ from services.study.measure.colour_errors import (
 from tests.effects.scenes import SMALL, context_of, merged
 from workers.geometry.camera import look_at, project
 from workers.geometry.frames import invert, transform
-from workers.pipeline.make_scene import Stopwatch, make_scene
+from workers.pipeline.make_scene import make_scene
+from workers.pipeline.stopwatch import Stopwatch
 
 HERE = importlib.util.find_spec("mitsuba") is not None
 traced = pytest.mark.skipif(not HERE, reason="Mitsuba is not installed: truth of colour goes untested")

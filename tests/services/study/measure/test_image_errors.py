@@ -21,7 +21,8 @@ from workers.cameras.mirror import mirror_pose
 from workers.geometry.camera import look_at
 from workers.geometry.frames import rotation_about
 from workers.geometry.raycast import cast_view
-from workers.pipeline.make_scene import Stopwatch, make_scene
+from workers.pipeline.make_scene import make_scene
+from workers.pipeline.stopwatch import Stopwatch
 
 UNITS = 5000.0
 WIDTH, HEIGHT, F = 160, 120, 500.0

@@ -11,20 +11,22 @@ from tests.shapes import asset_of, box, table
 from workers.assets.appearance.draw import draw_appearance
 from workers.plan.effect import Facts
 from workers.plan.effects import plan_effects, write_receipt
-from workers.plan.randomness import Stream, stream
-from workers.plan.step import plan_scene
+from workers.plan.randomness import SceneChance, Stream
+from workers.plan.step import draw_scene
 
 BOX, TABLE = asset_of(box(0.1, 0.08, 0.2)), table()
 JOBS = {tier: Job.model_validate({"name": "t", "seed": 5, "render": {"tier": tier}}) for tier in ("flat", "raster")}
 
 
 def look(scene: int, tier="raster"):
-    return draw_appearance(stream(5, scene, Stream.APPEARANCE), tier)
+    return draw_appearance(SceneChance(5, scene).stream(Stream.APPEARANCE), tier)
 
 
 def test_the_tier_changes_neither_poses_nor_cameras_nor_the_floors_geometry():
     for scene in range(20):
-        flat, raster = (plan_scene(JOBS[tier], scene, TABLE, BOX) for tier in ("flat", "raster"))
+        flat, raster = (
+            draw_scene(JOBS[tier], SceneChance(JOBS[tier].seed, scene), TABLE, BOX) for tier in ("flat", "raster")
+        )
         assert flat.objects[0].T_world_obj.tobytes() == raster.objects[0].T_world_obj.tobytes()
         assert flat.input_cameras[0].T_world_cam.tobytes() == raster.input_cameras[0].T_world_cam.tobytes()
         assert flat.floor.vertices.tobytes() == raster.floor.vertices.tobytes()
@@ -65,7 +67,9 @@ def test_scenes_are_neither_dark_nor_burnt_out():
 )
 def test_the_receipt_says_which_effects_of_light_ran(tier, expected):
     job = JOBS["raster"].model_copy(update={"render": Render(tier=tier)})
-    ran, skipped = write_receipt(plan_effects(Facts(job, plan_scene(JOBS["raster"], 0, TABLE, BOX), False)))
+    ran, skipped = write_receipt(
+        plan_effects(Facts(job, draw_scene(JOBS["raster"], SceneChance(5, 0), TABLE, BOX), False))
+    )
     names = {"shadows", "ambient_occlusion", "antialiasing", "global_illumination", "glass"}
     assert names & set(ran) == expected
     assert {one["effect"]: one["why"] for one in skipped if one["effect"] in names} == dict.fromkeys(
