@@ -9,6 +9,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from schemas.job.job import Job
 from schemas.scene.camera import Camera
+from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import REGION_FIRST_OBJECT, PosedScene
 from workers.assets.catalogue import open_catalogue
 from workers.cameras.pivot_depth import front_distance
@@ -41,17 +42,20 @@ def draw_strip(scenes: list[tuple[str, int]]) -> NDArray[np.uint8]:
 def _cell(category: str, number: int, tier: str) -> NDArray[np.uint8]:
     render = {"tier": tier, "path_samples": SAMPLES, "samples": 4}
     job = Job.model_validate({"name": "strip", "seed": SEED, "categories": [category], "render": render})
-    posed, camera = _posed(job, number)
+    posed, camera, effects = _posed(job, number)
     rng = np.random.default_rng(np.random.SeedSequence(SEED, spawn_key=(number,)))
-    return draw_view(shared_renderer(), posed.things, posed.appearance, camera, job.render, rng).rgb
+    drawn = draw_view(shared_renderer(), posed.things, posed.appearance, camera, job.render, rng, effects)
+    assert drawn.rgb is not None
+    return drawn.rgb
 
 
-def _posed(job: Job, number: int) -> tuple[PosedScene, Camera]:
-    """A scene at rest, and a camera at its mirror pose that sees the object alone, enlarged."""
+def _posed(job: Job, number: int) -> tuple[PosedScene, Camera, EffectPlan]:
+    """A scene at rest, a camera at its mirror pose that sees the object alone, enlarged, and the plan of effects."""
     catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
     context = WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
     plan = plan_with_assets(context, number)
-    rest = settle_scene(plan, job.physics, plan_effects(Facts(job, plan, False)))
+    effects = plan_effects(Facts(job, plan, False))
+    rest = settle_scene(plan, job.physics, effects)
     posed = pose_scene(plan, rest.settled)
     seen = shared_renderer().draw(posed.things, posed.appearance, plan.input_cameras[0])
     d_z_m = front_distance(seen.depth_m.astype(np.float64), seen.region >= REGION_FIRST_OBJECT, job.cameras.mirror)
@@ -62,7 +66,7 @@ def _posed(job: Job, number: int) -> tuple[PosedScene, Camera]:
     closer = {"fx": ZOOM * k.fx, "fy": ZOOM * k.fy, "width": CELL[0], "height": CELL[1]}
     closer["cx"] = 0.5 * CELL[0] + ZOOM * (k.cx - float(u.min() + u.max()) / 2)
     closer["cy"] = 0.5 * CELL[1] + ZOOM * (k.cy - float(v.min() + v.max()) / 2)
-    return posed, Camera(k.model_copy(update=closer), mirror.T_world_cam)
+    return posed, Camera(k.model_copy(update=closer), mirror.T_world_cam), effects
 
 
 def _padded(cell: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -36,7 +36,6 @@ from workers.plan.effect import Facts
 from workers.plan.effects import is_raycast_scene, plan_effects
 from workers.plan.randomness import Stream, of_object, stream
 from workers.plan.step import choose_category, count_objects, plan_scene
-from workers.render.overrides import Passes
 from workers.render.step import draw_view
 from workers.sensor.step import SensorChance, sense_view
 
@@ -103,7 +102,7 @@ def make_scene(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Scene
     posed = pose_scene(plan, rest.settled)
     view = SceneView(context, plan, posed, effects, watch)
     with watch.stage("render", "light_maps" if effects.runs("light_maps") else None):
-        context.renderer.prepare_light(posed.things, posed.appearance, job.render, view.passes)
+        context.renderer.prepare_light(posed.things, posed.appearance, job.render, effects)
     pairs = tuple(make_pair(view, camera, number) for number, camera in enumerate(plan.input_cameras))
     with watch.stage("check"):
         for pair in pairs:
@@ -142,11 +141,6 @@ class SceneView:
     posed: PosedScene
     effects: EffectPlan
     watch: Stopwatch
-
-    @property
-    def passes(self) -> Passes:
-        """What the renderer leaves out and what it is forced to draw."""
-        return Passes(frozenset(self.effects.skipped), self.effects.forced)
 
 
 def make_pair(scene: SceneView, camera: Camera, number: int) -> Pair:
@@ -190,7 +184,7 @@ def sense(scene: SceneView, exact: View, number: int) -> View:
         return exact
     own = (scene.plan.scene_id, number, ROLES.index(exact.role))
     with scene.watch.stage("sensor", on[0] if len(on) == 1 else None):
-        return sense_view(job.sensor, job.images, exact, sensor_chance(job.seed, *own))
+        return sense_view(job.sensor, job.images, exact, sensor_chance(job.seed, *own), scene.effects)
 
 
 def sensor_chance(seed: int, scene_id: int, pair: int, role: int) -> SensorChance:
@@ -205,7 +199,7 @@ def render_view(scene: SceneView, role: Role, ids: tuple[int, int], camera: Came
     with scene.watch.stage("render"):
         paths = stream(job.seed, scene.plan.scene_id, Stream.PATHS, *ids, ROLES.index(role))
         buffer = draw_view(
-            renderer, scene.posed.things, scene.posed.appearance, camera, job.render, paths, scene.passes
+            renderer, scene.posed.things, scene.posed.appearance, camera, job.render, paths, scene.effects
         )
     if scene.effects.runs("raycast_check"):
         with scene.watch.stage("raycast", "raycast_check"):
@@ -213,7 +207,7 @@ def render_view(scene: SceneView, role: Role, ids: tuple[int, int], camera: Came
     with scene.watch.stage("labels"):
         labels = label_view(scene, camera, buffer)
         depth = quantise_depth(buffer.depth_m, job.images)
-    return View(role, *ids, camera, buffer.rgb if job.render.rgb else None, depth, buffer.region, labels)
+    return View(role, *ids, camera, buffer.rgb, depth, buffer.region, labels)
 
 
 def label_view(scene: SceneView, camera: Camera, buffer: GBuffer) -> tuple[ObjectLabel, ...]:
