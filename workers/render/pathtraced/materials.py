@@ -15,7 +15,7 @@ from schemas.scene.effects import EffectPlan
 from schemas.scene.shape import Material, Part
 from workers.geometry.frames import transform
 from workers.geometry.srgb import SRGB_STEPS, decode_srgb
-from workers.render.raster.batches import MATTE_ROUGHNESS
+from workers.render.raster.batches import MATTE_ROUGHNESS, texture_of
 
 Bsdf = dict[str, Any]
 
@@ -37,14 +37,11 @@ VERTEX_COLOR = "vertex_color"
 
 def planned_part(part: Part, effects: EffectPlan) -> Part:
     """The part without what the plan leaves out: textures, their holes, glass."""
-    material = part.material
-    if not effects.runs("glass"):
-        material = replace(material, transmission=0.0)
-    if material.texture is not None and not effects.runs("textures"):
-        material = replace(material, texture=None)
-    if material.texture is not None and not effects.runs("transparency"):
-        material = replace(material, texture=material.texture[..., :3])
-    return replace(part, material=material)
+    transmission = part.material.transmission if effects.runs("glass") else 0.0
+    texture = part.material.texture if effects.runs("textures") else None
+    if texture is not None and not effects.runs("transparency"):
+        texture = texture[..., :3]
+    return replace(part, material=replace(part.material, transmission=transmission, texture=texture))
 
 
 def make_mesh(mi: ModuleType, part: Part, T_world_shape: Pose, name: str) -> Any:
@@ -76,7 +73,7 @@ def bsdf_of(mi: ModuleType, part: Part) -> Bsdf:
     body = _opaque(material, color)
     if material.transmission > 0.0:
         body = _glass(mi, part, body)
-    texture = _texture(part)
+    texture = texture_of(part)
     if texture is not None and texture.shape[2] == 4 and int(texture[..., 3].min()) < 255 * HOLE:
         solid = (texture[..., 3] >= 255 * HOLE).astype(np.float32)
         body = {"type": "mask", "opacity": _picture(mi, solid), "nested": body}
@@ -120,7 +117,7 @@ def _glass(mi: ModuleType, part: Part, body: Bsdf) -> Bsdf:
 
 def tint_of(part: Part) -> Array:
     """[3] share of linear light that crosses a sheet of glass; of a textured one, from the mean of its clearest texels."""
-    material, texture = part.material, _texture(part)
+    material, texture = part.material, texture_of(part)
     color = decode_srgb(np.array(material.base_color[:3]))
     if texture is not None:
         clear = np.ones(texture.shape[:2], np.bool_)
@@ -137,7 +134,7 @@ def _both_sides(bsdf: Bsdf) -> Bsdf:
 def _color(mi: ModuleType, part: Part) -> Any:
     """The albedo; a texture takes precedence over vertex colours, which Mitsuba cannot multiply it with."""
     factor = decode_srgb(np.array(part.material.base_color[:3]))
-    texture = _texture(part)
+    texture = texture_of(part)
     if texture is not None:
         return _picture(mi, (SRGB_STEPS[texture[..., :3]] * factor).astype(np.float32))
     if _has_vertex_colors(part):
@@ -145,12 +142,8 @@ def _color(mi: ModuleType, part: Part) -> Any:
     return _rgb(factor)
 
 
-def _texture(part: Part) -> NDArray[np.uint8] | None:
-    return part.material.texture if part.uv is not None else None
-
-
 def _has_vertex_colors(part: Part) -> bool:
-    return part.colors is not None and _texture(part) is None
+    return part.colors is not None and texture_of(part) is None
 
 
 def _picture(mi: ModuleType, linear: NDArray[np.float32]) -> Bsdf:

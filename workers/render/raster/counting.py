@@ -42,9 +42,3 @@ class PixelCounter:
         gl.glEndQuery(gl.GL_SAMPLES_PASSED)
         gl.glDisable(gl.GL_STENCIL_TEST)
         return int(np.ravel(gl.glGetQueryObjectuiv(self._query, gl.GL_QUERY_RESULT))[0])
-
-    def free(self) -> None:
-        """Free its memory on the GPU."""
-        self._gl.glDeleteQueries(1, [self._query])
-        self._framebuffer.free()
-        self.program.free()

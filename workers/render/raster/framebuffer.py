@@ -4,10 +4,14 @@ from collections.abc import Mapping
 from types import ModuleType
 
 import numpy as np
+from numpy.typing import NDArray
+
+from schemas.scene.scene import Appearance
+from workers.geometry.srgb import encode_srgb
 
 
 class Framebuffer:
-    """A framebuffer of renderbuffers, which keep the size that was bound last: views of one job have the same size."""
+    """Renderbuffers of the size that was bound last: views of one job have the same size."""
 
     def __init__(self, gl: ModuleType, formats: Mapping[int, int]) -> None:
         """`formats`: OpenGL's internal format of each attachment point."""
@@ -35,7 +39,18 @@ class Framebuffer:
             raise RuntimeError(f"a framebuffer of {width} x {height} is not complete: status {status:#x}")
         self.size = (width, height)
 
-    def free(self) -> None:
-        """Free its memory on the GPU."""
-        self._gl.glDeleteFramebuffers(1, [self._framebuffer])
-        self._gl.glDeleteRenderbuffers(len(self._buffers), self._buffers)
+    def clear(self, appearance: Appearance) -> None:
+        """Set every pixel to the background, infinitely far away: depth falls with distance."""
+        gl = self._gl
+        background = np.append(encode_srgb(np.array(appearance.background)), 0.0)
+        gl.glClearBufferfv(gl.GL_COLOR, 0, background.astype(np.float32))
+        if gl.GL_COLOR_ATTACHMENT1 in self._formats:
+            gl.glClearBufferfv(gl.GL_COLOR, 1, np.zeros(4, np.float32))
+        gl.glClearBufferfv(gl.GL_DEPTH, 0, np.zeros(1, np.float32))
+
+    def read(self, rgba: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Read the first colour attachment into `rgba` [H, W, 4], and return it."""
+        gl = self._gl
+        gl.glReadBuffer(gl.GL_COLOR_ATTACHMENT0)
+        gl.glReadPixels(0, 0, *self.size, gl.GL_RGBA, gl.GL_UNSIGNED_BYTE, rgba)
+        return rgba

@@ -23,6 +23,7 @@ its antialiasing and its cut-out texels change colour alone: labels treat every 
 import ctypes
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -30,11 +31,10 @@ from numpy.typing import NDArray
 
 from schemas.base import Pose
 from schemas.job.job import Render
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.camera import Camera
 from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import Appearance, GBuffer, Placed
 from workers.geometry.frames import invert
-from workers.geometry.srgb import encode_srgb
 from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_edges, smooth_edges
 from workers.render.raster.buffers import INDEX_BYTES, ShapeStore, UploadedShape
 from workers.render.raster.colour import ColourTarget
@@ -61,18 +61,14 @@ FLAT = Render(tier="flat")
 FLAT_EFFECTS = EffectPlan(("rgb", "floor", "table", "textures"), {})
 """Everything that tier flat draws of any scene."""
 
-_shared: "Renderer | None" = None
 
-
+@cache
 def shared_renderer() -> "Renderer":
     """This process's renderer, made at the first call: a process has one OpenGL context.
 
     Raises MachineError, with the packages to install, where there is no EGL or no OpenGL.
     """
-    global _shared
-    if _shared is None or _shared.closed:
-        _shared = Renderer()
-    return _shared
+    return Renderer()
 
 
 class Renderer:
@@ -86,7 +82,6 @@ class Renderer:
         gl = self._gl
         self.name: str = gl.glGetString(gl.GL_RENDERER).decode()
         """OpenGL's name of the device: tells a GPU from software."""
-        self.closed = False
         self._shapes = ShapeStore(gl)
         self._scene_size = 0  # things of the scene drawn last, whose other views come next
         colors = {gl.GL_COLOR_ATTACHMENT0: gl.GL_RGBA8, gl.GL_COLOR_ATTACHMENT1: gl.GL_R32F}
@@ -120,7 +115,9 @@ class Renderer:
         self.prepare_light(things, appearance, render, effects)
         k, color = camera.intrinsics, effects.runs("rgb") and render.tier != "pathtraced"
         view = RenderPass(appearance, k, invert(camera.T_world_cam), effects, color, _is_lit(render, effects))
-        self._clear(k, appearance)
+        self._target.bind(k.width, k.height)
+        self._gl.glEnable(self._gl.GL_DEPTH_TEST)
+        self._target.clear(appearance)
         self._draw_things(things, view)
         rgb, depth_m, region = self._read(view)
         if rgb is not None:
@@ -160,21 +157,6 @@ class Renderer:
         self._gl.glDisable(self._gl.GL_CULL_FACE)
         self._shapes.trim(max(1, self._scene_size))
         return count
-
-    def close(self) -> None:
-        """Free everything on the GPU and the context itself; the renderer cannot be used afterwards."""
-        if self.closed:
-            return
-        self._platform.make_current()
-        self._shapes.clear()
-        for program in self._programs.values():
-            program.free()
-        self._target.free()
-        self._counter.free()
-        self._light_maps.free()
-        self._colour_target.free()
-        self._platform.delete_context()
-        self.closed = True
 
     def _draw_things(self, things: Sequence[Placed], view: RenderPass) -> None:
         """Draw into the bound framebuffer."""
@@ -219,7 +201,7 @@ class Renderer:
             return
         self._colour_target.select(mask, view.k)
         moved = [self._draw_colour(things, view.shift(*offset), cut) for offset in OFFSETS_PX[: samples - 1]]
-        self._colour_target.release()
+        self._gl.glDisable(self._gl.GL_STENCIL_TEST)
         blend_samples(rgb, moved, mask)
 
     def _cut_out(self, rgb: NDArray[np.uint8], things: Sequence[Placed], view: RenderPass) -> None:
@@ -228,9 +210,8 @@ class Renderer:
         Other pixels stay, because a pass for colour alone has another depth test than labels have, and may show another
         of two faces that meet.
         """
-        self._colour_target.select(None, view.k)
+        self._colour_target.bind(view.k.width, view.k.height)
         whole, cut = (self._draw_colour(things, view, cut) for cut in (False, True))
-        self._colour_target.release()
         seen_through = (whole != cut).any(axis=2)
         rgb[seen_through] = cut[seen_through, :3]
 
@@ -238,16 +219,7 @@ class Renderer:
         """[H, W, 4] uint8 sRGB of the pixels that were selected; `cut`: with holes cut out."""
         self._colour_target.clear(view.appearance)
         self._draw_things(things, replace(view, labels=False, cut=cut))
-        return self._colour_target.read()
-
-    def _clear(self, k: Intrinsics, appearance: Appearance) -> None:
-        gl = self._gl
-        self._target.bind(k.width, k.height)
-        gl.glEnable(gl.GL_DEPTH_TEST)
-        background = np.append(encode_srgb(np.array(appearance.background)), 0.0)
-        gl.glClearBufferfv(gl.GL_COLOR, 0, background.astype(np.float32))
-        gl.glClearBufferfv(gl.GL_COLOR, 1, np.zeros(4, np.float32))
-        gl.glClearBufferfv(gl.GL_DEPTH, 0, np.zeros(1, np.float32))
+        return self._colour_target.read(np.empty((view.k.height, view.k.width, 4), np.uint8))
 
     def _program(self, variant: Variant) -> Program:
         if variant not in self._programs:
@@ -275,9 +247,7 @@ class Renderer:
         gl, k = self._gl, view.k
         if self._rgba.shape[:2] != (k.height, k.width):
             self._rgba = np.empty((k.height, k.width, 4), np.uint8)
-        rgba, depth = self._rgba, np.empty((k.height, k.width), np.float32)
-        gl.glReadBuffer(gl.GL_COLOR_ATTACHMENT0)
-        gl.glReadPixels(0, 0, k.width, k.height, gl.GL_RGBA, gl.GL_UNSIGNED_BYTE, rgba)
+        rgba, depth = self._target.read(self._rgba), np.empty((k.height, k.width), np.float32)
         gl.glReadBuffer(gl.GL_COLOR_ATTACHMENT1)
         gl.glReadPixels(0, 0, k.width, k.height, gl.GL_RED, gl.GL_FLOAT, depth)
         # OpenCV splits channels 20 times faster than a numpy slice is copied, and faster than GL_RGB is read.

@@ -90,12 +90,6 @@ class LightMaps:
             self._placements[id(thing)] = (thing, self._place(thing))
         program.set_maps(self._placements[id(thing)][1])
 
-    def free(self) -> None:
-        """Free their memory on the GPU."""
-        self._gl.glDeleteFramebuffers(1, [self._framebuffer])
-        self._gl.glDeleteTextures(4, [self._shadow, self._floor, self._stand, self._open])
-        self._program.free()
-
     def _bake(self, things: Sequence[Placed], appearance: Appearance, shadows: bool, occlusion: bool) -> Baked:
         casters, objects = baking.shadow_casters(things), baking.objects_of(things)
         if not casters or not appearance.lights or not (shadows or occlusion):

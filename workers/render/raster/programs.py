@@ -103,10 +103,6 @@ class Program:
         self._gl.glUniform2f(self._location("thing"), region_id / 255.0, bias)
         self._gl.glUniform1f(self._location("nearer"), 2.0 * NEAR_M * nearer)
 
-    def free(self) -> None:
-        """Free its memory on the GPU."""
-        self._gl.glDeleteProgram(self._name)
-
     def _location(self, name: str) -> int:
         """A uniform's location; -1, which OpenGL ignores, where the compiler removed it."""
         return self._locations.get(name, -1)
