@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from schemas.job.job import Job
-from schemas.scene.scene import REGION_FIRST_OBJECT
+from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.shape import Part, Shape
 from tests.shapes import asset_of
 from workers.assets.builtin.solid import circle, lathe

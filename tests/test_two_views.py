@@ -22,7 +22,8 @@ import trimesh
 from schemas.base import Counts
 from schemas.errors import SceneError
 from schemas.job.job import Job
-from schemas.scene.scene import Pair, PosedScene
+from schemas.scene.scene import PosedScene
+from schemas.scene.view import Pair
 from services.job.read import load_job
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import WorkerContext, settings_digest

@@ -5,7 +5,7 @@ from typing import Literal
 
 from schemas.job.job import Job
 from schemas.scene.camera import ROLES, Role
-from schemas.scene.scene import REGION_FIRST_OBJECT
+from schemas.scene.region import REGION_FIRST_OBJECT
 
 JOB_FILE = "job.yaml"
 README_FILE = "DATASET.md"

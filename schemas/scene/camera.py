@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from schemas.base import Array, Frozen, Pose
-from schemas.job.job import Sensor
+from schemas.job.cameras import Sensor
 
 Role = Literal["input", "aligned", "mirror", "projected"]
 ROLES: tuple[Role, ...] = ("input", "aligned", "mirror", "projected")

@@ -14,7 +14,7 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.errors import MachineError
-from schemas.job.job import Render
+from schemas.job.render import Render
 from schemas.scene.camera import Camera
 from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import PosedScene

@@ -7,8 +7,9 @@ import numpy as np
 
 from schemas.base import Pose
 from schemas.job.job import Job
-from schemas.scene.scene import Pair, Placed
+from schemas.scene.scene import Placed
 from schemas.scene.shape import Asset, Mesh, Shape
+from schemas.scene.view import Pair
 from workers.assets.glb import asset_glb
 from workers.geometry.srgb import SRGB_STEPS, decode_srgb, encode_srgb
 from workers.pipeline.image_files import image_boxes

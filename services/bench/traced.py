@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import MachineError, RunError, SceneError
-from schemas.job.job import Job, Render
+from schemas.job.job import Job
+from schemas.job.render import Render
 from services.bench.cycles import CyclesProcess, cycles_process, hand_over, trace_lap
 from services.bench.machine import describe_machine, pinned
 from services.bench.ratios import Lap, Spread, by_processor, slope_ratio

@@ -9,8 +9,9 @@ import numpy as np
 
 from schemas.base import Pose
 from schemas.scene.camera import Camera
-from schemas.scene.scene import Placed, PosedScene, View
+from schemas.scene.scene import Placed, PosedScene
 from schemas.scene.shape import Shape
+from schemas.scene.view import View
 from workers.geometry.camera import project
 from workers.geometry.frames import invert, moved_between, transform
 from workers.geometry.raycast import NEAR_M, edge_distance_px

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from schemas.dataset.layout import Content, image_path, patch_index, patch_path
-from schemas.scene.scene import REGION_FIRST_OBJECT
+from schemas.scene.region import REGION_FIRST_OBJECT
 from services.read.dataset_reader import Row, StoredRange, file_reader, iter_stored, read_image
 from workers.store.opening import open_store
 from workers.store.store import Store

@@ -11,7 +11,7 @@ from trimesh.visual.material import PBRMaterial
 
 from schemas.base import Pose
 from schemas.errors import InputError
-from schemas.scene.scene import ScenePlan
+from schemas.scene.plan import ScenePlan
 from schemas.scene.shape import Part, Shape
 from services.job.record import require_job
 from services.read.dataset_reader import Row, find_scene

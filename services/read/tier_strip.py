@@ -10,7 +10,8 @@ from PIL import Image, ImageDraw, ImageFont
 from schemas.job.job import Job
 from schemas.scene.camera import Camera
 from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import REGION_FIRST_OBJECT, PosedScene
+from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.scene import PosedScene
 from workers.assets.catalogue import open_catalogue
 from workers.cameras.pivot_depth import front_distance
 from workers.cameras.placement import place_mirror_camera

@@ -9,8 +9,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from schemas.errors import InputError
+from schemas.job.cameras import Sensor as Pinhole
 from schemas.job.job import Job
-from schemas.job.job import Sensor as Pinhole
 from schemas.job.preset import PRESETS
 from services.job.read import describe_fault
 from services.study.model import Changes, Group, Knob, Setting, Value

@@ -6,7 +6,8 @@ from functools import cache
 
 from schemas.base import Pose
 from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import ScenePlan, Settled
+from schemas.scene.plan import ScenePlan
+from schemas.scene.scene import Settled
 from services.read.audit_motion import MOST_DEG, MOST_MM
 from tests.effects.scenes import Setting, facts_of
 from tests.hard_cases.drops import Drop

@@ -11,7 +11,8 @@ import trimesh
 
 from schemas.base import Pose
 from schemas.job.job import CATEGORIES
-from schemas.scene.scene import ObjectStart, Settled, Table
+from schemas.scene.plan import ObjectStart, Table
+from schemas.scene.scene import Settled
 from tests.effects.physics_cases import on_a_bumpy_table
 from tests.effects.scenes import Setting
 from workers.geometry.frames import transform

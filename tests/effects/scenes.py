@@ -13,7 +13,7 @@ import numpy as np
 import workers.pipeline.make_scene
 from schemas.job.job import Category, Job
 from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import ScenePlan
+from schemas.scene.plan import ScenePlan
 from schemas.scene.shape import Part, Shape
 from services.job.read import validate_job
 from workers.assets.catalogue import Catalogue, open_catalogue

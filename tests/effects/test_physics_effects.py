@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from schemas.errors import SettleError
-from schemas.scene.scene import ObjectStart
+from schemas.scene.plan import ObjectStart
 from tests.effects.physics_cases import PHYSICS
 from tests.effects.physics_scenes import drop_on, facts_with, is_still, moved_from, moved_when_forced, settled, without
 from tests.effects.scenes import Setting, facts_of

@@ -10,7 +10,8 @@ import pytest
 from schemas.errors import SceneError
 from schemas.job.job import CATEGORIES
 from schemas.scene.camera import Camera
-from schemas.scene.scene import REGION_FLOOR, REGION_TABLE, Placed
+from schemas.scene.region import REGION_FLOOR, REGION_TABLE
+from schemas.scene.scene import Placed
 from tests.effects.cases import NO_OPS
 from tests.effects.physics_cases import PHYSICS
 from tests.effects.random_physics import needed, random_physics

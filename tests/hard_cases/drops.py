@@ -10,7 +10,7 @@ import shapely
 import trimesh
 
 from schemas.base import Array, frozen_array
-from schemas.scene.scene import ObjectStart, Table
+from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.shape import Asset
 from tests.shapes import box, shape_of
 from tests.shapes import table as plain_table

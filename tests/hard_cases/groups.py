@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.base import Array, frozen_array
-from schemas.scene.scene import ObjectStart, Table
+from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import ball, built_in, cube
 from tests.hard_cases.drops import Drop, Y, level, table_of, turn

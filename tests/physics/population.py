@@ -18,7 +18,7 @@ import numpy as np
 from schemas.base import Array
 from schemas.errors import SceneError
 from schemas.job.job import Job
-from schemas.scene.scene import ScenePlan, Table
+from schemas.scene.plan import ScenePlan, Table
 from schemas.scene.shape import Mesh
 from tests.physics.energy import watched, worst_of
 from tests.physics.room import G

@@ -5,8 +5,9 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.errors import ViewError
-from schemas.job.job import Images, Mirror
-from schemas.scene.scene import REGION_FIRST_OBJECT
+from schemas.job.cameras import Mirror
+from schemas.job.images import Images
+from schemas.scene.region import REGION_FIRST_OBJECT
 from workers.geometry.stored_depth import stored_depth_m
 
 

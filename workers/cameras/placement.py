@@ -1,7 +1,7 @@
 """Poses of the cameras that follow from an input camera: the depth camera and the mirror camera."""
 
 from schemas.base import frozen_array
-from schemas.job.job import DepthCamera, Mirror
+from schemas.job.cameras import DepthCamera, Mirror
 from schemas.scene.camera import Camera
 from workers.cameras.mirror import mirror_pose
 from workers.geometry.frames import UP, translation

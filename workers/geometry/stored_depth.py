@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.job.job import Images
+from schemas.job.images import Images
 from workers.geometry.pixels import round_depth
 
 

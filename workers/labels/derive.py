@@ -6,10 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.job.job import Images, Job, Patch
+from schemas.job.images import Images, Patch
+from schemas.job.job import Job
 from schemas.job.sensor import Distortion
 from schemas.scene.camera import Camera
-from schemas.scene.scene import REGION_FIRST_OBJECT, Agreement, ObjectLabel, View
+from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.view import Agreement, ObjectLabel, View
 from workers.geometry.camera import image_coordinates, project
 from workers.geometry.distortion import distort
 from workers.geometry.frames import invert

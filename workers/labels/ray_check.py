@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Range
 from schemas.errors import LabelError
-from schemas.job.job import Check
+from schemas.job.run import Check
 from schemas.scene.camera import Camera
-from schemas.scene.scene import REGION_FIRST_OBJECT, GBuffer, Pair, PosedScene
+from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.scene import PosedScene
+from schemas.scene.view import GBuffer, Pair
 from workers.geometry.raycast import cast_view, edge_distance_px, first_hit
 
 EDGE_PX = 1.0 / 64.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.job.physics import Physics
-from schemas.scene.scene import ObjectStart, Table
+from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.shape import MassProperties, Mesh
 from workers.geometry.frames import invert, pose, rotation_from_quaternion, transform
 from workers.geometry.hull import convex_hull

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.base import Pose
-from schemas.scene.scene import ObjectStart, Table
+from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.shape import Mesh
 from workers.geometry.convexity import solid_of, weld
 from workers.geometry.elevation import Terrain, survey

@@ -9,7 +9,8 @@ import numpy as np
 from schemas.base import Pose, frozen_array
 from schemas.errors import SettleError
 from schemas.job.physics import Physics
-from schemas.scene.scene import ObjectStart, Settled, SupportedBy, Table
+from schemas.scene.plan import ObjectStart, Table
+from schemas.scene.scene import Settled, SupportedBy
 from schemas.scene.shape import Mesh
 from workers.geometry.elevation import survey
 from workers.geometry.frames import transform

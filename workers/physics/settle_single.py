@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from schemas.base import Pose, frozen_array
 from schemas.errors import SettleError
 from schemas.job.physics import Physics
-from schemas.scene.scene import ObjectStart, Settled, SupportedBy, Table
+from schemas.scene.plan import ObjectStart, Table
+from schemas.scene.scene import Settled, SupportedBy
 from workers.geometry.elevation import heights_at
 from workers.geometry.frames import transform
 from workers.physics.effects import called_for, on_mesh

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from schemas.base import Pose
 from schemas.job.physics import Physics
 from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import ObjectStart, ScenePlan, Settled, Table
+from schemas.scene.plan import ObjectStart, ScenePlan, Table
+from schemas.scene.scene import Settled
 from workers.geometry.frames import moved_between
 from workers.physics.effects import called_for, on_mesh, rooms_m
 from workers.physics.settle_group import release_together, settle_together

@@ -5,7 +5,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from schemas.base import Array, frozen_array
 from schemas.errors import StartError
-from schemas.scene.scene import Table, TableTop
+from schemas.scene.plan import Table, TableTop
 from schemas.scene.shape import Asset, Mesh, Shape
 from workers.geometry.elevation import heights_at
 from workers.geometry.frames import transform, translation

@@ -10,7 +10,8 @@ from schemas.dataset.layout import file_pose_id, image_path, stored_images
 from schemas.dataset.tables import worst_rest
 from schemas.job.job import Job
 from schemas.scene.camera import Camera, Intrinsics, Role
-from schemas.scene.scene import REGION_FIRST_OBJECT, REGION_TABLE, ObjectLabel, View
+from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
+from schemas.scene.view import ObjectLabel, View
 from workers.cameras.pivot_depth import object_distance
 from workers.cameras.placement import place_aligned_camera, place_mirror_camera
 from workers.geometry.camera import image_coordinates

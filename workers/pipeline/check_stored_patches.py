@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from schemas.dataset.layout import PixelKind, file_pose_id, image_path, patch_index, patch_path, stored_images
 from schemas.job.job import Job
-from schemas.scene.scene import REGION_FIRST_OBJECT, View
+from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.view import View
 from workers.labels.derive import crop_box
 
 Row = Mapping[str, Any]

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from schemas.dataset.fingerprint import Fingerprint
-from schemas.job.job import Job, Tier
+from schemas.job.job import Job
+from schemas.job.render import Tier
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import WorkerContext, settings_digest
 from workers.pipeline.make_scene import Stopwatch, make_scene

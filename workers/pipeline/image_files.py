@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.dataset.layout import PixelKind, file_pose_id, image_path, patch_index, patch_path, stored_images
-from schemas.job.job import Job, Patch
-from schemas.scene.scene import REGION_FIRST_OBJECT, ObjectLabel, Pair, View
+from schemas.job.images import Patch
+from schemas.job.job import Job
+from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.view import ObjectLabel, Pair, View
 from workers.labels.derive import crop_box
 from workers.store.images import encode_png
 

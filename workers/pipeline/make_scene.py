@@ -11,18 +11,10 @@ from schemas.base import frozen_array
 from schemas.dataset.layout import input_pose_id
 from schemas.scene.camera import ROLES, Camera, Role
 from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import (
-    REGION_FLOOR,
-    REGION_TABLE,
-    GBuffer,
-    ObjectLabel,
-    Pair,
-    Placed,
-    PosedScene,
-    ScenePlan,
-    Settled,
-    View,
-)
+from schemas.scene.plan import ScenePlan
+from schemas.scene.region import REGION_FLOOR, REGION_TABLE
+from schemas.scene.scene import Placed, PosedScene, Settled
+from schemas.scene.view import GBuffer, ObjectLabel, Pair, View
 from workers.assets.catalogue import choose_object, choose_table, load_asset
 from workers.cameras.pivot_depth import object_distance
 from workers.cameras.placement import place_aligned_camera, place_mirror_camera

@@ -9,8 +9,11 @@ from schemas.dataset.tables import worst_rest
 from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.scene.camera import Camera
-from schemas.scene.scene import REGION_FIRST_OBJECT, ObjectStart, Pair, SceneOutput, Settled, View
+from schemas.scene.plan import ObjectStart
+from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.scene import SceneOutput, Settled
 from schemas.scene.shape import Asset
+from schemas.scene.view import Pair, View
 from workers.assets.catalogue import split_of
 from workers.assets.glb import asset_glb
 from workers.geometry.camera import inclination, yaw

@@ -16,7 +16,8 @@ from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, staging_path
 from schemas.dataset.shard import Blame, ShardOrder, ShardReport, SpanReport
 from schemas.errors import FingerprintError, SceneError
-from schemas.job.job import Job, Tier
+from schemas.job.job import Job
+from schemas.job.render import Tier
 from schemas.scene.scene import SceneOutput
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.context import WorkerContext, open_worker

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from schemas.base import Array, frozen_array
-from schemas.scene.scene import ObjectStart
+from schemas.scene.plan import ObjectStart
 from workers.geometry.frames import transform
 
 APART_M = 0.001

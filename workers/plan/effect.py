@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from schemas.job.job import Job
 from schemas.scene.effects import EffectKind
-from schemas.scene.scene import ScenePlan
+from schemas.scene.plan import ScenePlan
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from schemas.base import Array
-from schemas.job.job import Job, Tier
+from schemas.job.job import Job
+from schemas.job.render import Tier
 from schemas.job.sensor import SensorEffects
 from schemas.scene.camera import Camera
 from schemas.scene.effects import EffectKind, EffectPlan
-from schemas.scene.scene import ScenePlan
+from schemas.scene.plan import ScenePlan
 from schemas.scene.shape import Part
 from workers.cameras.placement import place_aligned_camera, place_mirror_camera
 from workers.geometry.frustum import outside_views

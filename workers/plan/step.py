@@ -6,10 +6,12 @@ import numpy as np
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import StartError
-from schemas.job.job import Cameras, Job
+from schemas.job.cameras import Cameras
+from schemas.job.job import Job
 from schemas.job.start import Start
 from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.scene import REGION_FIRST_OBJECT, ObjectStart, ScenePlan, Table
+from schemas.scene.plan import ObjectStart, ScenePlan, Table
+from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.shape import Asset, Hull, Mesh
 from workers.assets.appearance.draw import draw_look
 from workers.geometry.camera import orbit_pose

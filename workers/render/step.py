@@ -6,10 +6,12 @@ from functools import cache
 
 import numpy as np
 
-from schemas.job.job import Render
+from schemas.job.render import Render
+from schemas.scene.appearance import Appearance
 from schemas.scene.camera import Camera
 from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import Appearance, GBuffer, Placed
+from schemas.scene.scene import Placed
+from schemas.scene.view import GBuffer
 from workers.render.pathtraced.tracer import Tracer, require_mitsuba
 from workers.render.raster.gbuffer import Renderer
 

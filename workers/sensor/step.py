@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from schemas.job.job import Images
+from schemas.job.images import Images
 from schemas.job.sensor import SensorEffects
 from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import View
+from schemas.scene.view import View
 from workers.geometry.stored_depth import quantise_depth, stored_depth_m
 from workers.sensor.depth import sense_depth
 from workers.sensor.rgb import sense_rgb

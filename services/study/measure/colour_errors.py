@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import InputError
-from schemas.job.job import Render
+from schemas.job.render import Render
 from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.scene import REGION_FLOOR, Placed, ScenePlan
+from schemas.scene.plan import ScenePlan
+from schemas.scene.region import REGION_FLOOR
+from schemas.scene.scene import Placed
 from services.study.measure.flip import flip_between
 from services.study.measure.patch_rays import cast_patch
 from services.study.measure.rays import Box

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.job.job import Images
-from schemas.scene.scene import REGION_FIRST_OBJECT, REGION_TABLE, Pair, View
+from schemas.job.images import Images
+from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
+from schemas.scene.view import Pair, View
 from services.study.measure.patch_rays import Patch
 from services.study.measure.pixel_rays import Pixels, Seen
 from services.study.measure.truth import Truth

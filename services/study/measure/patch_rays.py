@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.camera import Camera
-from schemas.scene.scene import REGION_FIRST_OBJECT, Placed
+from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.scene import Placed
 from services.study.measure.rays import Box, cast_at, objects_of, project_box, sees, vertices_in
 from workers.geometry.raycast import NEAR_M
 

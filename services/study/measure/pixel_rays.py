@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.camera import Camera
-from schemas.scene.scene import REGION_FIRST_OBJECT, Placed
+from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.scene import Placed
 from services.study.measure.rays import cast_at, objects_of, project_box, sees
 from workers.geometry.camera import unproject
 from workers.geometry.frames import invert, transform

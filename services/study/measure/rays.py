@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.camera import Camera
-from schemas.scene.scene import REGION_FIRST_OBJECT, Placed
+from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.scene import Placed
 from workers.geometry.camera import project
 from workers.geometry.frames import invert, transform
 from workers.geometry.raycast import NEAR_M, RAYS_AT_ONCE, first_hit

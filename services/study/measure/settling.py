@@ -10,7 +10,8 @@ import numpy as np
 from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.job.physics import Physics
-from schemas.scene.scene import ScenePlan, Settled
+from schemas.scene.plan import ScenePlan
+from schemas.scene.scene import Settled
 from services.study.knobs import apply
 from services.study.model import Setting
 from workers.geometry.frames import moved_between, transform

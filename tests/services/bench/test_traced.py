@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from schemas.errors import MachineError
-from schemas.job.job import Render
+from schemas.job.render import Render
 from schemas.scene.scene import PosedScene
 from services.bench.cycles import cycles_process, hand_over
 from services.bench.ratios import Lap

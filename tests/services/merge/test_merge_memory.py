@@ -22,10 +22,10 @@ SCENES = 320
 
 MERGE = """
 import json, resource, sys, time
-from services import external_sort, merge_tables
+from services.merge import external_sort, tables
 from services.merge.step import merge
 from workers.store.local import LocalStore
-merge_tables.ROWS_PER_GROUP, merge_tables.ROWS_PER_BLOCK, external_sort.LIMIT_BYTES = json.loads(sys.argv[5])
+tables.ROWS_PER_GROUP, tables.ROWS_PER_BLOCK, external_sort.LIMIT_BYTES = json.loads(sys.argv[5])
 warm, root, scenes = LocalStore(sys.argv[1]), LocalStore(sys.argv[2]), int(sys.argv[3])
 merge(warm, 0, int(sys.argv[4]))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

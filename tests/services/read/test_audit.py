@@ -14,7 +14,8 @@ import workers.plan.effects
 from schemas.dataset.commit import Span
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
 from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.scene import Placed, PosedScene, View
+from schemas.scene.scene import Placed, PosedScene
+from schemas.scene.view import View
 from services.bench.stages import open_workbench
 from services.cli.main import main
 from services.job.read import validate_job

@@ -33,12 +33,12 @@ def test_the_depth_camera_stands_off_in_the_rgb_cameras_own_axes():
     assert np.array_equal(aligned.T_world_cam[:3, :3], R)
 
 
-@pytest.mark.parametrize(("front", "expected"), [("percentile", 1.02), ("median", 1.5), ("nearest", 1.0)])
-def test_the_front_distance_is_read_from_the_objects_own_depth(front, expected):
+@pytest.mark.parametrize(("estimator", "expected"), [("percentile", 1.02), ("median", 1.5), ("nearest", 1.0)])
+def test_the_front_distance_is_read_from_the_objects_own_depth(estimator, expected):
     depth = np.concatenate([np.linspace(1.0, 2.0, 101), np.full(500, 0.3), [0.0]])[None, :]
     mask = np.zeros(depth.shape, bool)
     mask[0, :101] = mask[0, -1] = True  # the last pixel has no depth and must not count as nearest
-    mirror = JOB.cameras.mirror.model_copy(update={"front": front})
+    mirror = JOB.cameras.mirror.model_copy(update={"pivot_depth": estimator})
     assert front_distance(depth, mask, mirror) == pytest.approx(expected)
 
 

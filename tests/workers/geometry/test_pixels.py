@@ -62,7 +62,7 @@ def test_what_is_filled_and_what_lies_behind_is_counted():
 
 
 def test_a_loop_is_compiled_also_where_nothing_can_be_kept_on_disk():
-    program = "from workers.geometry import loops; print(loops.compiled(eval('lambda x: x + 1'))(41))"
+    program = "from workers.geometry import jit; print(jit.compiled(eval('lambda x: x + 1'))(41))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "42"
 

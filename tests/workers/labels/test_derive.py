@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from schemas.job.job import Images, Patch, Projection
+from schemas.job.images import Images, Patch, Projection
 from schemas.scene.camera import Camera, Intrinsics, Role
-from schemas.scene.scene import ObjectLabel, View
+from schemas.scene.view import ObjectLabel, View
 from workers.cameras.mirror import mirror_pose
 from workers.geometry.camera import orbit_pose, unproject
 from workers.geometry.frames import translation

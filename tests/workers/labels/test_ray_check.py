@@ -11,7 +11,8 @@ from schemas.base import Range
 from schemas.errors import LabelError
 from schemas.job.job import Job
 from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.scene import Agreement, GBuffer, Placed, PosedScene
+from schemas.scene.scene import Placed, PosedScene
+from schemas.scene.view import Agreement, GBuffer
 from tests.shapes import asset_of, box, shape_of, table
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, translation

@@ -8,7 +8,7 @@ import trimesh
 
 from schemas.job.job import Job
 from schemas.job.physics import Collision, Physics
-from schemas.scene.scene import ObjectStart
+from schemas.scene.plan import ObjectStart
 from tests.shapes import asset_of, box, table
 from workers.geometry.frames import angle_between, pose, rotation_about, transform
 from workers.geometry.hull import convex_hull

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from schemas.job.job import Job
-from schemas.scene.scene import ObjectStart
+from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import Asset, Mesh
 from tests.shapes import asset_of, box
 from workers.geometry.frames import pose, quaternion_of, rotation_about, transform, translation, uniform_rotation

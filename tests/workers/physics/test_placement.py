@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from schemas.scene.scene import ObjectStart, Table
+from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.shape import Asset
 from tests.shapes import asset_of, box, shape_of, table
 from workers.geometry.frames import pose, rotation_about, transform, translation

@@ -9,7 +9,8 @@ import trimesh
 from schemas.errors import SettleError
 from schemas.job.job import Job
 from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import ObjectStart, Settled
+from schemas.scene.plan import ObjectStart
+from schemas.scene.scene import Settled
 from schemas.scene.shape import Asset
 from tests.shapes import asset_of, box, table
 from workers.geometry.frames import pose, rotation_about, translation

@@ -11,7 +11,7 @@ from schemas.errors import SettleError
 from schemas.job.assets import ProceduralSource
 from schemas.job.job import Job
 from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import ObjectStart
+from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import Mesh
 from tests.physics.population import draw
 from tests.shapes import asset_of, box, shape_of, table

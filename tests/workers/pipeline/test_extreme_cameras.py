@@ -12,7 +12,7 @@ from schemas.dataset.commit import CommitTerms, Span
 from schemas.dataset.layout import FINGERPRINT_FILE, IMAGES, commit_path
 from schemas.dataset.shard import ShardOrder
 from schemas.errors import JobError, MachineError
-from schemas.scene.scene import REGION_FIRST_OBJECT
+from schemas.scene.region import REGION_FIRST_OBJECT
 from services.job.read import validate_job
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.frames import invert, transform

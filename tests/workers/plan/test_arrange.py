@@ -10,7 +10,7 @@ import trimesh
 
 from schemas.errors import StartError
 from schemas.job.job import Job
-from schemas.scene.scene import ObjectStart, ScenePlan
+from schemas.scene.plan import ObjectStart, ScenePlan
 from schemas.scene.shape import Asset
 from tests.shapes import asset_of, box, table
 from workers.geometry.frames import transform

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from schemas.base import Array, frozen_array
-from schemas.job.job import Render
+from schemas.job.render import Render
+from schemas.scene.appearance import Appearance, Light
 from schemas.scene.camera import Camera
 from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import Appearance, Light, Placed
+from schemas.scene.scene import Placed
 from schemas.scene.shape import Material, Part, Shape
 from tests.workers.render.random_scenes import EYE, floor
 from workers.geometry.frames import invert

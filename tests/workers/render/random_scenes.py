@@ -9,8 +9,9 @@ import trimesh
 from schemas.base import Array, Pose, frozen_array
 from schemas.job.assets import Assets
 from schemas.job.job import CATEGORIES
+from schemas.scene.appearance import Appearance, Light
 from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.scene import Appearance, Light, Placed
+from schemas.scene.scene import Placed
 from schemas.scene.shape import Material, Part, Shape
 from workers.assets.catalogue import Catalogue, choose_object, choose_table, load_asset, open_catalogue
 from workers.cameras.mirror import mirror_pose

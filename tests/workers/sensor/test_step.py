@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.job.job import Images
+from schemas.job.images import Images
 from schemas.job.sensor import SensorEffects
 from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import View
+from schemas.scene.view import View
 from services.job.read import validate_job
 from services.read.query import query
 from services.read.verify import verify

@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from schemas.base import Array, frozen_array
-from schemas.job.job import Tier
-from schemas.scene.scene import Appearance, Light
+from schemas.job.render import Tier
+from schemas.scene.appearance import Appearance, Light
 from schemas.scene.shape import Material, Part, Shape
 from workers.assets.appearance.floors import draw_covering
 

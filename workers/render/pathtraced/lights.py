@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from schemas.base import Array
-from schemas.scene.scene import Appearance, Light
+from schemas.scene.appearance import Appearance, Light
 from workers.render.raster.baking import LAMP_RAD
 
 LAMPS = 32

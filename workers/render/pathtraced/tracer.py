@@ -30,10 +30,11 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.errors import InputError
-from schemas.job.job import Render
+from schemas.job.render import Render
+from schemas.scene.appearance import Appearance
 from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import Appearance, Placed
+from schemas.scene.scene import Placed
 from workers.geometry.srgb import encode_codes
 from workers.render.pathtraced.lights import lights_of
 from workers.render.pathtraced.materials import make_mesh, planned_part

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
-from schemas.scene.scene import REGION_FIRST_OBJECT, REGION_FLOOR, Placed
+from schemas.scene.region import REGION_FIRST_OBJECT, REGION_FLOOR
+from schemas.scene.scene import Placed
 from workers.geometry.frames import transform
 from workers.render.raster.heightfield import column_extents
 from workers.render.raster.occlusion import sky_visibility

@@ -4,9 +4,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from schemas.base import Pose
+from schemas.scene.appearance import Appearance
 from schemas.scene.camera import Intrinsics
 from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import REGION_FLOOR, REGION_TABLE, Appearance, Placed
+from schemas.scene.region import REGION_FLOOR, REGION_TABLE
+from schemas.scene.scene import Placed
 from schemas.scene.shape import Shape
 from workers.render.raster.buffers import Uploaded, UploadedShape
 from workers.render.raster.programs import light_slots

@@ -6,7 +6,7 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.scene.scene import Appearance
+from schemas.scene.appearance import Appearance
 from workers.geometry.srgb import encode_srgb
 
 

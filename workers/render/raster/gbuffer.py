@@ -30,10 +30,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Pose
-from schemas.job.job import Render
+from schemas.job.render import Render
+from schemas.scene.appearance import Appearance
 from schemas.scene.camera import Camera
 from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import Appearance, GBuffer, Placed
+from schemas.scene.scene import Placed
+from schemas.scene.view import GBuffer
 from workers.geometry.frames import invert
 from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_edges, smooth_edges
 from workers.render.raster.buffers import INDEX_BYTES, ShapeStore, UploadedShape

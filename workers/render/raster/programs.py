@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Pose
+from schemas.scene.appearance import Appearance
 from schemas.scene.camera import Intrinsics
-from schemas.scene.scene import Appearance
 from workers.render.raster.shaders import MAX_LIGHTS
 
 NEAR_M = 0.05

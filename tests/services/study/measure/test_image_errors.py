@@ -7,9 +7,11 @@ import pytest
 import trimesh
 
 from schemas.base import Range, frozen_array
-from schemas.job.job import Images
+from schemas.job.images import Images
+from schemas.scene.appearance import Appearance
 from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.scene import Agreement, Appearance, Pair, Placed, PosedScene, View
+from schemas.scene.scene import Placed, PosedScene
+from schemas.scene.view import Agreement, Pair, View
 from services.job.read import validate_job
 from services.study.measure.image_errors import measure_images
 from services.study.measure.truth import Truth, truth_of

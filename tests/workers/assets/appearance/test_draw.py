@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from schemas.job.job import Job, Render
+from schemas.job.job import Job
+from schemas.job.render import Render
 from tests.shapes import asset_of, box, table
 from workers.assets.appearance.draw import draw_look
 from workers.assets.appearance.floors import COVERINGS, PERIOD_M, TEXTURE_PX, draw_covering, pattern_of

@@ -5,7 +5,7 @@ import importlib.util
 import pytest
 
 from schemas.base import frozen_array
-from schemas.scene.scene import Light
+from schemas.scene.appearance import Light
 from schemas.scene.shape import Material, Part, Shape
 
 MITSUBA = importlib.util.find_spec("mitsuba") is not None

@@ -11,7 +11,9 @@ import pytest
 import trimesh
 
 from schemas.errors import InputError
-from schemas.scene.scene import REGION_FIRST_OBJECT, Appearance, Placed
+from schemas.scene.appearance import Appearance
+from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.scene import Placed
 from tests.workers.render.looks import BLACK, paths, without
 from tests.workers.render.pathtraced.scenes import DOWN, matte, traced, with_material
 from tests.workers.render.random_scenes import (

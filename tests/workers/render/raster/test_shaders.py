@@ -5,7 +5,8 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.scene.scene import Appearance, Light, Placed
+from schemas.scene.appearance import Appearance, Light
+from schemas.scene.scene import Placed
 from schemas.scene.shape import Material, Part, Shape
 from tests.workers.render.random_scenes import (
     EYE,

@@ -1,0 +1,43 @@
+"""The `check`, `output` and `run` branches of a job: what is checked, how files are laid out, how the work is driven."""
+
+from typing import Literal
+
+from schemas.base import Frozen, Positive, PositiveInt, Share
+
+
+class Check(Frozen):
+    """What is checked before a scene is committed."""
+
+    raycast_share: Share = 0.01
+    """Share of scenes, chosen by scene id, whose depth and masks are compared with a ray caster, and whose objects are
+    released again to see that they stay where they are."""
+    mirror_agreement_mm: Positive = 1.0
+    """Largest median difference between input depth carried into the mirror view and the mirror depth."""
+
+
+class Output(Frozen):
+    """How files are laid out."""
+
+    layout: Literal["files", "tar"] = "files"
+    """`tar`: one tar for each range and category, required on object stores."""
+
+
+class Run(Frozen):
+    """How the work is driven. None of these keys changes a byte of the dataset."""
+
+    workers: PositiveInt | None = None
+    """None: the cores that this container may use, or the cluster's."""
+    shard_size: PositiveInt | None = None
+    """Scenes in a Ray task; rounded up to whole ranges. None: 64, and fewer where that would leave workers idle."""
+    range_size: PositiveInt = 16
+    """Scenes in a commit; recorded at the first run."""
+    max_failure_share: Share = 0.01
+    """Above this share of failed scenes the run exits 1, and stops early once that is certain."""
+    max_attempts: PositiveInt = 3
+    """Tries of a range whose worker dies, before the scene it died in is recorded as an environmental failure."""
+    scene_timeout_s: Positive = 120.0
+    """A worker that takes longer over one scene is killed."""
+    device: Literal["any", "gpu"] = "any"
+    """What may draw: `gpu` refuses workers on which OpenGL runs in software, on the CPU."""
+    fingerprint: Literal["strict", "record"] = "strict"
+    """`strict` refuses workers whose stack makes other bytes; `record` allows them and stores which made what."""

@@ -1,0 +1,99 @@
+"""What cameras see of a scene: raw buffers, stored views with their labels, and pairs of views."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Pose
+from schemas.scene.camera import Camera, Role
+
+
+@dataclass(frozen=True, eq=False)
+class GBuffer:
+    """What one camera sees at the centre of every pixel.
+
+    rgb [H, W, 3] uint8 sRGB, None where no colour was drawn; depth_m [H, W] float32, z along the optical axis, 0 where
+    nothing was hit (not yet clipped to the stored range); region [H, W] uint8.
+    """
+
+    rgb: NDArray[np.uint8] | None
+    depth_m: NDArray[np.float32]
+    region: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectLabel:
+    """What one view says of one region.
+
+    `T_cam_obj` [4, 4], the pixel (u, v) of the object's origin or (-1, -1), the bounding box and count of its pixels,
+    and the share of its own unoccluded pixels (also outside the frame) that is seen.
+    """
+
+    region_id: int
+    category: str
+    instance_id: str
+    T_cam_obj: Pose
+    u: int
+    v: int
+    bbox_xywh: tuple[int, int, int, int]
+    pixels: int
+    visible_fraction: float
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One camera's images as they are stored, and its labels (none for a projected view).
+
+    rgb [H, W, 3] uint8, or None where the job asks for no colour; depth [H, W] uint16 in units of
+    `Images.depth_units_per_m`; region [H, W] uint8, or None where the images were projected and not rendered. `pose_id` is
+    the view's own; `parent_id` the input pose's.
+    """
+
+    role: Role
+    pose_id: int
+    parent_id: int
+    camera: Camera
+    rgb: NDArray[np.uint8] | None
+    depth: NDArray[np.uint16]
+    region: NDArray[np.uint8] | None
+    labels: tuple[ObjectLabel, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """Input depth carried into the mirror view against mirror depth, where both cameras see the surface.
+
+    Of the object: median_mm, share within the bound, points compared; median and share are None below 50 points.
+    `scene_median_mm` is over every region.
+    """
+
+    median_mm: float | None
+    share: float | None
+    points: int
+    scene_median_mm: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """An input pose and its mirror pose with all their views; None is what the job has switched off.
+
+    filled_share: of the mirror image's pixels, those that the projection fills; hidden_share: of the filled ones,
+    those that show a surface behind what the mirror camera sees. `agreement` is of the stored images;
+    `exact_agreement` of what they were before the sensors' effects, and the same where there are none.
+    """
+
+    d_z_m: float
+    input: View
+    aligned: View | None
+    mirror: View | None = None
+    projected: View | None = None
+    agreement: Agreement | None = None
+    exact_agreement: Agreement | None = None
+    filled_share: float | None = None
+    hidden_share: float | None = None
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """Those that there are, in the order of `ROLES`."""
+        return tuple(view for view in (self.input, self.aligned, self.mirror, self.projected) if view is not None)
