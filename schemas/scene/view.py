@@ -13,11 +13,11 @@ from schemas.scene.camera import Camera, Role
 class GBuffer:
     """One camera's colour, depth and region at the centre of every pixel.
 
-    rgb [H, W, 3] uint8 sRGB; depth_m [H, W] float32, z along the optical axis, 0 where nothing was hit (not yet
-    clipped to the stored range); region [H, W] uint8.
+    rgb [H, W, 3] uint8 sRGB, None where no colour was drawn; depth_m [H, W] float32, z along the optical axis, 0 where
+    nothing was hit (not yet clipped to the stored range); region [H, W] uint8.
     """
 
-    rgb: NDArray[np.uint8]
+    rgb: NDArray[np.uint8] | None
     depth_m: NDArray[np.float32]
     region: NDArray[np.uint8]
 

@@ -16,6 +16,7 @@ from schemas.base import Array
 from schemas.errors import MachineError
 from schemas.job.render import Render
 from schemas.scene.camera import Camera
+from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import PosedScene
 from schemas.scene.shape import Part
 from services.bench.ratios import Lap
@@ -23,8 +24,8 @@ from workers.geometry.frames import transform
 from workers.geometry.srgb import decode_srgb
 from workers.render.pathtraced.lights import GLOW, SKY_PX, sky_directions, sky_picture
 from workers.render.pathtraced.materials import tint_of
+from workers.render.pathtraced.tracer import Tracer
 from workers.render.raster.baking import LAMP_RAD
-from workers.render.step import shared_tracer
 
 SCRIPT = Path(__file__).with_name("cycles_script.py")
 
@@ -99,13 +100,12 @@ def _facing(towards: Array) -> Array:
     return T
 
 
-def trace_lap(posed: PosedScene, cameras: Sequence[Camera], render: Render) -> Lap:
+def trace_lap(posed: PosedScene, cameras: Sequence[Camera], render: Render, effects: EffectPlan) -> Lap:
     """Our side: the scene built anew, and every view traced."""
-    tracer = shared_tracer()
-    tracer.forget()
+    tracer = Tracer()
     wall, cpu = time.perf_counter(), time.process_time()
     for camera in cameras:
-        tracer.trace(posed.things, posed.appearance, camera, render, 0)
+        tracer.trace(posed.things, posed.appearance, camera, render, effects, 0)
     return Lap(len(cameras), time.perf_counter() - wall, time.process_time() - cpu, {})
 
 

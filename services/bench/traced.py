@@ -18,6 +18,8 @@ from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene, make_scene
 from workers.pipeline.stopwatch import Stopwatch
+from workers.plan.effect import Facts
+from workers.plan.effects import plan_effects
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.step import require_tier
 
@@ -80,7 +82,8 @@ def measure_scene(scene: Scene, folder: Path, cycles: CyclesProcess | None) -> d
     handed = None if cycles is None else hand_over(scene.posed, cameras, Render(), folder)
     for samples in SAMPLES:
         render = Render(tier="pathtraced", path_samples=samples)
-        laps[f"ours {samples}"] = trace_lap(scene.posed, cameras, render)
+        effects = plan_effects(Facts(Job(name="bench", render=render), scene.plan, False))
+        laps[f"ours {samples}"] = trace_lap(scene.posed, cameras, render, effects)
         if cycles is not None and handed is not None:
             laps[f"cycles {samples}"] = cycles.lap(handed, len(cameras), samples)
     return laps

@@ -10,17 +10,8 @@ from workers.plan.effects import EFFECTS, plan_effects
 
 TRACED_EFFECTS = ("global_illumination", "glass")
 
-AWAITED = {
-    "restitution", "shadows", "ambient_occlusion", "antialiasing", "samples", "global_illumination", "glass",
-    "sensor_depth_noise", "sensor_distortion", "sensor_rgb_noise", "sensor_exposure",
-}  # fmt: skip
-"""Effects whose step in workers/physics, workers/render or workers/sensor still reads the job's switch. A name leaves the
-list when its step asks the plan."""
 
-XFAIL = pytest.mark.xfail(reason="the step reads the job's switch")
-
-
-@pytest.mark.parametrize("name", [pytest.param(e.name, marks=[XFAIL] if e.name in AWAITED else []) for e in EFFECTS])
+@pytest.mark.parametrize("name", [effect.name for effect in EFFECTS])
 def test_an_effect_that_is_taken_out_of_the_plan_is_taken_out_of_the_run(name):
     if name in TRACED_EFFECTS and not importlib.util.find_spec("mitsuba"):
         pytest.skip("mitsuba is not installed: `./verso extra pathtraced`")

@@ -1,4 +1,4 @@
-"""d_z: how far in front of the input camera the point lies that the mirror camera turns about."""
+"""d_z: the distance from the input camera to the pivot of the mirror camera, along the optical axis."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +12,15 @@ from workers.geometry.stored_depth import stored_depth_m
 
 
 def object_distance(depth: NDArray[np.uint16], region: NDArray[np.uint8], images: Images, mirror: Mirror) -> float:
-    """`front_distance` of the object in a stored view; of its depth only the object's pixels are turned to metres."""
+    """`front_distance` of the object in a stored view; converts only the object's pixels to metres."""
     return front_distance(stored_depth_m(depth[region >= REGION_FIRST_OBJECT], images), np.True_, mirror)
 
 
 def front_distance(depth_m: Array, object_pixels: NDArray[np.bool_] | np.bool_, mirror: Mirror) -> float:
     """d_z: distance to the object's front surface along the optical axis, metres, from its stored depth.
 
-    A low percentile by default, because the single nearest pixel is noisy. Raises ViewError where the object has no
-    pixel with depth.
+    A low percentile by default, because the nearest pixel is noisy. Raises ViewError where no pixel of the object has
+    depth.
     """
     z = depth_m[object_pixels & (depth_m > 0.0)]
     if z.size == 0:

@@ -1,4 +1,4 @@
-"""Where the cameras of a pair stand, and what depth becomes when it is stored."""
+"""Poses of the cameras that follow from an input camera: the depth camera and the mirror camera."""
 
 from schemas.base import frozen_array
 from schemas.job.cameras import DepthCamera, Mirror
@@ -8,7 +8,7 @@ from workers.geometry.frames import UP, translation
 
 
 def place_aligned_camera(camera: Camera, depth_camera: DepthCamera) -> Camera:
-    """The depth camera: T_world_depth = T_world_rgb Trans(t), t in the RGB camera's optical axes, same rotation [D]."""
+    """The depth camera: T_world_depth = T_world_rgb Trans(t), t along the RGB camera's optical axes, same rotation [D]."""
     return Camera(camera.intrinsics, frozen_array(camera.T_world_cam @ translation(*depth_camera.offset_m)))
 
 

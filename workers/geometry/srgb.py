@@ -11,10 +11,6 @@ def decode_srgb(encoded: Array) -> Array:
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
-SRGB_STEPS = decode_srgb(np.arange(256) / 255.0)
-"""[256] float64: linear light of every 8-bit sRGB value."""
-
-
 def encode_srgb(linear: Array) -> Array:
     """sRGB values in [0, 1] of linear light, which is clipped to [0, 1] (IEC 61966-2-1)."""
     linear = np.clip(linear, 0.0, 1.0)
@@ -27,8 +23,8 @@ def _to_linear(code: float) -> float:
     return value / 12.92 if value <= 0.04045 else float(((value + 0.055) / 1.055) ** 2.4)
 
 
-LINEAR = np.array([_to_linear(code) for code in range(256)])
-"""[256] linear light of each code."""
+SRGB_STEPS = np.array([_to_linear(code) for code in range(256)])
+"""[256] float64: linear light, 0 to 1, of each code."""
 
 LIMITS = np.array([_to_linear(code + 0.5) for code in range(255)])
 """[255] linear light halfway, in sRGB, between a code and the next."""
@@ -36,7 +32,7 @@ LIMITS = np.array([_to_linear(code + 0.5) for code in range(255)])
 
 def decode_codes(rgb: NDArray[np.uint8]) -> Array:
     """Linear light, 0 to 1, float64."""
-    light: Array = LINEAR[rgb]
+    light: Array = SRGB_STEPS[rgb]
     return light
 
 

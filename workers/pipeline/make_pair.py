@@ -18,7 +18,6 @@ from workers.labels.regions import label_regions
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.stopwatch import Stopwatch
 from workers.plan.randomness import SceneChance, Stream
-from workers.render.overrides import Passes
 from workers.render.step import draw_view
 from workers.sensor.step import SensorChance, sense_view
 
@@ -33,11 +32,6 @@ class SettledScene:
     posed: PosedScene
     effects: EffectPlan
     stopwatch: Stopwatch
-
-    @property
-    def passes(self) -> Passes:
-        """What the renderer leaves out and what it is forced to draw."""
-        return Passes(frozenset(self.effects.skipped), self.effects.forced)
 
 
 def make_pair(scene: SettledScene, camera: Camera, number: int) -> Pair:
@@ -81,15 +75,14 @@ def render_view(scene: SettledScene, role: Role, number: int, camera: Camera) ->
     pose_id = file_pose_id(role, parent_id)
     with stopwatch.stage("render"):
         rng = scene.chance.stream(Stream.PATHS, pose_id, parent_id, ROLES.index(role))
-        buffer = draw_view(renderer, scene.posed.things, scene.posed.appearance, camera, job.render, rng, scene.passes)
+        buffer = draw_view(renderer, scene.posed.things, scene.posed.appearance, camera, job.render, rng, scene.effects)
     if scene.effects.runs("raycast_check"):
         with stopwatch.stage("raycast", "raycast_check"):
             check_against_rays(scene.posed, camera, buffer, job.images.depth_range_m)
     with stopwatch.stage("labels"):
         labels = label_regions(scene.plan, scene.posed, camera, buffer.region, renderer.count_pixels)
         depth = quantise_depth(buffer.depth_m, job.images)
-    rgb = buffer.rgb if scene.effects.runs("rgb") else None
-    return View(role, pose_id, parent_id, camera, rgb, depth, buffer.region, labels)
+    return View(role, pose_id, parent_id, camera, buffer.rgb, depth, buffer.region, labels)
 
 
 def sense(scene: SettledScene, exact: View, number: int) -> View:
@@ -100,4 +93,4 @@ def sense(scene: SettledScene, exact: View, number: int) -> View:
     streams = (Stream.SENSOR_DEPTH, Stream.SENSOR_RGB, Stream.SENSOR_EXPOSURE)
     chance = SensorChance(*(scene.chance.stream(name, number, ROLES.index(exact.role)) for name in streams))
     with scene.stopwatch.stage("sensor", ran[0] if len(ran) == 1 else None):
-        return sense_view(job.sensor, job.images, exact, chance)
+        return sense_view(job.sensor, job.images, exact, chance, scene.effects)

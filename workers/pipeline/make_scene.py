@@ -56,7 +56,7 @@ def make_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> S
     posed = pose_scene(plan, rest.settled)
     scene = SettledScene(context, chance, plan, posed, effects, stopwatch)
     with stopwatch.stage("render", "light_maps" if effects.runs("light_maps") else None):
-        context.renderer.prepare_light(posed.things, posed.appearance, job.render, scene.passes)
+        context.renderer.prepare_light(posed.things, posed.appearance, job.render, effects)
     pairs = tuple(make_pair(scene, camera, number) for number, camera in enumerate(plan.input_cameras))
     with stopwatch.stage("check"):
         for pair in pairs:

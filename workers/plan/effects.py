@@ -89,6 +89,9 @@ def _tier(*tiers: Tier) -> Reason:
     return _first_of(_stored("rgb"), skipped_because)
 
 
+_NOT_TRACED = _where(lambda facts: facts.job.render.tier != "pathtraced", "part of global_illumination")
+"""Traced paths are shadowed, and spread over a pixel, in any case: nothing of that can be left out."""
+
 _PROJECTION = _stored("projected")
 _SPLAT = _where(lambda facts: facts.job.images.projection.splat > 1, "images.projection.splat is 1")
 _HIDDEN_POINTS = _where(
@@ -168,9 +171,13 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("splat", "asked", _first_of(_PROJECTION, _SPLAT), "several pixels a point", "projection"),
     Effect("hidden_point_removal", "asked", _first_of(_PROJECTION, _HIDDEN_POINTS), "a normal a point", "projection"),
     Effect("rgb", "asked", _stored("rgb"), "colour in every view", "render"),
-    Effect("shadows", "asked", _tier("raster", "pathtraced"), "one shadow map a scene", "render"),
+    Effect(
+        "shadows", "asked", _first_of(_stored("rgb"), _NOT_TRACED, _tier("raster")), "one shadow map a scene", "render"
+    ),
     Effect("ambient_occlusion", "asked", _tier("raster"), "two level maps a scene", "render"),
-    Effect("antialiasing", "asked", _tier("raster", "pathtraced"), "1 to 2 ms a view", "render"),
+    Effect(
+        "antialiasing", "asked", _first_of(_stored("rgb"), _NOT_TRACED, _tier("raster")), "1 to 2 ms a view", "render"
+    ),
     Effect("samples", "asked", _first_of(_tier("raster"), _SAMPLES), "three more draws of edges", "render"),
     Effect("global_illumination", "asked", _tier("pathtraced"), "seconds a view", "render"),
     Effect("glass", "asked", _tier("pathtraced"), "longer paths", "render"),

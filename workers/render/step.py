@@ -1,6 +1,7 @@
-"""Where a view's colour comes from: the label pass itself, or paths traced beside it. Labels are the same in all tiers."""
+"""Rendering of one view: labels by the label pass in all tiers; colour by the same pass or by the path tracer."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -8,18 +9,18 @@ import numpy as np
 from schemas.job.render import Render
 from schemas.scene.appearance import Appearance
 from schemas.scene.camera import Camera
+from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import Placed
 from schemas.scene.view import GBuffer
-from workers.render.overrides import AS_CALLED_FOR, Passes
 from workers.render.pathtraced.tracer import Tracer, require_mitsuba
-from workers.render.raster.gbuffer import FLAT, Renderer
+from workers.render.raster.gbuffer import Renderer
 
 SEEDS = 2**32
-"""As many as Mitsuba's samplers tell apart."""
+"""Number of seeds that Mitsuba's samplers tell apart."""
 
 
 def require_tier(render: Render) -> None:
-    """Raises InputError, with the remedy, where what the tier needs is not installed."""
+    """Raises InputError, with the remedy, where the tier's packages are not installed."""
     if render.tier == "pathtraced" and render.rgb:
         require_mitsuba()
 
@@ -31,20 +32,15 @@ def draw_view(
     camera: Camera,
     render: Render,
     rng: np.random.Generator,
-    passes: Passes = AS_CALLED_FOR,
+    effects: EffectPlan,
 ) -> GBuffer:
-    """What one camera sees, in the tier that the job asks for; `rng` seeds the paths, `passes` are of the label pass.
-
-    Without RGB, colour means nothing.
-    """
-    if not render.rgb:
-        return renderer.draw(things, appearance, camera, FLAT, passes)
-    if render.tier != "pathtraced":
-        return renderer.draw(things, appearance, camera, render, passes)
-    labels = renderer.draw(things, appearance, camera, FLAT, passes)
-    rgb = shared_tracer().trace(things, appearance, camera, render, int(rng.integers(SEEDS)))
+    """What one camera sees, drawn with the effects of the plan; `rng` seeds the paths. RGB is None without `rgb`."""
+    drawn = renderer.draw(things, appearance, camera, render, effects)
+    if render.tier != "pathtraced" or not effects.runs("rgb"):
+        return drawn
+    rgb = shared_tracer().trace(things, appearance, camera, render, effects, int(rng.integers(SEEDS)))
     rgb.setflags(write=False)
-    return GBuffer(rgb, labels.depth_m, labels.region)
+    return replace(drawn, rgb=rgb)
 
 
 @cache

@@ -1,8 +1,7 @@
-"""What a time-of-flight depth camera makes of exact depth. Pure: the same generator state gives the same image.
+"""Noise of a time-of-flight depth camera. Pure: the same generator state gives the same image.
 
-The steps, in the order in which they act: a pixel at an edge may look past its place, or at both surfaces at once; the
-measurement has a systematic and a random error; some pixels give nothing. `schemas/job/sensor.py` says where the numbers of
-the preset come from.
+Its steps in order: a pixel at an edge may measure a neighbour, or both surfaces at once; the measurement has a systematic and
+a random error; some pixels have no depth. `schemas/job/sensor.py` names the sources of the preset's numbers.
 """
 
 import math
@@ -20,10 +19,9 @@ from workers.geometry.normals import facing_cosine
 def sense_depth(
     depth_m: Array, region: NDArray[np.uint8], camera: Camera, noise: DepthNoise, rng: np.random.Generator
 ) -> Array:
-    """[H, W] float64 metres: exact depth [H, W] (0 for none) as the camera would measure it; what is 0 stays 0.
+    """[H, W] float64 metres: measured depth of exact depth [H, W]; 0, which stands for none, stays 0.
 
-    Every random number is drawn for every pixel, whatever is switched on, so that one setting never moves another's
-    noise.
+    Every random number is drawn for every pixel, whatever is on, so that no setting changes the numbers of another.
     """
     shape = depth_m.shape
     shift = rng.standard_normal((2, *shape))
@@ -32,7 +30,7 @@ def sense_depth(
     edge = near_edge(depth_m, noise)
     # Differences across an edge within one region are no surface's slope.
     cosine = np.where(edge, 1.0, incidence_cosine(depth_m, region, camera))
-    z = np.where(edge, look_aside(depth_m, shift * noise.lateral_px, noise.edge_px), depth_m)
+    z = np.where(edge, shift_lookup(depth_m, shift * noise.lateral_px, noise.edge_px), depth_m)
     near, far = surfaces_around(depth_m, noise.edge_px)
     z = np.where(edge & (flies < noise.flying_share), weight * near + (1.0 - weight) * far, z)
     z = z * (1.0 + noise.offset_share) + noise.offset_m + axial_sigma(z, cosine, noise) * error
@@ -45,16 +43,16 @@ def sense_depth(
 def axial_sigma(z: Array, cosine: Array, noise: DepthNoise) -> Array:
     """Standard deviation along the optical axis, metres: (axial_m + axial_per_m z^2) / cos^incidence_power.
 
-    No steeper than `grazing_deg`, beyond which nothing is measured.
+    The angle of incidence is limited to `grazing_deg`, beyond which nothing is measured.
     """
     steepest = max(math.cos(math.radians(noise.grazing_deg)), 1e-3)
     return (noise.axial_m + noise.axial_per_m * z * z) / np.maximum(cosine, steepest) ** noise.incidence_power
 
 
 def incidence_cosine(depth_m: Array, region: NDArray[np.uint8], camera: Camera) -> Array:
-    """[H, W] cosine between the surface's normal and the direction to the camera; 1 where it is unknown.
+    """[H, W] cosine between the surface's normal and the direction to the camera.
 
-    It is unknown along the rims of regions and of the image, a pixel wide.
+    It is unknown, and set to 1, along the borders of regions and of the image, a pixel wide.
     """
     everywhere = np.arange(depth_m.size)
     cosine = facing_cosine(depth_m, region, everywhere, camera, camera.position).reshape(depth_m.shape)
@@ -64,42 +62,33 @@ def incidence_cosine(depth_m: Array, region: NDArray[np.uint8], camera: Camera) 
 def near_edge(depth_m: Array, noise: DepthNoise) -> NDArray[np.bool_]:
     """[H, W] bool: pixels at most `edge_px` from the far side of a depth edge.
 
-    As on every plane 1/z is linear in the image, an edge is where its second difference, times z squared, exceeds
-    `edge_step_m`: a floor seen at a flat angle has none. Pixels without depth make no edge.
+    On every plane 1/z is linear in the image. At an edge its second difference, times z squared, exceeds `edge_step_m`: a
+    floor seen at a flat angle has none. Pixels without depth make no edge.
     """
     edge = np.zeros(depth_m.shape, bool)
     known = depth_m > 0.0
     inverse = 1.0 / np.where(known, depth_m, 1.0)
-    for axis in (0, 1):
-        here, before, after = _triples(axis)
-        bend = inverse[before] + inverse[after] - 2.0 * inverse[here]
-        all_known = known[before] & known[after] & known[here]
-        edge[here] |= all_known & (np.abs(bend) * depth_m[here] ** 2 > noise.edge_step_m)
+    along_rows, down_columns = (edge.T, known.T, inverse.T, depth_m.T), (edge, known, inverse, depth_m)
+    for marked, has, inv, z in (down_columns, along_rows):
+        bend = inv[:-2] + inv[2:] - 2.0 * inv[1:-1]
+        marked[1:-1] |= has[:-2] & has[2:] & has[1:-1] & (np.abs(bend) * z[1:-1] ** 2 > noise.edge_step_m)
     side = 2 * (noise.edge_px - 1) + 1
     grown: NDArray = cv2.dilate(edge.astype(np.uint8), np.ones((side, side), np.uint8))
     return grown.astype(bool) & known
 
 
-def _triples(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...], tuple[slice, ...]]:
-    inner, every = slice(1, -1), slice(None)
-    if axis == 0:
-        return (inner, every), (slice(None, -2), every), (slice(2, None), every)
-    return (every, inner), (every, slice(None, -2)), (every, slice(2, None))
-
-
 def surfaces_around(depth_m: Array, reach_px: int) -> tuple[Array, Array]:
-    """Nearest and farthest depth [H, W] within a square of `reach_px` pixels; pixels without depth do not count."""
+    """Nearest and farthest depth [H, W] within `reach_px` pixels along rows and columns, of pixels with depth."""
     kernel = np.ones((2 * reach_px + 1,) * 2, np.uint8)
     near = cv2.erode(np.where(depth_m > 0.0, depth_m, np.inf), kernel, borderType=cv2.BORDER_REPLICATE)
     far = cv2.dilate(depth_m, kernel, borderType=cv2.BORDER_REPLICATE)
     return np.where(np.isinf(near), 0.0, near), np.asarray(far)
 
 
-def look_aside(depth_m: Array, shift_px: Array, reach_px: int) -> Array:
-    """[H, W]: the depth at the pixel that lies `shift_px` [2, H, W] (down, right) away, to the nearest, within reach.
+def shift_lookup(depth_m: Array, shift_px: Array, reach_px: int) -> Array:
+    """[H, W]: depth of the pixel `shift_px` [2, H, W] (down, right) away, rounded, within reach, if that has depth.
 
-    A pixel that would look at one without depth keeps its own. Within one surface a shift adds nothing that the axial
-    error, which is measured on surfaces, does not hold already: it acts at edges alone.
+    It acts at edges alone: within a surface the axial error, measured on surfaces, includes the effect of a shift.
     """
     height, width = depth_m.shape
     down, right = np.clip(np.rint(shift_px), -reach_px, reach_px).astype(np.int64)

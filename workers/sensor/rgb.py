@@ -1,7 +1,7 @@
-"""What an RGB camera makes of exact colours, in linear light: lens, exposure, shot and read noise. Pure.
+"""Lens distortion, exposure, shot noise and read noise of an RGB camera, in linear light. Pure.
 
-8-bit sRGB is decoded by table and encoded by comparing with the 255 limits between codes, so that no power function
-of some machine decides a rounding.
+8-bit sRGB is decoded by table and encoded by comparison with the 255 limits between codes, so that no machine's power
+function decides a rounding.
 """
 
 from functools import lru_cache
@@ -23,12 +23,12 @@ def sense_rgb(
     exposure_rng: np.random.Generator,
     noise_rng: np.random.Generator,
 ) -> NDArray[np.uint8]:
-    """[H, W, 3] uint8: what the camera stores of an exact picture. With nothing switched on it is the same array."""
+    """[H, W, 3] uint8: the stored image of an exact one; the same array where no effect on RGB is on."""
     if not effects.changes_rgb:
         return rgb
     light = decode_codes(rgb)
     if effects.distortion is not None:
-        light = bend(light, effects.distortion, intrinsics)
+        light = distort(light, effects.distortion, intrinsics)
     if effects.exposure is not None:
         light = expose(light, effects.exposure, exposure_rng)
     if effects.rgb_noise is not None:
@@ -36,8 +36,8 @@ def sense_rgb(
     return encode_codes(light)
 
 
-def bend(light: Array, lens: Distortion, k: Intrinsics) -> Array:
-    """[H, W, 3] linear light through the lens: each stored pixel looks up, bilinearly, what it sees; black outside."""
+def distort(light: Array, lens: Distortion, k: Intrinsics) -> Array:
+    """[H, W, 3] linear light through the lens, interpolated bilinearly; black where the pinhole image ends."""
     u, v = lens_map(lens, k)
     inside = (u >= 0.0) & (u < k.width) & (v >= 0.0) & (v < k.height)
     x = np.clip(np.where(inside, u, 0.5) - 0.5, 0.0, k.width - 1.0)
@@ -52,9 +52,9 @@ def bend(light: Array, lens: Distortion, k: Intrinsics) -> Array:
 
 @lru_cache(maxsize=4)
 def lens_map(lens: Distortion, k: Intrinsics) -> tuple[Array, Array]:
-    """(u, v), each [H, W], read-only: what the pinhole camera would call the place that each stored pixel's centre sees.
+    """(u, v), each [H, W], read-only: pinhole pixel coordinates of each stored pixel's centre.
 
-    A function of its arguments alone and the same for every view of a job: kept, as it takes longer than a rendering.
+    Cached, because it is the same for every view of a job and takes longer than a rendering.
     """
     rows, columns = np.mgrid[0 : k.height, 0 : k.width]
     u, v = undistort(columns + 0.5, rows + 0.5, lens, k)
@@ -62,15 +62,15 @@ def lens_map(lens: Distortion, k: Intrinsics) -> tuple[Array, Array]:
 
 
 def expose(light: Array, exposure: Exposure, rng: np.random.Generator) -> Array:
-    """Linear light times 2 to the power of the drawn stops, clipped at white: one gain for the whole picture."""
+    """Linear light times 2 to the power of the drawn stops, clipped at white: one gain for the whole image."""
     stops = rng.uniform(exposure.stops.low, exposure.stops.high)
     return np.minimum(light * 2.0**stops, 1.0)
 
 
 def add_noise(light: Array, noise: RgbNoise, rng: np.random.Generator) -> Array:
-    """Linear light with shot and read noise, as normal deviates: variance light / full_well + (read / full_well)^2.
+    """Linear light with normal noise of variance light / full_well + (read / full_well)^2: shot noise and read noise.
 
-    Photons are Poisson distributed, their variance is their mean (EMVA standard 1288); thousands of them are normal.
+    Photon counts are Poisson distributed (EMVA standard 1288), and nearly normal for thousands of photons.
     """
     variance = light / noise.full_well_e + (noise.read_noise_e / noise.full_well_e) ** 2
     return light + np.sqrt(variance) * rng.standard_normal(light.shape)

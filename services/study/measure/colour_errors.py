@@ -2,7 +2,7 @@
 
 import importlib.util
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from schemas.errors import InputError
 from schemas.job.render import Render
-from schemas.scene.appearance import Appearance
 from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.plan import ScenePlan
 from schemas.scene.region import REGION_FLOOR
 from schemas.scene.scene import Placed
 from services.study.measure.flip import flip_between
@@ -20,6 +20,8 @@ from services.study.measure.rays import Box
 from workers.assets.appearance.draw import draw_appearance
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene
+from workers.plan.effect import Facts
+from workers.plan.effects import plan_effects
 from workers.plan.randomness import SceneChance, Stream
 from workers.render.step import draw_view, require_tier
 
@@ -78,10 +80,12 @@ def converged_colour(context: WorkerContext, scene: Scene, paths: int, salt: int
     if crop is None:
         return None
     camera = scene.pairs[0].input.camera
-    things, appearance = _in_studio(context, scene)
+    things, plan = _in_studio(context, scene)
     render = Render(tier="pathtraced", path_samples=paths, path_bounces=BOUNCES)
+    effects = plan_effects(Facts(context.job.model_copy(update={"render": render}), plan, False))
     rng = np.random.default_rng([TRUTH_SEED, scene.plan.scene_id, salt])
-    drawn = draw_view(context.renderer, things, appearance, crop_camera(camera, crop), render, rng)
+    drawn = draw_view(context.renderer, things, plan.appearance, crop_camera(camera, crop), render, rng, effects)
+    assert drawn.rgb is not None
     return ColourTruth(crop, drawn.rgb)
 
 
@@ -133,12 +137,12 @@ def crop_colour(rgb: NDArray[np.uint8], crop: Crop) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(rgb, (WIDTH, HEIGHT), interpolation=way), np.uint8)[here]
 
 
-def _in_studio(context: WorkerContext, scene: Scene) -> tuple[Sequence[Placed], Appearance]:
-    """The scene's things and light as tier pathtraced draws them: flat scenes have another floor and other lights."""
+def _in_studio(context: WorkerContext, scene: Scene) -> tuple[Sequence[Placed], ScenePlan]:
+    """The scene's things and plan as tier pathtraced draws them: flat scenes have another floor and other lights."""
     rng = SceneChance(context.job.seed, scene.plan.scene_id).stream(Stream.APPEARANCE)
     floor, appearance = draw_appearance(rng, "pathtraced")
     things = tuple(
         Placed(thing.region_id, floor, thing.T_world_shape) if thing.region_id == REGION_FLOOR else thing
         for thing in scene.posed.things
     )
-    return things, appearance
+    return things, replace(scene.plan, floor=floor, appearance=appearance)

@@ -10,7 +10,7 @@ from schemas.job.sensor import Distortion, Exposure, RgbNoise, SensorEffects
 from schemas.scene.camera import Intrinsics
 from workers.geometry.srgb import decode_codes as decode
 from workers.geometry.srgb import encode_codes as encode
-from workers.sensor.rgb import add_noise, bend, expose, sense_rgb
+from workers.sensor.rgb import add_noise, distort, expose, sense_rgb
 
 K = Intrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=80.0, cy=60.0)
 LENS = Distortion(k1=-0.2, k2=0.05, p1=0.002, p2=-0.001, k3=0.01)
@@ -62,7 +62,7 @@ def test_a_straight_line_lands_where_opencv_says_that_the_lens_draws_it():
     """Bright lines seen through the lens, undone with OpenCV's own undistortPoints, are straight again."""
     light = np.zeros((120, 160, 3))
     light[:, 30] = light[:, 120] = 1.0
-    seen = bend(light, LENS, K)[..., 0]
+    seen = distort(light, LENS, K)[..., 0]
     matrix = np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]])
     coefficients = np.array([LENS.k1, LENS.k2, LENS.p1, LENS.p2, LENS.k3])
     for column in (30, 120):
@@ -79,7 +79,7 @@ def test_a_straight_line_lands_where_opencv_says_that_the_lens_draws_it():
 
 def test_without_distortion_the_lens_shows_the_same_picture():
     light = seeded().random((120, 160, 3))
-    assert bend(light, Distortion(), K) == pytest.approx(light, abs=1e-9)
+    assert distort(light, Distortion(), K) == pytest.approx(light, abs=1e-9)
 
 
 def test_with_everything_off_rgb_is_the_same_array():

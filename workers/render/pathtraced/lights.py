@@ -1,11 +1,10 @@
-"""An `Appearance` as Mitsuba's lights: the same directions and strengths as in the raster tier.
+"""Mitsuba's lights of an `Appearance`: the same directions and strengths as in the raster tier.
 
-**The key light** is `LAMPS` distant lights spread evenly over a lamp of `LAMP_RAD`: its shadows are as soft as a disc's, but
-no path ever runs into it. A disc a thousand times as bright as the sky, met by chance after a mirror, leaves white specks
-that hundreds of samples do not average out. What mirrors would show of it is a glow in the sky, which has `GLOW` of its
-light.
+**The key light** is `LAMPS` distant lights spread evenly over a lamp of `LAMP_RAD`. Their shadows are as soft as a disc's,
+and no path can hit them: a disc a thousand times as bright as the sky, hit after a mirror, leaves fireflies that hundreds of
+samples do not average out. Mirrors show a glow in the sky instead, which has the share `GLOW` of the light.
 
-**The sky,** the other lights as soft lamps, and what comes from below the horizon are one picture around the scene.
+**The environment map** holds the sky, the other lights as soft lamps, and the light from below the horizon.
 """
 
 import math
@@ -19,39 +18,39 @@ from schemas.scene.appearance import Appearance, Light
 from workers.render.raster.baking import LAMP_RAD
 
 LAMPS = 32
-"""The shadow of a table top has an edge of 4 cm on the floor, or eight pixels: no step of it shows."""
+"""Enough to hide their steps: the edge of a table top's shadow on the floor is 4 cm wide, or eight pixels."""
 
 GLOW, GLOW_RAD = 0.04, 0.15
-"""Share of the key light that comes from a glow about it, and its standard deviation."""
+"""Share of the key light that comes from the glow around it, and the glow's standard deviation."""
 
 SKY_PX = (128, 64)
-"""Width and height of the picture around the scene; it holds nothing sharp."""
+"""Width and height of the environment map; nothing in it is sharp."""
 
 FILL_RAD = 0.25
 """Standard deviation of a fill light about its direction: a lamp of a metre at two."""
 
 ZENITH, HORIZON = 1.2, 0.6
-"""Radiance of the sky straight up and at the horizon, over what lights a level surface as much from everywhere.
+"""Radiance of the sky at the zenith and at the horizon, relative to a uniform sky of the same irradiance from above.
 
 It grows with the sine of the elevation: then HORIZON + 2/3 (ZENITH - HORIZON) must be 1.
 """
 
 
 def lights_of(mi: ModuleType, appearance: Appearance) -> dict[str, Any]:
-    """Mitsuba's emitters by name. Half of the samples go to the key light, half to the sky."""
+    """Mitsuba's emitters by name. Half of the light samples go to the key light, half to the environment map."""
     lamps = _lamps(appearance.lights[0]) if appearance.lights else []
-    return {f"key-{n}": lamp for n, lamp in enumerate(lamps)} | {"sky": _surroundings(mi, appearance)}
+    return {f"key-{n}": lamp for n, lamp in enumerate(lamps)} | {"sky": _environment(mi, appearance)}
 
 
 def _lamps(light: Light) -> list[dict[str, Any]]:
-    """A distant light of `color` gives a surface that faces it an irradiance of pi times `color`."""
+    """Distant lights. One of `color` gives a surface that faces it an irradiance of pi times `color`."""
     irradiance = [math.pi * (1.0 - GLOW) * c / LAMPS for c in light.color]
     shine: dict[str, Any] = {"type": "directional", "irradiance": {"type": "rgb", "value": irradiance}}
     return [shine | {"direction": (-towards).tolist()} for towards in lamp_directions(light.direction)]
 
 
 def lamp_directions(direction: Array) -> Array:
-    """[LAMPS, 3] unit: evenly over a disc of `LAMP_RAD` about a direction, in a sunflower's spiral (Vogel 1979)."""
+    """[LAMPS, 3] unit: spread evenly over a disc of `LAMP_RAD` around a direction, in a spiral (Vogel 1979)."""
     x = np.cross([0.0, 1.0, 0.0] if abs(direction[1]) < 0.9 else [1.0, 0.0, 0.0], direction)
     x /= np.linalg.norm(x)
     y = np.cross(direction, x)
@@ -62,16 +61,16 @@ def lamp_directions(direction: Array) -> Array:
     return np.asarray(spread / np.linalg.norm(spread, axis=1, keepdims=True), np.float64)
 
 
-def _surroundings(mi: ModuleType, appearance: Appearance) -> dict[str, Any]:
+def _environment(mi: ModuleType, appearance: Appearance) -> dict[str, Any]:
     picture = sky_picture(appearance, sky_directions(np.arange(SKY_PX[1]) / (SKY_PX[1] - 1.0)))
-    # Mitsuba's picture has y up and -z at its left edge; ours has z up and -x there.
+    # Mitsuba's map has y up and -z at its left edge; ours has z up and -x there.
     turn = mi.ScalarTransform4f(np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]))
     around = {"type": "envmap", "bitmap": mi.Bitmap(picture.astype(np.float32)), "to_world": turn}
     return around | {"sampling_weight": float(LAMPS) if appearance.lights else 1.0}
 
 
 def sky_picture(appearance: Appearance, directions: Array) -> Array:
-    """[H, W, 3] linear radiance from each of the directions [H, W, 3], which go around the whole sphere in even steps."""
+    """[H, W, 3] linear radiance from directions [H, W, 3] in even steps over the whole sphere."""
     sine = directions[..., 2:]
     sky = np.array(appearance.ambient) * (HORIZON + (ZENITH - HORIZON) * sine)
     picture = np.where(sine > 0.0, sky, np.array(appearance.below))
@@ -88,7 +87,7 @@ def sky_picture(appearance: Appearance, directions: Array) -> Array:
 
 
 def sky_directions(fall: Array) -> Array:
-    """[H, W, 3] unit, world: where each cell of a picture looks whose rows lie `fall` [H] of the way from zenith to nadir.
+    """[H, W, 3] unit, world: the direction of each cell. `fall` [H]: each row's angle from the zenith, 1 at the nadir.
 
     Mitsuba's first row is the zenith itself and its last the nadir; columns are centred.
     """

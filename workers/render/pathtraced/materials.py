@@ -1,8 +1,9 @@
-"""What things are made of, in Mitsuba's terms: pure functions from parts to its dictionaries.
+"""Mitsuba's meshes and materials of a scene's parts: pure functions to its dictionaries.
 
-The module `mitsuba` is handed in, because one file alone imports it (pathtrace.py). Both sides of every face are drawn.
+The module `mitsuba` is an argument, because tracer.py alone imports it. Both sides of every face are drawn.
 """
 
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -10,27 +11,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
+from schemas.scene.effects import EffectPlan
 from schemas.scene.shape import Material, Part
 from workers.geometry.frames import transform
 from workers.geometry.srgb import SRGB_STEPS, decode_srgb
-from workers.render.raster.batches import MATTE_ROUGHNESS
+from workers.render.raster.batches import MATTE_ROUGHNESS, texture_of
 
 Bsdf = dict[str, Any]
 
 GLASS_PALENESS = 0.3
-"""Light keeps this power of the colour that glass shows as an opaque body at each sheet that it crosses: a bottle of
-green (0.03 of the light, opaque) lets an eighth through two walls, as wine bottles do."""
+"""Each sheet of glass transmits its opaque colour to this power: a bottle of green (0.03 of the light, opaque) lets an eighth
+through two walls, as wine bottles do."""
 
 LEAST_WIDTH = 0.02
-"""Of a lobe: a mirror any sharper is noise at the samples that one can afford."""
+"""Least width of a lobe: a sharper mirror is noise at affordable numbers of samples."""
 
 LEAST_METAL_WIDTH = 0.12
-"""The same of metal, whose sharper reflections of the key light would leave more specks on whatever is near."""
+"""Least width of a metal's lobe, whose reflections of the key light would leave fireflies on surfaces nearby."""
 
 HOLE = 0.5
-"""Texels more transparent than this are holes, as in the raster tier."""
+"""Texels of a smaller alpha are holes, as in the raster tier."""
 
 VERTEX_COLOR = "vertex_color"
+
+
+def planned_part(part: Part, effects: EffectPlan) -> Part:
+    """The part without what the plan leaves out: textures, their holes, glass."""
+    transmission = part.material.transmission if effects.runs("glass") else 0.0
+    texture = part.material.texture if effects.runs("textures") else None
+    if texture is not None and not effects.runs("transparency"):
+        texture = texture[..., :3]
+    return replace(part, material=replace(part.material, transmission=transmission, texture=texture))
 
 
 def make_mesh(mi: ModuleType, part: Part, T_world_shape: Pose, name: str) -> Any:
@@ -56,13 +67,13 @@ def make_mesh(mi: ModuleType, part: Part, T_world_shape: Pose, name: str) -> Any
 
 
 def bsdf_of(mi: ModuleType, part: Part) -> Bsdf:
-    """Diffuse, plastic, rough metal or a blend of them; thin glass where it transmits; holes where texels are clear."""
+    """Diffuse, plastic, rough metal or a blend of them; thin glass where it transmits; a mask where texels are clear."""
     material = part.material
     color = _color(mi, part)
     body = _opaque(material, color)
     if material.transmission > 0.0:
         body = _glass(mi, part, body)
-    texture = _texture(part)
+    texture = texture_of(part)
     if texture is not None and texture.shape[2] == 4 and int(texture[..., 3].min()) < 255 * HOLE:
         solid = (texture[..., 3] >= 255 * HOLE).astype(np.float32)
         body = {"type": "mask", "opacity": _picture(mi, solid), "nested": body}
@@ -85,10 +96,11 @@ def _opaque(material: Material, color: Any) -> Bsdf:
 
 
 def _glass(mi: ModuleType, part: Part, body: Bsdf) -> Bsdf:
-    """A sheet that light crosses straight on, tinted, and that mirrors some: it neither bends light nor turns black.
+    """A tinted sheet that transmits light without refraction and mirrors some of it.
 
-    A vessel's outline is one such sheet, as if it were empty; so is a wall, whose other side says `ior` 1. Light that
-    crosses straight on is found by the lamps' samples too, so that shadows of glass are tinted and free of fireflies.
+    The surface of a vessel is one such sheet, as if the vessel were empty; so is a wall, whose second side has `ior` 1.
+    Samples of the lamps also find light that crosses straight on, so that shadows of glass are tinted and without
+    fireflies.
     """
     material = part.material
     if material.ior == 1.0:
@@ -104,8 +116,8 @@ def _glass(mi: ModuleType, part: Part, body: Bsdf) -> Bsdf:
 
 
 def tint_of(part: Part) -> Array:
-    """[3] share of linear light that crosses a sheet of glass: of a textured one, by the mean of what lets most through."""
-    material, texture = part.material, _texture(part)
+    """[3] share of linear light that crosses a sheet of glass; of a textured one, from the mean of its clearest texels."""
+    material, texture = part.material, texture_of(part)
     color = decode_srgb(np.array(material.base_color[:3]))
     if texture is not None:
         clear = np.ones(texture.shape[:2], np.bool_)
@@ -122,7 +134,7 @@ def _both_sides(bsdf: Bsdf) -> Bsdf:
 def _color(mi: ModuleType, part: Part) -> Any:
     """The albedo; a texture takes precedence over vertex colours, which Mitsuba cannot multiply it with."""
     factor = decode_srgb(np.array(part.material.base_color[:3]))
-    texture = _texture(part)
+    texture = texture_of(part)
     if texture is not None:
         return _picture(mi, (SRGB_STEPS[texture[..., :3]] * factor).astype(np.float32))
     if _has_vertex_colors(part):
@@ -130,12 +142,8 @@ def _color(mi: ModuleType, part: Part) -> Any:
     return _rgb(factor)
 
 
-def _texture(part: Part) -> NDArray[np.uint8] | None:
-    return part.material.texture if part.uv is not None else None
-
-
 def _has_vertex_colors(part: Part) -> bool:
-    return part.colors is not None and _texture(part) is None
+    return part.colors is not None and texture_of(part) is None
 
 
 def _picture(mi: ModuleType, linear: NDArray[np.float32]) -> Bsdf:

@@ -1,16 +1,19 @@
-"""The `pathtraced` tier: colour by Mitsuba 3, the only file that imports it; depth and region are the label pass's.
+"""The path tracer: colour of tier `pathtraced` by Mitsuba 3, which this file alone imports. Labels are the label pass's.
 
-**Variant.** `scalar_rgb`, on one thread. It is deterministic, and needs no compiler: `llvm_ad_rgb` would take Mesa's LLVM, and
+**Variant.** `scalar_rgb`, on one thread. It is deterministic and needs no compiler: `llvm_ad_rgb` would take Mesa's LLVM, and
 with Debian 12's (15) Mitsuba 3.9.1 ends the whole process with "LLVM ERROR: Cannot select: fminimum".
 
-**Camera.** Mitsuba's pinhole with its principal point moved. A box filter, so that a sample counts for its own pixel. Where
-fx and fy differ, square pixels at least as fine as either are traced and averaged by area.
+**Camera.** Mitsuba's pinhole with its principal point moved. A box filter, so that a sample counts for its own pixel alone.
+Where fx and fy differ, square pixels at least as fine as either are traced and averaged by area.
 
 **Samples.** Correlated multi-jittered (Kensler 2013): every choice along a path is spread evenly over a pixel's samples. At 16
-samples, noise on floor and table is a tenth of what independent ones leave, for an eighth more time.
+samples, noise on floor and table is a tenth of that of independent samples, for an eighth more time.
 
-**Light.** Paths of `render.path_bounces` bounces. The key light and the sky are sampled at every bounce; through glass and
-holes straight on, so that both throw tinted shadows.
+**Light.** Paths of `render.path_bounces` bounces; without the effect `global_illumination` of one. The key light and the
+environment map are sampled at every bounce, straight through glass and holes, so that both throw tinted shadows.
+
+**Inherent effects.** Paths start at random points of a pixel and end at lights that they see: the plan cannot withdraw
+`antialiasing` or `shadows` here.
 """
 
 import ctypes
@@ -30,31 +33,33 @@ from schemas.errors import InputError
 from schemas.job.render import Render
 from schemas.scene.appearance import Appearance
 from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import Placed
 from workers.geometry.srgb import encode_codes
 from workers.render.pathtraced.lights import lights_of
-from workers.render.pathtraced.materials import make_mesh
+from workers.render.pathtraced.materials import make_mesh, planned_part
 from workers.render.raster.lit_shaders import KNEE
 
 VARIANT = "scalar_rgb"
 
 NEAR_M = 0.05
-"""As in the other tiers: what is nearer is not seen."""
+"""Nearer surfaces are not seen, as in the other tiers."""
 
 ROULETTE_DEPTH = 5
-"""Bounces after which paths end by chance, the sooner the less they carry."""
+"""Bounces after which Russian roulette may end a path."""
 
-SPECK = 1.4
-"""Cycles bounds what a sample may add, which Mitsuba cannot; texture at the size of a pixel stays below this."""
+FIREFLY_RATIO = 1.4
+"""Greatest brightness of a pixel relative to the second brightest neighbour; pixel-sized texture stays below it. Cycles clamps
+samples instead, which Mitsuba cannot."""
 
 SYSTEM_LIBRARY = "libatomic.so.1"
-"""Of the compiler's run time; Mitsuba's wheel does not bring it, and small images of Debian lack it."""
+"""A library of the compiler's run time: Mitsuba's wheel does not bring it, and small images of Debian lack it."""
 
 REMEDY = "`./verso extra pathtraced` installs it (mitsuba==3.9.1), or set render.tier to raster or flat"
 
 
 def require_mitsuba() -> None:
-    """Raises InputError, with the remedy, where Mitsuba or the system's library that it loads is not there."""
+    """Raises InputError, with the remedy, where Mitsuba or the system library that it loads is missing."""
     if importlib.util.find_spec("mitsuba") is None:
         raise InputError(f"render.tier is pathtraced, and Mitsuba is not installed: {REMEDY}")
     try:
@@ -79,44 +84,65 @@ def load_mitsuba() -> ModuleType:
 
 
 @dataclass(frozen=True, eq=False)
-class Built:
-    """A scene in Mitsuba, and what it was made of: kept, so that its ids are no other's."""
+class TracedScene:
+    """A scene in Mitsuba, and the models that it was made from."""
 
     scene: Any
     clear: bool
     """Whether something in it lets light through."""
     things: Sequence[Placed]
     appearance: Appearance
+    effects: EffectPlan
+
+    def is_of(self, things: Sequence[Placed], appearance: Appearance, effects: EffectPlan) -> bool:
+        """Whether it was made from the same models."""
+        same = self.appearance is appearance and self.effects.ran == effects.ran and len(self.things) == len(things)
+        return same and all(
+            a.shape is b.shape and a.region_id == b.region_id and np.array_equal(a.T_world_shape, b.T_world_shape)
+            for a, b in zip(self.things, things, strict=True)
+        )
 
 
 class Tracer:
-    """Traces views; keeps the scene traced last, because views of one scene follow one another."""
+    """Traces views. It keeps the last scene, because views of one scene follow one another."""
 
     def __init__(self) -> None:
         self._mi = load_mitsuba()
-        self._built: Built | None = None
+        self._built: TracedScene | None = None
 
     def trace(
-        self, things: Sequence[Placed], appearance: Appearance, camera: Camera, render: Render, seed: int
+        self,
+        things: Sequence[Placed],
+        appearance: Appearance,
+        camera: Camera,
+        render: Render,
+        effects: EffectPlan,
+        seed: int,
     ) -> NDArray[np.uint8]:
         """[H, W, 3] uint8 sRGB, the same bytes for the same arguments; `seed` below 2**32."""
-        light = self.radiance(things, appearance, camera, render, seed)
-        return encode_codes(compress(without_specks(light)))
+        light = self.radiance(things, appearance, camera, render, effects, seed)
+        return encode_codes(tone_map(clamp_fireflies(light)))
 
     def radiance(
-        self, things: Sequence[Placed], appearance: Appearance, camera: Camera, render: Render, seed: int
+        self,
+        things: Sequence[Placed],
+        appearance: Appearance,
+        camera: Camera,
+        render: Render,
+        effects: EffectPlan,
+        seed: int,
     ) -> Array:
-        """[H, W, 3] float64 linear light, with the background where nothing is."""
-        built = self.build(things, appearance)
+        """[H, W, 3] float64 linear light, with the background where nothing is hit."""
+        built = self.build(things, appearance, effects)
         kind = "volpath" if built.clear else "path"
-        depth = render.path_bounces + 1
-        integrator = {"type": kind, "max_depth": depth, "rr_depth": ROULETTE_DEPTH, "hide_emitters": True}
+        bounces = render.path_bounces if effects.runs("global_illumination") else 1
+        integrator = {"type": kind, "max_depth": bounces + 1, "rr_depth": ROULETTE_DEPTH, "hide_emitters": True}
         mi = self._mi
         image = mi.render(
             built.scene,
             sensor=self.sensor(camera),
             integrator=mi.load_dict(integrator),
-            spp=whole_grid(render.path_samples),
+            spp=round_up_samples(render.path_samples),
             seed=seed,
         )
         pixels = np.array(image, np.float64)
@@ -124,23 +150,20 @@ class Tracer:
         light = pixels[..., :3] + (1.0 - covered) * np.array(appearance.background)
         return average(light, camera.intrinsics)
 
-    def build(self, things: Sequence[Placed], appearance: Appearance) -> Built:
+    def build(self, things: Sequence[Placed], appearance: Appearance, effects: EffectPlan) -> TracedScene:
         """The scene in Mitsuba; a mesh's id is region-REGION-THING-PART."""
-        if self._built is not None and _same(self._built, things, appearance):
+        if self._built is not None and self._built.is_of(things, appearance, effects):
             return self._built
         tree: dict[str, Any] = {"type": "scene", **lights_of(self._mi, appearance)}
+        clear = False
         for number, thing in enumerate(things):
-            for piece, part in enumerate(thing.shape.parts):
+            for piece, part in enumerate(planned_part(part, effects) for part in thing.shape.parts):
                 name = f"region-{thing.region_id}-{number}-{piece}"
+                clear = clear or lets_through(part.material)
                 if len(part.faces):
                     tree[name] = make_mesh(self._mi, part, thing.T_world_shape, name)
-        clear = any(lets_through(part.material) for thing in things for part in thing.shape.parts)
-        self._built = Built(self._mi.load_dict(tree), clear, tuple(things), appearance)
+        self._built = TracedScene(self._mi.load_dict(tree), clear, tuple(things), appearance, effects)
         return self._built
-
-    def forget(self) -> None:
-        """Build the next scene anew, whatever it is."""
-        self._built = None
 
     def sensor(self, camera: Camera) -> Any:
         """Mitsuba's camera, looking along its z with x to the left and y up; ours has x to the right and y down."""
@@ -164,10 +187,10 @@ class Tracer:
         )
 
 
-def without_specks(light: Array) -> Array:
-    """Pixels brighter than `SPECK` times the second brightest of their eight neighbours, brought down to that.
+def clamp_fireflies(light: Array) -> Array:
+    """Reduces pixels brighter than `FIREFLY_RATIO` times the second brightest of eight neighbours to the latter's level.
 
-    A path that by chance finds the key light in a mirror leaves such a pixel; lines, edges and spots of three stay.
+    A path that finds the key light in a mirror leaves such a pixel; lines, edges and spots of three pixels stay.
     """
     level = light @ np.array([0.2126, 0.7152, 0.0722])
     height, width = level.shape
@@ -177,26 +200,26 @@ def without_specks(light: Array) -> Array:
         other = around[v : v + height, u : u + width]
         np.maximum(second, np.minimum(first, other), out=second)
         np.maximum(first, other, out=first)
-    too_bright = level > SPECK * second
+    too_bright = level > FIREFLY_RATIO * second
     result = light.copy()
     result[too_bright] *= (second[too_bright] / level[too_bright])[:, None]
     return result
 
 
-def compress(light: Array) -> Array:
-    """Light as bright as it is below the knee, running into 1 above it: the raster tier's curve (lighting.py)."""
+def tone_map(light: Array) -> Array:
+    """The raster tier's tone curve (lit_shaders.py): linear below the knee, approaching 1 above it."""
     over = np.maximum(light - KNEE, 0.0) / (1.0 - KNEE)
     return np.minimum(light, KNEE) + (1.0 - KNEE) * over / (1.0 + over)
 
 
-def whole_grid(samples: int) -> int:
-    """The least number from `samples` on that fills a grid of nearly equal sides, which the sampler needs."""
+def round_up_samples(samples: int) -> int:
+    """The least number, not below `samples`, that fills a grid of nearly equal sides, as the sampler needs it."""
     side = math.isqrt(samples)
     return side * -(-samples // side)
 
 
 def lets_through(material: Any) -> bool:
-    """Whether light may cross a material straight on: glass, and textures with clear texels."""
+    """Whether light may cross a material: glass, and textures with an alpha channel."""
     texture = material.texture
     return material.transmission > 0.0 or (texture is not None and texture.shape[2] == 4)
 
@@ -208,7 +231,7 @@ def square_pixels(k: Intrinsics) -> tuple[int, int, float]:
 
 
 def average(light: Array, k: Intrinsics) -> Array:
-    """[H, W, 3] of a film of square pixels: the mean of what each of the image's pixels covers of it."""
+    """[H, W, 3]: the mean of a film of square pixels over each pixel of the image."""
     f = max(k.fx, k.fy)
     if k.fx != k.fy:
         light = np.einsum("vh,hwc->vwc", _shares(k.height, f / k.fy, light.shape[0]), light)
@@ -217,16 +240,7 @@ def average(light: Array, k: Intrinsics) -> Array:
 
 
 def _shares(count: int, step: float, fine: int) -> Array:
-    """[count, fine]: the share of each of the fine pixels in each pixel, which is `step` of them wide."""
+    """[count, fine]: the share of each fine pixel in each pixel, which is `step` fine pixels wide."""
     edges, cells = np.arange(count + 1) * step, np.arange(fine)
     overlap = np.minimum(edges[1:, None], cells + 1.0) - np.maximum(edges[:-1, None], cells)
     return np.maximum(overlap, 0.0) / step
-
-
-def _same(built: Built, things: Sequence[Placed], appearance: Appearance) -> bool:
-    if built.appearance is not appearance or len(built.things) != len(things):
-        return False
-    return all(
-        a.shape is b.shape and a.region_id == b.region_id and np.array_equal(a.T_world_shape, b.T_world_shape)
-        for a, b in zip(built.things, things, strict=True)
-    )

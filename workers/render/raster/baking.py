@@ -1,11 +1,12 @@
-"""What is worked out once for a scene and its key light, and used by all of its views.
+"""Light maps of a scene, made once and used by all of its views: pure functions.
 
 **Shadow map.** The depth of everything but the floor as the key light sees it, `SHADOW_PX` square, fitted to the things.
 
-**Level maps.** One for the floor, about the table; one for the level that the objects stand on, about the objects. Each
-comes from the heights of things (heightfield.py) at `LEVEL_PX` square. RGBA8: openness of the level, openness of what is
-on top, the top's height in units of the box's, and share of key light: on the floor the table's shadow, as wide at its
-edge as a lamp of `LAMP_RAD` makes it from a table's height.
+**Level maps.** A level is a horizontal plane: the floor, with a map around the table, and the plane that objects stand on,
+with a map around the objects. Each map is made from elevations on a grid of `LEVEL_PX` square (heightfield.py). RGBA8:
+share of the sky seen from the level, share seen from the top of what stands there, elevation of that top in units of the
+box, and share of the key light. On the floor the last is the table's shadow, with an edge as wide as a lamp of `LAMP_RAD`
+makes it from a table's height.
 """
 
 import math
@@ -20,13 +21,13 @@ from schemas.base import Array, Pose
 from schemas.scene.region import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.scene import Placed
 from workers.geometry.frames import transform
-from workers.render.raster.heightfield import column_heights
-from workers.render.raster.occlusion import openness
+from workers.render.raster.heightfield import column_extents
+from workers.render.raster.occlusion import sky_visibility
 
 SHADOW_PX = 768
 LEVEL_PX = 56
 MAP_PX = 192
-"""Side of a level's map, in which shadows have edges: 13 mm a pixel under a large table, 3 mm about an object."""
+"""Side of a level map, fine enough for the edges of shadows: 13 mm a pixel under a large table, 3 mm about an object."""
 
 LAMP_RAD = 0.06
 """Angle across the key light, seen from the scene: a softbox of 12 cm at 2 m."""
@@ -35,21 +36,24 @@ SOFT_M = 0.006
 """Radius of the shadow's edge on tables and objects: a lamp of `LAMP_RAD` over 20 cm."""
 
 BIAS_M = 0.0015
-"""What lies this much deeper than the shadow map says is lit: half a pixel of the map, seen slantwise."""
+"""A surface no deeper than this below the shadow map's depth is lit: half a pixel of the map, seen slantwise."""
 
 LOWEST_SINE = 0.2
-"""Of the key light's elevation, for which shadows on levels are followed to their end."""
+"""Least sine of the key light's elevation for which a level map reaches to the end of the shadows."""
 
 SCENE_MARGIN_M = 0.02
 FLOOR_REACH_M = 0.35
-"""How far around the table the floor's map goes."""
+"""Margin of the floor's map around the table and its shadow."""
 STAND_REACH_M = 0.15
-"""How far around the objects their level's map goes."""
+"""Margin of the objects' level map around them and their shadow."""
+
+Triangles = tuple[Array, NDArray[np.int32]]
+"""(vertices [V, 3] in the world, faces [F, 3])."""
 
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """An orthographic view: `T_view_world` [4, 4] (a rotation) and what it spans, [2, 3] lower and upper, metres."""
+    """An orthographic view: `T_view_world` [4, 4] (a rotation), and its bounds [2, 3], lower and upper, metres."""
 
     T_view_world: Pose
     bounds: Array
@@ -64,14 +68,14 @@ class Box:
 
     @property
     def clip_from_world(self) -> Pose:
-        """[4, 4]: the same in [-1, 1]."""
+        """[4, 4]: world to (u, v, depth), each in [-1, 1] within the box."""
         spread = np.diag([2.0, 2.0, 2.0, 1.0])
         spread[:3, 3] = -1.0
         return spread @ self.unit_from_world
 
 
 def light_box(vertices: Array, towards: Array) -> Box:
-    """What a distant light sees of vertices [N, 3]; depth grows away from it. `towards` [3]: unit, to the light."""
+    """A distant light's view of vertices [N, 3]; depth grows away from it. `towards` [3]: unit, to the light."""
     z = -towards
     x = np.cross([0.0, 1.0, 0.0] if abs(towards[1]) < 0.9 else [1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)
@@ -83,7 +87,7 @@ def light_box(vertices: Array, towards: Array) -> Box:
 
 
 def level_box(vertices: Array, level_m: float, towards: Array, reach_m: float) -> Box:
-    """A level square that holds vertices [N, 3], their shadow on the level, and `reach_m` around; depth is height."""
+    """A square on a level around vertices [N, 3] and their shadow, with a margin of `reach_m`; depth is elevation."""
     on_level = vertices[:, :2]
     if towards[2] > LOWEST_SINE:
         shadow = vertices - np.maximum(vertices[:, 2:] - level_m, 0.0) / towards[2] * towards
@@ -94,33 +98,31 @@ def level_box(vertices: Array, level_m: float, towards: Array, reach_m: float) -
     return Box(np.eye(4), np.array([[*(centre - half), level_m], [*(centre + half), top]]))
 
 
-def level_pixels(
-    vertices: Array, faces: NDArray[np.int32], box: Box, lit: NDArray[np.uint8], hollow: bool
-) -> NDArray[np.uint8]:
-    """[MAP_PX, MAP_PX, 4] uint8 of a level's map.
+def level_pixels(vertices: Array, faces: NDArray[np.int32], box: Box, hollow: bool) -> NDArray[np.uint8]:
+    """[MAP_PX, MAP_PX, 4] uint8 of a level map that the key light reaches everywhere.
 
-    `hollow`: light comes in below what stands there, as under a table; else it reaches down to the level.
-    Vertices [V, 3] in the world and faces [F, 3] of what stands on the level or over it; lit [MAP_PX, MAP_PX]: share of
-    the key light.
+    vertices [V, 3] in the world and faces [F, 3] of the things on or over the level. `hollow`: light also comes in below
+    them, as under a table; otherwise they reach down to the level.
     """
     size = box.bounds[1] - box.bounds[0]
     step_m = float(size[0]) / LEVEL_PX
-    top, under = column_heights(vertices, faces, box.bounds[0], step_m, LEVEL_PX)
+    top, under = column_extents(vertices, faces, box.bounds[0], step_m, LEVEL_PX)
     nothing = np.zeros_like(top)
     under = under if hollow else nothing
-    on_level = openness(top, under, nothing, step_m)
-    on_top = openness(top, nothing, top, step_m) if not under.any() else on_level
-    soft = [cv2.GaussianBlur(image, (0, 0), 0.8) for image in (on_level, on_top)]
-    heights = top / np.float32(size[2])
-    image = cv2.resize(np.stack([*soft, heights], axis=-1), (MAP_PX, MAP_PX), interpolation=cv2.INTER_LINEAR)
-    return np.dstack([np.rint(255.0 * np.clip(image, 0.0, 1.0)).astype(np.uint8), lit])
+    from_level = sky_visibility(top, under, nothing, step_m)
+    from_top = sky_visibility(top, nothing, top, step_m) if not under.any() else from_level
+    soft = [cv2.GaussianBlur(image, (0, 0), 0.8) for image in (from_level, from_top)]
+    elevation = top / np.float32(size[2])
+    image = cv2.resize(np.stack([*soft, elevation], axis=-1), (MAP_PX, MAP_PX), interpolation=cv2.INTER_LINEAR)
+    codes = np.rint(255.0 * np.clip(image, 0.0, 1.0)).astype(np.uint8)
+    return np.dstack([codes, np.full((MAP_PX, MAP_PX), 255, np.uint8)])
 
 
 def level_shadow(depth: NDArray[np.float32], light: Box, level: Box, towards: Array) -> NDArray[np.uint8]:
     """[MAP_PX, MAP_PX] uint8: share of the key light on a level, from the shadow map's depth [S, S].
 
-    The edge of a shadow is as wide as the lamp's angle times the way from what throws it: sharp where a thing stands, soft
-    where the top's shadow falls (percentage-closer soft shadows, Fernando 2005, as a blend of a narrow and a wide blur).
+    A shadow's edge is as wide as the lamp's angle times the distance to the caster: sharp where a thing stands, soft where
+    the shadow of its top falls (percentage-closer soft shadows, Fernando 2005, as a blend of a narrow and a wide blur).
     """
     low, high = level.bounds
     step = (high[:2] - low[:2]) / MAP_PX
@@ -130,8 +132,8 @@ def level_shadow(depth: NDArray[np.float32], light: Box, level: Box, towards: Ar
         (M[i, 0] * columns[None, :] + M[i, 1] * rows[:, None] + M[i, 2] * low[2] + M[i, 3]).astype(np.float32)
         for i in range(3)
     )
-    where = (u * len(depth) - 0.5, v * len(depth) - 0.5)
-    nearest = cv2.remap(depth, *where, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, 1.0)
+    texels = (u * len(depth) - 0.5, v * len(depth) - 0.5)
+    nearest = cv2.remap(depth, *texels, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, 1.0)
     depth_m = float(light.bounds[1, 2] - light.bounds[0, 2])
     away_m = (z - nearest) * depth_m
     dark = ((away_m > BIAS_M) & (nearest < 1.0)).astype(np.float32)
@@ -144,30 +146,25 @@ def level_shadow(depth: NDArray[np.float32], light: Box, level: Box, towards: Ar
     return np.rint(255.0 * (1.0 - np.clip(narrow + share * (wide - narrow), 0.0, 1.0))).astype(np.uint8)
 
 
-def triangles_of(things: Sequence[Placed]) -> tuple[Array, NDArray[np.int32]]:
-    """(vertices [V, 3] in the world, faces [F, 3]) of all of them."""
+def triangles_of(things: Sequence[Placed]) -> Triangles:
+    """The triangles of all things together."""
     vertices = [transform(thing.T_world_shape, thing.shape.vertices) for thing in things]
     starts = np.cumsum([0, *(len(one) for one in vertices)])[:-1]
     faces = [thing.shape.faces + start for thing, start in zip(things, starts, strict=True)]
     return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
 
 
-def casters(things: Sequence[Placed]) -> list[Placed]:
-    """Everything that throws a shadow: not the floor."""
+def shadow_casters(things: Sequence[Placed]) -> list[Placed]:
+    """Everything but the floor."""
     return [thing for thing in things if thing.region_id > REGION_FLOOR]
 
 
-def standing(things: Sequence[Placed]) -> list[Placed]:
-    """What stands on the table."""
+def objects_of(things: Sequence[Placed]) -> list[Placed]:
+    """The objects that stand on the table."""
     return [thing for thing in things if thing.region_id >= REGION_FIRST_OBJECT]
 
 
-def level_of(vertices: Array) -> float:
-    """The level on which vertices [N, 3] stand, metres."""
-    return float(vertices[:, 2].min())
-
-
-def soft_radius(light: Box) -> tuple[float, float, float]:
-    """(radius of the filter, bias, side of a pixel of the shadow map) in units of the light's box."""
+def shadow_filter(light: Box) -> tuple[float, float, float]:
+    """(filter radius, depth bias, pixel size) of the shadow map, in units of the light's box."""
     size = light.bounds[1] - light.bounds[0]
     return SOFT_M / float(math.sqrt(size[0] * size[1])), BIAS_M / float(size[2]), 1.0 / SHADOW_PX

@@ -1,8 +1,8 @@
 """Shapes packed for the GPU: pure functions from parts to interleaved vertices and indices.
 
-The depth of a face is computed from its plane (see gbuffer.py), and a plane belongs to a face while GPUs shade vertices.
-So each face owns one vertex, the last of its three, from which flat attributes are taken: as a mesh has about half as
-many vertices as faces, about half of the faces find a vertex of their own and the rest get a copy of one.
+Depth is computed from each face's plane (gbuffer.py), but GPUs take attributes from vertices. So each face owns one vertex,
+the last of its three, which provides flat attributes. A mesh has about half as many vertices as faces: about half of the
+faces own one of them, the others get a copy.
 """
 
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ from workers.geometry.srgb import SRGB_STEPS, decode_srgb
 COLUMNS = {"position": 3, "normal_metallic": 4, "albedo_roughness": 4, "uv": 2, "face_plane": 4}
 """Floats of each attribute, in the order of the shader's locations."""
 
-
 MATTE_ROUGHNESS = 0.8
+"""Surfaces at least this rough are drawn without highlights."""
 
 SAME_LEVEL_M = 1e-4
 
@@ -28,53 +28,54 @@ _PLANE_Z = -2
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """What one draw call draws.
+    """Triangles with one texture, drawn together.
 
-    vertices [V, 17] float32 in the columns of `COLUMNS`; the normal is 0 where the face's own is meant; the plane of a
-    face is (n, n . p) in the shape's frame, n of unit length or 0 where the face has no area. indices [F, 3] uint32,
-    whose last column never repeats. texture [h, w, 3 or 4] uint8 sRGB, row 0 at the top, or None.
+    vertices [V, 17] float32 in the columns of `COLUMNS`: a normal of 0 stands for the face's own; the plane of a face is
+    (n, n . p) in the shape's frame, n of unit length or 0 where the face has no area. indices [F, 3] uint32, whose last
+    column never repeats. texture [h, w, 3 or 4] uint8 sRGB, row 0 at the top, or None.
     """
 
     vertices: NDArray[np.float32]
     indices: NDArray[np.uint32]
     texture: NDArray[np.uint8] | None
     matte: bool
-    """Nothing in it is metal or smoother than `MATTE_ROUGHNESS`."""
+    """Whether no part is metal or smoother than `MATTE_ROUGHNESS`."""
     top_faces: int = 0
-    """The first so many faces are level, look up, and lie within `SAME_LEVEL_M` of the shape's highest point."""
+    """The first so many faces are horizontal, face up, and lie within `SAME_LEVEL_M` of the shape's highest point."""
 
 
 def pack_shape(shape: Shape) -> tuple[Batch, ...]:
-    """As few batches as textures allow: all parts without one go into one."""
+    """One batch for each texture, and one for all parts without."""
     by_texture: dict[int, list[Part]] = {}
     for part in shape.parts:
-        by_texture.setdefault(id(_texture(part)), []).append(part)
+        by_texture.setdefault(id(texture_of(part)), []).append(part)
     highest = max(float(part.vertices[:, 2].max()) for part in shape.parts)
     return tuple(_pack(parts, highest) for parts in by_texture.values())
 
 
 def own_vertices(faces: NDArray, vertex_count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(faces [F, 3] int64, source [V'] int64): each face turned so that its last vertex is no other face's last.
+    """(faces [F, 3] int64, source [V'] int64): each face rotated so that its last vertex is no other face's last.
 
-    `source` says of which vertex each new vertex is a copy; the first `vertex_count` are the vertices themselves.
+    `source` names the vertex that each new vertex is a copy of; the first `vertex_count` are the vertices themselves.
     """
     turned = faces.astype(np.int64)
     owner = np.full(vertex_count, -1)
-    homeless = np.arange(len(faces))
+    unowned = np.arange(len(faces))
     for last in (2, 0, 1):
-        wanted = faces[homeless, last]
-        free = homeless[owner[wanted] < 0]
+        wanted = faces[unowned, last]
+        free = unowned[owner[wanted] < 0]
         owner[faces[free, last]] = free
-        won = owner[faces[homeless, last]] == homeless
-        winners = homeless[won]
+        won = owner[faces[unowned, last]] == unowned
+        winners = unowned[won]
         turned[winners] = faces[winners][:, [(last + 1) % 3, (last + 2) % 3, last]]
-        homeless = homeless[~won]
-    source = np.concatenate([np.arange(vertex_count), turned[homeless, 2]])
-    turned[homeless, 2] = vertex_count + np.arange(len(homeless))
+        unowned = unowned[~won]
+    source = np.concatenate([np.arange(vertex_count), turned[unowned, 2]])
+    turned[unowned, 2] = vertex_count + np.arange(len(unowned))
     return turned, source
 
 
-def _texture(part: Part) -> NDArray[np.uint8] | None:
+def texture_of(part: Part) -> NDArray[np.uint8] | None:
+    """The part's texture, if it has coordinates for one."""
     return part.material.texture if part.uv is not None else None
 
 
@@ -92,11 +93,11 @@ def _pack(parts: list[Part], highest_m: float) -> Batch:
     upwards = vertices[corners[:, 2], _PLANE_Z] > 0.0
     top = upwards & (vertices[corners, 2] > highest_m - SAME_LEVEL_M).all(axis=1)
     corners = corners[np.argsort(~top, kind="stable")]
-    return Batch(vertices, corners, _texture(parts[0]), matte, int(np.count_nonzero(top)))
+    return Batch(vertices, corners, texture_of(parts[0]), matte, int(np.count_nonzero(top)))
 
 
 def _vertex_columns(part: Part) -> NDArray[np.float32]:
-    """[V, 17] float32 in the columns of `COLUMNS`; what a part does not have, and the plane, is 0."""
+    """[V, 17] float32 in the columns of `COLUMNS`; missing attributes, and the plane, are 0."""
     material = part.material
     albedo = decode_srgb(np.array(material.base_color[:3]))
     if part.colors is not None:
@@ -114,7 +115,7 @@ def _vertex_columns(part: Part) -> NDArray[np.float32]:
 
 
 def _planes(part: Part) -> Array:
-    """[F, 4] float64: unit normal and its product with a point of the face, in the part's frame; 0 without area."""
+    """[F, 4] float64: unit normal and its dot product with a point of the face, part frame; 0 without area."""
     a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The process's one OpenGL context: off-screen, through EGL, opened with pyrender's platform."""
+"""The OpenGL context, one a process: off-screen, through EGL, opened by pyrender's platform."""
 
 import importlib
 import socket
@@ -14,7 +14,7 @@ REMEDY = (
 )
 
 SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swr ", "swiftshader", "lavapipe", "basic render")
-"""What GL_RENDERER holds, in lower case, where OpenGL runs on the CPU."""
+"""Words of GL_RENDERER, in lower case, where OpenGL runs on the CPU."""
 
 NO_GPU = (
     "install the GPU's driver with its EGL library (NVIDIA: libnvidia-gl; in a container run with --gpus all and "

@@ -1,4 +1,4 @@
-"""How many pixels a thing alone would cover: counted by the GPU, without an image."""
+"""The pixel counter: how many pixels a thing covers by itself, counted by the GPU without an image."""
 
 from types import ModuleType
 
@@ -6,12 +6,10 @@ import numpy as np
 
 from schemas.scene.camera import Intrinsics
 from workers.render.raster.buffers import UploadedShape
+from workers.render.raster.framebuffer import Framebuffer
 from workers.render.raster.programs import Program
 from workers.render.raster.shaders import COUNT_FRAGMENT, COUNT_VERTEX
 from workers.render.raster.tiles import TILE_PX
-
-TARGET_BYTES = 4 * TILE_PX * TILE_PX
-"""Depth, which is not used, and stencil."""
 
 
 class PixelCounter:
@@ -21,19 +19,12 @@ class PixelCounter:
         self._gl = gl
         self.program = Program(gl, COUNT_VERTEX, COUNT_FRAGMENT)
         self._query = int(np.ravel(gl.glGenQueries(1))[0])
-        self._stencil = int(gl.glGenRenderbuffers(1))
-        self._framebuffer = int(gl.glGenFramebuffers(1))
-        gl.glBindRenderbuffer(gl.GL_RENDERBUFFER, self._stencil)
-        gl.glRenderbufferStorage(gl.GL_RENDERBUFFER, gl.GL_DEPTH24_STENCIL8, TILE_PX, TILE_PX)
-        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self._framebuffer)
-        attached = (gl.GL_DEPTH_STENCIL_ATTACHMENT, gl.GL_RENDERBUFFER, self._stencil)
-        gl.glFramebufferRenderbuffer(gl.GL_FRAMEBUFFER, *attached)
-        gl.glDrawBuffer(gl.GL_NONE)
+        self._framebuffer = Framebuffer(gl, {gl.GL_DEPTH_STENCIL_ATTACHMENT: gl.GL_DEPTH24_STENCIL8})
 
     def count(self, shape: UploadedShape, tile: Intrinsics) -> int:
-        """Pixels of a tile, of at most `TILE_PX` a side, that the shape covers; `program` must know where it stands."""
+        """Pixels of a tile, of at most `TILE_PX` a side, that the shape covers; `program` must hold its pose."""
         gl = self._gl
-        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self._framebuffer)
+        self._framebuffer.bind(TILE_PX, TILE_PX)
         gl.glViewport(0, 0, tile.width, tile.height)
         gl.glDisable(gl.GL_DEPTH_TEST)
         gl.glEnable(gl.GL_STENCIL_TEST)
@@ -51,10 +42,3 @@ class PixelCounter:
         gl.glEndQuery(gl.GL_SAMPLES_PASSED)
         gl.glDisable(gl.GL_STENCIL_TEST)
         return int(np.ravel(gl.glGetQueryObjectuiv(self._query, gl.GL_QUERY_RESULT))[0])
-
-    def free(self) -> None:
-        """Give the GPU's memory back."""
-        self._gl.glDeleteQueries(1, [self._query])
-        self._gl.glDeleteFramebuffers(1, [self._framebuffer])
-        self._gl.glDeleteRenderbuffers(1, [self._stencil])
-        self.program.free()

@@ -1,6 +1,6 @@
-"""The GPU's side of a scene's light: the shadow map and two level maps of the scene drawn last, and no other's.
+"""The light maps of one scene on the GPU: the shadow map of the key light and two level maps (baking.py).
 
-Views of one scene follow one another, so one scene is all that is kept; the textures are made once and overwritten.
+Views of one scene follow one another, so the maps of one scene are kept; the textures are made once and overwritten.
 """
 
 from collections.abc import Sequence
@@ -15,62 +15,63 @@ from schemas.scene.appearance import Appearance
 from schemas.scene.region import REGION_FLOOR
 from schemas.scene.scene import Placed
 from workers.render.raster import baking
-from workers.render.raster.baking import MAP_PX, SHADOW_PX, Box
+from workers.render.raster.baking import SHADOW_PX, Box
 from workers.render.raster.buffers import ShapeStore
 from workers.render.raster.lit_shaders import CAST_FRAGMENT, CAST_VERTEX
-from workers.render.raster.programs import Program, ThingMaps
+from workers.render.raster.programs import LEVEL_UNIT, SHADOW_UNIT, MapPlacement, Program
 
 UPRIGHT = 1.0 - 1e-9
-"""Cosine between two directions that are one."""
+"""Least cosine between two directions that count as equal."""
 
 SAME_LEVEL_M = 5e-4
-"""What lies this near to a level is lit as if it lay on it."""
+"""Surfaces no farther than this from a level are lit by its map."""
 
-LEVEL_UNIT, SHADOW_UNIT = 1, 2
-"""Texture units; unit 0 is the albedo's."""
+LIT_AND_OPEN = (255, 255, 0, 255)
+"""Texel of a level map where nothing stands."""
 
 
 @dataclass(frozen=True, eq=False)
 class Baked:
-    """Where the maps lie in the world; `light` is None where nothing casts a shadow."""
+    """The boxes in the world that the maps cover; `light` is None without shadows, a level's box without its map."""
 
-    light: Box | None
-    floor: Box | None
-    stand: Box | None
+    light: Box | None = None
+    floor: Box | None = None
+    stand: Box | None = None
 
 
-class SceneLight:
-    """Makes and holds the maps; `prepare` before drawing a view, `bind` before drawing a thing of it."""
+class LightMaps:
+    """Makes and holds the maps: `prepare` before drawing a view, `bind` before drawing a thing of it."""
 
     def __init__(self, gl: ModuleType, shapes: ShapeStore) -> None:
         self._gl, self._shapes = gl, shapes
         self._program = Program(gl, CAST_VERTEX, CAST_FRAGMENT)
         self._shadow = self._depth_texture()
-        self._floor, self._stand, self._open = (self._color_texture() for _ in range(3))
-        self._upload(self._open, np.full((1, 1, 4), (255, 255, 0, 255), np.uint8))
+        self._floor, self._stand, self._open = (self._texture((1.0, 1.0, 0.0, 1.0)) for _ in range(3))
+        self._upload(self._open, np.full((1, 1, 4), LIT_AND_OPEN, np.uint8))
         self._framebuffer = int(gl.glGenFramebuffers(1))
         gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self._framebuffer)
         gl.glFramebufferTexture2D(gl.GL_FRAMEBUFFER, gl.GL_DEPTH_ATTACHMENT, gl.GL_TEXTURE_2D, self._shadow, 0)
         gl.glDrawBuffer(gl.GL_NONE)
         self._key: tuple[object, ...] = ()
         self._held: tuple[object, ...] = ()
-        self._baked = Baked(None, None, None)
-        self._places: dict[int, tuple[Placed, ThingMaps]] = {}
-        self.bakes = 0
-        """How often maps were made."""
+        self._baked = Baked()
+        self._placements: dict[int, tuple[Placed, MapPlacement]] = {}
 
-    def prepare(self, things: Sequence[Placed], appearance: Appearance) -> None:
-        """Make the scene's maps, unless they are there. Binds a framebuffer of its own where it does."""
-        key = (id(appearance), *((id(t.shape), t.T_world_shape.tobytes(), t.region_id) for t in things))
+    def prepare(self, things: Sequence[Placed], appearance: Appearance, shadows: bool, occlusion: bool) -> None:
+        """Make the scene's maps, unless they are there; where it makes them, it binds a framebuffer of its own.
+
+        Without `shadows` the key light reaches every surface; without `occlusion` the whole sky is seen from everywhere.
+        """
+        placed = ((id(t.shape), t.T_world_shape.tobytes(), t.region_id) for t in things)
+        key = (id(appearance), shadows, occlusion, *placed)
         if key == self._key:
             return
-        self._key, self._held = key, (appearance, *(thing.shape for thing in things))
-        self._places.clear()
-        self._baked = self._bake(things, appearance)
-        self.bakes += 1
+        self._key, self._held = key, (appearance, *(thing.shape for thing in things))  # ids stay theirs while held
+        self._placements.clear()
+        self._baked = self._bake(things, appearance, shadows, occlusion)
 
-    def top_is_level(self, thing: Placed) -> bool:
-        """Whether a thing's highest points, if its up is the world's, lie on the level that objects stand on."""
+    def has_level_top(self, thing: Placed) -> bool:
+        """Whether a thing is upright and its highest points lie on the level that objects stand on."""
         stand, T = self._baked.stand, thing.T_world_shape
         if stand is None or T[2, 2] < UPRIGHT:
             return False
@@ -78,7 +79,7 @@ class SceneLight:
         return abs(top - float(stand.bounds[0, 2])) < SAME_LEVEL_M
 
     def bind(self, program: Program, thing: Placed) -> None:
-        """The maps that a thing is lit with, for the program in use."""
+        """Bind the maps that light a thing, for the program in use."""
         gl, baked = self._gl, self._baked
         ground = thing.region_id == REGION_FLOOR
         level = baked.floor if ground else baked.stand
@@ -87,46 +88,48 @@ class SceneLight:
             gl.glActiveTexture(gl.GL_TEXTURE0 + unit)
             gl.glBindTexture(gl.GL_TEXTURE_2D, name)
         gl.glActiveTexture(gl.GL_TEXTURE0)
-        if id(thing) not in self._places:
-            self._places[id(thing)] = (thing, self._place(thing))
-        program.set_maps(self._places[id(thing)][1])
+        if id(thing) not in self._placements:
+            self._placements[id(thing)] = (thing, self._place(thing))
+        program.set_maps(self._placements[id(thing)][1])
 
-    def free(self) -> None:
-        """Give the GPU's memory back."""
-        self._gl.glDeleteFramebuffers(1, [self._framebuffer])
-        self._gl.glDeleteTextures(4, [self._shadow, self._floor, self._stand, self._open])
-        self._program.free()
+    def _bake(self, things: Sequence[Placed], appearance: Appearance, shadows: bool, occlusion: bool) -> Baked:
+        casters, objects = baking.shadow_casters(things), baking.objects_of(things)
+        if not casters or not appearance.lights or not (shadows or occlusion):
+            return Baked()
+        towards, triangles = appearance.lights[0].direction, baking.triangles_of(casters)
+        light = baking.light_box(triangles[0], towards) if shadows else None
+        depth = None if light is None else self._cast(casters, light.clip_from_world)
 
-    def _bake(self, things: Sequence[Placed], appearance: Appearance) -> Baked:
-        solid, objects = baking.casters(things), baking.standing(things)
-        if not solid or not appearance.lights:
-            return Baked(None, None, None)
-        towards, triangles = appearance.lights[0].direction, baking.triangles_of(solid)
-        light = baking.light_box(triangles[0], towards)
-        depth = self._cast(solid, light.clip_from_world)
+        def bake_level(texture: int, above: baking.Triangles, level: Box, hollow: bool) -> None:
+            pixels = baking.level_pixels(*above, level, hollow)
+            if not occlusion:
+                pixels[..., :2] = 255
+            if light is not None and depth is not None:
+                pixels[..., 3] = baking.level_shadow(depth, light, level, towards)
+            self._upload(texture, pixels)
+
         floor = baking.level_box(triangles[0], 0.0, towards, baking.FLOOR_REACH_M)
-        below = [thing for thing in solid if thing not in objects] or solid
-        lit = baking.level_shadow(depth, light, floor, towards)
-        self._upload(self._floor, baking.level_pixels(*baking.triangles_of(below), floor, lit, hollow=True))
+        below = [thing for thing in casters if thing not in objects] or casters
+        bake_level(self._floor, baking.triangles_of(below), floor, True)
         if not objects:
-            return Baked(light, floor, None)
-        upper, faces = baking.triangles_of(objects)
-        stand = baking.level_box(upper, baking.level_of(upper), towards, baking.STAND_REACH_M)
-        lit = baking.level_shadow(depth, light, stand, towards)
-        self._upload(self._stand, baking.level_pixels(upper, faces, stand, lit, hollow=False))
+            return Baked(light, floor)
+        upper = baking.triangles_of(objects)
+        stand = baking.level_box(upper[0], float(upper[0][:, 2].min()), towards, baking.STAND_REACH_M)
+        bake_level(self._stand, upper, stand, False)
         return Baked(light, floor, stand)
 
-    def _place(self, thing: Placed) -> ThingMaps:
+    def _place(self, thing: Placed) -> MapPlacement:
         """Where a thing lies in the maps that light it."""
-        baked = self._baked
-        level = baked.floor if thing.region_id == REGION_FLOOR else baked.stand
-        if baked.light is None:
-            return ThingMaps.of(np.zeros((4, 4)), np.diag([0.0, 0.0, 0.0, 1.0]), (0.0, 1.0, 0.0))
+        light = self._baked.light
+        level = self._baked.floor if thing.region_id == REGION_FLOOR else self._baked.stand
         level_from_shape = np.zeros((4, 4)) if level is None else level.unit_from_world @ thing.T_world_shape
-        shadow_from_shape = baked.light.unit_from_world @ thing.T_world_shape
-        return ThingMaps.of(level_from_shape, shadow_from_shape, baking.soft_radius(baked.light))
+        if light is None:  # every point before the shadow map, so that light reaches it
+            return MapPlacement.of(level_from_shape, np.diag([0.0, 0.0, 0.0, 1.0]), (0.0, 1.0, 0.0))
+        return MapPlacement.of(
+            level_from_shape, light.unit_from_world @ thing.T_world_shape, baking.shadow_filter(light)
+        )
 
-    def _cast(self, things: list[Placed], clip_from_world: Pose) -> NDArray[np.float32]:
+    def _cast(self, things: Sequence[Placed], clip_from_world: Pose) -> NDArray[np.float32]:
         """[SHADOW_PX, SHADOW_PX] float32: least depth of things in an orthographic view; 1 where there is none."""
         gl = self._gl
         gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self._framebuffer)
@@ -147,23 +150,20 @@ class SceneLight:
 
     def _depth_texture(self) -> int:
         gl = self._gl
-        name = self._texture(gl.GL_LINEAR, (1.0, 1.0, 1.0, 1.0))
+        name = self._texture((1.0, 1.0, 1.0, 1.0))
         gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_COMPARE_MODE, gl.GL_COMPARE_REF_TO_TEXTURE)
         gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_COMPARE_FUNC, gl.GL_LEQUAL)
         form = (gl.GL_DEPTH_COMPONENT32F, SHADOW_PX, SHADOW_PX, 0, gl.GL_DEPTH_COMPONENT, gl.GL_FLOAT, None)
         gl.glTexImage2D(gl.GL_TEXTURE_2D, 0, *form)
         return name
 
-    def _color_texture(self) -> int:
-        return self._texture(self._gl.GL_LINEAR, (1.0, 1.0, 0.0, 1.0))
-
-    def _texture(self, filtering: int, border: tuple[float, float, float, float]) -> int:
-        """A texture, bound, that shows `border` outside of [0, 1]."""
+    def _texture(self, border: tuple[float, float, float, float]) -> int:
+        """A texture, bound, interpolated, that shows `border` outside of [0, 1]."""
         gl = self._gl
         name = int(gl.glGenTextures(1))
         gl.glBindTexture(gl.GL_TEXTURE_2D, name)
         for setting in (gl.GL_TEXTURE_MIN_FILTER, gl.GL_TEXTURE_MAG_FILTER):
-            gl.glTexParameteri(gl.GL_TEXTURE_2D, setting, filtering)
+            gl.glTexParameteri(gl.GL_TEXTURE_2D, setting, gl.GL_LINEAR)
         for setting in (gl.GL_TEXTURE_WRAP_S, gl.GL_TEXTURE_WRAP_T):
             gl.glTexParameteri(gl.GL_TEXTURE_2D, setting, gl.GL_CLAMP_TO_BORDER)
         gl.glTexParameterfv(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_BORDER_COLOR, np.array(border, np.float32))
@@ -176,7 +176,3 @@ class SceneLight:
         height, width = pixels.shape[:2]
         form = (gl.GL_RGBA8, width, height, 0, gl.GL_RGBA, gl.GL_UNSIGNED_BYTE, np.ascontiguousarray(pixels))
         gl.glTexImage2D(gl.GL_TEXTURE_2D, 0, *form)
-
-
-MAP_BYTES = 4 * (SHADOW_PX**2 + 2 * MAP_PX**2 + 1)
-"""All that is ever held."""

@@ -1,17 +1,17 @@
-"""GLSL of the `raster` tier: one light with shadows, the others and the sky dimmed where things stand close.
+"""GLSL of tier `raster`: one light with shadows; ambient occlusion of the sky and of the other lights.
 
-All that needs more than the surface itself comes from what baking.py makes once a scene: a *level* map for the floor and
-one for what objects stand on (how open the sky is, and on the floor the shadow), and the key light's shadow map.
+Occlusion and shadows are looked up in the light maps that baking.py makes once a scene: the *level* maps of the floor and
+of the plane that objects stand on, and the key light's shadow map.
 """
 
 KNEE = 0.8
-"""Up to this much light the picture is proportional to it; above, it bends towards 1 and never reaches it."""
+"""Up to here the image is proportional to light; above, it approaches 1 without reaching it."""
 
 ASIDE_M = 0.014
-"""How far in front of a wall its surroundings are looked up: somewhat more than a pixel of the heights' grid."""
+"""Distance in front of a wall at which its level map is looked up: somewhat more than a pixel of the elevation grid."""
 
 LIT_VERTEX = """
-uniform mat4 level_from_shape;     // to (u, v, height above the level in units of its map)
+uniform mat4 level_from_shape;     // to (u, v, elevation above the level in units of its map)
 uniform vec3 up;                   // the world's, in the optical frame
 uniform vec3 below;
 out vec3 v_level;
@@ -31,7 +31,7 @@ void pass_light() {
     v_level = (level_from_shape * vec4(position, 1.0)).xyz;
 #if !LEVEL
     v_shadow = (shadow_from_shape * vec4(position, 1.0)).xyz;
-    // A face's plane n . p = d is one in the map too, where depth falls off by n_xy / n_z.
+    // A face's plane n . p = d is a plane in the map too, where depth changes by -n_xy / n_z.
     vec3 n = shadow_normal * face_plane.xyz;
     v_slope = abs(n.z) > 1e-6 * length(n) ? clamp(-n.xy / n.z, -40.0, 40.0) : vec2(0.0);
     v_aside = ASIDE_M * (mat3(level_from_shape) * face_plane.xyz).xy;
@@ -61,16 +61,16 @@ in vec3 v_shadow;
 flat in vec2 v_slope;
 flat in vec2 v_aside;
 uniform sampler2DShadow shadow_map;
-uniform vec3 softness;             // radius of the filter in the shadow map; what its depths are off by; its pixel
+uniform vec3 softness;             // filter radius, depth bias and pixel size of the shadow map
 const vec2 RING[4] = vec2[4](vec2(0.92, 0.38), vec2(-0.38, 0.92), vec2(-0.92, -0.38), vec2(0.38, -0.92));
 
-// How much of the key light arrives. On the level it is in the map; elsewhere each tap compares with the face's own
-// plane, so that no face shades itself. A loop, because llvmpipe skips one that no fragment enters, and no branch: it is
-// not entered on the level, nor by what is turned away from the light.
+// Share of the key light that arrives. On the level it is in the map; elsewhere each tap compares with the face's own
+// plane, so that no face shades itself. A loop instead of a branch, because llvmpipe skips a loop that no fragment enters:
+// none does on the level or on a face turned away from the light.
 float key_share(float on_map, float facing) {
     bool on_level = abs(v_level.z) < 0.01, inside = all(lessThan(abs(v_level.xy - 0.5), vec2(0.5)));
     int taps = facing <= 0.0 ? 0 : on_level ? (inside ? 0 : 1) : 4;
-    // The map's pixels hold the depth of their centres, up to a pixel away from where they are compared.
+    // The map's pixels hold the depth of their centres, up to a pixel away from the point that is compared.
     float depth = v_shadow.z - softness.y - dot(abs(v_slope), vec2(softness.z));
     float sum = 0.0;
     for (int i = 0; i < taps; ++i) {
@@ -81,8 +81,8 @@ float key_share(float on_map, float facing) {
 }
 #endif
 
-// Light that is as bright as it is below the knee, and above it runs into 1.
-vec3 compress(vec3 c) {
+// Tone curve: linear below the knee, approaching 1 above it.
+vec3 tone_map(vec3 c) {
     vec3 over = max(c - KNEE, 0.0) / (1.0 - KNEE);
     return min(c, KNEE) + (1.0 - KNEE) * over / (1.0 + over);
 }
@@ -93,7 +93,8 @@ vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float rou
     vec4 level = textureLod(level_map, v_level.xy, 0.0);
     float open = level.r, lit = level.a;
 #else
-    // A wall asks in front of itself, where the map does not jump; the higher above what lies there, the more is open.
+    // A wall looks the map up in front of itself, where the map does not jump. Points high above the things there see more
+    // of the sky.
     vec4 level = textureLod(level_map, v_level.xy + v_aside, 0.0);
     float open = mix(level.r, level.g, clamp(v_level.z / max(level.b, 0.004), 0.0, 1.0));
     open = v_level.z < -0.01 ? 1.0 : mix(open, 1.0, clamp(2.5 * (v_level.z - level.b), 0.0, 1.0));

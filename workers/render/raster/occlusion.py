@@ -1,8 +1,8 @@
-"""How open the sky is above a level on which things stand, from their heights: pure functions.
+"""Ambient occlusion: the share of the sky seen from a level on which things stand. Pure functions.
 
-A thing is a column from `under` to `top` above the level, as seen from straight above and below on a square grid. From a
-point, in one direction along the ground, columns hide the sky between two elevations a < b; of cosine-weighted sky,
-between them lies sin^2 b - sin^2 a (integral of 2 sin cos). Openness is the mean over directions of what is left.
+On a square grid, things are columns from `under` to `top` above the level. Seen from a point, in one horizontal direction,
+columns hide the sky between two elevation angles a < b, a share sin^2 b - sin^2 a of the cosine-weighted sky (integral of
+2 sin cos). Sky visibility is the mean, over directions, of the remaining share.
 """
 
 import math
@@ -15,33 +15,33 @@ from workers.geometry.jit import compiled
 
 DIRECTIONS = 8
 REACHES = (1.0, 2.0, 3.5, 5.5, 8.5, 12.5, 18.0)
-"""Distances that are looked at, in steps of the grid."""
+"""Distances of the sampled columns, in steps of the grid."""
 
 
-def openness(
+def sky_visibility(
     top: NDArray[np.float32], under: NDArray[np.float32], base: NDArray[np.float32], step_m: float
 ) -> NDArray[np.float32]:
-    """[N, N] in [0, 1]: share of the sky seen from height `base` [N, N] above the level, looking up.
+    """[N, N] in [0, 1]: share of the sky seen from points `base` [N, N] metres above the level.
 
     top, under [N, N] metres above the level, both 0 where there is nothing, as around the grid.
     """
-    return _openness(top, under, base, _looks(), np.float32(step_m * step_m))
+    return _sky_visibility(top, under, base, _offsets(), np.float32(step_m * step_m))
 
 
 @cache
-def _looks() -> NDArray[np.int64]:
-    """[DIRECTIONS, len(REACHES), 2]: steps (dx, dy) of the grid that are looked at."""
+def _offsets() -> NDArray[np.int64]:
+    """[DIRECTIONS, len(REACHES), 2]: steps (dx, dy) of the grid to the sampled columns."""
     angles = [2.0 * math.pi * (turn + 0.5) / DIRECTIONS for turn in range(DIRECTIONS)]
-    looks = [[(round(r * math.cos(a)), round(r * math.sin(a))) for r in REACHES] for a in angles]
-    return np.array(looks)
+    offsets = [[(round(r * math.cos(a)), round(r * math.sin(a))) for r in REACHES] for a in angles]
+    return np.array(offsets)
 
 
 @compiled
-def _openness(
+def _sky_visibility(
     top: NDArray[np.float32],
     under: NDArray[np.float32],
     base: NDArray[np.float32],
-    looks: NDArray[np.int64],
+    offsets: NDArray[np.int64],
     step2: np.float32,
 ) -> NDArray[np.float32]:
     size = len(top)
@@ -50,10 +50,10 @@ def _openness(
     for y in range(size):
         for x in range(size):
             hidden = zero
-            for turn in range(looks.shape[0]):
+            for turn in range(offsets.shape[0]):
                 high, low = zero, one
-                for reach in range(looks.shape[1]):
-                    dx, dy = looks[turn, reach, 0], looks[turn, reach, 1]
+                for reach in range(offsets.shape[1]):
+                    dx, dy = offsets[turn, reach, 0], offsets[turn, reach, 1]
                     if not (0 <= x + dx < size and 0 <= y + dy < size):
                         break
                     rise = top[y + dy, x + dx] - base[y, x]
@@ -64,5 +64,5 @@ def _openness(
                     high = max(high, rise * rise / (rise * rise + square))
                     low = min(low, foot * foot / (foot * foot + square))
                 hidden += max(high - low, zero)
-            sky[y, x] = one - hidden / np.float32(looks.shape[0])
+            sky[y, x] = one - hidden / np.float32(offsets.shape[0])
     return sky

@@ -1,9 +1,9 @@
-"""GLSL of the label pass and of the pixel counter.
+"""GLSL of the label pass, of passes for colour alone, and of the pixel counter.
 
-How what is the same for a whole draw (camera, region, light) reaches the fragment shader is a matter of speed alone.
-llvmpipe fetches a uniform anew for every fragment, which takes a third of the time of a floor that fills the image; and
-it sets up every input anew for every triangle, which takes two thirds of the time of an object with 20,000 of them. So
-there are two variants of one text: flat inputs where triangles are few, uniforms where they are many.
+Values of a whole draw call (camera, region, light) reach the fragment shader in two ways, for speed alone. llvmpipe fetches
+a uniform again for every fragment, which takes a third of the time of a floor that fills the image. It sets up every input
+again for every triangle, which takes two thirds of the time of an object with 20,000 of them. So one text has two variants:
+flat inputs where triangles are few, uniforms where they are many.
 """
 
 from typing import NamedTuple
@@ -11,26 +11,28 @@ from typing import NamedTuple
 from workers.render.raster.lit_shaders import LIT_FRAGMENT, LIT_VERTEX
 
 MAX_LIGHTS = 6
-"""What the 60 floats that OpenGL 4.1 promises between the two shaders have room for."""
+"""More do not fit into the 60 floats between the two shaders that OpenGL 4.1 guarantees."""
 
 
 class Variant(NamedTuple):
-    """One of the label pass's programs; `lights` is at least 1 and at most `MAX_LIGHTS`."""
+    """The choices that one program is compiled for; `lights` is from 1 to `MAX_LIGHTS`."""
 
+    color: bool
+    """False: depth and region alone, without textures and lights."""
     textured: bool
     few_triangles: bool
     matte: bool
     lights: int
     raster: bool = False
-    """With shadows and occlusion (lighting.py)."""
+    """Lit as in tier raster (lit_shaders.py)."""
     ground: bool = False
-    """A floor: its depth in the test is the rasteriser's, so that what things hide of it is not shaded."""
+    """The floor: tested by the rasteriser's depth, so that its hidden fragments are not shaded."""
     level: bool = False
-    """All of it lies on the level of its map, which then says where the key light falls: for `raster` only."""
+    """All of it lies on the level of its map, which then holds its shadows: for `raster` only."""
     labels: bool = True
-    """False: colour alone, tested by the depth that the rasteriser interpolates, so that hidden fragments cost nothing."""
+    """False: colour alone, tested by the rasteriser's depth, so that hidden fragments are not shaded."""
     cutout: bool = False
-    """Its texture has holes. Apart from the rest, because a program that may discard is not spared hidden fragments."""
+    """Its texture has holes. A variant of its own, because a program that may discard also shades hidden fragments."""
 
 
 _VERTEX = """
@@ -47,7 +49,7 @@ out vec4 v_albedo_roughness;
 out vec2 v_uv;
 flat out vec4 v_plane;
 #if GROUND || !LABELS
-uniform float ahead;
+uniform float nearer;
 #endif
 
 #if FEW_TRIANGLES
@@ -93,15 +95,15 @@ void main() {
     v_uv = uv;
     gl_Position = clip_from_cam * vec4(turn * position + shift, 1.0);
 #if GROUND || !LABELS
-    gl_Position.z += ahead;
+    gl_Position.z += nearer;
 #endif
 }
 """
 
 _FRAGMENT = """
-const float NEAR_M = 0.05;         // any length serves: it scales what the depth test compares
+const float NEAR_M = 0.05;         // of any length: it scales what the depth test compares
 const float HOLE = 0.5;          // texels more transparent than this are holes in colour, never in labels
-const float GRAZING = 0.01;        // cosine of incidence below which a face's plane says nothing about z
+const float GRAZING = 0.01;        // cosine of incidence below which a face's plane does not determine z
 
 in vec4 v_normal_metallic;
 in vec4 v_albedo_roughness;
@@ -110,7 +112,7 @@ flat in vec4 v_plane;
 
 #if FEW_TRIANGLES
 flat in vec4 v_view;               // cx, cy, 1 / fx, 1 / fy
-flat in vec2 v_thing;              // region id / 255, share of its distance by which it stands back
+flat in vec2 v_thing;              // region id / 255, depth bias as a share of the distance
 flat in vec3 v_ambient;
 flat in vec3 v_light_towards[LIGHTS];
 flat in vec3 v_light_color[LIGHTS];
@@ -181,6 +183,7 @@ void main() {
 #endif
 #endif
 
+#if COLOR
     vec3 face_normal = across > 0.0 ? -v_plane.xyz : v_plane.xyz;
     vec3 normal = v_normal_metallic.xyz;
     float length2 = dot(normal, normal);
@@ -196,9 +199,12 @@ void main() {
 #endif
     vec3 light = shade(normal, -ray * per_length, albedo, v_normal_metallic.w, v_albedo_roughness.w);
 #if RASTER
-    light = compress(light);
+    light = tone_map(light);
 #endif
     out_color_region = vec4(encode_srgb(light), v_thing.x);
+#else
+    out_color_region = vec4(vec3(0.0), v_thing.x);
+#endif
 }
 """
 
@@ -220,7 +226,7 @@ void main() {}
 
 
 def label_sources(variant: Variant) -> tuple[str, str]:
-    """(vertex, fragment) shader of the label pass."""
+    """(vertex, fragment) shader of a variant."""
     head = "#version 410 core\n" + "".join(
         f"#define {name.upper()} {int(v)}\n" for name, v in variant._asdict().items()
     )

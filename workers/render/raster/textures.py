@@ -1,8 +1,9 @@
-"""Textures on the GPU, by the identity of their pictures: floors and labels share them across scenes."""
+"""Textures on the GPU, by the identity of their pictures: scenes share those of floors and labels."""
 
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from types import ModuleType
 
 import cv2
@@ -13,46 +14,42 @@ from workers.geometry.srgb import SRGB_STEPS
 from workers.geometry.texels import has_holes
 
 MAX_TEXTURE_PX = 2048
-"""A larger texture is made smaller before it is uploaded: at most this many pixels wide and high."""
-
+"""Greatest width and height of an uploaded texture; a larger picture is scaled down."""
 
 _ROOTS = np.stack([np.rint(255.0 * np.sqrt(SRGB_STEPS))] * 3 + [np.arange(256.0)], axis=-1).astype(np.uint8)[:, None, :]
-"""[256, 1, 4] uint8: the root of linear light of each sRGB code, in 255ths; alpha as it is."""
+"""[256, 1, 4] uint8: the root of the linear light of each sRGB code, in 255ths; alpha unchanged."""
 
 
 @dataclass(eq=False)
 class Texture:
-    """A picture on the GPU, and how many batches draw with it. The picture is held, so that its id stays its own."""
+    """A picture on the GPU, and the number of batches that use it. It holds the picture, so that no other can take its id."""
 
     picture: NDArray[np.uint8]
     name: int
     bytes: int
     holes: bool
-    """Some texels are cut out of colour."""
+    """Whether some texels are cut out of colour."""
     uses: int = 0
 
 
 class TextureStore:
-    """Textures in use, and beside them the last that were, while they all fit into `max_bytes`."""
+    """Textures in use, and the most recently used others while all fit into `max_bytes`."""
 
     def __init__(self, gl: ModuleType, max_bytes: int = 32 * 2**20) -> None:
         self._gl, self._max_bytes = gl, max_bytes
         self._stored: OrderedDict[int, Texture] = OrderedDict()
         self.bytes = 0
-        self._white: int | None = None
 
-    @property
+    @cached_property
     def white(self) -> int:
-        """A texture that multiplies by one everywhere, for what has none of its own."""
-        if self._white is None:
-            self._white = upload_texture(self._gl, mip_levels(np.full((1, 1, 3), 255, np.uint8)))
-        return self._white
+        """A texture that multiplies by one, for surfaces without their own."""
+        return upload_texture(self._gl, mip_levels(np.full((1, 1, 3), 255, np.uint8)))
 
     def __len__(self) -> int:
         return len(self._stored)
 
     def take(self, picture: NDArray[np.uint8]) -> Texture:
-        """The texture of a picture [h, w, 3 or 4] uint8 sRGB, uploaded now if it is not there, with one use more."""
+        """The texture of a picture [h, w, 3 or 4] uint8 sRGB, uploaded now if it is not there; counts one use more."""
         key = id(picture)
         if key not in self._stored:
             levels = mip_levels(picture)
@@ -65,36 +62,26 @@ class TextureStore:
         return texture
 
     def give_back(self, texture: Texture) -> None:
-        """One use less. Of those without any, the longest unused are freed until the rest fit."""
+        """Count one use less; free the least recently used textures without any use until the rest fit."""
         texture.uses -= 1
         for key in [key for key, held in self._stored.items() if held.uses == 0]:
-            if self.fit:
+            if self.fits:
                 return
-            self._free(self._stored.pop(key))
+            unused = self._stored.pop(key)
+            self._gl.glDeleteTextures(1, [unused.name])
+            self.bytes -= unused.bytes
 
     @property
-    def fit(self) -> bool:
+    def fits(self) -> bool:
         """Whether all of them together are within the bound."""
         return self.bytes <= self._max_bytes
 
-    def clear(self) -> None:
-        """Free everything; nothing may be in use."""
-        while self._stored:
-            self._free(self._stored.popitem()[1])
-        if self._white is not None:
-            self._gl.glDeleteTextures(1, [self._white])
-            self._white = None
-
-    def _free(self, texture: Texture) -> None:
-        self._gl.glDeleteTextures(1, [texture.name])
-        self.bytes -= texture.bytes
-
 
 def mip_levels(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
-    """A picture [h, w, 3 or 4] sRGB and its copies at half the size down to one pixel, [h', w', 4] uint8, area means.
+    """Mip levels [h', w', 4] uint8 of a picture [h, w, 3 or 4] sRGB: area means at half the size, down to one pixel.
 
-    Colours are roots of linear light, which a shader squares: half the time of decoding sRGB for each texel. The first is
-    the picture itself, or the largest that fits into `MAX_TEXTURE_PX`; row 0 is the lowest, OpenGL's.
+    Colours are roots of linear light, which a shader squares in half the time of decoding sRGB. The first level is the
+    picture itself, or the largest that fits into `MAX_TEXTURE_PX`; row 0 is the lowest, as in OpenGL.
     """
     level: NDArray = np.ascontiguousarray(image[::-1])
     if level.shape[2] == 3:
@@ -113,7 +100,7 @@ def mip_levels(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
 
 
 def upload_texture(gl: ModuleType, levels: Sequence[NDArray[np.uint8]]) -> int:
-    """A texture, repeated, interpolated between its pixels; of its levels the nearest is read."""
+    """A texture that repeats, with bilinear filtering within the nearest mip level."""
     texture = int(gl.glGenTextures(1))
     gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
     gl.glPixelStorei(gl.GL_UNPACK_ALIGNMENT, 1)

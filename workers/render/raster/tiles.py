@@ -1,4 +1,4 @@
-"""Where a thing falls on the pixel grid, inside the image and around it: pure functions."""
+"""Tiles of the pixel grid that a thing covers, inside the image and around it: pure functions."""
 
 import math
 from collections.abc import Iterator
@@ -13,14 +13,14 @@ from workers.geometry.frames import transform
 from workers.render.raster.programs import NEAR_M
 
 TILE_PX = 1024
-"""Side of the square of pixels that is counted at a time."""
+"""Side of a tile, pixels."""
 
 
 def tiles(shape: Shape, T_cam_shape: Pose, k: Intrinsics) -> Iterator[Intrinsics]:
-    """Cameras of at most `TILE_PX` pixels a side which together see all that `k`, widened on all sides, would see.
+    """Cameras of at most `TILE_PX` pixels a side that together cover the shape's projected bounding box.
 
-    Each is `k` with its principal point moved by whole pixels, so that its pixels are `k`'s; together they cover the
-    shape's projected bounding box within the image and one width and one height of it around.
+    Each is `k` with its principal point moved by whole pixels, so that pixels coincide. The bounding box ends one width and
+    one height of the image outside of it.
     """
     left, top, right, bottom = window(transform(T_cam_shape, shape.vertices), k)
     for y, x in product(range(top, bottom, TILE_PX), range(left, right, TILE_PX)):
@@ -29,10 +29,10 @@ def tiles(shape: Shape, T_cam_shape: Pose, k: Intrinsics) -> Iterator[Intrinsics
 
 
 def window(vertices: Array, k: Intrinsics) -> tuple[int, int, int, int]:
-    """(left, top, right, bottom), whole pixels, right and bottom excluded: the bounding box of what is seen.
+    """(left, top, right, bottom), whole pixels, right and bottom excluded: the projected bounding box of vertices.
 
-    vertices [V, 3] are in the optical frame. What reaches behind the near plane has no bounding box, and gets all of
-    the image and its surroundings; what lies behind it altogether gets none of it.
+    vertices [V, 3], optical frame. A thing that crosses the near plane gets the whole image and its surroundings; a thing
+    behind it gets nothing.
     """
     reach = (-k.width, -k.height, 2 * k.width, 2 * k.height)
     seen = vertices[:, 2] > NEAR_M

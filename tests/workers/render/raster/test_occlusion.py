@@ -1,23 +1,23 @@
-"""Openness of a level, against closed forms."""
+"""Sky visibility above a level, against closed forms."""
 
 import math
 
 import numpy as np
 import pytest
 
-from workers.render.raster.occlusion import openness
+from workers.render.raster.occlusion import sky_visibility
 
 
 def test_nothing_hides_nothing():
     nothing = np.zeros((32, 32), np.float32)
-    assert (openness(nothing, nothing, nothing, 0.01) == 1.0).all()
+    assert (sky_visibility(nothing, nothing, nothing, 0.01) == 1.0).all()
 
 
 def test_a_long_wall_hides_what_its_form_factor_says():
     """A wall of height h at distance d, endless: half of 1 - d / sqrt(d^2 + h^2) of the sky."""
     top, nothing, step = np.zeros((120, 120), np.float32), np.zeros((120, 120), np.float32), 0.01
     top[:, 60:] = 0.06
-    seen = openness(top, nothing, nothing, step)
+    seen = sky_visibility(top, nothing, nothing, step)
     for steps in (2, 4, 8):
         d = (steps + 0.0) * step
         expected = 1.0 - 0.5 * (1.0 - d / math.hypot(d, 0.06))
@@ -27,8 +27,8 @@ def test_a_long_wall_hides_what_its_form_factor_says():
 def test_a_board_overhead_hides_the_sky_and_lets_light_in_from_the_sides():
     top, under = np.zeros((80, 80), np.float32), np.zeros((80, 80), np.float32)
     top[30:50, 30:50], under[30:50, 30:50] = 0.12, 0.1
-    seen = openness(top, under, np.zeros_like(top), 0.01)
+    seen = sky_visibility(top, under, np.zeros_like(top), 0.01)
     assert 0.35 < seen[40, 40] < 0.7
     assert seen[40, 40] < seen[40, 52] < seen[40, 70] <= 1.0
-    higher = openness(top + 0.3 * (top > 0), under + 0.3 * (top > 0), np.zeros_like(top), 0.01)
+    higher = sky_visibility(top + 0.3 * (top > 0), under + 0.3 * (top > 0), np.zeros_like(top), 0.01)
     assert higher[40, 40] > seen[40, 40]

@@ -62,10 +62,10 @@ def test_a_picture_is_uploaded_once_and_kept_while_there_is_room():
     assert store.take(pictures[0]) is first, "kept without a use"
     store.give_back(first)
     others = [store.take(picture) for picture in pictures[1:]]
-    assert not store.fit and driver.freed == []
+    assert not store.fits and driver.freed == []
     store.give_back(others[0])
     assert driver.freed == [first.name], "the longest unused goes first"
-    assert store.fit and len(store) == 3
+    assert store.fits and len(store) == 3
 
 
 def test_what_is_in_use_is_not_freed():

@@ -1,8 +1,8 @@
-"""Anti-aliasing of colour: pure functions on images. Labels are never touched: they are the ones of the pixel's centre.
+"""Antialiasing of colour: pure functions on images. Labels stay those of the pixel's centre.
 
-Two ways. `smooth` blends each pixel at an edge with what lies along that edge (after FXAA, Lottes 2009), a millisecond or
-two an image. `blend` takes the mean, in linear light, with the same pixels drawn at three more points, which costs twice
-what the image itself does.
+`smooth_edges` blends each edge pixel with its neighbours along the edge (after FXAA, Lottes 2009) in one to two
+milliseconds an image. `blend_samples` averages, in linear light, each edge pixel with the same pixel drawn at three more
+points, which takes twice as long as the image itself.
 """
 
 import math
@@ -16,36 +16,37 @@ from workers.geometry.jit import compiled
 from workers.geometry.srgb import SRGB_STEPS, encode_srgb
 
 CONTRAST = 24
-"""Steps of 8 bits between a pixel and a neighbour from which on the pixel counts as an edge."""
+"""An edge pixel differs from one of its neighbours by more than this, in steps of 8 bits."""
 
 RADIUS_PX = 0.38
 OFFSETS_PX = tuple(
     (RADIUS_PX * math.cos(math.radians(a)), RADIUS_PX * math.sin(math.radians(a))) for a in (15, 135, 255)
 )
-"""Where the three lie about the centre: no two of the four share a row or a column, and their mean is the centre."""
+"""The three further sample points about the centre. No two of the four share a row or a column; their mean is the centre."""
 
 SPAN_PX = 8.0
+"""Greatest distance, along an edge, of the neighbours that an edge pixel is blended with."""
 
 LINEAR_STEPS = 16_383
 _LINEAR = np.rint(SRGB_STEPS * LINEAR_STEPS).astype(np.uint16)
 _SRGB = np.rint(255.0 * encode_srgb(np.arange(LINEAR_STEPS + 1) / LINEAR_STEPS)).astype(np.uint8)
 
 
-def edges(rgb: NDArray[np.uint8], region: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """[H, W] uint8, 255 where a pixel's colour is more than `CONTRAST` from one of the four beside it. rgb [H, W, 3].
+def find_edges(rgb: NDArray[np.uint8], region: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """[H, W] uint8: 255 at edge pixels of rgb [H, W, 3], whose colour is more than `CONTRAST` from one of four neighbours.
 
-    Not amid the floor (region [H, W]): what is seen there is its texture, which is smooth already.
+    Two pixels of the floor (region [H, W]) make no edge: the floor's texture is filtered already.
     """
     mask = np.zeros(region.shape, np.uint8)
-    _edges(np.ascontiguousarray(rgb), np.ascontiguousarray(region), REGION_FLOOR, CONTRAST, mask)
+    _mark_edges(np.ascontiguousarray(rgb), np.ascontiguousarray(region), REGION_FLOOR, CONTRAST, mask)
     return mask
 
 
 @compiled
-def _edges(
+def _mark_edges(
     rgb: NDArray[np.uint8], region: NDArray[np.uint8], floor: int, contrast: int, mask: NDArray[np.uint8]
 ) -> None:
-    """Each pair of neighbours is compared once, and marks both."""
+    """Compares each pair of neighbours once, and marks both."""
     height, width = region.shape
     for y in range(height):
         for x in range(width):
@@ -58,17 +59,18 @@ def _edges(
                         mask[y, x] = mask[v, u] = 255
 
 
-def smooth(rgb: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
-    """Blend `rgb` [H, W, 3] along its edges where the mask [H, W] says.
+def smooth_edges(rgb: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
+    """Blend `rgb` [H, W, 3] along its edges, in place, where the mask [H, W] is not 0.
 
-    The edge runs across the gradient of brightness over the four pixels' corners. Along it, two taps close by and two as
-    far as the edge is flat, at most `SPAN_PX`: the farther ones count where they stay between the neighbours' brightness.
+    The edge is perpendicular to the gradient of brightness over the 3 x 3 neighbours. Two taps lie on it half a pixel away,
+    two farther the flatter the edge is, at most `SPAN_PX` away. The farther taps count only where their blend stays
+    between the darkest and the brightest neighbour.
     """
-    _smooth(rgb.copy(), mask, np.float32(SPAN_PX), rgb)
+    _smooth_edges(rgb.copy(), mask, np.float32(SPAN_PX), rgb)
 
 
 @compiled
-def _smooth(seen: NDArray[np.uint8], mask: NDArray[np.uint8], span: np.float32, out: NDArray[np.uint8]) -> None:
+def _smooth_edges(seen: NDArray[np.uint8], mask: NDArray[np.uint8], span: np.float32, out: NDArray[np.uint8]) -> None:
     height, width = mask.shape
     half, quarter, one = np.float32(0.5), np.float32(0.25), np.float32(1.0)
     around = np.empty((3, 3), np.float32)
@@ -120,7 +122,7 @@ def _grey(red: float, green: float, blue: float) -> np.float32:
 
 @compiled
 def _add_tap(image: NDArray[np.uint8], x: float, y: float, weight: np.float32, total: NDArray[np.float32]) -> None:
-    """Add the colour at (x, y), between the centres of four pixels, those at the border repeated."""
+    """Add the bilinear colour at (x, y); pixels at the border are repeated."""
     height, width = image.shape[:2]
     x0, y0 = np.floor(x), np.floor(y)
     fx, fy = np.float32(x - x0), np.float32(y - y0)
@@ -133,8 +135,8 @@ def _add_tap(image: NDArray[np.uint8], x: float, y: float, weight: np.float32, t
         total[channel] += weight * ((one - fy) * above + fy * below)
 
 
-def blend(rgb: NDArray[np.uint8], others: Sequence[NDArray[np.uint8]], mask: NDArray[np.uint8]) -> None:
-    """Put the mean, in linear light, of `rgb` [H, W, 3] and the others [H, W, 4] where the mask says, into `rgb`."""
+def blend_samples(rgb: NDArray[np.uint8], others: Sequence[NDArray[np.uint8]], mask: NDArray[np.uint8]) -> None:
+    """Replace `rgb` [H, W, 3], where the mask is not 0, by its mean with the others [H, W, 4], in linear light."""
     chosen = np.flatnonzero(mask)
     pixels = rgb.reshape(-1, 3)
     total = _LINEAR[pixels[chosen]].astype(np.uint32)

@@ -1,0 +1,69 @@
+"""Looks for tests of the renderer: a tier's settings, and the plan of effects of a scene that calls for all it has."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from schemas.base import Array, frozen_array
+from schemas.job.render import Render
+from schemas.scene.appearance import Appearance, Light
+from schemas.scene.camera import Camera
+from schemas.scene.effects import EffectPlan
+from schemas.scene.scene import Placed
+from schemas.scene.shape import Material, Part, Shape
+from tests.workers.render.random_scenes import EYE, floor
+from workers.geometry.frames import invert
+from workers.geometry.srgb import decode_srgb
+
+Look = tuple[Render, EffectPlan]
+
+_SHADED = ("rgb", "shadows", "ambient_occlusion", "antialiasing")
+_DRAWN = ("floor", "table", "textures", "transparency")
+
+FLAT: Look = Render(tier="flat"), EffectPlan(("rgb", "floor", "table", "textures"), {})
+RASTER: Look = Render(tier="raster"), EffectPlan((*_SHADED, *_DRAWN, "light_maps"), {})
+FOUR: Look = Render(tier="raster", samples=4), EffectPlan((*_SHADED, "samples", *_DRAWN, "light_maps"), {})
+_TRACED = EffectPlan(("rgb", "global_illumination", "glass", *_DRAWN), {})
+
+
+def paths(samples: int, bounces: int = 8) -> Look:
+    """The path-traced look."""
+    return Render(tier="pathtraced", path_samples=samples, path_bounces=bounces), _TRACED
+
+
+def without(look: Look, *names: str) -> Look:
+    """The look with effects withdrawn from its plan; the numbers of the job stay."""
+    assert set(names) <= set(look[1].ran), "it does not run anyway"
+    return look[0], replace(look[1], ran=tuple(name for name in look[1].ran if name not in names))
+
+
+def forcing(look: Look, *names: str) -> Look:
+    """The look with effects forced, as the plan has them: what is forced runs."""
+    ran = (*look[1].ran, *(name for name in names if name not in look[1].ran))
+    return look[0], replace(look[1], ran=ran, forced=frozenset(names))
+
+
+BLACK = (0.0, 0.0, 0.0)
+DOWN = Appearance(BLACK, (Light(frozen_array([0.6, 0.0, 0.8]), (0.9, 0.9, 0.9)),), BLACK)
+"""One light from +x, 53 degrees above the horizon, and nothing else."""
+
+
+WHITE_MATTE = Material((1.0, 1.0, 1.0, 1.0), roughness=1.0)
+
+
+def white_floor() -> Placed:
+    """A matte floor that reflects all light."""
+    (part,) = floor().shape.parts
+    return Placed(1, Shape((Part("p", part.vertices, part.faces, WHITE_MATTE),)), EYE)
+
+
+def brightness(rgb: Array) -> Array:
+    """[H, W] linear green light."""
+    return decode_srgb(rgb[..., 1] / 255.0)
+
+
+def pixel_of(point: Array, view: Camera) -> tuple[float, float]:
+    """(u, v) of a point of the world."""
+    x, y, z = (invert(view.T_world_cam) @ np.append(point, 1.0))[:3]
+    k = view.intrinsics
+    return k.fx * x / z + k.cx, k.fy * y / z + k.cy

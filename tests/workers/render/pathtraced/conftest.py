@@ -1,0 +1,10 @@
+"""One tracer for all tests of a process."""
+
+import pytest
+
+from workers.render.pathtraced.tracer import Tracer
+
+
+@pytest.fixture(scope="session")
+def tracer() -> Tracer:
+    return Tracer()

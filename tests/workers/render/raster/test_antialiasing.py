@@ -1,0 +1,84 @@
+"""Antialiasing of colour: smooth edges with it, the colour of pixel centres without it."""
+
+from unittest import mock
+
+import numpy as np
+import pytest
+
+from schemas.scene.appearance import Appearance
+from schemas.scene.scene import Placed
+from schemas.scene.shape import Material
+from tests.workers.render.looks import BLACK, FLAT, FOUR, RASTER, without
+from tests.workers.render.random_scenes import APPEARANCE, camera, orbit_and_mirror, procedural_things, quad, small
+from workers.geometry.frames import translation
+from workers.geometry.srgb import encode_srgb
+from workers.render.raster.antialiasing import blend_samples, find_edges
+from workers.render.raster.gbuffer import Renderer
+
+
+@pytest.mark.parametrize("render", [RASTER, FOUR])
+def test_a_slanted_edge_is_smooth_and_its_labels_are_not_touched(renderer, render):
+    """White on black: along each row brightness never falls, and every third row has something in between."""
+    slope = 0.3
+    shape = quad(
+        [[0.0, -2.0, 2.0], [3.0, -2.0, 2.0], [3.0, 2.0, 2.0], [slope * 4, 2.0, 2.0]], material=Material((1, 1, 1, 1))
+    )
+    white = Appearance((0.7,) * 3, (), BLACK, (0.7,) * 3)
+    views = [
+        renderer.draw([Placed(3, shape, translation(-0.6, 0, 0))], white, camera(small(80, 80)), *one)
+        for one in (FLAT, render)
+    ]
+    assert views[0].region.tobytes() == views[1].region.tobytes()
+    rows = views[1].rgb[4:-4, :, 1].astype(int)
+    assert (np.diff(rows, axis=1)[:, 4:-4] >= -1).all()
+    top = rows.max()
+    between = ((rows > 0.1 * top) & (rows < 0.9 * top)).any(axis=1)
+    assert between.mean() > 0.5
+    flat_rows = views[0].rgb[4:-4, :, 1].astype(int)
+    assert not ((flat_rows > 0.1 * flat_rows.max()) & (flat_rows < 0.9 * flat_rows.max())).any()
+
+
+@pytest.mark.parametrize("look", [RASTER, FOUR], ids=["smoothed", "four samples"])
+def test_without_antialiasing_a_pixel_has_the_colour_of_its_centre(renderer, look):
+    """A white square in front of black: each pixel is one of the two, by the region of its centre."""
+    corners = [[-0.5, -0.4, 1.0], [0.5, -0.2, 1.0], [0.4, 0.5, 1.0], [-0.3, 0.4, 1.0]]
+    white = Placed(3, quad(corners, material=Material((1, 1, 1, 1))), np.eye(4))
+    sky = Appearance((0.7,) * 3, (), BLACK, (0.7,) * 3)
+    seen = renderer.draw([white], sky, camera(small(80, 80)), *without(look, "antialiasing"))
+    inside = seen.region == 3
+    assert 1000 < inside.sum() < 6400
+    assert (seen.rgb[~inside] == 0).all()
+    assert len(np.unique(seen.rgb[inside], axis=0)) == 1
+    smooth = renderer.draw([white], sky, camera(small(80, 80)), *look)
+    assert len(np.unique(smooth.rgb, axis=0)) > 2
+    assert smooth.region.tobytes() == seen.region.tobytes() and smooth.depth_m.tobytes() == seen.depth_m.tobytes()
+
+
+def test_without_samples_one_sample_is_taken_although_the_job_has_four(renderer):
+    rng = np.random.default_rng(31)
+    things, height = procedural_things(rng)
+    view = orbit_and_mirror(rng, height)[0]
+    with mock.patch.object(Renderer, "_draw_colour", autospec=True, side_effect=Renderer._draw_colour) as drawn:
+        four = renderer.draw(things, APPEARANCE, view, *FOUR)
+        taken = drawn.call_count
+        one = renderer.draw(things, APPEARANCE, view, *without(FOUR, "samples"))
+    assert (taken, drawn.call_count) == (3, 3)
+    assert np.array_equal(one.rgb, renderer.draw(things, APPEARANCE, view, *RASTER).rgb)
+    assert not np.array_equal(one.rgb, four.rgb)
+    assert one.region.tobytes() == four.region.tobytes() and one.depth_m.tobytes() == four.depth_m.tobytes()
+
+
+def test_the_floor_has_no_edges_amid_its_texture():
+    rgb = np.zeros((6, 6, 3), np.uint8)
+    rgb[:, 3:] = 100
+    assert (find_edges(rgb, np.ones((6, 6), np.uint8)) == 0).all()
+    edges = find_edges(rgb, np.full((6, 6), 2, np.uint8))
+    assert (edges[:, 2:4] == 255).all() and edges.sum() == 12 * 255
+
+
+def test_samples_are_averaged_in_linear_light():
+    """Three black samples and a white one: a quarter of white, code 137 of sRGB."""
+    rgb = np.full((1, 2, 3), 255, np.uint8)
+    blend_samples(rgb, [np.zeros((1, 2, 4), np.uint8)] * 3, np.array([[255, 0]], np.uint8))
+    assert rgb[0, 0].tolist() == [round(float(255.0 * encode_srgb(np.array(0.25))))] * 3
+    assert (rgb[0, 1] == 255).all()

@@ -1,0 +1,135 @@
+"""Light maps: made once a scene, only those that the plan asks for, and what colour is without them."""
+
+from dataclasses import replace
+from unittest import mock
+
+import numpy as np
+import pytest
+import trimesh
+
+from schemas.base import frozen_array
+from schemas.scene.appearance import Appearance, Light
+from schemas.scene.scene import Placed
+from schemas.scene.shape import Shape
+from tests.workers.render.looks import (
+    BLACK,
+    DOWN,
+    FLAT,
+    FOUR,
+    RASTER,
+    WHITE_MATTE,
+    brightness,
+    forcing,
+    pixel_of,
+    white_floor,
+    without,
+)
+from tests.workers.render.random_scenes import (
+    APPEARANCE,
+    camera,
+    floor,
+    orbit_and_mirror,
+    random_things,
+    shape_of,
+    small,
+)
+from workers.geometry.camera import orbit_pose
+from workers.geometry.frames import translation
+from workers.render.raster.baking import MAP_PX, SHADOW_PX
+from workers.render.raster.light_maps import LightMaps
+
+
+def counted(name: str):
+    """A method of the light maps that does its work and counts its calls."""
+    return mock.patch.object(LightMaps, name, autospec=True, side_effect=getattr(LightMaps, name))
+
+
+def test_light_is_worked_out_once_a_scene_and_one_scene_is_kept(renderer):
+    rng = np.random.default_rng(3)
+    things, height = random_things(rng)
+    views = orbit_and_mirror(rng, height)
+    renderer.draw([floor()], APPEARANCE, views[0], *RASTER)
+    with counted("_bake") as bake:
+        for view in (*views, *views):
+            renderer.draw(things, APPEARANCE, view, *RASTER)
+    assert bake.call_count == 1
+    assert 4 * (SHADOW_PX**2 + 2 * MAP_PX**2) <= 8 * 2**20
+    renderer.draw(things, APPEARANCE, camera(small(64, 48), views[0].T_world_cam), *FOUR)
+    assert renderer._colour_target.size == (64, 48)
+
+
+def test_without_its_maps_a_scene_has_no_shadow_and_no_light_of_another_scene(renderer):
+    rng = np.random.default_rng(2_000)
+    things, height = random_things(rng)
+    view, dark = orbit_and_mirror(rng, height)[0], without(RASTER, "light_maps")
+    renderer.draw(things[:2], APPEARANCE, view, *RASTER)
+    one = renderer.draw(things, APPEARANCE, view, *dark).rgb
+    renderer.draw(things, APPEARANCE, view, *RASTER)
+    two = renderer.draw(things, APPEARANCE, view, *dark).rgb
+    assert np.array_equal(one, two)
+    lit = renderer.draw(things, APPEARANCE, view, *RASTER).rgb
+    assert one.astype(np.int64).sum() > lit.astype(np.int64).sum()
+    neither = renderer.draw(things, APPEARANCE, view, *without(RASTER, "shadows", "ambient_occlusion")).rgb
+    assert np.array_equal(one, neither)
+
+
+@pytest.mark.parametrize("level_m", [0.0, 0.6], ids=["floor", "table"])
+def test_without_shadows_a_point_behind_a_box_has_lamberts_brightness(renderer, level_m):
+    """The key light alone, color 0.9 x cosine 0.8 on white, in the middle of what is the box's shadow; to 2 %."""
+    box = shape_of(trimesh.creation.box((0.2, 0.2, 0.2)))
+    (slab,) = shape_of(trimesh.creation.box((1.6, 1.2, 0.05))).parts
+    matte = Shape((replace(slab, material=WHITE_MATTE),))
+    table = [Placed(2, matte, translation(0.0, 0.0, level_m - 0.025))] if level_m else []
+    things = [white_floor(), *table, Placed(3 if table else 2, box, translation(0.0, 0.0, level_m + 0.1))]
+    view = camera(T=orbit_pose(np.array([0.0, 0.0, level_m]), 1.0, -np.pi / 2, 1.5))
+    u, v = (int(c) for c in pixel_of(np.array([-0.16, 0.0, level_m]), view))
+    shadowed = renderer.draw(things, DOWN, view, *RASTER)
+    with counted("_cast") as cast:
+        lit = renderer.draw(things, DOWN, view, *without(RASTER, "shadows"))
+    assert cast.call_count == 0, "a shadow map was made"
+    assert brightness(shadowed.rgb)[v, u] < 0.1 * 0.72
+    assert brightness(lit.rgb)[v, u] == pytest.approx(0.9 * 0.8, rel=0.02)
+    assert lit.depth_m.tobytes() == shadowed.depth_m.tobytes()
+    assert lit.region.tobytes() == shadowed.region.tobytes()
+
+
+def wall_on_a_table():
+    """(things, a view, pixel of a point x metres in front of the wall)."""
+    wall = shape_of(trimesh.creation.box((0.02, 0.5, 0.3)))
+    slab = shape_of(trimesh.creation.box((2.0, 2.0, 0.05)))
+    things = [floor(), Placed(2, slab, translation(0, 0, 0.575)), Placed(3, wall, translation(0, 0, 0.75))]
+    view = camera(T=orbit_pose(np.array([0.0, 0.0, 0.6]), 0.9, -0.3, 1.5))
+    return things, view, lambda x: tuple(int(c) for c in pixel_of(np.array([x, 0.0, 0.6]), view)[::-1])
+
+
+SKY = Appearance((0.5,) * 3, (Light(frozen_array([0.0, 0.0, 1.0]), BLACK),), BLACK)
+
+
+def test_where_a_thing_stands_the_table_is_darker_without_any_light_but_the_sky(renderer):
+    """Beside a wall the sky is half hidden; half a metre from it hardly."""
+    things, view, pixel = wall_on_a_table()
+    seen = brightness(renderer.draw(things, SKY, view, *RASTER).rgb)
+    at = {x: seen[pixel(x)] for x in (0.03, 0.1, 0.5)}
+    assert 0.4 < at[0.03] / at[0.5] < 0.75
+    assert at[0.03] < at[0.1] < at[0.5]
+
+
+def test_without_ambient_occlusion_the_whole_sky_is_seen_beside_a_wall_as_far_from_it(renderer):
+    """Sky 0.5 x (albedo + 4 % that is mirrored), everywhere on the table; and shadows stay."""
+    things, view, pixel = wall_on_a_table()
+    look = without(RASTER, "ambient_occlusion")
+    seen = brightness(renderer.draw(things, SKY, view, *look).rgb)
+    albedo = brightness(np.array([0.0, 0.7 * 255.0, 0.0]))
+    for x in (0.03, 0.1, 0.5):
+        assert seen[pixel(x)] == pytest.approx(0.5 * (albedo + 0.04), rel=0.03), f"{x} m from the wall"
+    beyond = Appearance(BLACK, (Light(frozen_array([-0.6, 0.0, 0.8]), (0.9, 0.9, 0.9)),), BLACK)
+    both = [brightness(renderer.draw(things, beyond, view, *one).rgb)[pixel(0.1)] for one in (RASTER, look)]
+    assert max(both) < 0.02, "light from beyond the wall arrives"
+
+
+def test_maps_that_are_forced_are_made_in_full_although_no_colour_uses_them(renderer):
+    things, view, _ = wall_on_a_table()
+    renderer.draw([floor()], APPEARANCE, view, *RASTER)
+    with counted("_cast") as cast:
+        renderer.draw(things, APPEARANCE, view, *forcing(FLAT, "light_maps"))
+    assert cast.call_count == 1

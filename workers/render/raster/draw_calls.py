@@ -1,0 +1,98 @@
+"""Draw calls of a pass over a scene: which triangles of which thing are drawn by which program. Pure."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+from schemas.base import Pose
+from schemas.scene.appearance import Appearance
+from schemas.scene.camera import Intrinsics
+from schemas.scene.effects import EffectPlan
+from schemas.scene.region import REGION_FLOOR, REGION_TABLE
+from schemas.scene.scene import Placed
+from schemas.scene.shape import Shape
+from workers.render.raster.buffers import Uploaded, UploadedShape
+from workers.render.raster.programs import light_slots
+from workers.render.raster.shaders import Variant
+
+NAMES = {REGION_FLOOR: "floor", REGION_TABLE: "table"}
+"""Effects that draw one thing; objects are always drawn."""
+
+
+@dataclass(frozen=True, eq=False)
+class RenderPass:
+    """One pass over all things of a scene: camera, light, and what is drawn."""
+
+    appearance: Appearance
+    k: Intrinsics
+    T_cam_world: Pose
+    effects: EffectPlan
+    color: bool
+    """Whether colour is drawn, in tier flat or raster."""
+    raster: bool
+    """Whether that colour is of tier raster."""
+    labels: bool = True
+    """Whether depth and region are drawn."""
+    cut: bool = False
+    """Whether clear texels are cut out; in a pass for colour alone."""
+
+    def shift(self, x_px: float, y_px: float) -> "RenderPass":
+        """The same with every pixel's centre moved by (x_px, y_px)."""
+        return replace(self, k=self.k.model_copy(update={"cx": self.k.cx - x_px, "cy": self.k.cy - y_px}))
+
+
+@dataclass(frozen=True, eq=False)
+class Draw:
+    """One draw call: `count` indices of a thing's batch from `first` on."""
+
+    thing: Placed
+    shape: UploadedShape
+    batch: Uploaded
+    first: int
+    count: int
+
+
+def is_drawn(effects: EffectPlan, name: str, needed: bool) -> bool:
+    """Whether an exact no-op runs for one batch or view, given whether that needs it."""
+    return name in effects.forced or (needed and effects.runs(name))
+
+
+def sort_draws(
+    things: Sequence[Placed],
+    fetch: Callable[[Shape], UploadedShape],
+    view: RenderPass,
+    has_level_top: Callable[[Placed], bool],
+) -> dict[Variant, list[Draw]]:
+    """Draw calls by program. The floor comes last, so that its hidden pixels are not shaded.
+
+    `has_level_top` tells whether the top of a thing has a level map; only tier raster asks. Raises ValueError above six
+    lights.
+    """
+    lights, raster = light_slots(view.appearance) if view.color else 1, view.raster
+    by_variant: dict[Variant, list[Draw]] = {}
+    for thing in reversed(things):
+        name = NAMES.get(thing.region_id)
+        if name is not None and not view.effects.runs(name):
+            continue
+        shape, ground = fetch(thing.shape), thing.region_id == REGION_FLOOR
+        split = raster and has_level_top(thing)
+        for batch in shape.batches:
+            textured = view.color and is_drawn(view.effects, "textures", batch.texture is not None)
+            cutout = view.cut and textured and is_drawn(view.effects, "transparency", batch.holes)
+            # Each program takes megabytes; only a floor is large enough to gain from one without highlights.
+            matte = view.color and batch.matte and ground
+            for first, count, level in _ranges(batch, split, raster and ground):
+                look = (view.color, textured, batch.few_triangles, matte, lights, raster)
+                variant = Variant(*look, ground, level, view.labels, cutout)
+                by_variant.setdefault(variant, []).append(Draw(thing, shape, batch, first, count))
+    return by_variant
+
+
+def _ranges(batch: Uploaded, split: bool, level: bool) -> Iterator[tuple[int, int, bool]]:
+    """(first index, count, whether all of them lie on a level) of a batch; `split`: its top apart from the rest."""
+    if not split:
+        yield 0, batch.index_count, level
+        return
+    if batch.top_count:
+        yield 0, batch.top_count, True
+    if batch.top_count < batch.index_count:
+        yield batch.top_count, batch.index_count - batch.top_count, False
