@@ -36,7 +36,7 @@ from schemas.errors import MachineError, MeshError
 from schemas.scene.shape import Asset, Mesh
 from workers.geometry.convexity import components, concavity_m, solid_of, triangles_of, weld
 from workers.geometry.hull import convex_hull
-from workers.geometry.lathe_decomposition import TOLERANCE, parts_of_lofts
+from workers.geometry.lathe_decomposition import TOLERANCE, decompose_lofts
 from workers.physics.convex_parts.coacd_process import MISSING
 from workers.physics.convex_parts.parts_cache import USUAL_FOLDER, PartsCache, key_of
 
@@ -93,7 +93,7 @@ _CACHE = PartsCache()
 def parts_of(asset: Asset, threshold: float = THRESHOLD, share: float = TOLERANCE) -> tuple[Array, ...]:
     """Vertex clouds [N, 3] of an asset's convex parts, object frame: those that follow from its making, or else CoACD's.
 
-    `threshold` is CoACD's, `share` that of `parts_of_lofts`. Where a built-in shape's own outlines cannot be cut, for they
+    `threshold` is CoACD's, `share` that of `decompose_lofts`. Where a built-in shape's own outlines cannot be cut, for they
     meet but for the last bits, it is cut by CoACD too.
     """
     lofts = asset.lofts
@@ -101,7 +101,7 @@ def parts_of(asset: Asset, threshold: float = THRESHOLD, share: float = TOLERANC
         return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
     key = key_of("lofts", repr(share), asset.sha256, asset.shape.mesh.vertices.tobytes())
     try:
-        return _CACHE.get(key, None, lambda: ("lofts", parts_of_lofts(lofts, share)))[1]
+        return _CACHE.get(key, None, lambda: ("lofts", decompose_lofts(lofts, share)))[1]
     except (ValueError, shapely.errors.GEOSException):
         return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
 
