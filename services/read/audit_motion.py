@@ -12,7 +12,7 @@ from schemas.scene.camera import Camera
 from schemas.scene.scene import Placed, PosedScene, View
 from schemas.scene.shape import Shape
 from workers.geometry.camera import project
-from workers.geometry.frames import invert, moved_between, transform
+from workers.geometry.frames import invert, motion_between, transform
 from workers.geometry.raycast import NEAR_M, edge_distance_px
 from workers.physics.step import release_again
 from workers.pipeline.context import WorkerContext
@@ -78,7 +78,7 @@ def measure_motion(context: WorkerContext, scene: Scene) -> Motion:
 
 def move_between(shape: Shape, before: Pose, after: Pose) -> Motion:
     """How far the farthest point of a shape moves between two poses [4, 4], and by what angle it turns."""
-    moved_m, turned_rad = moved_between(shape.vertices, before, after)
+    moved_m, turned_rad = motion_between(shape.vertices, before, after)
     return Motion(moved_m * 1e3, math.degrees(turned_rad))
 
 

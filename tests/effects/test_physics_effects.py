@@ -16,7 +16,7 @@ from tests.hard_cases.bodies import built_in, cube, mug_on_peg, over_edge, rod
 from tests.hard_cases.drops import EDGE_M, X, Y, drop, level, lowered, ring, turn
 from tests.hard_cases.measures import Z
 from tests.shapes import asset_of
-from workers.geometry.elevation import survey
+from workers.geometry.elevation import prepare_terrain
 from workers.geometry.frames import transform
 from workers.physics.placement import gap_m, ground_of, placed_mesh
 from workers.physics.separation import clearances
@@ -90,7 +90,9 @@ def test_without_object_contacts_the_cubes_of_a_stack_overlap_by_their_size():
     through = [settle_alone(start, plan.table, physics, alone).T_world_obj for start in plan.objects]
     stacked = [rest.T_world_obj for rest in settled(facts).settled]
     gaps = [
-        clearances([placed_mesh(s, T) for s, T in zip(plan.objects, poses, strict=True)], survey(plan.table.mesh))
+        clearances(
+            [placed_mesh(s, T) for s, T in zip(plan.objects, poses, strict=True)], prepare_terrain(plan.table.mesh)
+        )
         for poses in (through, stacked)
     ]
     assert min(gaps[0]) < -0.09

@@ -7,12 +7,12 @@ from schemas.base import Array
 from schemas.errors import ViewError
 from schemas.job.job import Images, Mirror
 from schemas.scene.scene import REGION_FIRST_OBJECT
-from workers.geometry.stored_depth import stored_depth_m
+from workers.geometry.stored_depth import dequantise_depth
 
 
 def object_distance(depth: NDArray[np.uint16], region: NDArray[np.uint8], images: Images, mirror: Mirror) -> float:
     """`front_distance` of the object in a stored view; of its depth only the object's pixels are turned to metres."""
-    return front_distance(stored_depth_m(depth[region >= REGION_FIRST_OBJECT], images), np.True_, mirror)
+    return front_distance(dequantise_depth(depth[region >= REGION_FIRST_OBJECT], images), np.True_, mirror)
 
 
 def front_distance(depth_m: Array, object_pixels: NDArray[np.bool_] | np.bool_, mirror: Mirror) -> float:

@@ -14,8 +14,8 @@ from workers.geometry.camera import image_coordinates, project
 from workers.geometry.distortion import distort
 from workers.geometry.frames import invert
 from workers.geometry.normals import facing_cosine, is_smooth
-from workers.geometry.pixels import Extent, count_filled, take_colours
-from workers.geometry.projection import Projected, carry_pixels, forward_project, in_frame, sample_inverse_depth
+from workers.geometry.pixels import Extent, count_filled, gather_colours
+from workers.geometry.projection import Projected, forward_project, in_frame, reproject_pixels, sample_inverse_depth
 from workers.geometry.stored_depth import quantise_depth
 
 FEWEST_POINTS = 50
@@ -51,7 +51,7 @@ def derive_projected(
         seen = projected.source >= 0
         rgb[seen] = colours_of(source, projected.source[seen], lens)
         return rgb, quantise_depth(projected.depth_m, images)
-    return take_colours(source.rgb, projected.source), quantise_depth(projected.depth_m, images)
+    return gather_colours(source.rgb, projected.source), quantise_depth(projected.depth_m, images)
 
 
 def colours_of(source: View, pixels: NDArray[np.integer], lens: Distortion | None) -> NDArray[np.uint8]:
@@ -136,7 +136,7 @@ def agree_across(source: View, mirror: View, images: Images, bound_mm: float, fi
     facing = facing_cosine(source.depth, source.region, pixels, source.camera, mirror.camera.position, units)
     smooth = is_smooth(source.depth, source.region, pixels, SMOOTH_INPUT_M, units)
     index = pixels[(np.nan_to_num(facing, nan=-1.0) > FACING) & smooth]
-    points = carry_pixels(source.depth, index, source.camera, mirror.camera, units)
+    points = reproject_pixels(source.depth, index, source.camera, mirror.camera, units)
     keep = points[:, 2] > 0.0
     points, index = points[keep], index[keep]
     u, v = project(points, mirror.camera.intrinsics)

@@ -14,7 +14,7 @@ from schemas.base import Array, Pose
 from schemas.errors import SettleError
 from schemas.job.physics import Physics
 from schemas.scene.shape import Mesh
-from workers.geometry.frames import quaternion_of
+from workers.geometry.frames import quaternion_from_rotation
 from workers.physics.bullet_buffers import Numbers
 from workers.physics.silence_stderr import silence_c_stderr
 from workers.physics.stop_conditions import SAME_PLANE_M, Motion
@@ -263,7 +263,7 @@ def _add_body(client: int, body: Body, R_world_body: Array | None) -> int:
     shape with axes of its own is a compound to Bullet, and compounds do not stay as well on one another.
     """
     parts = [np.round(part if R_world_body is None else part @ R_world_body.T, ROUND_TO) for part in body.parts]
-    orientation = [0.0, 0.0, 0.0, 1.0] if R_world_body is None else quaternion_of(R_world_body.T).tolist()
+    orientation = [0.0, 0.0, 0.0, 1.0] if R_world_body is None else quaternion_from_rotation(R_world_body.T).tolist()
     if len(parts) > 1:
         shape = _compound(client, parts, orientation)
     elif R_world_body is None:
@@ -324,5 +324,5 @@ def _size_m(body: Body) -> float:
 
 
 def _place(client: int, thing: int, T: Pose) -> None:
-    quaternion = quaternion_of(T[:3, :3])
+    quaternion = quaternion_from_rotation(T[:3, :3])
     pybullet.resetBasePositionAndOrientation(thing, T[:3, 3].tolist(), quaternion.tolist(), physicsClientId=client)

@@ -9,7 +9,7 @@ from shapely.geometry import MultiPoint, Point
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
-from workers.geometry.contact_points import touching_points
+from workers.geometry.contact_points import find_contact_points
 from workers.geometry.elevation import Terrain
 
 CONE_EDGES = 8
@@ -42,14 +42,14 @@ class Contact:
 def contact_points(upper: Mesh, lower: Mesh | Terrain, within_m: float) -> tuple[Array, Array]:
     """(points [N, 3], unit normals [N, 3], from lower to upper) where two meshes in world coordinates touch.
 
-    Where they are within `within_m` of one another, see `touching_points`; of a surveyed ground only its vertices and
+    Where they are within `within_m` of one another, see `find_contact_points`; of a surveyed ground only its vertices and
     faces that are not vertical.
     """
     if isinstance(lower, Terrain):
         a, b, c = lower.corners
         faces = np.arange(3 * len(a), dtype=np.int32).reshape(3, -1).T
         lower = Mesh(np.concatenate([a, b, c]), np.ascontiguousarray(faces))
-    return touching_points(upper, lower, within_m)
+    return find_contact_points(upper, lower, within_m)
 
 
 def equilibrium_residual(bodies: Sequence[Weight], contacts: Sequence[Contact], friction: float) -> Array:

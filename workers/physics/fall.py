@@ -13,7 +13,7 @@ from schemas.scene.scene import ObjectStart, Table
 from schemas.scene.shape import MassProperties, Mesh
 from workers.geometry.frames import invert, pose, rotation_from_quaternion, transform
 from workers.geometry.hull import convex_hull
-from workers.geometry.hull_offset import inset_hull, least_width_m
+from workers.geometry.hull_offset import least_width_m, offset_hull
 from workers.geometry.lathe_decomposition import TOLERANCE
 from workers.physics.bullet import GRAVITY_M_S2, SLOP_M, Body, World, open_world
 from workers.physics.convex_parts.step import parts_of
@@ -126,12 +126,12 @@ def make_faller(
     T_obj_body, moments = body_frame(start.asset.mass)
     hulls = [convex_hull(part) for part in cut] or [start.hull]
     wanted = physics.margin_mm / 1e3 - SLOP_M
-    smaller = [inset_hull(hull, wanted) for hull in hulls]
-    inset = min(each.inset_m for each in smaller)
+    smaller = [offset_hull(hull, wanted) for hull in hulls]
+    inset = min(each.offset_m for each in smaller)
     if cut:
         each_to = zip(smaller, hulls, strict=True)
-        smaller = [each if each.inset_m == inset else inset_hull(hull, inset) for each, hull in each_to]
-    shapes, margin = [each.vertices for each in smaller], min(each.inset_m for each in smaller) + SLOP_M
+        smaller = [each if each.offset_m == inset else offset_hull(hull, inset) for each, hull in each_to]
+    shapes, margin = [each.vertices for each in smaller], min(each.offset_m for each in smaller) + SLOP_M
     to_body = invert(T_obj_body)
     reach = float(np.linalg.norm(transform(to_body, start.hull.vertices), axis=1).max())
     parts = tuple(transform(to_body, each) for each in shapes)

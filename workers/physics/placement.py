@@ -8,7 +8,7 @@ from schemas.base import Pose
 from schemas.scene.scene import ObjectStart, Table
 from schemas.scene.shape import Mesh
 from workers.geometry.convexity import solid_of, weld
-from workers.geometry.elevation import Terrain, survey
+from workers.geometry.elevation import Terrain, prepare_terrain
 from workers.geometry.frames import transform, translation
 from workers.physics.equilibrium import FIXED, Contact, Weight, contact_points, equilibrium_residual, support_margin_m
 from workers.physics.rest_pose import CONTACT_M
@@ -56,7 +56,7 @@ class Support:
 
 def ground_of(table: Table) -> Ground:
     """The table made ready."""
-    return Ground(table, survey(table.mesh))
+    return Ground(table, prepare_terrain(table.mesh))
 
 
 def placed_mesh(start: ObjectStart, T_world_obj: Pose) -> Mesh:

@@ -11,7 +11,7 @@ from schemas.errors import SettleError
 from schemas.job.physics import Physics
 from schemas.scene.scene import ObjectStart, Settled, SupportedBy, Table
 from schemas.scene.shape import Mesh
-from workers.geometry.elevation import survey
+from workers.geometry.elevation import prepare_terrain
 from workers.geometry.frames import transform
 from workers.geometry.lathe_decomposition import COARSE, TOLERANCE
 from workers.physics.equilibrium import FIXED, Contact, Weight, contact_points, equilibrium_residual, support_margin_m
@@ -116,7 +116,7 @@ def _describe(
     """The figures of every rest pose, measured between the meshes and not taken from the simulator."""
     meshes = [placed_mesh(start, T) for start, T in zip(starts, motion.poses, strict=True)]
     coms = [transform(T, start.asset.mass.com[None, :])[0] for start, T in zip(starts, motion.poses, strict=True)]
-    gaps, contacts = clearances(meshes, survey(table.mesh)), _contacts(meshes, table)
+    gaps, contacts = clearances(meshes, prepare_terrain(table.mesh)), _contacts(meshes, table)
     weights = [
         Weight(start.asset.mass.mass_kg, com, float(np.ptp(mesh.vertices, axis=0).max()))
         for start, com, mesh in zip(starts, coms, meshes, strict=True)

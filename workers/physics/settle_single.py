@@ -9,7 +9,7 @@ from schemas.base import Pose, frozen_array
 from schemas.errors import SettleError
 from schemas.job.physics import Physics
 from schemas.scene.scene import ObjectStart, Settled, SupportedBy, Table
-from workers.geometry.elevation import heights_at
+from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import transform
 from workers.physics.effects import called_for, on_mesh
 from workers.physics.fall import FINEST, Fall, Faller, choose_pace, fall, faller_of, free_fall_m, shaped
@@ -151,7 +151,9 @@ def let_go(
 def _require_rest(task: _Task, motion: Fall) -> None:
     table, start = task.ground.table, task.start
     com = transform(motion.poses[0], start.asset.mass.com[None, :])[0]
-    over_top = heights_at(com[None, :2], task.ground.terrain)[0] >= table.top.height_m - LEFT_M  # nan compares false
+    over_top = (
+        sample_elevation(com[None, :2], task.ground.terrain)[0] >= table.top.height_m - LEFT_M
+    )  # nan compares false
     high = com[2] >= table.top.height_m - LEFT_M
     if not (over_top and high) and not (motion.rested and _is_held(task, motion)):
         raise SettleError(

@@ -9,7 +9,7 @@ from schemas.base import Pose
 from schemas.job.physics import Physics
 from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import ObjectStart, ScenePlan, Settled, Table
-from workers.geometry.frames import moved_between
+from workers.geometry.frames import motion_between
 from workers.physics.effects import called_for, on_mesh, rooms_m
 from workers.physics.settle_group import release_together, settle_together
 from workers.physics.settle_single import LeftRoomError, let_go, settle_alone, watching
@@ -95,5 +95,5 @@ def release_again(
 
 def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, float]:
     """Between two poses of an object: how far its farthest point went, mm, and by how much it turned, degrees."""
-    moved_m, turned_rad = moved_between(start.hull.vertices, before, after)
+    moved_m, turned_rad = motion_between(start.hull.vertices, before, after)
     return moved_m * 1e3, math.degrees(turned_rad)

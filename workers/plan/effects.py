@@ -18,7 +18,7 @@ from schemas.scene.effects import EffectKind, EffectPlan
 from schemas.scene.scene import ScenePlan
 from schemas.scene.shape import Part
 from workers.cameras.placement import place_aligned_camera, place_mirror_camera
-from workers.geometry.frustum import outside_views
+from workers.geometry.frustum import is_outside_views
 from workers.geometry.texels import has_holes
 from workers.physics.effects import COSTS, PREDICATES
 from workers.plan.effect import Effect, Facts
@@ -144,7 +144,7 @@ def _table(facts: Facts) -> str | None:
 
 def _seen(facts: Facts, points: Array) -> bool:
     """Whether any view may see something of the convex hull of points [N, 3], world."""
-    return any(not outside_views(points, cameras) for cameras in _views(facts.job, facts.plan))
+    return any(not is_outside_views(points, cameras) for cameras in _views(facts.job, facts.plan))
 
 
 def _views(job: Job, plan: ScenePlan) -> Iterator[tuple[Camera, ...]]:

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from workers.geometry.elevation import survey
+from workers.geometry.elevation import prepare_terrain
 from workers.geometry.frames import pose, rotation_about, transform
 from workers.physics.equilibrium import (
     FIXED,
@@ -60,7 +60,7 @@ def test_nothing_touches_beyond_the_distance():
 
 def test_a_surveyed_ground_is_touched_as_its_mesh_is():
     upper = box((0.1, 0.2, 0.3), (0.46, 0, 0.15))
-    points, normals = contact_points(upper, survey(GROUND), WITHIN_M)
+    points, normals = contact_points(upper, prepare_terrain(GROUND), WITHIN_M)
     expected, _ = contact_points(upper, GROUND, WITHIN_M)
     assert sorted(map(tuple, np.round(points, 9))) == sorted(map(tuple, np.round(expected, 9)))
     assert normals[:, 2] == pytest.approx(1.0)

@@ -10,7 +10,14 @@ from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart
 from schemas.scene.shape import Asset, Mesh
 from tests.shapes import asset_of, box
-from workers.geometry.frames import pose, quaternion_of, rotation_about, transform, translation, uniform_rotation
+from workers.geometry.frames import (
+    pose,
+    quaternion_from_rotation,
+    rotation_about,
+    transform,
+    translation,
+    uniform_rotation,
+)
 from workers.geometry.hull import convex_hull
 from workers.physics.bullet import GRAVITY_M_S2, SLOP_M, Body
 from workers.physics.fall import FINEST, SKIPPED_TO_M, Faller, Pace, as_pose, fall, make_faller
@@ -143,7 +150,7 @@ def test_a_watch_ends_the_fall_and_says_which_it_was():
 
 def test_a_pose_comes_back_from_its_quaternion():
     T = pose(uniform_rotation(np.random.default_rng(2)), np.array([0.1, 0.2, 0.3]))
-    quaternion = quaternion_of(T[:3, :3])
+    quaternion = quaternion_from_rotation(T[:3, :3])
     assert as_pose(((0.1, 0.2, 0.3), tuple(quaternion))) == pytest.approx(T, abs=1e-12)
 
 

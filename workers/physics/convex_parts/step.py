@@ -34,7 +34,7 @@ import shapely
 from schemas.base import Array, frozen_array
 from schemas.errors import MachineError, MeshError
 from schemas.scene.shape import Asset, Mesh
-from workers.geometry.convexity import components, concavity_m, solid_of, triangles_of, weld
+from workers.geometry.convexity import components, concavity_m, mesh_of, solid_of, weld
 from workers.geometry.hull import convex_hull
 from workers.geometry.lathe_decomposition import TOLERANCE, decompose_lofts
 from workers.physics.convex_parts.coacd_process import MISSING
@@ -152,7 +152,7 @@ def _parts_of(piece: Mesh, threshold: float) -> tuple[Way, list[Array]]:
     if solid is None:
         found = _run(piece, {**OPTIONS, **OPEN, "threshold": threshold})
     else:
-        found = _run(triangles_of(solid.simplify(SIMPLER * size)), {**OPTIONS, **CLOSED, "threshold": threshold})
+        found = _run(mesh_of(solid.simplify(SIMPLER * size)), {**OPTIONS, **CLOSED, "threshold": threshold})
     fitted = _fit(found, hull.vertices, hull.normals)
     return ("coacd", fitted) if fitted else ("pieces", [hull.vertices])
 
@@ -186,7 +186,7 @@ def _fit(clouds: list[Array], vertices: Array, normals: Array) -> list[Array]:
     fitted = []
     for cloud in clouds:
         if (cloud @ normals.T - reach).max() > 1e-9 * size:
-            cloud = triangles_of(manifold3d.Manifold.hull_points(np.ascontiguousarray(cloud)) ^ whole).vertices
+            cloud = mesh_of(manifold3d.Manifold.hull_points(np.ascontiguousarray(cloud)) ^ whole).vertices
         if len(cloud) >= 4:
             fitted.append(cloud)
     if not fitted:  # CoACD gave up, or the hull is flat and what is left of its voxels is nothing
