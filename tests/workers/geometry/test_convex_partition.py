@@ -1,4 +1,4 @@
-"""Plane outlines cut into convex cells, against shapely's areas and hulls."""
+"""Convex partitions of plane outlines, against shapely's areas and hulls."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def test_cells_are_convex_and_tile_the_outline(name):
     )
 
 
-def test_there_is_at_most_one_cell_more_than_corners_that_turn_inwards():
+def test_there_is_at_most_one_cell_more_than_reflex_corners():
     assert len(polygons(L_SHAPE)) == 2
     assert len(polygons(STAR)) <= 8
 
@@ -50,7 +50,7 @@ def test_a_shallow_arc_is_kept_whole_only_within_the_tolerance():
 
 
 def test_outlines_that_are_cut_alike_are_all_convex():
-    """The second turns inwards where the first is straight."""
+    """The second has a reflex corner where the first is straight."""
     first = np.array([(0, 0), (2, 0), (2, 1), (2, 2), (0, 2)], dtype=np.float64)
     second = np.array([(0, 0), (2, 0), (1, 1), (2, 2), (0, 2)], dtype=np.float64)
     found = partition_outlines(np.stack([first, second]), 1e-9)

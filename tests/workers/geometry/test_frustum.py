@@ -1,4 +1,4 @@
-"""What is told to be outside of a picture is; what is in it is never told to be outside."""
+"""Clouds outside all images are found, and no point inside an image is ever called outside."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Bodies made smaller by a margin, against what is known of them and against Qhull's intersection of half-spaces."""
+"""Inward offsets of hulls, against closed forms and against Qhull's intersection of half-spaces."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Convex parts that follow from how a shape is built, against manifold3d's booleans, rays and hulls."""
+"""Convex parts of lofts, against manifold3d's booleans, rays and hulls."""
 
 import manifold3d
 import numpy as np
@@ -19,7 +19,7 @@ from workers.physics.convex_parts import step as decompose
 from workers.physics.convex_parts.step import parts_of
 
 AIM_M = 5e-5
-"""Of parts in any shape 0.25 m along its diagonal: so far they may stand out, or leave something uncovered."""
+"""Largest distance that parts of a shape 0.25 m along its diagonal may stand out, or leave uncovered."""
 
 TWISTED_M = 1.7e-4
 """Soft squares that turn into circles have twisted facets, which may stand out by four times the tolerance."""

@@ -1,4 +1,4 @@
-"""Loops over pixels against what they mean, written with numpy."""
+"""Compiled loops over pixels, against numpy."""
 
 import numpy as np
 import pytest
