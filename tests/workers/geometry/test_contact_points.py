@@ -30,6 +30,12 @@ def test_a_box_on_the_ground_touches_it_with_its_four_corners(gap_m):
     assert normals == pytest.approx(np.tile([0.0, 0.0, 1.0], (len(normals), 1)))
 
 
+def test_a_plate_on_a_post_touches_the_posts_corners():
+    points, normals = find_contact_points(box((1.0, 1.0, 0.1), (0.0, 0.0, 0.15)), box((0.2, 0.2, 0.2)), WITHIN_M)
+    assert rows(points) == {(x, y, 0.1) for x in (-0.1, 0.1) for y in (-0.1, 0.1)}
+    assert normals == pytest.approx(np.tile([0.0, 0.0, 1.0], (len(normals), 1)))
+
+
 def test_a_plank_across_another_touches_it_where_their_edges_cross():
     lower, upper = box((1.0, 0.1, 0.1)), box((1.0, 0.1, 0.1), (0.0, 0.0, 0.1), np.pi / 2)
     points, normals = find_contact_points(upper, lower, WITHIN_M)

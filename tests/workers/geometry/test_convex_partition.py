@@ -32,6 +32,13 @@ def test_there_is_at_most_one_cell_more_than_reflex_corners():
     assert len(polygons(STAR)) <= 8
 
 
+def test_a_cut_that_later_cuts_made_needless_is_taken_out():
+    """The shortest diagonals of a plus cut off all four arms; two of them and the middle are one bar."""
+    plus = [(1, 0), (2, 0), (2, 1), (3, 1), (3, 2), (2, 2), (2, 3), (1, 3), (1, 2), (0, 2), (0, 1), (1, 1)]
+    cells = polygons(np.array(plus, dtype=np.float64))
+    assert sorted(cell.area for cell in cells) == pytest.approx([1.0, 1.0, 3.0])
+
+
 def test_what_is_convex_is_one_cell():
     circle = np.array([(np.cos(t), np.sin(t)) for t in np.linspace(0, 2 * np.pi, 60, endpoint=False)])
     assert len(polygons(circle)) == 1

@@ -23,6 +23,11 @@ def test_a_cone_is_visible_as_a_whole_and_of_a_cup_only_the_bottom():
     assert not is_covered(CUP, visible(CUP), 1e-3)
 
 
+def test_what_lies_behind_the_side_nearest_to_the_axis_is_not_visible():
+    collar = np.array([(0, 0), (3, 0), (3, 4), (2, 4), (2, 1), (1, 1), (1, 5), (0, 5)], dtype=np.float64)
+    assert visible(collar).area == pytest.approx(3.0 * 1.0 + 1.0 * 4.0)
+
+
 def test_a_spool_is_three_bodies_and_a_cone_is_one():
     stacks = stack_slabs(trace_visible_border(SPOOL), SPOOL[None], visible(SPOOL), 1e-3, 0.1)
     assert [(stack[0].height, stack[-1].height) for stack in stacks] == [(0.0, 1.0), (1.0, 4.0), (4.0, 5.0)]
