@@ -1,4 +1,4 @@
-"""Small datasets made in this process, without Ray: what the rows and files of whole scenes are tested on."""
+"""Small datasets made in this process, without Ray, for tests of the rows and files of whole scenes."""
 
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ SMALL: dict[str, Any] = {
 
 
 def overlaid(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """A tree of settings with changes laid over it, branch by branch."""
+    """A tree of settings merged with changes, branch by branch."""
     merged = dict(tree)
     for key, value in changes.items():
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)
@@ -37,7 +37,7 @@ def overlaid(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def make_dataset(out: Path, **changes: Any) -> tuple[LocalStore, str]:
-    """The finished dataset of `SMALL` with these changes, one range, and its digest."""
+    """(the finished dataset of `SMALL` with these changes, as one range; its digest)."""
     job = validate_job(overlaid(SMALL, changes), "test")
     catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
     context = open_worker(job, catalogue)
@@ -58,7 +58,7 @@ def make_dataset(out: Path, **changes: Any) -> tuple[LocalStore, str]:
 
 
 def faults_of(store: LocalStore) -> list[str]:
-    """What `verso verify` finds."""
+    """The faults that `verso verify` finds."""
     return verify(store, lambda _: None).faults
 
 

@@ -1,4 +1,4 @@
-"""Whether a body at rest is least in energy: told by rocking it, and by nothing that settles it."""
+"""An oracle for stable rest poses: rocks a body a little and compares potential energies, independently of settling."""
 
 import numpy as np
 
@@ -6,20 +6,20 @@ from schemas.base import Array, Pose
 from workers.geometry.frames import transform
 
 ROCK_RAD = 1e-3
-"""How far a body is rocked to see whether its centre of mass sinks: less than half a facet of a round shape."""
+"""Angle by which a body is rocked: less than half a facet of a round shape."""
 
 ROCK_AXES = 16
-"""Directions in which it is rocked."""
+"""Number of directions in which it is rocked."""
 
 SINKS_M = 1e-9
-"""A centre of mass that sinks by less did not sink."""
+"""Descent of the centre of mass below which it counts as level: rounding."""
 
 
 def is_energy_minimum(vertices: Array, T_world_obj: Pose, com: Array) -> bool:
-    """Whether a body on a level plane, rocked a little any way, does not sink: for what touches in a point or a line.
+    """Whether no small rocking lowers a body on a level plane; also where it touches in a point or a line.
 
     vertices [N, 3] and com [3] in the object's frame. The centre of mass is as high above a plane with the upward
-    normal u as max over vertices of u . (com - v), whichever part of the body touches (its support function).
+    normal u as max over vertices of u . (com - v), the support function, whichever part of the body touches.
     """
     depth = transform(T_world_obj, com[None, :]) - transform(T_world_obj, vertices)
     angle = 2.0 * np.pi * np.arange(ROCK_AXES) / ROCK_AXES

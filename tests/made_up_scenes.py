@@ -1,4 +1,4 @@
-"""Scenes whose files and rows are made up: what the store is tested with, quick and deterministic."""
+"""Scenes with made-up files and rows, quick and deterministic, for tests of the store."""
 
 import dataclasses
 import hashlib
@@ -25,7 +25,7 @@ def numbers_of(*keys: int) -> np.random.Generator:
 
 
 def bytes_of(path: str, size: int = 200) -> bytes:
-    """Bytes that belong to a path and to no other."""
+    """Bytes that differ for every path."""
     return b"".join(hashlib.sha256(f"{path}{i}".encode()).digest() for i in range(-(-size // 32)))[:size]
 
 
@@ -50,7 +50,7 @@ def category_of(scene_id: int) -> str:
 
 
 def made_scene(scene_id: int, salt: str = "", images=IMAGES, shapes: bool = True) -> SceneOutput:
-    """A scene that went well; `salt` changes its images, as another stack would; fewer `images` make it smaller."""
+    """A scene without failure; `salt` changes its images, as another software stack would; `images` are those it has."""
     category = category_of(scene_id)
     pose_id = input_pose_id(scene_id, 0, 1)
     files: list[EncodedFile] = []
@@ -98,17 +98,17 @@ def failed_scene(scene_id: int, kind: str = "intrinsic") -> SceneOutput:
 
 
 def fails(scene_id: int) -> bool:
-    """Every eleventh scene cannot be made."""
+    """Whether a scene fails: every eleventh does."""
     return scene_id % 11 == 5
 
 
 def scene(scene_id: int) -> SceneOutput:
-    """Made or failed, always the same."""
+    """The scene, made or failed, the same in every call."""
     return failed_scene(scene_id) if fails(scene_id) else made_scene(scene_id)
 
 
 def small_scene(scene_id: int) -> SceneOutput:
-    """As `scene`, with two images and their patches."""
+    """The scene with two images and their patches only."""
     return failed_scene(scene_id) if fails(scene_id) else made_scene(scene_id, images=(IMAGES[0], IMAGES[6]))
 
 
@@ -122,7 +122,7 @@ def attempt_at(store: Store, start: int, stop: int, settings: CommitTerms = TERM
 
 
 def timing(scene_id: int, category: str) -> dict[str, object]:
-    """Differs on every call, as clocks do."""
+    """A row of timings that differs in every call, as clocks do."""
     seconds = float(np.random.default_rng().uniform())
     stages = [{"name": "settle", "seconds": seconds}]
     return {"scene_id": scene_id, "category": category, "stages": stages, "effects": [], "total_s": seconds}
@@ -151,7 +151,7 @@ def _scene(scene_id: int, category: str, instance: str, table: str) -> dict[str,
 
 
 def _rest(scene_id: int) -> dict[str, object]:
-    """How a body rests; a scene's own columns are the worst of its bodies', which are alike here."""
+    """The columns of a body's rest; a scene's are the worst of its bodies', which are equal here."""
     return {
         "penetration_mm": 0.01,
         "hover_gap_mm": -0.0,
@@ -164,7 +164,7 @@ def _rest(scene_id: int) -> dict[str, object]:
 
 
 def _body(scene_id: int, region: int, category: str, instance: str) -> dict[str, object]:
-    """The first object is that of the scene's own columns."""
+    """A body's columns; the first object has those of the scene."""
     return {
         "region_id": region,
         "category": category,

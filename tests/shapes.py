@@ -1,4 +1,4 @@
-"""Simple assets with mass properties in closed form or from trimesh, for tests that need no catalogue."""
+"""Simple assets with mass properties from trimesh, for tests without a catalogue."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from schemas.scene.shape import Asset, MassProperties, Material, Part, Shape
 
 
 def shape_of(*meshes: trimesh.Trimesh) -> Shape:
-    """A part for each mesh."""
+    """A shape with a part for each mesh."""
     return Shape(
         tuple(
             Part(f"part{k}", frozen_array(m.vertices), frozen_array(m.faces, np.int32), Material())

@@ -1,4 +1,4 @@
-"""The oracle of stable poses, on bodies that everybody knows; and what production leaves, by it."""
+"""The oracle of stable rest poses on bodies of known stability, and settled objects by the oracle."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def ellipsoid(x, y, z):
 
 
 def on_a_face(vertices):
-    """A turn that brings the lowest face of a round hull level, as a snapped body lies."""
+    """A rotation that levels the lowest face of a round hull, as snapping does."""
     hull = trimesh.convex.convex_hull(vertices)
     lowest = int(np.argmin((hull.triangles_center - hull.vertices.mean(axis=0))[:, 2]))
     return pose(trimesh.geometry.align_vectors(hull.face_normals[lowest], [0, 0, -1.0])[:3, :3], np.zeros(3))

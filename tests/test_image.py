@@ -1,4 +1,4 @@
-"""The image, the compose file and a first start on a bare Debian, for real."""
+"""The container image, the compose file and a first start on a bare Debian, run with Docker."""
 
 import os
 import shutil
@@ -22,7 +22,7 @@ def docker(*args: str, cwd: Path | None = None) -> subprocess.CompletedProcess[s
 
 @pytest.fixture(scope="module")
 def owner() -> int:
-    """Whose the checkout is: not root where that can be arranged, and nobody whom the image knows."""
+    """User id of the checkout's owner: not root where the test can change owners, and no user of the image."""
     return 1234 if os.geteuid() == 0 else os.geteuid()
 
 

@@ -1,4 +1,4 @@
-"""Scenes of meshes with millions of faces, through the real path."""
+"""Scenes of meshes with millions of faces, made by the whole pipeline."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +23,7 @@ FACETS = 1000
 
 
 def fine_egg() -> Part:
-    """An egg of two million faces that stands on a flat, 100 mm high and as wide."""
+    """An egg of two million faces with a flat base, 100 mm high and as wide."""
     half = circle(4 * FACETS)[3 * FACETS :]
     half = half[half[:, 1] > -0.9]
     arc = np.concatenate([half, circle(4 * FACETS)[:FACETS]])
@@ -32,8 +32,8 @@ def fine_egg() -> Part:
     return Part("egg", egg.vertices, egg.faces.astype(np.int32))
 
 
-def written(part: Part, path: Path) -> float:
-    """Writes the part as GLB or OBJ; its volume."""
+def write_part(part: Part, path: Path) -> float:
+    """Writes the part as GLB or OBJ and returns its volume."""
     if path.suffix == ".glb":
         path.write_bytes(asset_glb(replace(asset_of(trimesh.creation.box((1, 1, 1))), shape=Shape((part,)))))
     else:
@@ -50,12 +50,12 @@ def written(part: Part, path: Path) -> float:
 def test_a_mesh_of_two_million_faces_makes_a_scene_within_the_time_that_a_scene_may_take(tmp_path, suffix):
     part = fine_egg()
     assert len(part.faces) > 2_000_000
-    volume = written(part, tmp_path / f"egg.{suffix}")
+    volume = write_part(part, tmp_path / f"egg.{suffix}")
     source = {"source": "urdf", "folder": ".", "category_map": {"egg.*": "mug"}}
     job = Job.model_validate({"name": "t", "categories": ["mug"], "assets": {"objects": [source]}})
     catalogue = open_catalogue(job.assets, tmp_path, ("mug",))
-    watch = Stopwatch()
-    scene = make_scene(WorkerContext(job, catalogue, shared_renderer(), "t"), 0, watch)
+    stopwatch = Stopwatch()
+    scene = make_scene(WorkerContext(job, catalogue, shared_renderer(), "t"), 0, stopwatch)
     asset = scene.plan.objects[0].asset
     assert asset.watertight and asset.notes == ()
     assert asset.volume_m3 == pytest.approx(volume, rel=1e-5)
@@ -64,4 +64,4 @@ def test_a_mesh_of_two_million_faces_makes_a_scene_within_the_time_that_a_scene_
     label = next(label for label in first.labels if label.region_id == REGION_FIRST_OBJECT)
     # A ball of 100 mm at 2.5 m is some 525 * 0.1 / 2.5 = 21 pixels across.
     assert label.pixels == pytest.approx(np.pi / 4 * 21**2, rel=0.25)
-    assert sum(watch.seconds.values()) < job.run.scene_timeout_s
+    assert sum(stopwatch.seconds.values()) < job.run.scene_timeout_s

@@ -1,15 +1,17 @@
-"""Input depth carried into the mirror view, on whole scenes: visibility by ray casting, interpolation written out here.
+"""Agreement of the input depth, projected into the mirror view, with the mirror depth, on whole scenes.
 
-The bound is the one that the quantisation of both images allows: 0.1 mm in the median, for the scene and for the object
-alone wherever fifty of its pixels are seen by both cameras. A pixel is compared where the point and the four mirror
-pixels about it lie on one surface, told by the triangles that rays meet there: the rim of a mug is about a
-pixel wide, and what lies between a rim's pixel and the next is on neither.
+Visibility is found by ray casting, and the interpolation is written out here.
 
-A step of the input's depth moves a point along the input's ray, and off its surface by that step times the ray's part along
-the normal; along the mirror's ray the surface is then missed by that much divided by the mirror ray's part. Where the mirror
-camera sees a surface more slantwise than the input camera, as a laptop's screen from behind its edge, the same step
-counts for more by the ratio of the two. On the object alone the bound is held with that ratio taken out where it is above
-1; what the median is with it is recorded beside.
+The bound follows from the quantisation of both images: 0.1 mm in the median, for the scene and for the object
+alone wherever both cameras see fifty of its pixels. A pixel is compared where the point and the four mirror pixels
+about it lie on one surface, judged by the triangles that rays meet there: the rim of a mug is about a pixel wide, and a
+point between a rim's pixel and the next is on neither.
+
+A step of the input's depth moves a point along the input's ray, and off its surface by that step times the cosine between
+ray and normal; along the mirror's ray the error is then that distance divided by the mirror ray's cosine. Where the mirror
+camera sees a surface at a more grazing angle than the input camera, as a laptop's screen from behind its edge, the error
+grows by the ratio of the two. On the object alone the bound holds with that ratio divided out where it is above 1; the
+median with the ratio is recorded as well.
 """
 
 from pathlib import Path
@@ -36,13 +38,14 @@ JOB = load_job(Path(__file__).resolve().parents[1] / "deploy" / "jobs" / "tablet
 MEDIAN_MM = 0.1
 FEWEST = 50
 SEEN_M = 0.0005
-"""A point counts as seen by the mirror camera if nothing lies further than this in front of it."""
+"""A point counts as seen by the mirror camera if the first surface on its ray is at most this far from it."""
 
 ONE_SURFACE = np.cos(np.radians(20.0))
-"""Normals of neighbouring facets of a lathed shape are up to 12 degrees apart, of two sides of an edge far more."""
+"""Least cosine between normals on one surface: neighbouring facets of a lathed shape differ by up to 12 degrees, the two
+sides of an edge by far more."""
 
 ONE_PLANE_M = 0.0005
-"""And a neighbouring pixel's surface, some 2.5 mm away, leaves the tangent plane by less than this: a sphere of 6 mm does."""
+"""Largest distance from the tangent plane of a neighbouring pixel's surface, some 2.5 mm away: that of a sphere of 6 mm."""
 
 
 def cast(scene: PosedScene, origin: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -62,9 +65,9 @@ def cast(scene: PosedScene, origin: np.ndarray, towards: np.ndarray) -> tuple[np
 
 
 def differences_mm(pair: Pair, scene: PosedScene, object_only: bool) -> tuple[np.ndarray, np.ndarray]:
-    """(|carried input depth - mirror depth|, ratio) of co-visible pixels, interpolated bilinearly in 1/z on one surface.
+    """(|projected input depth - mirror depth|, ratio) of co-visible pixels, interpolated bilinearly in 1/z on one surface.
 
-    The ratio is by how much more a step of the input's depth counts along the mirror's ray.
+    The ratio is the growth of an error of the input's depth along the mirror's ray.
     """
     first, mirror = pair.input, pair.mirror
     assert mirror is not None and first.region is not None and mirror.region is not None
@@ -103,7 +106,7 @@ def worst_medians(scenes: range, job: Job = JOB) -> tuple[float, float, float, i
     """Largest median over scenes of the whole scene, of objects alone, the same as stored, and how many counted."""
     catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
     context = WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
-    whole, alone, as_stored = [], [], []
+    whole, objects, as_stored = [], [], []
     for scene_id in scenes:
         try:
             scene = make_scene(context, scene_id, Stopwatch())
@@ -113,31 +116,31 @@ def worst_medians(scenes: range, job: Job = JOB) -> tuple[float, float, float, i
             whole.append(float(np.median(differences_mm(pair, scene.posed, object_only=False)[0])))
             of_object, ratio = differences_mm(pair, scene.posed, object_only=True)
             if len(of_object) >= FEWEST:
-                alone.append(float(np.median(of_object / np.maximum(ratio, 1.0))))
+                objects.append(float(np.median(of_object / np.maximum(ratio, 1.0))))
                 as_stored.append(float(np.median(of_object)))
-    return max(whole), max(alone), max(as_stored), len(alone)
+    return max(whole), max(objects), max(as_stored), len(objects)
 
 
 @pytest.mark.parametrize(
     "scenes", [pytest.param(range(12), id="12"), pytest.param(range(200), id="200", marks=pytest.mark.slow)]
 )
-def test_input_depth_carried_into_the_mirror_view_agrees(scenes, record_figure):
-    whole, alone, as_stored, counted = worst_medians(scenes)
+def test_input_depth_projected_into_the_mirror_view_agrees(scenes, record_figure):
+    whole, objects, as_stored, counted = worst_medians(scenes)
     record_figure(f"two views, whole scene, {len(scenes)} scenes", "must agree", whole, MEDIAN_MM)
-    record_figure(f"two views, object alone, {counted} of {len(scenes)} scenes", "must agree", alone, MEDIAN_MM)
+    record_figure(f"two views, object alone, {counted} of {len(scenes)} scenes", "must agree", objects, MEDIAN_MM)
     record_figure(f"two views, object alone, slant included, {counted} scenes", "either", as_stored, 1.1 * MEDIAN_MM)
     assert counted >= len(scenes) // 2
     assert as_stored <= 1.1 * MEDIAN_MM
     assert whole <= MEDIAN_MM
-    assert alone <= MEDIAN_MM
+    assert objects <= MEDIAN_MM
 
 
-def test_input_depth_of_five_objects_carried_into_the_mirror_view_agrees(record_figure):
-    """Together they are seen by both cameras in every scene, where one object alone often is not."""
+def test_input_depth_of_five_objects_projected_into_the_mirror_view_agrees(record_figure):
+    """Both cameras see some of five objects in every scene; a single object is often seen by one camera only."""
     job = JOB.model_copy(update={"objects_per_scene": Counts(5, 5)})
-    whole, alone, _, counted = worst_medians(range(6), job)
+    whole, objects, _, counted = worst_medians(range(6), job)
     record_figure("two views, five objects, whole scene, 6 scenes", "must agree", whole, MEDIAN_MM)
-    record_figure(f"two views, five objects, objects alone, {counted} of 6 scenes", "must agree", alone, MEDIAN_MM)
+    record_figure(f"two views, five objects, objects alone, {counted} of 6 scenes", "must agree", objects, MEDIAN_MM)
     assert counted >= 5
     assert whole <= MEDIAN_MM
-    assert alone <= MEDIAN_MM
+    assert objects <= MEDIAN_MM

@@ -13,7 +13,7 @@ from schemas.scene.scene import Placed, PosedScene
 from schemas.scene.shape import Shape
 from schemas.scene.view import View
 from workers.geometry.camera import project
-from workers.geometry.frames import invert, moved_between, transform
+from workers.geometry.frames import invert, motion_between, transform
 from workers.geometry.raycast import NEAR_M, edge_distance_px
 from workers.physics.step import release_again
 from workers.pipeline.context import WorkerContext
@@ -79,7 +79,7 @@ def measure_motion(context: WorkerContext, scene: Scene) -> Motion:
 
 def move_between(shape: Shape, before: Pose, after: Pose) -> Motion:
     """Largest motion of a shape's points, and its turn, between two poses [4, 4]."""
-    moved_m, turned_rad = moved_between(shape.vertices, before, after)
+    moved_m, turned_rad = motion_between(shape.vertices, before, after)
     return Motion(moved_m * 1e3, math.degrees(turned_rad))
 
 

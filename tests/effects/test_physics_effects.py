@@ -17,7 +17,7 @@ from tests.hard_cases.drops import EDGE_M, X, Y, drop, level, lowered, ring, tur
 from tests.hard_cases.measures import Z
 from tests.physics.settling import settle_single
 from tests.shapes import asset_of
-from workers.geometry.elevation import survey
+from workers.geometry.elevation import prepare_terrain
 from workers.geometry.frames import transform
 from workers.physics.placement import Ground, gap_m, placed_mesh
 from workers.physics.separation import clearances
@@ -90,7 +90,9 @@ def test_without_object_contacts_the_cubes_of_a_stack_overlap_by_their_size():
     through = [settle_single(start, plan.table, physics, alone).T_world_obj for start in plan.objects]
     stacked = [rest.T_world_obj for rest in settled(facts).settled]
     gaps = [
-        clearances([placed_mesh(s, T) for s, T in zip(plan.objects, poses, strict=True)], survey(plan.table.mesh))
+        clearances(
+            [placed_mesh(s, T) for s, T in zip(plan.objects, poses, strict=True)], prepare_terrain(plan.table.mesh)
+        )
         for poses in (through, stacked)
     ]
     assert min(gaps[0]) < -0.09

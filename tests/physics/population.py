@@ -24,7 +24,7 @@ from tests.physics.energy import watched, worst_of
 from tests.physics.room import G
 from tests.physics.settling import recheck, settle_single
 from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.geometry.elevation import heights_at
+from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import transform
 from workers.plan.randomness import SceneChance
 from workers.plan.step import choose_category, plan_scene
@@ -55,14 +55,14 @@ def draw(job: Job, catalogue: Catalogue, scene_id: int) -> ScenePlan:
 
 def fell_through(points: Array, table: Table) -> bool:
     """Whether an object's vertices [N, 3] are lower than the top by more than a millimetre where the top is above them."""
-    ground = heights_at(points[:, :2], table.mesh)
+    ground = sample_elevation(points[:, :2], table.mesh)
     over_top = ground >= table.top.height_m - 1e-3  # nan compares false
     return bool((over_top & (points[:, 2] < ground - 1e-3)).any())
 
 
 def above(mesh: Mesh, table: Mesh) -> float:
     """Metres from the table up to the mesh: from each of its vertices straight down, which is exact over a level top."""
-    found = mesh.vertices[:, 2] - heights_at(mesh.vertices[:, :2], table)
+    found = mesh.vertices[:, 2] - sample_elevation(mesh.vertices[:, :2], table)
     return float(np.nanmin(found))
 
 

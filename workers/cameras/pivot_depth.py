@@ -8,12 +8,12 @@ from schemas.errors import ViewError
 from schemas.job.cameras import Mirror
 from schemas.job.images import Images
 from schemas.scene.region import REGION_FIRST_OBJECT
-from workers.geometry.stored_depth import stored_depth_m
+from workers.geometry.stored_depth import dequantise_depth
 
 
 def object_distance(depth: NDArray[np.uint16], region: NDArray[np.uint8], images: Images, mirror: Mirror) -> float:
     """`front_distance` of the object in a stored view; converts only the object's pixels to metres."""
-    return front_distance(stored_depth_m(depth[region >= REGION_FIRST_OBJECT], images), np.True_, mirror)
+    return front_distance(dequantise_depth(depth[region >= REGION_FIRST_OBJECT], images), np.True_, mirror)
 
 
 def front_distance(depth_m: Array, object_pixels: NDArray[np.bool_] | np.bool_, mirror: Mirror) -> float:

@@ -1,4 +1,4 @@
-"""The pinhole camera: where it looks, and between pixels and points."""
+"""The pinhole camera: its pose, projection of points, and unprojection of pixels."""
 
 import math
 
@@ -13,7 +13,7 @@ from workers.geometry.frames import UP, pose
 def look_at(position: Array, target: Array, up: Array = UP) -> Pose:
     """Camera to world, [4, 4] float64, optical frame, zero roll: the image's x axis is level.
 
-    Straight up or down, where level leaves the roll open, the image's right is the world's x axis.
+    For a camera that looks straight up or down the image's x axis is the world's.
     """
     z = target - position
     z = z / np.linalg.norm(z)
@@ -45,7 +45,7 @@ def yaw(T_world_cam: Pose) -> float:
 
 
 def unproject(rows: NDArray, columns: NDArray, depth_m: Array, intrinsics: Intrinsics) -> Array:
-    """[N, 3] float64: points in the camera frame of pixels (row, column) at depth z, through their centres at +0.5."""
+    """[N, 3] float64: points in the camera frame at depth z on the rays through the centres, at +0.5, of pixels."""
     x = (columns + 0.5 - intrinsics.cx) / intrinsics.fx * depth_m
     y = (rows + 0.5 - intrinsics.cy) / intrinsics.fy * depth_m
     return np.stack([x, y, depth_m], axis=1)
@@ -61,6 +61,17 @@ def project(points_cam: Array, intrinsics: Intrinsics) -> tuple[Array, Array]:
         intrinsics.fx * points_cam[:, 0] / z + intrinsics.cx,
         intrinsics.fy * points_cam[:, 1] / z + intrinsics.cy,
     )
+
+
+def project_bounds(points_cam: Array, intrinsics: Intrinsics, near_m: float) -> tuple[float, float, float, float]:
+    """(left, top, right, bottom), pixels, of projected points [N, 3], N > 0, which may lie outside the image.
+
+    The bounds of the image where a point is not beyond the near plane.
+    """
+    if (points_cam[:, 2] <= near_m).any():
+        return 0.0, 0.0, float(intrinsics.width), float(intrinsics.height)
+    u, v = project(points_cam, intrinsics)
+    return float(u.min()), float(v.min()), float(u.max()), float(v.max())
 
 
 def image_coordinates(T_cam_obj: Pose, intrinsics: Intrinsics) -> tuple[int, int]:

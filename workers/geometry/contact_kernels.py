@@ -1,4 +1,4 @@
-"""Loops over pairs of features of two meshes that may touch, compiled; for `workers.geometry.contact_points`."""
+"""Compiled loops over pairs of features of two meshes, for `workers.geometry.contact_points`."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,18 +8,18 @@ from workers.geometry.jit import compiled
 from workers.geometry.nearest import nearest_on_triangle
 
 SLOPE = 0.02
-"""A surface that falls below the plane of contact by less than this may still lie on it: a degree."""
+"""Slope, about a degree, up to which a surface that falls below the plane of contact may still lie on it."""
 
 PARALLEL = 1e-3
-"""Sine of the angle between edges below which they have no common normal; their ends lie on faces then."""
+"""Sine of the angle between edges below which they count as parallel: their ends lie on faces then."""
 
 Index = NDArray[np.int64]
 
 
 @compiled
-def near_faces(points: Array, corners: Array, low: Array, high: Array, within: float, pairs: Index) -> int:
-    """How many pairs of a point and a face are within a distance; written into `pairs` [N, 2] as far as it holds."""
-    count = 0
+def find_near_faces(points: Array, corners: Array, low: Array, high: Array, within: float) -> Index:
+    """[N, 2]: the pairs of a point [P, 3] and a face, with its corners and bounds [F, ...], within a distance."""
+    pairs, count = np.empty((64, 2), np.int64), 0
     here = np.empty(3)
     for n in range(len(points)):
         for f in range(len(corners)):
@@ -31,16 +31,17 @@ def near_faces(points: Array, corners: Array, low: Array, high: Array, within: f
             nearest_on_triangle(points[n], corners[f], here)
             d2 = (here[0] - points[n, 0]) ** 2 + (here[1] - points[n, 1]) ** 2 + (here[2] - points[n, 2]) ** 2
             if d2 <= within * within:
-                if count < len(pairs):
-                    pairs[count, 0], pairs[count, 1] = n, f
+                if count == len(pairs):
+                    pairs = np.concatenate((pairs, pairs))
+                pairs[count, 0], pairs[count, 1] = n, f
                 count += 1
-    return count
+    return pairs[:count]
 
 
 @compiled
-def which_side(
+def clear_opposite_sides(
     vertices: Array,
-    who: Index,
+    chosen: Index,
     starts: Index,
     members: Index,
     normals: Array,
@@ -48,10 +49,13 @@ def which_side(
     over: NDArray[np.bool_],
     under: NDArray[np.bool_],
 ) -> None:
-    """Clears `over` [N] where a neighbour of a vertex lies below the plane through it, `under` [N] where one lies above."""
-    for n in range(len(who)):
-        v = vertices[who[n]]
-        for m in range(starts[who[n]], starts[who[n] + 1]):
+    """Clears `over` [N] where a neighbour of a vertex lies below the plane through it, and `under` [N] where one lies above.
+
+    chosen [N]: the vertices; normals [N, 3]: of the planes; starts, members: the neighbours of every vertex.
+    """
+    for n in range(len(chosen)):
+        v = vertices[chosen[n]]
+        for m in range(starts[chosen[n]], starts[chosen[n] + 1]):
             w = vertices[members[m]]
             up = length2 = 0.0
             for k in range(3):
@@ -63,12 +67,12 @@ def which_side(
 
 
 @compiled
-def crossings(a: Array, over: Array, b: Array, under: Array, within: float, found: Array) -> int:
-    """How many edges a [N, 2, 3] cross edges b [M, 2, 3] within a distance; middle and normal into `found` [K, 2, 3].
+def find_edge_crossings(a: Array, over: Array, b: Array, under: Array, within: float) -> Array:
+    """[K, 2, 3]: middle and normal of the places where edges a [N, 2, 3] cross edges b [M, 2, 3] within a distance.
 
-    Nearest points of two lines (Ericson 2005, 5.1.9), both within the edges.
+    Nearest points of two lines (Ericson 2005, 5.1.9), both within the edges. over, under: the vertices across the edges.
     """
-    count = 0
+    found, count = np.empty((64, 2, 3)), 0
     n = np.empty(3)
     for i in range(len(a)):
         for j in range(len(b)):
@@ -104,9 +108,10 @@ def crossings(a: Array, over: Array, b: Array, under: Array, within: float, foun
                 negative = negative and up <= slack_up and down >= -slack_down
             if not (positive or negative):
                 continue
-            if count < len(found):
-                for k in range(3):
-                    found[count, 0, k] = 0.5 * (a[i, 0, k] + s * u[k] + b[j, 0, k] + t * v[k])
-                    found[count, 1, k] = n[k] / length if positive else -n[k] / length
+            if count == len(found):
+                found = np.concatenate((found, found))
+            for k in range(3):
+                found[count, 0, k] = 0.5 * (a[i, 0, k] + s * u[k] + b[j, 0, k] + t * v[k])
+                found[count, 1, k] = n[k] / length if positive else -n[k] / length
             count += 1
-    return count
+    return found[:count]

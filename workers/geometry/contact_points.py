@@ -1,4 +1,4 @@
-"""Where two meshes touch: vertices on faces, and edges across edges. Pure."""
+"""Contact points of two meshes: vertices on faces, and edges across edges."""
 
 from dataclasses import dataclass
 
@@ -7,23 +7,23 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
-from workers.geometry.contact_kernels import Index, crossings, near_faces, which_side
+from workers.geometry.contact_kernels import Index, clear_opposite_sides, find_edge_crossings, find_near_faces
 from workers.geometry.convexity import weld
 
 FLAT = 1e-9
-"""One less the cosine between two faces: below this there is no edge between them."""
+"""One minus the cosine between two faces, below which there is no edge between them."""
 
 SAME_M, SAME_NORMAL = 1e-7, 1e-4
-"""Contacts nearer than this whose normals differ by less are one."""
+"""Distance between contacts, and difference between their normals, below which they are one."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Side:
-    """What of a mesh may touch another: its vertices [V, 3], triangles and edges that are near, and who lies about what.
+class _Surface:
+    """The features of a mesh that may touch another one, and their neighbours.
 
-    faces [F, 3], their corners [F, 3, 3] and unit normals [F, 3] as wound; used [N]: vertices of near triangles; ends
-    [E, 2] of edges that bend or bound, about [E, 2] the vertices across the edge (twice the same where there is one
-    triangle); star (starts [V + 1], members): the neighbours of each vertex.
+    vertices [V, 3]; faces [F, 3], their corners [F, 3, 3] and unit normals [F, 3] as wound; used [N]: vertices of faces;
+    edges [E, 2] that bend or bound, across [E, 2] the vertices beside them (twice the same at one triangle); star (starts
+    [V + 1], members): the neighbours of each vertex.
     """
 
     vertices: Array
@@ -31,89 +31,83 @@ class _Side:
     corners: Array
     normals: Array
     used: Index
-    ends: Index
-    about: Index
+    edges: Index
+    across: Index
     star: tuple[Index, Index]
 
 
-def touching_points(upper: Mesh, lower: Mesh, within_m: float) -> tuple[Array, Array]:
+def find_contact_points(upper: Mesh, lower: Mesh, within_m: float) -> tuple[Array, Array]:
     """(points [N, 3], unit normals [N, 3]) where two meshes, in one frame, are within `within_m` of one another.
 
     Normals point from the lower to the upper one. A vertex touches a face, or an edge another, where the plane between
     them has the one body's surface about the contact above it and the other's below, to within `SLOPE` or twice
     `within_m`; so that a corner over the edge of a table touches its top and not its side, whichever way faces are
-    wound. Winding decides only where all about a vertex is level.
+    wound. Winding decides only where everything about a vertex is level.
     """
-    sides = _sides(upper, lower, within_m)
-    if sides is None:
-        return np.empty((0, 3)), np.empty((0, 3))
-    above, below = sides
-    found = [_vertices_on_faces(above, below, within_m)]
-    points, normals = _vertices_on_faces(below, above, within_m)
-    found.append((points, -normals))
-    found.append(_edges_on_edges(above, below, within_m))
-    points, normals = (np.concatenate([pair[k] for pair in found]) for k in (0, 1))
+    none = np.empty((0, 3)), np.empty((0, 3))
+    if not (len(upper.faces) and len(lower.faces)):
+        return none
+    low = np.maximum(upper.vertices.min(axis=0), lower.vertices.min(axis=0)) - within_m
+    high = np.minimum(upper.vertices.max(axis=0), lower.vertices.max(axis=0)) + within_m
+    above, below = _surface_in(upper, low, high), _surface_in(lower, low, high)
+    if above is None or below is None:
+        return none
+    on_lower, on_upper = _vertices_on_faces(above, below, within_m), _vertices_on_faces(below, above, within_m)
+    crossed = _edges_on_edges(above, below, within_m)
+    points = np.concatenate([on_lower[0], on_upper[0], crossed[0]])
+    normals = np.concatenate([on_lower[1], -on_upper[1], crossed[1]])
     rounded = np.round(np.concatenate([points / SAME_M, normals / SAME_NORMAL], axis=1))
     kept = np.sort(np.unique(rounded, axis=0, return_index=True)[1])
     return points[kept], normals[kept]
 
 
-def _sides(upper: Mesh, lower: Mesh, within_m: float) -> tuple[_Side, _Side] | None:
-    if not (len(upper.faces) and len(lower.faces)):
-        return None
-    low = np.maximum(upper.vertices.min(axis=0), lower.vertices.min(axis=0)) - within_m
-    high = np.minimum(upper.vertices.max(axis=0), lower.vertices.max(axis=0)) + within_m
-    above, below = _side(upper, low, high), _side(lower, low, high)
-    return (above, below) if above is not None and below is not None else None
+def _overlap(points: Array, low: Array, high: Array) -> NDArray[np.bool_]:
+    """[N] bool: whether the bounds of points [N, K, 3] overlap a box."""
+    overlap: NDArray[np.bool_] = ((points.min(axis=1) <= high) & (points.max(axis=1) >= low)).all(axis=1)
+    return overlap
 
 
-def _cut(mesh: Mesh, low: Array, high: Array) -> Mesh | None:
-    """The triangles that reach into a box, and all that have a corner in common with one of them, welded."""
+def _crop(mesh: Mesh, low: Array, high: Array) -> Mesh | None:
+    """The triangles that overlap a box, and all that have a corner in common with one of them, welded."""
     corners = mesh.vertices[mesh.faces]
-    least, most = corners.min(axis=1), corners.max(axis=1)
-    near = ((least <= high) & (most >= low)).all(axis=1)
+    near = corners[_overlap(corners, low, high)]
+    if not len(near):
+        return None
+    return weld(Mesh(mesh.vertices, mesh.faces[_overlap(corners, near.min(axis=(0, 1)), near.max(axis=(0, 1)))]))
+
+
+def _surface_in(whole: Mesh, low: Array, high: Array) -> _Surface | None:
+    """The features of a mesh that overlap a box; None where there are none."""
+    mesh = _crop(whole, low, high)
+    if mesh is None:
+        return None
+    corners, faces = mesh.vertices[mesh.faces], mesh.faces.astype(np.int64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    doubled = np.linalg.norm(normals, axis=1)
+    solid = doubled > 0.0
+    near = _overlap(corners, low, high) & solid
     if not near.any():
         return None
-    low, high = least[near].min(axis=0), most[near].max(axis=0)
-    return weld(Mesh(mesh.vertices, mesh.faces[((least <= high) & (most >= low)).all(axis=1)]))
-
-
-def _side(mesh: Mesh, low: Array, high: Array) -> _Side | None:
-    """The parts of a mesh that reach into a box; None where there are none."""
-    cut = _cut(mesh, low, high)
-    if cut is None:
-        return None
-    mesh = cut
-    corners = mesh.vertices[mesh.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    doubled = np.linalg.norm(across, axis=1)
-    near = ((corners.min(axis=1) <= high) & (corners.max(axis=1) >= low)).all(axis=1) & (doubled > 0.0)
-    if not near.any():
-        return None
+    normals[solid] /= doubled[solid, None]
     # Whole stars, also of vertices at the border of what is near
-    about = np.isin(mesh.faces, mesh.faces[near]).any(axis=1) & (doubled > 0.0)
-    faces = mesh.faces[about].astype(np.int64)
-    normals = across[about] / doubled[about, None]
-    used = np.unique(mesh.faces[near])
-    inside = ((mesh.vertices[used] >= low) & (mesh.vertices[used] <= high)).all(axis=1)
-    ends, beside = _bent_edges(mesh, faces, normals)
-    ends_in = mesh.vertices[ends]
-    kept = ((ends_in.min(axis=1) <= high) & (ends_in.max(axis=1) >= low)).all(axis=1)
-    unit = across[near] / doubled[near, None]
-    star = _star(faces, len(mesh.vertices))
-    near_faces, near_corners = mesh.faces[near].astype(np.int64), np.ascontiguousarray(corners[near])
-    return _Side(mesh.vertices, near_faces, near_corners, unit, used[inside], ends[kept], beside[kept], star)
+    about = np.isin(faces, faces[near]).any(axis=1) & solid
+    used = np.unique(faces[near])
+    used = used[_overlap(mesh.vertices[used, None], low, high)]
+    edges, across = _bent_edges(mesh, faces[about], normals[about])
+    kept = _overlap(mesh.vertices[edges], low, high)
+    star = _star(faces[about], len(mesh.vertices))
+    return _Surface(mesh.vertices, faces[near], corners[near], normals[near], used, edges[kept], across[kept], star)
 
 
 def _star(faces: Index, count: int) -> tuple[Index, Index]:
-    """The neighbours of each vertex, one after the other."""
+    """(starts [count + 1], members): the neighbours of each vertex, one after the other."""
     pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     pairs = np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)
     return np.searchsorted(pairs[:, 0], np.arange(count + 1)).astype(np.int64), pairs[:, 1].copy()
 
 
 def _bent_edges(mesh: Mesh, faces: Index, normals: Array) -> tuple[Index, Index]:
-    """Edges [E, 2] that are not between two faces in one plane, and the vertices across them [E, 2]."""
+    """Edges [E, 2] that are not between two coplanar faces, and the vertices across them [E, 2]."""
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     across, face = faces[:, [2, 0, 1]].ravel(), np.repeat(np.arange(len(faces)), 3)
     order = np.lexsort((edges[:, 1], edges[:, 0]))
@@ -122,7 +116,7 @@ def _bent_edges(mesh: Mesh, faces: Index, normals: Array) -> tuple[Index, Index]
     last = np.r_[first[1:], len(edges)] - 1
     flat = (last == first + 1) & (np.abs((normals[face[first]] * normals[face[last]]).sum(axis=1)) > 1.0 - FLAT)
     across_first, across_last = across[first], across[last]
-    # Two faces folded onto one another are in one plane, and bent all the same
+    # Two faces folded onto one another are coplanar, and their edge is bent all the same
     folded = flat & (across_first != across_last) & _same_side(mesh.vertices, edges[first], across_first, across_last)
     kept = ~flat | folded
     return edges[first][kept], np.stack([across_first, across_last], axis=1)[kept]
@@ -134,41 +128,31 @@ def _same_side(vertices: Array, edges: Index, a: Index, b: Index) -> NDArray[np.
     return (one * other).sum(axis=1) > 0.0
 
 
-def _vertices_on_faces(above: _Side, below: _Side, within_m: float) -> tuple[Array, Array]:
+def _vertices_on_faces(above: _Surface, below: _Surface, within_m: float) -> tuple[Array, Array]:
     """Vertices of the first on faces of the second, normals towards the first."""
-    points = np.ascontiguousarray(above.vertices[above.used])
-    low, high = below.corners.min(axis=1), below.corners.max(axis=1)
-    pairs = np.empty((0, 2), dtype=np.int64)
-    count = near_faces(points, below.corners, low, high, within_m, pairs)
-    pairs = np.empty((count, 2), dtype=np.int64)
-    near_faces(points, below.corners, low, high, within_m, pairs)
-    vertex, face = above.used[pairs[:, 0]], pairs[:, 1]
-    over, under = _sides_of(above, vertex, below.normals[face], within_m)
+    points, low, high = above.vertices[above.used], below.corners.min(axis=1), below.corners.max(axis=1)
+    pairs = find_near_faces(points, below.corners, low, high, within_m)
+    face, faces = pairs[:, 1], below.normals
+    over, under = _lie_beside(above, above.used[pairs[:, 0]], faces[face], within_m)
     # The face's own body must lie on the other side, where the faces about it tell
-    around = [_sides_of(below, below.faces[:, k], below.normals, within_m) for k in range(3)]
+    around = [_lie_beside(below, below.faces[:, k], faces, within_m) for k in range(3)]
     on, beneath = (np.logical_and.reduce([one[k] for one in around])[face] for k in (0, 1))
     neither = ~on & ~beneath
     # About the deepest face of a hollow everything rises, as about the underside of a body: there the vertex tells
     upright, turned = over & (beneath | neither | ~under), under & (on | neither)
-    sign = np.where(upright, 1.0, -1.0)
     kept = upright | turned
-    return points[pairs[kept, 0]], below.normals[face[kept]] * sign[kept, None]
+    return points[pairs[kept, 0]], faces[face[kept]] * np.where(upright, 1.0, -1.0)[kept, None]
 
 
-def _sides_of(side: _Side, who: Index, normals: Array, within_m: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _lie_beside(side: _Surface, chosen: Index, normals: Array, within_m: float) -> tuple[NDArray[np.bool_], ...]:
     """Whether all neighbours of vertices [N] lie above the planes with normals [N, 3] through them, and whether below."""
-    over, under = np.ones(len(who), dtype=np.bool_), np.ones(len(who), dtype=np.bool_)
-    which_side(side.vertices, np.ascontiguousarray(who), *side.star, normals, within_m, over, under)
+    over, under = np.ones(len(chosen), dtype=np.bool_), np.ones(len(chosen), dtype=np.bool_)
+    clear_opposite_sides(side.vertices, np.ascontiguousarray(chosen), *side.star, normals, within_m, over, under)
     return over, under
 
 
-def _edges_on_edges(above: _Side, below: _Side, within_m: float) -> tuple[Array, Array]:
-    """Where an edge of the first lies across one of the second."""
-    if not (len(above.ends) and len(below.ends)):
-        return np.empty((0, 3)), np.empty((0, 3))
-    a, b = (np.ascontiguousarray(side.vertices[side.ends]) for side in (above, below))
-    over, under = (np.ascontiguousarray(side.vertices[side.about]) for side in (above, below))
-    count = crossings(a, over, b, under, within_m, np.empty((0, 2, 3)))
-    found = np.empty((count, 2, 3))
-    crossings(a, over, b, under, within_m, found)
+def _edges_on_edges(above: _Surface, below: _Surface, within_m: float) -> tuple[Array, Array]:
+    """Crossings of an edge of the first with one of the second."""
+    a, b = above.vertices[above.edges], below.vertices[below.edges]
+    found = find_edge_crossings(a, above.vertices[above.across], b, below.vertices[below.across], within_m)
     return found[:, 0], found[:, 1]

@@ -1,4 +1,4 @@
-"""How far a surface is from convex, and the pieces that it falls into. Pure."""
+"""Welding of meshes, their connected pieces, their depth below the hull, and conversion from and to manifold3d."""
 
 import manifold3d
 import numpy as np
@@ -30,7 +30,7 @@ def is_convex_surface(mesh: Mesh, solid: manifold3d.Manifold | None) -> bool:
 
 
 def weld(mesh: Mesh) -> Mesh:
-    """The same triangles, each once, with one vertex at each place and none loose; none has two corners at one place."""
+    """The mesh with one vertex at each place, without loose vertices, repeated triangles and triangles of two corners."""
     used = np.unique(mesh.faces)
     vertices, inverse = np.unique(mesh.vertices[used], axis=0, return_inverse=True)
     place = np.zeros(len(mesh.vertices), dtype=np.int32)
@@ -42,7 +42,7 @@ def weld(mesh: Mesh) -> Mesh:
 
 
 def components(mesh: Mesh) -> list[Mesh]:
-    """The pieces of a welded mesh that share no vertex, in the order of their first vertex; loose vertices are left out."""
+    """The pieces of a welded mesh that share no vertex, in the order of their first vertex, without loose vertices."""
     ends = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
     count = len(mesh.vertices)
     links = coo_matrix((np.ones(len(ends), dtype=np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
@@ -57,27 +57,27 @@ def _piece(mesh: Mesh, faces: NDArray[np.int32]) -> Mesh:
 
 
 def concavity_m(mesh: Mesh) -> float:
-    """How deep below its hull the surface lies, metres: the largest distance from the hull to the mesh.
+    """The depth of the surface below its hull, metres: the largest distance from the hull to the mesh.
 
-    Looked for at the middle of each triangle of the hull and of each of its edges: a dent is wider than it is deep, or
-    deeper than what is found. The other way, from the mesh to the hull, a thin wall would count by its thickness only.
+    Measured at the middle of each triangle of the hull and of each of its edges; a dent deeper than wide may be deeper
+    than that. From the mesh to the hull a thin wall would count by its thickness only.
     """
     hull = manifold3d.Manifold.hull_points(np.ascontiguousarray(mesh.vertices))
     if hull.is_empty():  # flat
         return 0.0
-    a, b, c = triangle_corners(triangles_of(hull))
+    a, b, c = triangle_corners(mesh_of(hull))
     points = np.concatenate([(a + b + c) / 3, (a + b) / 2, (b + c) / 2, (c + a) / 2])
     found, _ = nearest_on_mesh(points, mesh)
     return float(np.linalg.norm(found - points, axis=1).max())
 
 
 def triangle_corners(mesh: Mesh) -> tuple[Array, Array, Array]:
-    """Of every triangle, [F, 3] each."""
+    """The first, second and third corner of every triangle, each [F, 3]."""
     return mesh.vertices[mesh.faces[:, 0]], mesh.vertices[mesh.faces[:, 1]], mesh.vertices[mesh.faces[:, 2]]
 
 
 def solid_of(mesh: Mesh) -> manifold3d.Manifold | None:
-    """The body that a welded mesh encloses, wound outwards; None where it is not closed, or not a manifold."""
+    """The solid that a welded mesh encloses, wound either way; None where the mesh is not closed, or not a manifold."""
     hold_to_one_thread()
     for faces in (mesh.faces, mesh.faces[:, ::-1]):
         solid = manifold3d.Manifold(
@@ -90,7 +90,7 @@ def solid_of(mesh: Mesh) -> manifold3d.Manifold | None:
     return None
 
 
-def triangles_of(solid: manifold3d.Manifold) -> Mesh:
-    """Its surface as a mesh."""
+def mesh_of(solid: manifold3d.Manifold) -> Mesh:
+    """The surface of a solid."""
     mesh = solid.to_mesh64()
     return Mesh(np.array(mesh.vert_properties, dtype=np.float64)[:, :3], np.array(mesh.tri_verts, dtype=np.int32))

@@ -1,4 +1,4 @@
-"""Lens distortion, OpenCV's model (Brown-Conrady with k1 k2 p1 p2 k3), between ideal and stored image coordinates."""
+"""Lens distortion by OpenCV's model, Brown-Conrady with k1, k2, p1, p2 and k3."""
 
 import numpy as np
 
@@ -7,23 +7,23 @@ from schemas.job.sensor import Distortion
 from schemas.scene.camera import Intrinsics
 
 STEPS = 20
-"""Of Newton's method; a lens that can be inverted needs fewer than ten."""
+"""Steps of Newton's method; a lens that can be inverted needs fewer than ten."""
 
 CONVERGED = 1e-9
-"""Largest miss, in focal lengths, of a point that counts as found: a millionth of a pixel."""
+"""Largest error, in focal lengths, of a point that counts as found: a millionth of a pixel."""
 
 
 def distort(u: Array, v: Array, lens: Distortion, k: Intrinsics) -> tuple[Array, Array]:
-    """Where the lens draws what a pinhole camera would draw at (u, v); pixels from the left and upper edge."""
+    """Distorted image coordinates of the pinhole coordinates (u, v), pixels from the left and upper edge."""
     x, y = distort_rays((u - k.cx) / k.fx, (v - k.cy) / k.fy, lens)
     return k.fx * x + k.cx, k.fy * y + k.cy
 
 
 def undistort(u: Array, v: Array, lens: Distortion, k: Intrinsics) -> tuple[Array, Array]:
-    """The inverse of `distort`: the pinhole image coordinates of what the lens draws at (u, v); nan where nothing is.
+    """The inverse of `distort`: pinhole coordinates of the distorted (u, v); nan where the lens maps nothing to.
 
-    Newton's method from the point itself with the analytic Jacobian, so that it converges to rounding; OpenCV's default
-    stops after five steps of a fixed-point iteration.
+    Newton's method from the point itself with the analytic Jacobian converges to rounding; OpenCV's default stops after
+    five steps of a fixed-point iteration.
     """
     goal_x, goal_y = (u - k.cx) / k.fx, (v - k.cy) / k.fy
     x, y = goal_x.copy(), goal_y.copy()
@@ -36,14 +36,14 @@ def undistort(u: Array, v: Array, lens: Distortion, k: Intrinsics) -> tuple[Arra
             x = x + (yy * miss_x - xy * miss_y) / area
             y = y + (xx * miss_y - yx * miss_x) / area
         at_x, at_y = distort_rays(x, y, lens)
-        # A lens that folds over meets the goal twice: beyond the fold its mapping turns the picture over.
+        # A lens that folds over maps two points to one place: beyond the fold the Jacobian's determinant is negative.
         (xx, xy), (yx, yy) = _jacobian(x, y, lens)
         found = (np.hypot(goal_x - at_x, goal_y - at_y) < CONVERGED) & (xx * yy - xy * yx > 0.0)
     return np.where(found, k.fx * x + k.cx, np.nan), np.where(found, k.fy * y + k.cy, np.nan)
 
 
 def distort_rays(x: Array, y: Array, lens: Distortion) -> tuple[Array, Array]:
-    """OpenCV's formula (calib3d, "Detailed Description") on coordinates at z = 1."""
+    """Distorted coordinates at z = 1, by OpenCV's formula (calib3d, "Detailed Description")."""
     r2 = x * x + y * y
     radial = 1.0 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
     return (

@@ -1,4 +1,4 @@
-"""Vertical distances: how high a mesh stands at a point, and how far one mesh hangs above another."""
+"""Elevation of a mesh above points of the plane, and the vertical gap between two meshes."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,7 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
+from workers.geometry.convexity import triangle_corners
 
 EDGE_SLACK = 1e-12
 """Barycentric slack, so that a point on the edge of two triangles lies in at least one of them."""
@@ -13,8 +14,8 @@ EDGE_SLACK = 1e-12
 SAME_HEIGHT_M = 1e-9
 """A vertex this near the highest crossing of its vertical line is the top of its mesh there."""
 
-FIRST_LOOK_M = 1e-4
-"""Vertices this near the lowest one are held against the ground first: of an object that stands they settle the gap."""
+FIRST_BAND_M = 1e-4
+"""Vertices this near the lowest one are compared with the ground first: they settle the gap of an object that stands."""
 
 CHUNK = 4_000_000
 """Point-triangle pairs worked on at once: about 200 MB."""
@@ -22,9 +23,9 @@ CHUNK = 4_000_000
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """A mesh whose heights are asked for more than once, [F, ...] float64 for its F triangles that are not vertical.
+    """A mesh prepared for many queries of its elevation, with its F triangles that are not vertical.
 
-    Their corners a, b, c; twice the area that each has in the plane; and the corners of the box about it.
+    vertices [V, 3]; corners a, b, c, each [F, 3]; area [F], twice that in the plane; low and high [F, 3], the bounds.
     """
 
     vertices: Array
@@ -34,12 +35,9 @@ class Terrain:
     high: Array
 
 
-def survey(mesh: Mesh) -> Terrain:
-    """A mesh made ready for `heights_at`.
-
-    Vertical triangles have no height of their own: their edges belong to their neighbours.
-    """
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+def prepare_terrain(mesh: Mesh) -> Terrain:
+    """A mesh prepared for `sample_elevation`, without its vertical triangles, whose edges belong to neighbours."""
+    a, b, c = triangle_corners(mesh)
     area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     level = np.abs(area) > 1e-18
     a, b, c = a[level], b[level], c[level]
@@ -47,62 +45,56 @@ def survey(mesh: Mesh) -> Terrain:
     return Terrain(mesh.vertices, (a, b, c), area[level], low, high)
 
 
-def heights_at(points_xy: Array, ground: Mesh | Terrain, highest: bool = True) -> Array:
-    """Height of the mesh above or below each point of the plane, [N] float64 metres; nan where there is none.
+def sample_elevation(points_xy: Array, ground: Mesh | Terrain, highest: bool = True) -> Array:
+    """[N] float64 metres: the highest, or the lowest, crossing of the mesh with vertical lines; nan where there is none.
 
-    points_xy [N, 2] metres. The highest crossing of the vertical line, or the lowest.
+    points_xy [N, 2] metres.
     """
     result = np.full(len(points_xy), np.nan)
     if len(points_xy) == 0:
         return result
-    terrain = survey(ground) if isinstance(ground, Mesh) else ground
-    (left, front), (right, back) = points_xy.min(axis=0), points_xy.max(axis=0)
-    low, high = terrain.low, terrain.high
-    near = np.flatnonzero((low[:, 0] <= right) & (low[:, 1] <= back) & (high[:, 0] >= left) & (high[:, 1] >= front))
-    a, b, c = (corner[near] for corner in terrain.corners)
-    area = terrain.area[near]
+    terrain = prepare_terrain(ground) if isinstance(ground, Mesh) else ground
+    low, high = points_xy.min(axis=0), points_xy.max(axis=0)
+    near = np.flatnonzero(((terrain.low[:, :2] <= high) & (terrain.high[:, :2] >= low)).all(axis=1))
     if len(near) == 0:
         return result
+    a, b, c = (corner[near] for corner in terrain.corners)
+    area = terrain.area[near]
     size = max(1, CHUNK // len(near))
+    outside = -np.inf if highest else np.inf
     for start in range(0, len(points_xy), size):
-        z = _crossings(points_xy[start : start + size], a, b, c, area)
-        missed = np.isnan(z)
-        outside = -np.inf if highest else np.inf
-        z[missed] = outside
+        z = _crossings(points_xy[start : start + size], a, b, c, area, outside)
         best = z.max(axis=1) if highest else z.min(axis=1)
-        best[best == outside] = np.nan
-        result[start : start + size] = best
+        result[start : start + size] = np.where(best == outside, np.nan, best)
     return result
 
 
-def _crossings(points: Array, a: Array, b: Array, c: Array, area: Array) -> Array:
-    """[N, F] heights at which vertical lines cross triangles, nan where they miss."""
+def _crossings(points: Array, a: Array, b: Array, c: Array, area: Array, outside: float) -> Array:
+    """[N, F] heights at which vertical lines cross triangles, `outside` where they miss."""
     x, y = points[:, :1], points[:, 1:]
     wb = ((x - a[:, 0]) * (c[:, 1] - a[:, 1]) - (y - a[:, 1]) * (c[:, 0] - a[:, 0])) / area
     wc = ((b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (b[:, 1] - a[:, 1]) * (x - a[:, 0])) / area
     inside = (wb >= -EDGE_SLACK) & (wc >= -EDGE_SLACK) & (wb + wc <= 1.0 + EDGE_SLACK)
-    return np.where(inside, a[:, 2] + wb * (b[:, 2] - a[:, 2]) + wc * (c[:, 2] - a[:, 2]), np.nan)
+    return np.where(inside, a[:, 2] + wb * (b[:, 2] - a[:, 2]) + wc * (c[:, 2] - a[:, 2]), outside)
 
 
 def vertical_gap(upper: Mesh, lower: Mesh | Terrain, band_m: float = 0.02) -> float:
     """Least vertical distance from `upper` down to `lower`, metres; negative where it reaches into it.
 
-    Both in world coordinates, the first standing on top of the second. Vertices of each are held against faces of the
+    Both in world coordinates, the first standing on top of the second. Vertices of each are compared with faces of the
     other; that is exact unless the nearest features are two crossing edges. Of the upper mesh only vertices within
     `band_m` of its lowest point are tried. inf where nothing is above anything.
     """
-    terrain = survey(lower) if isinstance(lower, Mesh) else lower
+    terrain = prepare_terrain(lower) if isinstance(lower, Mesh) else lower
     gap = _least_gap_below(upper.vertices, terrain, band_m)
-    bottom, summit = upper.vertices.min(axis=0), upper.vertices.max(axis=0)
-    # A vertex of the lower mesh has at least the distance to the lowest point of all above it.
-    rises = bottom[2] - terrain.vertices[:, 2] < gap
-    under = terrain.vertices[rises]
-    under = under[((under[:, :2] >= bottom[:2]) & (under[:, :2] <= summit[:2])).all(axis=1)]
+    bottom, top = upper.vertices.min(axis=0), upper.vertices.max(axis=0)
+    # The gap above a vertex of the lower mesh is at least its distance to the lowest point of the upper one.
+    under = terrain.vertices[bottom[2] - terrain.vertices[:, 2] < gap]
+    under = under[((under[:, :2] >= bottom[:2]) & (under[:, :2] <= top[:2])).all(axis=1)]
     if len(under):
-        under = under[under[:, 2] >= heights_at(under[:, :2], terrain) - SAME_HEIGHT_M]
-        ceiling = heights_at(under[:, :2], upper, highest=False)
-        if np.isfinite(ceiling).any():
-            gap = min(gap, float(np.nanmin(ceiling - under[:, 2])))
+        under = under[under[:, 2] >= sample_elevation(under[:, :2], terrain) - SAME_HEIGHT_M]
+        ceiling = sample_elevation(under[:, :2], upper, highest=False)
+        gap = float(np.fmin.reduce(ceiling - under[:, 2], initial=gap))
     return gap
 
 
@@ -111,10 +103,8 @@ def _least_gap_below(vertices: Array, terrain: Terrain, band_m: float) -> float:
     z = vertices[:, 2]
     points = vertices[z <= z.min() + band_m]
     gap = np.inf
-    for part in (points[:, 2] <= z.min() + FIRST_LOOK_M, points[:, 2] > z.min() + FIRST_LOOK_M):
-        # Where the highest of all ground leaves more than the gap that is known, no vertex lies nearer.
+    for part in (points[:, 2] <= z.min() + FIRST_BAND_M, points[:, 2] > z.min() + FIRST_BAND_M):
+        # A vertex at least the known gap above the terrain's highest point cannot lessen the gap.
         tried = points[part & (points[:, 2] - terrain.vertices[:, 2].max() < gap)]
-        ground = heights_at(tried[:, :2], terrain)
-        if np.isfinite(ground).any():
-            gap = min(gap, float(np.nanmin(tried[:, 2] - ground)))
+        gap = float(np.fmin.reduce(tried[:, 2] - sample_elevation(tried[:, :2], terrain), initial=gap))
     return gap

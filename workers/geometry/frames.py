@@ -1,4 +1,4 @@
-"""Rigid transforms. World: z up, metres, floor at z = 0. Optical frame: x right, y down, z forward."""
+"""Rigid transforms and rotations. World: z up, metres, floor at z = 0. Optical frame: x right, y down, z forward."""
 
 import math
 
@@ -19,19 +19,19 @@ def pose(rotation: Array, position: Array) -> Pose:
 
 
 def translation(x: float, y: float, z: float) -> Pose:
-    """[4, 4] float64."""
+    """[4, 4] float64: the transform without rotation."""
     return pose(np.eye(3), np.array([x, y, z]))
 
 
 def rotation_about(axis: Array, angle_rad: float) -> Array:
-    """[3, 3] float64: right-handed turn about a unit axis (Rodrigues' formula)."""
+    """[3, 3] float64: right-handed rotation about a unit axis (Rodrigues' formula)."""
     x, y, z = axis
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + math.sin(angle_rad) * K + (1.0 - math.cos(angle_rad)) * (K @ K)
 
 
 def half_turn(axis: Array) -> Array:
-    """[3, 3] float64: the turn by pi about a unit axis, 2 a a^T - I, exact where sin(pi) is not."""
+    """[3, 3] float64: the rotation by pi about a unit axis, 2 a a^T - I, exact where sin(pi) is not."""
     return 2.0 * np.outer(axis, axis) - np.eye(3)
 
 
@@ -42,7 +42,7 @@ def invert(T: Pose) -> Pose:
 
 
 def transform(T: Pose, points: Array) -> Array:
-    """[N, 3] float64: points taken through a rigid transform.
+    """[N, 3] float64: points after a rigid transform.
 
     Written out as sums of products, because a matrix product may add in another order on another machine.
     """
@@ -68,9 +68,9 @@ def uniform_rotation(rng: np.random.Generator) -> Array:
 
 
 def rotation_between(a: Array, b: Array) -> Array:
-    """[3, 3] float64: the smallest turn that takes unit vector a to unit vector b.
+    """[3, 3] float64: the smallest rotation that takes unit vector a to unit vector b.
 
-    Where b = -a every axis in the plane across a serves; the one nearest the x axis (or y, along x) is taken.
+    For b = -a, where every axis normal to a would do, the axis is normal to a and to x (or to y, for a along x).
     """
     axis = np.cross(a, b)
     sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
@@ -84,19 +84,19 @@ def rotation_between(a: Array, b: Array) -> Array:
 
 
 def angle_between(A: Array, B: Array) -> float:
-    """Angle, radians in [0, pi], of the turn between two rotations [3, 3]; accurate also where it is tiny."""
+    """Angle, radians in [0, pi], between two rotations [3, 3]; accurate for tiny angles too."""
     D = A.T @ B
     sine = 0.5 * np.linalg.norm([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
     return math.atan2(float(sine), 0.5 * (float(np.trace(D)) - 1.0))
 
 
-def moved_between(points: Array, before: Array, after: Array) -> tuple[float, float]:
-    """Between two poses [4, 4] of a body: metres that the farthest of its points [N, 3] went, and radians that it turned."""
-    way = transform(after, points) - transform(before, points)
-    return float(np.linalg.norm(way, axis=1).max()), angle_between(before[:3, :3], after[:3, :3])
+def motion_between(points: Array, before: Array, after: Array) -> tuple[float, float]:
+    """(largest travel of a body's points [N, 3], metres; rotation, radians) between two poses [4, 4] of the body."""
+    travel = transform(after, points) - transform(before, points)
+    return float(np.linalg.norm(travel, axis=1).max()), angle_between(before[:3, :3], after[:3, :3])
 
 
-def quaternion_of(R: Array) -> Array:
+def quaternion_from_rotation(R: Array) -> Array:
     """(x, y, z, w) of a rotation [3, 3], by the largest of the four components (Shepperd 1978)."""
     trace = float(np.trace(R))
     squares = np.array([R[0, 0], R[1, 1], R[2, 2], trace])

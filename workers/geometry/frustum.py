@@ -1,4 +1,4 @@
-"""What cannot be in a camera's picture: pure functions."""
+"""Test of point clouds against the view frusta of cameras."""
 
 from collections.abc import Sequence
 
@@ -9,15 +9,15 @@ from schemas.scene.camera import Camera, Intrinsics
 from workers.geometry.frames import invert, transform
 
 MARGIN_PX = 2.0
-"""The picture is taken to be this much larger on each side: what lies outside of that touches no sample of a pixel."""
+"""Width by which the image is extended on each side: what lies outside of that touches no sample of a pixel."""
 
 
-def outside_views(points: Array, cameras: Sequence[Camera]) -> bool:
-    """Whether no camera between these sees anything of the convex hull of points [N, 3], world.
+def is_outside_views(points: Array, cameras: Sequence[Camera]) -> bool:
+    """Whether the convex hull of points [N, 3], world, is certainly outside the image of every camera between these.
 
-    The cameras have the same rotation and intrinsics, and stand for every camera on the lines between them: so each side
-    of the picture is one bundle of parallel planes, and the hull is not seen where all points as seen from all cameras lie
-    beyond one of them, or below every camera while the whole picture looks up. False says nothing.
+    The cameras have the same rotation and intrinsics, and stand for every camera on the lines between them. So each side
+    of the image is one bundle of parallel planes, and the hull is outside where all points as seen from all cameras lie
+    beyond one of them, or below every camera while the whole image looks up. False leaves it open.
     """
     k, rotation = cameras[0].intrinsics, cameras[0].T_world_cam[:3, :3]
     if (_corner_rays(k) @ rotation[2] > 0.0).all():
@@ -29,9 +29,9 @@ def outside_views(points: Array, cameras: Sequence[Camera]) -> bool:
 
 
 def _side_normals(k: Intrinsics) -> Array:
-    """[5, 3]: inward normals, in the optical frame, of the picture's four sides and of the plane of the camera itself.
+    """[5, 3]: inward normals, in the optical frame, of the image's four sides and of the plane of the camera itself.
 
-    Of the left side, by example: u = fx X / Z + cx > -margin for Z > 0 is fx X + (cx + margin) Z > 0.
+    For the left side: u = fx X / Z + cx > -margin for Z > 0 is fx X + (cx + margin) Z > 0.
     """
     left, top = k.cx + MARGIN_PX, k.cy + MARGIN_PX
     right, bottom = k.width + MARGIN_PX - k.cx, k.height + MARGIN_PX - k.cy
@@ -39,6 +39,6 @@ def _side_normals(k: Intrinsics) -> Array:
 
 
 def _corner_rays(k: Intrinsics) -> Array:
-    """[4, 3]: the rays through the picture's corners, in the optical frame; every other is between them."""
+    """[4, 3]: the rays through the image's corners, in the optical frame; every other is between them."""
     columns, rows = (-MARGIN_PX, k.width + MARGIN_PX), (-MARGIN_PX, k.height + MARGIN_PX)
     return np.array([[(u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0] for v in rows for u in columns])

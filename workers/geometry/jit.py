@@ -1,6 +1,6 @@
-"""Loops over pixels that numpy can only write as many passes over memory, compiled by numba.
+"""Compilation by numba of loops that numpy could write only as many passes over memory.
 
-Compiled without `fastmath`, so that each sum is the one that is written, in its order, on every machine.
+Without `fastmath`, so that sums are added in the order that is written, on every machine.
 """
 
 from collections.abc import Callable
@@ -15,5 +15,5 @@ def compiled(loop: Loop) -> Loop:
     """The function compiled at its first call, and kept on disk for the next process where there is a place to write."""
     try:
         return cast(Loop, numba.njit(cache=True, error_model="numpy")(loop))
-    except RuntimeError:  # neither the package's folder nor the user's cache can be written
+    except RuntimeError:  # neither the package's folder nor the user's cache is writable
         return cast(Loop, numba.njit(error_model="numpy")(loop))

@@ -1,4 +1,4 @@
-"""manifold3d, held to one thread: it would start one for each core, in every worker."""
+"""Limit of manifold3d to one thread: by default it starts one for each core, in every worker."""
 
 import functools
 import os
@@ -8,10 +8,10 @@ import manifold3d
 
 @functools.cache
 def hold_to_one_thread() -> None:
-    """To be called before manifold3d is used.
+    """Limits manifold3d's thread pool to one core; to be called before manifold3d is used.
 
-    Its pool of threads counts the cores that the calling thread may use when a boolean is first made, and never again:
-    so the first one is made while only one core is allowed.
+    The pool counts the cores that the calling thread may use at the first boolean, and never again: so the first boolean
+    is made while only one core is allowed.
     """
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(allowed)})

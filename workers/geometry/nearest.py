@@ -1,4 +1,4 @@
-"""The nearest point of a mesh's surface. Pure."""
+"""Nearest points of a mesh's surface."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from workers.geometry.jit import compiled
 
 
 def nearest_on_mesh(points: Array, mesh: Mesh, within_m: float = np.inf) -> tuple[Array, NDArray[np.int64]]:
-    """For each point [N, 3]: the nearest point of the surface [N, 3] and the face that it lies on [N].
+    """(nearest point of the surface [N, 3], its face [N]) for each point [N, 3].
 
     The first face among equals; nan and -1 where no face is within `within_m` (or as near as it).
     """
@@ -25,7 +25,7 @@ def nearest_on_mesh(points: Array, mesh: Mesh, within_m: float = np.inf) -> tupl
 def _nearest(
     points: Array, corners: Array, low: Array, high: Array, limit2: float, found: Array, faces: NDArray[np.int64]
 ) -> None:
-    """Every face is held against every point whose box is not farther than the nearest so far."""
+    """Compares each point with every face whose box is nearer than the nearest face so far."""
     here = np.empty(3)
     for n in range(len(points)):
         best = limit2
@@ -48,7 +48,7 @@ def _nearest(
 def nearest_on_triangle(p: Array, corners: Array, nearest: Array) -> None:
     """Writes into `nearest` [3] the point of the triangle `corners` [3, 3] that is nearest to p [3].
 
-    By the Voronoi regions of corners and edges (Ericson, Real-Time Collision Detection 2005, 5.1.5).
+    Uses the Voronoi regions of corners and edges (Ericson, Real-Time Collision Detection 2005, 5.1.5).
     """
     a, b, c = corners[0], corners[1], corners[2]
     d1 = d2 = d3 = d4 = d5 = d6 = 0.0

@@ -1,4 +1,4 @@
-"""Which way the surface in a depth image faces, and whether it is one surface."""
+"""Direction and smoothness of the surfaces in a depth image."""
 
 import math
 
@@ -10,7 +10,7 @@ from schemas.scene.camera import Camera
 from workers.geometry.jit import compiled
 
 Depth = NDArray[np.floating] | NDArray[np.uint16]
-"""[H, W] z along the optical axis, in units of which there are `units_per_m`; 0 where there is none."""
+"""[H, W] z along the optical axis, in units of 1 / `units_per_m` metres; 0 where there is none."""
 
 
 def facing_cosine(
@@ -29,9 +29,7 @@ def facing_cosine(
     """
     k = camera.intrinsics
     eye = camera.T_world_cam[:3, :3].T @ (viewpoint - camera.position)
-    cosine = np.full(len(pixels), np.nan)
-    _facing_cosine(depth, units_per_m, region, pixels, (k.cx, k.cy, k.fx, k.fy), eye, cosine)
-    return cosine
+    return _facing_cosine(depth, units_per_m, region, pixels, (k.cx, k.cy, k.fx, k.fy), eye)
 
 
 @compiled
@@ -42,10 +40,10 @@ def _facing_cosine(
     pixels: NDArray[np.int64],
     k: tuple[float, float, float, float],
     eye: Array,
-    cosine: Array,
-) -> None:
+) -> Array:
     """k: cx, cy, fx, fy. In the camera's frame x runs right and y down, so that y across x points towards the camera."""
     height, width = depth.shape
+    cosine = np.full(len(pixels), np.nan)
     points = np.empty((5, 3))
     for n in range(len(pixels)):
         row, column = pixels[n] // width, pixels[n] % width
@@ -68,33 +66,20 @@ def _facing_cosine(
         away2 = towards[0] * towards[0] + towards[1] * towards[1] + towards[2] * towards[2]
         if length2 > 0.0 and away2 > 0.0:
             cosine[n] = along / (math.sqrt(length2) * math.sqrt(away2))
+    return cosine
 
 
+@compiled
 def is_smooth(
     depth: Depth, region: NDArray[np.uint8], pixels: NDArray[np.int64], bound_m: float, units_per_m: float = 1.0
 ) -> NDArray[np.bool_]:
     """[N] bool: whether a pixel (flat index) and its four neighbours see one smooth surface of one region.
 
-    On a plane 1/z is linear in the image; what its second differences leave, times z squared, is the step in depth that
+    On a plane 1/z is linear in the image; its second differences, times z squared, are the step in depth that
     a plane does not explain, and must stay below `bound_m` along rows and along columns.
     """
-    smooth = np.zeros(len(pixels), np.bool_)
-    if min(depth.shape) < 3:
-        return smooth  # no pixel has four neighbours
-    _is_smooth(depth, units_per_m, region, pixels, bound_m, smooth)
-    return smooth
-
-
-@compiled
-def _is_smooth(
-    depth: Depth,
-    units_per_m: float,
-    region: NDArray[np.uint8],
-    pixels: NDArray[np.int64],
-    bound_m: float,
-    smooth: NDArray[np.bool_],
-) -> None:
     height, width = depth.shape
+    smooth = np.zeros(len(pixels), np.bool_)
     for n in range(len(pixels)):
         row, column = pixels[n] // width, pixels[n] % width
         z = depth[row, column] / units_per_m
@@ -105,3 +90,4 @@ def _is_smooth(
                 alike = region[row + dy, column + dx] == region[row, column] == region[row - dy, column - dx]
                 good = alike and a > 0.0 and b > 0.0 and abs(1.0 / a + 1.0 / b - 2.0 / z) * z * z < bound_m
         smooth[n] = good
+    return smooth

@@ -1,4 +1,4 @@
-"""Forward projection of a depth image into another camera, and the comparison of two views of one surface."""
+"""Forward projection of a depth image into another camera, and sampling of depth between pixels."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from workers.geometry.normals import Depth
 
 @dataclass(frozen=True, eq=False)
 class Projected:
-    """What a cloud looks like from another camera.
+    """A cloud as seen by another camera.
 
     depth_m [H, W] float64, z, 0 in holes; source [H, W] int32, the flat index of the source pixel, -1 in holes.
     """
@@ -24,7 +24,7 @@ class Projected:
     source: NDArray[np.int32]
 
 
-def carry_pixels(
+def reproject_pixels(
     depth: Depth, pixels: NDArray[np.int64], source: Camera, target: Camera, units_per_m: float = 1.0
 ) -> Array:
     """[N, 3] float64: points in the target's frame of the source's pixels (flat indices [N]).
@@ -40,32 +40,31 @@ def carry_pixels(
 def forward_project(
     depth: Depth, source: Camera, target: Camera, splat: int = 1, units_per_m: float = 1.0
 ) -> Projected:
-    """Carry a depth image into another camera.
+    """The cloud of a depth image as seen by another camera.
 
     The target pixel is the floor of (u, v); nearest z wins, ties to the lowest source index; holes stay 0
     (dataset.md "Projection"). With `splat` n > 1 each point fills a square of n x n pixels.
     """
     m = target.intrinsics
-    carried, index = np.zeros((m.height, m.width)), np.full((m.height, m.width), -1, np.int32)
     T = invert(target.T_world_cam) @ source.T_world_cam
     k = source.intrinsics
-    _carry(depth, units_per_m, (k.cx, k.cy, k.fx, k.fy), T, (m.cx, m.cy, m.fx, m.fy), splat // 2, carried, index)
-    return Projected(carried, index)
+    source_k, target_k = (k.cx, k.cy, k.fx, k.fy), (m.cx, m.cy, m.fx, m.fy)
+    return Projected(*_splat(depth, units_per_m, source_k, T, target_k, splat // 2, (m.height, m.width)))
 
 
 @compiled
-def _carry(
+def _splat(
     depth: Depth,
     units_per_m: float,
     k: tuple[float, float, float, float],
     T_target_source: Array,
     m: tuple[float, float, float, float],
     reach: int,
-    carried: Array,
-    index: NDArray[np.int32],
-) -> None:
-    """Fill carried and index; k and m: cx, cy, fx, fy of source and target. Sums in the order of `carry_pixels`."""
-    height, width = carried.shape
+    shape: tuple[int, int],
+) -> tuple[Array, NDArray[np.int32]]:
+    """(depth, source index); k and m: cx, cy, fx, fy of source and target. Sums in the order of `reproject_pixels`."""
+    height, width = shape
+    nearest, index = np.zeros(shape), np.full(shape, -1, np.int32)
     T = T_target_source
     for i in range(depth.shape[0]):
         ray_y = (i + 0.5 - k[1]) / k[3]
@@ -84,11 +83,13 @@ def _carry(
             column, row = int(np.floor(u)), int(np.floor(v))
             for at_row in range(max(row - reach, 0), min(row + reach + 1, height)):
                 for at in range(max(column - reach, 0), min(column + reach + 1, width)):
-                    if index[at_row, at] < 0 or carried[at_row, at] > Z:
-                        carried[at_row, at] = Z
+                    if index[at_row, at] < 0 or nearest[at_row, at] > Z:
+                        nearest[at_row, at] = Z
                         index[at_row, at] = i * depth.shape[1] + j
+    return nearest, index
 
 
+@compiled
 def sample_inverse_depth(
     depth: Depth, region: NDArray[np.uint8], u: Array, v: Array, units_per_m: float = 1.0
 ) -> tuple[Array, NDArray[np.uint8]]:
@@ -98,20 +99,6 @@ def sample_inverse_depth(
     and region 0. On a plane 1/z is linear in the image, so this is exact there. Returns [N] float64 metres and [N] uint8.
     """
     sampled, regions = np.zeros(len(u)), np.zeros(len(u), np.uint8)
-    _sample(depth, units_per_m, region, u, v, sampled, regions)
-    return sampled, regions
-
-
-@compiled
-def _sample(
-    depth: Depth,
-    units_per_m: float,
-    region: NDArray[np.uint8],
-    u: Array,
-    v: Array,
-    sampled: Array,
-    regions: NDArray[np.uint8],
-) -> None:
     height, width = depth.shape
     for n in range(len(u)):
         x, y = u[n] - 0.5, v[n] - 0.5
@@ -128,6 +115,7 @@ def _sample(
                     inverse += share / z
         if good:
             sampled[n], regions[n] = 1.0 / inverse, region[row, column]
+    return sampled, regions
 
 
 def in_frame(u: Array, v: Array, intrinsics: Intrinsics) -> NDArray[np.bool_]:

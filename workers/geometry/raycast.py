@@ -1,13 +1,13 @@
-"""A ray caster in float64 on Embree: the slow, independent answer to what a camera sees at its pixel centres.
+"""A ray caster in float64 on Embree: the slow, independent reference for what a camera sees at its pixel centres.
 
-Embree, in its watertight mode, only says which triangle a ray meets; where it meets it is computed again in float64
-from that triangle's plane, so that neither Embree's float32 distance nor anything of the rasteriser limits it. Each
-thing is cast on its own, which is how ties between coplanar faces of two things can be seen and given to the lower
-region id. Both sides of every face count.
+Embree, in its watertight mode, only finds the triangle that a ray meets; the distance is computed again in float64
+from that triangle's plane, so that neither Embree's float32 nor the rasteriser limits it. Each thing is cast on its own:
+so ties between coplanar faces of two things are found and go to the lower region id. Both sides of every face count.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -17,26 +17,28 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.scene.camera import Camera
 from schemas.scene.scene import Placed
+from schemas.scene.shape import Mesh
+from workers.geometry.camera import project_bounds
+from workers.geometry.convexity import triangle_corners
 from workers.geometry.frames import invert, transform
 
 NEAR_M = 0.05
 """Surfaces nearer than this, along the optical axis, are not seen: the near plane of the fast renderer."""
 
 COPLANAR_M = 1e-6
-"""Two surfaces less than this apart, measured along the normal, are one: ten times what float32 coordinates of a scene
+"""Surfaces nearer than this along the normal count as one: ten times what float32 coordinates of a scene
 a few metres across resolve, and a hundredth of the smallest gap that physics leaves."""
 
 GRAZING = 1e-6
-"""Cosine of incidence below which a plane no longer says where the ray meets the triangle; Embree's distance then does."""
-
+"""Cosine of incidence below which the plane does not fix the distance, and Embree's is used."""
 
 RAYS_AT_ONCE = 65_536
-"""Of a view: some ten megabytes of what is in between, where a whole image of 640 x 480 took a hundred."""
+"""Rays of one call: ten megabytes of intermediate arrays, where a whole image of 640 x 480 takes a hundred."""
 
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where rays first meet a surface.
+    """The first hits of rays.
 
     distance [N] float64, in lengths of each ray's direction, inf where nothing is met; region [N] uint8, 0 there;
     incidence_cos [N] float32, cosine of the angle between ray and face normal in [0, 1], 0 there.
@@ -48,7 +50,7 @@ class Hits:
 
 
 def cast_view(things: Sequence[Placed], camera: Camera) -> tuple[Array, NDArray[np.uint8], NDArray[np.float32]]:
-    """What the camera sees through every pixel's centre (column + 0.5, row + 0.5).
+    """The view of a camera through every pixel's centre (column + 0.5, row + 0.5).
 
     Returns depth_m [H, W] float64, z along the optical axis in metres, 0 where nothing is hit; region [H, W] uint8;
     incidence_cos [H, W] float32. Surfaces with z below `NEAR_M` are passed through.
@@ -58,8 +60,8 @@ def cast_view(things: Sequence[Placed], camera: Camera) -> tuple[Array, NDArray[
     rays = np.ones((rows.size, 3))
     rays[:, 0] = (columns.ravel() + 0.5 - intrinsics.cx) / intrinsics.fx
     rays[:, 1] = (rows.ravel() + 0.5 - intrinsics.cy) / intrinsics.fy
-    best = _nothing(len(rays))
-    for thing in _ascending(things):
+    best = _no_hits(len(rays))
+    for thing in sorted(things, key=attrgetter("region_id")):
         mesh = _in_camera(thing, camera)
         pixels = _pixels_in_reach(mesh.vertices, camera)
         caster = _Caster(mesh)
@@ -76,10 +78,10 @@ def first_hit(things: Sequence[Placed], origins: Array, directions: Array) -> Hi
 
     Keep origins within some metres of the things: Embree holds coordinates in float32.
     """
-    best = _nothing(len(origins))
+    best = _no_hits(len(origins))
     everything = np.arange(len(origins))
-    for thing in _ascending(things):
-        mesh = _Mesh(transform(thing.T_world_shape, thing.shape.vertices), thing.shape.faces)
+    for thing in sorted(things, key=attrgetter("region_id")):
+        mesh = Mesh(transform(thing.T_world_shape, thing.shape.vertices), thing.shape.faces)
         _keep_nearer(best, everything, *_Caster(mesh).cast(origins, directions), thing.region_id)
     return best
 
@@ -91,14 +93,14 @@ def edge_distance_px(
 
     pixels [N, 2] are (row, column). Edges are cut at the near plane; inf where no edge is in front of the camera. With
     `outline_only`, only edges at which a mask can end count: those of a boundary, of a fold (more than two faces), and
-    those between a face that is seen from its front and one that is seen from its back. At most `chunk` distances are
-    held at once. Lines along which surfaces cut through one another are not edges of either.
+    those between a front-facing and a back-facing triangle. At most `chunk` distances are
+    held at once. Lines along which surfaces intersect one another are no edges.
     """
     centres = np.asarray(pixels, dtype=np.float64)[:, ::-1] + 0.5
     nearest = np.full(len(centres), np.inf)
     for thing in things:
         mesh = _in_camera(thing, camera)
-        starts, ends = _project_edges(mesh, _outline(mesh) if outline_only else _edges(mesh), camera)
+        starts, ends = _project_edges(mesh, _edges(mesh, outline_only), camera)
         step = max(1, chunk // max(1, len(centres)))
         for first in range(0, len(starts), step):
             part = slice(first, first + step)
@@ -106,42 +108,29 @@ def edge_distance_px(
     return nearest
 
 
-@dataclass(frozen=True, eq=False)
-class _Mesh:
-    """vertices [V, 3] float64 in some frame; faces [F, 3] int32."""
-
-    vertices: Array
-    faces: NDArray[np.int32]
+def _in_camera(thing: Placed, camera: Camera) -> Mesh:
+    return Mesh(transform(invert(camera.T_world_cam) @ thing.T_world_shape, thing.shape.vertices), thing.shape.faces)
 
 
-def _ascending(things: Sequence[Placed]) -> list[Placed]:
-    return sorted(things, key=lambda thing: thing.region_id)
-
-
-def _in_camera(thing: Placed, camera: Camera) -> _Mesh:
-    return _Mesh(transform(invert(camera.T_world_cam) @ thing.T_world_shape, thing.shape.vertices), thing.shape.faces)
-
-
-def _nothing(count: int) -> Hits:
+def _no_hits(count: int) -> Hits:
     return Hits(np.full(count, np.inf), np.zeros(count, np.uint8), np.zeros(count, np.float32))
 
 
 def _pixels_in_reach(vertices: Array, camera: Camera) -> NDArray[np.int64]:
     """Flat indices of the pixels whose rays can meet a mesh: its projected bounding box, a pixel wider on each side."""
     k = camera.intrinsics
-    if (vertices[:, 2] <= NEAR_M).any():
-        return np.arange(k.width * k.height)
-    u = k.fx * vertices[:, 0] / vertices[:, 2] + k.cx
-    v = k.fy * vertices[:, 1] / vertices[:, 2] + k.cy
-    left, right = np.clip([np.floor(u.min()) - 1, np.ceil(u.max()) + 1], 0, k.width).astype(np.int64)
-    top, bottom = np.clip([np.floor(v.min()) - 1, np.ceil(v.max()) + 1], 0, k.height).astype(np.int64)
+    if not len(vertices):
+        return np.empty(0, np.int64)
+    u_min, v_min, u_max, v_max = project_bounds(vertices, k, NEAR_M)
+    left, right = np.clip([np.floor(u_min) - 1, np.ceil(u_max) + 1], 0, k.width).astype(np.int64)
+    top, bottom = np.clip([np.floor(v_min) - 1, np.ceil(v_max) + 1], 0, k.height).astype(np.int64)
     return (np.arange(top, bottom)[:, None] * k.width + np.arange(left, right)).ravel()
 
 
 class _Caster:
     """A mesh in Embree's tree."""
 
-    def __init__(self, mesh: _Mesh) -> None:
+    def __init__(self, mesh: Mesh) -> None:
         self._empty = not len(mesh.faces)  # Embree does not take empty scenes
         if self._empty:
             return
@@ -167,9 +156,9 @@ class _Caster:
         return distance, cosine
 
 
-def _planes(mesh: _Mesh) -> tuple[Array, Array]:
+def _planes(mesh: Mesh) -> tuple[Array, Array]:
     """(normals [F, 3], offsets [F]): unit normal n of each face, 0 where it has no area, and n . p of its points p."""
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    a, b, c = triangle_corners(mesh)
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
@@ -179,7 +168,7 @@ def _planes(mesh: _Mesh) -> tuple[Array, Array]:
 def _keep_nearer(
     best: Hits, rays: NDArray[np.int64], distance: Array, cosine: Array, region_id: int, *, offset: float = 0.0
 ) -> None:
-    """Write into `best` the hits that are nearer by more than `COPLANAR_M` along the normal than what stands there."""
+    """Writes into `best` the hits that are nearer than its own by more than `COPLANAR_M` along the normal."""
     distance = distance + offset
     nearer = distance + COPLANAR_M / np.maximum(cosine, GRAZING) < best.distance[rays]
     won = rays[nearer]
@@ -188,32 +177,24 @@ def _keep_nearer(
     best.incidence_cos[won] = cosine[nearer]
 
 
-def _edges(mesh: _Mesh) -> NDArray[np.int64]:
-    """[E, 2]: the vertex pairs of every edge, once each."""
-    pairs = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
-    key = np.unique(pairs[:, 0] * len(mesh.vertices) + pairs[:, 1])
-    return np.stack(np.divmod(key, len(mesh.vertices)), axis=1)
+def _edges(mesh: Mesh, outline_only: bool) -> NDArray[np.int64]:
+    """[E, 2]: the vertex pairs of all edges; or of those without exactly two faces, or whose faces show different sides.
 
-
-def _outline(mesh: _Mesh) -> NDArray[np.int64]:
-    """[E, 2]: edges without exactly two faces, or whose two faces show the camera different sides.
-
-    Vertices at one place are one vertex here, because seams of texture and shading split them.
+    Vertices at one place count as one, because seams of texture and shading split them.
     """
     _, first, welded = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
     faces = welded.reshape(-1)[mesh.faces].astype(np.int64)
-    front = _planes(mesh)[1] < 0.0
     directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    turned = directed[:, 0] > directed[:, 1]
     pairs = np.sort(directed, axis=1)
-    side = np.where(np.repeat(front, 3), 1, -1) * np.where(turned, -1, 1)
     key, group, count = np.unique(pairs[:, 0] * len(first) + pairs[:, 1], return_inverse=True, return_counts=True)
-    balance = np.bincount(group.reshape(-1), weights=side, minlength=len(key))
-    kept = key[(count != 2) | (balance != 0)]
-    return first[np.stack(np.divmod(kept, len(first)), axis=1)]
+    if outline_only:
+        front = np.repeat(_planes(mesh)[1] < 0.0, 3)
+        side = np.where(front == (directed[:, 0] <= directed[:, 1]), 1, -1)
+        key = key[(count != 2) | (np.bincount(group.reshape(-1), weights=side, minlength=len(key)) != 0)]
+    return first[np.stack(np.divmod(key, len(first)), axis=1)]
 
 
-def _project_edges(mesh: _Mesh, edges: NDArray[np.int64], camera: Camera) -> tuple[Array, Array]:
+def _project_edges(mesh: Mesh, edges: NDArray[np.int64], camera: Camera) -> tuple[Array, Array]:
     """(starts, ends), each [E', 2] float64: image coordinates of the parts of edges in front of the near plane."""
     a, b = mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]]
     seen = (a[:, 2] > NEAR_M) | (b[:, 2] > NEAR_M)

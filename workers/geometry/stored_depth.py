@@ -1,4 +1,4 @@
-"""Depth as it is stored: 16-bit units along the optical axis, and back to metres."""
+"""Conversion between depth in metres and depth as it is stored, in 16-bit units along the optical axis."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,11 +9,11 @@ from workers.geometry.pixels import round_depth
 
 
 def quantise_depth(depth_m: NDArray[np.floating], images: Images) -> NDArray[np.uint16]:
-    """[H, W] uint16: z in units, to the nearest; 0 where nothing was hit or z is outside the stored range (open)."""
+    """[H, W] uint16: z to the nearest unit; 0 where nothing was hit or z is outside the open range that is stored."""
     low, high = images.depth_range_m
     return round_depth(depth_m, low, high, images.depth_units_per_m)
 
 
-def stored_depth_m(depth: NDArray[np.uint16], images: Images) -> Array:
+def dequantise_depth(depth: NDArray[np.uint16], images: Images) -> Array:
     """[H, W] float64 metres, 0 where there is none: what a reader of the stored image gets."""
     return depth / images.depth_units_per_m

@@ -9,7 +9,7 @@ from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.view import Agreement, View
 from workers.geometry.camera import project
 from workers.geometry.normals import facing_cosine, is_smooth
-from workers.geometry.projection import carry_pixels, in_frame, sample_inverse_depth
+from workers.geometry.projection import in_frame, reproject_pixels, sample_inverse_depth
 from workers.labels.projected_view import HIDDEN_M
 
 FEWEST_POINTS = 50
@@ -43,7 +43,7 @@ def compare_views(source: View, mirror: View, images: Images, bound_mm: float) -
     facing = facing_cosine(source.depth, source.region, pixels, source.camera, mirror.camera.position, units)
     smooth = is_smooth(source.depth, source.region, pixels, SMOOTH_INPUT_M, units)
     index = pixels[(np.nan_to_num(facing, nan=-1.0) > FACING) & smooth]
-    points = carry_pixels(source.depth, index, source.camera, mirror.camera, units)
+    points = reproject_pixels(source.depth, index, source.camera, mirror.camera, units)
     keep = points[:, 2] > 0.0
     points, index = points[keep], index[keep]
     u, v = project(points, mirror.camera.intrinsics)

@@ -10,7 +10,7 @@ from schemas.scene.effects import EffectPlan
 from schemas.scene.view import View
 from workers.geometry.distortion import distort
 from workers.geometry.normals import facing_cosine
-from workers.geometry.pixels import count_filled, take_colours
+from workers.geometry.pixels import count_filled, gather_colours
 from workers.geometry.projection import Projected, forward_project, in_frame
 from workers.geometry.stored_depth import quantise_depth
 
@@ -32,7 +32,7 @@ def derive_projected(
         return None, depth
     if lens is not None and effects.runs("sensor_distortion"):
         pixels = pixels_behind(lens, pixels, source.camera.intrinsics)
-    return take_colours(source.rgb, pixels), depth
+    return gather_colours(source.rgb, pixels), depth
 
 
 def pixels_behind(lens: Distortion, pixels: NDArray[np.integer], k: Intrinsics) -> NDArray[np.int64]:

@@ -14,7 +14,7 @@ from schemas.base import Array, Pose
 from schemas.errors import SettleError
 from schemas.job.physics import Physics
 from schemas.scene.shape import Mesh
-from workers.geometry.frames import quaternion_of
+from workers.geometry.frames import quaternion_from_rotation
 from workers.physics.bullet_buffers import BulletBuffers
 from workers.physics.rest_pose import stands_on_face
 from workers.physics.rigid_body import Body, BodyPose
@@ -153,7 +153,7 @@ def open_world(
             level = len(placed) == 1 and stands_on_face(np.concatenate(body.parts), -T_world_body[2, :3])
             things.append(_add_body(client, body, T_world_body[:3, :3] if level else None))
             _set_surface(client, things[-1], physics, body)
-            position, quaternion = T_world_body[:3, 3].tolist(), quaternion_of(T_world_body[:3, :3]).tolist()
+            position, quaternion = T_world_body[:3, 3].tolist(), quaternion_from_rotation(T_world_body[:3, :3]).tolist()
             pybullet.resetBasePositionAndOrientation(things[-1], position, quaternion, physicsClientId=client)
         repair_s = REPAIR_S if len(placed) == 1 and not isinstance(ground, Mesh) else 0.0
         world = World(client, things[0], tuple(things[1:]), steps, repair_s)
@@ -222,7 +222,7 @@ def _add_body(client: int, body: Body, R_world_body: Array | None) -> int:
     its own is a compound to Bullet, and compounds are less stable on one another.
     """
     parts = [np.round(part if R_world_body is None else part @ R_world_body.T, DECIMALS) for part in body.parts]
-    orientation = [0.0, 0.0, 0.0, 1.0] if R_world_body is None else quaternion_of(R_world_body.T).tolist()
+    orientation = [0.0, 0.0, 0.0, 1.0] if R_world_body is None else quaternion_from_rotation(R_world_body.T).tolist()
     if len(parts) > 1:
         shape = _compound(client, parts, orientation)
     else:

@@ -9,9 +9,9 @@ import numpy as np
 from schemas.base import Pose
 from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.shape import Mesh
-from workers.geometry.contact_points import touching_points
+from workers.geometry.contact_points import find_contact_points
 from workers.geometry.convexity import solid_of, weld
-from workers.geometry.elevation import Terrain, survey
+from workers.geometry.elevation import Terrain, prepare_terrain
 from workers.geometry.frames import transform, translation
 from workers.physics.equilibrium import FIXED, Contact, Weight, equilibrium_residual, support_margin_m
 from workers.physics.rest_pose import CONTACT_M
@@ -42,7 +42,7 @@ class Ground:
     @cached_property
     def terrain(self) -> Terrain:
         """The mesh, prepared."""
-        return survey(self.table.mesh)
+        return prepare_terrain(self.table.mesh)
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,9 @@ def measure_supports(
 
 def _find_contacts(meshes: Sequence[Mesh], table: Mesh) -> list[Contact]:
     """Contacts of every mesh with the table, and of every two whose boxes are near one another."""
-    found = [Contact(k, FIXED, *touching_points(mesh, table, CONTACT_M)) for k, mesh in enumerate(meshes)]
+    found = [Contact(k, FIXED, *find_contact_points(mesh, table, CONTACT_M)) for k, mesh in enumerate(meshes)]
     pairs = find_near(meshes, 2.0 * CONTACT_M)
-    return found + [Contact(i, j, *touching_points(meshes[i], meshes[j], CONTACT_M)) for i, j in pairs]
+    return found + [Contact(i, j, *find_contact_points(meshes[i], meshes[j], CONTACT_M)) for i, j in pairs]
 
 
 def _describe_support(number: int, contacts: Sequence[Contact], weight: Weight, residual: float) -> Support:
@@ -135,11 +135,11 @@ def _may_be_hooked(mesh: Mesh, ground: Ground) -> bool:
 
 def _distance_m(mesh: Mesh, ground: Ground) -> float:
     """The least distance between two meshes, to `NEAREST_M`; inf beyond `FARTHEST_M`."""
-    if len(touching_points(mesh, ground.table.mesh, FARTHEST_M)[0]) == 0:
+    if len(find_contact_points(mesh, ground.table.mesh, FARTHEST_M)[0]) == 0:
         return np.inf
     low, high = 0.0, FARTHEST_M
     while high - low > NEAREST_M:
         middle = (low + high) / 2
-        near = len(touching_points(mesh, ground.table.mesh, middle)[0]) > 0
+        near = len(find_contact_points(mesh, ground.table.mesh, middle)[0]) > 0
         low, high = (low, middle) if near else (middle, high)
     return high

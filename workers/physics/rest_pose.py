@@ -5,7 +5,7 @@ from scipy.spatial import ConvexHull
 
 from schemas.base import Array, Pose
 from schemas.scene.shape import Hull, Mesh
-from workers.geometry.elevation import Terrain, heights_at
+from workers.geometry.elevation import Terrain, sample_elevation
 from workers.geometry.frames import pose, rotation_about, rotation_between, transform
 from workers.physics.table_top import inside_margin
 
@@ -140,5 +140,5 @@ def find_contacts_xy(hull: Hull, T_world_obj: Pose, support: Mesh | Terrain) -> 
     """[N, 2] float64, world: the vertices of the hull within `CONTACT_M` of the mesh below them."""
     points = transform(T_world_obj, hull.vertices)
     points = points[points[:, 2] <= points[:, 2].min() + NEAR_LOWEST_M]
-    gap = points[:, 2] - heights_at(points[:, :2], support)
+    gap = points[:, 2] - sample_elevation(points[:, :2], support)
     return points[np.isfinite(gap) & (np.abs(gap) <= CONTACT_M)][:, :2]

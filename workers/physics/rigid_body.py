@@ -12,7 +12,7 @@ from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import MassProperties
 from workers.geometry.frames import invert, pose, transform
 from workers.geometry.hull import convex_hull
-from workers.geometry.hull_offset import inset_hull
+from workers.geometry.hull_offset import offset_hull
 from workers.geometry.lathe_decomposition import TOLERANCE
 from workers.physics.convex_parts.step import parts_of
 from workers.physics.effects import is_convex
@@ -78,12 +78,13 @@ def make_body(start: ObjectStart, physics: Physics, damping: float = 0.0, parts:
     """
     T_obj_body, moments = body_frame(start.asset.mass)
     hulls = [convex_hull(part) for part in parts] or [start.hull]
-    insets = [inset_hull(hull, physics.margin_mm / 1e3 - SLOP_M) for hull in hulls]
-    inset_m = min(each.inset_m for each in insets)
+    insets = [offset_hull(hull, physics.margin_mm / 1e3 - SLOP_M) for hull in hulls]
+    offset_m = min(each.offset_m for each in insets)
     insets = [
-        each if each.inset_m == inset_m else inset_hull(hull, inset_m) for each, hull in zip(insets, hulls, strict=True)
+        each if each.offset_m == offset_m else offset_hull(hull, offset_m)
+        for each, hull in zip(insets, hulls, strict=True)
     ]
-    margin_m = min(each.inset_m for each in insets) + SLOP_M
+    margin_m = min(each.offset_m for each in insets) + SLOP_M
     T_body_obj = invert(T_obj_body)
     reach_m = float(np.linalg.norm(transform(T_body_obj, start.hull.vertices), axis=1).max())
     vertices = tuple(transform(T_body_obj, each.vertices) for each in insets)

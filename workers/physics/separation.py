@@ -8,7 +8,7 @@ import manifold3d
 import numpy as np
 
 from schemas.scene.shape import Mesh
-from workers.geometry.convexity import solid_of, triangles_of, weld
+from workers.geometry.convexity import mesh_of, solid_of, weld
 from workers.geometry.elevation import Terrain, vertical_gap
 from workers.geometry.hull import convex_hull
 from workers.geometry.hull_offset import least_width_m
@@ -92,7 +92,7 @@ def between(a: manifold3d.Manifold, b: manifold3d.Manifold) -> float:
     pieces = [piece for piece in (a ^ b).decompose() if piece.volume() > NO_VOLUME]
     if not pieces:
         return float(a.min_gap(b, NEAR_M))
-    return -max(least_width_m(convex_hull(triangles_of(piece).vertices)) for piece in pieces)
+    return -max(least_width_m(convex_hull(mesh_of(piece).vertices)) for piece in pieces)
 
 
 def _solid(mesh: Mesh) -> manifold3d.Manifold:

@@ -10,7 +10,7 @@ from schemas.errors import SettleError
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart
 from schemas.scene.scene import Settled, SupportedBy
-from workers.geometry.elevation import heights_at
+from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import transform
 from workers.physics.effects import called_for_with
 from workers.physics.fall import Outcome
@@ -177,7 +177,7 @@ def _is_on_table(ending: _Ending, com: Array) -> bool:
     lowest_m = ground.table.top.height_m - LEFT_M
     high = bool(com[2] >= lowest_m)
     # nan compares false
-    if not drop.single or (high and heights_at(com[None, :2], ground.terrain)[0] >= lowest_m):
+    if not drop.single or (high and sample_elevation(com[None, :2], ground.terrain)[0] >= lowest_m):
         return high
     return ending.outcome.rested and ending.support.residual <= UNBALANCED and ending.support.highest_m >= lowest_m
 

@@ -10,7 +10,7 @@ from schemas.job.physics import Physics
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart, ScenePlan
 from schemas.scene.scene import Settled
-from workers.geometry.frames import moved_between
+from workers.geometry.frames import motion_between
 from workers.physics.effects import called_for_with, rooms_m
 from workers.physics.fall import FINEST
 from workers.physics.placement import Ground
@@ -87,5 +87,5 @@ def release_again(
 
 def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, float]:
     """(mm that the farthest point of an object moves between two poses, degrees that it turns)."""
-    moved_m, turned_rad = moved_between(start.hull.vertices, before, after)
+    moved_m, turned_rad = motion_between(start.hull.vertices, before, after)
     return moved_m * 1e3, math.degrees(turned_rad)

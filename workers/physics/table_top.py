@@ -7,7 +7,7 @@ from schemas.base import Array, frozen_array
 from schemas.errors import StartError
 from schemas.scene.plan import Table, TableTop
 from schemas.scene.shape import Asset, Mesh, Shape
-from workers.geometry.elevation import heights_at
+from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import transform, translation
 
 LEVEL = 0.999
@@ -81,7 +81,7 @@ def inside_margin(points_xy: Array, outline: Array) -> Array:
 
 def support_height(points_xy: Array, table: Mesh) -> float:
     """Height of the table's highest point below, or within the bounding box of, points [N, 2]; -inf off the table."""
-    heights = heights_at(points_xy, table)
+    heights = sample_elevation(points_xy, table)
     low, high = points_xy.min(axis=0), points_xy.max(axis=0)
     inside = ((table.vertices[:, :2] >= low) & (table.vertices[:, :2] <= high)).all(axis=1)
     candidates = np.concatenate([heights[np.isfinite(heights)], table.vertices[inside, 2]])

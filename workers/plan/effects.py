@@ -19,7 +19,7 @@ from schemas.scene.camera import Camera, Role
 from schemas.scene.effects import EffectPlan
 from schemas.scene.shape import Part
 from workers.cameras.placement import place_aligned_camera, place_mirror_camera
-from workers.geometry.frustum import outside_views
+from workers.geometry.frustum import is_outside_views
 from workers.geometry.texels import has_holes
 from workers.physics.effects import COSTS, PREDICATES
 from workers.plan.effect import Effect, Facts, Reason
@@ -131,7 +131,7 @@ def _table(facts: Facts) -> str | None:
 
 def _outside(facts: Facts, points: Array) -> str | None:
     """Whether no view sees anything of the convex hull of points [N, 3], world."""
-    unseen = all(outside_views(points, cameras) for cameras in _views(facts))
+    unseen = all(is_outside_views(points, cameras) for cameras in _views(facts))
     return "outside of every view" if unseen else None
 
 

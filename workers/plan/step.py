@@ -17,7 +17,7 @@ from workers.assets.appearance.draw import draw_appearance
 from workers.assets.catalogue import Catalogue
 from workers.assets.step import choose_object, choose_table, load_asset
 from workers.geometry.camera import orbit_pose
-from workers.geometry.elevation import heights_at
+from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import UP, pose, rotation_about, transform, translation, uniform_rotation
 from workers.geometry.hull import convex_hull
 from workers.physics.rest_pose import find_contacts_xy, support_margin
@@ -95,7 +95,7 @@ def draw_start(
     over_table = False
     for redraws in range(spec.max_redraws + 1):
         com_xy = (R @ asset.mass.com)[:2] + xy
-        if heights_at(com_xy[None, :], table.mesh)[0] >= table.top.height_m - RECESS_M:  # nan compares false
+        if sample_elevation(com_xy[None, :], table.mesh)[0] >= table.top.height_m - RECESS_M:  # nan compares false
             over_table = True
             rested = set_down(pose(R, np.array([xy[0], xy[1], 0.0])), hull, table.mesh)
             points = transform(rested, hull.vertices)

@@ -8,7 +8,7 @@ from schemas.job.images import Images
 from schemas.job.sensor import SensorEffects
 from schemas.scene.effects import EffectPlan
 from schemas.scene.view import View
-from workers.geometry.stored_depth import quantise_depth, stored_depth_m
+from workers.geometry.stored_depth import dequantise_depth, quantise_depth
 from workers.sensor.depth import sense_depth
 from workers.sensor.rgb import sense_rgb
 
@@ -35,6 +35,6 @@ def sense_view(sensor: SensorEffects, images: Images, view: View, chance: Sensor
     if rgb is not None:
         rgb = sense_rgb(rgb, view.camera.intrinsics, sensor, chance.exposure, chance.rgb)
     if sensor.depth_noise is not None:
-        exact_m = stored_depth_m(depth, images)
+        exact_m = dequantise_depth(depth, images)
         depth = quantise_depth(sense_depth(exact_m, view.region, view.camera, sensor.depth_noise, chance.depth), images)
     return view if rgb is view.rgb and depth is view.depth else replace(view, rgb=rgb, depth=depth)

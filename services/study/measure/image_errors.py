@@ -17,7 +17,7 @@ from schemas.scene.view import Pair, View
 from services.study.measure.patch_rays import Patch
 from services.study.measure.pixel_rays import Pixels, Seen
 from services.study.measure.truth import Truth
-from workers.geometry.stored_depth import stored_depth_m
+from workers.geometry.stored_depth import dequantise_depth
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene
 
@@ -98,7 +98,7 @@ def _depth_mm(view: View, seen: Seen, chosen: NDArray[np.bool_], images: Images)
     assert view.region is not None
     depth = seen.of(view.depth)
     same = chosen & (seen.of(view.region) == seen.region) & (depth > 0)
-    return np.abs(stored_depth_m(depth[same], images) - seen.depth_m[same]) * 1e3
+    return np.abs(dequantise_depth(depth[same], images) - seen.depth_m[same]) * 1e3
 
 
 def _of_labels(errors: Sequence[LabelErrors]) -> dict[str, float]:
@@ -119,7 +119,7 @@ def _of_patches(pairs: Sequence[Pair], patches: Sequence[Patch], images: Images)
         row = np.minimum((patch.at[:, 1] * k.height).astype(np.int64), k.height - 1)
         mask, depth = region[row, column], pair.input.depth[row, column]
         same = (mask == patch.region) & (mask >= REGION_FIRST_OBJECT) & (depth > 0)
-        off_mm.append(np.abs(stored_depth_m(depth[same], images) - patch.depth_m[same]) * 1e3)
+        off_mm.append(np.abs(dequantise_depth(depth[same], images) - patch.depth_m[same]) * 1e3)
         wrong += int(np.count_nonzero(mask != patch.region))
         rays += len(mask)
     return {**_percentile("between_mm", off_mm, 50.0), **_share("outline_share", wrong, rays)}
@@ -152,7 +152,7 @@ def _of_projections(pairs: Sequence[Pair], truth: Truth, images: Images) -> dict
         empty += int(np.count_nonzero(shared & (seen.box.of(depth) == 0)))
         both += int(np.count_nonzero(shared))
         drawn, z = seen.spread.of(depth), seen.spread.depth_m
-        behind = (drawn > 0) & (z > 0.0) & (stored_depth_m(drawn, images) > z + HIDDEN_M)
+        behind = (drawn > 0) & (z > 0.0) & (dequantise_depth(drawn, images) > z + HIDDEN_M)
         hidden += int(np.count_nonzero(behind))
         filled += int(np.count_nonzero(drawn))
     return {**_share("unfilled_share", empty, both), **_share("hidden_share", hidden, filled)}

@@ -9,7 +9,7 @@ from schemas.base import Array
 from schemas.scene.camera import Camera
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.scene import Placed
-from workers.geometry.camera import project
+from workers.geometry.camera import project, project_bounds
 from workers.geometry.frames import invert, transform
 from workers.geometry.raycast import NEAR_M, RAYS_AT_ONCE, first_hit
 
@@ -35,11 +35,8 @@ def project_box(things: Sequence[Placed], camera: Camera) -> Box | None:
     points = vertices_in(things, camera)
     if not len(points):
         return None
-    if (points[:, 2] <= NEAR_M).any():
-        return 0.0, 0.0, float(k.width), float(k.height)
-    u, v = project(points, k)
-    left, right = (float(np.clip(edge, 0, k.width)) for edge in (u.min(), u.max()))
-    top, bottom = (float(np.clip(edge, 0, k.height)) for edge in (v.min(), v.max()))
+    bounds = project_bounds(points, k, NEAR_M)
+    left, top, right, bottom = np.clip(bounds, 0, [k.width, k.height] * 2).tolist()
     return (left, top, right, bottom) if left < right and top < bottom else None
 
 

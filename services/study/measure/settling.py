@@ -14,7 +14,7 @@ from schemas.scene.plan import ScenePlan
 from schemas.scene.scene import Settled
 from services.study.knobs import apply
 from services.study.model import Setting
-from workers.geometry.frames import moved_between, transform
+from workers.geometry.frames import motion_between, transform
 from workers.physics.step import Rest, moved_by, recheck_scene, settle_scene
 from workers.pipeline.context import WorkerContext
 from workers.plan.effect import Facts
@@ -104,7 +104,7 @@ def _way(plan: ScenePlan, number: int, rest: Settled) -> tuple[float, float]:
     start = plan.objects[number]
     com = start.asset.mass.com[None, :]
     before, after = (transform(T, com)[0, :2] for T in (start.T_world_obj, rest.T_world_obj))
-    _, turned = moved_between(start.hull.vertices, start.T_world_obj, rest.T_world_obj)
+    _, turned = motion_between(start.hull.vertices, start.T_world_obj, rest.T_world_obj)
     return float(np.linalg.norm(after - before)) * 1e3, math.degrees(turned)
 
 

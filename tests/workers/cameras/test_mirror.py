@@ -5,9 +5,23 @@ import math
 import numpy as np
 import pytest
 
-from workers.cameras.mirror import article_product, mirror_pose
+from workers.cameras.mirror import mirror_pose
 from workers.geometry.camera import inclination, look_at, orbit_pose
-from workers.geometry.frames import pose, rotation_about
+from workers.geometry.frames import half_turn, pose, rotation_about, translation
+
+X_AXIS = np.array([1.0, 0.0, 0.0])
+Y_AXIS = np.array([0.0, 1.0, 0.0])
+
+
+def article_product(T_world_cam: np.ndarray, d_z_m: float, T_z_m: float = 1.3) -> np.ndarray:
+    """The article's product of transforms, [4, 4] float64, for a zero-roll camera.
+
+    T_in Trans_z(d_z) Rot_x(phi) Rot_y(pi) Rot_x(-phi) Trans_z(-T_z), with phi the angle of the axis below the
+    horizontal.
+    """
+    phi = inclination(T_world_cam)
+    turn = rotation_about(X_AXIS, phi) @ half_turn(Y_AXIS) @ rotation_about(X_AXIS, -phi)
+    return T_world_cam @ translation(0, 0, d_z_m) @ pose(turn, np.zeros(3)) @ translation(0, 0, -T_z_m)
 
 
 def random_camera(seed: int, roll: bool) -> np.ndarray:

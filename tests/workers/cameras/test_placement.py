@@ -9,7 +9,7 @@ from schemas.scene.camera import Camera, Intrinsics
 from workers.cameras.pivot_depth import front_distance, object_distance
 from workers.cameras.placement import place_aligned_camera, place_mirror_camera
 from workers.geometry.camera import orbit_pose
-from workers.geometry.stored_depth import quantise_depth, stored_depth_m
+from workers.geometry.stored_depth import dequantise_depth, quantise_depth
 
 JOB = Job(name="t")
 CAMERA = Camera(Intrinsics.of(JOB.cameras.sensor), orbit_pose(np.array([0, 0, 0.7]), 0.8, 1.0, 2.5))
@@ -23,7 +23,7 @@ def test_depth_is_rounded_to_the_nearest_unit_and_zero_outside_the_range():
 
 def test_stored_depth_is_off_by_at_most_half_a_unit():
     depth = np.random.default_rng(0).uniform(0.3, 7.9, (50, 50))
-    assert np.abs(stored_depth_m(quantise_depth(depth, JOB.images), JOB.images) - depth).max() <= 1e-4 + 1e-12
+    assert np.abs(dequantise_depth(quantise_depth(depth, JOB.images), JOB.images) - depth).max() <= 1e-4 + 1e-12
 
 
 def test_the_depth_camera_stands_off_in_the_rgb_cameras_own_axes():

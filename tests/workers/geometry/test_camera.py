@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 
 from schemas.scene.camera import Intrinsics
-from workers.geometry.camera import image_coordinates, inclination, look_at, orbit_pose, project, unproject, yaw
+from workers.geometry.camera import (
+    image_coordinates,
+    inclination,
+    look_at,
+    orbit_pose,
+    project,
+    project_bounds,
+    unproject,
+    yaw,
+)
 from workers.geometry.frames import translation
 
 K = Intrinsics(width=640, height=480, fx=525.0, fy=520.0, cx=320.0, cy=240.0)
@@ -51,3 +60,9 @@ def test_image_coordinates_are_whole_pixels_and_minus_one_outside_and_behind():
     assert image_coordinates(translation(-320.0 / 525.0 + 1e-6, 0.0, 1.0), K) == (0, 240)
     assert image_coordinates(translation(-320.0 / 525.0 - 1e-6, 0.0, 1.0), K) == (-1, -1)
     assert image_coordinates(translation(0.0, 0.0, -1.0), K) == (-1, -1)
+
+
+def test_projected_bounds_reach_beyond_the_image_and_are_the_images_where_a_point_is_too_near():
+    points = np.array([(0.0, 0.0, 1.0), (-1.0, 0.5, 1.0), (0.1, -0.2, 2.0)])
+    assert project_bounds(points, K, 0.05) == pytest.approx((320.0 - 525.0, 240.0 - 52.0, 320.0 + 26.25, 240.0 + 260.0))
+    assert project_bounds(np.array([(0.0, 0.0, 1.0), (0.0, 0.0, 0.05)]), K, 0.05) == (0.0, 0.0, 640.0, 480.0)

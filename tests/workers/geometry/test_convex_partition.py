@@ -1,10 +1,10 @@
-"""Plane outlines cut into convex cells, against shapely's areas and hulls."""
+"""Convex partitions of plane outlines, against shapely's areas and hulls."""
 
 import numpy as np
 import pytest
 import shapely
 
-from workers.geometry.convex_partition import convex_cells
+from workers.geometry.convex_partition import partition_outlines
 
 L_SHAPE = np.array([(0, 0), (3, 0), (3, 1), (1, 1), (1, 3), (0, 3)], dtype=np.float64)
 STAR = np.array([(np.cos(k * np.pi / 7) * r, np.sin(k * np.pi / 7) * r) for k, r in enumerate([2.0, 0.7] * 7)])
@@ -13,9 +13,7 @@ OUTLINES = {"l": L_SHAPE, "star": STAR, "comb": np.concatenate([COMB, [(5.0, 1.0
 
 
 def polygons(outline, tolerance=0.0):
-    found = convex_cells(outline[None], tolerance)
-    points = found.points(outline)
-    return [shapely.Polygon(points[cell]) for cell in found.cells]
+    return [shapely.Polygon(outline[cell]) for cell in partition_outlines(outline[None], tolerance)]
 
 
 @pytest.mark.parametrize("name", OUTLINES)
@@ -29,9 +27,16 @@ def test_cells_are_convex_and_tile_the_outline(name):
     )
 
 
-def test_there_is_at_most_one_cell_more_than_corners_that_turn_inwards():
+def test_there_is_at_most_one_cell_more_than_reflex_corners():
     assert len(polygons(L_SHAPE)) == 2
     assert len(polygons(STAR)) <= 8
+
+
+def test_a_cut_that_later_cuts_made_needless_is_taken_out():
+    """The shortest diagonals of a plus cut off all four arms; two of them and the middle are one bar."""
+    plus = [(1, 0), (2, 0), (2, 1), (3, 1), (3, 2), (2, 2), (2, 3), (1, 3), (1, 2), (0, 2), (0, 1), (1, 1)]
+    cells = polygons(np.array(plus, dtype=np.float64))
+    assert sorted(cell.area for cell in cells) == pytest.approx([1.0, 1.0, 3.0])
 
 
 def test_what_is_convex_is_one_cell():
@@ -52,12 +57,12 @@ def test_a_shallow_arc_is_kept_whole_only_within_the_tolerance():
 
 
 def test_outlines_that_are_cut_alike_are_all_convex():
-    """The second turns inwards where the first is straight."""
+    """The second has a reflex corner where the first is straight."""
     first = np.array([(0, 0), (2, 0), (2, 1), (2, 2), (0, 2)], dtype=np.float64)
     second = np.array([(0, 0), (2, 0), (1, 1), (2, 2), (0, 2)], dtype=np.float64)
-    found = convex_cells(np.stack([first, second]), 1e-9)
-    assert len(found.cells) == 2
+    found = partition_outlines(np.stack([first, second]), 1e-9)
+    assert len(found) == 2
     for outline in (first, second):
-        cells = [shapely.Polygon(found.points(outline)[cell]) for cell in found.cells]
+        cells = [shapely.Polygon(outline[cell]) for cell in found]
         assert all(cell.convex_hull.area - cell.area < 1e-12 for cell in cells)
         assert sum(cell.area for cell in cells) == pytest.approx(shapely.Polygon(outline).area)

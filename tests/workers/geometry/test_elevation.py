@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from workers.geometry.elevation import heights_at, vertical_gap
+from workers.geometry.elevation import sample_elevation, vertical_gap
 
 
 def mesh(m: trimesh.Trimesh) -> Mesh:
@@ -17,18 +17,18 @@ BOX = trimesh.creation.box((2, 2, 0.1))
 
 def test_a_box_has_its_top_its_bottom_and_nothing_beside_it():
     points = np.array([[0.0, 0.0], [0.9, -0.9], [1.1, 0.0]])
-    assert heights_at(points, mesh(BOX))[:2] == pytest.approx(0.05)
-    assert heights_at(points, mesh(BOX), highest=False)[:2] == pytest.approx(-0.05)
-    assert np.isnan(heights_at(points, mesh(BOX))[2])
+    assert sample_elevation(points, mesh(BOX))[:2] == pytest.approx(0.05)
+    assert sample_elevation(points, mesh(BOX), highest=False)[:2] == pytest.approx(-0.05)
+    assert np.isnan(sample_elevation(points, mesh(BOX))[2])
 
 
 def test_a_slope_has_the_height_of_its_plane():
     slope = Mesh(np.array([[0, 0, 0], [2, 0, 1], [0, 2, 3.0]]), np.array([[0, 1, 2]], np.int32))
-    assert heights_at(np.array([[0.4, 0.6]]), slope)[0] == pytest.approx(0.4 * 0.5 + 0.6 * 1.5)
+    assert sample_elevation(np.array([[0.4, 0.6]]), slope)[0] == pytest.approx(0.4 * 0.5 + 0.6 * 1.5)
 
 
 def test_a_point_on_a_shared_edge_is_not_missed():
-    assert np.isfinite(heights_at(np.array([[0.3, 0.3], [0.0, 0.0], [1.0, 1.0]]), mesh(BOX))).all()
+    assert np.isfinite(sample_elevation(np.array([[0.3, 0.3], [0.0, 0.0], [1.0, 1.0]]), mesh(BOX))).all()
 
 
 @pytest.mark.parametrize("gap", [-0.003, 0.0, 0.02])

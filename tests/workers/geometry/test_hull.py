@@ -1,4 +1,4 @@
-"""Convex hulls, against Qhull and against what is known of a shape."""
+"""Convex hulls, against Qhull and closed forms."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Bodies made smaller by a margin, against what is known of them and against Qhull's intersection of half-spaces."""
+"""Inward offsets of hulls, against closed forms and against Qhull's intersection of half-spaces."""
 
 import numpy as np
 import pytest
@@ -10,9 +10,9 @@ from schemas.job.assets import ProceduralSource
 from schemas.job.job import CATEGORIES
 from schemas.scene.shape import Hull
 from workers.assets.builtin.make import make_asset
-from workers.geometry import hull_offset as inset
+from workers.geometry import hull_offset
 from workers.geometry.hull import convex_hull
-from workers.geometry.hull_offset import FEW, inset_hull, least_width_m
+from workers.geometry.hull_offset import FEW, least_width_m, offset_hull
 
 SOURCE = ProceduralSource(source="procedural")
 
@@ -33,8 +33,8 @@ def rows(points):
 def test_a_box_loses_the_margin_on_every_side(sides):
     at = np.array([3.0, -2.0, 0.5])
     box = convex_hull(trimesh.creation.box(sides).vertices + at)
-    smaller = inset_hull(box, 1e-4)
-    assert smaller.inset_m == 1e-4
+    smaller = offset_hull(box, 1e-4)
+    assert smaller.offset_m == 1e-4
     expected = trimesh.creation.box(np.array(sides) - 2e-4).vertices + at
     assert rows(smaller.vertices) == rows(expected)
 
@@ -42,7 +42,7 @@ def test_a_box_loses_the_margin_on_every_side(sides):
 def test_an_octahedron_becomes_a_smaller_octahedron():
     """Its faces lie 1 / sqrt 3 from the middle, and six corners of four faces each stay six."""
     corners = np.concatenate([np.eye(3), -np.eye(3)])
-    smaller = inset_hull(convex_hull(corners), 0.01)
+    smaller = offset_hull(convex_hull(corners), 0.01)
     assert rows(smaller.vertices) == rows(corners * (1.0 - 0.01 * np.sqrt(3.0)))
 
 
@@ -52,7 +52,7 @@ def test_faces_between_round_edges_may_vanish_and_the_others_stay():
     points = [
         p for p in np.array(np.meshgrid(*[[-1, -planed, planed, 1]] * 3)).reshape(3, -1).T if (abs(p) == 1).sum() == 1
     ]
-    smaller = inset_hull(convex_hull(np.array(points)), 0.1)
+    smaller = offset_hull(convex_hull(np.array(points)), 0.1)
     assert rows(smaller.vertices) == rows(trimesh.creation.box((1.8, 1.8, 1.8)).vertices)
 
 
@@ -60,8 +60,8 @@ def test_faces_between_round_edges_may_vanish_and_the_others_stay():
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_the_smaller_body_is_the_one_that_qhull_finds(category, by_m):
     hull = hull_of(category, 1)
-    smaller = inset_hull(hull, by_m)
-    assert smaller.inset_m == by_m
+    smaller = offset_hull(hull, by_m)
+    assert smaller.offset_m == by_m
     spaces = np.column_stack([hull.normals, by_m - reach(hull.vertices, hull)])
     exact = HalfspaceIntersection(spaces, hull.vertices.mean(axis=0)).intersections
     size = np.linalg.norm(np.ptp(hull.vertices, axis=0))
@@ -85,9 +85,9 @@ def test_the_smaller_body_is_the_one_that_qhull_finds(category, by_m):
 )
 def test_with_its_margin_the_smaller_body_touches_the_plane_of_every_face(body, by_m, missed_m):
     hull = convex_hull(np.asarray(body.vertices))
-    smaller = inset_hull(hull, by_m)
-    missed = reach(hull.vertices, hull) - reach(smaller.vertices, hull) - smaller.inset_m
-    assert smaller.inset_m == by_m
+    smaller = offset_hull(hull, by_m)
+    missed = reach(hull.vertices, hull) - reach(smaller.vertices, hull) - smaller.offset_m
+    assert smaller.offset_m == by_m
     assert missed.min() >= -1e-13 and missed.max() <= missed_m
     assert len(smaller.vertices) <= max(FEW, 2 * len(hull.vertices))
 
@@ -95,8 +95,8 @@ def test_with_its_margin_the_smaller_body_touches_the_plane_of_every_face(body, 
 @pytest.mark.parametrize("sides", [(0.2, 0.2, 0.0005), (0.2, 0.0003, 0.0003), (0.001, 0.001, 0.001)])
 def test_half_of_a_body_is_left_however_large_the_margin(sides):
     hull = convex_hull(trimesh.creation.box(sides).vertices)
-    smaller = inset_hull(hull, 0.04)
-    assert smaller.inset_m == pytest.approx(min(sides) / 4, rel=1e-12)
+    smaller = offset_hull(hull, 0.04)
+    assert smaller.offset_m == pytest.approx(min(sides) / 4, rel=1e-12)
     assert np.ptp(smaller.vertices, axis=0) == pytest.approx(np.array(sides) - min(sides) / 2, rel=1e-12)
 
 
@@ -104,8 +104,8 @@ def test_a_tetrahedron_does_not_vanish():
     """At a quarter of its height all its faces meet in one point."""
     corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * 0.1
     hull = convex_hull(corners)
-    smaller = inset_hull(hull, 1.0)
-    assert smaller.inset_m == pytest.approx(0.75 * 0.1 / np.sqrt(3.0), rel=1e-9)
+    smaller = offset_hull(hull, 1.0)
+    assert smaller.offset_m == pytest.approx(0.75 * 0.1 / np.sqrt(3.0), rel=1e-9)
     assert rows(smaller.vertices) == rows(corners * 0.25)
 
 
@@ -115,8 +115,8 @@ def test_where_the_middle_of_the_vertices_is_no_place_to_stand_the_largest_ball_
     blade = np.column_stack([1e-3 * np.sin(np.pi * along), np.zeros(200), along])
     base = np.array([[-0.1, y, z] for y in (-0.05, 0.05) for z in (0.0, 1.0)])
     hull = convex_hull(np.concatenate([blade, base]))
-    smaller = inset_hull(hull, 5e-3)
-    assert smaller.inset_m == 5e-3
+    smaller = offset_hull(hull, 5e-3)
+    assert smaller.offset_m == 5e-3
     assert (reach(smaller.vertices, hull) <= reach(hull.vertices, hull) - 5e-3 + 1e-12).all()
     base_face = hull.normals[:, 0] < -0.999
     assert reach(smaller.vertices, hull)[base_face] == pytest.approx(0.1 - 5e-3, abs=1e-12)
@@ -126,16 +126,16 @@ def test_where_the_middle_of_the_vertices_is_no_place_to_stand_the_largest_ball_
 def test_a_flat_sheet_stays_as_it_is(count):
     points = np.random.default_rng(2).random((count, 3)) * [0.2, 0.1, 0.0]
     hull = convex_hull(points)
-    smaller = inset_hull(hull, 4e-5)
-    assert smaller.inset_m == 0.0
+    smaller = offset_hull(hull, 4e-5)
+    assert smaller.offset_m == 0.0
     assert (smaller.vertices == hull.vertices).all()
 
 
 def test_where_the_fast_hull_leaves_something_out_qhull_finds_it(monkeypatch):
     """With a pole dropped the body would reach too far."""
     hull = hull_of("can")
-    expected = inset_hull(hull, 4e-5).vertices
-    complete = inset.manifold3d.Manifold.hull_points
+    expected = offset_hull(hull, 4e-5).vertices
+    complete = hull_offset.manifold3d.Manifold.hull_points
 
     class Forgetful:
         """manifold3d that overlooks the plane under the can."""
@@ -144,18 +144,18 @@ def test_where_the_fast_hull_leaves_something_out_qhull_finds_it(monkeypatch):
         def hull_points(poles):
             return complete(np.delete(poles, np.argmin(poles[:, 2]), axis=0))
 
-    monkeypatch.setattr(inset.manifold3d, "Manifold", Forgetful)
-    again = inset_hull(hull, 4e-5).vertices
+    monkeypatch.setattr(hull_offset.manifold3d, "Manifold", Forgetful)
+    again = offset_hull(hull, 4e-5).vertices
     assert ConvexHull(again).volume == pytest.approx(ConvexHull(expected).volume, rel=1e-9)
     assert (reach(again, hull) <= reach(hull.vertices, hull) - 4e-5 + 1e-13).all()
 
 
 def test_the_same_hull_gives_the_same_bits():
     hull = hull_of("bottle", 2)
-    first = inset_hull(hull, 1e-4).vertices
-    inset_hull(hull_of("mug"), 3e-4)
+    first = offset_hull(hull, 1e-4).vertices
+    offset_hull(hull_of("mug"), 3e-4)
     copied = Hull(frozen_array(hull.vertices), frozen_array(hull.normals))
-    assert inset_hull(copied, 1e-4).vertices.tobytes() == first.tobytes()
+    assert offset_hull(copied, 1e-4).vertices.tobytes() == first.tobytes()
 
 
 def test_the_least_width_of_a_plate_is_its_thickness():

@@ -1,4 +1,4 @@
-"""Convex parts that follow from how a shape is built, against manifold3d's booleans, rays and hulls."""
+"""Convex parts of lofts, against manifold3d's booleans, rays and hulls."""
 
 import manifold3d
 import numpy as np
@@ -13,13 +13,13 @@ from workers.assets.builtin.make import make_asset
 from workers.assets.builtin.solid import circle, difference, lathe, union
 from workers.assets.builtin.sweeps import prism
 from workers.geometry.convexity import solid_of, weld
-from workers.geometry.lathe_decomposition import COARSE, parts_of_lofts
+from workers.geometry.lathe_decomposition import COARSE, decompose_lofts
 from workers.geometry.nearest import nearest_on_mesh
 from workers.physics.convex_parts import step as decompose
 from workers.physics.convex_parts.step import parts_of
 
 AIM_M = 5e-5
-"""Of parts in any shape 0.25 m along its diagonal: so far they may stand out, or leave something uncovered."""
+"""Largest distance that parts of a shape 0.25 m along its diagonal may stand out, or leave uncovered."""
 
 TWISTED_M = 1.7e-4
 """Soft squares that turn into circles have twisted facets, which may stand out by four times the tolerance."""
@@ -94,7 +94,7 @@ def test_parts_have_the_volume_of_the_shape(category, number):
 def test_a_cup_is_a_bottom_and_wedges():
     """The volume of its wall and bottom over a polygon: Pappus with the polygon's area for the circle's."""
     body = lathe(CUP, [0] * 5, 24)
-    parts = parts_of_lofts(body.lofts)
+    parts = decompose_lofts(body.lofts)
     beyond, missing = volumes(parts, solid_of(Mesh(body.vertices, body.faces.astype(np.int32))))
     assert (beyond, missing) == pytest.approx((0.0, 0.0), abs=1e-4 * 1e-4)
     assert len(parts) == 1 + 24
@@ -105,7 +105,7 @@ def test_a_cup_is_a_bottom_and_wedges():
 def test_a_bolt_is_stacked_of_whole_rings():
     """A solid of revolution that is seen from its axis everywhere needs no wedges."""
     profile = np.array([(0, 0), (10, 0), (10, 5), (4, 5), (4, 30), (0, 30)], dtype=np.float64)
-    parts = parts_of_lofts(lathe(profile, [0] * 5, 24).lofts)
+    parts = decompose_lofts(lathe(profile, [0] * 5, 24).lofts)
     share = 12 * np.sin(np.pi / 12)  # of a polygon with 24 corners, over the square of its radius
     assert sorted(ConvexHull(part).volume for part in parts) == pytest.approx([share * 16 * 25, share * 100 * 5])
 
@@ -114,7 +114,7 @@ def test_a_notch_is_cut_out_of_a_block():
     block = prism(np.array([(0.0, 0.0), (0.0, 1.0)]), (2.0, 2.0), 0.1, [0, 0, 0])
     notch = prism(np.array([(0.0, 0.5), (0.0, 2.0)]), (3.0, 0.5), 0.01, [1, 1, 1])
     body = difference(block, [notch])
-    parts = parts_of_lofts(body.lofts)
+    parts = decompose_lofts(body.lofts)
     beyond, missing = volumes(parts, solid_of(Mesh(body.vertices, body.faces.astype(np.int32))))
     assert (beyond, missing) == pytest.approx((0.0, 0.0), abs=1e-3)
     assert len(parts) == 3
@@ -125,7 +125,7 @@ def test_a_union_has_the_parts_of_all_and_moves_with_them():
     both = union([cup, bar.moved(z=0.02)]).placed(
         np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0, 0, 1.0]]), np.ones(3)
     )
-    parts = parts_of_lofts(both.lofts)
+    parts = decompose_lofts(both.lofts)
     assert len(parts) == 26
     points = np.concatenate(parts)
     assert points.min(axis=0) == pytest.approx(both.vertices.min(axis=0), abs=1e-12)
@@ -145,9 +145,9 @@ def test_a_straight_chain_of_rings_is_one_part_and_a_bent_one_several():
     up = np.array([0.0, 0.0, 1.0])
     straight = np.stack([ring, ring + up, ring + 3.0 * up])
     ends = np.array([(0, 0, 0), (0, 0, 3.0)])
-    assert len(parts_of_lofts([Loft(straight, ends)])) == 1
+    assert len(decompose_lofts([Loft(straight, ends)])) == 1
     bent = np.stack([ring, ring + 2.0 * up, ring[:, [2, 1, 0]] * [1, 1, -1] + np.array([3.0, 0, 4.0])])
-    assert len(parts_of_lofts([Loft(bent, ends)])) == 2
+    assert len(decompose_lofts([Loft(bent, ends)])) == 2
 
 
 def test_built_in_shapes_are_never_handed_to_coacd(monkeypatch):
@@ -174,7 +174,7 @@ def test_a_shape_whose_outlines_cannot_be_cut_is_cut_as_a_mesh_from_outside_is(m
     def fails(*_: object) -> None:
         raise shapely.errors.GEOSException("TopologyException: side location conflict")
 
-    monkeypatch.setattr(decompose, "parts_of_lofts", fails)
+    monkeypatch.setattr(decompose, "decompose_lofts", fails)
     monkeypatch.setattr(
         decompose, "decompose", lambda mesh, digest, threshold: decompose.Parts((mesh.vertices,), "coacd")
     )

@@ -1,4 +1,4 @@
-"""A worker is one thread, whatever the libraries would like."""
+"""manifold3d starts no threads in a worker."""
 
 import os
 import subprocess

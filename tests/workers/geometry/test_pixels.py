@@ -1,13 +1,9 @@
-"""Loops over pixels against what they mean, written with numpy."""
-
-import subprocess
-import sys
+"""Compiled loops over pixels, against numpy."""
 
 import numpy as np
 import pytest
 
-from workers.geometry.jit import compiled
-from workers.geometry.pixels import Extent, count_filled, measure_regions, round_depth, take_colours
+from workers.geometry.pixels import Extent, count_filled, gather_colours, measure_regions, round_depth
 
 
 @pytest.mark.parametrize("width", [70, 72])
@@ -49,7 +45,7 @@ def test_depth_is_rounded_to_the_nearest_unit_and_is_zero_outside_the_open_range
 def test_colours_come_from_where_the_source_says_and_holes_are_black():
     rgb = np.random.default_rng(2).integers(0, 256, (4, 5, 3)).astype(np.uint8)
     source = np.array([[19, -1], [0, 7]])
-    assert take_colours(rgb, source).tolist() == [
+    assert gather_colours(rgb, source).tolist() == [
         [rgb[3, 4].tolist(), [0, 0, 0]],
         [rgb[0, 0].tolist(), rgb[1, 2].tolist()],
     ]
@@ -59,21 +55,3 @@ def test_what_is_filled_and_what_lies_behind_is_counted():
     projected = np.array([[0, 10, 20, 65535, 30]], np.uint16)
     seen = np.array([[5, 0, 14, 65500, 30]], np.uint16)
     assert count_filled(projected, seen, 5.5) == (4, 2)
-
-
-def test_a_loop_is_compiled_also_where_nothing_can_be_kept_on_disk():
-    program = "from workers.geometry import jit; print(jit.compiled(eval('lambda x: x + 1'))(41))"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "42"
-
-
-def test_a_compiled_loop_adds_in_the_order_that_is_written():
-    @compiled
-    def total(values: np.ndarray) -> float:
-        result = 0.0
-        for value in values:
-            result += value
-        return result
-
-    values = np.array([1e16, 1.0, -1e16] * 9)
-    assert total(values) == sum(values.tolist())

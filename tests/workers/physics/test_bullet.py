@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from schemas.job.job import Job
 from tests.physics.room import at, ball_body, drop, physics
 from tests.shapes import box
-from workers.geometry.frames import pose, quaternion_of, rotation_about
+from workers.geometry.frames import pose, quaternion_from_rotation, rotation_about
 from workers.physics.bullet import GRAVITY_M_S2, REPAIR_S, WORLDS_BEFORE_RESET
 from workers.physics.rigid_body import SLOP_M, Body
 
@@ -108,9 +108,9 @@ def test_worlds_come_and_go_without_their_memory_staying():
 @pytest.mark.parametrize("seed", range(10))
 def test_quaternions_agree_with_scipy(seed):
     R = Rotation.random(random_state=seed).as_matrix()
-    assert abs(quaternion_of(R) @ Rotation.from_matrix(R).as_quat()) == pytest.approx(1.0)
+    assert abs(quaternion_from_rotation(R) @ Rotation.from_matrix(R).as_quat()) == pytest.approx(1.0)
     half = Rotation.from_rotvec(math.pi * np.eye(3)[seed % 3]).as_matrix()
-    assert Rotation.from_quat(quaternion_of(half)).as_matrix() == pytest.approx(half, abs=1e-12)
+    assert Rotation.from_quat(quaternion_from_rotation(half)).as_matrix() == pytest.approx(half, abs=1e-12)
 
 
 @pytest.mark.parametrize("step_hz", [960, 3840, 15360])

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from workers.geometry.contact_points import touching_points
+from workers.geometry.contact_points import find_contact_points
 from workers.geometry.frames import pose, rotation_about, transform
 from workers.physics.equilibrium import (
     FIXED,
@@ -35,7 +35,7 @@ def tipped(angle_rad):
 
 
 def rest(upper, lower, com, size_m, friction=0.5):
-    points, normals = touching_points(upper, lower, WITHIN_M)
+    points, normals = find_contact_points(upper, lower, WITHIN_M)
     contact = Contact(0, FIXED, points, normals)
     return float(equilibrium_residual([Weight(1.0, np.array(com), size_m)], [contact], friction)[0])
 
@@ -44,7 +44,7 @@ GROUND = box((1.0, 1.0, 0.1), (0, 0, -0.05))
 
 
 def test_a_box_on_a_level_touches_it_with_four_corners():
-    points, normals = touching_points(box((0.1, 0.2, 0.3), (0, 0, 0.15)), GROUND, WITHIN_M)
+    points, normals = find_contact_points(box((0.1, 0.2, 0.3), (0, 0, 0.15)), GROUND, WITHIN_M)
     assert {tuple(p) for p in np.round(points, 9) + 0.0} == {(x, y, 0.0) for x in (-0.05, 0.05) for y in (-0.1, 0.1)}
     assert normals == pytest.approx(np.tile(UP, (len(points), 1)), abs=1e-12)
     assert rest(box((0.1, 0.2, 0.3), (0, 0, 0.15)), GROUND, (0, 0, 0.15), 0.37) < 1e-9
@@ -52,7 +52,7 @@ def test_a_box_on_a_level_touches_it_with_four_corners():
 
 def test_nothing_touches_beyond_the_distance():
     for gap_m, count in ((4e-5, 4), (6e-5, 0), (-4e-5, 4), (-6e-5, 0)):
-        points, _ = touching_points(box((0.1, 0.1, 0.1), (0, 0, 0.05 + gap_m)), GROUND, WITHIN_M)
+        points, _ = find_contact_points(box((0.1, 0.1, 0.1), (0, 0, 0.05 + gap_m)), GROUND, WITHIN_M)
         assert len(points) == count
     assert rest(box((0.1, 0.1, 0.1), (0, 0, 0.06)), GROUND, (0, 0, 0.06), 0.1) == 1.0
 
@@ -62,17 +62,17 @@ def test_the_way_faces_are_wound_does_not_turn_normals():
     inside_out = Mesh(GROUND.vertices, np.ascontiguousarray(GROUND.faces[:, ::-1]))
     for lower in (GROUND, inside_out):
         for top in (upper, Mesh(upper.vertices, np.ascontiguousarray(upper.faces[:, ::-1]))):
-            points, normals = touching_points(top, lower, WITHIN_M)
+            points, normals = find_contact_points(top, lower, WITHIN_M)
             assert len(points) >= 4
             assert normals == pytest.approx(np.tile(UP, (len(points), 1)), abs=1e-9)
 
 
 def test_over_the_edge_of_a_table_edges_touch_where_they_cross():
     """And a corner that lies on the edge touches the top, not the side."""
-    points, normals = touching_points(box((0.1, 0.1, 0.1), (0.48, 0, 0.05)), GROUND, WITHIN_M)
+    points, normals = find_contact_points(box((0.1, 0.1, 0.1), (0.48, 0, 0.05)), GROUND, WITHIN_M)
     assert points[:, 0].max() == pytest.approx(0.5)
     assert normals == pytest.approx(np.tile(UP, (len(points), 1)), abs=1e-9)
-    flush, normals = touching_points(box((0.1, 0.1, 0.1), (0.45, 0, 0.05)), GROUND, WITHIN_M)
+    flush, normals = find_contact_points(box((0.1, 0.1, 0.1), (0.45, 0, 0.05)), GROUND, WITHIN_M)
     assert flush[:, 0].max() == pytest.approx(0.5)
     assert normals == pytest.approx(np.tile(UP, (len(flush), 1)), abs=1e-9)
 
@@ -93,7 +93,7 @@ def test_a_box_stands_on_a_slope_up_to_the_angle_of_friction(angle, stands):
     turn = tipped(angle)
     slope = mesh_of(trimesh.creation.box((1.0, 1.0, 0.1)), pose(turn, -0.05 * turn[:, 2]))
     at = 0.02 * turn[:, 2]
-    points, normals = touching_points(box((0.1, 0.1, 0.04), at, turn), slope, WITHIN_M)
+    points, normals = find_contact_points(box((0.1, 0.1, 0.04), at, turn), slope, WITHIN_M)
     assert normals == pytest.approx(np.tile(turn[:, 2], (len(points), 1)), abs=1e-9)
     residual = equilibrium_residual([Weight(1.0, at, 10.0)], [Contact(0, FIXED, points, normals)], 0.5)[0]
     assert residual == pytest.approx(0.0 if stands else np.sin(angle - np.arctan(0.5)), rel=0.01, abs=1e-9)
@@ -112,7 +112,7 @@ def test_a_ladder_against_a_wall_needs_its_friction(friction, stands):
     wall = box((1.0, 9.0, 9.0), (high[0] + 0.5, 0, 0))
     contacts = []
     for ground in (floor, wall):
-        points, normals = touching_points(ladder, ground, WITHIN_M)
+        points, normals = find_contact_points(ladder, ground, WITHIN_M)
         assert len(points) >= 2
         contacts.append(Contact(0, FIXED, points, normals))
     assert contacts[1].normals == pytest.approx(np.tile([-1.0, 0, 0], (len(contacts[1].points), 1)), abs=1e-9)
@@ -125,8 +125,8 @@ def test_of_a_stack_the_upper_may_not_hang_over_by_half(over_m, stands):
     under, over = box((0.1, 0.1, 0.1), (0, 0, 0.05)), box((0.1, 0.1, 0.1), (over_m, 0, 0.15))
     bodies = [Weight(1.0, np.array([0, 0, 0.05]), 0.17), Weight(1.0, np.array([over_m, 0, 0.15]), 0.17)]
     contacts = [
-        Contact(0, FIXED, *touching_points(under, GROUND, WITHIN_M)),
-        Contact(1, 0, *touching_points(over, under, WITHIN_M)),
+        Contact(0, FIXED, *find_contact_points(under, GROUND, WITHIN_M)),
+        Contact(1, 0, *find_contact_points(over, under, WITHIN_M)),
     ]
     residual = equilibrium_residual(bodies, contacts, 0.5)
     assert (residual.max() < 1e-9) if stands else (residual[1] > 1e-3)
@@ -136,8 +136,8 @@ def test_the_lower_of_a_stack_bears_the_upper():
     """A body on the overhanging end of a plate tips it, though the plate alone would stand, and a heavier plate does not."""
     plate, load = box((0.2, 0.1, 0.01), (0.45, 0, 0.005)), box((0.02, 0.02, 0.02), (0.54, 0, 0.02))
     contacts = [
-        Contact(0, FIXED, *touching_points(plate, GROUND, WITHIN_M)),
-        Contact(1, 0, *touching_points(load, plate, WITHIN_M)),
+        Contact(0, FIXED, *find_contact_points(plate, GROUND, WITHIN_M)),
+        Contact(1, 0, *find_contact_points(load, plate, WITHIN_M)),
     ]
     at = np.array([0.54, 0, 0.02])
     for mass, stands in ((0.7, False), (0.9, True), (500.0, True)):  # 0.05 m in, 0.04 m out: 0.8 kg a kilogram
@@ -148,7 +148,7 @@ def test_the_lower_of_a_stack_bears_the_upper():
 
 def test_two_crossed_bars_touch_where_they_cross():
     bar, other = box((0.3, 0.02, 0.02), (0, 0, 0.03)), box((0.02, 0.3, 0.02), (0, 0, 0.01))
-    points, normals = touching_points(bar, other, WITHIN_M)
+    points, normals = find_contact_points(bar, other, WITHIN_M)
     assert {tuple(p) for p in np.round(points, 9) + 0.0} == {(x, y, 0.02) for x in (-0.01, 0.01) for y in (-0.01, 0.01)}
     assert normals == pytest.approx(np.tile(UP, (len(points), 1)), abs=1e-9)
 
@@ -157,7 +157,7 @@ def test_two_edges_across_one_another_touch_in_one_point():
     """Square bars on their edges, one along x and one along y."""
     along_x = box((0.3, 0.02, 0.02), (0, 0, 0.02 * np.sqrt(0.5)), rotation_about(np.array([1.0, 0, 0]), np.pi / 4))
     along_y = box((0.02, 0.3, 0.02), (0, 0, -0.02 * np.sqrt(0.5)), tipped(np.pi / 4))
-    points, normals = touching_points(along_x, along_y, WITHIN_M)
+    points, normals = find_contact_points(along_x, along_y, WITHIN_M)
     assert points == pytest.approx(np.zeros((1, 3)), abs=1e-9)
     assert normals == pytest.approx(UP[None, :], abs=1e-9)
 
@@ -166,7 +166,7 @@ def test_a_ring_hangs_on_a_peg():
     """A square ring over a square bar: forces from its concave side bear it from above its centre of mass."""
     ring = trimesh.boolean.difference([trimesh.creation.box((0.1, 0.02, 0.1)), trimesh.creation.box((0.08, 0.1, 0.08))])
     peg = box((0.01, 0.2, 0.01), (0.0, 0.0, 0.035))
-    points, normals = touching_points(mesh_of(ring), peg, WITHIN_M)
+    points, normals = find_contact_points(mesh_of(ring), peg, WITHIN_M)
     assert points[:, 2] == pytest.approx(0.04, abs=1e-9)
     assert normals == pytest.approx(np.tile(UP, (len(points), 1)), abs=1e-9)
     assert rest(mesh_of(ring), peg, (0, 0, 0), 0.14) < 1e-9
@@ -195,8 +195,8 @@ def test_forces_are_shared_between_a_thousandfold_of_masses():
     bodies = [Weight(1.0, np.array([0, 0, 0.05]), 0.17), Weight(1000.0, np.array([0, 0, 0.15]), 0.17)]
     under, over = box((0.1, 0.1, 0.1), (0, 0, 0.05)), box((0.1, 0.1, 0.1), (0.01, 0, 0.15))
     contacts = [
-        Contact(0, FIXED, *touching_points(under, GROUND, WITHIN_M)),
-        Contact(1, 0, *touching_points(over, under, WITHIN_M)),
+        Contact(0, FIXED, *find_contact_points(under, GROUND, WITHIN_M)),
+        Contact(1, 0, *find_contact_points(over, under, WITHIN_M)),
     ]
     assert equilibrium_residual(bodies, contacts, 0.5).max() < 1e-7
     assert equilibrium_residual(bodies[::-1], contacts, 0.5).max() < 1e-7
@@ -223,7 +223,7 @@ def test_a_ball_on_the_deepest_face_of_a_hollow_is_held_by_it():
     point, normal = dish.triangles_center[deepest], dish.face_normals[deepest]
     ball = trimesh.creation.icosphere(3, 0.03)
     ball.apply_translation(point - ball.vertices[np.argmin(ball.vertices @ normal)])
-    points, normals = touching_points(
+    points, normals = find_contact_points(
         mesh_of(ball), Mesh(vertices, np.asarray(dish.faces, dtype=np.int32)), WITHIN_M / 10
     )
     assert len(points) >= 1

@@ -10,7 +10,14 @@ from schemas.job.physics import Physics
 from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import Mesh
 from tests.shapes import asset_of, box
-from workers.geometry.frames import pose, quaternion_of, rotation_about, transform, translation, uniform_rotation
+from workers.geometry.frames import (
+    pose,
+    quaternion_from_rotation,
+    rotation_about,
+    transform,
+    translation,
+    uniform_rotation,
+)
 from workers.geometry.hull import convex_hull
 from workers.physics.bullet import GRAVITY_M_S2
 from workers.physics.fall import FINEST, SKIPPED_TO_M, StepSizes, as_pose, fall
@@ -83,7 +90,7 @@ def test_a_stop_condition_ends_the_fall_and_is_named():
 
 def test_a_pose_comes_back_from_its_quaternion():
     T = pose(uniform_rotation(np.random.default_rng(2)), np.array([0.1, 0.2, 0.3]))
-    quaternion = quaternion_of(T[:3, :3])
+    quaternion = quaternion_from_rotation(T[:3, :3])
     assert as_pose(((0.1, 0.2, 0.3), tuple(quaternion))) == pytest.approx(T, abs=1e-12)
 
 

@@ -10,7 +10,7 @@ import trimesh
 from schemas.scene.shape import Mesh
 from tests.shapes import box
 from workers.geometry.convexity import solid_of, weld
-from workers.geometry.elevation import survey
+from workers.geometry.elevation import prepare_terrain
 from workers.geometry.frames import pose, rotation_about, transform, uniform_rotation
 from workers.physics.separation import NEAR_M, between, clearances, find_gaps_m
 
@@ -25,7 +25,7 @@ def solid(mesh: Mesh):
 
 
 CUBE = box(0.1, 0.1, 0.1)
-GROUND = survey(mesh_of(box(2.0, 2.0, 0.1, (0, 0, -0.05))))
+GROUND = prepare_terrain(mesh_of(box(2.0, 2.0, 0.1, (0, 0, -0.05))))
 
 
 @pytest.mark.parametrize("gap_m", [1e-5, 0.003, 0.015, -1e-5, -0.002, -0.03])
@@ -96,7 +96,7 @@ def test_an_overlap_is_the_depth_and_nothing_where_two_bodies_only_touch_or_are_
 
 
 def test_what_touches_the_side_of_a_wall_is_as_deep_in_it_as_it_reaches_and_not_as_the_wall_is_high():
-    walled = survey(
+    walled = prepare_terrain(
         mesh_of(trimesh.util.concatenate([box(2.0, 2.0, 0.1, (0, 0, -0.05)), box(0.02, 1.0, 0.3, (0.06, 0, 0.1))]))
     )
     for way in (1e-6, 3e-5, 4e-4):

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from tests.shapes import box
-from workers.geometry.frames import pose, quaternion_of, rotation_about, uniform_rotation
+from workers.geometry.frames import pose, quaternion_from_rotation, rotation_about, uniform_rotation
 from workers.geometry.hull import convex_hull
 from workers.physics.rest_pose import TIPPED_RAD, stands_on_face
 from workers.physics.stop_conditions import (
@@ -29,7 +29,7 @@ SOLIDS = {
 
 
 def at(x: float, y: float, R=None):
-    return (x, y, 0.0), tuple(quaternion_of(np.eye(3) if R is None else R))
+    return (x, y, 0.0), tuple(quaternion_from_rotation(np.eye(3) if R is None else R))
 
 
 @pytest.mark.parametrize("name", SOLIDS)

@@ -32,9 +32,9 @@ from schemas.base import Array, frozen_array
 from schemas.errors import MachineError, MeshError
 from schemas.scene.shape import Asset, Mesh
 from workers.geometry import convexity
-from workers.geometry.convexity import components, is_convex_surface, solid_of, triangles_of, weld
+from workers.geometry.convexity import components, is_convex_surface, mesh_of, solid_of, weld
 from workers.geometry.hull import convex_hull
-from workers.geometry.lathe_decomposition import TOLERANCE, parts_of_lofts
+from workers.geometry.lathe_decomposition import TOLERANCE, decompose_lofts
 from workers.physics.convex_parts.coacd_process import MISSING
 from workers.physics.convex_parts.parts_cache import USUAL_FOLDER, Parts, PartsCache, key_of
 
@@ -69,7 +69,7 @@ _CACHE = PartsCache()
 def parts_of(asset: Asset, threshold: float = THRESHOLD, share: float = TOLERANCE) -> tuple[Array, ...]:
     """Vertices [N, 3], object frame, of each of an asset's convex parts: from its making if known, or else by CoACD.
 
-    `threshold` is CoACD's, `share` that of `parts_of_lofts`. CoACD also cuts a built-in shape whose outlines touch except
+    `threshold` is CoACD's, `share` that of `decompose_lofts`. CoACD also cuts a built-in shape whose outlines touch except
     for the last bits, which cannot be cut by its making.
     """
     lofts = asset.lofts
@@ -77,7 +77,7 @@ def parts_of(asset: Asset, threshold: float = THRESHOLD, share: float = TOLERANC
         return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
     key = key_of("lofts", repr(share), asset.sha256, asset.shape.mesh.vertices.tobytes())
     try:
-        return _CACHE.get(key, None, lambda: Parts(parts_of_lofts(lofts, share), "lofts")).clouds
+        return _CACHE.get(key, None, lambda: Parts(decompose_lofts(lofts, share), "lofts")).clouds
     except (ValueError, shapely.errors.GEOSException):
         return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
 
@@ -124,7 +124,7 @@ def _parts_of(piece: Mesh, threshold: float) -> tuple[str, list[Array]]:
         return "convex", [hull.vertices]
     options = {**OPTIONS, **(OPEN if solid is None else CLOSED), "threshold": threshold}
     size = float(np.linalg.norm(np.ptp(hull.vertices, axis=0)))
-    cut = _run(piece if solid is None else triangles_of(solid.simplify(SIMPLER * size)), options)
+    cut = _run(piece if solid is None else mesh_of(solid.simplify(SIMPLER * size)), options)
     fitted = _fit(cut, hull.vertices, hull.normals)
     return ("coacd", fitted) if fitted else ("pieces", [hull.vertices])
 
@@ -158,7 +158,7 @@ def _fit(clouds: list[Array], vertices: Array, normals: Array) -> list[Array]:
     fitted = []
     for cloud in clouds:
         if (cloud @ normals.T - reach).max() > 1e-9 * size:
-            cloud = triangles_of(manifold3d.Manifold.hull_points(np.ascontiguousarray(cloud)) ^ whole).vertices
+            cloud = mesh_of(manifold3d.Manifold.hull_points(np.ascontiguousarray(cloud)) ^ whole).vertices
         if len(cloud) >= 4:
             fitted.append(cloud)
     if not fitted:  # CoACD gave up, or the hull is flat and clips all voxels away

@@ -1,0 +1,62 @@
+"""Welding, pieces, depth below the hull and solids, on bodies of known measure."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from schemas.scene.shape import Mesh
+from workers.geometry.convexity import components, concavity_m, mesh_of, solid_of, triangle_corners, weld
+
+
+def as_mesh(*bodies: trimesh.Trimesh) -> Mesh:
+    whole: Any = trimesh.util.concatenate(list(bodies))
+    return Mesh(np.asarray(whole.vertices), np.asarray(whole.faces, dtype=np.int32))
+
+
+def box(size, at=(0.0, 0.0, 0.0)) -> trimesh.Trimesh:
+    return trimesh.creation.box(size, trimesh.transformations.translation_matrix(at))
+
+
+def soup_of(mesh: Mesh) -> Mesh:
+    """The same triangles, none of which shares a vertex with another."""
+    return Mesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(mesh.faces.size, dtype=np.int32).reshape(-1, 3))
+
+
+def test_a_welded_soup_has_one_vertex_at_each_place():
+    whole = as_mesh(box((1, 2, 3)))
+    welded = weld(soup_of(whole))
+    assert len(welded.vertices) == 8 and len(welded.faces) == 12
+    assert np.concatenate(triangle_corners(welded)) == pytest.approx(np.concatenate(triangle_corners(whole)))
+
+
+def test_repeated_and_collapsed_triangles_and_loose_vertices_are_left_out():
+    vertices = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 0), (5, 5, 5)], dtype=np.float64)
+    welded = weld(Mesh(vertices, np.array([(0, 1, 2), (1, 2, 3), (0, 1, 3)], dtype=np.int32)))
+    assert len(welded.vertices) == 3 and len(welded.faces) == 1
+
+
+def test_pieces_that_share_no_vertex_are_told_apart():
+    pieces = components(weld(as_mesh(box((1, 1, 1)), box((2, 1, 1), (5, 0, 0)))))
+    assert [np.ptp(piece.vertices[:, 0]) for piece in pieces] == pytest.approx([1.0, 2.0])
+    assert [len(piece.faces) for piece in pieces] == [12, 12]
+
+
+def test_a_solid_has_its_volume_however_it_is_wound():
+    mesh = weld(as_mesh(box((1, 2, 3))))
+    for faces in (mesh.faces, mesh.faces[:, ::-1]):
+        solid = solid_of(Mesh(mesh.vertices, faces))
+        assert solid is not None and solid.volume() == pytest.approx(6.0)
+        assert np.ptp(mesh_of(solid).vertices, axis=0) == pytest.approx([1.0, 2.0, 3.0])
+    assert solid_of(Mesh(mesh.vertices, mesh.faces[1:])) is None
+
+
+def test_the_depth_of_a_dent_is_found_and_a_convex_body_has_none():
+    assert concavity_m(as_mesh(box((1, 1, 1)))) == pytest.approx(0.0, abs=1e-12)
+    dented = trimesh.creation.box((1, 1, 1)).subdivide()
+    vertices = np.asarray(dented.vertices).copy()
+    top = int(np.flatnonzero((np.abs(vertices[:, :2]) < 1e-9).all(axis=1) & (vertices[:, 2] > 0))[0])
+    vertices[top, 2] -= 0.1
+    depth = concavity_m(Mesh(vertices, np.asarray(dented.faces, dtype=np.int32)))
+    assert 0.05 < depth <= 0.1
