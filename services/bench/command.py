@@ -12,6 +12,7 @@ from schemas.errors import InputError
 from schemas.job.job import Job
 from schemas.job.start import ONE_OBJECT
 from services.bench.effects import measure_effects
+from services.bench.extra import require_extra
 from services.bench.measure import bench_folder, measure
 from services.bench.others import other_systems
 from services.bench.report import describe, summarise
@@ -22,6 +23,7 @@ from workers.store.mounts import file_system_of
 
 def main(options: argparse.Namespace) -> int:
     """Measure what the options ask for; 0, or an error where a side cannot be run at all."""
+    require_extra("bench")
     job, job_folder = _job(options)
     if options.effects is not None:
         return measure_effects(options, job, job_folder)

@@ -13,6 +13,7 @@ import yaml
 
 from schemas.errors import InputError
 from schemas.job.job import Job
+from services.bench.extra import require_extra
 from services.job.read import load_job, read_tree
 from services.run.cores import usable_cores
 from services.run.progress import ProgressLine
@@ -24,8 +25,6 @@ from services.study.measure.colour_errors import colour_truth_missing
 from services.study.measure.process_pool import Crew
 from services.study.model import Row
 from services.study.plan import Plan, Sizes
-from services.study.report.page import write_page
-from services.study.report.plots import write_plots
 from services.study.report.tables import write_tables
 from services.study.study import Progress, header_of, run_study, study_of
 from workers.assets.catalogue import open_catalogue
@@ -40,6 +39,10 @@ LEAST_SCENES = 4
 
 def main(options: argparse.Namespace) -> int:
     """0 where the study is whole and the targets are met; raises InputError or RunError otherwise."""
+    require_extra("tradeoff")
+    from services.study.report.page import write_page  # draws with matplotlib, of the extra `study`
+    from services.study.report.plots import write_plots
+
     targets = parse_targets(options.target) if options.target else None
     asked = load_job(options.job, options.changes)
     plan, left_out = make_plan(asked, options, targets)

@@ -5,13 +5,14 @@ The package calls `sys.exit` where its arguments are wrong, and takes whole numb
 [0, 1] alone. Its map is the same on one thread (`OMP_NUM_THREADS`) and on several; its mean, summed in float32, is not used.
 """
 
-import flip_evaluator
 import numpy as np
 from numpy.typing import NDArray
 
 
 def flip_between(reference: NDArray[np.uint8], rgb: NDArray[np.uint8]) -> float:
     """The mean of FLIP's map, 0 where both are the same and at most 1; two images [H, W, 3] uint8 sRGB of one size."""
+    import flip_evaluator  # of the extra `study`
+
     for image in (reference, rgb):
         if image.shape != reference.shape or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise ValueError(f"FLIP compares [H, W, 3] uint8 of one size, not {image.shape} {image.dtype}")
