@@ -25,6 +25,7 @@ from services.study.measure.colour_errors import colour_truth_missing
 from services.study.measure.process_pool import Crew
 from services.study.model import Row
 from services.study.plan import Plan, Sizes
+from services.study.report.page import write_page
 from services.study.report.tables import write_tables
 from services.study.study import Progress, header_of, run_study, study_of
 from workers.assets.catalogue import open_catalogue
@@ -40,8 +41,7 @@ LEAST_SCENES = 4
 def main(options: argparse.Namespace) -> int:
     """0 where the study is whole and the targets are met; raises InputError or RunError otherwise."""
     require_extra("tradeoff")
-    from services.study.report.page import write_page  # draws with matplotlib, of the extra `study`
-    from services.study.report.plots import write_plots
+    from services.study.report.plots import write_plots  # draws with matplotlib, of the extra `study`
 
     targets = parse_targets(options.target) if options.target else None
     asked = load_job(options.job, options.changes)

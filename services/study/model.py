@@ -49,6 +49,13 @@ class Setting:
         """Such as "step=240" or "step=240, tier=flat"; "the job" where nothing is changed."""
         return ", ".join(f"{knob}={label}" for knob, label in self.parts) or "the job"
 
+    @property
+    def kind(self) -> Literal["own", "preset", "single", "several"]:
+        """The job itself, a preset, one knob turned, or several."""
+        if not self.parts:
+            return "own"
+        return "preset" if self.parts[0][0] == "preset" else "single" if len(self.parts) == 1 else "several"
+
 
 @dataclass(frozen=True)
 class ErrorKind:
