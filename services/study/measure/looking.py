@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from schemas.errors import SceneError
+from services.study.knobs import size_value
 from services.study.measure.colour_errors import (
     ColourTruth,
     Crop,
@@ -75,15 +76,8 @@ def _input_alone(context: WorkerContext, setting: Setting) -> WorkerContext:
 
 def _smooth(context: WorkerContext, scene_id: int, crop: Crop) -> ColourTruth | None:
     """What an image of tier raster is with 64 samples a pixel: drawn 4 times as wide with 4 each, and averaged by area."""
-    sensor = context.job.cameras.sensor
-    scale = FINE_WIDTH / sensor.width
-    fine = {
-        "width": FINE_WIDTH,
-        "height": round(sensor.height * scale),
-        **{name: getattr(sensor, name) * scale for name in ("fx", "fy", "cx", "cy")},
-    }
-    changes = {f"cameras.sensor.{name}": value for name, value in fine.items()}
-    setting = Setting((("truth", "edges"),), {**changes, "render.tier": "raster", "render.samples": 4})
+    fine = size_value(context.job, FINE_WIDTH).changes
+    setting = Setting((("truth", "edges"),), {**fine, "render.tier": "raster", "render.samples": 4})
     made = _make(_input_alone(context, setting), scene_id)
     rgb = None if made is None else made[1].pairs[0].input.rgb
     return None if rgb is None else ColourTruth(crop, crop_colour(rgb, crop))
