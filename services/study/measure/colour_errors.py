@@ -13,8 +13,7 @@ from schemas.job.job import Render
 from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import REGION_FLOOR, Appearance, Placed
 from services.study.measure.flip import flip_between
-from services.study.measure.patch_rays import cast_patch
-from services.study.measure.rays import Box
+from services.study.measure.rays import Box, cast_patch
 from workers.assets.appearance.draw import draw_look
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.job.job import Images
 from schemas.scene.scene import REGION_FIRST_OBJECT, REGION_TABLE, Pair, View
-from services.study.measure.patch_rays import Patch
-from services.study.measure.pixel_rays import Pixels, Seen
+from services.study.measure.rays import Patch, Pixels, Seen
 from services.study.measure.truth import Truth
 from workers.geometry.stored_depth import stored_depth_m
 from workers.pipeline.context import WorkerContext

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from schemas.scene.camera import Camera
 from schemas.scene.scene import Placed
-from services.study.measure.patch_rays import Patch, cast_patch
-from services.study.measure.pixel_rays import Pixels, cast_pixels, seen_by_other
+from services.study.measure.rays import Patch, Pixels, cast_patch, cast_pixels, seen_by_other
 from workers.pipeline.make_scene import Scene
 
 KEPT = 12
