@@ -21,11 +21,10 @@ from services.bench.ratios import Spread
 from workers.assets.catalogue import open_catalogue
 from workers.physics.effects import called_for
 from workers.physics.step import settle_scene
-from workers.pipeline.context import WorkerContext, settings_digest
+from workers.pipeline.context import WorkerContext, open_worker
 from workers.pipeline.make_scene import plan_with_assets
 from workers.plan.effect import Facts
 from workers.plan.effects import PHYSICS_EFFECTS, plan_effects
-from workers.render.raster.gbuffer import shared_renderer
 
 ROUNDS = 3
 """Each scene is settled so often in each way, after once in each way that fills the caches."""
@@ -56,14 +55,13 @@ def measure_effects(options: argparse.Namespace, job: Job, job_folder: Path) -> 
     """Time the job's first scenes, print and answer in JSON. Raises RunError where none of them settles."""
     with pinned() as core:
         catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
-        renderer = shared_renderer()
-        context = WorkerContext(job, catalogue, renderer, settings_digest(job, catalogue.digest))
+        context = open_worker(job, catalogue)
         timed = time_settling(_draw(context, options.effects), ROUNDS)
         figures = {
             "ok": True,
             "command": shlex.join(["verso", *sys.argv[1:]]),
             "job": job.name,
-            "machine": describe_machine(renderer.name),
+            "machine": describe_machine(context.renderer.name),
             "core": core,
             **summarise(timed),
         }

@@ -9,13 +9,11 @@ from schemas.dataset.shard import ShardOrder
 from schemas.errors import RunError, SceneError
 from schemas.job.job import Job
 from services.bench.ratios import Lap
-from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.pipeline.allocator import keep_freed_memory
-from workers.pipeline.context import WorkerContext, settings_digest
+from workers.assets.catalogue import open_catalogue
+from workers.pipeline.context import WorkerContext, open_worker
 from workers.pipeline.make_scene import Scene, Stopwatch, make_scene
 from workers.pipeline.run_shard import run_span
 from workers.render.raster.context import require_device
-from workers.render.raster.gbuffer import shared_renderer
 from workers.store.commit import read_record
 from workers.store.local import LocalStore
 
@@ -67,8 +65,9 @@ def open_workbench(job: Job, job_folder: Path, out: Path) -> Workbench:
     catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
     store = LocalStore(out)
     store.prepare()
-    order = bench_order(job, out)
-    return Workbench(_context(job, catalogue), store, order, job.first_scene)
+    context = open_worker(job, catalogue)
+    require_device(context.renderer.name, job.run.device)
+    return Workbench(context, store, bench_order(job, out), job.first_scene)
 
 
 def bench_order(job: Job, out: Path) -> ShardOrder:
@@ -82,10 +81,3 @@ def bench_order(job: Job, out: Path) -> ShardOrder:
         range_size=job.run.range_size,
     )
     return ShardOrder(out=str(out), job=job, terms=terms, spans=())
-
-
-def _context(job: Job, catalogue: Catalogue) -> WorkerContext:
-    keep_freed_memory()
-    renderer = shared_renderer()
-    require_device(renderer.name, job.run.device)
-    return WorkerContext(job, catalogue, renderer, settings_digest(job, catalogue.digest))

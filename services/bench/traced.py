@@ -13,7 +13,7 @@ from services.bench.cycles import CyclesProcess, cycles_process, hand_over, trac
 from services.bench.machine import describe_machine, pinned
 from services.bench.ratios import Lap, Spread, by_processor, slope_ratio
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.context import WorkerContext, settings_digest
+from workers.pipeline.context import open_worker
 from workers.pipeline.make_scene import Scene, Stopwatch, make_scene
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.step import require_tier
@@ -57,7 +57,7 @@ def first_scenes(job: Job, job_folder: Path, count: int) -> list[Scene]:
     """The first scenes that can be made, posed and with their cameras. Raises RunError where there is none."""
     job = job.model_copy(update={"render": Render(tier="raster")})
     catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
-    context = WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
+    context = open_worker(job, catalogue)
     made, reason = [], ""
     for scene_id in range(job.first_scene, job.first_scene + count):
         try:

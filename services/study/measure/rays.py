@@ -105,7 +105,7 @@ def _spread(width: int, height: int) -> tuple[Index, Index]:
 
 
 def _cast_centres(things: Sequence[Placed], camera: Camera, rows: Index, columns: Index) -> Seen:
-    return Seen(rows, columns, *cast_at(things, camera, columns + 0.5, rows + 0.5))
+    return Seen(rows, columns, *cast_at(things, camera, columns.astype(float) + 0.5, rows.astype(float) + 0.5))
 
 
 def cast_patch(things: Sequence[Placed], camera: Camera, *names: int) -> Patch:
