@@ -28,7 +28,7 @@ SCRIPT = Path(__file__).with_name("cycles_script.py")
 
 
 def hand_over(posed: PosedScene, cameras: Sequence[Camera], render: Render, folder: Path) -> Path:
-    """Write what the script is to render, once, outside any clock. Returns the path of its description."""
+    """Write the scene for the script, outside any clock. Returns the path of its description."""
     folder.mkdir(parents=True)
     parts: list[dict[str, Any]] = []
     for thing in posed.things:
@@ -83,7 +83,7 @@ def _part(part: Part, arrays: str) -> dict[str, Any]:
 
 
 def _blenders_sky(posed: PosedScene) -> Array:
-    """The sky in Blender's projection, which has the same columns as ours, and rows that are centred."""
+    """The sky in Blender's projection: the same columns as ours, and centred rows."""
     directions = sky_directions((np.arange(SKY_PX[1]) + 0.5) / SKY_PX[1])
     return np.asarray(sky_picture(posed.appearance, directions).astype(np.float32))
 
@@ -98,7 +98,7 @@ def _facing(towards: Array) -> Array:
 
 
 def trace_lap(posed: PosedScene, cameras: Sequence[Camera], render: Render) -> Lap:
-    """Our side: the scene built anew, and every view traced."""
+    """Our side: builds the scene anew and traces every view."""
     tracer = shared_tracer()
     tracer.forget()
     wall, cpu = time.perf_counter(), time.process_time()

@@ -1,4 +1,4 @@
-"""Every lossless PNG encoder at hand, and the fastest of them for each kind of image."""
+"""Lossless PNG encoders, and the fastest of them for each kind of image."""
 
 import importlib
 import struct
@@ -16,7 +16,7 @@ from workers.store.images import Pixels, encode_png
 Encoder = Callable[[Pixels], bytes]
 
 NO_LARGER = 2.0
-"""An encoder that is fast because it hardly compresses is no floor: it may make at most this many times our bytes."""
+"""An encoder may make at most this many times our bytes; a faster one that hardly compresses is no lower bound."""
 
 STRATEGIES = {
     "huffman": cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
@@ -29,7 +29,7 @@ REPEATS = 3
 
 
 def encoders() -> dict[str, Encoder]:
-    """Every encoder, by name; ours is one of them, so that the floor is never above it."""
+    """Every encoder, by name; ours is one of them, so that the lower bound is never above it."""
     found: dict[str, Encoder] = {"ours": encode_png}
     for row_filter, number in FILTERS.items():
         for level in ISAL_LEVELS:

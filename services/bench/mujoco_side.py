@@ -1,4 +1,4 @@
-"""The same scenes by MuJoCo: its own physics, and RGB, depth and segmentation of three views, in memory.
+"""The same scenes by MuJoCo: physics, and RGB, depth and segmentation of three views, in memory.
 
 Run as a process of its own (see others.py) where the `mujoco` wheel is installed; it is in no lock file. Written as a user
 of MuJoCo would: one model a scene, its renderer's defaults (four samples, one light and the head light, shadows).

@@ -1,4 +1,4 @@
-"""Our side: whole scenes of a job, through the real path, onto a real disk."""
+"""Our side of the benchmark: whole scenes of a job by the production code, onto a real disk."""
 
 import time
 from dataclasses import dataclass, field
@@ -28,7 +28,7 @@ class Workbench:
     next_scene: int = field(default=0)
 
     def next_span(self, scenes: int) -> Span:
-        """The next range: scenes that were not made before, so that no shape is at hand already."""
+        """The next range, of new scenes, so that no shape is cached already."""
         span = Span(start=self.next_scene, stop=self.next_scene + scenes)
         self.next_scene = span.stop
         return span
@@ -44,13 +44,13 @@ class Workbench:
         return lap
 
     def record(self, span: Span) -> CommitRecord:
-        """What the range left on disk."""
+        """The range's commit record."""
         record = read_record(self.store, span.start)
         assert record is not None
         return record
 
     def scenes(self, span: Span) -> list[Scene]:
-        """The same scenes once more in memory, those that can be made, for the sides that we are compared with."""
+        """The same scenes once more in memory, without those that fail, as input for the other sides."""
         made = []
         for scene_id in span.scene_ids:
             try:
@@ -71,7 +71,7 @@ def open_workbench(job: Job, job_folder: Path, out: Path) -> Workbench:
 
 
 def bench_order(job: Job, out: Path) -> ShardOrder:
-    """The pattern of every shard of a benchmark."""
+    """The order that every shard of a benchmark follows."""
     terms = CommitTerms(
         job_digest="bench",
         fingerprint="bench",

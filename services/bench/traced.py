@@ -54,7 +54,7 @@ def measure_traced(options: argparse.Namespace, job: Job, job_folder: Path, fold
 
 
 def first_scenes(job: Job, job_folder: Path, count: int) -> list[Scene]:
-    """The first scenes that can be made, posed and with their cameras. Raises RunError where there is none."""
+    """The first scenes that can be made, posed and with their cameras. Raises RunError for none."""
     job = job.model_copy(update={"render": Render(tier="raster")})
     catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
     context = open_worker(job, catalogue)
@@ -70,7 +70,7 @@ def first_scenes(job: Job, job_folder: Path, count: int) -> list[Scene]:
 
 
 def measure_scene(scene: Scene, folder: Path, cycles: CyclesProcess | None) -> dict[str, Lap]:
-    """Laps over the scene's three rendered views by side and samples, such as `ours 16`; its building is in each."""
+    """Laps over the scene's three rendered views by side and samples, such as `ours 16`, including building the scene."""
     pair = scene.pairs[0]
     cameras = [view.camera for view in pair.views if view.role != "projected"]
     laps = {}
@@ -84,7 +84,7 @@ def measure_scene(scene: Scene, folder: Path, cycles: CyclesProcess | None) -> d
 
 
 def summarise(laps: list[dict[str, Lap]]) -> dict[str, Any]:
-    """Milliseconds of processor a view, and how many views ours makes while Cycles makes one, over scenes."""
+    """Milliseconds of processor a view, and our views for each view of Cycles, over scenes."""
     sides = {name: [lap[name] for lap in laps] for name in laps[0]}
     ms = {name: asdict(Spread.of([1e3 * by_processor(lap) for lap in own])) for name, own in sides.items()}
     both = [n for n in SAMPLES if f"cycles {n}" in sides]
@@ -93,7 +93,7 @@ def summarise(laps: list[dict[str, Lap]]) -> dict[str, Any]:
 
 
 def describe(figures: dict[str, Any]) -> list[str]:
-    """The same for a reader."""
+    """The figures as text, line by line."""
     machine = figures["machine"]
     lines = [
         f"machine    {machine['cpu']}, load {machine['load_1min']:.1f}",
