@@ -62,7 +62,7 @@ def bench_folder(parent: Path) -> Iterator[Path]:
 def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
     """Ranges of the job's size until `scenes` are made, each by all sides in turn.
 
-    Nothing is deleted in between, because for seconds afterwards ext4 is slower to make files.
+    Nothing is deleted in between: for seconds afterwards ext4 searches the deleted entries whenever it makes a file.
     """
     with pinned() as core, ExitStack() as processes:
         bench = open_workbench(job, job_folder, folder / "ours")
@@ -120,8 +120,8 @@ class _Sides:
         """Ours, the lower bound, the others. The input of the next side is made between their clocks."""
         ours = self.bench.run(span)
         files = committed_files(self.bench.store.root, self.bench.record(span))
-        scenes, out = self.bench.scenes(span), self.folder / f"lower_bound{span.start}"
-        bound = run_lower_bound(self.bench.context.renderer, scenes, files, self.encoders, out)
+        out = self.folder / f"lower_bound{span.start}"
+        bound = run_lower_bound(self.bench.context.renderer, self.bench.scenes(span), files, self.encoders, out)
         given = self.give(span)
         others = {
             side.name: self.processes[side.module].run(given, self.folder / side.name, side.asked)
