@@ -1,4 +1,4 @@
-"""Pure: amounts, times and sizes in words, for the sentence, the plots and the page."""
+"""Amounts, times and sizes in words, for the sentence, the plots and the page. Pure."""
 
 from services.study.errors import ERRORS
 

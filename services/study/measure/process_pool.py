@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from schemas.job.job import Job
-from services.study.measure.looking import measure_colour, measure_pictures
+from services.study.measure.scene_images import measure_colour, measure_scene_images
 from services.study.measure.settling import measure_settling
 from services.study.rounds import Unit
 from workers.assets.catalogue import open_catalogue
@@ -41,5 +41,5 @@ def _measure(job: str, folder: str, unit: Unit) -> Any:
     context = _context(job, folder)
     if unit.kind == "settling":
         return measure_settling(context, unit.settings, unit.scene_id, unit.posed, unit.released)
-    measure = measure_pictures if unit.kind == "images" else measure_colour
+    measure = measure_scene_images if unit.kind == "images" else measure_colour
     return measure(context, unit.settings, unit.scene_id)

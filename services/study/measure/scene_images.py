@@ -33,7 +33,9 @@ FINE_WIDTH = 2560
 """Pixels: 4 times the width that colours are compared at."""
 
 
-def measure_pictures(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> dict[str, dict[str, float]]:
+def measure_scene_images(
+    context: WorkerContext, settings: Sequence[Setting], scene_id: int
+) -> dict[str, dict[str, float]]:
     """Errors of depth, masks, mirror pose and projection by the settings' names, where the scene can be made."""
     truth, answers = None, {}
     for setting in settings:
