@@ -2,18 +2,16 @@
 
 Run as a process of its own (`python -m services.bench.baseline`), because stock pyrender ends EGL for its whole process
 when it is done. It reads one line of JSON for each scene, `{"scene": FILE, "out": FOLDER, "look": LOOK}`, makes the
-scene's images, and answers with one line of seconds by stage. It uses none of our code.
+scene's images, and answers with one line of seconds by stage. It uses none of the code under test.
 
 It has two looks. `plain` is what such scripts do: a floor of one colour, one light, no shadows. `same` is what one has to
-write to get images such as the raster tier's: the floor's texture, each of the scene's distant lights, and pyrender's
-own shadows of them. Everything else is as pyrender comes.
+write to get images like those of the raster tier: the floor's texture, each of the scene's distant lights, and pyrender's
+own shadows of them. All other settings are pyrender's defaults.
 """
 
-import json
-import os
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,16 +26,13 @@ import trimesh  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from PIL import Image  # noqa: E402
 
-STEP_HZ, SECONDS = 240, 3.0
-OPTICAL_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-TABLE, OBJECT = 2, 3
-FLOOR = 1
+from services.bench.answers import FLOOR, OBJECT, OPTICAL_TO_OPENGL, SECONDS, STEP_HZ, TABLE, answer_scenes  # noqa: E402
 
 Images = dict[str, NDArray]
 
 
-def load(description: dict[str, Any], folder: Path, look: str) -> dict[str, Any]:
-    """The meshes of a scene as pyrender wants them."""
+def load_meshes(description: dict[str, Any], folder: Path, look: str) -> dict[str, Any]:
+    """The meshes of a scene for pyrender."""
     given = description["floor"]
     floor: Any = trimesh.Trimesh(given["vertices"], given["faces"], process=False)
     if look == "same":
@@ -148,70 +143,41 @@ def write(views: dict[str, Images], images: list[dict[str, Any]], units: float, 
 
 
 class Script:
-    """What the script keeps from one scene to the next: its renderer and PyBullet's world."""
+    """The script's state between scenes: its renderer and PyBullet's world."""
 
     def __init__(self) -> None:
         pybullet.connect(pybullet.DIRECT)
         self._renderer: Any = None
 
-    def make(self, description: dict[str, Any], meshes: dict[str, Any], asked: dict[str, str]) -> dict[str, float]:
+    def make(self, loaded: tuple[dict[str, Any], Path, dict[str, Any]], asked: dict[str, str]) -> dict[str, float]:
         """One scene's images; seconds by stage."""
-        folder, out, look = Path(asked["scene"]).parent, Path(asked["out"]), asked["look"]
+        (description, folder, meshes), out, look = loaded, Path(asked["out"]), asked["look"]
         seconds: dict[str, float] = {}
         k = description["intrinsics"]
         if self._renderer is None:
             self._renderer = pyrender.OffscreenRenderer(k["width"], k["height"])
-        T_world_obj = _timed(seconds, "physics", lambda: simulate(description, folder))
-        scene, colors = _timed(seconds, "scene", lambda: build(description, meshes, T_world_obj, look))
+        with _timed(seconds, "physics"):
+            T_world_obj = simulate(description, folder)
+        with _timed(seconds, "scene"):
+            scene, colors = build(description, meshes, T_world_obj, look)
         for pair in description["pairs"]:
             cameras = {role: np.array(T) for role, T in pair["cameras"].items()}
-            views = _timed(
-                seconds,
-                "render",
-                lambda cameras=cameras: {  # type: ignore[misc]
-                    role: render(scene, colors, self._renderer, k, T, look) for role, T in cameras.items()
-                },
-            )
+            with _timed(seconds, "render"):
+                views = {role: render(scene, colors, self._renderer, k, T, look) for role, T in cameras.items()}
             T_mirror_input = np.linalg.inv(cameras["mirror"]) @ cameras["input"]
-            views["projected"] = _timed(
-                seconds,
-                "projection",
-                lambda views=views, T=T_mirror_input: project(views["input"], k, T),  # type: ignore[misc]
-            )
-            _timed(
-                seconds,
-                "write",
-                lambda views=views, pair=pair: write(  # type: ignore[misc]
-                    views, pair["images"], description["depth_units_per_m"], out
-                ),
-            )
+            with _timed(seconds, "projection"):
+                views["projected"] = project(views["input"], k, T_mirror_input)
+            with _timed(seconds, "write"):
+                write(views, pair["images"], description["depth_units_per_m"], out)
         return seconds
 
 
-def _timed(seconds: dict[str, float], stage: str, work: Callable[[], Any]) -> Any:
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     begun = time.perf_counter()
-    result = work()
+    yield
     seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - begun
-    return result
-
-
-def main() -> None:
-    """Answer one line with one line until there are no more. PyBullet talks on standard output, so that is moved."""
-    answers = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)
-    script = Script()
-    print(json.dumps({"ready": True}), file=answers)
-    for line in sys.stdin:
-        asked = json.loads(line)
-        path, before = Path(asked["scene"]), time.perf_counter()
-        description = json.loads(path.read_text())
-        meshes = load(description, path.parent, asked["look"])
-        wall, cpu = time.perf_counter(), time.process_time()
-        stages = script.make(description, meshes, asked)
-        answer = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu, "stages_s": stages}
-        answer["load_s"] = wall - before
-        print(json.dumps(answer), file=answers)
 
 
 if __name__ == "__main__":
-    main()
+    answer_scenes(lambda told, folder, asked: (told, folder, load_meshes(told, folder, asked["look"])), Script().make)

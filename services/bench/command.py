@@ -1,4 +1,4 @@
-"""`verso bench`: measures, prints, and answers in JSON."""
+"""`verso bench`: measures, and prints the figures as text and JSON."""
 
 import argparse
 import json
@@ -12,7 +12,9 @@ from schemas.errors import InputError
 from schemas.job.job import Job
 from schemas.job.start import ONE_OBJECT
 from services.bench.effects import measure_effects
+from services.bench.extra import require_extra
 from services.bench.measure import bench_folder, measure
+from services.bench.memory import measure_memory
 from services.bench.others import other_systems
 from services.bench.report import describe, summarise
 from services.bench.traced import measure_traced
@@ -21,7 +23,8 @@ from workers.store.mounts import file_system_of
 
 
 def main(options: argparse.Namespace) -> int:
-    """Measure what the options ask for; 0, or an error where a side cannot be run at all."""
+    """Measure what the options ask for and print it; returns 0. Raises VersoError where a side cannot run."""
+    require_extra("bench")
     job, job_folder = _job(options)
     if options.effects is not None:
         return measure_effects(options, job, job_folder)
@@ -29,17 +32,24 @@ def main(options: argparse.Namespace) -> int:
     with bench_folder(options.folder) as folder:
         if options.pathtraced is not None:
             return measure_traced(options, job, job_folder, folder)
+        rounds = summarise(measure(job, job_folder, folder, options.scenes))
+        memory = options.memory and asdict(measure_memory(job, job_folder, folder / "memory", options.memory))
+        scaling = None
+        if options.workers is not None:
+            from services.bench.scaling import measure_scaling  # loads Ray, which would count as our start-up
+
+            scaling = asdict(measure_scaling(job, job_folder, folder, options.workers, options.scaling_scenes))
         figures = {
             "ok": True,
             "command": shlex.join(["verso", *sys.argv[1:]]),
             "job": job.name,
             "file_system": file_system_of(folder),
-            **summarise(measure(job, job_folder, folder, options.scenes)),
-            "memory": _memory(options, job, job_folder, folder),
-            "scaling": _scaling(options, job, job_folder, folder),
+            **rounds,
+            "memory": memory,
+            "scaling": scaling,
             "other_systems": other_systems(),
         }
-        # Before the folder goes: thousands of files take a while where the disk is busy.
+        # Printed before the folder is deleted, which takes a while on a busy disk.
         print("\n".join(describe(figures)), flush=True)
     if options.json:
         print(json.dumps(figures))
@@ -47,7 +57,7 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _job(options: argparse.Namespace) -> tuple[Job, Path]:
-    """The job to measure, and where its relative folders are resolved from."""
+    """The job to measure, and the folder that its relative paths start from."""
     if options.job is None:
         tree: dict[str, Any] = {"name": "bench"}
         for change in options.changes:
@@ -59,7 +69,7 @@ def _job(options: argparse.Namespace) -> tuple[Job, Path]:
 
 
 def refuse_unmatched(job: Job) -> None:
-    """Raises InputError for a job whose scenes the straightforward script does not make, or that is stored in tars."""
+    """Raises InputError for a job whose scenes the script does not make, or that is stored in tars."""
     if job.output.layout != "files":
         raise InputError(f"output.layout is {job.output.layout!r}: the benchmark compares files, leave it at 'files'")
     if job.objects_per_scene != ONE_OBJECT:
@@ -72,19 +82,3 @@ def refuse_unmatched(job: Job) -> None:
     }
     if off := [name for name, on in switches.items() if not on]:
         raise InputError(f"{', '.join(off)} is off: the benchmark compares whole pairs, leave it on")
-
-
-def _memory(options: argparse.Namespace, job: Job, job_folder: Path, folder: Path) -> dict[str, Any] | None:
-    if options.memory is None:
-        return None
-    from services.bench.memory import measure_memory
-
-    return asdict(measure_memory(job, job_folder, folder / "memory", options.memory))
-
-
-def _scaling(options: argparse.Namespace, job: Job, job_folder: Path, folder: Path) -> dict[str, Any] | None:
-    if options.workers is None:
-        return None
-    from services.bench.scaling import measure_scaling
-
-    return asdict(measure_scaling(job, job_folder, folder, options.workers, options.scaling_scenes))

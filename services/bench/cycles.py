@@ -2,24 +2,22 @@
 
 import contextlib
 import json
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
 from schemas.base import Array
-from schemas.errors import MachineError
 from schemas.job.render import Render
 from schemas.scene.camera import Camera
 from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import PosedScene
 from schemas.scene.shape import Part
 from services.bench.ratios import Lap
+from services.bench.side_process import SideProcess, start_side
 from workers.geometry.frames import transform
 from workers.geometry.srgb import decode_srgb
 from workers.render.pathtraced.lights import GLOW, SKY_PX, sky_directions, sky_picture
@@ -31,7 +29,7 @@ SCRIPT = Path(__file__).with_name("cycles_script.py")
 
 
 def hand_over(posed: PosedScene, cameras: Sequence[Camera], render: Render, folder: Path) -> Path:
-    """Write what the script is to render, once, outside any clock. Returns the path of its description."""
+    """Write the scene for the script, outside any clock. Returns the path of its description."""
     folder.mkdir(parents=True)
     parts: list[dict[str, Any]] = []
     for thing in posed.things:
@@ -86,7 +84,7 @@ def _part(part: Part, arrays: str) -> dict[str, Any]:
 
 
 def _blenders_sky(posed: PosedScene) -> Array:
-    """The sky in Blender's projection, which has the same columns as ours, and rows that are centred."""
+    """The sky in Blender's projection: the same columns as ours, and centred rows."""
     directions = sky_directions((np.arange(SKY_PX[1]) + 0.5) / SKY_PX[1])
     return np.asarray(sky_picture(posed.appearance, directions).astype(np.float32))
 
@@ -101,7 +99,7 @@ def _facing(towards: Array) -> Array:
 
 
 def trace_lap(posed: PosedScene, cameras: Sequence[Camera], render: Render, effects: EffectPlan) -> Lap:
-    """Our side: the scene built anew, and every view traced."""
+    """Our side: builds the scene anew and traces every view."""
     tracer = Tracer()
     wall, cpu = time.perf_counter(), time.process_time()
     for camera in cameras:
@@ -112,44 +110,19 @@ def trace_lap(posed: PosedScene, cameras: Sequence[Camera], render: Render, effe
 class CyclesProcess:
     """A running script under an interpreter that has bpy; it inherits our core."""
 
-    def __init__(self, process: subprocess.Popen[str], errors: IO[str]) -> None:
-        self._process, self._errors = process, errors
-        self.version: str = self._answer()["version"]
+    def __init__(self, side: SideProcess) -> None:
+        self._side = side
+        self.version: str = side.greeting["version"]
 
     def lap(self, scene: Path, views: int, samples: int, out: Path | None = None) -> Lap:
-        """Every view of a scene with these samples, building it included; `out`: where its pictures are left."""
+        """Every view of a scene with these samples, building it included; `out`: where its images are left."""
         question = {"scene": str(scene), "samples": [samples], "out": None if out is None else str(out)}
-        assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.write(json.dumps(question) + "\n")
-            self._process.stdin.flush()
-        wall_s, cpu_s = self._answer()["seconds"][str(samples)]
+        wall_s, cpu_s = self._side.ask(question)["seconds"][str(samples)]
         return Lap(views, wall_s, cpu_s, {})
-
-    def _answer(self) -> dict[str, Any]:
-        """The next answer. Raises MachineError with the script's last words where it died."""
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            self._process.wait()
-            self._errors.seek(0)
-            last = " | ".join(self._errors.read().strip().splitlines()[-5:])
-            raise MachineError(f"Blender's script ended ({self._process.returncode}): {last}")
-        answer: dict[str, Any] = json.loads(line)
-        return answer
 
 
 @contextlib.contextmanager
 def cycles_process(python: str = sys.executable) -> Iterator[CyclesProcess]:
     """The script, ready for its first scene. Raises MachineError where that interpreter has no bpy that loads."""
-    with tempfile.TemporaryFile("w+") as errors:
-        pipe, command = subprocess.PIPE, [python, "-I", str(SCRIPT)]
-        try:
-            process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=errors, text=True)
-        except OSError as error:
-            raise MachineError(f"{python} cannot be run: {error}") from error
-        try:
-            yield CyclesProcess(process, errors)
-        finally:
-            process.kill()
-            process.communicate()
+    with start_side([python, "-I", str(SCRIPT)], "Blender's script") as side:
+        yield CyclesProcess(side)

@@ -2,7 +2,7 @@
 
 Run by an interpreter that has `bpy`, as a process of its own. It reads one line of JSON for each scene, `{"scene": FILE,
 "samples": [1, 16]}`, renders its views with each number of samples, and answers with one line of seconds. It imports none
-of our code; what it is given is written by cycles.py.
+of our code; cycles.py writes its input.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""`verso bench --effects N`: what settling takes by each scene's own plan of effects, and with what the plan leaves out."""
+"""`verso bench --effects N`: time of settling by each scene's plan of effects, and with effects forced."""
 
 import argparse
 import json
@@ -14,7 +14,6 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.errors import RunError, SceneError
-from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.scene.effects import EffectPlan
 from services.bench.machine import describe_machine, pinned
@@ -22,20 +21,19 @@ from services.bench.ratios import Spread
 from workers.assets.catalogue import open_catalogue
 from workers.physics.effects import called_for
 from workers.physics.step import settle_scene
-from workers.pipeline.context import WorkerContext
+from workers.pipeline.context import WorkerContext, open_worker
 from workers.plan.effect import Facts
 from workers.plan.effects import PHYSICS_EFFECTS, plan_effects
 from workers.plan.randomness import SceneChance
 from workers.plan.step import plan_scene
-from workers.render.raster.gbuffer import shared_renderer
 
 ROUNDS = 3
-"""Each scene is settled so often in each way, after once in each way that fills the caches."""
+"""Timed rounds, after one round that fills the caches."""
 
 EFFECTS = tuple(effect.name for effect in PHYSICS_EFFECTS if effect.kind == "approximation")
 
 PLAN, WHOLE, EVERYTHING = "plan", "all but decomposition", "all"
-"""Names of what is timed: by the plan, and with every approximation forced, once as hulls and once as convex parts."""
+"""Names of the variants: by the plan, and with every approximation forced, once as hulls and once as convex parts."""
 
 FORCED: dict[str, frozenset[str]] = {
     PLAN: frozenset(),
@@ -43,29 +41,28 @@ FORCED: dict[str, frozenset[str]] = {
     EVERYTHING: frozenset(EFFECTS),
     **{name: frozenset({name}) for name in EFFECTS},
 }
-"""What is forced, by name; an effect's own name stands for the plan and that effect."""
+"""Forced effects by the variant's name; an effect's own name stands for the plan and that effect."""
 
 
 @dataclass(frozen=True, eq=False)
 class Timed:
-    """Seconds of processor by what was forced, [rounds, scenes]: nan where the plan has the effect, or settling failed."""
+    """Seconds of processor by variant, [rounds, scenes]: nan where the plan has the effect, or settling failed."""
 
     seconds: Mapping[str, Array]
     failed: Mapping[str, int]
 
 
 def measure_effects(options: argparse.Namespace, job: Job, job_folder: Path) -> int:
-    """Time the job's first scenes, print and answer in JSON. Raises RunError where none of them settles."""
+    """Time the job's first scenes and print the figures. Raises RunError where no scene settles."""
     with pinned() as core:
         catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
-        renderer = shared_renderer()
-        context = WorkerContext(job, catalogue, renderer, settings_digest(job, catalogue.digest))
+        context = open_worker(job, catalogue)
         timed = time_settling(_draw(context, options.effects), ROUNDS)
         figures = {
             "ok": True,
             "command": shlex.join(["verso", *sys.argv[1:]]),
             "job": job.name,
-            "machine": describe_machine(renderer.name),
+            "machine": describe_machine(context.renderer.name),
             "core": core,
             **summarise(timed),
         }
@@ -76,7 +73,7 @@ def measure_effects(options: argparse.Namespace, job: Job, job_folder: Path) -> 
 
 
 def _draw(context: WorkerContext, count: int) -> list[Facts]:
-    """The first scenes as they are drawn, those that can be."""
+    """The first scenes as planned, without those that fail."""
     drawn = []
     for scene_id in range(context.job.first_scene, context.job.first_scene + count):
         try:
@@ -93,7 +90,7 @@ def _draw(context: WorkerContext, count: int) -> list[Facts]:
 
 
 def time_settling(scenes: Sequence[Facts], rounds: int) -> Timed:
-    """Settle each scene in each way in turn. Raises RunError where no scene settles by plan and with all forced."""
+    """Settle each scene in each variant in turn. Raises RunError where no scene settles both by plan and with all forced."""
     seconds = {name: np.full((rounds + 1, len(scenes)), np.nan) for name in FORCED}
     failed = dict.fromkeys(FORCED, 0)
     for lap in range(rounds + 1):
@@ -114,7 +111,7 @@ def time_settling(scenes: Sequence[Facts], rounds: int) -> Timed:
 
 
 def _settle_s(facts: Facts, plan: EffectPlan, by_plan: bool) -> float | None:
-    """Seconds of processor, those for choosing the effects included `by_plan`; None where it does not come to rest."""
+    """Seconds of processor, with `by_plan` including the choice of effects; None where the scene does not come to rest."""
     scene, physics = facts.plan, facts.job.physics
     began = time.process_time()
     if by_plan:
@@ -127,12 +124,12 @@ def _settle_s(facts: Facts, plan: EffectPlan, by_plan: bool) -> float | None:
 
 
 def _compared(seconds: Mapping[str, Array]) -> Array:
-    """[scenes] bool: those that settle by plan and with all forced."""
+    """[scenes] bool: scenes that settle by plan and with all forced."""
     return ~np.any([np.isnan(seconds[name]).any(axis=0) for name in (PLAN, WHOLE, EVERYTHING)], axis=0)
 
 
 def summarise(timed: Timed) -> dict[str, Any]:
-    """Milliseconds a scene, the share of all scenes' time that the plan saves, and what each effect would cost."""
+    """Milliseconds a scene, the share of time that the plan saves, and the cost of each effect."""
     seconds, both = timed.seconds, _compared(timed.seconds)
     plan = seconds[PLAN][:, both]
     forced = {}
@@ -153,20 +150,20 @@ def summarise(timed: Timed) -> dict[str, Any]:
 
 
 def _side(seconds: Array) -> dict[str, float]:
-    """Of seconds [rounds, scenes]: over scenes, each scene's being its median over rounds."""
+    """Median and mean over scenes of each scene's median over rounds; seconds are [rounds, scenes]."""
     each = np.median(seconds, axis=0) * 1e3
     return {"median_ms": float(np.median(each)), "mean_ms": float(each.mean())}
 
 
 def _cost(own: Array, plan: Array) -> dict[str, Any]:
-    """How much longer scenes take that leave an effect out when it is forced, alone; None where there are none."""
+    """Extra time of a forced effect in scenes whose plan leaves it out; None where there are none."""
     both = ~(np.isnan(own) | np.isnan(plan)).any(axis=0)
     more = [float(a.mean() * 1e3) for a in (own - plan)[:, both]] if both.any() else []
     return {"scenes": int(both.sum()), "more_ms": asdict(Spread.of(more)) if more else None}
 
 
 def describe(figures: dict[str, Any]) -> list[str]:
-    """The same for a reader, one line each."""
+    """The figures as text, line by line."""
     machine = figures["machine"]
     lines = [
         f"machine    {machine['cpu']}, load {machine['load_1min']:.1f}",

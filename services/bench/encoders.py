@@ -1,4 +1,4 @@
-"""Every lossless PNG encoder at hand, and the fastest of them for each kind of image."""
+"""Lossless PNG encoders, and the fastest of them for each kind of image."""
 
 import importlib
 import struct
@@ -9,7 +9,6 @@ from functools import partial
 
 import cv2
 import numpy as np
-from isal import isal_zlib
 from numpy.typing import NDArray
 
 from workers.store.images import Pixels, encode_png
@@ -17,7 +16,7 @@ from workers.store.images import Pixels, encode_png
 Encoder = Callable[[Pixels], bytes]
 
 NO_LARGER = 2.0
-"""An encoder that is fast because it hardly compresses is no floor: it may make at most this many times our bytes."""
+"""An encoder may make at most this many times our bytes; a faster one that hardly compresses is no lower bound."""
 
 STRATEGIES = {
     "huffman": cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
@@ -30,7 +29,7 @@ REPEATS = 3
 
 
 def encoders() -> dict[str, Encoder]:
-    """Every encoder, by name; ours is one of them, so that the floor is never above it."""
+    """Every encoder, by name; ours is one of them, so that the lower bound is never above it."""
     found: dict[str, Encoder] = {"ours": encode_png}
     for row_filter, number in FILTERS.items():
         for level in ISAL_LEVELS:
@@ -51,6 +50,8 @@ def encoders() -> dict[str, Encoder]:
 
 def encode_isal(pixels: Pixels, row_filter: str, level: int) -> bytes:
     """PNG (ISO/IEC 15948) with one filter for all rows, deflated by ISA-L in one piece."""
+    from isal import isal_zlib  # of the extra `study`
+
     height, width = pixels.shape[:2]
     depth, color = (16, 0) if pixels.dtype == np.uint16 else (8, 2 if pixels.ndim == 3 else 0)
     rows = np.ascontiguousarray(pixels.astype(">u2") if depth == 16 else pixels).view(np.uint8).reshape(height, -1)
@@ -60,7 +61,11 @@ def encode_isal(pixels: Pixels, row_filter: str, level: int) -> bytes:
     header = struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0)
     data = isal_zlib.compress(lines, level)
     chunks = ((b"IHDR", header), (b"IDAT", data), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(kind, body) for kind, body in chunks)
+    checks = [isal_zlib.crc32(body, zlib.crc32(kind)) for kind, body in chunks]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", check)
+        for (kind, body), check in zip(chunks, checks, strict=True)
+    )
 
 
 def _filter(rows: NDArray[np.uint8], out: NDArray[np.uint8], row_filter: str, pixel_bytes: int) -> None:
@@ -73,11 +78,6 @@ def _filter(rows: NDArray[np.uint8], out: NDArray[np.uint8], row_filter: str, pi
         np.subtract(rows[1:], rows[:-1], out=out[1:])
     else:
         out[:] = rows
-
-
-def _chunk(kind: bytes, body: bytes) -> bytes:
-    check = isal_zlib.crc32(body, zlib.crc32(kind))
-    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", check)
 
 
 def _opencv(settings: list[int]) -> Encoder:

@@ -1,4 +1,4 @@
-"""What the straightforward script is given of a scene: the same shapes, start and cameras, as files that it can load."""
+"""A scene as files for the other systems: the same shapes, start and cameras."""
 
 import json
 from pathlib import Path
@@ -25,7 +25,7 @@ URDF = """<robot name="{name}"><link name="base">
 
 
 def hand_over(scene: Scene, job: Job, folder: Path) -> Path:
-    """Write `scene.json` and the files it names, once, outside any clock. Returns its path."""
+    """Write `scene.json` and the files that it names, outside any clock. Returns its path."""
     folder.mkdir(parents=True)
     start, table = scene.plan.objects[0], scene.plan.table
     for name, asset in (("object", start.asset), ("table", table.asset)):
@@ -51,7 +51,7 @@ def hand_over(scene: Scene, job: Job, folder: Path) -> Path:
 
 
 def _pair(pair: Pair, job: Job) -> dict[str, object]:
-    """Poses of the three cameras, and of every image its path, view, kind of pixels and crop (or none)."""
+    """Poses of the three cameras, and the path, view, kind of pixels and crop (or none) of every image."""
     cameras = {view.role: _matrix(view.camera.T_world_cam) for view in pair.views if view.role != "projected"}
     images = []
     for view in pair.views:
@@ -66,7 +66,7 @@ def _matrix(T: Pose) -> list[list[float]]:
 
 
 def _floor(placed: Placed, folder: Path) -> dict[str, object]:
-    """Its geometry, its mean colour, and where it has a texture that as `floor.png`, with coordinates."""
+    """The floor's geometry and mean colour, and its texture, if any, as `floor.png` with coordinates."""
     shape: Shape = placed.shape
     part = shape.parts[0]
     described: dict[str, object] = {

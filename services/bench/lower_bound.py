@@ -1,4 +1,4 @@
-"""The least that a machine can do for the same files: bare draws, the fastest encoder, and a durable write."""
+"""The lower bound of time for the same files: bare draws, the fastest encoder, and a durable write."""
 
 import os
 import time
@@ -15,7 +15,7 @@ from workers.store.images import Pixels, decode_png
 
 
 def committed_files(root: Path, record: CommitRecord) -> dict[str, bytes]:
-    """Every file that a commit named, as it is on disk."""
+    """The bytes of every file that a commit names."""
     return {entry.path: (root / entry.path).read_bytes() for entry in record.files}
 
 
@@ -24,16 +24,16 @@ def images_of(files: Mapping[str, bytes]) -> list[tuple[Pixels, int]]:
     return [(decode_png(data, path), len(data)) for path, data in files.items() if path.endswith(".png")]
 
 
-def run_floor(
+def run_lower_bound(
     renderer: Renderer,
     scenes: Sequence[Scene],
     files: Mapping[str, bytes],
     chosen: Mapping[str, tuple[str, Encoder]],
     folder: Path,
 ) -> Lap:
-    """Draw every view, encode every image, write every byte so that it survives a loss of power. `folder` is new.
+    """Draw every view, encode every image, and write every byte so that it survives a loss of power. `folder` is new.
 
-    `apart_s` of the lap: a first draw of each scene, which uploads its shapes.
+    The lap's `apart_s` is a first draw of each scene, which uploads its shapes.
     """
     upload, draw, draw_cpu = _draw(renderer, scenes)
     images = images_of(files)
@@ -48,9 +48,9 @@ def run_floor(
 
 
 def _draw(renderer: Renderer, scenes: Sequence[Scene]) -> tuple[float, float, float]:
-    """Seconds apart, in which every scene's shapes reach the GPU, then of the clock and of the processor for bare passes.
+    """Seconds of uploading every scene's shapes, then of the clock and of the processor for bare passes.
 
-    A bare pass: colour without shadows, depth and region of everything, read back; flat's, whatever the job's tier.
+    A bare pass draws and reads back colour without shadows, depth and region, as tier flat does, whatever the job's tier.
     """
     upload, wall, cpu = 0.0, 0.0, 0.0
     for scene in scenes:

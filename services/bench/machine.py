@@ -1,4 +1,4 @@
-"""What a benchmark ran on, and how it keeps to one core of it."""
+"""The machine of a benchmark: its description, and pinning to one core."""
 
 import contextlib
 import os
@@ -14,7 +14,7 @@ LIBRARIES = ("numpy", "opencv-contrib-python-headless", "pybullet", "pyrender", 
 
 @contextlib.contextmanager
 def pinned(core: int | None = None) -> Iterator[int]:
-    """Keeps this thread, and what it starts, on one core while the block runs: by default the last that it may use."""
+    """Pins this thread, and the processes that it starts, to one core: by default the last that it may use."""
     before = os.sched_getaffinity(0)
     chosen = max(before) if core is None else core
     os.sched_setaffinity(0, {chosen})
@@ -25,7 +25,7 @@ def pinned(core: int | None = None) -> Iterator[int]:
 
 
 def describe_machine(renderer: str) -> dict[str, object]:
-    """Cores, processor, OpenGL device, load and versions: what a figure means nothing without."""
+    """Cores, processor, OpenGL device, load and versions: the context of every figure."""
     return {
         "cores": os.cpu_count(),
         "usable_cores": len(os.sched_getaffinity(0)),
@@ -41,7 +41,7 @@ def describe_machine(renderer: str) -> dict[str, object]:
 
 
 def threads_per_core(topology: Path = Path("/sys/devices/system/cpu/cpu0/topology/thread_siblings_list")) -> int | None:
-    """How many logical cores share a physical one, as far as this machine tells: those gain less than 2 times together."""
+    """Logical cores per physical core, None where unknown. Two of one physical core gain less than 2 times."""
     try:
         parts = [part.split("-") for part in topology.read_text().strip().split(",")]
     except OSError:
@@ -50,19 +50,19 @@ def threads_per_core(topology: Path = Path("/sys/devices/system/cpu/cpu0/topolog
 
 
 def process_age_s() -> float:
-    """Seconds since this process began, to a hundredth."""
+    """Seconds since this process started, to a hundredth."""
     began = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
     return time.clock_gettime(time.CLOCK_BOOTTIME) - began
 
 
 def resident_mb() -> float:
-    """Memory that this process holds, MB."""
+    """Resident memory of this process, MB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def peak_resident_mb(status: Path = Path("/proc/self/status")) -> float:
-    """The most memory that this process ever held, MB. Not `ru_maxrss`, which a child inherits from its parent."""
+    """Peak resident memory of this process, MB. Not `ru_maxrss`, which a child inherits from its parent."""
     line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
     return int(line.split()[1]) * 1024 / 1e6
 

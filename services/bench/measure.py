@@ -1,4 +1,4 @@
-"""The benchmark's rounds: ours, the floor, the straightforward script and other systems, in turn, on one core."""
+"""The rounds of the benchmark: ours, the lower bound, the script and other systems, in turn, on one core."""
 
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -11,7 +11,7 @@ from schemas.errors import MachineError, OutputError
 from schemas.job.job import Job
 from services.bench.encoders import Encoder, choose_encoders
 from services.bench.handover import hand_over
-from services.bench.lower_bound import committed_files, images_of, run_floor
+from services.bench.lower_bound import committed_files, images_of, run_lower_bound
 from services.bench.machine import describe_machine, pinned, process_age_s
 from services.bench.others import Side, sides_of
 from services.bench.ratios import Lap
@@ -19,15 +19,15 @@ from services.bench.side_process import SideProcess, side_process
 from services.bench.stages import Workbench, open_workbench
 
 WARM_UP = 8
-"""Scenes before the clock: shaders are made, of which pyrender has one for each number of lights, and caches filled."""
+"""Scenes before the clock: they compile shaders, of which pyrender has one for each number of lights, and fill caches."""
 
 
 @dataclass(frozen=True)
 class Round:
-    """The same scenes made by each side, one after the other, and the bytes that ours committed."""
+    """The same scenes made by each side, one after the other, and the bytes that our side committed."""
 
     ours: Lap
-    floor: Lap
+    lower_bound: Lap
     others: Mapping[str, Lap]
     """By name of the side."""
     bytes: int
@@ -35,7 +35,7 @@ class Round:
 
 @dataclass(frozen=True)
 class Measured:
-    """All rounds, and seconds from the start of each process to the end of its first scenes, by side."""
+    """All rounds, and by side the seconds from the start of its process to the end of its first scenes."""
 
     machine: dict[str, object]
     core: int
@@ -44,12 +44,12 @@ class Measured:
     sides: tuple[Side, ...]
     startup_s: Mapping[str, float]
     left_out: Mapping[str, str]
-    """Optional sides that are installed and could not run, and why."""
+    """Optional sides that are installed but could not run, and why."""
 
 
 @contextmanager
 def bench_folder(parent: Path) -> Iterator[Path]:
-    """A folder on the disk that is measured, gone afterwards. Raises OutputError where none can be made."""
+    """A temporary folder on the disk that is measured. Raises OutputError where none can be made."""
     try:
         parent.mkdir(parents=True, exist_ok=True)
         folder = tempfile.TemporaryDirectory(prefix="bench-", dir=parent, ignore_cleanup_errors=True)
@@ -62,7 +62,7 @@ def bench_folder(parent: Path) -> Iterator[Path]:
 def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
     """Ranges of the job's size until `scenes` are made, each by all sides in turn.
 
-    Nothing is deleted in between: for seconds afterwards ext4 searches what was deleted whenever a file is made.
+    Nothing is deleted in between: for seconds afterwards ext4 searches the deleted entries whenever it makes a file.
     """
     with pinned() as core, ExitStack() as processes:
         bench = open_workbench(job, job_folder, folder / "ours")
@@ -88,7 +88,7 @@ def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """Everything that is compared, and the processes of those that are not us: one for each module."""
+    """Everything that is compared, and the processes of the other sides: one for each module."""
 
     bench: Workbench
     encoders: dict[str, tuple[str, Encoder]]
@@ -99,9 +99,9 @@ class _Sides:
     left_out: dict[str, str] = field(default_factory=dict)
 
     def open(self, side: Side, given: list[Path]) -> float:
-        """Start a side and let it make these scenes; the seconds that took.
+        """Start a side and let it make these scenes; returns the seconds that took.
 
-        Raises MachineError where the script cannot run; an optional side that cannot is left out, saying why.
+        Raises MachineError where the script cannot run; an optional side that cannot is left out with the reason.
         """
         took = 0.0
         try:
@@ -117,30 +117,22 @@ class _Sides:
         return took + lap.wall_s + lap.apart_s
 
     def round(self, span: Span) -> Round:
-        """Ours, the floor, the others: what one hands to the next is made between their clocks."""
+        """Ours, the lower bound, the others. The input of the next side is made between their clocks."""
         ours = self.bench.run(span)
         files = committed_files(self.bench.store.root, self.bench.record(span))
-        floor = self.floor(span, files)
+        out = self.folder / f"lower_bound{span.start}"
+        bound = run_lower_bound(self.bench.context.renderer, self.bench.scenes(span), files, self.encoders, out)
         given = self.give(span)
         others = {
             side.name: self.processes[side.module].run(given, self.folder / side.name, side.asked)
             for side in self.opened
         }
-        return Round(ours, floor, others, sum(map(len, files.values())))
-
-    def floor(self, span: Span, files: dict[str, bytes]) -> Lap:
-        """The least for the scenes of a span."""
-        out = self.folder / f"floor{span.start}"
-        return run_floor(self.bench.context.renderer, self.bench.scenes(span), files, self.encoders, out)
+        return Round(ours, bound, others, sum(map(len, files.values())))
 
     def give(self, span: Span) -> list[Path]:
-        """The same scenes as files for the others."""
-        folder, job = self.given_folder(span), self.bench.context.job
+        """The same scenes as files for the other sides."""
+        folder, job = self.folder / f"given{span.start}", self.bench.context.job
         return [hand_over(scene, job, folder / str(scene.plan.scene_id)) for scene in self.bench.scenes(span)]
-
-    def given_folder(self, span: Span) -> Path:
-        """Where they lie."""
-        return self.folder / f"given{span.start}"
 
 
 def _counts(scenes: int, size: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""Memory and speed of one worker over many scenes, in a process of its own."""
+"""Memory and pace of one worker over many scenes, in a process of its own."""
 
 import multiprocessing
 from bisect import bisect_left
@@ -14,12 +14,12 @@ from services.bench.ratios import by_processor, growth
 from services.bench.stages import open_workbench
 
 SETTLED = 200
-"""After so many scenes every cache is full and every shader made."""
+"""Scenes after which every cache is full and every shader compiled."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One range: its scenes, MB held after it, seconds of the processor for a scene of it."""
+    """One range: its scenes, resident MB after it, and seconds of processor a scene."""
 
     scenes: int
     mb: float
@@ -30,9 +30,9 @@ class Sample:
 class Memory:
     """Resident memory, MB, and pace over the scenes.
 
-    grown: of the memory since it settled, 0.05 being 5 % more. peak_mb: the most that the process ever held. first_ms and
-    last_ms: of the processor for a scene in the first `settled_after` scenes and in as many at the end, medians over
-    ranges, which neighbours on the machine disturb little; last_to_first: their ratio.
+    grown: growth of the memory since it settled, 0.05 for 5 %. peak_mb: the peak of the process. first_ms and last_ms: of
+    processor a scene in the first `settled_after` scenes and in as many at the end, medians over ranges, which other
+    processes disturb little; last_to_first: their ratio.
     """
 
     scenes: int
@@ -47,7 +47,7 @@ class Memory:
 
 
 def measure_memory(job: Job, job_folder: Path, folder: Path, scenes: int) -> Memory:
-    """Make so many scenes in one fresh worker."""
+    """Make that many scenes in one fresh worker."""
     fresh = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=fresh) as pool:
         samples, peak = pool.submit(sample_memory, job, job_folder, folder, scenes).result()
@@ -55,7 +55,7 @@ def measure_memory(job: Job, job_folder: Path, folder: Path, scenes: int) -> Mem
 
 
 def sample_memory(job: Job, job_folder: Path, folder: Path, scenes: int) -> tuple[list[Sample], float]:
-    """What each range left, and the most MB that this process ever held."""
+    """A sample for each range, and the peak MB of this process."""
     bench = open_workbench(job, job_folder, folder)
     stop, samples = job.first_scene + scenes, []
     while bench.next_scene < stop:

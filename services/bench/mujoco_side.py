@@ -1,13 +1,11 @@
-"""The same scenes by MuJoCo: its own physics, and RGB, depth and segmentation of three views, in memory.
+"""The same scenes by MuJoCo: physics, and RGB, depth and segmentation of three views, in memory.
 
 Run as a process of its own (see others.py) where the `mujoco` wheel is installed; it is in no lock file. Written as a user
 of MuJoCo would: one model a scene, its renderer's defaults (four samples, one light and the head light, shadows).
 """
 
 import importlib
-import json
 import os
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-STEP_HZ, SECONDS = 240, 3.0
-FLOOR, TABLE, OBJECT = 1, 2, 3
+from services.bench.answers import FLOOR, OBJECT, OPTICAL_TO_OPENGL, SECONDS, STEP_HZ, TABLE, answer_scenes
 
 MODEL = """<mujoco>
 <option timestep="{step_s}"/>
@@ -37,8 +34,6 @@ MODEL = """<mujoco>
 
 CAMERA = """<camera name="{name}" {at} resolution="{width} {height}" sensorsize="{width} {height}"
  focalpixel="{fx} {fy}" principalpixel="{px} {py}"/>"""
-
-OPTICAL_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def describe(scene: Mapping[str, Any]) -> str:
@@ -73,18 +68,26 @@ def _at(T: NDArray[np.float64]) -> str:
     return f'pos="{T[0, 3]:.9g} {T[1, 3]:.9g} {T[2, 3]:.9g}" xyaxes="{axes}"'
 
 
+Loaded = tuple[str, dict[str, bytes], tuple[int, int]]
+"""A scene's MJCF, the files that it names, and the height and width of its images."""
+
+
 class Simulator:
-    """What stays from one scene to the next: the module."""
+    """The state between scenes: the module, and the last scene's images by camera (`rgb`, `depth` in metres, `region`)."""
 
     def __init__(self) -> None:
         os.environ["MUJOCO_GL"] = "egl"  # noqa: TID251 - read at import, there is no other way to say it
         self._mujoco: Any = importlib.import_module("mujoco")
+        self._images: dict[str, dict[str, NDArray]] = {}
 
-    def make(
-        self, description: str, files: dict[str, bytes], size: tuple[int, int], seconds: dict[str, float]
-    ) -> dict[str, dict[str, NDArray]]:
-        """Images by camera: `rgb`, `depth` (metres) and `region`. Adds to the seconds by stage."""
-        mujoco, marks = self._mujoco, [time.perf_counter()]
+    def load(self, scene: dict[str, Any], folder: Path, asked: dict[str, str]) -> Loaded:
+        """What MuJoCo is given of a scene."""
+        files = {name: (folder / name).read_bytes() for name in ("table.obj", "object.obj")}
+        return describe(scene), files, (scene["intrinsics"]["height"], scene["intrinsics"]["width"])
+
+    def make(self, loaded: Loaded, asked: dict[str, str]) -> dict[str, float]:
+        """Make the images; seconds by stage."""
+        (description, files, size), mujoco, marks = loaded, self._mujoco, [time.perf_counter()]
         model = mujoco.MjModel.from_xml_string(description, assets=files)
         data = mujoco.MjData(model)
         marks.append(time.perf_counter())
@@ -93,11 +96,15 @@ class Simulator:
         marks.append(time.perf_counter())
         with mujoco.Renderer(model, *size) as renderer:
             regions = self._regions(model)
-            images = {model.camera(i).name: self._look(renderer, data, i, regions) for i in range(model.ncam)}
+            self._images = {model.camera(i).name: self._look(renderer, data, i, regions) for i in range(model.ncam)}
         marks.append(time.perf_counter())
-        for stage, took in zip(("scene", "physics", "render"), np.diff(marks).tolist(), strict=True):
-            seconds[stage] = took
-        return images
+        return dict(zip(("scene", "physics", "render"), np.diff(marks).tolist(), strict=True))
+
+    def keep(self, asked: dict[str, str]) -> None:
+        """Write the images to the file that `keep` names, if any."""
+        if asked.get("keep"):
+            flat: dict[str, Any] = {f"{n}_{kind}": a for n, view in self._images.items() for kind, a in view.items()}
+            np.savez(asked["keep"], **flat)
 
     def _regions(self, model: Any) -> NDArray[np.uint8]:
         """Region id by a geom's id, plus one for what is no geom."""
@@ -118,28 +125,6 @@ class Simulator:
         return {"rgb": rgb, "depth": depth, "region": region}
 
 
-def main() -> None:
-    """Answer one line with one line until there are no more."""
-    answers = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)
-    simulator = Simulator()
-    print(json.dumps({"ready": True}), file=answers)
-    for line in sys.stdin:
-        asked = json.loads(line)
-        path, before = Path(asked["scene"]), time.perf_counter()
-        scene = json.loads(path.read_text())
-        files = {name: (path.parent / name).read_bytes() for name in ("table.obj", "object.obj")}
-        wall, cpu = time.perf_counter(), time.process_time()
-        stages: dict[str, float] = {}
-        k = scene["intrinsics"]
-        images = simulator.make(describe(scene), files, (k["height"], k["width"]), stages)
-        answer = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu, "stages_s": stages}
-        answer["load_s"] = wall - before
-        if asked.get("keep"):
-            flat: dict[str, Any] = {f"{name}_{kind}": a for name, view in images.items() for kind, a in view.items()}
-            np.savez(asked["keep"], **flat)
-        print(json.dumps(answer), file=answers)
-
-
 if __name__ == "__main__":
-    main()
+    simulator = Simulator()
+    answer_scenes(simulator.load, simulator.make, simulator.keep)

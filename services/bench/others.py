@@ -1,8 +1,9 @@
-"""The other systems that make the scenes beside us. A new one is a module that answers lines, and a row in `SIDES`.
+"""The other systems that make the same scenes. A new one is a module that answers lines, and a row in `SIDES`.
 
 Such a module is a process of its own. It says `{"ready": true}`, then reads one line of JSON for each scene (`scene`: the
-`scene.json` that handover.py wrote beside its meshes; `out`: a folder; and what its row says in `asked`) and answers
-with one line: `wall_s`, `cpu_s`, `stages_s` by stage, and `load_s`, the seconds before its clock in which it read files.
+`scene.json` that handover.py wrote beside its meshes; `out`: a folder; and the items of `asked` in its row) and answers
+with one line: `wall_s`, `cpu_s`, `stages_s` by stage, and `load_s`, the seconds of reading files before its clock.
+`answer_scenes` in answers.py does that.
 """
 
 from collections.abc import Mapping
@@ -14,7 +15,7 @@ from schemas.job.job import Job
 
 @dataclass(frozen=True)
 class Side:
-    """One row: its name in JSON and on paper, what it makes, the module that answers, and the wheel that it needs."""
+    """One other system: its name in JSON and in the text, what it makes, its module, and the package that it needs."""
 
     name: str
     title: str
@@ -23,7 +24,7 @@ class Side:
     asked: Mapping[str, str] = field(default_factory=dict)
     package: str | None = None
     only_raster: bool = False
-    """Whether its images are comparable with the raster tier's alone."""
+    """Whether its images are comparable with those of the raster tier only."""
 
 
 SIDES = (
@@ -56,19 +57,19 @@ ELSEWHERE = {"Blender Cycles": "bpy"}
 
 
 def sides_of(job: Job) -> list[Side]:
-    """The rows that can be filled for a job on this machine."""
+    """The systems that can make a job's scenes on this machine."""
     comparable = [side for side in SIDES if job.render.tier == "raster" or not side.only_raster]
     return [side for side in comparable if side.package is None or installed(side.package)]
 
 
 def other_systems() -> dict[str, str]:
-    """Version by name of the optional systems that are installed, `not installed` for the rest. Nothing is imported."""
+    """Versions of the optional systems by name, `not installed` for those that are not. Imports nothing."""
     packages = {side.title: side.package for side in SIDES if side.package is not None} | ELSEWHERE
     return {title: installed(package) or "not installed" for title, package in packages.items()}
 
 
 def installed(package: str) -> str | None:
-    """Version of a package, None where it is not there."""
+    """Version of a package, None where it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:

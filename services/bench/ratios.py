@@ -1,4 +1,4 @@
-"""Pure: from the times of rounds to the figures of the report."""
+"""Figures of the report from the times of rounds. Pure."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from statistics import median
 
 @dataclass(frozen=True)
 class Spread:
-    """A figure over rounds: its median, its least and its greatest."""
+    """A figure over rounds: its median, minimum and maximum."""
 
     median: float
     least: float
@@ -15,7 +15,7 @@ class Spread:
 
     @classmethod
     def of(cls, figures: Sequence[float]) -> "Spread":
-        """Raises ValueError where there is none."""
+        """The spread of at least one figure. Raises ValueError for none."""
         if not figures:
             raise ValueError("a spread of no figures")
         return cls(median(figures), min(figures), max(figures))
@@ -23,10 +23,10 @@ class Spread:
 
 @dataclass(frozen=True)
 class Lap:
-    """One side's part of a round: how long it took for how many scenes, and of that how long by stage.
+    """One side's part of a round: its scenes, its time, and the time of each stage.
 
-    wall_s by the clock; cpu_s of the processor, which neighbours on the machine disturb less and waiting for the disk
-    does not show in; apart_s of the clock for work that is not in wall_s: the script loads each scene's meshes before.
+    wall_s is by the clock; cpu_s is of the processor, without waiting for the disk and less disturbed by other processes;
+    apart_s is by the clock for work outside wall_s, such as the script's loading of meshes.
     """
 
     scenes: int
@@ -37,7 +37,7 @@ class Lap:
 
     @property
     def slope_s(self) -> float:
-        """Seconds for one scene more: no start-up is in it."""
+        """Seconds for one scene more, without start-up."""
         return self.wall_s / self.scenes
 
 
@@ -55,19 +55,19 @@ def by_processor(lap: Lap) -> float:
 
 
 def with_loading(lap: Lap) -> float:
-    """Seconds for one scene more, what is done apart included."""
+    """Seconds for one scene more, including the work outside the clock."""
     return (lap.wall_s + lap.apart_s) / lap.scenes
 
 
 def slope_ratio(slow: Sequence[Lap], fast: Sequence[Lap], slope: Slope = by_clock) -> Spread:
-    """How many times as many scenes `fast` makes in the same time: of each pair of laps, taken side by side."""
+    """How many times as many scenes `fast` makes in the same time, over pairs of laps of the same round."""
     return Spread.of([slope(a) / slope(b) for a, b in zip(slow, fast, strict=True)])
 
 
 def stage_table(laps: Sequence[Lap], middle: Callable[[list[float]], float] = median) -> dict[str, float]:
     """Milliseconds per scene by stage, the median over laps; `rest` is the remainder.
 
-    With `middle=mean` a stage that few scenes have, such as casting rays, shows what it costs all of them.
+    With `middle=mean` a stage of few scenes, such as casting rays, shows its cost spread over all scenes.
     """
     names = list(dict.fromkeys(name for lap in laps for name in lap.stages_s))
     table = {name: middle([lap.stages_s.get(name, 0.0) / lap.scenes * 1e3 for lap in laps]) for name in names}
@@ -76,10 +76,10 @@ def stage_table(laps: Sequence[Lap], middle: Callable[[list[float]], float] = me
 
 
 def idle_share(shard_wall_s: float, slots: int, run_wall_s: float) -> float:
-    """Share of the slots' time in which no shard ran: what handing out the work, and its uneven end, cost."""
+    """Share of the slots' time in which no shard ran: the cost of handing out work, and of its uneven end."""
     return 1.0 - shard_wall_s / (slots * run_wall_s)
 
 
 def growth(samples: Sequence[float], window: int) -> float:
-    """How far the last `window` samples lie above the first, by medians: 0.05 is 5 % more."""
+    """Relative growth from the first `window` samples to the last, by medians: 0.05 is 5 % more."""
     return median(samples[-window:]) / median(samples[:window]) - 1.0

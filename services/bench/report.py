@@ -1,4 +1,4 @@
-"""Pure: what a benchmark says, as one object and as text."""
+"""The report of a benchmark, as one object and as text. Pure."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -12,7 +12,7 @@ from services.bench.ratios import Lap, Spread, by_processor, slope_ratio, stage_
 
 def summarise(measured: Measured) -> dict[str, Any]:
     """The figures of the rounds: plain numbers, milliseconds per scene, ratios of slopes."""
-    ours, floor = [one.ours for one in measured.rounds], [one.floor for one in measured.rounds]
+    ours, bound = [one.ours for one in measured.rounds], [one.lower_bound for one in measured.rounds]
     scenes = sum(lap.scenes for lap in ours)
     return {
         "machine": measured.machine,
@@ -22,9 +22,9 @@ def summarise(measured: Measured) -> dict[str, Any]:
         "bytes_per_scene": sum(one.bytes for one in measured.rounds) / scenes,
         "startup_s": dict(measured.startup_s),
         "ours": _side(ours),
-        "floor": _side(floor) | {"encoders": measured.encoders, "upload_ms": _apart(floor)},
-        "times_floor": asdict(slope_ratio(ours, floor)),
-        "times_floor_cpu": asdict(slope_ratio(ours, floor, by_processor)),
+        "floor": _side(bound) | {"encoders": measured.encoders, "upload_ms": _apart(bound)},
+        "times_floor": asdict(slope_ratio(ours, bound)),
+        "times_floor_cpu": asdict(slope_ratio(ours, bound, by_processor)),
         "others": {side.name: _other(side, measured, ours) for side in measured.sides},
         "left_out": dict(measured.left_out),
     }
@@ -57,7 +57,7 @@ def _side(laps: Sequence[Lap]) -> dict[str, Any]:
 
 
 def describe(figures: dict[str, Any]) -> list[str]:
-    """The same for a reader, one line each."""
+    """The figures as text, line by line."""
     machine = figures["machine"]
     others: dict[str, dict[str, Any]] = figures["others"]
     threads = machine["threads_per_core"]

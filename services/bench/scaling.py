@@ -1,7 +1,7 @@
-"""Several workers against one, through the real coordinator, and beside it several plain processes against one."""
+"""Scaling: several workers against one through the coordinator, and several plain processes against one."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +20,10 @@ from workers.store.local import LocalStore
 
 @dataclass(frozen=True)
 class Gain:
-    """What several at once gain over one, over rounds.
+    """The gain of several at once over one, over rounds.
 
-    speedup: how many times one's pace; inflation: how many times the processor time that a scene takes alone, which is
-    what they cost one another by sharing caches, memory and clock, and no time that anybody waits.
+    speedup: ratio of the paces; inflation: ratio of the processor time a scene, the cost of sharing caches, memory and clock,
+    without waiting.
     """
 
     scenes: int
@@ -34,7 +34,7 @@ class Gain:
 
     @classmethod
     def of(cls, one: Sequence[Lap], several: Sequence[Lap]) -> "Gain":
-        """From laps of one and of all, in pairs; a lap's wall is from the first scene's begin to the last one's end."""
+        """The gain from laps of one and of all, in pairs; a lap lasts from the first scene's start to the last one's end."""
         pairs = list(zip(one, several, strict=True))
         return cls(
             scenes=several[0].scenes,
@@ -49,8 +49,8 @@ class Gain:
 class Scaling:
     """`ray`: workers through the coordinator; `bare`: plain processes, each on a core of its own.
 
-    ray_share: of the slots' time, what no shard used while all worked, the uneven end of the last shards included;
-    ray_share_one: the same with one worker, which has no such end. share_of_bare: the one speed-up over the other.
+    ray_share: the share of the slots' time without a shard, the uneven end of the last shards included; ray_share_one: the
+    same with one worker, which has no such end. share_of_bare: Ray's speed-up over that of plain processes.
     """
 
     workers: int
@@ -98,13 +98,13 @@ def measure_scaling(
 
 
 def _together(laps: Sequence[Lap]) -> Lap:
-    """One lap of processes that began together: until the last has ended."""
+    """One lap of processes that started together, until the last one's end."""
     return Lap(sum(lap.scenes for lap in laps), max(lap.wall_s for lap in laps), sum(lap.cpu_s for lap in laps), {})
 
 
 @dataclass(frozen=True)
 class _RayDrive:
-    """Runs of the coordinator on a Ray that is there."""
+    """Runs of the coordinator on a running Ray."""
 
     job: Job
     catalogue: Catalogue
@@ -112,20 +112,17 @@ class _RayDrive:
     workers: int
 
     def run(self, name: str, slots: int, count: int, shard_size: int) -> tuple[Lap, float]:
-        """A lap of so many scenes, and the share of the slots' time in which no shard ran."""
+        """A lap of that many scenes, and the share of the slots' time without a shard."""
         out, size, first = self.folder / name, self.job.run.range_size, self.job.first_scene
         store = LocalStore(out)
         store.prepare()
         spans = [Span(start=s, stop=min(s + size, first + count)) for s in range(first, first + count, size)]
         tally = Tally(asked=count)
-        # A shard that waits could be started by the other slot: one at a time where one is to work.
+        # The other slot could start a waiting shard, so one worker gets one shard at a time.
         limits = Limits(PREFETCH * slots if slots == self.workers else slots, 1, count)
         begun = time.perf_counter()
         work = Work(store, bench_order(self.job, out), self.catalogue)
-        run_spans(work, group_shards(spans, shard_size), limits, _quiet, tally)
+        run_spans(work, group_shards(spans, shard_size), limits, lambda tally: None, tally)
         seconds = time.perf_counter() - begun
         idle = idle_share(tally.shard_wall_s, slots, seconds)
         return Lap(tally.made, seconds, tally.shard_cpu_s, {}), idle
-
-
-_quiet: Callable[[Tally], None] = lambda tally: None  # noqa: E731

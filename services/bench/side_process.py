@@ -1,4 +1,4 @@
-"""Another system as a process beside us: one line to it for each scene, one line back."""
+"""Another system in a process of its own: one line of JSON to it for each scene, one line back."""
 
 import contextlib
 import json
@@ -17,13 +17,15 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 class SideProcess:
-    """A running module. It inherits our core and our environment, and never shares our OpenGL context."""
+    """A running script. It inherits our core and our environment, and never shares our OpenGL context."""
 
-    def __init__(self, module: str, process: subprocess.Popen[str], errors: IO[str]) -> None:
-        self._module, self._process, self._errors = module, process, errors
+    def __init__(self, name: str, process: subprocess.Popen[str], errors: IO[str]) -> None:
+        self._name, self._process, self._errors = name, process, errors
+        self.greeting = self.ask()
+        """The first answer, given before any question."""
 
     def run(self, scenes: Sequence[Path], out: Path, asked: Mapping[str, str]) -> Lap:
-        """Make these scenes, one after another, into one folder."""
+        """Makes these scenes, one after another, into one folder."""
         wall, cpu, load = 0.0, 0.0, 0.0
         stages: dict[str, float] = {}
         for scene in scenes:
@@ -33,8 +35,8 @@ class SideProcess:
                 stages[stage] = stages.get(stage, 0.0) + seconds
         return Lap(len(scenes), wall, cpu, stages, load)
 
-    def ask(self, question: Mapping[str, str] | None = None) -> dict[str, Any]:
-        """The next answer. Raises MachineError with the process's last words where it died."""
+    def ask(self, question: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """The next answer. Raises MachineError with the process's last lines where it died."""
         assert self._process.stdin is not None and self._process.stdout is not None
         line = ""
         with contextlib.suppress(BrokenPipeError):
@@ -46,28 +48,30 @@ class SideProcess:
             self._process.wait()
             self._errors.seek(0)
             last = " | ".join(self._errors.read().strip().splitlines()[-5:])
-            raise MachineError(f"{self._module} ended ({self._process.returncode}): {last}")
+            raise MachineError(f"{self._name} ended ({self._process.returncode}): {last}")
         answer: dict[str, Any] = json.loads(line)
         return answer
 
 
 @contextlib.contextmanager
 def side_process(module: str) -> Iterator[tuple[SideProcess, float]]:
-    """The module as a process, ready for its first scene, and the seconds that took. Raises MachineError."""
+    """One of our modules as a process, ready for its first scene, and the seconds that took. Raises MachineError."""
     begun = time.perf_counter()
+    with start_side([sys.executable, "-W", "ignore", "-m", module], module) as side:
+        yield side, time.perf_counter() - begun
+
+
+@contextlib.contextmanager
+def start_side(command: Sequence[str], name: str) -> Iterator[SideProcess]:
+    """The command as a process, after its first answer; `name` stands in messages. Raises MachineError."""
+    pipe = subprocess.PIPE
     with tempfile.TemporaryFile("w+") as errors:
-        process = subprocess.Popen(
-            [sys.executable, "-W", "ignore", "-m", module],
-            cwd=ROOT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            text=True,
-        )
         try:
-            side = SideProcess(module, process, errors)
-            side.ask()
-            yield side, time.perf_counter() - begun
+            process = subprocess.Popen(command, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=errors, text=True)
+        except OSError as error:
+            raise MachineError(f"{command[0]} cannot be run: {error}") from error
+        try:
+            yield SideProcess(name, process, errors)
         finally:
             process.kill()
             process.communicate()

@@ -1,4 +1,4 @@
-"""Our side: whole scenes of a job, through the real path, onto a real disk."""
+"""Our side of the benchmark: whole scenes of a job by the production code, onto a real disk."""
 
 import time
 from dataclasses import dataclass, field
@@ -7,17 +7,14 @@ from pathlib import Path
 from schemas.dataset.commit import CommitRecord, CommitTerms, Span
 from schemas.dataset.shard import ShardOrder
 from schemas.errors import RunError, SceneError
-from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from services.bench.ratios import Lap
-from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.pipeline.allocator import keep_freed_memory
-from workers.pipeline.context import WorkerContext
+from workers.assets.catalogue import open_catalogue
+from workers.pipeline.context import WorkerContext, open_worker
 from workers.pipeline.make_scene import Scene, make_scene
 from workers.pipeline.run_shard import run_span
 from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.context import require_device
-from workers.render.raster.gbuffer import shared_renderer
 from workers.store.commit import read_record
 from workers.store.local import LocalStore
 
@@ -32,7 +29,7 @@ class Workbench:
     next_scene: int = field(default=0)
 
     def next_span(self, scenes: int) -> Span:
-        """The next range: scenes that were not made before, so that no shape is at hand already."""
+        """The next range, of new scenes, so that no shape is cached already."""
         span = Span(start=self.next_scene, stop=self.next_scene + scenes)
         self.next_scene = span.stop
         return span
@@ -48,13 +45,13 @@ class Workbench:
         return lap
 
     def record(self, span: Span) -> CommitRecord:
-        """What the range left on disk."""
+        """The range's commit record."""
         record = read_record(self.store, span.start)
         assert record is not None
         return record
 
     def scenes(self, span: Span) -> list[Scene]:
-        """The same scenes once more in memory, those that can be made, for the sides that we are compared with."""
+        """The same scenes once more in memory, without those that fail, as input for the other sides."""
         made = []
         for scene_id in span.scene_ids:
             try:
@@ -69,12 +66,13 @@ def open_workbench(job: Job, job_folder: Path, out: Path) -> Workbench:
     catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
     store = LocalStore(out)
     store.prepare()
-    order = bench_order(job, out)
-    return Workbench(_context(job, catalogue), store, order, job.first_scene)
+    context = open_worker(job, catalogue)
+    require_device(context.renderer.name, job.run.device)
+    return Workbench(context, store, bench_order(job, out), job.first_scene)
 
 
 def bench_order(job: Job, out: Path) -> ShardOrder:
-    """The pattern of every shard of a benchmark."""
+    """The order that every shard of a benchmark follows."""
     terms = CommitTerms(
         job_digest="bench",
         fingerprint="bench",
@@ -84,10 +82,3 @@ def bench_order(job: Job, out: Path) -> ShardOrder:
         range_size=job.run.range_size,
     )
     return ShardOrder(out=str(out), job=job, terms=terms, spans=())
-
-
-def _context(job: Job, catalogue: Catalogue) -> WorkerContext:
-    keep_freed_memory()
-    renderer = shared_renderer()
-    require_device(renderer.name, job.run.device)
-    return WorkerContext(job, catalogue, renderer, settings_digest(job, catalogue.digest))

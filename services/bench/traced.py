@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import MachineError, RunError, SceneError
-from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.job.render import Render
 from services.bench.cycles import CyclesProcess, cycles_process, hand_over, trace_lap
 from services.bench.machine import describe_machine, pinned
 from services.bench.ratios import Lap, Spread, by_processor, slope_ratio
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.context import WorkerContext
+from workers.pipeline.context import open_worker
 from workers.pipeline.make_scene import Scene, make_scene
 from workers.pipeline.stopwatch import Stopwatch
 from workers.plan.effect import Facts
@@ -59,10 +58,10 @@ def measure_traced(options: argparse.Namespace, job: Job, job_folder: Path, fold
 
 
 def first_scenes(job: Job, job_folder: Path, count: int) -> list[Scene]:
-    """The first scenes that can be made, posed and with their cameras. Raises RunError where there is none."""
+    """The first scenes that can be made, posed and with their cameras. Raises RunError for none."""
     job = job.model_copy(update={"render": Render(tier="raster")})
     catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
-    context = WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
+    context = open_worker(job, catalogue)
     made, reason = [], ""
     for scene_id in range(job.first_scene, job.first_scene + count):
         try:
@@ -75,7 +74,7 @@ def first_scenes(job: Job, job_folder: Path, count: int) -> list[Scene]:
 
 
 def measure_scene(scene: Scene, folder: Path, cycles: CyclesProcess | None) -> dict[str, Lap]:
-    """Laps over the scene's three rendered views by side and samples, such as `ours 16`; its building is in each."""
+    """Laps over the scene's three rendered views by side and samples, such as `ours 16`, including building the scene."""
     pair = scene.pairs[0]
     cameras = [view.camera for view in pair.views if view.role != "projected"]
     laps = {}
@@ -90,7 +89,7 @@ def measure_scene(scene: Scene, folder: Path, cycles: CyclesProcess | None) -> d
 
 
 def summarise(laps: list[dict[str, Lap]]) -> dict[str, Any]:
-    """Milliseconds of processor a view, and how many views ours makes while Cycles makes one, over scenes."""
+    """Milliseconds of processor a view, and our views for each view of Cycles, over scenes."""
     sides = {name: [lap[name] for lap in laps] for name in laps[0]}
     ms = {name: asdict(Spread.of([1e3 * by_processor(lap) for lap in own])) for name, own in sides.items()}
     both = [n for n in SAMPLES if f"cycles {n}" in sides]
@@ -99,7 +98,7 @@ def summarise(laps: list[dict[str, Lap]]) -> dict[str, Any]:
 
 
 def describe(figures: dict[str, Any]) -> list[str]:
-    """The same for a reader."""
+    """The figures as text, line by line."""
     machine = figures["machine"]
     lines = [
         f"machine    {machine['cpu']}, load {machine['load_1min']:.1f}",

@@ -1,20 +1,20 @@
-"""Pure: the one sentence that a study comes to."""
+"""The answer of a study in one sentence. Pure."""
 
 from collections.abc import Sequence
 
 from services.study.choose import AS_CHEAP, TargetError, Targets, candidates, cheapest, choose, error_of, own_row
-from services.study.model import Figure, Row, Study
+from services.study.model import Row, Study
 from services.study.words import amount, duration, listed, milliseconds, short, size, times
 
 DEFAULT_TARGETS: Targets = {"penetration_mm": 0.1, "gap_mm": 0.1, "pose_mm": 0.1, "depth_mm": 0.1, "mask_share": 0.001}
-"""What is asked where nothing is: what a dataset's labels are promised to keep to."""
+"""The targets without a wish of the user: the accuracy that a dataset's labels promise."""
 
 
 def answer(study: Study, targets: Targets | None = None) -> str:
-    """One sentence: which setting to use for the targets, what it costs, and what the next better costs.
+    """One sentence: which setting to use for the targets, what it costs, and what the next better one costs.
 
-    Where no targets are given they are `DEFAULT_TARGETS` as far as the study measured them, and nothing else may become
-    worse than the job is, as far as the scenes can tell: whoever asks for nothing keeps the images that they have.
+    Without targets they are `DEFAULT_TARGETS` as far as the study measured them, and no other error may grow beyond the
+    job's own interval, so that a user without a wish keeps the same images.
     """
     asked, bounds = (targets, {}) if targets is not None else default_targets(study.rows)
     wish = describe_targets(asked)
@@ -52,14 +52,14 @@ def recommend(study: Study, targets: Targets | None = None) -> Row:
 
 
 def default_targets(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]:
-    """What is asked where nothing is, and what every other error may be: the upper end of the job's own interval."""
+    """The default targets that were measured, and the bound of every other error: the upper end of the job's own interval."""
     own = own_row(rows).errors
     asked = {name: target for name, target in DEFAULT_TARGETS.items() if name in own}
     return asked, {name: max(own[name].value, own[name].high) for name in own if name not in asked}
 
 
 def blind_knobs(rows: Sequence[Row]) -> set[str]:
-    """Knobs of which no value has a figure, such as the tier where FLIP was not measured: nobody knows what they cost."""
+    """Knobs without any measured error, such as the tier without FLIP: their loss is unknown."""
     single = [(row.setting.parts[0][0], row) for row in rows if len(row.setting.parts) == 1]
     return {knob for knob, _ in single} - {knob for knob, row in single if set(row.errors) - {"failed_share"}}
 
@@ -74,26 +74,23 @@ def describe_targets(targets: Targets) -> str:
 
 
 def next_better(rows: Sequence[Row], chosen: Row, targets: Targets) -> Row | None:
-    """The cheapest that is better in what was asked: one interval below, and no other value above.
+    """The cheapest setting that is better: in one target its interval lies below, and in no other its value is above.
 
-    Intervals decide, so that noise of a few scenes is not called better; and of what costs as much as the cheapest
-    (`AS_CHEAP`) errors decide, as in `choose`.
+    Intervals decide, so that the noise of a few scenes does not count as better; among equal costs (`AS_CHEAP`) errors
+    decide, as in `choose`.
     """
-
-    def pair(row: Row, name: str) -> tuple[Figure, Figure] | None:
-        theirs, ours = error_of(row, name, rows), error_of(chosen, name, rows)
-        return (theirs, ours) if theirs and ours else None
-
     better = []
     for row in candidates(rows, targets):
-        pairs = [both for name in targets if (both := pair(row, name))]
-        if all(theirs.value <= ours.high for theirs, ours in pairs):
-            better += [row] if any(theirs.high < ours.low for theirs, ours in pairs) else []
+        both = [(error_of(row, name, rows), error_of(chosen, name, rows)) for name in targets]
+        pairs = [(theirs, ours) for theirs, ours in both if theirs and ours]
+        no_worse = all(theirs.value <= ours.high for theirs, ours in pairs)
+        if no_worse and any(theirs.high < ours.low for theirs, ours in pairs):
+            better.append(row)
     return cheapest(better, rows) if better else None
 
 
 def worse_than(row: Row, own: Row, rows: Sequence[Row]) -> list[str]:
-    """What a setting gives up against the job, in words: errors whose interval lies above the job's."""
+    """The losses of a setting against the job, in words: errors whose interval lies above the job's."""
     worse = []
     for name, ours in own.errors.items():
         theirs = error_of(row, name, rows)

@@ -1,8 +1,9 @@
-"""Pure: which settings are worth their time, and which one meets a target at the least cost."""
+"""Chooses the cheapest setting that meets the targets, and the front of settings worth their time. Pure."""
 
 import difflib
 import math
 from collections.abc import Mapping, Sequence
+from decimal import ROUND_CEILING, Context
 
 from schemas.errors import InputError, RunError
 from services.study.errors import ERRORS
@@ -10,13 +11,13 @@ from services.study.model import Figure, Row
 from services.study.words import amount, listed, number, shown, times, unit
 
 Targets = Mapping[str, float]
-"""The most that an error may be, by name of `ERRORS`, in the unit of the table: shares from 0 to 1."""
+"""The greatest allowed value of each error, by name of `ERRORS`, in the unit of the table: shares from 0 to 1."""
 
 AS_CHEAP = 1.05
-"""Costs this many times the least count as the least: interleaved medians on one core come back within some 3 %."""
+"""Costs up to this many times the least count as the least: interleaved medians on one core repeat within some 3 %."""
 
 MORE_FAILED = 0.01
-"""A setting may fail this many more of the scenes than the job does: beyond that, being cheap is leaving work out."""
+"""A setting may fail this share of scenes more than the job; one that fails more is cheap because it leaves work out."""
 
 
 class TargetError(RunError):
@@ -34,7 +35,7 @@ def own_row(rows: Sequence[Row]) -> Row:
 def error_of(row: Row, name: str, rows: Sequence[Row]) -> Figure | None:
     """An error of a setting, or the job's own where this setting did not measure it, or None where neither did.
 
-    A setting measures the errors that its knobs can move: in the others it is as the job is.
+    A setting measures only the errors that its knobs can move.
     """
     found = row.errors.get(name)
     if found is None and name == "failed_share":
@@ -43,9 +44,9 @@ def error_of(row: Row, name: str, rows: Sequence[Row]) -> Figure | None:
 
 
 def front(rows: Sequence[Row], error: str) -> list[Row]:
-    """Those that measured an error and of which no other is as cheap and as good, from the cheapest to the best.
+    """The Pareto front of time and an error, from the cheapest setting to the best.
 
-    Of settings alike in both, the first by name stands for all.
+    Of settings equal in both, the first by name is kept.
     """
     kept: list[Row] = []
     measured = [row for row in rows if error in row.errors and not math.isnan(row.errors[error].value)]
@@ -65,12 +66,12 @@ def choose(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None)
 
     An error that a setting did not measure is the job's own (`error_of`). Unless failed scenes are a target themselves, a
     setting that fails `MORE_FAILED` more of them than the job is left out. `bounds` are further targets that the message
-    does not speak of.
+    does not name.
 
-    Run twice, it should be the same one. Errors are, to the bit, as scenes are a pure function of job and seed; so
-    is who meets the targets. Times are not. Hence what costs at most `AS_CHEAP` times the least counts as the least, and
-    among those what does not change decides: the job itself before anything else, as a change for 5 % is not worth making;
-    then the least sum of errors relative to the job's own; then the fewest changes; then the name.
+    The choice should be repeatable. Errors are, to the bit, because scenes are a pure function of job and seed; times are
+    not. So every cost up to `AS_CHEAP` times the least counts as the least, and facts without noise decide among those: the
+    job itself first, because a change for 5 % is not worth making; then the least sum of errors relative to the job's own;
+    then the fewest changes; then the name.
     """
     check_targets(rows, targets)
     meeting = [row for row in candidates(rows, targets) if meets(row, {**(bounds or {}), **targets}, rows)]
@@ -80,20 +81,20 @@ def choose(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None)
 
 
 def cheapest(some: Sequence[Row], rows: Sequence[Row]) -> Row:
-    """Of some of the rows, at least one, that which costs the least; among those as cheap, by what is told in `choose`."""
+    """The cheapest of some of the rows, at least one, by the rules of `choose`."""
     least = min(row.ratio for row in some)
-    return min((row for row in some if row.ratio <= least * AS_CHEAP), key=lambda row: _steady_order(row, rows))
+    return min((row for row in some if row.ratio <= least * AS_CHEAP), key=lambda row: _tie_order(row, rows))
 
 
-def _steady_order(row: Row, rows: Sequence[Row]) -> tuple[bool, float, int, str]:
+def _tie_order(row: Row, rows: Sequence[Row]) -> tuple[bool, float, int, str]:
     setting = row.setting
     return (bool(setting.parts), round(relative_error(row, rows), 6), len(setting.parts), setting.name)
 
 
 def relative_error(row: Row, rows: Sequence[Row]) -> float:
-    """The sum of a setting's errors, each in shares of the job's own: as many as there are errors where it is the job's.
+    """The sum of a setting's errors, each as a share of the job's own.
 
-    Where the job's own is 0, any error counts as twice as much.
+    Where the job's own is 0, any error counts as a share of 2.
     """
     total = 0.0
     for name, own in own_row(rows).errors.items():
@@ -104,13 +105,13 @@ def relative_error(row: Row, rows: Sequence[Row]) -> float:
 
 
 def candidates(rows: Sequence[Row], targets: Targets) -> list[Row]:
-    """Those that may be chosen at all."""
+    """The settings that may be chosen: those that do not fail too many scenes."""
     most = own_row(rows).failed_share + MORE_FAILED
     return [row for row in rows if "failed_share" in targets or row.failed_share <= most]
 
 
 def meets(row: Row, targets: Targets, rows: Sequence[Row]) -> bool:
-    """Whether all errors are at most their targets; one that nothing measured meets none."""
+    """Whether all errors are at most their targets; an error that was never measured meets none."""
     return all(
         (found := error_of(row, name, rows)) is not None and found.value <= target for name, target in targets.items()
     )
@@ -135,11 +136,11 @@ def _unknown(name: str) -> str:
     return f"--target {name}: there is no such error; {hint}Known: {', '.join(ERRORS)}"
 
 
-# ---------------------------------------------------------------------------------------------- nobody meets them
+# ---------------------------------------------------------------------------------------------- no setting meets them
 
 
 def describe_miss(rows: Sequence[Row], targets: Targets) -> str:
-    """What the nearest setting misses the targets by, and what to ask for instead."""
+    """The nearest setting, by how much it misses the targets, and which targets it would meet."""
     nearest = nearest_row(rows, targets)
     told, loosened = [], []
     for name, target in targets.items():
@@ -161,30 +162,24 @@ def describe_miss(rows: Sequence[Row], targets: Targets) -> str:
 
 
 def nearest_row(rows: Sequence[Row], targets: Targets) -> Row:
-    """The one whose farthest miss, as a multiple of its target, is the least; of such the cheapest, then by name."""
+    """The setting whose greatest excess over its targets is the least; then the cheapest, then by name."""
 
     def key(row: Row) -> tuple[float, float, str]:
-        found = {name: error_of(row, name, rows) for name in targets}
-        values = {name: math.inf if figure is None else figure.value for name, figure in found.items()}
-        worst = max(_excess(values[name], target) for name, target in targets.items())
+        found = [(error_of(row, name, rows), target) for name, target in targets.items()]
+        worst = max(_excess(math.inf if figure is None else figure.value, target) for figure, target in found)
         return (worst, row.ratio, row.setting.name)
 
     return min(candidates(rows, targets), key=key)
 
 
 def _excess(value: float, target: float) -> float:
-    """How many times its target a value is; against a target of 0, as if that were a millionth."""
+    """How many times its target a value is; a target of 0 counts as a millionth."""
     return value / max(target, 1e-6) if value > target else 1.0
 
 
 def _above(value: float) -> str:
-    """A short number, not under the value, so that a target of it is met."""
-    for digits in range(2, 18):
-        step = 10.0 ** (math.floor(math.log10(value)) - digits + 1)
-        text = f"{math.ceil(value / step * (1 - 1e-12)) * step:.{digits}g}"
-        if float(text) >= value:
-            return text
-    return repr(value)
+    """The value in two digits, rounded up, so that a target of it is met."""
+    return f"{Context(prec=2, rounding=ROUND_CEILING).create_decimal(repr(value)):f}"
 
 
 # ---------------------------------------------------------------------------------------------- what a user types

@@ -1,4 +1,4 @@
-"""The errors that the study measures, and what each is held against. Truth never comes from the setting under test."""
+"""The errors that the study measures, each with the truth it is held against, which is never the setting under test."""
 
 from services.study.model import ErrorKind
 
@@ -8,31 +8,42 @@ _PATCH = "rays at random in the objects' patch"
 _FINEST = "the finest steps, 1 s"
 _REFERENCE = "finer steps than any that is measured"
 
+# fmt: off
 KINDS: tuple[ErrorKind, ...] = (
-    ErrorKind("penetration_mm", "mm", "how deep an object stands in what it rests on", "the stored shapes", "physics"),
-    ErrorKind("gap_mm", "mm", "how high an object hovers", "the stored shapes", "physics"),
-    ErrorKind("moved_mm", "mm", "how far an object moves when it is let go again", _FINEST, "physics"),
-    ErrorKind("turned_deg", "deg", "how far it turns when it is let go again", _FINEST, "physics"),
-    ErrorKind("pose_mm", "mm", "pose off, where two finer settings agree", _REFERENCE, "physics"),
-    ErrorKind(
-        "outcome_mm", "mm", "how far things slide and roll: two distributions apart", _REFERENCE, "physics", True
-    ),
-    ErrorKind("outcome_deg", "deg", "how far things turn: two distributions apart", _REFERENCE, "physics", True),
-    ErrorKind("failed_share", "", "scenes that do not come to rest", "counted", "physics", True),
-    ErrorKind("depth_mm", "mm", "stored depth of objects off, 99 % of pixels", _RAYS, "labels"),
-    ErrorKind("table_depth_mm", "mm", "stored depth of the table off, 99 % of pixels", _RAYS, "labels"),
-    ErrorKind("mask_share", "", "object pixels that are wrong in the mask", _RAYS, "labels"),
-    ErrorKind("between_mm", "mm", "depth between pixels, read at the nearest", _PATCH, "labels"),
-    ErrorKind("outline_share", "", "rays at random whose region the nearest pixel has wrong", _PATCH, "labels"),
-    ErrorKind("mirror_mm", "mm", "mirror camera off, as d_z is", _FRONT, "mirror"),
-    ErrorKind("agreement_mm", "mm", "input depth carried into the mirror view, off", "the mirror view", "mirror"),
-    ErrorKind("unfilled_share", "", "object pixels of the mirror view seen by both that stay empty", _RAYS, "mirror"),
-    ErrorKind("hidden_share", "", "projected pixels that show what the mirror camera cannot see", _RAYS, "mirror"),
-    ErrorKind("flip", "", "colour: FLIP, 0 the same to 1", "a converged path-traced image", "colour"),
-    ErrorKind(
-        "edge_flip", "", "smoothness of edges: FLIP, 0 the same to 1", "64 samples a pixel, same light", "colour"
-    ),
+    ErrorKind("penetration_mm", "mm", "penetration",
+              "how deep an object stands in what it rests on", "the stored shapes", "physics"),
+    ErrorKind("gap_mm", "mm", "gap", "how high an object hovers", "the stored shapes", "physics"),
+    ErrorKind("moved_mm", "mm", "motion when let go again",
+              "how far an object moves when it is let go again", _FINEST, "physics"),
+    ErrorKind("turned_deg", "deg", "turn when let go again",
+              "how far it turns when it is let go again", _FINEST, "physics"),
+    ErrorKind("pose_mm", "mm", "pose", "pose off, where two finer settings agree", _REFERENCE, "physics"),
+    ErrorKind("outcome_mm", "mm", "where things end, on the whole",
+              "how far things slide and roll: two distributions apart", _REFERENCE, "physics", True),
+    ErrorKind("outcome_deg", "deg", "how they lie, on the whole",
+              "how far things turn: two distributions apart", _REFERENCE, "physics", True),
+    ErrorKind("failed_share", "", "scenes that fail", "scenes that do not come to rest", "counted", "physics", True),
+    ErrorKind("depth_mm", "mm", "depth of objects", "stored depth of objects off, 99 % of pixels", _RAYS, "labels"),
+    ErrorKind("table_depth_mm", "mm", "depth of the table",
+              "stored depth of the table off, 99 % of pixels", _RAYS, "labels"),
+    ErrorKind("mask_share", "", "the object's mask pixels",
+              "object pixels that are wrong in the mask", _RAYS, "labels"),
+    ErrorKind("between_mm", "mm", "depth between pixels",
+              "depth between pixels, read at the nearest", _PATCH, "labels"),
+    ErrorKind("outline_share", "", "regions between pixels",
+              "rays at random whose region the nearest pixel has wrong", _PATCH, "labels"),
+    ErrorKind("mirror_mm", "mm", "mirror camera", "mirror camera off, as d_z is", _FRONT, "mirror"),
+    ErrorKind("agreement_mm", "mm", "agreement of the views",
+              "input depth carried into the mirror view, off", "the mirror view", "mirror"),
+    ErrorKind("unfilled_share", "", "projected pixels left empty",
+              "object pixels of the mirror view seen by both that stay empty", _RAYS, "mirror"),
+    ErrorKind("hidden_share", "", "projected pixels that show through",
+              "projected pixels that show what the mirror camera cannot see", _RAYS, "mirror"),
+    ErrorKind("flip", "", "colour, FLIP", "colour: FLIP, 0 the same to 1", "a converged path-traced image", "colour"),
+    ErrorKind("edge_flip", "", "edges, FLIP",
+              "smoothness of edges: FLIP, 0 the same to 1", "64 samples a pixel, same light", "colour"),
 )
+# fmt: on
 
 ERRORS: dict[str, ErrorKind] = {kind.name: kind for kind in KINDS}
 """By name."""

@@ -1,4 +1,4 @@
-"""What is measured, unit by unit, in a file that outlives the process: the same command goes on where it stopped."""
+"""The journal of a study: a file of answers, with which the same command goes on where it stopped."""
 
 import json
 from collections.abc import Mapping
@@ -11,9 +11,9 @@ JOURNAL_FILE = "journal.jsonl"
 
 
 class Journal:
-    """Answers by the name of what was asked, one JSON line each; the first line says of which study.
+    """Answers by the unit's name, one JSON line each; the first line identifies the study.
 
-    A line that was cut off by the end of a process is dropped, and its unit measured again.
+    A line that the end of a process cut off is dropped, and its unit measured again.
     """
 
     def __init__(self, folder: Path, header: Mapping[str, Any]) -> None:
@@ -55,7 +55,7 @@ class Journal:
         return self._answers[unit]
 
     def add(self, unit: str, answer: Any) -> None:
-        """Keep what was measured."""
+        """Keep an answer, on disk too."""
         self._answers[unit] = answer
         self._write({"unit": unit, "answer": answer})
 

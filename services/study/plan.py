@@ -1,4 +1,4 @@
-"""What is asked of a study: the job, what is turned, and how much is measured."""
+"""The plan of a study: the job, its knobs, and how much is measured."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,9 +12,9 @@ from services.study.model import Knob, Setting
 class Sizes:
     """How much is measured, in scenes.
 
-    Of `scenes` the images are looked at; of `settled` only how they come to rest: `released` of them are let go again, and
-    `posed` have their poses compared with the truth. `timed` are timed in each of `laps` rounds; `coloured` are drawn with
-    very many paths.
+    `scenes` have their images measured. `settled` only come to rest; the first `released` of them are released again, and
+    the first `posed` have their poses compared with the truth. `timed` are timed in each of `laps` rounds; `coloured` are
+    drawn with very many paths.
     """
 
     scenes: int = 48
@@ -28,7 +28,7 @@ class Sizes:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked: the job that is timed, its knobs and settings, the presets, the targets."""
+    """The job that is timed, its knobs and settings, the presets, the targets, and the sizes."""
 
     job: Job
     job_folder: Path

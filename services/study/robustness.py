@@ -1,4 +1,4 @@
-"""Pure: whether the choice would be another one if a time were off by its noise."""
+"""Finds the settings whose noise in time would change the choice. Pure."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ from services.study.choose import Targets, candidates, choose, meets
 from services.study.model import Row
 
 NOISE = 0.02
-"""How far a ratio may be off: what interleaved medians on one core differ by from run to run."""
+"""Relative noise of a ratio: the difference of interleaved medians on one core from run to run."""
 
 
 def close_calls(
@@ -15,9 +15,9 @@ def close_calls(
 ) -> list[Row]:
     """The settings whose time decides the choice: were one of them off by `noise`, another setting would be chosen.
 
-    None means that the choice holds. No rule makes it hold where times decide: of made-up studies with 5 to 45 settings
-    and ratios off by 1 %, two runs agree on the cheapest setting in 93 of 100, and on what `choose` says in 96. So these
-    are the settings to time for some more rounds. Raises what `choose` raises.
+    They are to be timed for some more rounds; an empty list means that the choice holds. No rule makes it always hold: in
+    made-up studies with 5 to 45 settings and ratios off by 1 %, two runs agree on the cheapest setting in 93 of 100, and on
+    the result of `choose` in 96. Raises what `choose` raises.
     """
     chosen = choose(rows, targets, bounds)
     wanted = {**(bounds or {}), **targets}

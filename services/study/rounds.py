@@ -1,4 +1,4 @@
-"""A round of the study: settings that are measured beside one another, what of each, and the table that comes of it."""
+"""A round of the study: settings that are measured side by side, the units of work, and the resulting table."""
 
 import itertools
 from collections.abc import Iterator
@@ -16,18 +16,24 @@ from services.study.plan import Plan
 
 @dataclass(frozen=True)
 class Unit:
-    """One thing to measure, which is kept by its name: `kind` is time, settling, images or colour."""
+    """One scene to measure with these settings; its answer is kept by its name.
+
+    `kind`: time, settling, images or colour. Of time: its `lap`. Of settling: whether poses are held against the truth
+    (`posed`) and objects released again (`released`).
+    """
 
     name: str
     kind: str
     settings: tuple[Setting, ...]
     scene_id: int
     lap: int = 0
+    posed: bool = False
+    released: bool = False
 
 
 @dataclass(frozen=True)
 class Round:
-    """Settings that are measured beside one another; the job itself is the first of them."""
+    """Settings that are measured side by side; the first is the job itself."""
 
     plan: Plan
     name: str
@@ -35,50 +41,46 @@ class Round:
     times_only: bool = False
 
     def of(self, *groups: Group) -> tuple[Setting, ...]:
-        """The settings that change any of these parts of a scene, and the job's own."""
+        """The job's own setting, and those that change any of these parts of a scene."""
         knobs = {knob.name: knob for knob in self.plan.knobs}
-        return tuple(
-            setting
-            for number, setting in enumerate(self.settings)
-            if number == 0 or groups_of(setting, knobs) & set(groups)
-        )
+        return (self.settings[0], *(one for one in self.settings[1:] if groups_of(one, knobs) & set(groups)))
 
     def timings(self) -> list[Unit]:
-        """Rounds of timing, one unit a scene."""
-        scenes, sizes = self._scenes(self.plan.sizes.timed), self.plan.sizes
+        """The units of time, in the order in which they are taken: lap by lap."""
+        first, sizes = self.plan.job.first_scene, self.plan.sizes
         return [
             Unit(f"{self.name}/time/{lap}/{scene}", "time", self.settings, scene, lap)
-            for lap, scene in itertools.product(range(sizes.laps), scenes)
+            for lap, scene in itertools.product(range(sizes.laps), range(first, first + sizes.timed))
         ]
 
     def errors(self) -> list[Unit]:
-        """Everything else, a unit a scene each."""
-        sizes = self.plan.sizes
+        """The units of errors."""
+        first, sizes = self.plan.job.first_scene, self.plan.sizes
         kinds: list[tuple[str, tuple[Setting, ...], int]] = [
             ("colour", self.of("colour"), sizes.coloured),
             ("images", self.of("labels", "mirror"), sizes.scenes),
             ("settling", self.of("physics"), sizes.settled),
         ]
         return [
-            Unit(f"{self.name}/{kind}/{scene}", kind, settings, scene)
+            Unit(
+                f"{self.name}/{kind}/{first + number}",
+                kind,
+                settings,
+                first + number,
+                posed=number < sizes.posed,
+                released=number < sizes.released,
+            )
             for kind, settings, count in kinds
-            for scene in self._scenes(count)
+            for number in range(count)
             if len(settings) > 1 and not self.times_only
         ]
 
-    def units(self) -> list[Unit]:
-        """All."""
-        return [*self.timings(), *self.errors()]
-
-    def _scenes(self, count: int) -> list[int]:
-        return list(range(self.plan.job.first_scene, self.plan.job.first_scene + count))
-
     def rows(self, journal: Journal) -> tuple[Row, ...]:
-        """The table of this round from what was measured."""
+        """The round's table, from the answers in the journal."""
         return tuple(_rows(self, journal))
 
     def answers(self, journal: Journal, kind: str) -> list[dict[str, Any]]:
-        """Of all scenes, in order."""
+        """The answers of one kind, scene by scene."""
         return [journal[unit.name] for unit in self.errors() if unit.kind == kind]
 
 

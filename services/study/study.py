@@ -1,4 +1,4 @@
-"""The study from end to end: every knob by itself, then what is promising together, and the table of both."""
+"""The whole study: every knob by itself, then promising combinations, and the table of both."""
 
 import hashlib
 from collections.abc import Sequence
@@ -7,13 +7,14 @@ from typing import Any
 
 from schemas.job.job import Job
 from services.bench.machine import describe_machine, pinned
+from services.run.progress import ProgressLine
 from services.study.answer import DEFAULT_TARGETS, default_targets
 from services.study.choose import TargetError
 from services.study.errors import ERRORS
 from services.study.journal import Journal
 from services.study.knobs import apply
 from services.study.measure.convergence import slopes
-from services.study.measure.process_pool import Crew, Task
+from services.study.measure.process_pool import measure_in_pool
 from services.study.measure.timing import time_scene, warm_up
 from services.study.model import Row, Setting, Study
 from services.study.pairs import promising
@@ -23,27 +24,27 @@ from services.study.rounds import Round, Unit
 from workers.pipeline.context import WorkerContext
 
 LAPS_OF_CLOSE_CALLS = 3
-"""So many times the rounds of timing for settings whose time decides the choice."""
+"""Factor on the rounds of timing for settings whose time decides the choice."""
 
 
 def run_study(
-    plan: Plan, journal: Journal, context: WorkerContext, crew: Crew, progress: "Progress"
+    plan: Plan, journal: Journal, context: WorkerContext, processes: int, progress: ProgressLine
 ) -> tuple[Row, ...]:
-    """Measure what is not in the journal yet, and make the table. The job itself is its first row.
+    """Measure what is not in the journal yet, and make the table; its first row is the job itself.
 
-    Every knob by itself; then what is promising together; then those settings once more against the clock whose time decides
-    the choice.
+    First every knob by itself; then promising combinations; then the settings whose time decides the choice are timed for
+    longer.
     """
-    bench = _Bench(journal, context, crew, progress)
+    bench = _Bench(journal, context, processes, progress)
     rows = bench.measure(Round(plan, "alone", plan.settings))
     units = {name: kind.unit for name, kind in ERRORS.items()}
     chosen = (Setting(), *plan.presets, *promising(rows, units, plan.targets or DEFAULT_TARGETS))
-    together = bench.measure(Round(plan, f"together-{_digest(chosen)}", chosen))
-    rows = (*rows, *(replace(row, ms=rows[0].ms * row.ratio) for row in together[1:]))
+    combined = bench.measure(Round(plan, f"together-{_digest(chosen)}", chosen))
+    rows = (*rows, *(replace(row, ms=rows[0].ms * row.ratio) for row in combined[1:]))
     asked, bounds = (plan.targets, {}) if plan.targets else default_targets(rows)
     try:
         close = close_calls(rows, asked, bounds)
-    except TargetError:  # nothing meets them, however long it takes
+    except TargetError:  # no setting meets the targets, however long it is timed
         return rows
     if not close:
         return rows
@@ -54,7 +55,7 @@ def run_study(
 
 
 def _with_time(row: Row, timed: Sequence[Row], own_ms: float) -> Row:
-    """The row with the time of the longer measurement, where it was in it."""
+    """The row with the time of the longer measurement, where it was timed there."""
     for other in timed[1:]:
         if other.setting == row.setting:
             ratios = {name: getattr(other, name) for name in ("ratio", "ratio_least", "ratio_most")}
@@ -63,50 +64,31 @@ def _with_time(row: Row, timed: Sequence[Row], own_ms: float) -> Row:
 
 
 def _digest(settings: Sequence[Setting]) -> str:
-    """A few letters that tell these settings from others: which are promising depends on the targets."""
+    """Eight hexadecimal digits of the settings' names: which settings are promising depends on the targets."""
     return hashlib.sha256("; ".join(setting.name for setting in settings).encode()).hexdigest()[:8]
 
 
-class Progress:
-    """How many units are to be measured, and when one is."""
-
-    def expect(self, units: int) -> None:
-        """So many more."""
-
-    def tick(self) -> None:
-        """One is done."""
-
-
-@dataclass(frozen=True)
+@dataclass
 class _Bench:
-    """Who measures, and where it is kept."""
+    """Measures rounds, keeps the answers in the journal and shows the progress."""
 
     journal: Journal
     context: WorkerContext
-    crew: Crew
-    progress: Progress
+    processes: int
+    progress: ProgressLine
+    asked: int = 0
+    done: int = 0
 
     def measure(self, part: Round) -> tuple[Row, ...]:
-        """What is missing of a round: its times first and alone, then the rest beside one another. The round's table."""
-        self.progress.expect(len(part.units()))
-        missing = [unit for unit in part.units() if unit.name not in self.journal]
-        for _ in range(len(part.units()) - len(missing)):
-            self.progress.tick()
-        self._take_times(part, [unit for unit in missing if unit.kind == "time"])
-        sizes, first = part.plan.sizes, part.plan.job.first_scene
-        tasks = [
-            Task(
-                unit.name,
-                unit.kind,
-                unit.settings,
-                unit.scene_id,
-                posed=unit.scene_id - first < sizes.posed,
-                released=unit.scene_id - first < sizes.released,
-            )
-            for unit in missing
-            if unit.kind != "time"
-        ]
-        for name, answer in self.crew.measure(tasks):
+        """The round's table. Missing times are taken first and with no other load, then errors side by side."""
+        timings, errors = part.timings(), part.errors()
+        missing = [unit for unit in errors if unit.name not in self.journal]
+        untimed = [unit for unit in timings if unit.name not in self.journal]
+        self.asked += len(timings) + len(errors)
+        self.done = self.asked - len(untimed) - len(missing)
+        self.progress.expect(self.asked)
+        self._take_times(part, untimed)
+        for name, answer in measure_in_pool(self.context.job, part.plan.job_folder, self.processes, missing):
             self._keep(name, answer)
         return part.rows(self.journal)
 
@@ -121,11 +103,12 @@ class _Bench:
 
     def _keep(self, name: str, answer: Any) -> None:
         self.journal.add(name, answer)
-        self.progress.tick()
+        self.done += 1
+        self.progress.show(self.done)
 
 
 def _time(part: Round, context: WorkerContext, unit: Unit) -> dict[str, Any]:
-    """Settings of physics alone are timed by settling; those drawn with paths in the first round's first scene alone."""
+    """Settings of physics are timed by settling alone; path-traced ones only in the first scene of the first lap."""
     drawn = part.of("labels", "mirror", "colour")
     first = unit.name == part.timings()[0].name
     whole = [one for one in drawn if first or not _is_slow(context.job, one)]
@@ -138,7 +121,7 @@ def _is_slow(job: Job, setting: Setting) -> bool:
 
 
 def study_of(plan: Plan, rows: Sequence[Row], renderer: str, command: str, left_out: Sequence[str]) -> Study:
-    """What the report is made of."""
+    """The content of the report."""
     return Study(
         job=plan.job.name,
         command=command,
@@ -148,12 +131,13 @@ def study_of(plan: Plan, rows: Sequence[Row], renderer: str, command: str, left_
         job_scenes=plan.job.scenes,
         rows=tuple(rows),
         slopes=slopes(),
+        preset=plan.job.preset,
         notes=tuple(left_out),
     )
 
 
 def header_of(plan: Plan, settings_digest: str, code: str) -> dict[str, Any]:
-    """What must be the same for measurements to go on."""
+    """The journal's first line: what must be the same for measurements to go on."""
     return {
         "job": settings_digest,
         "code": code,

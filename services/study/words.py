@@ -1,52 +1,24 @@
-"""Pure: amounts, times and sizes in words, for the sentence, the plots and the page."""
+"""Amounts, times and sizes in words, for the sentence, the plots and the page. Pure."""
 
 from services.study.errors import ERRORS
-
-SHORT: dict[str, str] = {
-    "penetration_mm": "penetration",
-    "gap_mm": "gap",
-    "moved_mm": "motion when let go again",
-    "turned_deg": "turn when let go again",
-    "pose_mm": "pose",
-    "outcome_mm": "where things end, on the whole",
-    "outcome_deg": "how they lie, on the whole",
-    "failed_share": "scenes that fail",
-    "depth_mm": "depth of objects",
-    "table_depth_mm": "depth of the table",
-    "mask_share": "the object's mask pixels",
-    "between_mm": "depth between pixels",
-    "outline_share": "regions between pixels",
-    "mirror_mm": "mirror camera",
-    "agreement_mm": "agreement of the views",
-    "unfilled_share": "projected pixels left empty",
-    "hidden_share": "projected pixels that show through",
-    "flip": "colour, FLIP",
-    "edge_flip": "edges, FLIP",
-}
-"""What an error is called where there is no room for its title."""
 
 _SPANS = ((60.0, 1.0, "s"), (5400.0, 60.0, "min"), (float("inf"), 3600.0, "h"))
 _SIZES = ((1e3, 1.0, "kB"), (1e6, 1e3, "MB"), (1e9, 1e6, "GB"), (float("inf"), 1e9, "TB"))
 
 
 def short(name: str) -> str:
-    """What an error is called in few words."""
-    return SHORT.get(name, name.replace("_", " "))
-
-
-def is_share(name: str) -> bool:
-    """Whether an error is a share, which is shown in per cent."""
-    return name.endswith("_share")
+    """An error's name in a few words."""
+    return ERRORS[name].short if name in ERRORS else name.replace("_", " ")
 
 
 def unit(name: str) -> str:
-    """As it is shown: "mm", "deg", "%" or nothing."""
-    return "%" if is_share(name) else ERRORS[name].unit if name in ERRORS else ""
+    """The unit that an error is shown in: "mm", "deg", "%" for shares, or nothing."""
+    return "%" if name.endswith("_share") else ERRORS[name].unit if name in ERRORS else ""
 
 
 def shown(name: str, value: float) -> float:
-    """In the unit that it is shown in."""
-    return value * 100.0 if is_share(name) else value
+    """An error in the unit that it is shown in."""
+    return value * 100.0 if name.endswith("_share") else value
 
 
 def amount(name: str, value: float) -> str:
@@ -67,29 +39,29 @@ def as_often(ratio: float) -> str:
     return "1" if abs(ratio - 1.0) < 0.05 else number(float(f"{ratio:.2g}"))
 
 
-def cost(ratio: float, of: str = "the time") -> str:
-    """What takes so many times as long: "2 × the time", or "no more time" within the noise."""
+def cost(ratio: float) -> str:
+    """A ratio of times as a cost: "2 × the time", or "no more time" within the noise."""
     often = as_often(ratio)
-    return "no more time" if often == "1" else f"{often} × {of}".rstrip()
+    return "no more time" if often == "1" else f"{often} × the time"
 
 
 def times(ratio: float) -> str:
-    """The same with its word, and a third digit where it is near 1: "1.07 times"."""
+    """A ratio of times with its word, and a third digit near 1: "1.07 times"."""
     return f"{number(round(ratio, 2)) if 0.9 <= ratio < 1.1 else as_often(ratio)} times"
 
 
 def milliseconds(ms: float) -> str:
-    """What a scene costs: "118 ms", "11.2 s"."""
+    """The time of a scene: "118 ms", "11.2 s"."""
     return f"{number(ms)} ms" if ms < 9999.5 else f"{number(ms / 1e3)} s"
 
 
 def duration(seconds: float) -> str:
-    """What a job costs: "8 s", "12 min", "31 h"."""
+    """The time of a job: "8 s", "12 min", "31 h"."""
     return next(f"{number(_two(seconds / one))} {name}" for most, one, name in _SPANS if seconds < most)
 
 
 def size(kilobytes: float) -> str:
-    """What a job stores: "15 MB"."""
+    """The size of a job's files: "15 MB"."""
     return next(f"{number(_two(kilobytes / one))} {name}" for most, one, name in _SIZES if kilobytes < most)
 
 
@@ -97,6 +69,6 @@ def _two(value: float) -> float:
     return float(f"{value:.2g}") if value < 100.0 else float(round(value))
 
 
-def listed(words: list[str], last: str = "and") -> str:
-    """Such as "a", "a and b" or "a, b and c"."""
-    return f" {last} ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+def listed(words: list[str]) -> str:
+    """Words in one phrase: "a", "a and b" or "a, b and c"."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

@@ -5,7 +5,7 @@ import subprocess
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-LOCKS = ("requirements.lock", "requirements-pathtraced.lock", "requirements-dev.lock")
+LOCKS = ("requirements.lock", "requirements-pathtraced.lock", "requirements-study.lock", "requirements-dev.lock")
 
 # Answers the launcher's probe, makes a `.venv` that links back to itself, and logs every call of pip.
 # Files named after what should go wrong, in the folder $FAULTS, make it go wrong.

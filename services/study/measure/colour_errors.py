@@ -1,4 +1,4 @@
-"""How far a view's colour is from where the light really goes: FLIP against a path-traced image that has converged."""
+"""Errors of colour: FLIP of the input view against a converged path-traced image."""
 
 import importlib.util
 from collections.abc import Sequence
@@ -15,8 +15,7 @@ from schemas.scene.plan import ScenePlan
 from schemas.scene.region import REGION_FLOOR
 from schemas.scene.scene import Placed
 from services.study.measure.flip import flip_between
-from services.study.measure.patch_rays import cast_patch
-from services.study.measure.rays import Box
+from services.study.measure.rays import Box, cast_patch
 from workers.assets.appearance.draw import draw_appearance
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene
@@ -26,17 +25,17 @@ from workers.plan.randomness import SceneChance, Stream
 from workers.render.step import draw_view, require_tier
 
 WIDTH, HEIGHT = 640, 480
-"""Of the image that colours are compared in, whatever the size of the one under test: the patch in it is traced alone."""
+"""The size of the image that colours are compared at, whatever the size of the image under test. Only a crop is traced."""
 
 MARGIN_SHARE = 0.25
 MARGIN_PX = 4
-"""What is compared about the objects on each side: their contact shadows fall there."""
+"""Margin about the objects that is compared too, because their contact shadows fall there."""
 
 BOUNCES = 16
-"""Of the truth's paths, whatever the job's: glass before glass takes eight."""
+"""Bounces of the truth's paths, whatever the job's: glass before glass takes eight."""
 
 TRUTH_SEED = 0xC0107
-"""Of the truth's paths: a stream of their own, which no job's seed reaches."""
+"""The random stream of the truth's paths, which no job's seed reaches."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class ColourTruth:
 
 
 def colour_truth_missing() -> str | None:
-    """Why there is no truth of colour on this machine, and the remedy; None where there is."""
+    """Why this machine has no truth of colour, with the remedy; None where it has."""
     if importlib.util.find_spec("mitsuba") is None:
         return (
             "errors of colour need the path-traced tier, which is not installed: `./verso extra pathtraced` installs it"
@@ -71,10 +70,10 @@ def colour_truth_missing() -> str | None:
 
 
 def converged_colour(context: WorkerContext, scene: Scene, paths: int, salt: int = 0) -> ColourTruth | None:
-    """The first pair's input view about the objects by that many paths a pixel; None where it sees none of them.
+    """The objects' crop of the first pair's input view by that many paths a pixel; None where no object is visible.
 
-    Neither tier nor samples, seed of paths, bounces, sensor or size of the scene's own images decide it: its look is the one
-    that the raster and path-traced tiers share, its seed its own. Another `salt` traces other paths.
+    It depends on neither tier nor samples, seed of paths, bounces, sensor or size of the scene's own images: it has the look
+    that the raster and path-traced tiers share, and a seed of its own. Another `salt` traces other paths.
     """
     crop = crop_of(scene)
     if crop is None:
@@ -90,18 +89,18 @@ def converged_colour(context: WorkerContext, scene: Scene, paths: int, salt: int
 
 
 def crop_of(scene: Scene) -> Crop | None:
-    """What is compared of the first pair's input view; None where it sees no object."""
+    """The compared crop of the first pair's input view; None where no object is visible."""
     patch = cast_patch(scene.posed.things, scene.pairs[0].input.camera)
     return None if patch.box is None else crop_about(patch.box)
 
 
 def flip_error(truth: ColourTruth, rgb: NDArray[np.uint8]) -> float:
-    """FLIP of a stored input view [H, W, 3] uint8 of any size in the truth's crop, the sensor's effects in it."""
+    """FLIP of a stored input view [H, W, 3] uint8 of any size, with the sensor's effects, in the truth's crop."""
     return flip_between(truth.rgb, crop_colour(rgb, truth.crop))
 
 
 def crop_about(box: Box) -> Crop:
-    """A box in shares of an image (`Patch.box`) with a margin, in whole pixels of an image of `WIDTH` x `HEIGHT`."""
+    """The crop, in whole pixels, of a box in shares of the image (`Patch.box`) and its margin."""
     left, top, right, bottom = np.array(box) * (WIDTH, HEIGHT, WIDTH, HEIGHT)
     margin = MARGIN_PX + MARGIN_SHARE * max(right - left, bottom - top)
     low = np.floor(np.maximum((left - margin, top - margin), 0.0)).astype(int)
@@ -110,7 +109,7 @@ def crop_about(box: Box) -> Crop:
 
 
 def crop_camera(camera: Camera, crop: Crop) -> Camera:
-    """The camera whose image is the crop of this one's, brought to `WIDTH` x `HEIGHT`."""
+    """The camera whose image is the crop of this camera's image at `WIDTH` x `HEIGHT`."""
     k = camera.intrinsics
     across, down = WIDTH / k.width, HEIGHT / k.height
     cropped = Intrinsics(
@@ -127,18 +126,18 @@ def crop_camera(camera: Camera, crop: Crop) -> Camera:
 def crop_colour(rgb: NDArray[np.uint8], crop: Crop) -> NDArray[np.uint8]:
     """[bottom - top, right - left, 3] uint8: the crop of an image of any size.
 
-    A larger image is averaged by area, a smaller one interpolated linearly: so detail that it lacks counts against it.
+    A larger image is averaged by area, a smaller one interpolated linearly, so that its lack of detail counts as error.
     """
     here = (slice(crop.top, crop.bottom), slice(crop.left, crop.right))
     if rgb.shape[:2] == (HEIGHT, WIDTH):
         return rgb[here]
     smaller = rgb.shape[0] < HEIGHT or rgb.shape[1] < WIDTH
-    way = cv2.INTER_LINEAR if smaller else cv2.INTER_AREA
-    return np.asarray(cv2.resize(rgb, (WIDTH, HEIGHT), interpolation=way), np.uint8)[here]
+    method = cv2.INTER_LINEAR if smaller else cv2.INTER_AREA
+    return np.asarray(cv2.resize(rgb, (WIDTH, HEIGHT), interpolation=method), np.uint8)[here]
 
 
 def _in_studio(context: WorkerContext, scene: Scene) -> tuple[Sequence[Placed], ScenePlan]:
-    """The scene's things and plan as tier pathtraced draws them: flat scenes have another floor and other lights."""
+    """The scene's things and plan as the path-traced tier draws them; the flat tier has another floor and other lights."""
     rng = SceneChance(context.job.seed, scene.plan.scene_id).stream(Stream.APPEARANCE)
     floor, appearance = draw_appearance(rng, "pathtraced")
     things = tuple(

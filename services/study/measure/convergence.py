@@ -1,4 +1,4 @@
-"""How the integrator's error falls with the step, on two smooth cases with an answer in closed form."""
+"""Order of convergence of the integrator, on two smooth cases with a closed-form answer."""
 
 import math
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ _HEIGHT_M = 3.0
 
 
 def slopes() -> dict[str, float]:
-    """Order in the step, by least squares of log error over log step, of each case: 1 is a method of the first order.
+    """Order in the step of each case, by least squares of log error over log step.
 
     Semi-implicit Euler, which is what Bullet integrates with, is of the first order (Hairer, Lubich and Wanner 2006, I.1).
     """
@@ -52,14 +52,14 @@ def _at(height_m: float) -> Array:
 
 
 def _fall_error_m(rate_hz: int) -> float:
-    """Against half g t squared."""
+    """Error of a free fall against half g t squared."""
     with open_world([(_block(), _at(_HEIGHT_M))], 0.0, _physics(rate_hz), 1) as world:
         _advance(world, round(FALL_S * rate_hz))
         return float(_HEIGHT_M - world.pose()[0][2] - GRAVITY_M_S2 * FALL_S**2 / 2)
 
 
 def _slide_error_m(rate_hz: int) -> float:
-    """Against v squared / 2 mu g, as Coulomb friction brakes evenly; after a second in which the block comes to lie."""
+    """Error of a sliding distance against v squared / 2 mu g (Coulomb friction); the block first settles for a second."""
     with open_world([(_block(), _at(_SIDES_M[2] / 2 + _MARGIN_M))], 0.0, _physics(rate_hz), 1) as world:
         _advance(world, rate_hz)
         before = world.pose()[0][0]

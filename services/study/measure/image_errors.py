@@ -1,7 +1,7 @@
-"""How far a made scene's depth, masks, mirror pose and projection are from what rays say. Pure.
+"""Errors of a made scene's depth, masks, mirror pose and projection against rays. Pure.
 
-The truth is cast about the cameras and poses of the scene itself, at its own pixels' centres or, where an error is about
-the size of pixels, at places that do not depend on it. Views of all pairs count together.
+The rays are cast from the scene's own cameras at its own poses: through pixels' centres or, for errors that depend on the
+size of pixels, through places that do not depend on it. Views of all pairs count together.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,23 +14,22 @@ from schemas.base import Array
 from schemas.job.images import Images
 from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
 from schemas.scene.view import Pair, View
-from services.study.measure.patch_rays import Patch
-from services.study.measure.pixel_rays import Pixels, Seen
+from services.study.measure.rays import Patch, Pixels, Seen
 from services.study.measure.truth import Truth
 from workers.geometry.stored_depth import dequantise_depth
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene
 
 PERCENTILE = 99.0
-"""Of pixels: the errors of almost all, and not of the one where a ray grazes an edge."""
+"""Percentile of pixels: leaves out the few where a ray grazes an edge."""
 
 HIDDEN_M = 0.005
-"""A projected pixel this far behind what the mirror camera sees there shows something else."""
+"""A projected pixel this far behind the surface that the mirror camera sees shows a hidden surface."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelErrors:
-    """A view's depth errors, mm, [N] of objects and [M] of the table; and of its `pixels` of objects by ray, how many differ."""
+    """A view's depth errors, mm, [N] of objects and [M] of the table; `differ` of its `pixels` of objects have a wrong mask."""
 
     object_mm: Array
     table_mm: Array
@@ -39,23 +38,22 @@ class LabelErrors:
 
 
 def measure_images(context: WorkerContext, scene: Scene, truth: Truth) -> dict[str, float]:
-    """The errors of a made scene by names of `ERRORS`; what has no meaning there is left out.
+    """The errors of a made scene by names of `ERRORS`; an error without meaning there is left out.
 
-    Over the input, aligned and mirror views of all pairs, with pixels of objects only where not said:
+    Over the input, aligned and mirror views of all pairs, and over pixels of objects unless stated:
 
-    - depth_mm: the 99th percentile of |stored depth - ray's z| of pixels whose mask and ray name the same object. It has
-      quantisation and the sensor's effects in it. Pixels without depth, stored as 0, are not counted here.
+    - depth_mm: the 99th percentile of |stored depth - ray's z| of pixels whose mask and ray name the same object. It
+      includes quantisation and the sensor's effects. Pixels without depth, stored as 0, are not counted.
     - table_depth_mm: the same for the table, at pixels evenly over the image (`SPREAD_PIXELS`).
-    - mask_share: pixels whose mask and ray differ where either names an object, per pixel that is an object's by ray. It
-      can be above 1.
-    - between_mm: over `BETWEEN` rays at random in the box about what is seen of the objects in the input view: the median
+    - mask_share: pixels whose mask and ray differ where either names an object, per object pixel by ray. It can exceed 1.
+    - between_mm: over `BETWEEN` random rays in the box about the objects' visible part in the input view: the median
       of |stored depth of the pixel that the ray crosses - ray's z|, where mask and ray name the same object.
-    - outline_share: the share of these rays whose region, whatever it is, the pixel that they cross does not have.
-    - mirror_mm: |d_z - z of the nearest point that the input camera sees of the objects|, the largest of all pairs.
+    - outline_share: the share of these rays whose region differs from that of the pixel they cross.
+    - mirror_mm: |d_z - z of the objects' nearest point that the input camera sees|, the largest of all pairs.
       `mirror_pose` sets the mirror camera T_z_m away from the point d_z ahead of the input camera, and turns it by the input
-      pose alone. So it stands off by just this, along the input camera's optical axis, and is not turned.
-    - agreement_mm: the stored input depth carried into the mirror view against the stored mirror depth, the median
-      (workers/labels/agreement.py), the largest of all pairs; no ray is in it.
+      pose alone. So the camera is off by exactly this, along the input camera's optical axis, and is not turned.
+    - agreement_mm: the stored input depth projected into the mirror view against the stored mirror depth, the median
+      (workers/labels/agreement.py), the largest of all pairs; it needs no rays.
     - unfilled_share: of the mirror view's object pixels by ray whose point the input camera sees too, the share that the
       projected depth leaves empty.
     - hidden_share: of the projected depth's filled pixels, of objects and all else, evenly over the image: the share that
@@ -126,19 +124,14 @@ def _of_patches(pairs: Sequence[Pair], patches: Sequence[Patch], images: Images)
 
 
 def _of_mirrors(pairs: Sequence[Pair], patches: Sequence[Patch]) -> dict[str, float]:
-    found = {}
     off = [
         abs(pair.d_z_m - patch.front_m) * 1e3
         for pair, patch in zip(pairs, patches, strict=True)
         if pair.mirror is not None and patch.box is not None
     ]
-    if off:
-        found["mirror_mm"] = max(off)
     medians = [pair.agreement.median_mm for pair in pairs if pair.agreement is not None]
     known = [median for median in medians if median is not None]
-    if known:
-        found["agreement_mm"] = max(known)
-    return found
+    return {name: max(values) for name, values in (("mirror_mm", off), ("agreement_mm", known)) if values}
 
 
 def _of_projections(pairs: Sequence[Pair], truth: Truth, images: Images) -> dict[str, float]:
@@ -159,7 +152,7 @@ def _of_projections(pairs: Sequence[Pair], truth: Truth, images: Images) -> dict
 
 
 def _percentile(name: str, errors: Iterable[Array], percent: float) -> dict[str, float]:
-    """The figure by its name, or none where there is nothing to take it of."""
+    """The figure by its name, or none for no values."""
     values = np.concatenate([np.empty(0), *errors])
     return {name: float(np.percentile(values, percent))} if len(values) else {}
 

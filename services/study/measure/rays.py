@@ -1,6 +1,9 @@
-"""Rays through any place of an image, and where in it objects can be seen. Pure; float64, by workers/geometry/raycast.py."""
+"""Views by rays in float64: at pixels' centres, at random places, and of the objects' patch. Pure."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,30 +12,156 @@ from schemas.base import Array
 from schemas.scene.camera import Camera
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.scene import Placed
-from workers.geometry.camera import project, project_bounds
+from workers.geometry.camera import project, project_bounds, unproject
 from workers.geometry.frames import invert, transform
 from workers.geometry.raycast import NEAR_M, RAYS_AT_ONCE, first_hit
 
 Box = tuple[float, float, float, float]
 """(left, top, right, bottom)."""
 
+Index = NDArray[np.int64]
+
 SAME_M = 1e-4
-"""A ray to a point meets it where z is this near: half of a stored unit, and a hundred times what Embree's float32 rays
-miss a grazing surface by."""
+"""A ray to a point meets it where z is this near: half of a stored unit, and a hundred times the error of Embree's float32
+rays at a grazing surface."""
+
+SPREAD_PIXELS = 19_200
+"""The most pixels, about, that are cast evenly over the image: a sixteenth of 640 x 480."""
+
+SPREAD_SEED = 0x5B4EAD
+
+DENSE = 256
+"""Rays along each side of the box about the objects: 16 in a pixel and more while that box has at most 4,096 of a 640 x 480
+image's pixels, as the objects of the built-in jobs have."""
+
+BETWEEN = 4096
+"""Rays at random in the objects' patch. A median of as many is off by 2 % of the spread."""
+
+BETWEEN_SEED = 0x0B5E55ED
+"""The random stream of those rays, which no job's seed reaches."""
 
 
-def objects_of(things: Sequence[Placed]) -> list[Placed]:
-    """All but floor and table."""
-    return [thing for thing in things if thing.region_id >= REGION_FIRST_OBJECT]
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The hits of rays through the centres of some pixels of an image.
+
+    rows [N], columns [N] int64; depth_m [N] float64, z along the optical axis, 0 without a hit; region [N] uint8.
+    """
+
+    rows: Index
+    columns: Index
+    depth_m: Array
+    region: NDArray[np.uint8]
+
+    def of(self, image: NDArray) -> NDArray:
+        """[N, ...]: these pixels of an image [H, W, ...]."""
+        return image[self.rows, self.columns]
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """A view by rays at its own pixels: all in the box that objects can be seen in, and some evenly over the image."""
+
+    box: Seen
+    spread: Seen
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """The objects in a view by rays that do not depend on the image's size.
+
+    front_m: least z of their visible points, inf where none is visible. box: (left, top, right, bottom) of the visible part
+    in shares of the image's width and height, None where there is none. at [N, 2] float64: random places in the box,
+    (across, down) in shares of the image; depth_m [N] and region [N] of the rays through these.
+    """
+
+    front_m: float
+    box: Box | None
+    at: Array
+    depth_m: Array
+    region: NDArray[np.uint8]
+
+
+def cast_pixels(things: Sequence[Placed], camera: Camera) -> Pixels:
+    """A view at its own pixels' centres."""
+    box = project_box(things, camera) or (0.0, 0.0, 0.0, 0.0)
+    left, top, right, bottom = math.floor(box[0]), math.floor(box[1]), math.ceil(box[2]), math.ceil(box[3])
+    rows, columns = np.mgrid[top:bottom, left:right]
+    inside = _cast_centres(things, camera, rows.ravel(), columns.ravel())
+    return Pixels(inside, _cast_centres(things, camera, *_spread(camera.intrinsics.width, camera.intrinsics.height)))
+
+
+@cache
+def _spread(width: int, height: int) -> tuple[Index, Index]:
+    """(rows, columns) of about `SPREAD_PIXELS` pixels: one at random in each square of pixels, the same in every image.
+
+    A grid would fall in step with the pattern of pixels that a projection fills.
+    """
+    step = max(1, round(math.sqrt(width * height / SPREAD_PIXELS)))
+    rows, columns = (corner.ravel() for corner in np.mgrid[0:height:step, 0:width:step])
+    within = np.random.default_rng([SPREAD_SEED, width, height]).integers(step, size=(2, len(rows)))
+    rows, columns = rows + within[0], columns + within[1]
+    there = (rows < height) & (columns < width)
+    return rows[there], columns[there]
+
+
+def _cast_centres(things: Sequence[Placed], camera: Camera, rows: Index, columns: Index) -> Seen:
+    return Seen(rows, columns, *cast_at(things, camera, columns.astype(float) + 0.5, rows.astype(float) + 0.5))
+
+
+def cast_patch(things: Sequence[Placed], camera: Camera, *names: int) -> Patch:
+    """The objects in a view; `names` seed the random rays: the scene and the pair."""
+    k = camera.intrinsics
+    nothing = Patch(math.inf, None, np.empty((0, 2)), np.empty(0), np.empty(0, np.uint8))
+    reach = project_box(things, camera)
+    if reach is None:
+        return nothing
+    left, top, right, bottom = reach
+    cell = ((right - left) / DENSE, (bottom - top) / DENSE)
+    rows, columns = (index.ravel() for index in np.mgrid[0:DENSE, 0:DENSE])
+    depth_m, region = cast_at(things, camera, left + cell[0] * (columns + 0.5), top + cell[1] * (rows + 0.5))
+    mine = region >= REGION_FIRST_OBJECT
+    if not mine.any():
+        return nothing
+    rows, columns, depth_m = rows[mine], columns[mine], depth_m[mine]
+    front_m = _nearest_seen(things, camera, float(depth_m.min()))
+    across = (left + cell[0] * np.array([columns.min(), columns.max() + 1])) / k.width
+    down = (top + cell[1] * np.array([rows.min(), rows.max() + 1])) / k.height
+    rng = np.random.default_rng([BETWEEN_SEED, *names])
+    at = rng.uniform((across[0], down[0]), (across[1], down[1]), (BETWEEN, 2))
+    z, hit = cast_at(things, camera, at[:, 0] * k.width, at[:, 1] * k.height)
+    return Patch(front_m, (float(across[0]), float(down[0]), float(across[1]), float(down[1])), at, z, hit)
+
+
+def _nearest_seen(things: Sequence[Placed], camera: Camera, dense_m: float) -> float:
+    """Least z of the objects' visible points, given the least z of the dense rays.
+
+    A flat face is nearest at a vertex, so the visible vertices before `dense_m` are tried as well.
+    """
+    points = _vertices(things, camera)
+    points = points[(points[:, 2] > NEAR_M) & (points[:, 2] < dense_m)]
+    return float(points[sees(camera, things, points), 2].min(initial=dense_m))
+
+
+def seen_by_other(things: Sequence[Placed], camera: Camera, seen: Seen, other: Camera) -> NDArray[np.bool_]:
+    """[N] bool: whether the object point that each ray hits is visible in the other camera's image too."""
+    mine = np.flatnonzero(seen.region >= REGION_FIRST_OBJECT)
+    points = unproject(seen.rows[mine], seen.columns[mine], seen.depth_m[mine], camera.intrinsics)
+    there = transform(invert(other.T_world_cam) @ camera.T_world_cam, points)
+    before = there[:, 2] > NEAR_M
+    mine, there = mine[before], there[before]
+    both = np.zeros(len(seen.region), bool)
+    both[mine] = sees(other, things, there)
+    return both
 
 
 def project_box(things: Sequence[Placed], camera: Camera) -> Box | None:
-    """The box about the projected vertices, pixels, cut to the image; None where it is outside.
+    """The box about the objects' projected vertices, pixels, cut to the image; None where it is outside.
 
     The whole image where a vertex is not in front of the near plane.
     """
     k = camera.intrinsics
-    points = vertices_in(things, camera)
+    points = _vertices(things, camera)
     if not len(points):
         return None
     bounds = project_bounds(points, k, NEAR_M)
@@ -40,17 +169,18 @@ def project_box(things: Sequence[Placed], camera: Camera) -> Box | None:
     return (left, top, right, bottom) if left < right and top < bottom else None
 
 
-def vertices_in(things: Sequence[Placed], camera: Camera) -> Array:
-    """[V, 3] float64: the vertices of things in the camera's frame."""
+def _vertices(things: Sequence[Placed], camera: Camera) -> Array:
+    """[V, 3] float64: the vertices of the objects, which are all things but floor and table, in the camera's frame."""
     T_cam_world = invert(camera.T_world_cam)
-    parts = [transform(T_cam_world @ thing.T_world_shape, thing.shape.vertices) for thing in things]
+    objects = [thing for thing in things if thing.region_id >= REGION_FIRST_OBJECT]
+    parts = [transform(T_cam_world @ thing.T_world_shape, thing.shape.vertices) for thing in objects]
     return np.concatenate([np.empty((0, 3)), *parts])
 
 
 def cast_at(things: Sequence[Placed], camera: Camera, u: Array, v: Array) -> tuple[Array, NDArray[np.uint8]]:
-    """(z [N] float64 metres, region [N] uint8) of the rays through image coordinates; 0 where nothing is met.
+    """(z [N] float64 metres, region [N] uint8) of the rays through image coordinates; 0 without a hit.
 
-    As `cast_view` does: in the camera's frame, where Embree's float32 is finest, and from the near plane on.
+    Like `cast_view`: in the camera's frame, where Embree's float32 is finest, and from the near plane on.
     """
     k, T_cam_world = camera.intrinsics, invert(camera.T_world_cam)
     there = [Placed(thing.region_id, thing.shape, T_cam_world @ thing.T_world_shape) for thing in things]
@@ -66,7 +196,7 @@ def cast_at(things: Sequence[Placed], camera: Camera, u: Array, v: Array) -> tup
 
 
 def sees(camera: Camera, things: Sequence[Placed], points: Array) -> NDArray[np.bool_]:
-    """[N] bool: whether the camera sees points [N, 3] of surfaces, in its frame and before it: the rays to them meet them."""
+    """[N] bool: whether surface points [N, 3] in the camera's frame, before it, are visible: the rays to them hit them."""
     k = camera.intrinsics
     u, v = project(points, k)
     z, region = cast_at(things, camera, u, v)

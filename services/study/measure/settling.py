@@ -1,4 +1,4 @@
-"""How a scene comes to rest with each setting, against finer steps than any that is measured."""
+"""Errors of settling: a scene's rest with each setting against finer steps than any that is measured."""
 
 import dataclasses
 import math
@@ -23,17 +23,17 @@ from workers.plan.randomness import SceneChance
 from workers.plan.step import plan_scene
 
 AGREE_MM = 0.05
-"""Two finer settings that end nearer than this agree, and a pose has an error."""
+"""Two references agree where their poses are nearer than this; only then is there a true pose."""
 
 REFERENCES: tuple[Mapping[str, Any], ...] = (
     {"step_hz": 3840, "max_step_travel_mm": 0.03, "solver_iterations": 400},
     {"step_hz": 7680, "max_step_travel_mm": 0.015, "solver_iterations": 400},
 )
-"""Of physics, finer than every value that is measured: the first gives the distribution of outcomes; a pose has a truth where
-the second ends where the first did."""
+"""Settings of physics finer than every measured value. The first gives the distribution of outcomes; a pose has a truth where
+both agree."""
 
 RELEASED: Mapping[str, Any] = {"step_hz": 960, "max_step_travel_mm": 0.05, "solver_iterations": 400}
-"""With these, in steps 16 times shorter, is released again what came to rest with any setting."""
+"""Settings of physics, in steps 16 times shorter, with which objects at rest are released again."""
 
 Answer = dict[str, Any]
 
@@ -43,9 +43,9 @@ def measure_settling(
 ) -> dict[str, Answer]:
     """Figures of one scene by the settings' names, and of the reference under "reference".
 
-    Each has `failed`, or else penetration_mm and gap_mm, slid_mm and rolled_deg (how far the centre of mass went sideways and
-    the object turned from where it was let go; the most of several objects). With `posed` also pose_mm, where there is a
-    truth; with `released` moved_mm and turned_deg. A scene that cannot even be drawn has no answers.
+    Each has `failed`, or else penetration_mm and gap_mm, slid_mm and rolled_deg (sideways travel of the centre of mass, and
+    turn, since the object was released; the largest of several objects). With `posed` also pose_mm, where there is a
+    truth; with `released` moved_mm and turned_deg. A scene that cannot be drawn has no answers.
     """
     try:
         plan = plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
@@ -89,18 +89,18 @@ def _physics(job: Job, changes: Mapping[str, Any]) -> Physics:
 def _describe(plan: ScenePlan, rest: Rest | None) -> Answer:
     if rest is None:
         return {"failed": True}
-    ways = [_way(plan, number, one) for number, one in enumerate(rest.settled)]
+    travels = [_travel(plan, number, one) for number, one in enumerate(rest.settled)]
     return {
         "failed": False,
         "penetration_mm": max(one.penetration_mm for one in rest.settled),
         "gap_mm": max(one.hover_gap_mm for one in rest.settled),
-        "slid_mm": max(slid for slid, _ in ways),
-        "rolled_deg": max(turned for _, turned in ways),
+        "slid_mm": max(slid for slid, _ in travels),
+        "rolled_deg": max(turned for _, turned in travels),
     }
 
 
-def _way(plan: ScenePlan, number: int, rest: Settled) -> tuple[float, float]:
-    """Of an object from its start to its rest: sideways way of its centre of mass, mm, and its turn, degrees."""
+def _travel(plan: ScenePlan, number: int, rest: Settled) -> tuple[float, float]:
+    """Travel of an object from its start to its rest: of its centre of mass sideways, mm, and its turn, degrees."""
     start = plan.objects[number]
     com = start.asset.mass.com[None, :]
     before, after = (transform(T, com)[0, :2] for T in (start.T_world_obj, rest.T_world_obj))
@@ -109,7 +109,7 @@ def _way(plan: ScenePlan, number: int, rest: Settled) -> tuple[float, float]:
 
 
 def _apart_mm(plan: ScenePlan, one: Rest, other: Rest) -> float:
-    """The farthest that a point of an object lies from where it lies in the other."""
+    """The largest distance between the places of a point of an object in two rests, mm."""
     return max(
         moved_by(start, a.T_world_obj, b.T_world_obj)[0]
         for start, a, b in zip(plan.objects, one.settled, other.settled, strict=True)

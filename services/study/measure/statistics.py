@@ -1,4 +1,4 @@
-"""Pure: from figures scene by scene to a setting's errors with their confidence."""
+"""A setting's errors with their confidence intervals, from the figures of scenes. Pure."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -11,10 +11,10 @@ from services.study.errors import ERRORS
 from services.study.model import Figure
 
 PERCENTILE = 95.0
-"""Of the scenes' figures: the error of a setting."""
+"""The percentile of the scenes' figures that is a setting's error."""
 
 RESAMPLES = 200
-"""Of the scenes, with replacement, for an interval."""
+"""Bootstrap samples of the scenes for an interval."""
 
 INTERVAL = (2.5, 97.5)
 
@@ -23,7 +23,7 @@ Rows = NDArray[np.int64]
 
 
 def figure_over_scenes(figures: Sequence[float]) -> Figure:
-    """The 95th percentile of one figure a scene, at least one. ValueError where there is none."""
+    """The 95th percentile of one figure a scene. Raises ValueError for no scenes."""
     if not figures:
         raise ValueError("an error of no scenes")
     values = np.asarray(figures, float)
@@ -31,17 +31,17 @@ def figure_over_scenes(figures: Sequence[float]) -> Figure:
 
 
 def share(flags: Sequence[bool]) -> Figure:
-    """The share that is true."""
+    """The share of true flags."""
     values = np.asarray(flags, float)
     return _figure(len(values), lambda rows: float(values[rows].mean()), float(values.mean()))
 
 
 def apart(own: Sequence[float], truth: Sequence[float]) -> Figure:
-    """How far apart two distributions are: the first Wasserstein distance of samples [N], scene by scene the same scenes.
+    """The first Wasserstein distance of two distributions, given by samples [N] of the same scenes in the same order.
 
-    Their area between cumulative distributions, in the samples' unit (Villani 2009, Optimal Transport, 6.2; Ramdas, Garcia
-    and Cuturi 2017 for one dimension). Where a tumbling thing ends is chance, and the distance of two poses says nothing;
-    that of their distributions does. Its interval is a paired bootstrap's; its median is the value again.
+    It is the area between the cumulative distributions, in the samples' unit (Villani 2009, Optimal Transport, 6.2; Ramdas,
+    Garcia and Cuturi 2017 for one dimension). The end of a tumbling object is random, so that only distributions can be
+    compared. The interval is a paired bootstrap's; the median repeats the value.
     """
     mine, other = np.asarray(own, float), np.asarray(truth, float)
     whole = float(wasserstein_distance(mine, other))
@@ -56,7 +56,7 @@ def _figure(count: int, measure: Callable[[Rows], float], median: float) -> Figu
 
 
 def settling_figures(name: str, scenes: Sequence[Answer]) -> dict[str, Figure]:
-    """Errors of physics of a setting from the answers of `measure_settling`, of which each has those of all settings."""
+    """A setting's errors of physics, from the answers of `measure_settling`, each of which has all settings."""
     mine = [scene[name] for scene in scenes if name in scene]
     if not mine:
         return {}
@@ -76,6 +76,6 @@ def settling_figures(name: str, scenes: Sequence[Answer]) -> dict[str, Figure]:
 
 
 def image_figures(scenes: Sequence[Mapping[str, float]]) -> dict[str, Figure]:
-    """Errors of images of a setting from one mapping a scene, in the order of `ERRORS`."""
+    """A setting's errors of images, from one mapping a scene, in the order of `ERRORS`."""
     names = [name for name in ERRORS if any(name in scene for scene in scenes)]
     return {name: figure_over_scenes([scene[name] for scene in scenes if name in scene]) for name in names}

@@ -1,4 +1,4 @@
-"""What a scene takes with each setting: in turn within a round, on one core."""
+"""Processor time of a scene with each setting, in turn within a round, on one core."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -31,9 +31,9 @@ def time_scene(
 ) -> Answer:
     """Seconds of processor by setting: of the whole scene up to its encoded files, or of `settling` alone.
 
-    The first run, of the job itself, meets the shapes for the first time, as a job does in every scene; all others have
-    them at hand, so that what new shapes cost is told apart. The others are run in another order in each scene and `lap`, so
-    that none always follows the same one. Bytes are those of all files and of no rows.
+    The first run, of the job itself, builds the scene's shapes, as a job does in every scene; all others find them in caches,
+    so that the cost of new shapes is known (`cold`). The others run in a new order in each scene and `lap`, so that no
+    setting always follows the same one. Bytes are those of all files and of no rows.
     """
     began = time.process_time()
     run_scene(context, scene_id, Stopwatch())
@@ -60,7 +60,7 @@ def _shuffled(settings: Sequence[Setting], order: np.random.Generator) -> list[S
 
 
 def warm_up(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> None:
-    """Make a scene that is not timed with everything at least once: code is compiled and shaders are made in a first run."""
+    """Make untimed scenes with every setting: the first run compiles code and shaders."""
     for number in range(WARM_SCENES):
         run_scene(context, scene_id + number, Stopwatch())
     for setting in settings:
@@ -68,7 +68,7 @@ def warm_up(context: WorkerContext, settings: Sequence[Setting], scene_id: int) 
 
 
 def _settle_s(context: WorkerContext, scene_id: int) -> float | None:
-    """Seconds for choosing the effects and settling; None where it does not come to rest."""
+    """Seconds for choosing the effects and settling; None where the scene does not come to rest."""
     try:
         plan = plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
         began = time.process_time()
@@ -81,7 +81,7 @@ def _settle_s(context: WorkerContext, scene_id: int) -> float | None:
 
 @dataclass(frozen=True)
 class Cost:
-    """Of a setting: its time over the job's own, round by round, and kilobytes a scene (None: as the job's own)."""
+    """A setting's time over the job's own, round by round, kilobytes a scene (None: as the job's own), and scenes timed."""
 
     ratio: Spread
     kilobytes: float | None
@@ -104,7 +104,7 @@ def _made(lap: Mapping[int, Answer], name: str) -> list[int]:
 
 
 def _own_s(lap: Mapping[int, Answer], first: Mapping[int, Answer], scene: int, own: str) -> float:
-    """Seconds of the job's own scene in this round with what new shapes cost, which is measured once."""
+    """Seconds of the job's own scene in this round, plus the cost of new shapes, which is measured once."""
     new = max(0.0, first[scene]["cold"] - first[scene]["whole"].get(own, first[scene]["cold"]))
     return float(lap[scene]["whole"][own]) + new
 
@@ -112,7 +112,7 @@ def _own_s(lap: Mapping[int, Answer], first: Mapping[int, Answer], scene: int, o
 def cost_of(name: str, own: str, laps: Sequence[Mapping[int, Answer]]) -> Cost | None:
     """A setting's cost over the scenes that it and the job made in a round; None where there are none.
 
-    What settles alone is compared by settling: its difference to the job's own is added to the whole.
+    A setting that only settles is compared by settling: its difference to the job's own is added to the whole.
     """
     ratios, scenes_seen = [], set[int]()
     for lap in laps:

@@ -1,4 +1,4 @@
-"""What rays say of one scene's geometry, kept from setting to setting while its things stand where they stood."""
+"""The ray casts of one scene's geometry, kept from setting to setting while its poses stay."""
 
 from collections import OrderedDict
 from collections.abc import Callable
@@ -9,20 +9,19 @@ from numpy.typing import NDArray
 
 from schemas.scene.camera import Camera
 from schemas.scene.scene import Placed
-from services.study.measure.patch_rays import Patch, cast_patch
-from services.study.measure.pixel_rays import Pixels, cast_pixels, seen_by_other
+from services.study.measure.rays import Patch, Pixels, cast_patch, cast_pixels, seen_by_other
 from workers.pipeline.make_scene import Scene
 
 KEPT = 12
-"""Answers kept of a scene, some 0.3 MB each: those asked for last. The input camera's are asked for by every setting; a
-mirror camera stands elsewhere whenever d_z changes."""
+"""Casts kept of a scene, some 0.3 MB each: the last ones used. Every setting uses the input camera's; the mirror camera moves
+whenever d_z changes."""
 
 Key = tuple[object, ...]
 Answer = TypeVar("Answer")
 
 
 class Truth:
-    """Rays of one scene; a cache, so not frozen: what it answers depends on the scene and the question alone."""
+    """Casts of rays in one scene, with a cache of the last ones."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene_id = scene.plan.scene_id
@@ -30,7 +29,7 @@ class Truth:
         self._kept: OrderedDict[Key, object] = OrderedDict()
 
     def fits(self, scene: Scene) -> bool:
-        """Whether this is the truth of that scene too: the same shapes at the same poses."""
+        """Whether the scene has the same shapes at the same poses."""
         theirs = scene.posed.things
         return (
             self.scene_id == scene.plan.scene_id
@@ -43,7 +42,7 @@ class Truth:
         return self._keep(("pixels", *_key(camera)), lambda: cast_pixels(self.things, camera))
 
     def patch(self, camera: Camera, pair: int) -> Patch:
-        """The objects in a pair's input view, alike for images of all sizes."""
+        """The objects in a pair's input view, the same for images of all sizes."""
         k = camera.intrinsics
         # To 12 digits: a camera scaled to another size is the same one but for rounding.
         frame = [round(x, 12) for x in (k.fx / k.width, k.fy / k.height, k.cx / k.width, k.cy / k.height)]
@@ -51,7 +50,7 @@ class Truth:
         return self._keep(key, lambda: cast_patch(self.things, camera, self.scene_id, pair))
 
     def both(self, camera: Camera, other: Camera) -> NDArray[np.bool_]:
-        """Which pixels of `pixels(camera).box` show a point of an object that the other camera sees too."""
+        """[N] bool: which pixels of `pixels(camera).box` show an object point that the other camera sees too."""
         key = ("both", *_key(camera), *_key(other))
         return self._keep(key, lambda: seen_by_other(self.things, camera, self.pixels(camera).box, other))
 
@@ -65,7 +64,7 @@ class Truth:
 
 
 def truth_of(scene: Scene, kept: Truth | None = None) -> Truth:
-    """The truth to hold a scene against: `kept`, of an earlier setting, where it is of the same geometry, or a new one."""
+    """The truth of a scene: `kept`, of an earlier setting, where the geometry is the same, or a new one."""
     return kept if kept is not None and kept.fits(scene) else Truth(scene)
 
 

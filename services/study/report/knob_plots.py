@@ -1,45 +1,38 @@
-"""A picture for each knob: the errors that it moves, over processor time, from its coarsest value to its finest."""
+"""A plot for each knob: the errors that it moves over processor time, from its coarsest value to its finest."""
 
 import math
 from collections.abc import Sequence
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Picture
-from matplotlib.transforms import Bbox
 
 from services.study.choose import own_row
 from services.study.model import Row, Study
-from services.study.report.labels import Label, place_labels
-from services.study.report.panel import LONGEST, MOVED
-from services.study.report.pictures import (
+from services.study.report.axes import (
     COLORS,
-    DOTS,
     INK,
     TEXT_COLORS,
-    boxed,
     cut,
-    fit,
+    draw_row,
     new_picture,
-    pieces,
     place_of,
-    renderer_of,
     set_axes,
-    up_scale,
+    write_head,
 )
-from services.study.report.scales import Scale, scale_of
-from services.study.words import as_often, shown
+from services.study.report.labels import Label, place_labels
+from services.study.report.panel import MOVED, OWN_MARK, knob_mark
+from services.study.words import as_often
 
 MOST_ERRORS = 3
-"""A picture shows the errors that move most."""
+"""The most errors that a plot shows: those that move most."""
 
-SIDE, HEIGHT = 4.0, 3.7
+SIDE, HEIGHT, HEAD = 4.0, 3.7, 0.55
 """Inches."""
 
 
 def single_knobs(rows: Sequence[Row]) -> list[str]:
     """Knobs that were turned by themselves, in the order of the table."""
-    turned = (row.setting.parts[0][0] for row in rows if len(row.setting.parts) == 1)
-    return [knob for knob in dict.fromkeys(turned) if knob != "preset"]
+    return list(dict.fromkeys(row.setting.parts[0][0] for row in rows if row.setting.kind == "single"))
 
 
 def knob_rows(rows: Sequence[Row], knob: str) -> list[Row]:
@@ -63,70 +56,35 @@ def draw_knob(study: Study, knob: str) -> Picture | None:
     errors = moved_errors(study.rows, knob)[:MOST_ERRORS]
     if not errors:
         return None
-    picture = new_picture(SIDE * max(len(errors), 2), HEIGHT)
-    wide, high = picture.get_size_inches()
+    columns = max(len(errors), 2)
+    picture = new_picture(SIDE * columns, HEIGHT, HEAD)
     turned = knob_rows(study.rows, knob)
-    least, most = (as_often(pick(row.ratio for row in turned)) for pick in (min, max))
-    title = f"{knob}: {_span(least, most)} × the job's time"
-    head = picture.text(0.15 / wide, 1 - 0.15 / high, title, fontsize=13, fontweight="bold", color=INK, va="top")
-    fit(head, (wide - 0.3) * DOTS)
+    ends = dict.fromkeys(as_often(pick(row.ratio for row in turned)) for pick in (min, max))
+    title = f"{knob}: {' to '.join(ends)} × the job's time"
+    write_head(picture, title, 0.15, fontsize=13, fontweight="bold", color=INK)
+    labels = {}
     for number, error in enumerate(errors):
-        left = number * wide / len(errors) + 0.95
-        box = (left / wide, 0.55 / high, (wide / len(errors) - 1.1) / wide, (HEIGHT - 1.15) / high)
-        _draw_along(picture.add_axes(box), study, [row for row in turned if error in row.errors], error)
+        axes = picture.add_subplot(1, columns, number + 1)
+        labels[axes] = _draw_along(axes, study, [row for row in turned if error in row.errors], error)
+    picture.draw_without_rendering()
+    picture.set_layout_engine("none")
+    for axes, some in labels.items():
+        place_labels(axes, some)
     return picture
 
 
-def _span(least: str, most: str) -> str:
-    return least if least == most else f"{least} to {most}"
-
-
-def _draw_along(axes: Axes, study: Study, turned: Sequence[Row], error: str) -> None:
-    """The knob's values as they follow one another, each with both its intervals, and the job as a star."""
+def _draw_along(axes: Axes, study: Study, turned: Sequence[Row], error: str) -> list[Label]:
+    """The knob's values joined in their order, with intervals of error and time, and the job as a star; their labels."""
     own = own_row(study.rows)
     rows = [*turned, own] if error in own.errors else list(turned)
-    up, ratios = (
-        up_scale(rows, error),
-        [ratio for row in rows for ratio in (row.ratio_least, row.ratio, row.ratio_most)],
-    )
-    set_axes(axes, scale_of([ratio * own.ms for ratio in ratios]), up, error)
-    places = [place_of(row, error, up) for row in turned]
+    ratios = [ratio for row in rows for ratio in (row.ratio_least, row.ratio, row.ratio_most)]
+    set_axes(axes, [ratio * own.ms for ratio in ratios], rows, error)
+    places = [place_of(row, error) for row in turned]
     axes.plot(*zip(*places, strict=True), color=COLORS[0], lw=1.2, alpha=0.45, zorder=2)
-    marks, labels, lines = [], [], pieces(axes, places)
-    for order, row in enumerate(rows):
-        is_own = row is own
-        marks.append(_draw_mark(axes, place_of(row, error, up), is_own))
-        lines += _draw_intervals(axes, row, error, up, own.ms)
-        text, color = ("the job", INK) if is_own else (row.setting.parts[0][1], TEXT_COLORS[0])
-        labels.append(
-            Label(cut(text, LONGEST), *place_of(row, error, up), color, 0.0 if is_own else order + 1.0, must=is_own)
-        )
-    place_labels(axes, renderer_of(axes.figure), labels, marks, lines)
-
-
-def _draw_mark(axes: Axes, at: tuple[float, float], is_own: bool) -> Bbox:
-    """The marker, whose box in pixels is returned."""
-    color, marker, size = ("black", "*", 15.0) if is_own else (COLORS[0], "o", 6.0)
-    axes.plot(
-        *[[place] for place in at],
-        ls="",
-        marker=marker,
-        ms=size,
-        color=color,
-        mec="white",
-        mew=0.7,
-        zorder=4,
-        clip_on=False,
-    )
-    return boxed(axes, at, size / 2)
-
-
-def _draw_intervals(axes: Axes, row: Row, error: str, up: Scale, own_ms: float) -> list[Bbox]:
-    """Of error and time, thin; returned in boxes of pixels."""
-    (x, y), figure = place_of(row, error, up), row.errors[error]
-    low, high = (up.place(shown(error, value)) for value in (figure.low, figure.high))
-    boxes = []
-    for ends in ([(x, low), (x, high)], [(row.ratio_least * own_ms, y), (row.ratio_most * own_ms, y)]):
-        axes.plot(*zip(*ends, strict=True), color=COLORS[0] if row.setting.parts else "black", lw=0.9, alpha=0.6)
-        boxes += pieces(axes, ends)
-    return boxes
+    for row in rows:
+        draw_row(axes, row, error, own_ms=own.ms, **(OWN_MARK if row is own else knob_mark(0)))
+    labels = [
+        Label(cut(row.setting.parts[0][1]), place, TEXT_COLORS[0], order + 1.0)
+        for order, (row, place) in enumerate(zip(turned, places, strict=True))
+    ]
+    return labels + ([Label("the job", place_of(own, error), INK, 0.0, must=True)] if own in rows else [])

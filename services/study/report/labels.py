@@ -1,120 +1,118 @@
-"""Labels beside points: each where it hides nothing, or left out."""
+"""Labels beside the points of a plot, placed where they hide nothing."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import RendererAgg
-from matplotlib.text import Annotation
+from matplotlib.lines import Line2D
+from matplotlib.text import Annotation, Text
 from matplotlib.transforms import Bbox
 
-PAD_ACROSS, PAD_UP = 5.0, 1.0
-"""Pixels kept free around a label: more beside it, so that two do not read as one."""
+from services.study.report.axes import DOTS, renderer_of
 
-_WAYS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
+SPACE_X, SPACE_Y = 5.0, 1.0
+"""Pixels kept free around a label: more at its sides, so that two do not read as one."""
+
+_DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
 """Right of the point first, then left, above, below and the corners."""
 
 _DISTANCES = (6.5, 9.0, 16.0, 26.0, 38.0)
-"""Points from the middle of the marker to the label; from the third on a line leads to it."""
+"""Points from the middle of the marker to the label."""
 
 _LED = 16.0
+"""From this distance on a line leads to the label."""
 
 ON_LINE = 12.0
-"""A label would rather stand this many points farther away than on a line."""
+"""Points of distance that a label accepts to avoid one line."""
 
 
 @dataclass(frozen=True)
 class Label:
-    """A text beside a point of an axes, in data coordinates; the most important are placed first.
+    """A text beside a point of an axes, in data coordinates; the lowest rank is placed first.
 
-    `must`: may stand as far away as there is room, with a line that leads to it.
+    `must`: bold, and may stand at any of the distances.
     """
 
     text: str
-    x: float
-    y: float
+    at: tuple[float, float]
     color: str
     rank: float
     must: bool = False
-    size: float = 9.0
 
 
-def place_labels(
-    axes: Axes, renderer: RendererAgg, labels: Sequence[Label], marks: Sequence[Bbox], lines: Sequence[Bbox] = ()
-) -> list[Annotation]:
-    """Draw the labels that have room within the axes, over no mark and no other label; as little as can be over `lines`.
+def place_labels(axes: Axes, labels: Sequence[Label]) -> None:
+    """Draw the labels within the axes, over no marker and no other label, and over as few lines as can be.
 
-    `marks` and `lines` are boxes in pixels. A label that has no room is left out.
+    A label without room is left out. The axes must have its final place and content.
     """
-    frame, taken, drawn = axes.get_window_extent(renderer), list(marks), []
+    taken = [box for line in axes.get_lines() for box in marker_boxes(line)]
+    paths = [
+        line.get_path().transformed(line.get_transform()) for line in axes.get_lines() if line.get_linestyle() != "None"
+    ]
     for label in sorted(labels, key=lambda label: (label.rank, label.text)):
         note = axes.annotate(
             label.text,
-            (label.x, label.y),
+            label.at,
             (0.0, 0.0),
             textcoords="offset points",
             color=label.color,
-            fontsize=label.size,
+            fontsize=9.0,
             fontweight="bold" if label.must else "normal",
-            ha="left",
-            va="bottom",
             zorder=6,
+            arrowprops={"arrowstyle": "-", "color": label.color, "lw": 0.6, "shrinkA": 0, "shrinkB": 6},
         )
-        found = _best_place(axes, note, label, renderer, frame, taken, lines)
-        if found is None:
+        best: tuple[float, dict[str, Any], Bbox, bool] | None = None
+        for cost, spot, led in _spots(label):
+            box = _put(axes, note, spot)
+            if box is None or any(_too_near(box, other) for other in taken):
+                continue
+            cost += ON_LINE * sum(path.intersects_bbox(box, filled=False) for path in paths)
+            if best is None or cost < best[0]:
+                best = cost, spot, box, led
+        if best is None:
             note.remove()
             continue
-        note.set_position(found[0])
-        taken.append(found[1])
-        drawn.append(note)
-        if found[2] >= _LED:
-            drawn.append(_lead(axes, label, found[1]))
-    return drawn
+        _put(axes, note, best[1])
+        taken.append(best[2])
+        assert note.arrow_patch is not None
+        note.arrow_patch.set_visible(best[3])
 
 
-def _best_place(
-    axes: Axes,
-    note: Annotation,
-    label: Label,
-    renderer: RendererAgg,
-    frame: Bbox,
-    taken: Sequence[Bbox],
-    lines: Sequence[Bbox],
-) -> tuple[tuple[float, float], Bbox, float] | None:
-    """Offset in points, box in pixels and distance of the place that costs least."""
-    dots = renderer.points_to_pixels(1.0)
-    extent = note.get_window_extent(renderer)
-    width, height = extent.width, extent.height
-    x, y = axes.transData.transform((label.x, label.y))
-    best: tuple[float, tuple[float, float], Bbox, float] | None = None
+def _spots(label: Label) -> Iterator[tuple[float, dict[str, Any], bool]]:
+    """Cost, properties of the text and whether a line leads there, of every place that a label may have."""
     for distance in _DISTANCES if label.must else _DISTANCES[:3]:
-        for turn, (right, up) in enumerate(_WAYS):
-            gap = distance * dots * (0.75 if right and up else 1.0)
-            left = x + right * gap - (width if right < 0 else 0.0 if right > 0 else width / 2)
-            bottom = y + up * gap - (height if up < 0 else 0.0 if up > 0 else height / 2)
-            box = Bbox.from_bounds(left, bottom, width, height)
-            if not _inside(box, frame) or any(_overlap(box, other) for other in taken):
-                continue
-            cost = distance + 0.3 * turn + ON_LINE * sum(_overlap(box, line) for line in lines)
-            if best is None or cost < best[0]:
-                best = (cost, ((left - x) / dots, (bottom - y) / dots), box, distance)
-    return None if best is None else best[1:]
+        for turn, (x, y) in enumerate(_DIRECTIONS):
+            reach = distance * (0.75 if x and y else 1.0)
+            spot: dict[str, Any] = {
+                "position": (x * reach, y * reach),
+                "ha": ("center", "left", "right")[x],
+                "va": ("center", "bottom", "top")[y],
+            }
+            yield distance + 0.3 * turn, spot, distance >= _LED
 
 
-def _inside(box: Bbox, frame: Bbox) -> bool:
-    return bool(box.x0 >= frame.x0 + 2 and box.x1 <= frame.x1 and box.y0 >= frame.y0 + 2 and box.y1 <= frame.y1)
+def _put(axes: Axes, note: Annotation, spot: dict[str, Any]) -> Bbox | None:
+    """Move the text there; its box in pixels, None where it leaves the axes."""
+    renderer = renderer_of(axes.figure)
+    note.set(**spot)
+    note.update_positions(renderer)
+    box, frame = Text.get_window_extent(note, renderer), axes.get_window_extent(renderer)
+    inside = box.x0 >= frame.x0 + 2 and box.x1 <= frame.x1 and box.y0 >= frame.y0 + 2 and box.y1 <= frame.y1
+    return box if inside else None
 
 
-def _overlap(box: Bbox, other: Bbox) -> bool:
-    across = box.x0 - PAD_ACROSS < other.x1 and other.x0 < box.x1 + PAD_ACROSS
-    return bool(across and box.y0 - PAD_UP < other.y1 and other.y0 < box.y1 + PAD_UP)
+def _too_near(box: Bbox, other: Bbox) -> bool:
+    wide = Bbox.from_extents(box.x0 - SPACE_X, box.y0 - SPACE_Y, box.x1 + SPACE_X, box.y1 + SPACE_Y)
+    return bool(wide.overlaps(other))
 
 
-def _lead(axes: Axes, label: Label, box: Bbox) -> Annotation:
-    """A thin line from the point to the nearest place of the label's box."""
-    x, y = axes.transData.transform((label.x, label.y))
-    end = (min(max(x, box.x0), box.x1), min(max(y, box.y0), box.y1))
-    at = axes.transData.inverted().transform(end)
-    return axes.annotate(
-        "", (label.x, label.y), tuple(at), arrowprops={"arrowstyle": "-", "color": label.color, "lw": 0.6}, zorder=4
-    )
+def marker_boxes(line: Line2D) -> list[Bbox]:
+    """The boxes in pixels of a line's markers."""
+    if line.get_marker() in ("None", "", None):
+        return []
+    half = line.get_markersize() / 2 * DOTS / 72
+    return [
+        Bbox.from_extents(x - half, y - half, x + half, y + half)
+        for x, y in line.get_transform().transform(line.get_xydata())
+    ]

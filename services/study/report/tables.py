@@ -1,4 +1,4 @@
-"""A study on disk: two Parquet tables for whoever reads columns, and the study itself, exactly, as JSON."""
+"""The files of a study: two Parquet tables, and the whole study as JSON."""
 
 import json
 import os
@@ -10,16 +10,15 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.errors import CorruptError, OutputError
 from services.study.errors import ERRORS
-from services.study.model import Figure, Row, Setting, Study
+from services.study.model import Row, Study
 
 STUDY_FILE = "study.json"
 WIDE_FILE = "tradeoff.parquet"
 LONG_FILE = "errors.parquet"
 
 STUDY_VERSION = 1
-"""Of the JSON file; a newer one is refused."""
+"""The version of the JSON file's format."""
 
 _SETTING = [("setting", pa.string()), ("knob", pa.string()), ("value", pa.string())]
 _COST = ("ms", "ratio", "ratio_least", "ratio_most", "kilobytes", "failed_share")
@@ -37,7 +36,7 @@ LONG_SCHEMA = pa.schema(
 
 
 def wide_schema() -> pa.Schema:
-    """A row a setting. A column of each error, its interval beside it, null where it was not measured."""
+    """The schema of `tradeoff.parquet`: one row for each setting; an error and its interval are null where not measured."""
     errors = [name for name in ERRORS if name != "failed_share"]
     figures = [
         *((name, pa.float64()) for error in errors for name in (error, f"{error}_low", f"{error}_high")),
@@ -61,39 +60,8 @@ def write_tables(study: Study, folder: Path) -> list[Path]:
     ]
 
 
-def read_study(folder: Path) -> Study:
-    """What `write_tables` was given, exactly; a tuple among the values of changes or machine comes back as a list.
-
-    Raises OutputError where there is none or it is newer than this program, CorruptError where it cannot be read.
-    """
-    file = folder / STUDY_FILE
-    try:
-        tree = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise OutputError(
-            f"{folder} holds no {STUDY_FILE}: it is not a folder of a finished `verso tradeoff`"
-        ) from error
-    except ValueError as error:
-        raise CorruptError(f"{file}: cannot be read: {error}; measure again") from error
-    version = tree.pop("verso_study", None) if isinstance(tree, dict) else None
-    if isinstance(version, int) and version > STUDY_VERSION:
-        raise OutputError(
-            f"{file}: verso_study: {version} is newer than this program, which reads {STUDY_VERSION}: install a newer Verso"
-        )
-    try:
-        return Study(**(tree | {"rows": tuple(map(_row, tree["rows"])), "notes": tuple(tree["notes"])}))
-    except (KeyError, TypeError, ValueError) as error:
-        raise CorruptError(f"{file}: is not a study: {error!r}; measure again") from error
-
-
-def _row(tree: dict[str, Any]) -> Row:
-    setting = Setting(tuple((knob, label) for knob, label in tree["setting"]["parts"]), tree["setting"]["changes"])
-    errors = {name: Figure(**figure) for name, figure in tree["errors"].items()}
-    return Row(**(tree | {"setting": setting, "errors": errors, "notes": tuple(tree["notes"])}))
-
-
 def _names(row: Row) -> dict[str, str]:
-    """Of a pair, both knobs and both values."""
+    """A setting's name, knobs and values; those of a combination are joined by commas."""
     knobs, values = (", ".join(part[place] for part in row.setting.parts) for place in (0, 1))
     return {"setting": row.setting.name, "knob": knobs, "value": values}
 
@@ -114,14 +82,14 @@ def _long(row: Row) -> list[dict[str, Any]]:
 
 
 def _plain(value: Any) -> Any:
-    """What JSON does not know, one level of it: dataclasses, mappings of other kinds, numpy's numbers."""
+    """One level of a value that JSON does not know: a dataclass, a mapping that is no dict, or a number of numpy."""
     if is_dataclass(value):
         return {field.name: getattr(value, field.name) for field in fields(value)}
     return dict(value) if isinstance(value, Mapping) else value.item()
 
 
 def _replace(file: Path, write: Callable[[Path], Any]) -> Path:
-    """Under another name in the same folder first, so that a reader never sees half a file."""
+    """Write under another name in the same folder, then rename, so that no reader sees half a file."""
     partial = file.with_name(f".{file.name}.{os.getpid()}")
     write(partial)
     os.replace(partial, file)

@@ -12,7 +12,7 @@ from schemas.errors import MachineError
 from services.bench import others
 from services.bench.encoders import choose_encoders, encoders, kind_of
 from services.bench.handover import hand_over
-from services.bench.lower_bound import committed_files, images_of, run_floor, write_durably
+from services.bench.lower_bound import committed_files, images_of, run_lower_bound, write_durably
 from services.bench.machine import pinned
 from services.bench.side_process import side_process
 from services.bench.stages import open_workbench
@@ -148,7 +148,7 @@ def test_the_floor_writes_the_bytes_that_ours_committed(bench, tmp_path):
     files = committed_files(bench.store.root, record)
     chosen = choose_encoders(images_of(files))
     assert set(chosen) == {"rgb", "uint16", "uint8"}
-    lap = run_floor(bench.context.renderer, bench.scenes(span), files, chosen, tmp_path / "floor")
+    lap = run_lower_bound(bench.context.renderer, bench.scenes(span), files, chosen, tmp_path / "floor")
     assert list(lap.stages_s) == ["draw", "encode", "write"]
     assert lap.apart_s > 0, "shapes reach the GPU before the clock"
     written = {str(p.relative_to(tmp_path / "floor")): p.read_bytes() for p in (tmp_path / "floor").rglob("*.*")}

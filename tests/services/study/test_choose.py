@@ -21,7 +21,6 @@ from services.study.choose import (
 from services.study.errors import ERRORS
 from services.study.knobs import job_tree_with
 from services.study.model import Row
-from services.study.robustness import close_calls
 from tests.made_up_studies import large_study, row
 
 OWN = row(depth_mm=0.1, penetration_mm=0.01, mirror_mm=1.0)
@@ -127,14 +126,6 @@ def test_the_choice_stays_when_times_come_back_a_little_off():
     targets = {"depth_mm": 0.06, "mirror_mm": 1.0}
     chosen = {choose(large_study(seed, noise=0.01).rows, targets).setting.name for seed in range(20)}
     assert chosen == {"size=1280 x 960, depth units=10000 /m"}
-
-
-def test_settings_whose_time_decides_are_told():
-    near = [OWN, row("step=1", 0.5, depth_mm=0.3), row("step=2", 0.53, depth_mm=0.05)]
-    far = [OWN, row("step=1", 0.5, depth_mm=0.3), row("step=2", 0.6, depth_mm=0.05)]
-    assert names(close_calls(near, {"mirror_mm": 1.0})) == ["step=1", "step=2"]
-    assert close_calls(far, {"mirror_mm": 1.0}) == []
-    assert names(close_calls(far, {"mirror_mm": 1.0}, noise=0.2)) == ["step=1", "step=2"]
 
 
 def test_a_study_without_the_job_itself_is_a_bug():

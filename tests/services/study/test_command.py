@@ -11,8 +11,8 @@ from schemas.errors import MachineError
 from services.cli.main import main
 from services.study import command, study
 from services.study.journal import JOURNAL_FILE
-from services.study.report.tables import read_study
 from tests.services.cli.test_main import TABLETOP, told
+from tests.stored_studies import read_study
 
 SMALL = [
     *("--scenes", "4", "--physics-scenes", "5", "--laps", "1", "--workers", "1", "--knobs", "step,units,splat"),

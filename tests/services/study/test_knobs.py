@@ -13,7 +13,6 @@ from services.study.knobs import (
     job_tree_with,
     joined,
     knobs_of,
-    own_label,
     settings_of,
 )
 from services.study.model import Setting
@@ -32,15 +31,14 @@ def test_every_value_makes_a_job_that_is_allowed_and_is_not_the_job_itself():
 
 def test_of_each_knob_the_defaults_have_a_value_that_is_not_measured_twice():
     for knob in KNOBS:
-        label = own_label(JOB, knob)
-        assert label is not None, knob.name
+        labels = [value.label for value in knob.values if apply(JOB, value.changes) == JOB]
+        assert labels, knob.name
         settings, _ = settings_of(JOB, [knob])
-        assert f"{knob.name}={label}" not in {setting.name for setting in settings}
+        assert f"{knob.name}={labels[0]}" not in {setting.name for setting in settings}
 
 
-def test_every_error_that_a_knob_may_move_is_known_and_every_known_one_has_a_knob():
-    named = {error for knob in KNOBS for error in knob.errors}
-    assert named == set(ERRORS)
+def test_every_part_of_a_scene_that_has_errors_has_a_knob_and_no_other_has():
+    assert {knob.group for knob in KNOBS} == {kind.group for kind in ERRORS.values()}
 
 
 def test_another_image_size_is_the_same_picture():

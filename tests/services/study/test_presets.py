@@ -1,5 +1,6 @@
 """Presets: defaults under the keys of a job, held to the measurement that is kept in docs/tradeoff."""
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -7,12 +8,66 @@ import pytest
 from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.job.preset import PRESETS
+from services.study.choose import error_of, own_row
+from services.study.errors import ERRORS
 from services.study.knobs import apply
 from services.study.model import Figure, Row, Setting
-from services.study.preset_front import SLACK, better_than, preset_row, rivals
-from services.study.report.tables import read_study
+from services.study.pairs import NEGLIGIBLE
+from tests.stored_studies import read_study
 
 EVIDENCE = Path(__file__).resolve().parents[3] / "docs" / "tradeoff"
+
+SLACK = 0.1
+"""A preset may take a tenth more time than a setting that is as good, and have errors a tenth larger than one as cheap."""
+
+MORE_EFFORT = (
+    "physics.max_step_travel_mm",
+    "physics.solver_iterations",
+    "physics.rest.speed_mm_s",
+    "physics.rest.spin_rad_s",
+    "physics.collision",
+    "physics.correction",
+    "render.path_samples",
+)
+
+BY_EFFORT = frozenset((*PRESETS["balanced"], *MORE_EFFORT))
+"""The keys that presets choose or could. Settings that change other keys store other things, and are no rivals."""
+
+
+def preset_row(rows: Sequence[Row], name: str) -> Row:
+    """The row of a preset; that of the job where no preset's row has the name, as the job has one of them itself."""
+    return next((row for row in rows if row.setting.parts == (("preset", name),)), own_row(rows))
+
+
+def rivals(rows: Sequence[Row]) -> list[Row]:
+    return [row for row in rows if set(row.setting.changes) <= BY_EFFORT]
+
+
+def better_than(preset: Row, rows: Sequence[Row], slack: float = SLACK) -> list[str]:
+    """Names of rivals that put a preset off the front.
+
+    One that is no worse in any error, and cheaper by more than the slack; or one that is no dearer and no worse in any
+    error, and better in one by more than the slack, beyond the noise of either.
+    """
+    found = []
+    for rival in rivals(rows):
+        pairs = list(compared(rival, preset, rows))
+        if rival.setting == preset.setting or any(
+            theirs.value > max(ours.value, least) for theirs, ours, least in pairs
+        ):
+            continue
+        better = any(ours.value > least and theirs.high * (1.0 + slack) < ours.low for theirs, ours, least in pairs)
+        if rival.ratio * (1.0 + slack) < preset.ratio or (rival.ratio <= preset.ratio and better):
+            found.append(rival.setting.name)
+    return found
+
+
+def compared(rival: Row, preset: Row, rows: Sequence[Row]) -> Iterator[tuple[Figure, Figure, float]]:
+    """Both figures of each error that both have, and what is negligible of it."""
+    for name, kind in ERRORS.items():
+        theirs, ours = error_of(rival, name, rows), error_of(preset, name, rows)
+        if theirs and ours:
+            yield theirs, ours, NEGLIGIBLE[kind.unit]
 
 
 def value_at(job: Job, path: str) -> object:

@@ -13,9 +13,10 @@ from matplotlib.text import Annotation, Text
 from PIL import Image
 
 from services.study.model import Row, Study
+from services.study.report.axes import COLORS, plain_style, renderer_of
 from services.study.report.knob_plots import draw_knob, knob_rows, moved_errors, single_knobs
+from services.study.report.labels import marker_boxes
 from services.study.report.panel import half_row, looks_of, moving_rows, panels_of
-from services.study.report.pictures import COLORS, boxed, plain_style, renderer_of
 from services.study.report.plots import draw_tradeoff, headline, write_plots
 from tests.made_up_studies import figure, large_study, row, study
 
@@ -111,11 +112,7 @@ def texts_of_legend(axes) -> list[Text]:
 def test_no_label_covers_a_point():
     for picture in drawn_once("large"):
         for axes in picture.axes:
-            marks = [
-                boxed(axes, (line.get_xdata()[0], line.get_ydata()[0]), line.get_markersize() / 2)
-                for line in axes.get_lines()
-                if line.get_marker() not in ("None", "")
-            ]
+            marks = [box for line in axes.get_lines() for box in marker_boxes(line)]
             notes = [
                 one for one in axes.texts if isinstance(one, Annotation) and one.get_text() and one.xycoords == "data"
             ]

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.errors import CorruptError, OutputError
 from services.study.errors import ERRORS
 from services.study.model import Figure, Row, Setting, Study
-from services.study.report.tables import STUDY_FILE, read_study, wide_schema, write_tables
+from services.study.report.tables import wide_schema, write_tables
 from tests.made_up_studies import large_study, row, study
+from tests.stored_studies import read_study
 
 TEXT, NUMBER = st.text(max_size=8), st.floats(allow_nan=False)
 JSON = st.recursive(
@@ -120,25 +120,3 @@ def test_nothing_but_the_three_files_is_left(tmp_path: Path):
     for _ in range(2):
         written = write_tables(study(row(depth_mm=0.1)), tmp_path)
     assert sorted(tmp_path.iterdir()) == sorted(written)
-
-
-def test_a_folder_without_a_study_is_told(tmp_path: Path):
-    with pytest.raises(OutputError, match=r"holds no study\.json: it is not a folder of a finished `verso tradeoff`"):
-        read_study(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "text", ["", "{", "[]", "{}", '{"verso_study": 1, "rows": []}', '{"rows": 3, "notes": []}', "\x80"]
-)
-def test_a_study_that_cannot_be_read_is_told(tmp_path: Path, text: str):
-    (tmp_path / STUDY_FILE).write_bytes(text.encode("latin-1"))
-    with pytest.raises(CorruptError, match=r"study\.json.*measure again"):
-        read_study(tmp_path)
-
-
-def test_a_newer_study_is_refused(tmp_path: Path):
-    write_tables(study(row(depth_mm=0.1)), tmp_path)
-    tree = json.loads((tmp_path / STUDY_FILE).read_text()) | {"verso_study": 2}
-    (tmp_path / STUDY_FILE).write_text(json.dumps(tree))
-    with pytest.raises(OutputError, match="newer than this program"):
-        read_study(tmp_path)

@@ -4,14 +4,14 @@ from pathlib import Path
 
 from schemas.job.job import Job
 from services.study.knobs import apply, knobs_of, settings_of
-from services.study.measure import looking
-from services.study.measure.looking import measure_colour
+from services.study.measure import scene_images
+from services.study.measure.scene_images import measure_colour
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import open_worker
 
 
 def test_four_samples_are_nearer_to_smooth_edges_than_one_and_flat_light_has_no_edges_to_compare(monkeypatch):
-    monkeypatch.setattr(looking, "colour_truth_missing", lambda: "not here")
+    monkeypatch.setattr(scene_images, "colour_truth_missing", lambda: "not here")
     job = apply(Job(name="t", seed=2024), {"check.raycast_share": 0.0})
     context = open_worker(job, open_catalogue(job.assets, Path(), tuple(job.categories)))
     settings, _ = settings_of(job, [knob for knob in knobs_of(job) if knob.name == "colour"])

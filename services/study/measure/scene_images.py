@@ -1,8 +1,9 @@
-"""The images of a scene with each setting, held against what rays and very many paths say."""
+"""Measures the images of a scene with each setting, against rays and against very many paths."""
 
 from collections.abc import Sequence
 
 from schemas.errors import SceneError
+from services.study.knobs import size_value
 from services.study.measure.colour_errors import (
     ColourTruth,
     Crop,
@@ -33,8 +34,10 @@ FINE_WIDTH = 2560
 """Pixels: 4 times the width that colours are compared at."""
 
 
-def measure_pictures(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> dict[str, dict[str, float]]:
-    """Errors of depth, masks, the mirror pose and the projection by the settings' names, where the scene can be made."""
+def measure_scene_images(
+    context: WorkerContext, settings: Sequence[Setting], scene_id: int
+) -> dict[str, dict[str, float]]:
+    """Errors of depth, masks, mirror pose and projection by the settings' names, where the scene can be made."""
     truth, answers = None, {}
     for setting in settings:
         found = _make(context_for(context, setting), scene_id)
@@ -45,10 +48,10 @@ def measure_pictures(context: WorkerContext, settings: Sequence[Setting], scene_
 
 
 def measure_colour(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> dict[str, dict[str, float]]:
-    """FLIP of the input RGB by the settings' names: `flip` and `edge_flip`; nothing where no object is seen.
+    """FLIP of the input RGB by the settings' names: `flip` and `edge_flip`; nothing where no object is visible.
 
-    Against a path-traced image, where that tier is installed; and, of tier raster, against the same tier's own light at 64
-    samples a pixel, as FLIP against other light says little of edges.
+    `flip` is against a path-traced image, where that tier is installed. `edge_flip`, of tier raster, is against the same
+    tier's own light at 64 samples a pixel, because FLIP against other light tells little of edges.
     """
     made = {setting.name: _make(_input_alone(context, setting), scene_id) for setting in settings}
     found = {name: one for name, one in made.items() if one is not None}
@@ -70,21 +73,14 @@ def measure_colour(context: WorkerContext, settings: Sequence[Setting], scene_id
 
 
 def _input_alone(context: WorkerContext, setting: Setting) -> WorkerContext:
-    """The setting's job without the views whose colour nobody looks at."""
+    """The setting's job without the views whose colour is not compared."""
     return context_for(context, Setting(setting.parts, {**setting.changes, **INPUT_ALONE}))
 
 
 def _smooth(context: WorkerContext, scene_id: int, crop: Crop) -> ColourTruth | None:
-    """What an image of tier raster is with 64 samples a pixel: drawn 4 times as wide with 4 each, and averaged by area."""
-    sensor = context.job.cameras.sensor
-    scale = FINE_WIDTH / sensor.width
-    fine = {
-        "width": FINE_WIDTH,
-        "height": round(sensor.height * scale),
-        **{name: getattr(sensor, name) * scale for name in ("fx", "fy", "cx", "cy")},
-    }
-    changes = {f"cameras.sensor.{name}": value for name, value in fine.items()}
-    setting = Setting((("truth", "edges"),), {**changes, "render.tier": "raster", "render.samples": 4})
+    """The raster tier's image with 64 samples a pixel: drawn 4 times as wide with 4 samples each, averaged by area."""
+    fine = size_value(context.job, FINE_WIDTH).changes
+    setting = Setting((("truth", "edges"),), {**fine, "render.tier": "raster", "render.samples": 4})
     made = _make(_input_alone(context, setting), scene_id)
     rgb = None if made is None else made[1].pairs[0].input.rgb
     return None if rgb is None else ColourTruth(crop, crop_colour(rgb, crop))
