@@ -22,12 +22,14 @@ def pins(lock: str) -> dict[str, str]:
 
 
 def test_the_locks_agree_on_what_they_share():
-    runtime, extra, development = (pins(lock) for lock in LOCKS)
+    runtime, traced, study, development = (pins(lock) for lock in LOCKS)
     shared = runtime.keys() & development.keys()
     assert shared
     assert {name: runtime[name] for name in shared} == {name: development[name] for name in shared}
-    assert extra and extra.items() <= development.items()
-    assert not extra.keys() & runtime.keys()
+    assert traced and study
+    assert (traced | study).items() <= development.items()
+    assert not traced.keys() & runtime.keys()
+    assert {name: study[name] for name in study.keys() & runtime.keys()}.items() <= runtime.items()
 
 
 def test_the_extra_is_pinned_alike_wherever_it_is_named():

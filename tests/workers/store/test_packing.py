@@ -20,7 +20,7 @@ def store(tmp_path):
 
 def test_there_is_one_tar_for_each_range_and_category_with_every_image_in_it(store, tmp_path):
     record = attempt_at(store, 0, 8, TAR).commit().record
-    images = {path: data for i in range(8) for path, data in scene(i).files if not path.startswith("assets/")}
+    images = {file.path: file.data for i in range(8) for file in scene(i).files if not file.path.startswith("assets/")}
     assert dict(read_images(store, record)) == images
     tars = {entry.path for entry in record.files if entry.path.endswith(".tar")}
     assert tars == {f"{path.split('/')[0]}/0000000000.tar" for path in images}
@@ -60,5 +60,5 @@ def test_members_have_no_time_or_owner_and_are_sorted_by_pose(store, tmp_path):
 def test_images_of_a_range_without_tars_are_read_alike(store):
     record = attempt_at(store, 0, 4).commit().record
     assert dict(read_images(store, record)) == {
-        path: data for i in range(4) for path, data in scene(i).files if not path.startswith("assets/")
+        file.path: file.data for i in range(4) for file in scene(i).files if not file.path.startswith("assets/")
     }

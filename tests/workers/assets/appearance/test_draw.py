@@ -62,7 +62,7 @@ def test_scenes_are_neither_dark_nor_burnt_out():
     [
         ("flat", set()),
         ("raster", {"shadows", "ambient_occlusion", "antialiasing"}),
-        ("pathtraced", {"shadows", "antialiasing", "global_illumination", "glass"}),
+        ("pathtraced", {"global_illumination", "glass"}),
     ],
 )
 def test_the_receipt_says_which_effects_of_light_ran(tier, expected):
@@ -72,6 +72,7 @@ def test_the_receipt_says_which_effects_of_light_ran(tier, expected):
     )
     names = {"shadows", "ambient_occlusion", "antialiasing", "global_illumination", "glass"}
     assert names & set(ran) == expected
-    assert {one["effect"]: one["why"] for one in skipped if one["effect"] in names} == dict.fromkeys(
-        names - expected, f"render.tier is {tier}"
-    )
+    reasons = dict.fromkeys(names - expected, f"render.tier is {tier}")
+    if tier == "pathtraced":  # paths are shadowed, and spread over a pixel, in any case
+        reasons |= dict.fromkeys(("shadows", "antialiasing"), "part of global_illumination")
+    assert {one["effect"]: one["why"] for one in skipped if one["effect"] in names} == reasons
