@@ -10,9 +10,7 @@ from typing import IO
 
 from schemas.dataset.layout import COMMITS, RANGES, TEMPORARY, scratch_path
 from schemas.errors import OutputError
-from workers.store.disk_errors import explain_disk_errors
-from workers.store.durable import sync_folders, sync_path, sync_tree
-from workers.store.probe import probe_folder
+from workers.store.file_system import explain_disk_errors, probe_folder, sync_folders, sync_path, sync_tree
 from workers.store.store import Entry, Store, fenced_key, retry_if_swept
 
 
