@@ -14,10 +14,10 @@ from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import MANIFEST, SUCCESS_FILE, is_shape
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMA_VERSION, TABLES
 from schemas.errors import CorruptError, RunError
-from services.merge.digest import dataset_digest
 from services.merge.poses import PoseFiles
 from services.merge.shared import SharedRows
 from services.merge.tables import MergedTable
+from workers.store.canonical import dataset_digest
 from workers.store.commit import check_published, commits_digest
 from workers.store.committed_rows import iter_ranges, range_rows
 from workers.store.store import Store

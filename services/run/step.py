@@ -22,7 +22,7 @@ from services.run.ray_cluster import Slots, open_ray
 from workers.assets.catalogue import open_catalogue
 from workers.render.step import require_tier
 from workers.store.committed_rows import list_commits
-from workers.store.opening import open_store
+from workers.store.local import open_store
 from workers.store.sweep import sweep
 
 
