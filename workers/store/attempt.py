@@ -17,15 +17,7 @@ from schemas.errors import OutputError, RunError
 from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
 from workers.store.canonical import rows_digest
 from workers.store.commit import compare_records, encode_record, publish, read_record
-from workers.store.manifest import (
-    check_files,
-    distinct_assets,
-    encode_table,
-    outcome_of,
-    scene_digest,
-    sorted_rows,
-    table_of_rows,
-)
+from workers.store.manifest import check_files, encode_table, outcome_of, scene_digest, sorted_rows, table_of_rows
 from workers.store.store import Store
 from workers.store.tars import Packing
 
@@ -143,7 +135,7 @@ class Attempt:
         """The record of this attempt, after the last of its files is written."""
         tables, files = {}, {}
         for table in TABLES:
-            rows = sorted_rows(table, distinct_assets(table, pa.concat_tables(self._rows[table]).combine_chunks()))
+            rows = sorted_rows(table, pa.concat_tables(self._rows[table]).combine_chunks())
             file = encoded_file(range_table_path(self.span.start, table, self.span.retry), encode_table(rows))
             with self._skip_if_swept():
                 self._store.write_staged(self._staging, file.path, file.data)

@@ -32,7 +32,7 @@ class _Stream:
         self._present = hashlib.sha256()
         self._lengths = hashlib.sha256()
         self._values = hashlib.sha256()
-        self._children = [_Stream(child) for child in _child_types(kind)]
+        self._children = [_Stream(kind.field(i).type) for i in range(kind.num_fields)]
 
     def update(self, array: pa.Array) -> None:
         """Takes the next values of the column."""
@@ -115,12 +115,6 @@ def dataset_digest(tables: Mapping[str, str], files: Iterable[tuple[str, str]]) 
 
 def _is_list(kind: pa.DataType) -> bool:
     return bool(pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind))
-
-
-def _child_types(kind: pa.DataType) -> list[pa.DataType]:
-    if pa.types.is_struct(kind):
-        return [kind.field(i).type for i in range(kind.num_fields)]
-    return [kind.value_type] if _is_list(kind) else []
 
 
 def _tag(kind: pa.DataType) -> str:

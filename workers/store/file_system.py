@@ -55,18 +55,14 @@ def file_system_of(folder: str | Path) -> str:
 def sync_tree(folder: Path) -> None:
     """Returns when every file and folder below `folder`, and its own name, are on the disk.
 
-    Uses one syncfs where it can be trusted, otherwise an fsync for each file, several at once. 300 files of 60 kB on ext4
+    Uses one syncfs where it can be trusted, otherwise an fsync for each of them, several at once. 300 files of 60 kB on ext4
     take 12 ms by syncfs, 42 ms by fsync at once and 94 ms one by one.
     """
     if _trusts_syncfs(folder):
         _syncfs(folder)
     else:
-        parents, _, names = zip(*os.walk(folder, topdown=False), strict=True)
-        files = [Path(parent, name) for parent, inside in zip(parents, names, strict=True) for name in inside]
         with ThreadPoolExecutor(_AT_ONCE) as pool:
-            list(pool.map(sync_path, files))
-        for parent in parents:
-            sync_path(parent)
+            list(pool.map(sync_path, [*folder.rglob("*"), folder]))
     sync_path(folder.parent)
 
 

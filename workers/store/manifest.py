@@ -102,22 +102,15 @@ def scene_digest(rows: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def distinct_assets(table: str, rows: pa.Table) -> pa.Table:
-    """Rows of `assets` without repetitions, which scenes that share a shape make; other tables as they are.
-
-    Two different rows of one asset stay, and are refused later as a repeated key.
-    """
-    if table != "assets" or rows.num_rows < 2:
-        return rows
-    seen: dict[str, int] = {}
-    for index, row in enumerate(rows.to_pylist()):
-        seen.setdefault(json.dumps(row), index)
-    return rows.take(list(seen.values()))
-
-
 def sorted_rows(table: str, rows: pa.Table) -> pa.Table:
-    """Rows in the order of the table's key. Raises ValueError where two rows share a key."""
+    """Rows in the order of the table's key; equal rows of `assets` once, which scenes that share a shape repeat.
+
+    Raises ValueError where two rows share a key.
+    """
     names = SORT_KEYS[table]
+    if table == "assets":
+        distinct = {json.dumps(row): index for index, row in enumerate(rows.to_pylist())}
+        rows = rows.take(pa.array(distinct.values(), pa.int64()))
     result = rows.sort_by([(name, "ascending") for name in names])
     for key, following in pairwise(zip(*(result.column(name).to_pylist() for name in names), strict=True)):
         if key == following:

@@ -96,10 +96,6 @@ class Packing:
             archive.close()
 
 
-class _Dropped(Exception):
-    """Ends a stream that is not to be stored."""
-
-
 class _Archive:
     """A tar being written; its bytes are counted and hashed on the way."""
 
@@ -122,8 +118,8 @@ class _Archive:
         return FileEntry(path=self._path, bytes=self._bytes, sha256=self._sha256.hexdigest())
 
     def close(self) -> None:
-        with contextlib.suppress(_Dropped), self._open:
-            raise _Dropped
+        with contextlib.suppress(GeneratorExit), self._open:
+            raise GeneratorExit  # ends the stream, which is not stored then
 
     def _write(self, data: bytes) -> None:
         self._file.write(data)
