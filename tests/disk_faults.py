@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from workers.store import durable, local
+from workers.store import file_system, local
 
 _STEPS = ("link", "replace", "rename", "mkdir", "unlink", "rmdir", "fsync")
 
@@ -59,8 +59,8 @@ def disk(at: int = -1, then: Callable[[], object] | None = None) -> Iterator[Dis
         for name in _STEPS:
             patch.setattr(os, name, _counted(watched, name, getattr(os, name)))
         patch.setattr(local, "open", lambda path, mode="r", **more: _open(watched, path, mode, **more), raising=False)
-        patch.setattr(durable, "_syncfs", lambda folder: _sync_all(watched, folder))
-        patch.setattr(durable, "_trusts_syncfs", lambda folder: True)
+        patch.setattr(file_system, "_syncfs", lambda folder: _sync_all(watched, folder))
+        patch.setattr(file_system, "_trusts_syncfs", lambda folder: True)
         yield watched
 
 
@@ -69,8 +69,8 @@ def unflushed() -> Iterator[None]:
     """Nothing is flushed in this module: for tests that lose no power, which a busy disk would slow down."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
-        patch.setattr(durable, "_syncfs", lambda folder: True)
-        patch.setattr(durable, "_trusts_syncfs", lambda folder: True)
+        patch.setattr(file_system, "_syncfs", lambda folder: True)
+        patch.setattr(file_system, "_trusts_syncfs", lambda folder: True)
         yield
 
 

@@ -1,6 +1,5 @@
 """A commit: the record that a range of scenes is done, and the terms that all commits of a dataset share."""
 
-import hashlib
 from dataclasses import dataclass
 from typing import Literal
 
@@ -48,11 +47,6 @@ class FileEntry(Frozen):
     path: str
     bytes: NonNegativeInt
     sha256: str
-
-
-def describe_file(path: str, data: bytes) -> FileEntry:
-    """The entry of a file with these bytes."""
-    return FileEntry(path=path, bytes=len(data), sha256=hashlib.sha256(data).hexdigest())
 
 
 class TableEntry(Frozen):

@@ -19,7 +19,7 @@ from services.bench.others import other_systems
 from services.bench.report import describe, summarise
 from services.bench.traced import measure_traced
 from services.job.read import change_key, load_job, validate_job
-from workers.store.mounts import file_system_of
+from workers.store.file_system import file_system_of
 
 
 def main(options: argparse.Namespace) -> int:

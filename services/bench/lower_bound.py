@@ -10,7 +10,7 @@ from services.bench.encoders import Encoder, kind_of
 from services.bench.ratios import Lap
 from workers.pipeline.make_scene import Scene
 from workers.render.raster.gbuffer import FLAT, Renderer
-from workers.store.durable import sync_path, sync_tree
+from workers.store.file_system import sync_path, sync_tree
 from workers.store.images import Pixels, decode_png
 
 

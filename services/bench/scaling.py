@@ -11,7 +11,7 @@ from schemas.job.job import Job
 from services.bench.bare import bare_processes
 from services.bench.ratios import Lap, Spread, by_processor, idle_share
 from services.bench.stages import bench_order
-from services.run.coordinator import Limits, Tally, Work, run_spans
+from services.run.coordinator import Coordinator, Limits, Tally
 from services.run.range_planner import MAX_SHARD, group_shards
 from services.run.ray_cluster import PREFETCH, private_ray
 from workers.assets.catalogue import Catalogue, open_catalogue
@@ -121,8 +121,9 @@ class _RayDrive:
         # The other slot could start a waiting shard, so one worker gets one shard at a time.
         limits = Limits(PREFETCH * slots if slots == self.workers else slots, 1, count)
         begun = time.perf_counter()
-        work = Work(store, bench_order(self.job, out), self.catalogue)
-        run_spans(work, group_shards(spans, shard_size), limits, lambda tally: None, tally)
+        Coordinator(store, bench_order(self.job, out), self.catalogue, limits, tally).run(
+            group_shards(spans, shard_size)
+        )
         seconds = time.perf_counter() - begun
         idle = idle_share(tally.shard_wall_s, slots, seconds)
         return Lap(tally.made, seconds, tally.shard_cpu_s, {}), idle

@@ -185,6 +185,6 @@ def scene(options: argparse.Namespace) -> int:
 def _dataset(out: str) -> "Store":
     """The store of an output folder. Raises OutputError where it is none."""
     from services.job.record import require_dataset
-    from workers.store.opening import open_store
+    from workers.store.local import open_store
 
     return require_dataset(open_store(out))

@@ -10,9 +10,6 @@ import pyarrow.compute as pc
 from schemas.dataset.layout import CAM_POSES, CAMERAS, OBJECTS
 from schemas.scene.camera import ROLES
 
-POSE_ROLES = ("input", "mirror")
-"""The roles that have a row in camPoses.csv; aligned and projected cameras are in cameras.csv alone."""
-
 _ELEMENTS = [f"T{row}{column}" for row in range(4) for column in range(4)]
 _CAMERA_COLUMNS = [
     *("pose_id", "parent_id", "role", "width", "height", "fx", "fy", "cx", "cy"),
@@ -25,8 +22,8 @@ class PoseFiles:
     """The three files in `folder`, open for writing; takes whole ranges in order."""
 
     def __init__(self, folder: Path) -> None:
-        self._paths = {name: folder / name for name in (CAM_POSES, CAMERAS, OBJECTS)}
-        self._files = {name: open(path, "w", encoding="utf-8", newline="\n") for name, path in self._paths.items()}  # noqa: SIM115
+        self.paths = {name: folder / name for name in (CAM_POSES, CAMERAS, OBJECTS)}
+        self._files = {name: open(path, "w", encoding="utf-8", newline="\n") for name, path in self.paths.items()}  # noqa: SIM115
         self._files[CAM_POSES].write(",".join(["id", "parent_id", *_ELEMENTS]) + "\n")
         self._files[CAMERAS].write(",".join([*_CAMERA_COLUMNS, *_ELEMENTS]) + "\n")
 
@@ -36,13 +33,8 @@ class PoseFiles:
         self._files[CAMERAS].writelines(camera_lines(views))
         self._files[OBJECTS].writelines(object_lines(objects))
 
-    def finish(self) -> dict[str, Path]:
-        """Closes the files; their paths by key."""
-        self.close()
-        return self._paths
-
     def close(self) -> None:
-        """Closes the files as they are."""
+        """Closes the files."""
         for file in self._files.values():
             file.close()
 
@@ -82,4 +74,5 @@ def escaped(name: str) -> str:
 
 
 def _is_pose(rows: pa.Table) -> pa.ChunkedArray:
-    return pc.is_in(rows.column("role"), value_set=pa.array(POSE_ROLES))
+    """Which rows are of input and mirror cameras; aligned and projected cameras are in cameras.csv alone."""
+    return pc.is_in(rows.column("role"), value_set=pa.array(["input", "mirror"]))

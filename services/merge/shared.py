@@ -20,8 +20,6 @@ from schemas.errors import CommitConflict, CorruptError, MachineError
 CACHE_KIB = 16 << 10
 """Memory for SQLite's cache."""
 
-_ROWS_PER_BATCH = 4_096
-
 _SETUP = """
 PRAGMA journal_mode = OFF;
 PRAGMA synchronous = OFF;
@@ -30,9 +28,6 @@ CREATE TABLE files (path TEXT, sha256 TEXT, times INTEGER, PRIMARY KEY (path, sh
 BEGIN;
 """
 """No journal and no flush: another merge begins with a new file."""
-
-_ADD_ASSET = "INSERT INTO assets VALUES (?, ?) ON CONFLICT DO NOTHING"
-_ADD_FILE = "INSERT INTO files VALUES (?, ?, 1) ON CONFLICT DO UPDATE SET times = times + 1"
 
 
 class SharedRows:
@@ -48,7 +43,8 @@ class SharedRows:
 
     def add_assets(self, rows: pa.Table) -> None:
         """Takes rows of `assets`."""
-        self._insert(_ADD_ASSET, ((row["instance_id"], json.dumps(row)) for row in rows.to_pylist()))
+        pairs = ((row["instance_id"], json.dumps(row)) for row in rows.to_pylist())
+        self._insert("assets VALUES (?, ?) ON CONFLICT DO NOTHING", pairs)
 
     def add_images(self, views: pa.Table) -> None:
         """Takes the files that rows of `views` name."""
@@ -59,7 +55,7 @@ class SharedRows:
 
     def add_files(self, files: Iterable[tuple[str, str]]) -> None:
         """Takes (path, SHA-256) of files."""
-        self._insert(_ADD_FILE, files)
+        self._insert("files VALUES (?, ?, 1) ON CONFLICT DO UPDATE SET times = times + 1", files)
 
     def assets(self, mixed: bool) -> Iterator[pa.Table]:
         """The rows of `assets`, each instance once, by instance id.
@@ -67,7 +63,7 @@ class SharedRows:
         Raises CommitConflict where two differ, unless stacks are `mixed`: then always the same one is taken.
         """
         selected = self._select("instance_id, min(row), count(*) FROM assets")
-        while batch := list(islice(selected, _ROWS_PER_BATCH)):
+        while batch := list(islice(selected, 4_096)):
             for instance_id, _, count in batch:
                 if count > 1 and not mixed:
                     raise CommitConflict(f"the asset {instance_id} is described differently by two ranges of one stack")
@@ -90,9 +86,9 @@ class SharedRows:
         """Closes the file."""
         self._db.close()
 
-    def _insert(self, statement: str, rows: Iterable[tuple[str, str]]) -> None:
+    def _insert(self, what: str, rows: Iterable[tuple[str, str]]) -> None:
         with _explained():
-            self._db.executemany(statement, rows)
+            self._db.executemany(f"INSERT INTO {what}", rows)
 
     def _select(self, what: str) -> Iterator[tuple]:
         """Rows by the first column, which is read in the order of the primary key: nothing is sorted in memory."""

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 
@@ -14,10 +15,10 @@ from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import MANIFEST, SUCCESS_FILE, is_shape
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMA_VERSION, TABLES
 from schemas.errors import CorruptError, RunError
-from services.merge.digest import dataset_digest
 from services.merge.poses import PoseFiles
 from services.merge.shared import SharedRows
 from services.merge.tables import MergedTable
+from workers.store.canonical import dataset_digest
 from workers.store.commit import check_published, commits_digest
 from workers.store.committed_rows import iter_ranges, range_rows
 from workers.store.store import Store
@@ -110,10 +111,9 @@ class _Merging:
 
     def close(self) -> None:
         """Closes every file, finished or not."""
-        self._poses.close()
-        self._shared.close()
-        for table in self._tables.values():
-            table.close()
+        parts: list[PoseFiles | SharedRows | MergedTable] = [self._poses, self._shared, *self._tables.values()]
+        for part in parts:
+            part.close()
 
     def finish(self) -> tuple[dict, dict[str, Path]]:
         """The contents of `_SUCCESS`, and the finished files by key."""
@@ -121,11 +121,12 @@ class _Merging:
         for rows in self._shared.assets(mixed):
             self._tables["assets"].add(rows)
         categories = sorted(self._tables["scenes"].categories | self._tables["failures"].categories)
-        files = pose_files = self._poses.finish()
+        self._poses.close()
+        files = self._poses.paths
         for table in self._tables.values():
             files = files | table.finish(categories)
         entries = {path: _entry(local) for path, local in sorted(files.items())}
-        self._shared.add_files((path, str(entries[path]["sha256"])) for path in pose_files)
+        self._shared.add_files((path, str(entries[path]["sha256"])) for path in self._poses.paths)
         digests = {table: merged.digest.hexdigest() for table, merged in self._tables.items()}
         success = {
             "schema_version": SCHEMA_VERSION,
@@ -165,10 +166,6 @@ def _entry(path: Path) -> dict[str, object]:
         return {"bytes": path.stat().st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
 
 
-def _result(success: Mapping[str, dict]) -> MergeResult:
-    return MergeResult(
-        digest=str(success["digest"]),
-        complete=not success["scenes"]["environmental"],
-        scenes=dict(success["scenes"]),
-        rows=dict(success["rows"]),
-    )
+def _result(success: Mapping[str, Any]) -> MergeResult:
+    complete = not success["scenes"]["environmental"]
+    return MergeResult(success["digest"], complete, success["scenes"], success["rows"])

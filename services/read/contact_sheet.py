@@ -16,7 +16,7 @@ from schemas.dataset.codec import Row, read_world_poses
 from schemas.dataset.layout import Content, image_path, patch_index, patch_path
 from schemas.scene.region import REGION_FIRST_OBJECT
 from services.read.dataset_reader import StoredRange, file_reader, iter_stored, read_image
-from workers.store.opening import open_store
+from workers.store.local import open_store
 from workers.store.store import Store
 
 CELL = (256, 192)

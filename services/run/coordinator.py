@@ -30,8 +30,6 @@ EXPLANATIONS: dict[Reason, str] = {
 }
 """The stored detail of an environmental failure."""
 
-Progress = Callable[["Tally"], None]
-
 
 @dataclass
 class Tally:
@@ -69,39 +67,19 @@ class Limits:
     failures: int
 
 
-@dataclass(frozen=True)
-class Work:
-    """The same for every shard: the store, the pattern of its order, and the catalogue of its assets."""
-
-    store: Store
-    order: ShardOrder
-    catalogue: Catalogue
-
-
 _run_shard = ray.remote(num_cpus=1, max_retries=0)(run_shard)
 
 
-def run_spans(work: Work, shards: Iterator[tuple[Span, ...]], limits: Limits, progress: Progress, tally: Tally) -> None:
-    """Makes every range of every shard.
+class Coordinator:
+    """The state of a run: the shards that run, those to run again, and how often workers died.
 
-    Raises CommitConflict where two attempts made other bytes, RunError where a worker cannot be kept alive or too many
-    scenes fail. On KeyboardInterrupt, committed ranges stay and running shards are ended.
+    `order` is the pattern of every shard's order, `catalogue` that of its assets.
     """
-    coordinator = _Coordinator(work, limits, tally)
-    try:
-        coordinator.run(shards, progress)
-    except BaseException:
-        coordinator.cancel()
-        raise
 
-
-class _Coordinator:
-    """The state of the loop: the shards that run, those to run again, and how often workers died."""
-
-    def __init__(self, work: Work, limits: Limits, tally: Tally) -> None:
-        self._store = work.store
-        self._order = work.order.model_copy(update={"label": uuid.uuid4().hex[:8]})
-        self._catalogue = ray.put(work.catalogue)
+    def __init__(self, store: Store, order: ShardOrder, catalogue: Catalogue, limits: Limits, tally: Tally) -> None:
+        self._store = store
+        self._order = order.model_copy(update={"label": uuid.uuid4().hex[:8]})
+        self._catalogue = ray.put(catalogue)
         self._limits = limits
         self._tally = tally
         self._again: deque[tuple[Span, ...]] = deque()
@@ -110,32 +88,39 @@ class _Coordinator:
         """By ("scene", id), or ("range", start) where no scene was begun."""
         self._blamed: dict[int, Blame] = {}
 
-    def run(self, shards: Iterator[tuple[Span, ...]], progress: Progress) -> None:
-        """Gives out shards and collects reports until nothing is left."""
-        while True:
-            while len(self._running) < self._limits.in_flight:
-                spans = self._again.popleft() if self._again else next(shards, None)
-                if spans is None:
-                    break
-                self._submit(spans)
-            if not self._running:
-                return
-            ready, _ = ray.wait(list(self._running), num_returns=1, timeout=POLL_S)
-            for ref in ready:
-                self._collect(ref, self._running.pop(ref))
-            progress(self._tally)
+    def run(self, shards: Iterator[tuple[Span, ...]], progress: Callable[[Tally], None] = lambda tally: None) -> None:
+        """Makes every range of every shard.
 
-    def cancel(self) -> None:
+        Raises CommitConflict where two attempts made other bytes, RunError where a worker cannot be kept alive or too
+        many scenes fail. On KeyboardInterrupt, committed ranges stay and running shards are ended.
+        """
+        try:
+            while self._fill_slots(shards):
+                ready, _ = ray.wait(list(self._running), num_returns=1, timeout=POLL_S)
+                for ref in ready:
+                    self._collect(ref, self._running.pop(ref))
+                progress(self._tally)
+        except BaseException:
+            self._cancel()
+            raise
+
+    def _fill_slots(self, shards: Iterator[tuple[Span, ...]]) -> bool:
+        """Gives shards to Ray while there is room; False where nothing is left to wait for."""
+        while len(self._running) < self._limits.in_flight:
+            spans = self._again.popleft() if self._again else next(shards, None)
+            if spans is None:
+                break
+            blamed = tuple(self._blamed[scene] for span in spans for scene in span.scene_ids if scene in self._blamed)
+            order = self._order.model_copy(update={"spans": spans, "blamed": blamed})
+            self._running[_run_shard.remote(order, self._catalogue)] = spans
+        return bool(self._running)
+
+    def _cancel(self) -> None:
         """Ends running shards; what is not committed is made again by the next run."""
         for ref in self._running:
             ray.cancel(ref, force=True)
         if self._running:
             ray.wait(list(self._running), num_returns=len(self._running), timeout=5.0)
-
-    def _submit(self, spans: tuple[Span, ...]) -> None:
-        blamed = tuple(self._blamed[scene] for span in spans for scene in span.scene_ids if scene in self._blamed)
-        order = self._order.model_copy(update={"spans": spans, "blamed": blamed})
-        self._running[_run_shard.remote(order, self._catalogue)] = spans
 
     def _collect(self, ref: "ray.ObjectRef", spans: tuple[Span, ...]) -> None:
         try:
@@ -145,13 +130,10 @@ class _Coordinator:
                 raise error.cause from error
             raise RunError(f"a worker raised an error that is a bug:\n{error}") from error
         except RayError as error:
-            self._handle_death(spans, error)
-            return
+            return self._handle_death(spans, error)
         self._tally.add(report)
         for span in report.spans:
-            log_event(
-                "range committed", range=span.start, stop=span.stop, won=span.won, made=span.made, failed=span.failed
-            )
+            log_event("range committed", range=span.start, **span.model_dump(include={"stop", "won", "made", "failed"}))
         if self._tally.conflicts:
             raise CommitConflict(self._tally.conflicts[0])
         if self._tally.failed.total() > self._limits.failures:

@@ -97,9 +97,12 @@ def _show_life(store: Store, mine: Holder, period_s: float, ended: threading.Eve
 def _find_gone(store: Store, beat: Beat) -> Holder | None:
     """The holder if it is dead or shows no life, None if the lock is free. Raises RunError where it lives."""
     first = now = read_holder(store)
-    if first is None or _is_dead(first):
+    if first is None:
+        return None
+    on_this_machine = bool(first.machine) and first.machine == _machine()
+    if on_this_machine and _born(first.pid) != first.born:
         return first
-    if not _is_on_this_machine(first):
+    if not on_this_machine:
         for _ in range(beat.patience):
             time.sleep(beat.period_s)
             if (now := read_holder(store)) != first:
@@ -160,11 +163,3 @@ def _born(pid: int) -> str | None:
         return None
     state, *fields = stat.rpartition(")")[2].split()
     return None if state in "ZX" else fields[18]
-
-
-def _is_on_this_machine(holder: Holder) -> bool:
-    return bool(holder.machine) and holder.machine == _machine()
-
-
-def _is_dead(holder: Holder) -> bool:
-    return _is_on_this_machine(holder) and _born(holder.pid) != holder.born

@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import ray
 
@@ -46,23 +47,17 @@ def private_ray(workers: int) -> Iterator[Slots]:
     """
     # Otherwise Ray asks its own workers for a token that an earlier Ray left in the home folder.
     os.environ["RAY_AUTH_MODE"] = "disabled"  # noqa: TID251 - Ray reads this setting nowhere else
-    with _stdout_to_stderr(), tempfile.TemporaryDirectory(prefix="vr", ignore_cleanup_errors=True) as folder:
-        with _in_project_folder():
-            ray.init(
-                address="local",
-                num_cpus=workers,
-                include_dashboard=False,
-                object_store_memory=OBJECT_STORE_BYTES,
-                log_to_driver=False,
-                configure_logging=False,
-                _temp_dir=folder,
-                _plasma_directory=_object_store_folder(folder),
-                _node_ip_address="127.0.0.1",
-            )
-        try:
+    with tempfile.TemporaryDirectory(prefix="vr", ignore_cleanup_errors=True) as folder:
+        settings = {
+            "num_cpus": workers,
+            "include_dashboard": False,
+            "object_store_memory": OBJECT_STORE_BYTES,
+            "_temp_dir": folder,
+            "_plasma_directory": _object_store_folder(folder),
+            "_node_ip_address": "127.0.0.1",
+        }
+        with _connection("local", **settings):
             yield Slots(workers, PREFETCH * workers)
-        finally:
-            ray.shutdown()
 
 
 def _object_store_folder(temporary: str) -> str:
@@ -82,47 +77,40 @@ def cluster_ray(address: str, workers: int | None) -> Iterator[Slots]:
     Raises MachineError where no Ray answers at the address.
     """
     _check_reachable(address)
-    with _stdout_to_stderr():
+    with contextlib.ExitStack() as stack:
         try:
-            with _in_project_folder():
-                ray.init(address=address, log_to_driver=False, configure_logging=False)
+            stack.enter_context(_connection(address))
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise MachineError(f"--address {address}: {error}") from error
-        try:
-            cores = int(ray.cluster_resources().get("CPU", 0))
-            if cores < 1:
-                raise MachineError(f"--address {address}: the cluster has no CPU to run on")
-            # Any free core would start a waiting shard, so none may wait where there are fewer workers than cores.
-            yield Slots(workers, workers) if workers and workers < cores else Slots(cores, PREFETCH * cores)
-        finally:
-            ray.shutdown()
-
-
-def _stdout_to_stderr() -> contextlib.AbstractContextManager[object]:
-    """Keeps Ray's messages about dead workers off standard output, which is for the command's answer."""
-    return contextlib.redirect_stdout(sys.stderr)
+        cores = int(ray.cluster_resources().get("CPU", 0))
+        if cores < 1:
+            raise MachineError(f"--address {address}: the cluster has no CPU to run on")
+        # Any free core would start a waiting shard, so none may wait where there are fewer workers than cores.
+        yield Slots(workers, workers) if workers and workers < cores else Slots(cores, PREFETCH * cores)
 
 
 @contextlib.contextmanager
-def _in_project_folder() -> Iterator[None]:
-    """Changes to the project's folder, which Ray then puts first on its workers' search path.
+def _connection(address: str, **settings: Any) -> Iterator[None]:
+    """A connection to a Ray, shut down when the block ends.
 
-    The packages have generic names: a `services` folder in the user's working folder must not be found instead.
+    Ray's messages about dead workers go to standard error: standard output is for the command's answer. Ray puts the
+    current folder first on its workers' search path. It is the project's for that moment, because the packages have
+    generic names: a `services` folder in the user's working folder must not be found instead.
     """
-    before = Path.cwd()
-    os.chdir(Path(__file__).resolve().parents[2])
-    try:
-        yield
-    finally:
-        os.chdir(before)
+    with contextlib.redirect_stdout(sys.stderr):
+        with contextlib.chdir(Path(__file__).resolve().parents[2]):
+            ray.init(address=address, log_to_driver=False, configure_logging=False, **settings)
+        try:
+            yield
+        finally:
+            ray.shutdown()
 
 
 def _check_reachable(address: str) -> None:
     """Raises MachineError unless something accepts a connection; Ray itself would wait for a minute."""
     if address == "auto":
         return
-    plain = address.removeprefix("ray://")
-    host, _, port = plain.rpartition(":")
+    host, _, port = address.removeprefix("ray://").rpartition(":")
     if not host or not port.isdigit():
         raise MachineError(
             f"--address {address}: write it as HOST:PORT, as `ray start` prints it (port 6379 by default)"

@@ -14,15 +14,16 @@ from schemas.job.job import Job
 from services.job.record import JobRecord, adopt, encode_job, record_job, refuse_foreign
 from services.merge.dataset_card import describe_left_out, describe_sources, write_card
 from services.merge.step import MergeResult, merge, reopen
-from services.run.coordinator import Limits, Tally, Work, run_spans
+from services.run.coordinator import Coordinator, Limits, Tally
 from services.run.lock import hold_lock
 from services.run.progress import ProgressLine, event_log, log_event
 from services.run.range_planner import MAX_SHARD, choose_shard_size, group_shards, plan_spans
 from services.run.ray_cluster import Slots, open_ray
-from workers.assets.catalogue import open_catalogue
+from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.render.step import require_tier
 from workers.store.committed_rows import list_commits
-from workers.store.opening import open_store
+from workers.store.local import open_store
+from workers.store.store import Store
 from workers.store.sweep import sweep
 
 
@@ -84,15 +85,15 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
         store.write_whole(JOB_FILE, encode_job(record))
         if not commits:
             store.remove(FINGERPRINT_FILE)  # of a run that never made anything
-        tally = Tally(asked=sum(len(span.scene_ids) for span in spans))
+        made_now = 0
         if spans:
             reopen(store)
             with cluster or open_ray(request.address, record.job.run.workers) as slots:
-                _make(Work(store, _order(request.out, record), catalogue), spans, slots, tally)
+                made_now = _make(store, _order(request.out, record), catalogue, spans, slots)
         merged = merge(store, record.job.first_scene, record.job.stop_scene)
         write_card(store, record, catalogue, merged)
         log_event("finished", job=record.job.name, digest=merged.digest)
-    return RunResult(merged, time.monotonic() - begun, tally.made)
+    return RunResult(merged, time.monotonic() - begun, made_now)
 
 
 def _order(out: str, record: JobRecord) -> ShardOrder:
@@ -109,14 +110,14 @@ def _order(out: str, record: JobRecord) -> ShardOrder:
     return ShardOrder(out=out, job=job, terms=terms, spans=())
 
 
-def _make(work: Work, spans: Sequence[Span], slots: Slots, tally: Tally) -> None:
-    """Makes the ranges, and shows how many scenes are done."""
-    job = work.order.job
+def _make(store: Store, order: ShardOrder, catalogue: Catalogue, spans: Sequence[Span], slots: Slots) -> int:
+    """Makes the ranges, and shows how many scenes are done. The number of scenes made."""
+    job = order.job
+    tally = Tally(asked=sum(len(span.scene_ids) for span in spans))
     log_event("started", job=job.name, scenes=tally.asked, slots=slots.running)
     limits = Limits(slots.in_flight, job.run.max_attempts, int(job.run.max_failure_share * job.scenes))
     shards = group_shards(spans, job.run.shard_size or choose_shard_size(tally.asked, slots.running))
-    line = ProgressLine(tally.asked, job.name)
-    try:
-        run_spans(work, shards, limits, lambda now: line.show(now.done, now.failed.total()), tally)
-    finally:
-        line.close()
+    with contextlib.closing(ProgressLine(tally.asked, job.name)) as line:
+        coordinator = Coordinator(store, order, catalogue, limits, tally)
+        coordinator.run(shards, lambda now: line.show(now.done, now.failed.total()))
+    return tally.made

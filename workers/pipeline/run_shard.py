@@ -32,7 +32,7 @@ from workers.render.raster.context import require_device
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.step import require_tier
 from workers.store.attempt import Attempt, begin_attempt
-from workers.store.opening import open_store
+from workers.store.local import open_store
 from workers.store.store import Store
 
 TIMED_OUT = "_timed_out"

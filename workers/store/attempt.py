@@ -10,26 +10,16 @@ from collections.abc import Iterator, Mapping
 
 import pyarrow as pa
 
-from schemas.dataset.commit import (
-    CommitRecord,
-    CommitResult,
-    CommitTerms,
-    FileEntry,
-    SceneMark,
-    Span,
-    TableEntry,
-    describe_file,
-)
+from schemas.dataset.commit import CommitRecord, CommitResult, CommitTerms, FileEntry, SceneMark, Span, TableEntry
 from schemas.dataset.layout import FENCED, commit_path, range_table_path, staging_path
 from schemas.dataset.tables import SCHEMA_VERSION, SCHEMAS, TABLES
 from schemas.errors import OutputError, RunError
-from schemas.scene.scene import SceneOutput
+from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
 from workers.store.canonical import rows_digest
 from workers.store.commit import compare_records, encode_record, publish, read_record
-from workers.store.manifest import encode_table, sorted_rows, table_of_rows
-from workers.store.packing import Packing
-from workers.store.scene_rows import check_files, distinct_assets, outcome_of, scene_digest
+from workers.store.manifest import check_files, encode_table, outcome_of, scene_digest, sorted_rows, table_of_rows
 from workers.store.store import Store
+from workers.store.tars import Packing
 
 CURRENT = "_current"
 """A file in an attempt's folder that names the scene in progress, in case the worker dies."""
@@ -108,9 +98,7 @@ class Attempt:
         if unknown := output.rows.keys() - tables.keys():
             raise ValueError(f"scene {output.scene_id} has rows for unknown tables: {', '.join(sorted(unknown))}")
         outcome = outcome_of(output)
-        entries = {
-            file.path: FileEntry(path=file.path, bytes=len(file.data), sha256=file.sha256) for file in output.files
-        }
+        entries = {file.path: _entry_of(file) for file in output.files}
         check_files(output, entries)
         for path in self._files.keys() & entries.keys():
             if self._files[path] != entries[path]:
@@ -120,8 +108,7 @@ class Attempt:
         self._files |= entries
         for table, rows in tables.items():
             self._rows[table].append(rows)
-        digest = scene_digest(output.rows)
-        self._scenes.append(SceneMark(scene_id=output.scene_id, outcome=outcome, digest=digest))
+        self._scenes.append(SceneMark(scene_id=output.scene_id, outcome=outcome, digest=scene_digest(output.rows)))
 
     def commit(self) -> CommitResult:
         """Decides the range and, where this attempt wins, publishes it; a loser's folder is removed.
@@ -148,12 +135,11 @@ class Attempt:
         """The record of this attempt, after the last of its files is written."""
         tables, files = {}, {}
         for table in TABLES:
-            rows = sorted_rows(table, distinct_assets(table, pa.concat_tables(self._rows[table]).combine_chunks()))
-            data = encode_table(rows)
-            path = range_table_path(self.span.start, table, self.span.retry)
+            rows = sorted_rows(table, pa.concat_tables(self._rows[table]).combine_chunks())
+            file = encoded_file(range_table_path(self.span.start, table, self.span.retry), encode_table(rows))
             with self._skip_if_swept():
-                self._store.write_staged(self._staging, path, data)
-            files[path] = describe_file(path, data)
+                self._store.write_staged(self._staging, file.path, file.data)
+            files[file.path] = _entry_of(file)
             tables[table] = TableEntry(rows=rows.num_rows, digest=rows_digest(table, rows))
         with self._skip_if_swept():
             files |= {entry.path: entry for entry in self._packing.finish(self._files)}
@@ -197,3 +183,7 @@ class Attempt:
             yield
         except FileNotFoundError:
             self.fenced = True
+
+
+def _entry_of(file: EncodedFile) -> FileEntry:
+    return FileEntry(path=file.path, bytes=len(file.data), sha256=file.sha256)

@@ -1,4 +1,4 @@
-"""The canonical bytes of table rows: the same rows in the same order give the same digest, however they are stored.
+"""Digests of table rows and of a dataset: the same rows in the same order give the same digest, however stored.
 
 Each column is hashed as a few streams: which values are present (one byte each), lengths of strings and lists, and the
 values themselves (doubles as IEEE-754 little-endian, so -0.0 is not 0.0; integers as 8 bytes little-endian; booleans as
@@ -8,12 +8,13 @@ and its columns in the order of the schema. It does not depend on how rows were 
 """
 
 import hashlib
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from schemas.dataset.tables import SCHEMAS
+from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS
 
 _PRIMITIVES: dict[pa.DataType, tuple[str, float | bool]] = {
     pa.float64(): ("<f8", 0.0),
@@ -31,7 +32,7 @@ class _Stream:
         self._present = hashlib.sha256()
         self._lengths = hashlib.sha256()
         self._values = hashlib.sha256()
-        self._children = [_Stream(child) for child in _child_types(kind)]
+        self._children = [_Stream(kind.field(i).type) for i in range(kind.num_fields)]
 
     def update(self, array: pa.Array) -> None:
         """Takes the next values of the column."""
@@ -91,14 +92,29 @@ def rows_digest(table: str, rows: pa.Table) -> str:
     return digest.hexdigest()
 
 
+def dataset_digest(tables: Mapping[str, str], files: Iterable[tuple[str, str]]) -> str:
+    """64 hex characters: SHA-256 over the tables' digests, then over the (path, SHA-256) of `files`.
+
+    The tables are scenes, views, objects, assets and failures, by their canonical rows (`rows_digest`);
+    the files are images, shapes and merged files. They must come sorted by the UTF-8 bytes of their paths, each path
+    once; raises ValueError otherwise. In layout `tar` an image has the path that it would have as a file of its own, so
+    the digest does not depend on the layout.
+    """
+    total = hashlib.sha256(b"verso dataset 1\n")
+    for table in DETERMINISTIC_TABLES:
+        total.update(f"{table} {tables[table]}\n".encode())
+    previous = b""
+    for path, sha256 in files:
+        name = path.encode()
+        if name <= previous:
+            raise ValueError(f"{path} comes after {previous.decode()}: paths must be sorted and unique")
+        previous = name
+        total.update(b"%s\n%s\n" % (name, sha256.encode()))
+    return total.hexdigest()
+
+
 def _is_list(kind: pa.DataType) -> bool:
     return bool(pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind))
-
-
-def _child_types(kind: pa.DataType) -> list[pa.DataType]:
-    if pa.types.is_struct(kind):
-        return [kind.field(i).type for i in range(kind.num_fields)]
-    return [kind.value_type] if _is_list(kind) else []
 
 
 def _tag(kind: pa.DataType) -> str:

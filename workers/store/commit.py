@@ -11,10 +11,10 @@ import json
 from pydantic import ValidationError
 
 from schemas.dataset.commit import CommitRecord, CommitSummary, FileEntry
-from schemas.dataset.layout import COMMITS, commit_path, is_shape, parse_commit_path, staging_path
+from schemas.dataset.layout import COMMITS, FENCED, commit_path, is_shape, parse_commit_path, staging_path
 from schemas.dataset.tables import SCHEMA_VERSION
 from schemas.errors import CommitConflict, CorruptError, OutputError
-from workers.store.store import Store, fenced_key
+from workers.store.store import Store
 
 _SEAL = b',"seal":"'
 """The last key of a record: the SHA-256 of all bytes before it."""
@@ -186,7 +186,7 @@ def _check_range(key: str, start: int, retry: int) -> None:
 def _staging_folders(record: CommitRecord) -> tuple[str, str]:
     """Where the winner's files may lie before they are published: its folder, or that folder fenced."""
     staging = staging_path(record.span.start, record.attempt)
-    return staging, fenced_key(staging)
+    return staging, staging + FENCED
 
 
 def _move(store: Store, record: CommitRecord, entry: FileEntry) -> bool:

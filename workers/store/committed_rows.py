@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Iterator, Sequence
 from itertools import groupby
+from operator import itemgetter
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -22,13 +23,12 @@ def iter_ranges(store: Store, first_scene: int, stop_scene: int) -> Iterator[lis
     Raises RunError naming scenes that nobody committed, or that are committed beyond the end.
     """
     awaited = first_scene
-    for start, names in groupby(commit_names(store), key=lambda name: name[0]):
+    for start, retries in _commits_by_range(store):
         if start != awaited:
             raise RunError(
                 _gap(awaited, min(start, stop_scene)) if start > awaited else _beyond(start, first_scene, stop_scene)
             )
-        records = [record for _, retry, _ in names if (record := read_record(store, start, retry)) is not None]
-        _check_retries(start, [record.span.retry for record in records])
+        records = [record for retry in retries if (record := read_record(store, start, retry)) is not None]
         awaited = records[0].span.stop
         if awaited > stop_scene:
             raise RunError(_beyond(awaited - 1, first_scene, stop_scene))
@@ -42,11 +42,7 @@ def list_commits(store: Store) -> list[CommitSummary]:
 
     Raises CorruptError for a damaged or missing record, OutputError for one of a newer version.
     """
-    summaries = []
-    for start, names in groupby(commit_names(store), key=lambda name: name[0]):
-        summaries += (group := [read_summary(store, start, retry) for _, retry, _ in names])
-        _check_retries(start, [one.retry for one in group])
-    return summaries
+    return [read_summary(store, start, retry) for start, retries in _commits_by_range(store) for retry in retries]
 
 
 def range_rows(store: Store, records: Sequence[CommitRecord], table: str) -> pa.Table:
@@ -78,12 +74,15 @@ def read_range_table(store: Store, record: CommitRecord, table: str) -> pa.Table
     return decode_table(table, data, path)
 
 
-def _check_retries(start: int, retries: list[int]) -> None:
-    """Raises CorruptError where a retry of a range is missing."""
-    if retries != list(range(len(retries))):
-        raise CorruptError(
-            f"{COMMITS} has retries {retries} of the range from scene {start}, and must have all from 0: restore it"
-        )
+def _commits_by_range(store: Store) -> Iterator[tuple[int, list[int]]]:
+    """The start of each range, and its retries. Raises CorruptError where one is missing."""
+    for start, names in groupby(commit_names(store), key=itemgetter(0)):
+        retries = [retry for _, retry, _ in names]
+        if retries != list(range(len(retries))):
+            raise CorruptError(
+                f"{COMMITS} has retries {retries} of the range from scene {start}, and must have all from 0: restore it"
+            )
+        yield start, retries
 
 
 def _gap(start: int, stop: int) -> str:

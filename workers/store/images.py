@@ -16,14 +16,8 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CHUNK = struct.Struct(">I4s")
 
-FAST_LEVEL = 1
-"""The level of `png_level` that asks for speed."""
 
-_NONE, _SUB = 0, 1
-"""PNG filters of a row: unchanged values, and differences from the pixel to the left."""
-
-
-def encode_png(pixels: Pixels, level: int = FAST_LEVEL) -> bytes:
+def encode_png(pixels: Pixels, level: int = 1) -> bytes:
     """PNG bytes of [H, W, 3] uint8 RGB, [H, W] uint8 or [H, W] uint16. Raises ValueError for anything else.
 
     `level` 0 stores, 1 is fast, 9 is small; every level is lossless.
@@ -34,7 +28,7 @@ def encode_png(pixels: Pixels, level: int = FAST_LEVEL) -> bytes:
     if 0 in pixels.shape:
         raise ValueError(f"an image of shape {pixels.shape} has no pixels")
     whole: NDArray = np.ascontiguousarray(pixels)
-    return _encode_fast(whole) if level == FAST_LEVEL else _encode_small(whole, level)
+    return _encode_fast(whole) if level == 1 else _encode_small(whole, level)
 
 
 def _encode_fast(pixels: NDArray) -> bytes:
@@ -57,11 +51,11 @@ def _filter_rows(pixels: NDArray) -> NDArray[np.uint8]:
     row_bytes = samples.view(np.uint8).reshape(len(pixels), -1)
     rows = np.empty((len(pixels), 1 + row_bytes.shape[1]), np.uint8)
     if pixels.ndim == 3 and not _is_flat(pixels):
-        rows[:, 0] = _SUB
+        rows[:, 0] = 1  # `sub`: differences from the pixel to the left
         rows[:, 1:4] = row_bytes[:, :3]
         np.subtract(row_bytes[:, 3:], row_bytes[:, :-3], out=rows[:, 4:])
     else:
-        rows[:, 0] = _NONE
+        rows[:, 0] = 0  # `none`: unchanged values
         rows[:, 1:] = row_bytes
     return rows
 

@@ -2,18 +2,31 @@
 
 import contextlib
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from schemas.dataset.layout import COMMITS, RANGES, TEMPORARY, scratch_path
+from schemas.dataset.layout import COMMITS, FENCED, RANGES, TEMPORARY, scratch_path
 from schemas.errors import OutputError
-from workers.store.disk_errors import explain_disk_errors
-from workers.store.durable import sync_folders, sync_path, sync_tree
-from workers.store.probe import probe_folder
-from workers.store.store import Entry, Store, fenced_key, retry_if_swept
+from workers.store.file_system import explain_disk_errors, probe_folder, sync_folders, sync_path, sync_tree
+from workers.store.store import Entry, Store, retry_if_swept
+
+_URL = re.compile(r"[a-z][a-z0-9+.-]+://")
+
+
+def open_store(out: str) -> Store:
+    """The store that a user's --out means: an object store for a URL such as s3://bucket/path, otherwise a folder.
+
+    Reads and writes nothing yet. Raises OutputError for a URL of an unknown kind.
+    """
+    if not _URL.match(out):
+        return LocalStore(out)
+    from workers.store.objects import open_object_store  # obstore loads only where it is needed
+
+    return open_object_store(out)
 
 
 class LocalStore(Store):
@@ -94,7 +107,7 @@ class LocalStore(Store):
     def fence(self, staging: str) -> None:
         """Renames an attempt's folder: from then on the attempt cannot write, nor link a record."""
         with contextlib.suppress(FileNotFoundError):
-            os.rename(self.path(staging), self.path(fenced_key(staging)))
+            os.rename(self.path(staging), self.path(staging + FENCED))
             sync_path(self.path(staging).parent)
 
     def read(self, key: str) -> bytes:

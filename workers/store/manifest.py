@@ -1,18 +1,27 @@
-"""The tables of one range: checked against their schema, sorted by key, encoded as Parquet and decoded."""
+"""Rows of scenes and ranges: checked against their schema, digested, sorted by key, encoded as Parquet and decoded."""
 
+import hashlib
 import io
+import json
+import re
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.dataset.tables import SCHEMAS, SORT_KEYS
+from schemas.dataset.commit import FileEntry, Outcome
+from schemas.dataset.layout import is_shape
+from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, SORT_KEYS
 from schemas.errors import CorruptError
+from schemas.scene.scene import SceneOutput
 
 PARQUET_OPTIONS = {"compression": "zstd", "write_page_checksum": True}
 """For every Parquet file of a dataset: a flipped bit is found when the page is read."""
+
+_UNSAFE = re.compile(r"[\x00-\x1f\x7f\\]")
 
 
 def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
@@ -41,9 +50,67 @@ def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
+def outcome_of(output: SceneOutput) -> Outcome:
+    """How the scene ended. Raises ValueError unless its rows give exactly one outcome, of this scene alone."""
+    scene_id, tables = output.scene_id, output.rows
+    for table, rows in tables.items():
+        if any(row.get("scene_id", scene_id) != scene_id for row in rows):
+            raise ValueError(f"scene {scene_id} has rows of another scene in {table}")
+    made, failed, timed = (len(tables.get(table, ())) for table in ("scenes", "failures", "timings"))
+    if made + failed != 1 or timed > 1:
+        raise ValueError(
+            f"scene {scene_id} has {made} rows in scenes and {failed} in failures, and must have one in all"
+        )
+    if made:
+        return "made"
+    if extra := [table for table in ("views", "objects", "assets") if tables.get(table)]:
+        raise ValueError(f"scene {scene_id} failed and has rows in {', '.join(extra)}")
+    kind = tables["failures"][0]["kind"]
+    if kind not in ("intrinsic", "environmental"):
+        raise ValueError(f"scene {scene_id} failed with the unknown kind {kind!r}")
+    return kind
+
+
+def check_files(output: SceneOutput, entries: Mapping[str, FileEntry]) -> None:
+    """Raises ValueError unless the rows of `views` and the files agree: paths, sizes, digests, each path once."""
+    if len(entries) != len(output.files):
+        raise ValueError(f"scene {output.scene_id} writes a path twice")
+    for path in entries:
+        if _UNSAFE.search(path) or any(part in ("", ".", "..") for part in path.split("/")) or path[0] in "_.":
+            raise ValueError(f"{path!r} is not a path that a scene may write")
+    views = cast(Sequence[Mapping[str, Any]], output.rows.get("views", ()))
+    listed = [(file["path"], file["bytes"], file["sha256"]) for view in views for file in view["files"]]
+    images = {(path, entry.bytes, entry.sha256) for path, entry in entries.items() if not is_shape(path)}
+    if len(listed) != len(images) or set(listed) != images:
+        paths = {path for path, _, _ in listed}.symmetric_difference(path for path, _, _ in images)
+        wrong = sorted(paths) or ["sizes, digests or repetitions"]
+        raise ValueError(f"scene {output.scene_id}: files and the rows of views disagree about {', '.join(wrong[:5])}")
+
+
+def scene_digest(rows: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+    """64 hex characters: the digest of a scene's rows in the deterministic tables, except `assets`.
+
+    SHA-256 of canonical JSON, in which a double has the shortest digits that give it back. It is only compared with
+    another attempt at the same scene, and costs a tenth of the columns' digest.
+    """
+    tables = {
+        table: sorted(rows[table], key=lambda row, names=SORT_KEYS[table]: [row[name] for name in names])  # type: ignore[misc]
+        for table in DETERMINISTIC_TABLES
+        if table != "assets" and rows.get(table)
+    }
+    text = json.dumps(tables, sort_keys=True, separators=(",", ":"), allow_nan=False, default=np.generic.item)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
 def sorted_rows(table: str, rows: pa.Table) -> pa.Table:
-    """Rows in the order of the table's key. Raises ValueError where two rows share a key."""
+    """Rows in the order of the table's key; equal rows of `assets` once, which scenes that share a shape repeat.
+
+    Raises ValueError where two rows share a key.
+    """
     names = SORT_KEYS[table]
+    if table == "assets":
+        distinct = {json.dumps(row): index for index, row in enumerate(rows.to_pylist())}
+        rows = rows.take(pa.array(distinct.values(), pa.int64()))
     result = rows.sort_by([(name, "ascending") for name in names])
     for key, following in pairwise(zip(*(result.column(name).to_pylist() for name in names), strict=True)):
         if key == following:
@@ -65,32 +132,27 @@ def decode_table(table: str, data: bytes, name: str) -> pa.Table:
     """
     try:
         with pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True) as file:
-            return conform(table, file.read(), name)
+            return _conform(table, file.read(), name)
     except (pa.ArrowException, OSError, ValueError) as error:
         raise CorruptError(f"{name} cannot be read: {error}; `verso verify` lists every damaged file") from error
 
 
-def conform(table: str, rows: pa.Table, name: str) -> pa.Table:
+def _conform(table: str, rows: pa.Table, name: str) -> pa.Table:
     """Rows with exactly today's schema of `table`. Raises CorruptError where a required column is missing.
 
     A schema only grows. So rows that lack a column and have an unknown one have a damaged column name.
     """
     schema = SCHEMAS[table]
-    if rows.schema.equals(schema):
-        return rows.cast(schema)  # Parquet has other names inside lists
     missing = [column for column in schema.names if column not in rows.column_names]
     foreign = [column for column in rows.column_names if column not in schema.names]
     if missing and foreign:
         raise CorruptError(f"{name} lacks the column {missing[0]} of the table {table}, and has {foreign[0]!r}")
-    columns = []
-    for field in schema:
-        if field.name in rows.column_names:
-            columns.append(rows.column(field.name).cast(field.type))
-        elif field.nullable:
-            columns.append(pa.chunked_array([pa.nulls(rows.num_rows, field.type)]))
-        else:
-            raise CorruptError(f"{name} lacks the column {field.name} of the table {table}")
-    return pa.Table.from_arrays(columns, schema=schema)
+    for column in missing:
+        field = schema.field(column)
+        if not field.nullable:
+            raise CorruptError(f"{name} lacks the column {column} of the table {table}")
+        rows = rows.append_column(field, pa.nulls(rows.num_rows, field.type))
+    return rows.select(schema.names).cast(schema)  # Parquet has other names inside lists
 
 
 def _check_values(where: str, field: pa.Field, array: pa.Array) -> None:

@@ -19,9 +19,6 @@ from schemas.dataset.layout import PROBE_PREFIX, TEMPORARY
 from schemas.errors import MachineError, OutputError
 from workers.store.store import Entry, Store
 
-_PROBES = 3
-"""Attempts at a probe: a coordinator that already works here may sweep it away between its two puts."""
-
 _BEGUN = "_begun"
 """A mark in an attempt's folder from its beginning until it is swept."""
 
@@ -50,7 +47,8 @@ class ObjectStore(Store):
     def prepare(self) -> None:
         """Proves that a put is refused where something is."""
         try:
-            refused = any(self._refuses_a_second_put() for _ in range(_PROBES))
+            # A coordinator that already works here may sweep a probe away between its two puts.
+            refused = any(self._refuses_a_second_put() for _ in range(3))
         except (NotSupportedError, NotImplementedError):
             refused = False
         except (BaseError, OSError) as error:

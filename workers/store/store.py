@@ -9,16 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, NamedTuple, Protocol, TypeVar
 
-from schemas.dataset.layout import FENCED
-
 T = TypeVar("T")
-
-_TRIES = 3
-
-
-def fenced_key(staging: str) -> str:
-    """The key of a fenced attempt's folder."""
-    return f"{staging}{FENCED}"
 
 
 def retry_if_swept(step: Callable[[], T]) -> T:
@@ -26,7 +17,7 @@ def retry_if_swept(step: Callable[[], T]) -> T:
 
     Raises FileNotFoundError where the last call does.
     """
-    for _ in range(_TRIES - 1):
+    for _ in range(2):
         with contextlib.suppress(FileNotFoundError):
             return step()
     return step()
@@ -85,7 +76,7 @@ class Store(Protocol):
         return
 
     def fence(self, staging: str) -> None:
-        """Takes an attempt's folder, if there is one, out of the attempt's reach for good (to `fenced_key` on a disk).
+        """Takes an attempt's folder, if there is one, out of the attempt's reach for good (to a name with FENCED on a disk).
 
         On a disk, a fenced attempt can neither write nor commit.
         """

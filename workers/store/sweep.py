@@ -6,7 +6,7 @@ from schemas.dataset.layout import COMMITS, FENCED, PROBE_PREFIX, STAGING, TEMPO
 from schemas.errors import CorruptError
 from workers.store.attempt import retry_of_attempt
 from workers.store.commit import publish, read_record
-from workers.store.store import Store, fenced_key
+from workers.store.store import Store
 
 
 def sweep(store: Store, fenced: Collection[tuple[int, str]] | None = ()) -> list[str]:
@@ -48,6 +48,6 @@ def _sweep_attempt(store: Store, start: int, attempt: str, given_up: bool) -> bo
     if record is not None and record.attempt == attempt:
         publish(store, record)
         return False
-    for folder in (staging, fenced_key(staging)):
+    for folder in (staging, staging + FENCED):
         store.remove_tree(folder)
     return True

@@ -1,18 +1,22 @@
-"""Names of the members of tar archives, and reading of archives. There is one for each range and category.
+"""Files of a range in the output folder: each by itself, or images in a tar archive for each range and category.
 
 `mug/RGB00042.png` is the member `00042.RGB.png` of `mug/<start>.tar`, its patch `mug/patches/RGB00042.png` the member
 `00042.RGB.patch.png`, and with several objects `00042.RGB.patch.obj1.png`. The pose id comes first, up to a point, so
 tools that group members by it (WebDataset among them) see one sample for each pose.
 """
 
+import contextlib
+import hashlib
 import io
 import re
 import tarfile
-from collections.abc import Iterator
-from typing import cast
+from collections.abc import Iterator, Mapping
+from typing import IO, cast
 
-from schemas.dataset.layout import IMAGES, Content, image_path, patch_path
+from schemas.dataset.commit import FileEntry, Span
+from schemas.dataset.layout import IMAGES, Content, image_path, is_shape, patch_path, tar_path
 from schemas.errors import CorruptError
+from workers.store.store import Store
 
 _PATH = re.compile(
     r"(?P<category>[^/]+)/(?P<patch>patches/)?(?P<content>[A-Za-z]+)(?P<pose>\d{5,})(?:obj(?P<object>\d+))?\.png"
@@ -44,13 +48,6 @@ def member_order(path: str) -> tuple[int, int, bool, int]:
     return int(found["pose"]), _CONTENTS.index(found["content"]), bool(found["patch"]), int(found["object"] or 0)
 
 
-def member_header(name: str, size: int) -> bytes:
-    """A tar header that depends on name and size alone: mode 0644, no owner, time 0."""
-    header = tarfile.TarInfo(name)
-    header.size = size
-    return header.tobuf(tarfile.USTAR_FORMAT)
-
-
 def read_tar(category: str, data: bytes, name: str) -> Iterator[tuple[str, bytes]]:
     """(image path, bytes) of every member, in order. Raises CorruptError naming the archive where it is damaged."""
     try:
@@ -60,6 +57,74 @@ def read_tar(category: str, data: bytes, name: str) -> Iterator[tuple[str, bytes
                 yield path_of(category, header.name), file.read() if file else b""
     except (tarfile.TarError, ValueError, EOFError) as error:
         raise CorruptError(f"{name} is not a whole archive of images: {error}") from error
+
+
+class Packing:
+    """Stores an attempt's files scene by scene: by path, or, with `tar`, images in archives and shapes by path."""
+
+    def __init__(self, store: Store, staging: str, span: Span, tar: bool) -> None:
+        self._store = store
+        self._staging = staging
+        self._span = span
+        self._tar = tar
+        self._archives: dict[str, _Archive] = {}
+
+    def add(self, files: Mapping[str, bytes]) -> None:
+        """Stores the files of one scene by path; images go into archives in their fixed order.
+
+        Raises FileNotFoundError where the attempt's folder was swept, ValueError where a name has no place here.
+        """
+        images = [path for path in files if self._tar and not is_shape(path)]
+        for path, data in files.items():
+            if not self._tar or is_shape(path):
+                self._store.write_staged(self._staging, path, data)
+        for path in sorted(images, key=member_order):
+            category, member = member_of(path)
+            if category not in self._archives:
+                name = tar_path(category, self._span.start, self._span.retry)
+                self._archives[category] = _Archive(name, self._store.stream_staged(self._staging, name))
+            self._archives[category].add(member, files[path])
+
+    def finish(self, files: Mapping[str, FileEntry]) -> list[FileEntry]:
+        """The files to publish for all that were added, `files` by path. Nothing can be added afterwards."""
+        by_path = [entry for path, entry in files.items() if not self._tar or is_shape(path)]
+        return by_path + [archive.finish() for archive in self._archives.values()]
+
+    def close(self) -> None:
+        """Closes all archives, unfinished."""
+        for archive in self._archives.values():
+            archive.close()
+
+
+class _Archive:
+    """A tar being written; its bytes are counted and hashed on the way."""
+
+    def __init__(self, path: str, stream: contextlib.AbstractContextManager[IO[bytes]]) -> None:
+        self._path = path
+        self._open = contextlib.ExitStack()
+        self._file = self._open.enter_context(stream)
+        self._bytes = 0
+        self._sha256 = hashlib.sha256()
+
+    def add(self, member: str, data: bytes) -> None:
+        header = tarfile.TarInfo(member)  # mode 0644, no owner, time 0: it depends on name and size alone
+        header.size = len(data)
+        self._write(header.tobuf(tarfile.USTAR_FORMAT) + data + bytes(-len(data) % tarfile.BLOCKSIZE))
+
+    def finish(self) -> FileEntry:
+        end = 2 * tarfile.BLOCKSIZE
+        self._write(bytes(end + -(self._bytes + end) % tarfile.RECORDSIZE))
+        self._open.close()
+        return FileEntry(path=self._path, bytes=self._bytes, sha256=self._sha256.hexdigest())
+
+    def close(self) -> None:
+        with contextlib.suppress(GeneratorExit), self._open:
+            raise GeneratorExit  # ends the stream, which is not stored then
+
+    def _write(self, data: bytes) -> None:
+        self._file.write(data)
+        self._bytes += len(data)
+        self._sha256.update(data)
 
 
 def _match(pattern: re.Pattern[str], name: str) -> re.Match[str]:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from schemas.dataset.tables import SCHEMAS, TABLES
 from tests.made_up_scenes import failed_scene, made_scene
-from workers.store.canonical import TableDigest, rows_digest
+from workers.store.canonical import TableDigest, dataset_digest, rows_digest
 from workers.store.manifest import table_of_rows
 
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
@@ -140,3 +140,21 @@ def test_a_digest_tells(change):
 def test_every_row_counts_even_where_all_columns_are_alike():
     rows = table_of_rows("failures", failed_scene(5).rows["failures"])
     assert rows_digest("failures", rows) != rows_digest("failures", pa.concat_tables([rows, rows]))
+
+
+DIGESTS = {"scenes": "1", "views": "2", "objects": "3", "assets": "4", "failures": "5", "timings": "6"}
+
+
+def test_the_digest_of_a_dataset_is_that_of_the_tables_and_the_sorted_files():
+    text = "verso dataset 1\nscenes 1\nviews 2\nobjects 3\nassets 4\nfailures 5\na/b\nx\na/ü\ny\n"
+    assert dataset_digest(DIGESTS, [("a/b", "x"), ("a/ü", "y")]) == hashlib.sha256(text.encode()).hexdigest()
+
+
+def test_timings_are_no_part_of_the_digest_of_a_dataset():
+    assert dataset_digest({**DIGESTS, "timings": "other"}, []) == dataset_digest(DIGESTS, [])
+
+
+@pytest.mark.parametrize("paths", [["b", "a"], ["a", "a"], ["ü", "z"]])
+def test_paths_out_of_order_or_twice_are_refused(paths):
+    with pytest.raises(ValueError, match="sorted and unique"):
+        dataset_digest(DIGESTS, [(path, "x") for path in paths])

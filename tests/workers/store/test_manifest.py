@@ -6,7 +6,7 @@ import pytest
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError
 from tests.made_up_scenes import failed_scene, made_scene
-from workers.store.manifest import decode_table, encode_table, sorted_rows, table_of_rows
+from workers.store.manifest import decode_table, encode_table, scene_digest, sorted_rows, table_of_rows
 
 
 def rows_of(table: str) -> list[dict]:
@@ -108,3 +108,27 @@ def test_files_carry_the_schema_version_and_page_checksums():
     ).schema_arrow.metadata
     assert metadata[b"schema_version"] == b"1"
     assert metadata[b"verso_table"] == b"scenes"
+
+
+def test_the_digest_of_a_scene_knows_no_order_of_rows_or_keys_and_no_type_of_number():
+    base = made_scene(3).rows
+    turned = {
+        table: [dict(reversed(row.items())) for row in reversed(found)] for table, found in reversed(base.items())
+    }
+    turned["scenes"][0]["penetration_mm"] = np.float64(turned["scenes"][0]["penetration_mm"])
+    turned["scenes"][0]["redraws"] = np.int64(turned["scenes"][0]["redraws"])
+    assert scene_digest(turned) == scene_digest(base)
+
+
+@pytest.mark.parametrize("table", ["timings", "assets"])
+def test_timings_and_shapes_are_no_part_of_the_digest_of_a_scene(table):
+    rows = made_scene(3).rows
+    assert scene_digest({**rows, table: []}) == scene_digest(rows)
+
+
+@pytest.mark.parametrize(("table", "column"), [("scenes", "settle_s"), ("views", "d_z_m"), ("objects", "u")])
+def test_the_last_bit_of_any_number_is_part_of_the_digest_of_a_scene(table, column):
+    other = made_scene(3).rows
+    value = other[table][0][column]
+    other[table][0][column] = value + 1 if isinstance(value, int) else float(np.nextafter(value, np.inf))
+    assert scene_digest(other) != scene_digest(made_scene(3).rows)

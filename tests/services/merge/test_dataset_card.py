@@ -1,0 +1,22 @@
+"""The sources that the card names; the card of whole datasets is in tests/services/run/test_switches.py."""
+
+from schemas.job.assets import Assets
+from services.merge.dataset_card import describe_left_out, describe_sources
+from workers.assets.catalogue import Catalogue
+
+OBJECTS = [
+    {"source": "procedural", "weight": 2.0, "seed": 7},
+    {"source": "urdf", "folder": "meshes", "licence": "CC-BY-4.0"},
+]
+
+
+def test_every_source_is_named_with_its_weight_and_licence_and_what_was_left_out_of_it():
+    assets = Assets.model_validate({"objects": OBJECTS})
+    catalogue = Catalogue(assets, (None, None), (None,), "d" * 64, {"meshes": {"too large": 2, "torn": 1}})
+    lines = describe_sources(catalogue)
+    assert lines[:2] == [
+        "objects, weight 2: made from seed 7, licence CC0-1.0",
+        "objects, weight 1: urdf folder meshes, licence CC-BY-4.0",
+    ]
+    assert lines[2].startswith("tables, weight 1: made from seed")
+    assert lines[3:] == ["left out of meshes: 2 too large, 1 torn"] == describe_left_out(catalogue)
