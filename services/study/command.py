@@ -23,8 +23,7 @@ from services.study.choose import parse_targets
 from services.study.journal import Journal
 from services.study.knobs import apply, choose_knobs, job_tree_with, knobs_of, preset_settings, settings_of
 from services.study.measure.colour_errors import colour_truth_missing
-from services.study.model import Row
-from services.study.plan import Plan, Sizes
+from services.study.model import Plan, Row, Sizes
 from services.study.report.page import write_page
 from services.study.report.tables import write_tables
 from services.study.study import header_of, run_study, study_of

@@ -10,8 +10,7 @@ from services.study.journal import Journal
 from services.study.knobs import groups_of
 from services.study.measure.statistics import image_figures, settling_figures
 from services.study.measure.timing import cost_of, job_cost
-from services.study.model import Figure, Group, Row, Setting
-from services.study.plan import Plan
+from services.study.model import Figure, Group, Plan, Row, Setting
 
 
 @dataclass(frozen=True)

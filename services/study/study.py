@@ -9,17 +9,15 @@ from schemas.job.job import Job
 from services.bench.machine import describe_machine, pinned
 from services.run.progress import ProgressLine
 from services.study.answer import DEFAULT_TARGETS, default_targets
-from services.study.choose import TargetError
+from services.study.choose import TargetError, close_calls
 from services.study.errors import ERRORS
 from services.study.journal import Journal
 from services.study.knobs import apply
 from services.study.measure.convergence import slopes
 from services.study.measure.process_pool import measure_in_pool
 from services.study.measure.timing import time_scene, warm_up
-from services.study.model import Row, Setting, Study
+from services.study.model import Plan, Row, Setting, Study
 from services.study.pairs import promising
-from services.study.plan import Plan
-from services.study.robustness import close_calls
 from services.study.rounds import Round, Unit
 from workers.pipeline.context import WorkerContext
 

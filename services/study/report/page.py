@@ -9,7 +9,7 @@ from typing import Any
 
 from services.study.answer import answer
 from services.study.choose import Targets, own_row
-from services.study.errors import KINDS
+from services.study.errors import ERRORS
 from services.study.model import Study
 from services.study.report.page_table import group_table
 from services.study.words import duration, milliseconds, number, short, size
@@ -66,7 +66,7 @@ def _errors(study: Study) -> str:
     rows = [
         (kind.name, short(kind.name), kind.title, kind.unit or "0 to 1", kind.truth,
          "all scenes together" if kind.pooled else "95th percentile", "yes" if kind.name in measured else "no")
-        for kind in KINDS
+        for kind in ERRORS.values()
     ]  # fmt: skip
     return _table(rows, ("target", "in short", "what it says", "unit", "held against", "over scenes", "measured"))
 

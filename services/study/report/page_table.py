@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 
 from services.study.choose import as_cheap, front, own_row
-from services.study.errors import KINDS
+from services.study.errors import ERRORS
 from services.study.model import Figure, Group, Row, Study
 from services.study.words import duration, milliseconds, number, short, shown, size, times, unit
 
@@ -12,7 +12,7 @@ from services.study.words import duration, milliseconds, number, short, shown, s
 def group_table(study: Study, group: Group | str) -> str:
     """The settings that measured an error of this part, by knob; empty where none did."""
     measured = {name for row in study.rows for name in row.errors}
-    names = [kind.name for kind in KINDS if kind.group == group and kind.name in measured]
+    names = [kind.name for kind in ERRORS.values() if kind.group == group and kind.name in measured]
     if not names:
         return ""
     whole = [f"{study.job_scenes:,} scenes, one core", "on disk"] if study.job_scenes else ["on disk, a scene"]
