@@ -46,6 +46,11 @@ class Setting:
         return ", ".join(f"{knob}={label}" for knob, label in self.parts) or "the job"
 
     @property
+    def knob(self) -> str:
+        """The first of its knobs; empty for the job itself."""
+        return self.parts[0][0] if self.parts else ""
+
+    @property
     def kind(self) -> Literal["own", "preset", "single", "several"]:
         """The job itself, a preset, one knob turned, or several."""
         if not self.parts:

@@ -10,7 +10,6 @@ from services.bench.machine import describe_machine, pinned
 from services.run.progress import ProgressLine
 from services.study.answer import DEFAULT_TARGETS, default_targets
 from services.study.choose import TargetError, close_calls
-from services.study.errors import ERRORS
 from services.study.journal import Journal
 from services.study.knobs import apply
 from services.study.measure.convergence import slopes
@@ -35,8 +34,7 @@ def run_study(
     """
     bench = _Bench(journal, context, processes, progress)
     rows = bench.measure(Round(plan, "alone", plan.settings))
-    units = {name: kind.unit for name, kind in ERRORS.items()}
-    chosen = (Setting(), *plan.presets, *promising(rows, units, plan.targets or DEFAULT_TARGETS))
+    chosen = (Setting(), *plan.presets, *promising(rows, plan.targets or DEFAULT_TARGETS))
     combined = bench.measure(Round(plan, f"together-{_digest(chosen)}", chosen))
     rows = (*rows, *(replace(row, ms=rows[0].ms * row.ratio) for row in combined[1:]))
     asked, bounds = (plan.targets, {}) if plan.targets else default_targets(rows)
