@@ -30,12 +30,8 @@ class Truth:
 
     def fits(self, scene: Scene) -> bool:
         """Whether the scene has the same shapes at the same poses."""
-        theirs = scene.posed.things
-        return (
-            self.scene_id == scene.plan.scene_id
-            and len(self.things) == len(theirs)
-            and all(_same(mine, other) for mine, other in zip(self.things, theirs, strict=True))
-        )
+        alike = self.scene_id == scene.plan.scene_id and len(self.things) == len(scene.posed.things)
+        return alike and all(map(_same, self.things, scene.posed.things))
 
     def pixels(self, camera: Camera) -> Pixels:
         """The view at its pixels."""
