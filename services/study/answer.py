@@ -26,20 +26,21 @@ def answer(study: Study, targets: Targets | None = None) -> str:
     if bounds and (chosen is not own or not asked):
         wish = f"{wish} and nothing else worse than the job has it" if asked else "nothing worse than the job has it"
     use = "use the job as it is" if chosen is own else f"use {chosen.setting.name}"
-    cost = f"{milliseconds(chosen.ms)} of processor a scene{_whole(study, chosen)}"
+    cost, count = f"{milliseconds(chosen.ms)} of processor a scene", study.job_scenes
+    if count:
+        whole = f"{duration(chosen.ms * count / 1e3)}, {size(chosen.kilobytes * count)}"
+        cost += f" ({count:,} scene{'s' * (count != 1)}: {whole})"
     saved = "" if chosen is own else f", {times(chosen.ratio)} the job's time"
     given_up = [] if bounds else worse_than(chosen, own, study.rows)
     loss = f", and gives up {listed(given_up)}" if given_up else ""
-    after = _after(chosen, next_better(study.rows, chosen, {**bounds, **asked}))
-    return f"For {wish}, {use}, which costs {cost}{saved}{loss}; {after}."
-
-
-def _after(chosen: Row, better: Row | None) -> str:
+    better = next_better(study.rows, chosen, {**bounds, **asked})
     if better is None:
-        return "nothing that was measured is better"
-    if better.ratio <= chosen.ratio * AS_CHEAP:
-        return f"{better.setting.name} is better and costs as much"
-    return f"the next better, {better.setting.name}, costs {times(better.ratio / chosen.ratio)} as much"
+        after = "nothing that was measured is better"
+    elif better.ratio <= chosen.ratio * AS_CHEAP:
+        after = f"{better.setting.name} is better and costs as much"
+    else:
+        after = f"the next better, {better.setting.name}, costs {times(better.ratio / chosen.ratio)} as much"
+    return f"For {wish}, {use}, which costs {cost}{saved}{loss}; {after}."
 
 
 def recommend(study: Study, targets: Targets | None = None) -> Row:
@@ -60,7 +61,7 @@ def default_targets(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, fl
 
 def blind_knobs(rows: Sequence[Row]) -> set[str]:
     """Knobs without any measured error, such as the tier without FLIP: their loss is unknown."""
-    single = [(row.setting.parts[0][0], row) for row in rows if len(row.setting.parts) == 1]
+    single = [(row.setting.knob, row) for row in rows if len(row.setting.parts) == 1]
     return {knob for knob, _ in single} - {knob for knob, row in single if set(row.errors) - {"failed_share"}}
 
 
@@ -97,10 +98,3 @@ def worse_than(row: Row, own: Row, rows: Sequence[Row]) -> list[str]:
         if theirs is not None and theirs.low > ours.high:
             worse.append(f"{short(name)} ({amount(name, theirs.value)} instead of {amount(name, ours.value)})")
     return worse
-
-
-def _whole(study: Study, row: Row) -> str:
-    if not study.job_scenes:
-        return ""
-    count = f"{study.job_scenes:,} scene{'s' * (study.job_scenes != 1)}"
-    return f" ({count}: {duration(row.ms * study.job_scenes / 1e3)}, {size(row.kilobytes * study.job_scenes)})"

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -23,8 +22,7 @@ from services.study.choose import parse_targets
 from services.study.journal import Journal
 from services.study.knobs import apply, choose_knobs, job_tree_with, knobs_of, preset_settings, settings_of
 from services.study.measure.colour_errors import colour_truth_missing
-from services.study.model import Row
-from services.study.plan import Plan, Sizes
+from services.study.model import Plan, Row, Sizes
 from services.study.report.page import write_page
 from services.study.report.tables import write_tables
 from services.study.study import header_of, run_study, study_of
@@ -66,7 +64,9 @@ def main(options: argparse.Namespace) -> int:
         write_job(options.job, options.changes, chosen, options.out / "job.yaml", options.target)
         print(f"{options.out / 'job.yaml'}: the job with {chosen.setting.name}")
     if options.json:
-        print(json.dumps(_summary(options, chosen, study.rows)))
+        summary = {"chosen": chosen.setting.name, "changes": dict(chosen.setting.changes), "settings": len(study.rows)}
+        summary |= {"ok": True, "out": str(options.out), "ms": chosen.ms, "ratio": chosen.ratio}
+        print(json.dumps(summary))
     return 0
 
 
@@ -94,15 +94,3 @@ def write_job(source: Path, changes: list[str], row: Row, path: Path, target: st
     tree = job_tree_with(row.setting.changes, read_tree(source, changes))
     head = f"# {source.name} with {row.setting.name}: the cheapest measured setting with {target}.\n"
     path.write_text(head + yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
-
-
-def _summary(options: argparse.Namespace, chosen: Row, rows: tuple[Row, ...]) -> dict[str, Any]:
-    return {
-        "ok": True,
-        "out": str(options.out),
-        "chosen": chosen.setting.name,
-        "changes": dict(chosen.setting.changes),
-        "ms": chosen.ms,
-        "ratio": chosen.ratio,
-        "settings": len(rows),
-    }

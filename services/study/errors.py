@@ -1,6 +1,8 @@
 """The errors that the study measures, each with the truth it is held against, which is never the setting under test."""
 
-from services.study.model import ErrorKind
+from dataclasses import dataclass
+
+from services.study.model import Group
 
 _RAYS = "a ray caster in float64 at the same pixel centres"
 _FRONT = "65,536 rays about the objects, and their vertices"
@@ -8,8 +10,26 @@ _PATCH = "rays at random in the objects' patch"
 _FINEST = "the finest steps, 1 s"
 _REFERENCE = "finer steps than any that is measured"
 
+
+@dataclass(frozen=True)
+class ErrorKind:
+    """One error: its unit, its name in a few words, its definition, what it is held against, and its part of a scene.
+
+    A scene has one figure of it, and a setting the 95th percentile of its scenes' figures, or where it is `pooled` one
+    figure over all its scenes. Less is better.
+    """
+
+    name: str
+    unit: str
+    short: str
+    title: str
+    truth: str
+    group: Group
+    pooled: bool = False
+
+
 # fmt: off
-KINDS: tuple[ErrorKind, ...] = (
+ERRORS = {kind.name: kind for kind in (
     ErrorKind("penetration_mm", "mm", "penetration",
               "how deep an object stands in what it rests on", "the stored shapes", "physics"),
     ErrorKind("gap_mm", "mm", "gap", "how high an object hovers", "the stored shapes", "physics"),
@@ -42,8 +62,6 @@ KINDS: tuple[ErrorKind, ...] = (
     ErrorKind("flip", "", "colour, FLIP", "colour: FLIP, 0 the same to 1", "a converged path-traced image", "colour"),
     ErrorKind("edge_flip", "", "edges, FLIP",
               "smoothness of edges: FLIP, 0 the same to 1", "64 samples a pixel, same light", "colour"),
-)
+)}
 # fmt: on
-
-ERRORS: dict[str, ErrorKind] = {kind.name: kind for kind in KINDS}
 """By name."""

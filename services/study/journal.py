@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from schemas.errors import OutputError
 JOURNAL_FILE = "journal.jsonl"
 
 
-class Journal:
+class Journal(dict[str, Any], AbstractContextManager):
     """Answers by the unit's name, one JSON line each; the first line identifies the study.
 
     A line that the end of a process cut off is dropped, and its unit measured again.
@@ -19,7 +20,7 @@ class Journal:
     def __init__(self, folder: Path, header: Mapping[str, Any]) -> None:
         """Raises OutputError where the folder cannot be written, or holds another study."""
         self._path = folder / JOURNAL_FILE
-        self._answers: dict[str, Any] = {}
+        super().__init__()
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._file = self._path.open("a+b")
@@ -46,25 +47,16 @@ class Journal:
                 f"{self._path.parent} holds the measurements of another study (other {', '.join(other)}): choose another "
                 f"--out, or delete {self._path.name} there"
             )
-        self._answers = {entry["unit"]: entry["answer"] for entry in entries}
-
-    def __contains__(self, unit: str) -> bool:
-        return unit in self._answers
-
-    def __getitem__(self, unit: str) -> Any:
-        return self._answers[unit]
+        self.update((entry["unit"], entry["answer"]) for entry in entries)
 
     def add(self, unit: str, answer: Any) -> None:
         """Keep an answer, on disk too."""
-        self._answers[unit] = answer
+        self[unit] = answer
         self._write({"unit": unit, "answer": answer})
 
     def _write(self, entry: Mapping[str, Any]) -> None:
         self._file.write(json.dumps(entry, sort_keys=True).encode() + b"\n")
         self._file.flush()
-
-    def __enter__(self) -> "Journal":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._file.close()

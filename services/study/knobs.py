@@ -1,7 +1,6 @@
 """The knobs that the study turns, and the settings made of them. Pure."""
 
 import copy
-import difflib
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.util import find_spec
@@ -11,12 +10,12 @@ from pydantic import ValidationError
 from pydantic_core import to_jsonable_python
 
 from schemas.errors import InputError
-from schemas.job.cameras import Sensor as Pinhole
 from schemas.job.job import Job
 from schemas.job.keys import set_key
 from schemas.job.preset import PRESETS
 from services.job.read import describe_fault
 from services.study.model import Changes, Group, Knob, Setting, Value
+from services.study.words import did_you_mean
 
 SPIN_PER_SPEED = 0.01
 """rad/s of `physics.rest.spin_rad_s` for each mm/s of `physics.rest.speed_mm_s`: their defaults' ratio."""
@@ -31,18 +30,26 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
         "step": _values("physics.step_hz", (60, 120, 240, 480, 960, 1920)),
         "step_travel": _values("physics.max_step_travel_mm", (1.0, 0.3, 0.1, 0.05, 0.035)),
         "iterations": _values("physics.solver_iterations", (5, 10, 25, 50, 100, 200)),
-        "rest": [_rest(speed) for speed in (30.0, 10.0, 3.0, 1.0, 0.3)],
+        "rest": [
+            Value(f"{v:g}", {"physics.rest.speed_mm_s": v, "physics.rest.spin_rad_s": SPIN_PER_SPEED * v})
+            for v in (30.0, 10.0, 3.0, 1.0, 0.3)
+        ],
         "collision": _collisions(job),
         "correction": [Value("off", {"physics.correction": False}), Value("on", {"physics.correction": True})],
     }
     units = [n for n in (1000, 2000, 5000, 8000) if n * job.images.depth_range_m.high <= 65_535]
     sensors = [Value("exact", {"sensor.depth_noise": None}), Value("azure-kinect", {"sensor.depth_noise": {}})]
+    key, removal = "images.projection.splat", "images.projection.hidden_point_removal"
+    splats = [
+        Value(f"{size}{' without backs' if removed else ''}", {key: size, removal: removed})
+        for size, removed in itertools.product((1, 3, 5), (False, True))
+    ]
     return (
         *(Knob(name, "physics", tuple(values)) for name, values in physics.items()),
         Knob("size", "labels", tuple(size_value(job, width) for width in WIDTHS)),
         Knob("units", "labels", tuple(_values("images.depth_units_per_m", units))),
         Knob("front", "mirror", tuple(_pivot_depths())),
-        Knob("splat", "mirror", tuple(_splats())),
+        Knob("splat", "mirror", tuple(splats)),
         Knob("sensor", "labels", tuple(sensors)),
         Knob("colour", "colour", tuple(_tiers())),
     )
@@ -50,11 +57,6 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
 
 def _values(key: str, values: Iterable[float]) -> list[Value]:
     return [Value(f"{value:g}", {key: value}) for value in values]
-
-
-def _rest(speed: float) -> Value:
-    changes = {"physics.rest.speed_mm_s": speed, "physics.rest.spin_rad_s": SPIN_PER_SPEED * speed}
-    return Value(f"{speed:g}", changes)
 
 
 def _collisions(job: Job) -> list[Value]:
@@ -73,12 +75,8 @@ def size_value(job: Job, width: int) -> Value:
     """The job's camera with another number of pixels and the same field of view."""
     sensor = job.cameras.sensor
     scale = width / sensor.width
-    values = {
-        "width": width,
-        "height": max(1, round(sensor.height * scale)),
-        **{name: getattr(sensor, name) * scale for name in ("fx", "fy", "cx", "cy")},
-    }
-    assert set(values) == set(Pinhole.model_fields)
+    scaled = {name: value * scale for name, value in sensor}
+    values = scaled | {"width": width, "height": max(1, round(scaled["height"]))}
     return Value(str(width), {f"cameras.sensor.{name}": value for name, value in values.items()})
 
 
@@ -91,22 +89,12 @@ def _pivot_depths() -> list[Value]:
     ]
 
 
-def _splats() -> list[Value]:
-    key, removal = "images.projection.splat", "images.projection.hidden_point_removal"
-    return [
-        Value(f"{size}{' without backs' if removed else ''}", {key: size, removal: removed})
-        for size, removed in itertools.product((1, 3, 5), (False, True))
-    ]
-
-
 def _tiers() -> list[Value]:
     rasters = [("flat", "flat", 1), ("raster", "raster", 1), ("raster-4", "raster", 4)]
+    traced = {f"path-{paths}": {"render.tier": "pathtraced", "render.path_samples": paths} for paths in (1, 4, 16)}
     return [
         *(Value(label, {"render.tier": tier, "render.samples": samples}) for label, tier, samples in rasters),
-        *(
-            Value(f"path-{paths}", {"render.tier": "pathtraced", "render.path_samples": paths}, package="mitsuba")
-            for paths in (1, 4, 16)
-        ),
+        *(Value(label, changes, package="mitsuba") for label, changes in traced.items()),
     ]
 
 
@@ -117,8 +105,7 @@ def choose_knobs(knobs: Sequence[Knob], names: Sequence[str] | None) -> tuple[Kn
     known = {knob.name: knob for knob in knobs}
     for name in names:
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean '{near[0]}'? " if near else ""
+            hint = did_you_mean(name, known)
             raise InputError(f"--knobs {name}: there is no such knob; {hint}known: {', '.join(known)}")
     return tuple(known[name] for name in dict.fromkeys(names))
 
@@ -127,16 +114,14 @@ def settings_of(job: Job, knobs: Sequence[Knob]) -> tuple[tuple[Setting, ...], t
     """The job itself, then each value of each knob that it does not have itself; and what is left out, and why."""
     settings, left_out = [Setting()], []
     for knob in knobs:
-        missing = {
-            value.label: value.package for value in knob.values if value.package and not find_spec(value.package)
-        }
+        missing = [value for value in knob.values if value.package and not find_spec(value.package)]
         if missing:
-            packages = ", ".join(f"`{package}`" for package in dict.fromkeys(missing.values()))
+            labels, package = ", ".join(value.label for value in missing), missing[0].package
             left_out.append(
-                f"{knob.name} {', '.join(missing)}: the package {packages} is not installed: `./verso extra pathtraced`"
+                f"{knob.name} {labels}: the package `{package}` is not installed: `./verso extra pathtraced`"
             )
         for value in knob.values:
-            if value.label in missing:
+            if value in missing:
                 continue
             setting = Setting(((knob.name, value.label),), value.changes)
             try:

@@ -1,8 +1,11 @@
-"""The models of a study of accuracy against time: knobs, settings, errors, and rows of its table."""
+"""The models of a study of accuracy against time: knobs, settings, its plan, and rows of its table."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
+
+from schemas.job.job import Job
 
 Group = Literal["physics", "labels", "mirror", "colour"]
 """The part of a scene that a knob or an error belongs to: how objects come to rest; depth and masks; the mirror pose and the
@@ -43,28 +46,16 @@ class Setting:
         return ", ".join(f"{knob}={label}" for knob, label in self.parts) or "the job"
 
     @property
+    def knob(self) -> str:
+        """The first of its knobs; empty for the job itself."""
+        return self.parts[0][0] if self.parts else ""
+
+    @property
     def kind(self) -> Literal["own", "preset", "single", "several"]:
         """The job itself, a preset, one knob turned, or several."""
         if not self.parts:
             return "own"
         return "preset" if self.parts[0][0] == "preset" else "single" if len(self.parts) == 1 else "several"
-
-
-@dataclass(frozen=True)
-class ErrorKind:
-    """One error: its unit, its name in a few words, its definition, what it is held against, and its part of a scene.
-
-    A scene has one figure of it, and a setting the 95th percentile of its scenes' figures, or where it is `pooled` one
-    figure over all its scenes. Less is better.
-    """
-
-    name: str
-    unit: str
-    short: str
-    title: str
-    truth: str
-    group: Group
-    pooled: bool = False
 
 
 @dataclass(frozen=True)
@@ -116,3 +107,34 @@ class Study:
     preset: str = "balanced"
     job_scenes: int = 0
     notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured, in scenes.
+
+    `scenes` have their images measured. `settled` only come to rest; the first `released` of them are released again, and
+    the first `posed` have their poses compared with the truth. `timed` are timed in each of `laps` rounds; `coloured` are
+    drawn with very many paths.
+    """
+
+    scenes: int = 48
+    settled: int = 500
+    released: int = 16
+    posed: int = 48
+    timed: int = 12
+    laps: int = 3
+    coloured: int = 4
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The job that is timed, its knobs and settings, the presets, the targets, and the sizes."""
+
+    job: Job
+    job_folder: Path
+    knobs: tuple[Knob, ...]
+    settings: tuple[Setting, ...]
+    presets: tuple[Setting, ...]
+    targets: Mapping[str, float] | None
+    sizes: Sizes = field(default_factory=Sizes)

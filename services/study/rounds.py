@@ -1,7 +1,6 @@
 """A round of the study: settings that are measured side by side, the units of work, and the resulting table."""
 
 import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,9 +8,8 @@ from services.study.errors import ERRORS
 from services.study.journal import Journal
 from services.study.knobs import groups_of
 from services.study.measure.statistics import image_figures, settling_figures
-from services.study.measure.timing import cost_of, job_cost
-from services.study.model import Figure, Group, Row, Setting
-from services.study.plan import Plan
+from services.study.measure.timing import Cost, cost_of, job_cost
+from services.study.model import Figure, Group, Plan, Row, Setting
 
 
 @dataclass(frozen=True)
@@ -76,42 +74,36 @@ class Round:
         ]
 
     def rows(self, journal: Journal) -> tuple[Row, ...]:
-        """The round's table, from the answers in the journal."""
-        return tuple(_rows(self, journal))
+        """The round's table, from the answers in the journal; settings without a time are left out."""
+        own = self.settings[0].name
+        laps: list[dict[int, dict[str, Any]]] = [{} for _ in range(self.plan.sizes.laps)]
+        for unit in self.timings():
+            laps[unit.lap][unit.scene_id] = journal[unit.name]
+        own_ms, own_kb = job_cost(laps, own)
+        costs = [(setting, cost_of(setting.name, own, laps)) for setting in self.settings]
+        return tuple(self._row(journal, one, cost, own_ms, own_kb) for one, cost in costs if cost is not None)
 
-    def answers(self, journal: Journal, kind: str) -> list[dict[str, Any]]:
-        """The answers of one kind, scene by scene."""
-        return [journal[unit.name] for unit in self.errors() if unit.kind == kind]
-
-
-def _rows(part: Round, journal: Journal) -> Iterator[Row]:
-    own = part.settings[0].name
-    laps: list[dict[int, dict[str, Any]]] = [{} for _ in range(part.plan.sizes.laps)]
-    for unit in part.timings():
-        laps[unit.lap][unit.scene_id] = journal[unit.name]
-    own_ms, own_kb = job_cost(laps, own)
-    for setting in part.settings:
-        cost = cost_of(setting.name, own, laps)
-        if cost is None:
-            continue
-        errors = _errors(part, journal, setting)
-        failed = errors.pop("failed_share", None)
-        yield Row(
+    def _row(self, journal: Journal, setting: Setting, cost: Cost, own_ms: float, own_kb: float) -> Row:
+        errors = self._errors(journal, setting.name)
+        return Row(
             setting=setting,
             ms=own_ms * cost.ratio.median,
             ratio=cost.ratio.median,
             ratio_least=cost.ratio.least,
             ratio_most=cost.ratio.most,
             kilobytes=own_kb if cost.kilobytes is None else cost.kilobytes,
-            errors=errors if failed is None else {**errors, "failed_share": failed},
-            failed_share=0.0 if failed is None else failed.value,
-            notes=() if cost.scenes >= part.plan.sizes.timed else (f"timed in {cost.scenes} scenes",),
+            errors=errors,
+            failed_share=errors["failed_share"].value if "failed_share" in errors else 0.0,
+            notes=() if cost.scenes >= self.plan.sizes.timed else (f"timed in {cost.scenes} scenes",),
         )
 
-
-def _errors(part: Round, journal: Journal, setting: Setting) -> dict[str, Figure]:
-    """In the order of `ERRORS`."""
-    found = settling_figures(setting.name, part.answers(journal, "settling"))
-    for kind in ("images", "colour"):
-        found.update(image_figures([one[setting.name] for one in part.answers(journal, kind) if setting.name in one]))
-    return {name: found[name] for name in ERRORS if name in found}
+    def _errors(self, journal: Journal, name: str) -> dict[str, Figure]:
+        """A setting's errors, `failed_share` last and the others in the order of `ERRORS`."""
+        answers: dict[str, list[dict[str, Any]]] = {"settling": [], "images": [], "colour": []}
+        for unit in self.errors():
+            answers[unit.kind].append(journal[unit.name])
+        found = settling_figures(name, answers["settling"])
+        for kind in ("images", "colour"):
+            found |= image_figures([one[name] for one in answers[kind] if name in one])
+        order = [error for error in ERRORS if error != "failed_share"]
+        return {error: found[error] for error in (*order, "failed_share") if error in found}

@@ -1,27 +1,30 @@
 """The whole study: every knob by itself, then promising combinations, and the table of both."""
 
 import hashlib
-from collections.abc import Sequence
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 from schemas.job.job import Job
 from services.bench.machine import describe_machine, pinned
 from services.run.progress import ProgressLine
 from services.study.answer import DEFAULT_TARGETS, default_targets
-from services.study.choose import TargetError
-from services.study.errors import ERRORS
+from services.study.choose import TargetError, close_calls
 from services.study.journal import Journal
 from services.study.knobs import apply
 from services.study.measure.convergence import slopes
-from services.study.measure.process_pool import measure_in_pool
+from services.study.measure.scene_images import measure_colour, measure_scene_images
+from services.study.measure.settling import measure_settling
 from services.study.measure.timing import time_scene, warm_up
-from services.study.model import Row, Setting, Study
+from services.study.model import Plan, Row, Setting, Study
 from services.study.pairs import promising
-from services.study.plan import Plan
-from services.study.robustness import close_calls
 from services.study.rounds import Round, Unit
-from workers.pipeline.context import WorkerContext
+from workers.assets.catalogue import open_catalogue
+from workers.pipeline.context import WorkerContext, open_worker
 
 LAPS_OF_CLOSE_CALLS = 3
 """Factor on the rounds of timing for settings whose time decides the choice."""
@@ -37,10 +40,9 @@ def run_study(
     """
     bench = _Bench(journal, context, processes, progress)
     rows = bench.measure(Round(plan, "alone", plan.settings))
-    units = {name: kind.unit for name, kind in ERRORS.items()}
-    chosen = (Setting(), *plan.presets, *promising(rows, units, plan.targets or DEFAULT_TARGETS))
+    chosen = (Setting(), *plan.presets, *promising(rows, plan.targets or DEFAULT_TARGETS))
     combined = bench.measure(Round(plan, f"together-{_digest(chosen)}", chosen))
-    rows = (*rows, *(replace(row, ms=rows[0].ms * row.ratio) for row in combined[1:]))
+    rows = (*rows, *(with_time_of(row, row, rows[0].ms) for row in combined[1:]))
     asked, bounds = (plan.targets, {}) if plan.targets else default_targets(rows)
     try:
         close = close_calls(rows, asked, bounds)
@@ -51,16 +53,14 @@ def run_study(
     again = (Setting(), *(row.setting for row in close))
     longer = replace(plan, sizes=replace(plan.sizes, laps=LAPS_OF_CLOSE_CALLS * plan.sizes.laps))
     timed = bench.measure(Round(longer, f"close-{_digest(again)}", again, times_only=True))
-    return tuple(_with_time(row, timed, rows[0].ms) for row in rows)
+    longest = {row.setting.name: row for row in timed[1:]}
+    return tuple(with_time_of(row, longest.get(row.setting.name, row), rows[0].ms) for row in rows)
 
 
-def _with_time(row: Row, timed: Sequence[Row], own_ms: float) -> Row:
-    """The row with the time of the longer measurement, where it was timed there."""
-    for other in timed[1:]:
-        if other.setting == row.setting:
-            ratios = {name: getattr(other, name) for name in ("ratio", "ratio_least", "ratio_most")}
-            return replace(row, ms=own_ms * other.ratio, **ratios)
-    return row
+def with_time_of(row: Row, timed: Row, own_ms: float) -> Row:
+    """The row with the time of another measurement of its setting; `own_ms` is the job's own time."""
+    ratios = {name: getattr(timed, name) for name in ("ratio", "ratio_least", "ratio_most")}
+    return replace(row, ms=own_ms * timed.ratio, **ratios)
 
 
 def _digest(settings: Sequence[Setting]) -> str:
@@ -87,14 +87,13 @@ class _Bench:
         self.asked += len(timings) + len(errors)
         self.done = self.asked - len(untimed) - len(missing)
         self.progress.expect(self.asked)
-        self._take_times(part, untimed)
+        if untimed:
+            self._take_times(part, untimed)
         for name, answer in measure_in_pool(self.context.job, part.plan.job_folder, self.processes, missing):
             self._keep(name, answer)
         return part.rows(self.journal)
 
     def _take_times(self, part: Round, missing: Sequence[Unit]) -> None:
-        if not missing:
-            return
         with pinned():
             quick = [setting for setting in part.settings if not _is_slow(self.context.job, setting)]
             warm_up(self.context, quick, part.plan.job.first_scene + part.plan.sizes.timed)
@@ -118,6 +117,39 @@ def _time(part: Round, context: WorkerContext, unit: Unit) -> dict[str, Any]:
 
 def _is_slow(job: Job, setting: Setting) -> bool:
     return job.render.tier != "pathtraced" and apply(job, setting.changes).render.tier == "pathtraced"
+
+
+def measure_in_pool(job: Job, job_folder: Path, processes: int, units: Sequence[Unit]) -> Iterator[tuple[str, Any]]:
+    """Answers by the units' names, as they are ready, from a pool of processes.
+
+    What a unit raises is raised here, and the others are dropped.
+    """
+    if not units:
+        return
+    fresh = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, mp_context=fresh) as pool:
+        told = job.model_dump_json(), str(job_folder)
+        running = {pool.submit(_measure, *told, unit): unit.name for unit in units}
+        try:
+            for done in as_completed(running):
+                yield running[done], done.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+@cache
+def _context(job: str, folder: str) -> WorkerContext:
+    parsed = Job.model_validate_json(job)
+    return open_worker(parsed, open_catalogue(parsed.assets, Path(folder), tuple(parsed.categories)))
+
+
+def _measure(job: str, folder: str, unit: Unit) -> Any:
+    context = _context(job, folder)
+    if unit.kind == "settling":
+        return measure_settling(context, unit.settings, unit.scene_id, unit.posed, unit.released)
+    measure = measure_scene_images if unit.kind == "images" else measure_colour
+    return measure(context, unit.settings, unit.scene_id)
 
 
 def study_of(plan: Plan, rows: Sequence[Row], renderer: str, command: str, left_out: Sequence[str]) -> Study:

@@ -103,24 +103,18 @@ def crop_about(box: Box) -> Crop:
     """The crop, in whole pixels, of a box in shares of the image (`Patch.box`) and its margin."""
     left, top, right, bottom = np.array(box) * (WIDTH, HEIGHT, WIDTH, HEIGHT)
     margin = MARGIN_PX + MARGIN_SHARE * max(right - left, bottom - top)
-    low = np.floor(np.maximum((left - margin, top - margin), 0.0)).astype(int)
-    high = np.ceil(np.minimum((right + margin, bottom + margin), (WIDTH, HEIGHT))).astype(int)
-    return Crop(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+    low = np.floor(np.maximum((left - margin, top - margin), 0.0)).astype(int).tolist()
+    high = np.ceil(np.minimum((right + margin, bottom + margin), (WIDTH, HEIGHT))).astype(int).tolist()
+    return Crop(*low, *high)
 
 
 def crop_camera(camera: Camera, crop: Crop) -> Camera:
     """The camera whose image is the crop of this camera's image at `WIDTH` x `HEIGHT`."""
     k = camera.intrinsics
     across, down = WIDTH / k.width, HEIGHT / k.height
-    cropped = Intrinsics(
-        width=crop.right - crop.left,
-        height=crop.bottom - crop.top,
-        fx=k.fx * across,
-        fy=k.fy * down,
-        cx=k.cx * across - crop.left,
-        cy=k.cy * down - crop.top,
-    )
-    return Camera(cropped, camera.T_world_cam)
+    size = {"width": crop.right - crop.left, "height": crop.bottom - crop.top}
+    focus = {"fx": k.fx * across, "fy": k.fy * down, "cx": k.cx * across - crop.left, "cy": k.cy * down - crop.top}
+    return Camera(Intrinsics(**size, **focus), camera.T_world_cam)
 
 
 def crop_colour(rgb: NDArray[np.uint8], crop: Crop) -> NDArray[np.uint8]:

@@ -5,7 +5,6 @@ size of pixels, through places that do not depend on it. Views of all pairs coun
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,16 +24,6 @@ PERCENTILE = 99.0
 
 HIDDEN_M = 0.005
 """A projected pixel this far behind the surface that the mirror camera sees shows a hidden surface."""
-
-
-@dataclass(frozen=True, eq=False)
-class LabelErrors:
-    """A view's depth errors, mm, [N] of objects and [M] of the table; `differ` of its `pixels` of objects have a wrong mask."""
-
-    object_mm: Array
-    table_mm: Array
-    differ: int
-    pixels: int
 
 
 def measure_images(context: WorkerContext, scene: Scene, truth: Truth) -> dict[str, float]:
@@ -60,95 +49,80 @@ def measure_images(context: WorkerContext, scene: Scene, truth: Truth) -> dict[s
       lies more than 5 mm behind what the mirror camera's ray meets.
     """
     images = context.job.images
-    views = [
-        (view, truth.pixels(view.camera))
-        for pair in scene.pairs
-        for view in (pair.input, pair.aligned, pair.mirror)
-        if view is not None
-    ]
-    found = _of_labels([compare_labels(view, pixels, images) for view, pixels in views])
+    views = [view for pair in scene.pairs for view in (pair.input, pair.aligned, pair.mirror) if view is not None]
     patches = [truth.patch(pair.input.camera, number) for number, pair in enumerate(scene.pairs)]
-    found |= _of_patches(scene.pairs, patches, images)
-    found |= _of_mirrors(scene.pairs, patches)
-    found |= _of_projections(scene.pairs, truth, images)
-    return found
-
-
-def compare_labels(view: View, truth: Pixels, images: Images) -> LabelErrors:
-    """A stored view against rays at its pixels' centres."""
-    assert view.region is not None
-    mask = truth.box.of(view.region)
-    by_ray = truth.box.region >= REGION_FIRST_OBJECT
-    by_mask = mask >= REGION_FIRST_OBJECT
-    differ = int(np.count_nonzero((mask != truth.box.region) & (by_ray | by_mask)))
-    outside = int(np.count_nonzero(view.region >= REGION_FIRST_OBJECT) - np.count_nonzero(by_mask))
-    table = truth.spread.region == REGION_TABLE
-    return LabelErrors(
-        _depth_mm(view, truth.box, by_ray, images),
-        _depth_mm(view, truth.spread, table, images),
-        differ + outside,
-        int(np.count_nonzero(by_ray)),
+    projected = [pair for pair in scene.pairs if pair.projected is not None]
+    return (
+        _of_labels([(view, truth.pixels(view.camera)) for view in views], images)
+        | _of_patches(list(zip(scene.pairs, patches, strict=True)), images)
+        | _of_mirrors(list(zip(scene.pairs, patches, strict=True)))
+        | _of_projections(projected, truth, images)
     )
 
 
-def _depth_mm(view: View, seen: Seen, chosen: NDArray[np.bool_], images: Images) -> Array:
-    """[N] |stored depth - ray's z| of the chosen pixels that have depth and whose mask is the ray's region."""
-    assert view.region is not None
-    depth = seen.of(view.depth)
-    same = chosen & (seen.of(view.region) == seen.region) & (depth > 0)
-    return np.abs(dequantise_depth(depth[same], images) - seen.depth_m[same]) * 1e3
-
-
-def _of_labels(errors: Sequence[LabelErrors]) -> dict[str, float]:
-    pixels = sum(one.pixels for one in errors)
+def _of_labels(views: Sequence[tuple[View, Pixels]], images: Images) -> dict[str, float]:
+    """Stored views against rays at their pixels' centres."""
+    objects_mm: list[Array] = []
+    table_mm: list[Array] = []
+    differ = pixels = 0
+    for view, truth in views:
+        assert view.region is not None
+        mask, by_ray = truth.box.of(view.region), truth.box.region >= REGION_FIRST_OBJECT
+        by_mask = mask >= REGION_FIRST_OBJECT
+        outside = np.count_nonzero(view.region >= REGION_FIRST_OBJECT) - np.count_nonzero(by_mask)
+        differ += int(np.count_nonzero((mask != truth.box.region) & (by_ray | by_mask)) + outside)
+        pixels += int(np.count_nonzero(by_ray))
+        table = truth.spread.region == REGION_TABLE
+        for found, seen, chosen in ((objects_mm, truth.box, by_ray), (table_mm, truth.spread, table)):
+            found.append(_off_mm(seen.of(view.depth), seen.of(view.region), seen, chosen, images))
     return {
-        **_percentile("depth_mm", [one.object_mm for one in errors], PERCENTILE),
-        **_percentile("table_depth_mm", [one.table_mm for one in errors], PERCENTILE),
-        **_share("mask_share", sum(one.differ for one in errors), pixels),
+        **_percentile("depth_mm", objects_mm, PERCENTILE),
+        **_percentile("table_depth_mm", table_mm, PERCENTILE),
+        **({"mask_share": differ / pixels} if pixels else {}),
     }
 
 
-def _of_patches(pairs: Sequence[Pair], patches: Sequence[Patch], images: Images) -> dict[str, float]:
-    off_mm, wrong, rays = [], 0, 0
-    for pair, patch in zip(pairs, patches, strict=True):
+def _of_patches(pairs: Sequence[tuple[Pair, Patch]], images: Images) -> dict[str, float]:
+    off_mm, wrong = [], []
+    for pair, patch in pairs:
         region, k = pair.input.region, pair.input.camera.intrinsics
         assert region is not None
-        column = np.minimum((patch.at[:, 0] * k.width).astype(np.int64), k.width - 1)
-        row = np.minimum((patch.at[:, 1] * k.height).astype(np.int64), k.height - 1)
-        mask, depth = region[row, column], pair.input.depth[row, column]
-        same = (mask == patch.region) & (mask >= REGION_FIRST_OBJECT) & (depth > 0)
-        off_mm.append(np.abs(dequantise_depth(depth[same], images) - patch.depth_m[same]) * 1e3)
-        wrong += int(np.count_nonzero(mask != patch.region))
-        rays += len(mask)
-    return {**_percentile("between_mm", off_mm, 50.0), **_share("outline_share", wrong, rays)}
+        column, row = np.minimum((patch.at * (k.width, k.height)).astype(np.int64), (k.width - 1, k.height - 1)).T
+        mask, objects = region[row, column], patch.region >= REGION_FIRST_OBJECT
+        off_mm.append(_off_mm(pair.input.depth[row, column], mask, patch, objects, images))
+        wrong.append(mask != patch.region)
+    return _percentile("between_mm", off_mm, 50.0) | _mean("outline_share", wrong)
 
 
-def _of_mirrors(pairs: Sequence[Pair], patches: Sequence[Patch]) -> dict[str, float]:
+def _of_mirrors(pairs: Sequence[tuple[Pair, Patch]]) -> dict[str, float]:
     off = [
         abs(pair.d_z_m - patch.front_m) * 1e3
-        for pair, patch in zip(pairs, patches, strict=True)
+        for pair, patch in pairs
         if pair.mirror is not None and patch.box is not None
     ]
-    medians = [pair.agreement.median_mm for pair in pairs if pair.agreement is not None]
+    medians = [pair.agreement.median_mm for pair, _ in pairs if pair.agreement is not None]
     known = [median for median in medians if median is not None]
     return {name: max(values) for name, values in (("mirror_mm", off), ("agreement_mm", known)) if values}
 
 
 def _of_projections(pairs: Sequence[Pair], truth: Truth, images: Images) -> dict[str, float]:
-    empty = both = hidden = filled = 0
+    empty, hidden = [], []
     for pair in pairs:
-        if pair.projected is None:
-            continue
+        assert pair.projected is not None
         camera, depth = pair.projected.camera, pair.projected.depth
         seen = truth.pixels(camera)
-        shared = truth.both(camera, pair.input.camera)
-        empty += int(np.count_nonzero(shared & (seen.box.of(depth) == 0)))
-        both += int(np.count_nonzero(shared))
+        empty.append(seen.box.of(depth)[truth.both(camera, pair.input.camera)] == 0)
         drawn, z = seen.spread.of(depth), seen.spread.depth_m
-        behind = (drawn > 0) & (z > 0.0) & (dequantise_depth(drawn, images) > z + HIDDEN_M)
-        hidden += int(np.count_nonzero(behind))
-        filled += int(np.count_nonzero(drawn))
-    return {**_share("unfilled_share", empty, both), **_share("hidden_share", hidden, filled)}
+        hidden.append(((z > 0.0) & (dequantise_depth(drawn, images) > z + HIDDEN_M))[drawn > 0])
+    return _mean("unfilled_share", empty) | _mean("hidden_share", hidden)
+
+
+def _off_mm(
+    stored: NDArray[np.uint16], mask: NDArray[np.uint8], seen: Seen | Patch, chosen: NDArray[np.bool_], images: Images
+) -> Array:
+    """[N] |stored depth - ray's z| of the chosen pixels that have depth and whose mask is the ray's region."""
+    same = chosen & (mask == seen.region) & (stored > 0)
+    return np.abs(dequantise_depth(stored[same], images) - seen.depth_m[same]) * 1e3
 
 
 def _percentile(name: str, errors: Iterable[Array], percent: float) -> dict[str, float]:
@@ -157,5 +131,7 @@ def _percentile(name: str, errors: Iterable[Array], percent: float) -> dict[str,
     return {name: float(np.percentile(values, percent))} if len(values) else {}
 
 
-def _share(name: str, part: int, whole: int) -> dict[str, float]:
-    return {name: part / whole} if whole else {}
+def _mean(name: str, flags: Iterable[NDArray[np.bool_]]) -> dict[str, float]:
+    """The share of true flags by its name, or none for no flags."""
+    values = np.concatenate([np.empty(0, bool), *flags])
+    return {name: float(values.mean())} if len(values) else {}

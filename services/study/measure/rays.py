@@ -87,8 +87,10 @@ def cast_pixels(things: Sequence[Placed], camera: Camera) -> Pixels:
     box = project_box(things, camera) or (0.0, 0.0, 0.0, 0.0)
     left, top, right, bottom = math.floor(box[0]), math.floor(box[1]), math.ceil(box[2]), math.ceil(box[3])
     rows, columns = np.mgrid[top:bottom, left:right]
-    inside = _cast_centres(things, camera, rows.ravel(), columns.ravel())
-    return Pixels(inside, _cast_centres(things, camera, *_spread(camera.intrinsics.width, camera.intrinsics.height)))
+    places = (rows.ravel(), columns.ravel()), _spread(camera.intrinsics.width, camera.intrinsics.height)
+    return Pixels(
+        *(Seen(v, u, *cast_at(things, camera, u.astype(float) + 0.5, v.astype(float) + 0.5)) for v, u in places)
+    )
 
 
 @cache
@@ -103,10 +105,6 @@ def _spread(width: int, height: int) -> tuple[Index, Index]:
     rows, columns = rows + within[0], columns + within[1]
     there = (rows < height) & (columns < width)
     return rows[there], columns[there]
-
-
-def _cast_centres(things: Sequence[Placed], camera: Camera, rows: Index, columns: Index) -> Seen:
-    return Seen(rows, columns, *cast_at(things, camera, columns.astype(float) + 0.5, rows.astype(float) + 0.5))
 
 
 def cast_patch(things: Sequence[Placed], camera: Camera, *names: int) -> Patch:

@@ -11,14 +11,13 @@ from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.job.physics import Physics
 from schemas.scene.plan import ScenePlan
-from schemas.scene.scene import Settled
 from services.study.knobs import apply
 from services.study.model import Setting
 from workers.geometry.frames import motion_between, transform
 from workers.physics.step import Rest, moved_by, recheck_scene, settle_scene
 from workers.pipeline.context import WorkerContext
 from workers.plan.effect import Facts
-from workers.plan.effects import plan_effects
+from workers.plan.effects import EffectPlan, plan_effects
 from workers.plan.randomness import SceneChance
 from workers.plan.step import plan_scene
 
@@ -74,38 +73,33 @@ def measure_settling(
 
 def _settle(job: Job, plan: ScenePlan, physics: Mapping[str, Any] | None = None) -> Rest | None:
     """None where the scene does not come to rest."""
-    finer = _physics(job, physics or {})
-    effects = plan_effects(Facts(job.model_copy(update={"physics": finer}), plan, raycast_checked=False))
     try:
-        return settle_scene(plan, finer, effects)
+        return settle_scene(plan, *_physics(job, plan, physics or {}))
     except SceneError:
         return None
 
 
-def _physics(job: Job, changes: Mapping[str, Any]) -> Physics:
-    return job.physics.model_copy(update=dict(changes))
+def _physics(job: Job, plan: ScenePlan, changes: Mapping[str, Any]) -> tuple[Physics, EffectPlan]:
+    """The job's physics with these changes, and the plan of effects with them."""
+    physics = job.physics.model_copy(update=dict(changes))
+    return physics, plan_effects(Facts(job.model_copy(update={"physics": physics}), plan, raycast_checked=False))
 
 
 def _describe(plan: ScenePlan, rest: Rest | None) -> Answer:
     if rest is None:
         return {"failed": True}
-    travels = [_travel(plan, number, one) for number, one in enumerate(rest.settled)]
+    slid, rolled = [], []
+    for start, end in zip(plan.objects, rest.settled, strict=True):
+        before, after = (transform(T, start.asset.mass.com[None])[0, :2] for T in (start.T_world_obj, end.T_world_obj))
+        slid.append(float(np.linalg.norm(after - before)) * 1e3)
+        rolled.append(math.degrees(motion_between(start.hull.vertices, start.T_world_obj, end.T_world_obj)[1]))
     return {
         "failed": False,
         "penetration_mm": max(one.penetration_mm for one in rest.settled),
         "gap_mm": max(one.hover_gap_mm for one in rest.settled),
-        "slid_mm": max(slid for slid, _ in travels),
-        "rolled_deg": max(turned for _, turned in travels),
+        "slid_mm": max(slid),
+        "rolled_deg": max(rolled),
     }
-
-
-def _travel(plan: ScenePlan, number: int, rest: Settled) -> tuple[float, float]:
-    """Travel of an object from its start to its rest: of its centre of mass sideways, mm, and its turn, degrees."""
-    start = plan.objects[number]
-    com = start.asset.mass.com[None, :]
-    before, after = (transform(T, com)[0, :2] for T in (start.T_world_obj, rest.T_world_obj))
-    _, turned = motion_between(start.hull.vertices, start.T_world_obj, rest.T_world_obj)
-    return float(np.linalg.norm(after - before)) * 1e3, math.degrees(turned)
 
 
 def _apart_mm(plan: ScenePlan, one: Rest, other: Rest) -> float:
@@ -117,9 +111,7 @@ def _apart_mm(plan: ScenePlan, one: Rest, other: Rest) -> float:
 
 
 def _release(job: Job, plan: ScenePlan, rest: Rest) -> dict[str, float]:
-    physics = _physics(job, RELEASED)
-    planned = plan_effects(Facts(job.model_copy(update={"physics": physics}), plan, raycast_checked=False))
-    again = recheck_scene(plan, rest, physics, planned).settled
+    again = recheck_scene(plan, rest, *_physics(job, plan, RELEASED)).settled
     return {
         "moved_mm": max(one.recheck_move_mm or 0.0 for one in again),
         "turned_deg": max(one.recheck_turn_deg or 0.0 for one in again),

@@ -33,7 +33,7 @@ def figure_over_scenes(figures: Sequence[float]) -> Figure:
 def share(flags: Sequence[bool]) -> Figure:
     """The share of true flags."""
     values = np.asarray(flags, float)
-    return _figure(len(values), lambda rows: float(values[rows].mean()), float(values.mean()))
+    return _figure(len(values), lambda rows: float(values[rows].mean()))
 
 
 def apart(own: Sequence[float], truth: Sequence[float]) -> Figure:
@@ -44,15 +44,16 @@ def apart(own: Sequence[float], truth: Sequence[float]) -> Figure:
     compared. The interval is a paired bootstrap's; the median repeats the value.
     """
     mine, other = np.asarray(own, float), np.asarray(truth, float)
-    whole = float(wasserstein_distance(mine, other))
-    return _figure(len(mine), lambda rows: float(wasserstein_distance(mine[rows], other[rows])), whole)
+    return _figure(len(mine), lambda rows: float(wasserstein_distance(mine[rows], other[rows])))
 
 
-def _figure(count: int, measure: Callable[[Rows], float], median: float) -> Figure:
+def _figure(count: int, measure: Callable[[Rows], float], median: float | None = None) -> Figure:
+    """The value over all scenes, with a bootstrap's interval; without a median the value is it."""
     rng = np.random.default_rng(0)
     samples = [measure(rng.integers(0, count, count, dtype=np.int64)) for _ in range(RESAMPLES)]
     low, high = np.percentile(samples, INTERVAL)
-    return Figure(measure(np.arange(count, dtype=np.int64)), float(low), float(high), median, count)
+    value = measure(np.arange(count, dtype=np.int64))
+    return Figure(value, float(low), float(high), value if median is None else median, count)
 
 
 def settling_figures(name: str, scenes: Sequence[Answer]) -> dict[str, Figure]:

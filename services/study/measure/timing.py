@@ -2,8 +2,9 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from statistics import median
+from statistics import fmean, median
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ def time_scene(
     cold = time.process_time() - began
     answer: Answer = {"whole": {}, "settling": {}, "bytes": {}, "cold": cold}
     order = np.random.default_rng([scene_id, lap])
-    for setting in _shuffled(whole, order):
+    for setting in [whole[k] for k in order.permutation(len(whole))]:
         worker = context_for(context, setting)
         began = time.process_time()
         output = run_scene(worker, scene_id, Stopwatch())
@@ -48,15 +49,10 @@ def time_scene(
         if output.files:
             answer["whole"][setting.name] = took
             answer["bytes"][setting.name] = sum(len(file.data) for file in output.files)
-    for setting in _shuffled(settling, order):
-        took_or_none = _settle_s(context_for(context, setting), scene_id)
-        if took_or_none is not None:
-            answer["settling"][setting.name] = took_or_none
+    for setting in [settling[k] for k in order.permutation(len(settling))]:
+        with suppress(SceneError):  # where the scene does not come to rest
+            answer["settling"][setting.name] = _settle_s(context_for(context, setting), scene_id)
     return answer
-
-
-def _shuffled(settings: Sequence[Setting], order: np.random.Generator) -> list[Setting]:
-    return [settings[k] for k in order.permutation(len(settings))]
 
 
 def warm_up(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> None:
@@ -67,15 +63,11 @@ def warm_up(context: WorkerContext, settings: Sequence[Setting], scene_id: int) 
         run_scene(context_for(context, setting), scene_id, Stopwatch())
 
 
-def _settle_s(context: WorkerContext, scene_id: int) -> float | None:
-    """Seconds for choosing the effects and settling; None where the scene does not come to rest."""
-    try:
-        plan = plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
-        began = time.process_time()
-        effects = plan_effects(Facts(context.job, plan, raycast_checked=False))
-        settle_scene(plan, context.job.physics, effects)
-    except SceneError:
-        return None
+def _settle_s(context: WorkerContext, scene_id: int) -> float:
+    """Seconds for choosing the effects and settling. Raises SceneError."""
+    plan = plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
+    began = time.process_time()
+    settle_scene(plan, context.job.physics, plan_effects(Facts(context.job, plan, raycast_checked=False)))
     return time.process_time() - began
 
 
@@ -90,17 +82,9 @@ class Cost:
 
 def job_cost(laps: Sequence[Mapping[int, Answer]], own: str) -> tuple[float, float]:
     """(milliseconds of processor, kilobytes) a scene of the job itself: medians over rounds, shapes new."""
-    times = [
-        sum(_own_s(lap, laps[0], scene, own) for scene in scenes) / len(scenes)
-        for lap in laps
-        if (scenes := _made(lap, own))
-    ]
+    made = [[_own_s(lap, laps[0], scene, own) for scene, one in lap.items() if own in one["whole"]] for lap in laps]
     sizes = [answer["bytes"][own] for answer in laps[0].values() if own in answer["bytes"]]
-    return median(times) * 1e3, sum(sizes) / len(sizes) / 1e3
-
-
-def _made(lap: Mapping[int, Answer], name: str) -> list[int]:
-    return [scene for scene, answer in lap.items() if name in answer["whole"]]
+    return median(fmean(times) for times in made if times) * 1e3, fmean(sizes) / 1e3
 
 
 def _own_s(lap: Mapping[int, Answer], first: Mapping[int, Answer], scene: int, own: str) -> float:
@@ -129,4 +113,4 @@ def cost_of(name: str, own: str, laps: Sequence[Mapping[int, Answer]]) -> Cost |
     if not ratios:
         return None
     sizes = [a["bytes"][name] for a in laps[0].values() if name in a["bytes"]]
-    return Cost(Spread.of(ratios), sum(sizes) / len(sizes) / 1e3 if sizes else None, len(scenes_seen))
+    return Cost(Spread.of(ratios), fmean(sizes) / 1e3 if sizes else None, len(scenes_seen))

@@ -1,10 +1,10 @@
 """The ray casts of one scene's geometry, kept from setting to setting while its poses stay."""
 
-from collections import OrderedDict
 from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
+from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from schemas.scene.camera import Camera
@@ -26,16 +26,12 @@ class Truth:
     def __init__(self, scene: Scene) -> None:
         self.scene_id = scene.plan.scene_id
         self.things = scene.posed.things
-        self._kept: OrderedDict[Key, object] = OrderedDict()
+        self._kept: LRUCache[Key, object] = LRUCache(KEPT)
 
     def fits(self, scene: Scene) -> bool:
         """Whether the scene has the same shapes at the same poses."""
-        theirs = scene.posed.things
-        return (
-            self.scene_id == scene.plan.scene_id
-            and len(self.things) == len(theirs)
-            and all(_same(mine, other) for mine, other in zip(self.things, theirs, strict=True))
-        )
+        alike = self.scene_id == scene.plan.scene_id and len(self.things) == len(scene.posed.things)
+        return alike and all(map(_same, self.things, scene.posed.things))
 
     def pixels(self, camera: Camera) -> Pixels:
         """The view at its pixels."""
@@ -57,9 +53,6 @@ class Truth:
     def _keep(self, key: Key, cast: Callable[[], Answer]) -> Answer:
         if key not in self._kept:
             self._kept[key] = cast()
-        self._kept.move_to_end(key)
-        while len(self._kept) > KEPT:
-            self._kept.popitem(last=False)
         return self._kept[key]  # type: ignore[return-value]
 
 

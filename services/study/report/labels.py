@@ -62,21 +62,20 @@ def place_labels(axes: Axes, labels: Sequence[Label]) -> None:
             zorder=6,
             arrowprops={"arrowstyle": "-", "color": label.color, "lw": 0.6, "shrinkA": 0, "shrinkB": 6},
         )
-        best: tuple[float, dict[str, Any], Bbox, bool] | None = None
-        for cost, spot, led in _spots(label):
-            box = _put(axes, note, spot)
-            if box is None or any(_too_near(box, other) for other in taken):
-                continue
-            cost += ON_LINE * sum(path.intersects_bbox(box, filled=False) for path in paths)
-            if best is None or cost < best[0]:
-                best = cost, spot, box, led
-        if best is None:
+        spots = [(cost, spot, led, _put(axes, note, spot)) for cost, spot, led in _spots(label)]
+        free = [
+            (cost + ON_LINE * sum(path.intersects_bbox(box, filled=False) for path in paths), spot, led, box)
+            for cost, spot, led, box in spots
+            if box is not None and not any(box.padded(SPACE_X, SPACE_Y).overlaps(other) for other in taken)
+        ]
+        if not free:
             note.remove()
             continue
-        _put(axes, note, best[1])
-        taken.append(best[2])
+        _, spot, led, box = min(free, key=lambda one: one[0])
+        _put(axes, note, spot)
+        taken.append(box)
         assert note.arrow_patch is not None
-        note.arrow_patch.set_visible(best[3])
+        note.arrow_patch.set_visible(led)
 
 
 def _spots(label: Label) -> Iterator[tuple[float, dict[str, Any], bool]]:
@@ -84,12 +83,8 @@ def _spots(label: Label) -> Iterator[tuple[float, dict[str, Any], bool]]:
     for distance in _DISTANCES if label.must else _DISTANCES[:3]:
         for turn, (x, y) in enumerate(_DIRECTIONS):
             reach = distance * (0.75 if x and y else 1.0)
-            spot: dict[str, Any] = {
-                "position": (x * reach, y * reach),
-                "ha": ("center", "left", "right")[x],
-                "va": ("center", "bottom", "top")[y],
-            }
-            yield distance + 0.3 * turn, spot, distance >= _LED
+            side = {"ha": ("center", "left", "right")[x], "va": ("center", "bottom", "top")[y]}
+            yield distance + 0.3 * turn, {"position": (x * reach, y * reach), **side}, distance >= _LED
 
 
 def _put(axes: Axes, note: Annotation, spot: dict[str, Any]) -> Bbox | None:
@@ -102,17 +97,9 @@ def _put(axes: Axes, note: Annotation, spot: dict[str, Any]) -> Bbox | None:
     return box if inside else None
 
 
-def _too_near(box: Bbox, other: Bbox) -> bool:
-    wide = Bbox.from_extents(box.x0 - SPACE_X, box.y0 - SPACE_Y, box.x1 + SPACE_X, box.y1 + SPACE_Y)
-    return bool(wide.overlaps(other))
-
-
 def marker_boxes(line: Line2D) -> list[Bbox]:
     """The boxes in pixels of a line's markers."""
     if line.get_marker() in ("None", "", None):
         return []
     half = line.get_markersize() / 2 * DOTS / 72
-    return [
-        Bbox.from_extents(x - half, y - half, x + half, y + half)
-        for x, y in line.get_transform().transform(line.get_xydata())
-    ]
+    return [Bbox([at - half, at + half]) for at in line.get_transform().transform(line.get_xydata())]

@@ -27,12 +27,10 @@ from services.study.report.axes import (
 from services.study.report.labels import Label
 from services.study.words import cost
 
+_PHYSICS = ("pose_mm", "moved_mm", "outcome_mm", "penetration_mm", "gap_mm", "turned_deg", "outcome_deg")
+
 _MAIN = (
-    (
-        "at rest",
-        "How objects rest",
-        ("pose_mm", "moved_mm", "outcome_mm", "penetration_mm", "gap_mm", "turned_deg", "outcome_deg"),
-    ),
+    ("at rest", "How objects rest", _PHYSICS),
     ("in depth", "Depth and masks", ("between_mm", "depth_mm", "outline_share", "mask_share", "table_depth_mm")),
     ("in the mirror", "The other side", ("mirror_mm", "agreement_mm", "unfilled_share", "hidden_share")),
     ("in colour", "Colour", ("flip", "edge_flip")),
@@ -79,7 +77,7 @@ def moving_rows(rows: Sequence[Row], error: str) -> list[Row]:
     measured = [row for row in rows if error in row.errors]
     own = own_row(rows).errors.get(error)
     moving = {
-        _knob(row)
+        row.setting.knob
         for row in measured
         if row.setting.kind == "single"
         and (own is None or abs(row.errors[error].value - own.value) > MOVED * own.value)
@@ -97,12 +95,10 @@ def half_row(rows: Sequence[Row], error: str) -> Row | None:
 
 def looks_of(rows: Sequence[Row], panels: Sequence[Panel]) -> dict[str, Looks]:
     """Looks by the panel's error: a knob has the same in all panels, and as far as they go no other knob of a panel has it."""
-    turned = {
-        panel.error: list(
-            dict.fromkeys(_knob(row) for row in moving_rows(rows, panel.error) if row.setting.kind == "single")
-        )
-        for panel in panels
-    }
+    turned = {}
+    for panel in panels:
+        single = [row.setting for row in moving_rows(rows, panel.error) if row.setting.kind == "single"]
+        turned[panel.error] = list(dict.fromkeys(setting.knob for setting in single))
     often = Counter(knob for knobs in turned.values() for knob in knobs)
     everywhere: dict[str, int] = {}
     for knob in sorted(often, key=lambda knob: -often[knob]):  # knobs of several panels choose first
@@ -112,10 +108,6 @@ def looks_of(rows: Sequence[Row], panels: Sequence[Panel]) -> dict[str, Looks]:
     return {error: {knob: everywhere[knob] for knob in knobs} for error, knobs in turned.items()}
 
 
-def _knob(row: Row) -> str:
-    return row.setting.parts[0][0]
-
-
 def draw_panel(axes: Axes, study: Study, panel: Panel, looks: Looks, width: float) -> list[Label]:
     """Points, intervals, front, and a heading with its message; `width` in inches. Returns the labels to place."""
     rows, error = moving_rows(study.rows, panel.error), panel.error
@@ -123,8 +115,9 @@ def draw_panel(axes: Axes, study: Study, panel: Panel, looks: Looks, width: floa
     set_axes(axes, [row.ms for row in rows], rows, error)
     corners = pts_to_poststep(*zip(*(place_of(row, error) for row in best), strict=True))
     axes.plot(*corners, color=INK, lw=1.3, zorder=2, solid_joinstyle="round")
+    marks = {"own": OWN_MARK, "preset": PRESET_MARK, "several": SEVERAL_MARK}
     for row in rows:
-        draw_row(axes, row, error, **_look(row, looks))
+        draw_row(axes, row, error, **(marks.get(row.setting.kind) or knob_mark(looks[row.setting.knob])))
     lines = _draw_legend(axes, looks, width)
     place: dict[str, Any] = {"fontsize": 12, "fontweight": "bold", "color": INK, "pad": 8.0 + 14.0 * lines}
     title = axes.set_title(panel.heading, loc="left", **place)
@@ -157,29 +150,18 @@ PRESET_MARK: Mark = {"color": "black", "marker": "s", "ms": 10.0, "mfc": "none",
 SEVERAL_MARK: Mark = {"color": PALE, "marker": "d", "ms": 6.5, "mfc": "white", "mew": 1.0, "zorder": 4}
 
 
-def _look(row: Row, looks: Looks) -> Mark:
-    kind = row.setting.kind
-    if kind == "single":
-        return knob_mark(looks[_knob(row)])
-    return {"own": OWN_MARK, "preset": PRESET_MARK, "several": SEVERAL_MARK}[kind]
-
-
 def _draw_legend(axes: Axes, looks: Looks, width: float) -> int:
     """Which marker is which knob, between heading and axes; returns its number of lines, at most two."""
     handles = [Line2D([], [], ls="", label=cut(knob), **knob_mark(look)) for knob, look in looks.items()]
     columns = max(5, -(-len(looks) // 2))
+    style: dict[str, Any] = {"frameon": False, "handletextpad": 0.1, "columnspacing": 0.9, "ncols": columns}
+    style |= {
+        "loc": "lower left",
+        "bbox_to_anchor": (-0.02, 0.99),
+        "labelcolor": [TEXT_COLORS[n] for n in looks.values()],
+    }
     for size in (9.0, 8.0, 7.0, 6.0, 5.0, 4.0):
-        legend = axes.legend(
-            handles=handles,
-            loc="lower left",
-            bbox_to_anchor=(-0.02, 0.99),
-            ncols=columns,
-            frameon=False,
-            fontsize=size,
-            handletextpad=0.1,
-            columnspacing=0.9,
-            labelcolor=[TEXT_COLORS[look] for look in looks.values()],
-        )
+        legend = axes.legend(handles=handles, fontsize=size, **style)
         if legend.get_window_extent(renderer_of(axes.figure)).width <= width * DOTS:
             break
     return -(-len(looks) // columns)
@@ -191,13 +173,12 @@ def _labels(rows: Sequence[Row], panel: Panel, best: Sequence[Row], looks: Looks
     A combination has a long name, and is named on the front alone.
     """
     labels = []
-    for order, row in enumerate(sorted(rows, key=lambda row: row.ratio)):
-        kind, on_front = row.setting.kind, row in best
-        if kind == "several" and not on_front:
-            continue
+    named = [row for row in rows if row.setting.kind != "several" or row in best]
+    for order, row in enumerate(sorted(named, key=lambda row: row.ratio)):
+        kind = row.setting.kind
         must = kind in ("own", "preset") or row is panel.half
         text = row.setting.parts[0][1] if kind in ("preset", "single") else row.setting.name
-        color = TEXT_COLORS[looks[_knob(row)]] if kind == "single" else PALE if kind == "several" else INK
-        rank = 0.0 if must else (1.0 if on_front else 2.0) + order * 1e-3
+        color = TEXT_COLORS[looks[row.setting.knob]] if kind == "single" else PALE if kind == "several" else INK
+        rank = 0.0 if must else (1.0 if row in best else 2.0) + order * 1e-3
         labels.append(Label(cut(text), place_of(row, panel.error), color, rank, must))
     return labels

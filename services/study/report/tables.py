@@ -37,14 +37,10 @@ LONG_SCHEMA = pa.schema(
 
 def wide_schema() -> pa.Schema:
     """The schema of `tradeoff.parquet`: one row for each setting; an error and its interval are null where not measured."""
-    errors = [name for name in ERRORS if name != "failed_share"]
-    figures = [
-        *((name, pa.float64()) for error in errors for name in (error, f"{error}_low", f"{error}_high")),
-        ("failed_share_low", pa.float64()),
-        ("failed_share_high", pa.float64()),
-    ]
-    cost = [(name, pa.float64()) for name in _COST]
-    return pa.schema([*_SETTING, ("changes", pa.string()), *cost, *figures, ("notes", pa.list_(pa.string()))])
+    names = sorted(ERRORS, key=lambda name: name in _COST)  # those with a column among the costs last
+    figures = [f"{name}{end}" for name in names for end in ("", "_low", "_high") if f"{name}{end}" not in _COST]
+    numbers = [(name, pa.float64()) for name in (*_COST, *figures)]
+    return pa.schema([*_SETTING, ("changes", pa.string()), *numbers, ("notes", pa.list_(pa.string()))])
 
 
 def write_tables(study: Study, folder: Path) -> list[Path]:

@@ -5,8 +5,6 @@ import pytest
 from schemas.errors import InputError
 from services.study.answer import answer, blind_knobs, next_better, recommend
 from services.study.choose import TargetError
-from services.study.errors import ERRORS
-from services.study.words import short
 from tests.made_up_studies import large_study, row, study
 
 OWN = row(penetration_mm=0.01, gap_mm=0.0, mask_share=0.0002, depth_mm=0.1, flip=0.1)
@@ -103,8 +101,3 @@ def test_a_target_that_was_not_measured_is_told():
 
 def test_a_large_study_has_a_sentence():
     assert answer(large_study()).startswith("For at most 0.1 mm (penetration, gap, pose, depth of objects)")
-
-
-def test_every_error_has_a_short_name():
-    assert all(short(name) == kind.short != "" for name, kind in ERRORS.items())
-    assert len({kind.short for kind in ERRORS.values()}) == len(ERRORS)

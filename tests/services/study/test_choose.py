@@ -13,6 +13,7 @@ from services.study.choose import (
     TargetError,
     as_cheap,
     choose,
+    close_calls,
     error_of,
     front,
     own_row,
@@ -131,6 +132,14 @@ def test_the_choice_stays_when_times_come_back_a_little_off():
 def test_a_study_without_the_job_itself_is_a_bug():
     with pytest.raises(ValueError, match="the job as it is"):
         own_row([row("step=1", depth_mm=0.1)])
+
+
+def test_settings_whose_time_decides_are_told():
+    near = [OWN, row("step=1", 0.5, depth_mm=0.3), row("step=2", 0.53, depth_mm=0.05)]
+    far = [OWN, row("step=1", 0.5, depth_mm=0.3), row("step=2", 0.6, depth_mm=0.05)]
+    assert names(close_calls(near, {"mirror_mm": 1.0})) == ["step=1", "step=2"]
+    assert close_calls(far, {"mirror_mm": 1.0}) == []
+    assert names(close_calls(far, {"mirror_mm": 1.0}, noise=0.2)) == ["step=1", "step=2"]
 
 
 # ---------------------------------------------------------------------------------------------- nobody meets them

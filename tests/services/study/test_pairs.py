@@ -3,8 +3,6 @@
 from services.study.model import Figure, Row, Setting
 from services.study.pairs import promising
 
-UNITS = {"depth_mm": "mm", "mask_share": ""}
-
 
 def figure(value: float) -> Figure:
     return Figure(value, value, value, value, 10)
@@ -21,7 +19,7 @@ OWN = row("", 1.0, 0.1)
 
 
 def names(*rows: Row, targets=None) -> set[str]:
-    return {setting.name for setting in promising([OWN, *rows], UNITS, targets or {"depth_mm": 0.0})}
+    return {setting.name for setting in promising([OWN, *rows], targets or {"depth_mm": 0.0})}
 
 
 def test_values_that_save_time_and_keep_every_error_are_joined():
@@ -34,7 +32,7 @@ def test_what_makes_an_error_grow_is_not_joined():
 
 
 def test_an_error_that_stays_negligible_may_grow_by_any_factor():
-    found = promising([row("", 1.0, 1e-6), row("a=1", 0.8, 1e-3), row("b=1", 0.9, 1e-4)], UNITS, {"depth_mm": 0.0})
+    found = promising([row("", 1.0, 1e-6), row("a=1", 0.8, 1e-3), row("b=1", 0.9, 1e-4)], {"depth_mm": 0.0})
     assert [setting.name for setting in found] == ["a=1, b=1"]
 
 

@@ -7,7 +7,6 @@ import pytest
 
 from schemas.job.job import Job
 from services.study.knobs import apply, knobs_of
-from services.study.measure.convergence import slopes
 from services.study.measure.settling import REFERENCES, measure_settling
 from services.study.model import Setting
 from workers.assets.catalogue import open_catalogue
@@ -56,12 +55,6 @@ def test_a_pose_has_an_error_only_where_two_finer_settings_agree():
         found = answers(scene)
         assert ("pose_mm" in found["the job"]) == bool(found["reference"]["agreed"])
     assert sum(bool(answers(scene)["reference"]["agreed"]) for scene in (0, 1, 2)) >= 2
-
-
-def test_errors_fall_with_the_step_in_the_order_of_the_integrator():
-    found = slopes()
-    assert found["free fall"] == pytest.approx(1.0, abs=1e-3)
-    assert found["sliding to rest"] == pytest.approx(1.0, abs=0.05)
 
 
 def test_a_box_about_an_object_comes_to_rest_elsewhere_than_its_hull():
