@@ -10,6 +10,7 @@ import numpy as np
 from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.job.physics import Physics
+from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ScenePlan
 from services.study.knobs import apply
 from services.study.model import Setting
@@ -17,7 +18,7 @@ from workers.geometry.frames import motion_between, transform
 from workers.physics.step import Rest, moved_by, recheck_scene, settle_scene
 from workers.pipeline.context import WorkerContext
 from workers.plan.effect import Facts
-from workers.plan.effects import EffectPlan, plan_effects
+from workers.plan.effects import plan_effects
 from workers.plan.randomness import SceneChance
 from workers.plan.step import plan_scene
 
