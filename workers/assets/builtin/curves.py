@@ -94,6 +94,12 @@ def squircle(count: int, squareness: int) -> Array:
     return table
 
 
+def rounded_sections(outline: Array, share: Array) -> Array:
+    """[K, n, 2] float64: the unit circle where a share [K] is 0, an outline [n, 2] where it is 1, and between them."""
+    share = share[:, None, None]
+    return circle(len(outline))[None] * (1.0 - share) + outline[None] * share
+
+
 @functools.cache
 def _corner(steps: int) -> Array:
     return circle(4 * steps)[: steps + 1]

@@ -11,12 +11,10 @@ from schemas.base import Array
 from schemas.scene.shape import Material, Part, Shape
 from workers.assets.builtin.solid import TRIG_DIGITS, Indices, Solid
 
-UvMapping = Literal["none", "cylinder", "plane", "box"]
-
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The material of some faces of a solid, and how its texture is mapped onto them.
+    """The material of some faces of a solid, and how its texture, if it has one, is mapped onto them.
 
     `mapping`: `cylinder` runs u once around the z axis and v from `low` to `high` in z; `plane` runs u along `across` and
     v along `up` (vectors [3] from `origin` whose lengths are one texture); `box` projects along the axis that the face
@@ -25,12 +23,12 @@ class Surface:
 
     name: str
     material: Material
-    mapping: UvMapping = "none"
+    mapping: Literal["cylinder", "plane", "box"] = "cylinder"
     low: float = 0.0
     high: float = 1.0
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    across: tuple[float, float, float] = (1.0, 0.0, 0.0)
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    origin: Sequence[float] | Array = (0.0, 0.0, 0.0)
+    across: Sequence[float] | Array = (1.0, 0.0, 0.0)
+    up: Sequence[float] | Array = (0.0, 0.0, 1.0)
     size: float = 1.0
     grain: int = 0
 
@@ -135,6 +133,8 @@ def _texture_variants(
 
     across [3, F]: the faces' area vectors.
     """
+    if surface.material.texture is None:
+        return np.zeros_like(faces), None
     if surface.mapping == "cylinder":
         turn = _turns(vertices, faces)
         beyond = turn[faces]
@@ -150,14 +150,12 @@ def _texture_variants(
         return np.zeros_like(faces), lambda point, variant: np.stack(
             [(local[point] * axis).sum(axis=1) for axis in axes], axis=1
         )
-    if surface.mapping == "box":
-        axis = np.abs(across).argmax(axis=0)
-        low = vertices.min(axis=0)
-        sides = np.array(_SIDES[surface.grain])
-        return np.repeat(axis[:, None], 3, axis=1), lambda point, variant: np.take_along_axis(
-            (vertices[point] - low) / surface.size, sides[variant], axis=1
-        )
-    return np.zeros_like(faces), None
+    axis = np.abs(across).argmax(axis=0)
+    low = vertices.min(axis=0)
+    sides = np.array(_SIDES[surface.grain])
+    return np.repeat(axis[:, None], 3, axis=1), lambda point, variant: np.take_along_axis(
+        (vertices[point] - low) / surface.size, sides[variant], axis=1
+    )
 
 
 def _turns(vertices: Array, faces: Indices) -> Array:

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.assets.builtin.draws import chance
-from workers.assets.builtin.palette import Color, ink_on, mix, vivid
+from workers.assets.builtin.palette import BLACK, WHITE, Color, chance, ink_on, mix, vivid
 
 Texture = NDArray[np.uint8]
 Plane = NDArray[np.float32]
@@ -63,6 +62,12 @@ def wood(rng: np.random.Generator, light: Color, dark: Color, planks: int = 0, s
     return blend(light, dark, share)
 
 
+def kraft(rng: np.random.Generator, color: Color) -> Texture:
+    """[128, 128, 3]: kraft cardboard with faint corrugation and fibres."""
+    share = 0.5 * noise(rng, 128, 128, 3, 64) + 0.5 * noise(rng, 128, 128, 48, 48)
+    return blend(mix(color, WHITE, 0.08), mix(color, BLACK, 0.12), share)
+
+
 def stone(rng: np.random.Generator, a: Color, b: Color, size: int = 192) -> Texture:
     """Cloudy stone with veins."""
     cloud = 0.6 * noise(rng, size, size, 6, 6) + 0.4 * noise(rng, size, size, 20, 20)
@@ -83,6 +88,11 @@ def speckled(
     picture = blank(height, width, ground)
     picture[rng.random((height, width), dtype=np.float32) < share] = rgb(spot)
     return picture
+
+
+def flecked(rng: np.random.Generator, glaze: Color, height: int) -> Texture:
+    """A glaze with dark flecks."""
+    return speckled(rng, glaze, mix(glaze, BLACK, 0.6), rng.uniform(0.02, 0.07), height)
 
 
 def bands(rng: np.random.Generator, colors: Sequence[Color], height: int = 128) -> Texture:
