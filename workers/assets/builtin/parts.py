@@ -9,7 +9,7 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.scene.shape import Material, Part, Shape
-from workers.assets.builtin.solid import TRIG_DIGITS, Indices, Solid
+from workers.assets.builtin.solid import TRIG_DIGITS, Indices, Solid, renumber
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ def cut_into_parts(solid: Solid, surfaces: Sequence[Surface], centre: Array, sca
     """
     vertices = (solid.vertices - centre) * scale
     across, normals_at = _face_vectors(vertices, solid.faces)
-    shaded, point = _dense(solid.smooth[:, None] * len(vertices) + solid.faces)
+    shaded, point = renumber(solid.smooth[:, None] * len(vertices) + solid.faces)
     point %= len(vertices)
     normals = normals_at(shaded, len(point))
     order = np.argsort(solid.surface, kind="stable")
@@ -70,10 +70,10 @@ def cut_into_parts(solid: Solid, surfaces: Sequence[Surface], centre: Array, sca
             corners = shaded[chosen]
             variant, coordinates = _texture_variants(surface, solid.vertices, point[corners], across[:, chosen])
             if coordinates is None:
-                index, origin = _dense(corners)
+                index, origin = renumber(corners)
                 uv = None
             else:
-                index, origin = _dense(corners * 3 + variant)
+                index, origin = renumber(corners * 3 + variant)
                 origin, which = np.divmod(origin, 3)
                 uv = coordinates(point[origin], which)
             parts.append(_part(surface, vertices[point[origin]], index, normals[origin], uv))
@@ -86,15 +86,6 @@ def _part(surface: Surface, vertices: Array, faces: Indices, normals: Array, uv:
         if array is not None:
             array.setflags(write=False)
     return Part(surface.name, vertices, corners, surface.material, normals=normals, uv=uv)
-
-
-def _dense(keys: Indices) -> tuple[Indices, Indices]:
-    """Keys [...] int64 renumbered 0, 1, 2, ... in ascending order, and the key of each number."""
-    flat = keys.ravel()
-    seen = np.zeros(int(flat.max()) + 1, dtype=np.bool_)
-    seen[flat] = True
-    number = np.cumsum(seen) - 1
-    return number[keys], np.flatnonzero(seen)
 
 
 def _face_vectors(vertices: Array, faces: Indices) -> tuple[Array, Callable[[Indices, int], Array]]:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.assets.builtin.palette import BLACK, WHITE, Color, chance, ink_on, mix, vivid
+from workers.assets.builtin.palette import BLACK, WHITE, Color, chance, ink_on, mix, pick, vivid
 
 Texture = NDArray[np.uint8]
 Plane = NDArray[np.float32]
@@ -151,16 +151,9 @@ def draw_emblem(
     """Draws a round, square, diamond or ring-shaped emblem about (row, column), `size` its radius in pixels."""
     height, width = picture.shape[:2]
     y, x = (np.arange(height) - centre[0])[:, None] / size, (np.arange(width) - centre[1])[None] / size
-    kind = int(rng.integers(4))
-    if kind == 0:
-        inside = x * x + y * y < 1.0
-    elif kind == 1:
-        inside = np.maximum(np.abs(x) * 0.7, np.abs(y) * 1.2) < 0.9
-    elif kind == 2:
-        inside = np.abs(x) + np.abs(y) < 1.1
-    else:
-        inside = np.abs(x * x + y * y - 0.75) < 0.3
-    picture[inside] = rgb(color)
+    disc, square = x * x + y * y < 1.0, np.maximum(np.abs(x) * 0.7, np.abs(y) * 1.2) < 0.9
+    diamond, ring = np.abs(x) + np.abs(y) < 1.1, np.abs(x * x + y * y - 0.75) < 0.3
+    picture[pick(rng, (disc, square, diamond, ring))] = rgb(color)
 
 
 def label(rng: np.random.Generator, paper: Color, height: int = 128, width: int = 256, faces: int = 2) -> Texture:
