@@ -21,13 +21,8 @@ def make_bowl(rng: np.random.Generator) -> Model:
     foot_height = rng.uniform(0.002, 0.008)
     bottom = foot_height + thickness
     flat, flare = rng.uniform(0.35, 0.75), rng.uniform(0.75, 1.0)
-    hollow = bezier(
-        [0.0, bottom],
-        [radius * flat * 1.3, bottom],
-        [radius * flare, bottom + depth * rng.uniform(0.15, 0.55)],
-        [radius, bottom + depth],
-        15,
-    )
+    bend = [radius * flat * 1.3, bottom], [radius * flare, bottom + depth * rng.uniform(0.15, 0.55)]
+    hollow = bezier([0.0, bottom], *bend, [radius, bottom + depth], 15)
     foot = radius * rng.uniform(0.38, 0.55)
     wall = wall_around(hollow, thickness, foot, rng.uniform(0.004, 0.007), 0.7 * foot_height)
     section = None

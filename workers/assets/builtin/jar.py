@@ -45,13 +45,8 @@ def _glass_jar(rng: np.random.Generator) -> Wall:
     shoulder = height * rng.uniform(0.72, 0.82)
     # The bend into the neck is wider than the wall is thick, so that the wall's outside does not fold over.
     drop = max(0.9 * (radius - neck), 2.2 * thickness)
-    arc = bezier(
-        [radius, shoulder - drop],
-        [radius, shoulder - 0.25 * drop],
-        [neck, shoulder - 0.45 * drop],
-        [neck, shoulder + drop],
-        9,
-    )
+    below, above = [radius, shoulder - 0.25 * drop], [neck, shoulder - 0.45 * drop]
+    arc = bezier([radius, shoulder - drop], below, above, [neck, shoulder + drop], 9)
     corners = np.concatenate([[[0.0, bottom], [radius, bottom]], arc, [[neck, height]]])
     hollow, _ = fillet(corners, [0.0, rng.uniform(0.006, 0.014), *[0.0] * (len(corners) - 2)], 4)
     wall = wall_around(hollow, thickness, 0.82 * radius, 0.006, 0.0015)
@@ -63,13 +58,11 @@ def _with_thread(wall: Wall, height: float) -> Wall:
     at = int(np.flatnonzero(wall.profile[:, 1] >= height - 1e-9)[0])
     neck, top = wall.profile[at]
     low = wall.profile[at - 1, 1]
-    room, bead = top - low, 0.0012
-    extra = []
-    for centre in (0.35, 0.7):
-        z = low + centre * room
-        extra += [[neck, z - 0.0022], [neck + bead, z - 0.0007], [neck + bead, z + 0.0007], [neck, z + 0.0022]]
-    if room < 0.014:
+    if (room := top - low) < 0.014:
         return wall
+    z = low + np.array([[0.35], [0.7]]) * room + [-0.0022, -0.0007, 0.0007, 0.0022]
+    bead = neck + 0.0012
+    extra = np.column_stack([np.tile([neck, bead, bead, neck], 2), z.ravel()])
     profile = np.concatenate([wall.profile[:at], extra, wall.profile[at:]])
     surface = np.concatenate([wall.surface[:at], np.full(len(extra), OUTSIDE), wall.surface[at:]])
     return Wall(profile, surface, wall.outer, wall.thickness_m)

@@ -32,25 +32,18 @@ def _body(rng: np.random.Generator) -> Wall:
         taper = rng.uniform(0.7, 1.0)
         wall = np.array([[radius * taper, bottom], [radius, height]])
     elif kind == 2:  # bellied
-        belly = radius * rng.uniform(1.05, 1.2)
-        mouth = radius * rng.uniform(0.85, 1.0)
-        wall = spline(np.array([[radius * 0.85, bottom], [belly, 0.45 * height], [mouth, height]]), 4)
+        belly, rim = radius * rng.uniform(1.05, 1.2), radius * rng.uniform(0.85, 1.0)
+        wall = spline(np.array([[radius * 0.85, bottom], [belly, 0.45 * height], [rim, height]]), 4)
     elif kind == 3:  # bell
         waist = radius * rng.uniform(0.72, 0.85)
         wall = bezier([waist, bottom], [waist, 0.55 * height], [radius * 0.9, 0.8 * height], [radius * 1.03, height], 8)
     else:  # a cup that opens from a round bottom
-        wall = bezier(
-            [radius * 0.55, bottom],
-            [radius * 0.95, bottom + 0.04 * height],
-            [radius, 0.5 * height],
-            [radius * 1.05, height],
-            9,
-        )
-    hollow = np.concatenate([[[0.0, bottom]], wall])
-    reach = rng.uniform(0.004, 0.014)
-    hollow, _ = fillet(hollow, [0.0, reach, *[0.0] * (len(hollow) - 2)], 3)
-    foot = wall[0, 0] * rng.uniform(0.72, 0.88)
-    return wall_around(hollow, thickness, foot, rng.uniform(0.003, 0.005), rng.uniform(0.0008, 0.002))
+        foot, mouth = [radius * 0.55, bottom], [radius * 1.05, height]
+        wall = bezier(foot, [radius * 0.95, bottom + 0.04 * height], [radius, 0.5 * height], mouth, 9)
+    bend = [0.0, rng.uniform(0.004, 0.014), *[0.0] * (len(wall) - 1)]
+    hollow, _ = fillet(np.concatenate([[[0.0, bottom]], wall]), bend, 3)
+    foot_radius = wall[0, 0] * rng.uniform(0.72, 0.88)
+    return wall_around(hollow, thickness, foot_radius, rng.uniform(0.003, 0.005), rng.uniform(0.0008, 0.002))
 
 
 def _handle(rng: np.random.Generator, wall: Wall) -> Solid:
