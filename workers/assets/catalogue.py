@@ -18,7 +18,6 @@ from workers.assets.external.shapenet import find_models
 PROBES = 3
 """Meshes of a source and category that are loaded to test it when a catalogue is opened; one must be usable."""
 
-
 AnySource = ProceduralSource | ShapeNetSource | FolderSource
 
 
