@@ -16,7 +16,7 @@ from tests.shapes import box
 from tests.workers.assets.oracles import textured_cube, write
 from workers.assets.external.listing import Entry, hash_files
 from workers.assets.external.mesh import load_shape
-from workers.assets.external.placement import Placement, place_asset
+from workers.assets.external.placement import place_asset
 
 SIDE_M = 0.1
 
@@ -27,8 +27,8 @@ def enter(make_file: Callable[[Path], Path], scale: float = 1.0) -> Asset:
         path = make_file(Path(folder))
         loaded = load_shape(path, MeshLimits())
         entry = Entry("outside", hash_files([path], Path(folder)), "CC0-1.0")
-        settings, assets = FolderSource(source="urdf", folder=".", copy_assets=True), Assets()
-        return place_asset(loaded, Placement(np.eye(3), scale), entry, "box", settings, assets)
+        settings = FolderSource(source="urdf", folder=".", scale=scale, copy_assets=True)
+        return place_asset(loaded, entry, "box", settings, Assets())
 
 
 def obj(vertices: Array, faces: Array, more: str = "") -> Callable[[Path], Path]:

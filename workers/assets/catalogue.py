@@ -7,14 +7,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job.assets import Assets, ProceduralSource, SplitShares
-from workers.assets.builtin.make import VERSION
-from workers.assets.categories import TABLE
-from workers.assets.external.listing import Listing
-from workers.assets.sources import AnySource, count_instances, list_source, load_instance, name_instance
+from schemas.job.assets import Assets, FolderSource, MeshLimits, ProceduralSource, ShapeNetSource, SplitShares
+from schemas.scene.shape import Asset
+from workers.assets.builtin.make import TABLE, VERSION, instance_id, make_asset
+from workers.assets.external.folder import find_files
+from workers.assets.external.listing import Listing, read_listing
+from workers.assets.external.placement import load_entry
+from workers.assets.external.shapenet import find_models
 
 PROBES = 3
 """Meshes of a source and category that are loaded to test it when a catalogue is opened; one must be usable."""
+
+AnySource = ProceduralSource | ShapeNetSource | FolderSource
 
 
 @dataclass(frozen=True)
@@ -43,24 +47,49 @@ class Catalogue:
 
     def offers(self, category: str) -> list[tuple[int, AnySource, int]]:
         """Number, settings and count of instances of every source that has this category."""
-        counted = [
-            (number, settings, count_instances(settings, listing, category))
-            for number, (settings, listing) in enumerate(self._sources(category))
-        ]
-        return [offer for offer in counted if offer[2]]
+        offers: list[tuple[int, AnySource, int]] = []
+        for number, (settings, listing) in enumerate(self._sources(category)):
+            if isinstance(settings, ProceduralSource):
+                offers.append((number, settings, settings.instances))
+            elif listing is not None and (entries := listing.entries.get(category)):
+                offers.append((number, settings, len(entries)))
+        return offers
 
-    def source(self, number: int, category: str) -> tuple[AnySource, Listing | None]:
-        """Settings and listing of a source, by its number among those of objects or of tables."""
-        return self._sources(category)[number]
+    def settings(self, ref: InstanceRef) -> AnySource:
+        """The settings of the source of an instance."""
+        return self._sources(ref.category)[ref.source][0]
 
     def refer(self, number: int, category: str, index: int) -> InstanceRef:
-        """Instance `index` of a category in a source."""
-        return InstanceRef(number, category, index, name_instance(*self.source(number, category), category, index))
+        """Instance `index` of a category in a source, by its number among those of objects or of tables."""
+        settings, listing = self._sources(category)[number]
+        if isinstance(settings, ProceduralSource):
+            return InstanceRef(number, category, index, instance_id(category, settings.seed, index))
+        assert listing is not None
+        return InstanceRef(number, category, index, listing.entries[category][index].instance_id)
+
+    def load(self, ref: InstanceRef) -> Asset:
+        """An instance, made or read; MeshError where its mesh is refused or has changed."""
+        settings, listing = self._sources(ref.category)[ref.source]
+        if isinstance(settings, ProceduralSource):
+            return make_asset(ref.category, settings, ref.index, self.assets.density_kg_m3)
+        assert listing is not None
+        return load_entry(settings, listing.folder, listing.entries[ref.category][ref.index], ref.category, self.assets)
 
     def _sources(self, category: str) -> list[tuple[AnySource, Listing | None]]:
         if category == TABLE:
             return list(zip(self.assets.tables, self.tables, strict=True))
         return list(zip(self.assets.objects, self.objects, strict=True))
+
+
+def list_source(
+    settings: AnySource, job_folder: Path, categories: Collection[str], limits: MeshLimits
+) -> Listing | None:
+    """What a source of files offers, None for built-in shapes; AssetSourceError where the folder cannot be used."""
+    if isinstance(settings, ProceduralSource):
+        return None
+    if isinstance(settings, ShapeNetSource):
+        return read_listing(settings, *find_models(settings, job_folder, categories), limits)
+    return read_listing(settings, *find_files(settings, job_folder, categories), limits)
 
 
 def open_catalogue(assets: Assets, job_folder: Path, categories: Collection[str]) -> Catalogue:
@@ -121,7 +150,7 @@ def _probe(catalogue: Catalogue, number: int, category: str, count: int) -> None
     errors = []
     for index in range(min(PROBES, count)):
         try:
-            load_instance(*catalogue.source(number, category), category, index, catalogue.assets)
+            catalogue.load(catalogue.refer(number, category, index))
             return
         except MeshError as error:
             errors.append(str(error))

@@ -78,8 +78,14 @@ def asset_glb(asset: Asset, encode_opaque: EncodeImage = encode_with_pillow) -> 
     writer = _Writer(encode_opaque)
     materials = [_material(writer, part, asset.watertight) for part in asset.shape.parts]
     primitives = [_primitive(writer, part, number) for number, part in enumerate(asset.shape.parts)]
+    extras = {
+        "frame": "object frame: metres, z up, origin at the centre of the bounding box",
+        "category": asset.category,
+        "source": asset.source,
+        "sha256": asset.sha256,
+    }
     tree: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "verso", "copyright": asset.licence, "extras": _extras(asset)},
+        "asset": {"version": "2.0", "generator": "verso", "copyright": asset.licence, "extras": extras},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": asset.instance_id}],
@@ -94,15 +100,6 @@ def asset_glb(asset: Asset, encode_opaque: EncodeImage = encode_with_pillow) -> 
         tree["samplers"] = [{}]
         tree["textures"] = [{"source": number, "sampler": 0} for number in range(len(writer.images))]
     return _container(json.dumps(tree, separators=(",", ":")).encode(), bytes(writer.binary))
-
-
-def _extras(asset: Asset) -> dict[str, Any]:
-    return {
-        "frame": "object frame: metres, z up, origin at the centre of the bounding box",
-        "category": asset.category,
-        "source": asset.source,
-        "sha256": asset.sha256,
-    }
 
 
 def _container(text: bytes, binary: bytes) -> bytes:

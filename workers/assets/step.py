@@ -8,9 +8,8 @@ from cachetools import LRUCache
 from schemas.errors import AssetSourceError
 from schemas.job.assets import ProceduralSource
 from schemas.scene.shape import Asset
+from workers.assets.builtin.make import TABLE
 from workers.assets.catalogue import Catalogue, InstanceRef
-from workers.assets.categories import TABLE
-from workers.assets.sources import load_instance
 
 MAX_CACHED_INSTANCES = 10_000
 """Sources with more built-in instances are not cached: instances hardly ever repeat."""
@@ -40,11 +39,10 @@ def choose_table(catalogue: Catalogue, rng: np.random.Generator) -> InstanceRef:
 
 def load_asset(catalogue: Catalogue, ref: InstanceRef) -> Asset:
     """The asset, from this process's cache if it is there; MeshError where its mesh is refused."""
-    settings, listing = catalogue.source(ref.source, ref.category)
     key = (catalogue.digest, ref)
     if key in _cache:
         return _cache[key]
-    asset = load_instance(settings, listing, ref.category, ref.index, catalogue.assets)
+    asset, settings = catalogue.load(ref), catalogue.settings(ref)
     if not (isinstance(settings, ProceduralSource) and settings.instances > MAX_CACHED_INSTANCES):
         _cache[key] = asset
     return asset

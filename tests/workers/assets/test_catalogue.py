@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job.assets import Assets, FolderSource, ProceduralSource, ShapeNetSource, SplitShares
+from schemas.job.assets import Assets, FolderSource, MeshLimits, ProceduralSource, ShapeNetSource, SplitShares
 from schemas.job.job import CATEGORIES
 from tests.workers.assets.oracles import CUBE, write
-from workers.assets.catalogue import open_catalogue, split_of
+from workers.assets.catalogue import list_source, open_catalogue, split_of
 from workers.assets.step import choose_object, choose_table, load_asset
 
 BUILT_IN = ProceduralSource(source="procedural")
@@ -34,6 +34,26 @@ def test_the_built_in_source_offers_every_category_and_tables(tmp_path):
         asset = load_asset(catalogue, ref)
         assert (asset.category, asset.instance_id) == (category, ref.instance_id)
     assert load_asset(catalogue, choose_table(catalogue, np.random.default_rng(0))).category == "table"
+
+
+def test_built_in_shapes_need_no_listing_and_have_every_category(tmp_path):
+    assert list_source(BUILT_IN, tmp_path / "nowhere", ("mug",), MeshLimits()) is None
+    few = BUILT_IN.model_copy(update={"seed": 4, "instances": 7})
+    catalogue = opened(tmp_path, objects=(few,), tables=(few,))
+    assert catalogue.offers("mug") == catalogue.offers("table") == [(0, few, 7)]
+    ref = catalogue.refer(0, "mug", 3)
+    assert catalogue.load(ref).instance_id == ref.instance_id == "mug-4-000003"
+
+
+def test_a_folder_has_what_its_listing_says_and_loads_it_unless_it_has_changed(tmp_path):
+    path, settings = write(tmp_path / "things" / "mug.obj", CUBE), folder()
+    catalogue = opened(tmp_path, objects=(settings,))
+    assert [catalogue.offers(category) for category in ("mug", "can")] == [[(0, settings, 1)], []]
+    ref = catalogue.refer(0, "mug", 0)
+    assert catalogue.load(ref).instance_id == ref.instance_id
+    write(path, CUBE + "#")
+    with pytest.raises(MeshError, match="changed"):
+        catalogue.load(ref)
 
 
 def test_the_same_draw_gives_the_same_instance_and_one_stream_uses_two_numbers(tmp_path):

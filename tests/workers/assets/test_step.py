@@ -8,7 +8,7 @@ from schemas.errors import MeshError
 from schemas.job.assets import Assets, ProceduralSource
 from tests.shapes import asset_of
 from workers.assets import step
-from workers.assets.catalogue import open_catalogue
+from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.assets.step import asset_bytes, choose_object, load_asset, open_cache
 
 
@@ -25,7 +25,7 @@ def opened(tmp_path, instances=9):
 def loads(monkeypatch):
     """The index of every instance that is loaded and not found in an empty cache for two assets."""
     made = []
-    monkeypatch.setattr(step, "load_instance", lambda *args: made.append(args[3]) or make("mug"))
+    monkeypatch.setattr(Catalogue, "load", lambda _, ref: made.append(ref.index) or make("mug"))
     monkeypatch.setattr(step, "_cache", open_cache(2 * asset_bytes(make("mug"))))
     return made
 
@@ -53,7 +53,7 @@ def test_a_mesh_that_was_refused_is_tried_again(tmp_path, loads, monkeypatch):
         raise MeshError("unreadable", "no")
 
     catalogue = opened(tmp_path)
-    monkeypatch.setattr(step, "load_instance", refuse)
+    monkeypatch.setattr(Catalogue, "load", refuse)
     for _ in range(2):
         with pytest.raises(MeshError):
             load_asset(catalogue, catalogue.refer(0, "mug", 0))

@@ -1,20 +1,57 @@
 """Pure: bottles with neck and cap: wine, beer, soda, water, sauce, oil, shampoo, medicine, flasks."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from schemas.base import Array
 from schemas.scene.shape import Material
-from workers.assets.builtin.bottle_kinds import KINDS, Kind
-from workers.assets.builtin.curves import bezier, fillet, squircle
-from workers.assets.builtin.draws import chance, pick
+from workers.assets.builtin.curves import bezier, fillet, rounded_sections, squircle
 from workers.assets.builtin.materials import clear_glass, plastic, solid_color, steel, textured
-from workers.assets.builtin.palette import Color, glass_color, jitter, mix, pale, vivid
+from workers.assets.builtin.palette import Color, chance, glass_color, jitter, mix, pale, pick, vivid
 from workers.assets.builtin.parts import Model, Surface
-from workers.assets.builtin.solid import circle, lathe
+from workers.assets.builtin.solid import lathe
 from workers.assets.builtin.textures import band_height, bands, label
 
 BODY, LABEL, CAP = 0, 1, 2
 SEGMENTS = 48
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Ranges of one kind of bottle. Lengths are shares of the height but for `height_m`; radii are half widths.
+
+    body: where the straight body ends; shoulder: its height; neck: its radius as a share of the body's; cap: `cork`,
+    `crown`, `screw`, `wide` (as wide as the shoulder lets it be) or `foil`; material: `glass`, `clear`, `plastic` or
+    `metal`; sections: squareness of the body's section; depth: of the section as a share of its width; ribs: share of
+    bottles with grooves around the body.
+    """
+
+    height_m: tuple[float, float]
+    radius: tuple[float, float]
+    body: tuple[float, float]
+    shoulder: tuple[float, float]
+    neck: tuple[float, float]
+    cap: str
+    material: str
+    sections: tuple[int, ...] = (0,)
+    depth: tuple[float, float] = (1.0, 1.0)
+    ribs: float = 0.0
+
+
+KINDS = (
+    # bordeaux, burgundy, beer, soda, water, sauce, oil, shampoo, medicine, flask
+    Kind((0.28, 0.32), (0.118, 0.13), (0.58, 0.64), (0.09, 0.13), (0.36, 0.4), "foil", "glass"),
+    Kind((0.28, 0.31), (0.13, 0.145), (0.36, 0.44), (0.28, 0.34), (0.34, 0.4), "foil", "glass"),
+    Kind((0.2, 0.26), (0.118, 0.14), (0.48, 0.58), (0.15, 0.22), (0.38, 0.46), "crown", "glass"),
+    Kind((0.2, 0.33), (0.13, 0.155), (0.55, 0.66), (0.18, 0.26), (0.36, 0.44), "screw", "clear", ribs=0.4),
+    Kind((0.19, 0.31), (0.13, 0.17), (0.62, 0.74), (0.12, 0.18), (0.36, 0.46), "screw", "clear", (0, 0, 1), ribs=0.7),
+    Kind((0.16, 0.24), (0.13, 0.17), (0.5, 0.62), (0.12, 0.2), (0.36, 0.5), "screw", "glass", (0, 1, 2), (0.75, 1.0)),
+    Kind((0.24, 0.32), (0.105, 0.13), (0.58, 0.68), (0.1, 0.16), (0.36, 0.44), "cork", "glass", (0, 1, 2)),
+    Kind((0.15, 0.24), (0.17, 0.24), (0.68, 0.8), (0.06, 0.12), (0.4, 0.6), "wide", "plastic", (0, 1), (0.5, 0.8)),
+    Kind((0.08, 0.13), (0.22, 0.28), (0.68, 0.75), (0.06, 0.09), (0.6, 0.75), "wide", "glass"),
+    Kind((0.2, 0.28), (0.125, 0.16), (0.72, 0.8), (0.05, 0.1), (0.6, 0.85), "wide", "metal"),
+)
 
 
 def make_bottle(rng: np.random.Generator) -> Model:
@@ -50,7 +87,7 @@ def _outline(
     radii = [0.0, 0.0, 0.0, foot, *[0.0] * (len(side) + len(arc)), *[0.0012] * (len(top) - 1), 0.0]
     surface = np.full(len(corners) - 1, BODY)
     surface[len(base) : len(base) + len(side) - 1] = LABEL
-    surface[len(corners) - len(top) :][-len(top_surface) :] = top_surface
+    surface[-len(top_surface) :] = top_surface
     return corners, radii, surface
 
 
@@ -59,16 +96,10 @@ def _side(rng: np.random.Generator, kind: Kind, radius: float, low: float, high:
     if not chance(rng, kind.ribs):
         return np.array([[radius, low], [radius, high]])
     count, depth = int(rng.integers(3, 7)), radius * rng.uniform(0.03, 0.07)
-    points = []
-    for z in np.linspace(low, high, count + 1)[:-1]:
-        pitch = (high - low) / count
-        points += [
-            [radius, z],
-            [radius, z + 0.55 * pitch],
-            [radius - depth, z + 0.68 * pitch],
-            [radius - depth, z + 0.84 * pitch],
-        ]
-    return np.array([*points, [radius, high]])
+    pitch = (high - low) / count
+    levels = np.linspace(low, high, count + 1)[:-1, None] + pitch * np.array([0.0, 0.55, 0.68, 0.84])
+    radii = np.tile([radius, radius, radius - depth, radius - depth], count)
+    return np.column_stack([[*radii, radius], [*levels.ravel(), high]])
 
 
 def _closure(
@@ -78,56 +109,24 @@ def _closure(
     room = height - shoulder
     if kind.cap == "foil":
         start, lip = shoulder + room * rng.uniform(0.15, 0.5), height - 0.018 * height / 0.3
-        foil, ring = neck + 0.0004, neck * 1.12
-        points = [
-            [neck, start],
-            [foil, start + 0.0004],
-            [foil, lip],
-            [ring, lip + 0.001],
-            [ring, height],
-            [0.0, height],
-        ]
-        return np.array(points), [CAP] * 5
-    if kind.cap == "cork":
-        ring, lip = neck * 1.18, height - 0.34 * room
-        cork = neck * 0.72
-        points = [
-            [neck, lip - 0.25 * room],
-            [ring, lip - 0.22 * room],
-            [ring, lip],
-            [cork, lip],
-            [cork * 1.06, height],
-            [0.0, height],
-        ]
-        return np.array(points), [BODY, BODY, BODY, CAP, CAP]
-    if kind.cap == "crown":
-        cap, low = neck * 1.16, height - 0.0062
-        points = [
-            [neck, low - 0.004],
-            [neck * 1.08, low - 0.002],
-            [neck * 1.08, low],
-            [cap * 1.07, low + 0.0004],
-            [cap, height],
-            [0.0, height],
-        ]
-        return np.array(points), [BODY, BODY, CAP, CAP, CAP]
-    ring = neck * 1.25 if kind.cap == "screw" else min(radius * rng.uniform(0.75, 0.96), neck * 1.5)
-    if kind.cap == "screw":
-        start = height - max(0.4 * room, 0.014)
-        start = max(start, shoulder + 0.1 * room)
-        points = [
-            [neck, start - 0.08 * room],
-            [ring * 1.04, start - 0.05 * room],
-            [neck, start - 0.02 * room],
-            [neck, start],
-            [ring, start],
-            [ring * 0.97, height],
-            [0.0, height],
-        ]
-        return np.array(points), [BODY, BODY, BODY, CAP, CAP, CAP]
-    start, taper = shoulder + 0.06 * room, rng.uniform(0.8, 1.0)
-    points = [[neck, start], [ring, start], [ring * taper, height], [0.0, height]]
-    return np.array(points), [CAP, CAP, CAP]
+        foil, ring, surface = neck + 0.0004, neck * 1.12, [CAP] * 5
+        radii, levels = [neck, foil, foil, ring, ring], [start, start + 0.0004, lip, lip + 0.001, height]
+    elif kind.cap == "cork":
+        ring, cork, lip, surface = neck * 1.18, neck * 0.72, height - 0.34 * room, [BODY, BODY, BODY, CAP, CAP]
+        radii, levels = [neck, ring, ring, cork, cork * 1.06], [lip - 0.25 * room, lip - 0.22 * room, lip, lip, height]
+    elif kind.cap == "crown":
+        ring, cap, low, surface = neck * 1.08, neck * 1.16, height - 0.0062, [BODY, BODY, CAP, CAP, CAP]
+        radii, levels = [neck, ring, ring, cap * 1.07, cap], [low - 0.004, low - 0.002, low, low + 0.0004, height]
+    elif kind.cap == "screw":
+        ring, surface = neck * 1.25, [BODY, BODY, BODY, CAP, CAP, CAP]
+        start = max(height - max(0.4 * room, 0.014), shoulder + 0.1 * room)
+        radii = [neck, ring * 1.04, neck, neck, ring, ring * 0.97]
+        levels = [start - 0.08 * room, start - 0.05 * room, start - 0.02 * room, start, start, height]
+    else:
+        ring, surface = min(radius * rng.uniform(0.75, 0.96), neck * 1.5), [CAP, CAP, CAP]
+        start, taper = shoulder + 0.06 * room, rng.uniform(0.8, 1.0)
+        radii, levels = [neck, ring, ring * taper], [start, start, height]
+    return np.column_stack([[*radii, 0.0], [*levels, height]]), surface
 
 
 def _sections(profile: Array, body: float, shoulder: float, squareness: int, depth: float) -> Array | None:
@@ -136,9 +135,8 @@ def _sections(profile: Array, body: float, shoulder: float, squareness: int, dep
         return None
     z = profile[1:-1, 1]
     share = np.clip((shoulder - z) / (shoulder - body), 0.0, 1.0)
-    share = (share * share * (3.0 - 2.0 * share))[:, None, None]
     outline = squircle(SEGMENTS, squareness) * np.array([1.0, min(depth, 1.0)])
-    return circle(SEGMENTS)[None] * (1.0 - share) + outline[None] * share
+    return rounded_sections(outline, share * share * (3.0 - 2.0 * share))
 
 
 def _surfaces(rng: np.random.Generator, kind: Kind, corners: Array, surface: Array) -> tuple[Surface, ...]:
@@ -148,14 +146,13 @@ def _surfaces(rng: np.random.Generator, kind: Kind, corners: Array, surface: Arr
     on_label = np.flatnonzero(surface == LABEL)
     low, high = float(corners[on_label[0], 1]), float(corners[on_label[-1] + 1, 1])
     printed = body
-    mapping = chance(rng, 0.8)
-    if mapping:
+    if chance(rng, 0.8):
         rows = band_height(low, high, float(corners[on_label[0], 0]))
         picture = label(rng, paper, rows) if chance(rng, 0.8) else bands(rng, [paper, vivid(rng), color])
         printed = textured(picture, rng.uniform(0.4, 0.7))
     return (
         Surface("body", body),
-        Surface("label", printed, "cylinder" if mapping else "none", low=low, high=high),
+        Surface("label", printed, "cylinder", low=low, high=high),
         Surface("cap", _cap_material(rng, kind)),
     )
 

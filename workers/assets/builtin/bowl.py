@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from workers.assets.builtin.curves import bezier, squircle
-from workers.assets.builtin.draws import chance, pick
+from workers.assets.builtin.curves import bezier, rounded_sections, squircle
 from workers.assets.builtin.hollow import Wall, wall_around
 from workers.assets.builtin.materials import solid_color, steel, textured
-from workers.assets.builtin.palette import BLACK, WHITE, glaze_color, ink_on, jitter, mix, pale, wood_colors
+from workers.assets.builtin.palette import WHITE, chance, glaze_color, ink_on, jitter, mix, pale, pick, wood_colors
 from workers.assets.builtin.parts import Model, Surface
-from workers.assets.builtin.solid import circle, lathe
-from workers.assets.builtin.textures import band_height, bands, dots, speckled, upright_stripes, wood
+from workers.assets.builtin.solid import lathe
+from workers.assets.builtin.textures import band_height, bands, dots, flecked, upright_stripes, wood
 
 
 def make_bowl(rng: np.random.Generator) -> Model:
@@ -22,25 +21,15 @@ def make_bowl(rng: np.random.Generator) -> Model:
     foot_height = rng.uniform(0.002, 0.008)
     bottom = foot_height + thickness
     flat, flare = rng.uniform(0.35, 0.75), rng.uniform(0.75, 1.0)
-    hollow = bezier(
-        [0.0, bottom],
-        [radius * flat * 1.3, bottom],
-        [radius * flare, bottom + depth * rng.uniform(0.15, 0.55)],
-        [radius, bottom + depth],
-        15,
-    )
+    bend = [radius * flat * 1.3, bottom], [radius * flare, bottom + depth * rng.uniform(0.15, 0.55)]
+    hollow = bezier([0.0, bottom], *bend, [radius, bottom + depth], 15)
     foot = radius * rng.uniform(0.38, 0.55)
     wall = wall_around(hollow, thickness, foot, rng.uniform(0.004, 0.007), 0.7 * foot_height)
     section = None
     if chance(rng, 0.15):
-        section = _towards_square(wall.profile, foot, radius)
+        # Round at the foot and a soft square at the rim; it depends on the radius alone.
+        section = rounded_sections(squircle(56, 1), np.clip((wall.profile[1:-1, 0] - foot) / (radius - foot), 0.0, 1.0))
     return Model(lathe(wall.profile, wall.surface, 56, section), _surfaces(rng, wall))
-
-
-def _towards_square(profile: np.ndarray, foot: float, radius: float) -> np.ndarray:
-    """[P - 2, n, 2]: a section that is round at the foot and a soft square at the rim; it depends on the radius alone."""
-    share = np.clip((profile[1:-1, 0] - foot) / (radius - foot), 0.0, 1.0)[:, None, None]
-    return circle(56)[None] * (1.0 - share) + squircle(56, 1)[None] * share
 
 
 def _surfaces(rng: np.random.Generator, wall: Wall) -> tuple[Surface, ...]:
@@ -64,16 +53,16 @@ def _pottery(rng: np.random.Generator, high: float, radius: float) -> tuple[Surf
     roughness = rng.uniform(0.15, 0.4) if chance(rng, 0.75) else rng.uniform(0.6, 0.85)
     ground = glaze_color(rng)
     inside = ground if chance(rng, 0.45) else jitter(rng, WHITE, 0.03)
-    outside, wrapped = solid_color(ground, roughness), False
+    outside = solid_color(ground, roughness)
     if chance(rng, 0.55):
         ink, rows = ink_on(rng, ground), band_height(0.0, 1.4 * high, 0.75 * radius)
         painters = (
             lambda: bands(rng, [ground, mix(ground, ink, 0.7), pale(rng)]),
             lambda: upright_stripes(rng, [ground, ground, mix(ground, ink, 0.6)]),
             lambda: dots(rng, ground, mix(ground, ink, 0.8), rows),
-            lambda: speckled(rng, ground, mix(ground, BLACK, 0.6), rng.uniform(0.02, 0.07), rows),
+            lambda: flecked(rng, ground, rows),
         )
-        outside, wrapped = textured(pick(rng, painters)(), roughness), True
-    first = Surface("outside", outside, "cylinder" if wrapped else "none", low=0.0, high=high)
+        outside = textured(pick(rng, painters)(), roughness)
+    first = Surface("outside", outside, "cylinder", low=0.0, high=high)
     base = solid_color(mix(ground, (0.75, 0.7, 0.62), 0.6), 0.8)
     return first, Surface("inside", solid_color(inside, roughness)), Surface("base", base)

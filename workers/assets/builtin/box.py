@@ -1,15 +1,30 @@
 """Pure: boxes with a lid seam: cartons, shoe boxes, gift boxes, printed packets, tins, wooden chests."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from workers.assets.builtin.draws import chance, pick
-from workers.assets.builtin.gift import BOTTOM, EXTRA, LID, OTHER, SIDE, TOP, draw_size, make_lidded, on_front
+from schemas.base import Array
+from schemas.scene.shape import Material
 from workers.assets.builtin.materials import metal, solid_color, textured
-from workers.assets.builtin.palette import BLACK, WHITE, Color, jitter, mix, pale, vivid, wood_colors
+from workers.assets.builtin.palette import BLACK, WHITE, chance, ink_on, jitter, mix, pale, pick, vivid, wood_colors
 from workers.assets.builtin.parts import Model, Surface, over_top
-from workers.assets.builtin.solid import difference, union
+from workers.assets.builtin.solid import Solid, circle, combine, difference, lathe, union
 from workers.assets.builtin.sweeps import bevelled_profile, prism, split_sides, straight_prism
-from workers.assets.builtin.textures import Texture, band_height, bands, blank, blend, label, noise, rgb, wood
+from workers.assets.builtin.textures import band_height, bands, blank, dots, kraft, label, rgb, upright_stripes, wood
+
+SIDE, LID, TOP, BOTTOM, EXTRA, OTHER = 0, 1, 2, 3, 4, 5
+
+Size = tuple[float, float, float]
+"""Width along x, depth along y, height; metres."""
+
+
+def draw_size(
+    rng: np.random.Generator, width: tuple[float, float], depth: tuple[float, float], height: tuple[float, float]
+) -> Size:
+    """Draws a size: width in metres, depth and height as shares of the width."""
+    w = rng.uniform(*width)
+    return w, w * rng.uniform(*depth), w * rng.uniform(*height)
 
 
 def make_box(rng: np.random.Generator) -> Model:
@@ -18,68 +33,139 @@ def make_box(rng: np.random.Generator) -> Model:
     return pick(rng, builders)(rng)
 
 
+def _front_and_back(material: Material, size: Size) -> tuple[Surface, Surface]:
+    """A material mapped once over the front and once over the back, upright seen from outside."""
+    w, d, h = size
+    front = Surface("front", material, "plane", origin=(-w / 2, -d / 2, 0.0), across=(w, 0.0, 0.0), up=(0.0, 0.0, h))
+    return front, replace(front, name="back", origin=(w / 2, d / 2, 0.0), across=(-w, 0.0, 0.0))
+
+
+def _slotted(size: Size, bevel: float, radius: float, pieces: int, cutter: Solid) -> Solid:
+    """A box whose top has a slot; its front is SIDE and its back EXTRA."""
+    w, d, h = size
+    profile = np.array([[bevel, 0.0], [0.0, bevel], [0.0, 0.5 * h], [0.0, h - bevel], [bevel, h]])
+    body = prism(profile, (w, d), radius, [BOTTOM, SIDE, SIDE, SIDE, TOP, TOP], 3, (pieces, pieces))
+    return split_sides(difference(body, [cutter]), SIDE, (SIDE, LID, EXTRA, LID))
+
+
 def _carton(rng: np.random.Generator) -> Model:
     """A cardboard carton: four flaps above, a slot between them, tape along it."""
     size = draw_size(rng, (0.16, 0.4), (0.55, 0.95), (0.4, 0.95))
     w, d, h = size
     board = jitter(rng, (0.72, 0.56, 0.38), 0.05)
     crease = rng.uniform(0.0015, 0.003)
-    profile = np.array([[crease, 0.0], [0.0, crease], [0.0, 0.5 * h], [0.0, h - crease], [crease, h]])
-    body = prism(profile, (w, d), 0.004, [BOTTOM, SIDE, SIDE, SIDE, TOP, TOP], 3, (6, 6))
     slot = straight_prism((w + 0.02, 0.003), h - 0.0015, h + 0.01, 0.0008, OTHER)
-    body = split_sides(difference(body, [slot]), SIDE, (SIDE, LID, EXTRA, LID))
-    paper = textured(_board(rng, board), 0.85)
-    printed = _board(rng, board)
+    paper = textured(kraft(rng, board), 0.85)
+    printed = kraft(rng, board)
     if chance(rng, 0.7):
         mark = label(rng, board, height=64, width=128, faces=1)
-        printed[40:104] = np.where(
-            (np.abs(mark.astype(np.int16) - rgb(board)).sum(axis=2) > 40)[..., None], mark, printed[40:104]
-        )
-    top = _board(rng, board)
+        inked = np.abs(mark.astype(np.int16) - rgb(board)).sum(axis=2) > 40
+        printed[40:104] = np.where(inked[..., None], mark, printed[40:104])
+    top = kraft(rng, board)
     if chance(rng, 0.75):
         tape = pick(rng, ((0.8, 0.68, 0.45), (0.85, 0.83, 0.78), vivid(rng)))
         half = max(2, round(0.5 * 128 * rng.uniform(0.05, 0.07) / d))
         top[64 - half : 64 + half] = rgb(mix(board, tape, 0.8))
-    front = textured(printed, 0.85)
-    grain = Surface("sides", paper, "box", size=max(size))
+    front, back = _front_and_back(textured(printed, 0.85), size)
     surfaces = (
-        on_front("front", front, size, back=False),
-        grain,
+        front,
+        Surface("sides", paper, "box", size=max(size)),
         over_top("top", textured(top, 0.7), w, d),
         Surface("bottom", solid_color(board, 0.85)),
-        on_front("back", front, size, back=True),
+        back,
         Surface("slot", solid_color(mix(board, BLACK, 0.5), 0.9)),
+    )
+    return Model(_slotted(size, crease, 0.004, 6, slot), surfaces)
+
+
+def make_lidded(rng: np.random.Generator) -> Model:
+    """A box whose lid is a little wider than it: a shoe box, or a gift box with a ribbon."""
+    size = draw_size(rng, (0.08, 0.34), (0.5, 1.0), (0.3, 0.8))
+    w, d, h = size
+    step, deep = rng.uniform(0.0015, 0.003), h * rng.uniform(0.15, 0.5)
+    b = 0.0012
+    levels = [0.0, b, 0.5 * (h - deep), h - deep, h - deep, h - b, h]
+    profile = np.column_stack([[step + b, step, step, step, 0.0, 0.0, b], levels])
+    numbers = [BOTTOM, SIDE, SIDE, SIDE, BOTTOM, LID, LID, TOP]
+    body = prism(profile, (w, d), rng.uniform(0.0035, 0.006), numbers, 3, (6, 6))
+    color = pick(rng, (vivid(rng), pale(rng), WHITE, BLACK))
+    cover = color if chance(rng, 0.4) else jitter(rng, vivid(rng))
+    roughness = rng.uniform(0.4, 0.8)
+    side = Surface("side", solid_color(color, roughness))
+    top = Surface("top", solid_color(cover, roughness))
+    ribbon = Surface("ribbon", solid_color(vivid(rng), 0.35))
+    if chance(rng, 0.5):
+        body = union([body, *_ribbon(rng, size)])
+    elif chance(rng, 0.7):
+        top = over_top("top", textured(label(rng, cover, height=128, width=128, faces=1), roughness), w, d)
+    if chance(rng, 0.4):
+        patterns = (
+            dots(rng, color, mix(color, ink_on(rng, color), 0.7), 256),
+            upright_stripes(rng, [color, mix(color, WHITE, 0.5)]),
+        )
+        side = Surface("side", textured(pick(rng, patterns), roughness), "box", size=max(size))
+    surfaces = (
+        side,
+        Surface("lid", solid_color(cover, roughness)),
+        top,
+        Surface("bottom", solid_color(mix(color, BLACK, 0.2), 0.8)),
+        ribbon,
     )
     return Model(body, surfaces)
 
 
-def _board(rng: np.random.Generator, color: Color) -> Texture:
-    """Cardboard: faint corrugation and fibres."""
-    share = 0.5 * noise(rng, 128, 128, 3, 64) + 0.5 * noise(rng, 128, 128, 48, 48)
-    return blend(mix(color, WHITE, 0.08), mix(color, BLACK, 0.12), share)
+def _ribbon(rng: np.random.Generator, size: Size) -> list[Solid]:
+    """Two bands around the box and a bow of two loops and a knot."""
+    w, d, h = size
+    width, lift = min(w, d) * rng.uniform(0.08, 0.16), 0.0009
+    bands_around = [
+        straight_prism((w + 2 * lift, width), 0.0, h + lift, 0.0008, EXTRA),
+        straight_prism((width, d + 2 * lift), 0.0, h + lift, 0.0008, EXTRA),
+    ]
+    if chance(rng, 0.3):
+        return bands_around
+    loop = min(w, d) * rng.uniform(0.13, 0.2)
+    bow = []
+    for sign in (-1.0, 1.0):
+        petal = _ellipsoid(np.array([loop, 0.55 * width, 0.5 * loop]))
+        axes = _turned(sign, rng.uniform(0.2, 0.6))
+        bow.append(petal.placed(axes, np.array([sign * 1.08 * loop, 0.0, h + 0.3 * loop])))
+    knot = _ellipsoid(np.array([0.4 * loop, 0.6 * width, 0.42 * loop])).moved(z=h + 0.25 * loop)
+    return [*bands_around, combine(bow), knot]
+
+
+def _turned(sign: float, slope: float) -> Array:
+    """[3, 3]: rotation about y under which x rises with `slope` towards the side `sign`."""
+    length = float(np.sqrt(1.0 + slope * slope))
+    c, s = 1.0 / length, sign * slope / length
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def _ellipsoid(radii: Array) -> Solid:
+    """An ellipsoid about the origin."""
+    half = circle(16)[4:13]
+    profile = np.stack([-half[:, 0], -half[:, 1]], axis=1)
+    return lathe(profile, [EXTRA] * (len(profile) - 1), 12).stretched(radii)
 
 
 def _packet(rng: np.random.Generator) -> Model:
     """A printed packet: cereals, crackers, tea; a closing seam along the top."""
     size = draw_size(rng, (0.06, 0.2), (0.25, 0.6), (0.9, 1.55))
     w, d, h = size
-    b = 0.0015
-    profile = np.array([[b, 0.0], [0.0, b], [0.0, 0.5 * h], [0.0, h - b], [b, h]])
-    body = prism(profile, (w, d), 0.0025, [BOTTOM, SIDE, SIDE, SIDE, TOP, TOP], 3, (5, 5))
     seam = straight_prism((w + 0.02, 0.0016), h - 0.001, h + 0.01, 0.0004, OTHER)
-    body = split_sides(difference(body, [seam.moved(y=d * rng.uniform(-0.2, 0.2))]), SIDE, (SIDE, LID, EXTRA, LID))
+    body = _slotted(size, 0.0015, 0.0025, 5, seam.moved(y=d * rng.uniform(-0.2, 0.2)))
     paper = vivid(rng) if chance(rng, 0.75) else pale(rng)
     picture = label(rng, paper, height=160, width=128, faces=1)
     gloss = rng.uniform(0.35, 0.7)
-    front = textured(picture, gloss)
+    front, back = _front_and_back(textured(picture, gloss), size)
     second = bands(rng, [paper, mix(paper, WHITE, 0.6)]) if chance(rng, 0.4) else blank(8, 8, jitter(rng, paper))
     side = Surface("sides", textured(second, gloss), "plane", origin=(0, -d / 2, 0), across=(0, d, 0), up=(0, 0, h))
     surfaces = (
-        on_front("front", front, size, back=False),
+        front,
         side,
         Surface("top", solid_color(jitter(rng, paper, 0.02), gloss)),
         Surface("bottom", solid_color(paper, 0.7)),
-        on_front("back", front, size, back=True),
+        back,
         Surface("seam", solid_color(mix(paper, BLACK, 0.5), 0.8)),
     )
     return Model(body, surfaces)
@@ -87,26 +173,17 @@ def _packet(rng: np.random.Generator) -> Model:
 
 def _tin(rng: np.random.Generator) -> Model:
     """A tinplate box with round corners and a pressed lid."""
-    size = draw_size(rng, (0.08, 0.25), (0.5, 1.0), (0.25, 0.9))
-    w, d, h = size
+    w, d, h = draw_size(rng, (0.08, 0.25), (0.5, 1.0), (0.25, 0.9))
     radius = min(w, d) * rng.uniform(0.12, 0.45)
     deep, b, step = min(0.02, 0.25 * h), 0.003, 0.0012
     t = h - 0.0035
-    profile = np.array(
+    profile = np.column_stack(
         [
-            [b, 0.0],
-            [0.4 * b, 0.15 * b],
-            [step, b],
-            [step, 0.5 * h],
-            [step, h - deep],
-            [0.0, h - deep + 0.0005],
-            [0.0, t - 0.002],
-            [0.0012, t - 0.0003],
-            [0.12 * min(w, d), t],
-            [0.12 * min(w, d) + 0.004, h],
+            [b, 0.4 * b, step, step, step, 0.0, 0.0, 0.0012, 0.12 * min(w, d), 0.12 * min(w, d) + 0.004],
+            [0.0, 0.15 * b, b, 0.5 * h, h - deep, h - deep + 0.0005, t - 0.002, t - 0.0003, t, h],
         ]
     )
-    body = prism(profile, (w, d), radius, [BOTTOM, BOTTOM, SIDE, SIDE, SIDE, LID, LID, LID, LID, LID, TOP], 6, (2, 2))
+    body = prism(profile, (w, d), radius, [BOTTOM, BOTTOM, *[SIDE] * 3, *[LID] * 5, TOP], 6, (2, 2))
     paper = vivid(rng) if chance(rng, 0.7) else pale(rng)
     shine, gloss = (0.5 if chance(rng, 0.4) else 0.0), rng.uniform(0.3, 0.5)
     lid = metal(rng) if chance(rng, 0.3) else solid_color(jitter(rng, paper), gloss, shine)

@@ -4,11 +4,10 @@ import numpy as np
 
 from schemas.scene.shape import Material
 from workers.assets.builtin.curves import fillet
-from workers.assets.builtin.draws import chance, pick
 from workers.assets.builtin.materials import solid_color, steel, textured
-from workers.assets.builtin.palette import BLACK, Color, jitter, mix, vivid
+from workers.assets.builtin.palette import BLACK, Color, chance, jitter, mix, pick, vivid
 from workers.assets.builtin.parts import Model, Surface
-from workers.assets.builtin.solid import Solid, combine, lathe, loft, union_at
+from workers.assets.builtin.solid import Solid, combine, lathe, level_ring, loft, union_at
 from workers.assets.builtin.sweeps import prism, straight_prism
 from workers.assets.builtin.textures import Texture, blend, noise
 
@@ -41,22 +40,13 @@ def _body(rng: np.random.Generator, size: tuple[float, float, float], kind: int)
     radius = depth * (0.42 if kind == 1 and chance(rng, 0.6) else rng.uniform(0.15, 0.3))
     low, high = height * rng.uniform(0.1, 0.16), height * rng.uniform(0.74, 0.84)
     b, line = 0.0022, 0.0006
-    profile = np.array(
+    profile = np.column_stack(
         [
-            [b, 0.0],
-            [0.3 * b, 0.25 * b],
-            [0.0, b],
-            [0.0, low],
-            [line, low + line],
-            [line, high - line],
-            [0.0, high],
-            [0.0, height - b],
-            [0.3 * b, height - 0.3 * b],
-            [b, height],
+            [b, 0.3 * b, 0.0, 0.0, line, line, 0.0, 0.0, 0.3 * b, b],
+            [0.0, 0.25 * b, b, low, low + line, high - line, high, height - b, height - 0.3 * b, height],
         ]
     )
-    surface = [SHELL, SHELL, SHELL, SHELL, SKIN, SKIN, SKIN, SHELL, SHELL, SHELL, SHELL]
-    return prism(profile, (width, depth), radius, surface, 4)
+    return prism(profile, (width, depth), radius, [*[SHELL] * 4, *[SKIN] * 3, *[SHELL] * 4], 4)
 
 
 def _lens(rng: np.random.Generator, size: tuple[float, float, float], kind: int) -> Solid:
@@ -66,26 +56,13 @@ def _lens(rng: np.random.Generator, size: tuple[float, float, float], kind: int)
     length = radius * rng.uniform(*((1.0, 1.7), (0.6, 1.2), (0.35, 0.8))[kind])
     front = radius * rng.uniform(0.8, 1.0)
     a, b = rng.uniform(0.25, 0.4), rng.uniform(0.6, 0.8)
-    corners = np.array(
-        [
-            [0.0, -0.2 * depth],
-            [radius, -0.2 * depth],
-            [radius, a * length],
-            [0.94 * radius, a * length + 0.0005],
-            [0.94 * radius, a * length + 0.0015],
-            [radius * 0.99, a * length + 0.002],
-            [radius * 0.99, b * length],
-            [front * 0.95, b * length + 0.001],
-            [front * 0.95, length],
-            [front * 0.84, length],
-            [front * 0.66, length - 0.22 * radius],
-            [front * 0.6, length - 0.22 * radius],
-            [front * 0.34, length - 0.1 * radius],
-            [0.0, length - 0.06 * radius],
-        ]
-    )
+    steps = [0.0, 1.0, 1.0, 0.94, 0.94, 0.99, 0.99, 0.95, 0.95, 0.84, 0.66, 0.6, 0.34, 0.0]
+    starts = np.repeat([-0.2 * depth, a * length, b * length, length], [2, 4, 2, 6])
+    sunk = radius * np.array([-0.22, -0.22, -0.1, -0.06])
+    ends = starts + np.array([0.0, 0.0, 0.0, 0.0005, 0.0015, 0.002, 0.0, 0.001, 0.0, 0.0, *sunk])
+    corners = np.column_stack([np.repeat([radius, front], 7) * steps, ends])
     radii = [0.0, 0.0, 0.0008, 0.0, 0.0, 0.0, 0.0008, 0.0, 0.001, 0.0, 0.0, 0.0, 0.05 * radius, 0.0]
-    surface = np.array([LENS, LENS, LENS, RING, LENS, LENS, LENS, LENS, LENS, LENS, LENS, GLASS, GLASS])
+    surface = np.array([*[LENS] * 3, RING, *[LENS] * 7, GLASS, GLASS])
     profile, owner = fillet(corners, radii, 1)
     barrel = lathe(profile, surface[owner], 28)
     across = width * rng.uniform(0.0, 0.08)
@@ -123,30 +100,17 @@ def _finder(rng: np.random.Generator, size: tuple[float, float, float], kind: in
 
 def _frustum(low: tuple[float, float], high: tuple[float, float], bottom: float, top: float, surface: int) -> Solid:
     """A box that narrows towards its top, with bevelled upper edges."""
-    levels = (
-        (low, bottom, 0.0),
-        (low, bottom + 0.35 * (top - bottom), 0.0),
-        (high, top - 0.0012, 0.0),
-        (high, top, 0.0016),
-    )
     rings = []
-    for (w, d), z, inset in levels:
-        x, y = 0.5 * w - inset, 0.5 * d - inset
-        cut = 0.16 * min(w, d)
+    shoulder = bottom + 0.35 * (top - bottom)
+    for (w, d), z, inset in ((low, bottom, 0.0), (low, shoulder, 0.0), (high, top - 0.0012, 0.0), (high, top, 0.0016)):
+        x, y, cut = 0.5 * w - inset, 0.5 * d - inset, 0.16 * min(w, d)
         outline = [
-            (x, y - cut),
-            (x - cut, y),
-            (cut - x, y),
-            (-x, y - cut),
-            (-x, cut - y),
-            (cut - x, -y),
-            (x - cut, -y),
-            (x, cut - y),
+            [x, x - cut, cut - x, -x, -x, cut - x, x - cut, x],
+            [y - cut, y, y, y - cut, cut - y, -y, -y, cut - y],
         ]
-        rings.append([(px, py, z) for px, py in outline])
-    return loft(
-        np.array(rings), np.array([0.0, 0.0, bottom]), np.array([0.0, 0.0, top]), [surface] * 5, [0, 1, 2, 3, 4]
-    )
+        rings.append(level_ring(np.column_stack(outline), z))
+    ends = np.array([[0.0, 0.0, bottom], [0.0, 0.0, top]])
+    return loft(np.array(rings), ends[0], ends[1], [surface] * 5, range(5))
 
 
 def _controls(rng: np.random.Generator, size: tuple[float, float, float]) -> list[Solid]:
@@ -160,8 +124,8 @@ def _controls(rng: np.random.Generator, size: tuple[float, float, float]) -> lis
     for x, radius, rise in spots:
         r = min(radius * width * rng.uniform(0.85, 1.1), 0.3 * depth)
         top = height + rise
-        profile = np.array(
-            [[0.0, height - 0.003], [r, height - 0.003], [r, top - 0.0006], [r - 0.0006, top], [0.0, top]]
+        profile = np.column_stack(
+            [[0.0, r, r, r - 0.0006, 0.0], [height - 0.003, height - 0.003, top - 0.0006, top, top]]
         )
         solids.append(lathe(profile, [DIAL] * 4, 12).moved(x=x * width, y=0.05 * depth))
     w, h = width * rng.uniform(0.48, 0.56), height * rng.uniform(0.5, 0.58)

@@ -39,7 +39,8 @@ def fillet(points: Array, radii: Sequence[float] | Array, steps: int = 3) -> tup
     `radii` [P] is how far from each corner the arc begins (cut to 45 % of the shorter side; 0 keeps the corner). The
     first half of an arc belongs to the segment before it. Returns [Q, 2] float64 and [Q - 1] int64.
     """
-    out, owner = [points[0]], []
+    t = np.arange(steps + 1)[:, None] / steps
+    out, owner = [points[:1]], []
     for k in range(1, len(points) - 1):
         before, corner, after = points[k - 1], points[k], points[k + 1]
         back, ahead = before - corner, after - corner
@@ -47,28 +48,29 @@ def fillet(points: Array, radii: Sequence[float] | Array, steps: int = 3) -> tup
         size_a = float(np.sqrt(ahead[0] * ahead[0] + ahead[1] * ahead[1]))
         reach = min(radii[k], 0.45 * size_b, 0.45 * size_a)
         if reach <= 0.0:
-            out.append(corner)
+            out.append(corner[None])
             owner.append(k - 1)
             continue
         start, stop = corner + back * (reach / size_b), corner + ahead * (reach / size_a)
-        out.append(start)
-        owner.append(k - 1)
-        for step in range(1, steps + 1):
-            t = step / steps
-            out.append((1 - t) * (1 - t) * start + 2 * t * (1 - t) * corner + t * t * stop)
-            owner.append(k - 1 if 2 * step <= steps else k)
-    out.append(points[-1])
+        out.append((1 - t) * (1 - t) * start + 2 * t * (1 - t) * corner + t * t * stop)
+        owner += [k - 1] * (1 + steps // 2) + [k] * (steps - steps // 2)
+    out.append(points[-1:])
     owner.append(len(points) - 2)
-    return np.array(out), np.array(owner, dtype=np.int64)
+    return np.concatenate(out), np.array(owner, dtype=np.int64)
+
+
+def directions(path: Array, ends: tuple[Array, Array] | None = None) -> Array:
+    """[K, 2] float64: unit directions along a path [K, 2]; `ends`: those at its first and last point, where known."""
+    step = np.empty_like(path)
+    step[1:-1] = path[2:] - path[:-2]
+    step[0], step[-1] = ends or (path[1] - path[0], path[-1] - path[-2])
+    return step / np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2)[:, None]
 
 
 def outward_normals(curve: Array) -> Array:
     """[P, 2] float64: unit normals to the right of a polyline [P, 2]: out of a wall that runs upwards."""
-    step = np.empty_like(curve)
-    step[1:-1] = curve[2:] - curve[:-2]
-    step[0], step[-1] = curve[1] - curve[0], curve[-1] - curve[-2]
-    length = np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2)
-    return np.stack([step[:, 1], -step[:, 0]], axis=1) / length[:, None]
+    along = directions(curve)
+    return np.stack([along[:, 1], -along[:, 0]], axis=1)
 
 
 def half_circle_points(a: Array, b: Array, count: int) -> Array:
@@ -94,9 +96,10 @@ def squircle(count: int, squareness: int) -> Array:
     return table
 
 
-@functools.cache
-def _corner(steps: int) -> Array:
-    return circle(4 * steps)[: steps + 1]
+def rounded_sections(outline: Array, share: Array) -> Array:
+    """[K, n, 2] float64: the unit circle where a share [K] is 0, an outline [n, 2] where it is 1, and between them."""
+    share = share[:, None, None]
+    return circle(len(outline))[None] * (1.0 - share) + outline[None] * share
 
 
 def rounded_rectangles(size: Array, radius: Array, steps: int = 3, sides: tuple[int, int] = (1, 1)) -> Array:
@@ -105,7 +108,7 @@ def rounded_rectangles(size: Array, radius: Array, steps: int = 3, sides: tuple[
     size [L, 2]: width along x and depth along y; radius [L]; `sides`: into how many pieces the straight sides along x
     and along y are cut.
     """
-    arc = radius[:, None, None] * _corner(steps)
+    arc = radius[:, None, None] * circle(4 * steps)[: steps + 1]
     half = 0.5 * size[:, None, :] - radius[:, None, None]
     c, s, x, y = arc[..., 0], arc[..., 1], half[..., 0], half[..., 1]
     corners = np.empty((4, len(size), steps + 1, 2))

@@ -4,17 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from schemas.base import Array
 from schemas.scene.shape import Material
-from workers.assets.builtin.curves import bezier, fillet, spline, squircle
-from workers.assets.builtin.draws import chance, pick
+from workers.assets.builtin.curves import bezier, fillet, rounded_sections, spline, squircle
 from workers.assets.builtin.hollow import OUTSIDE, Wall, wall_around, with_handles
 from workers.assets.builtin.materials import clear_glass, solid_color, textured
-from workers.assets.builtin.palette import BLACK, WHITE, Color, glaze_color, ink_on, jitter, mix, pale
+from workers.assets.builtin.palette import WHITE, Color, chance, glaze_color, ink_on, jitter, mix, pale, pick
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import Solid, circle, lathe
 from workers.assets.builtin.sweeps import bend_radius, rod
-from workers.assets.builtin.textures import band_height, bands, blank, dots, label, speckled, upright_stripes
+from workers.assets.builtin.textures import band_height, bands, blank, dots, flecked, label, upright_stripes
 
 EAR = 3
 SEGMENTS = 40
@@ -26,11 +24,15 @@ def make_jar(rng: np.random.Generator) -> Model:
     wall = _glass_jar(rng) if glass else _pot(rng)
     section = None
     if glass and chance(rng, 0.3):
-        section = _soft_square(wall)
+        # A soft square that turns into a circle at the neck; it depends on the height alone.
+        z = wall.profile[1:-1, 1]
+        section = rounded_sections(
+            0.96 * squircle(SEGMENTS, 1), np.clip((0.78 * z.max() - z) / (0.2 * z.max()), 0.0, 1.0)
+        )
     body = lathe(wall.profile, wall.surface, SEGMENTS, section)
-    if glass or not chance(rng, 0.3):
-        return Model(body, _surfaces(rng, wall, glass))
-    return Model(with_handles(body, OUTSIDE, _ears(rng, wall)), _surfaces(rng, wall, glass))
+    if not glass and chance(rng, 0.3):
+        body = with_handles(body, OUTSIDE, _ears(rng, wall))
+    return Model(body, _surfaces(rng, wall, glass))
 
 
 def _glass_jar(rng: np.random.Generator) -> Wall:
@@ -43,13 +45,8 @@ def _glass_jar(rng: np.random.Generator) -> Wall:
     shoulder = height * rng.uniform(0.72, 0.82)
     # The bend into the neck is wider than the wall is thick, so that the wall's outside does not fold over.
     drop = max(0.9 * (radius - neck), 2.2 * thickness)
-    arc = bezier(
-        [radius, shoulder - drop],
-        [radius, shoulder - 0.25 * drop],
-        [neck, shoulder - 0.45 * drop],
-        [neck, shoulder + drop],
-        9,
-    )
+    below, above = [radius, shoulder - 0.25 * drop], [neck, shoulder - 0.45 * drop]
+    arc = bezier([radius, shoulder - drop], below, above, [neck, shoulder + drop], 9)
     corners = np.concatenate([[[0.0, bottom], [radius, bottom]], arc, [[neck, height]]])
     hollow, _ = fillet(corners, [0.0, rng.uniform(0.006, 0.014), *[0.0] * (len(corners) - 2)], 4)
     wall = wall_around(hollow, thickness, 0.82 * radius, 0.006, 0.0015)
@@ -61,13 +58,11 @@ def _with_thread(wall: Wall, height: float) -> Wall:
     at = int(np.flatnonzero(wall.profile[:, 1] >= height - 1e-9)[0])
     neck, top = wall.profile[at]
     low = wall.profile[at - 1, 1]
-    room, bead = top - low, 0.0012
-    extra = []
-    for centre in (0.35, 0.7):
-        z = low + centre * room
-        extra += [[neck, z - 0.0022], [neck + bead, z - 0.0007], [neck + bead, z + 0.0007], [neck, z + 0.0022]]
-    if room < 0.014:
+    if (room := top - low) < 0.014:
         return wall
+    z = low + np.array([[0.35], [0.7]]) * room + [-0.0022, -0.0007, 0.0007, 0.0022]
+    bead = neck + 0.0012
+    extra = np.column_stack([np.tile([neck, bead, bead, neck], 2), z.ravel()])
     profile = np.concatenate([wall.profile[:at], extra, wall.profile[at:]])
     surface = np.concatenate([wall.surface[:at], np.full(len(extra), OUTSIDE), wall.surface[at:]])
     return Wall(profile, surface, wall.outer, wall.thickness_m)
@@ -83,26 +78,12 @@ def _pot(rng: np.random.Generator) -> Wall:
     neck = belly * rng.uniform(0.4, 0.8)
     lip = neck * rng.uniform(1.05, 1.35)
     at = rng.uniform(0.4, 0.62)
-    points = np.array(
-        [
-            [foot, bottom],
-            [foot + 0.75 * (belly - foot), bottom + 0.5 * at * (height - bottom)],
-            [belly, bottom + at * (height - bottom)],
-            [neck + 0.28 * (belly - neck), bottom + (at + 0.65 * (0.86 - at)) * (height - bottom)],
-            [neck, bottom + 0.88 * (height - bottom)],
-            [lip, height],
-        ]
-    )
+    radii = [foot, foot + 0.75 * (belly - foot), belly, neck + 0.28 * (belly - neck), neck, lip]
+    levels = bottom + np.array([0.0, 0.5 * at, at, at + 0.65 * (0.86 - at), 0.88]) * (height - bottom)
+    points = np.column_stack([radii, [*levels, height]])
     hollow = np.concatenate([[[0.0, bottom]], spline(points, 3)])
     hollow, _ = fillet(hollow, [0.0, 0.006, *[0.0] * (len(hollow) - 2)], 3)
     return wall_around(hollow, thickness, 0.9 * foot, 0.006, 0.002)
-
-
-def _soft_square(wall: Wall) -> Array:
-    """[P - 2, n, 2]: a soft square that turns into a circle at the neck; it depends on the height alone."""
-    z = wall.profile[1:-1, 1]
-    share = np.clip((0.78 * z.max() - z) / (0.2 * z.max()), 0.0, 1.0)[:, None, None]
-    return circle(SEGMENTS)[None] * (1.0 - share) + 0.96 * squircle(SEGMENTS, 1)[None] * share
 
 
 def _ears(rng: np.random.Generator, wall: Wall) -> list[Solid]:
@@ -121,19 +102,18 @@ def _ears(rng: np.random.Generator, wall: Wall) -> list[Solid]:
 
 
 def _surfaces(rng: np.random.Generator, wall: Wall, glass: bool) -> tuple[Surface, ...]:
-    low, high = 0.0, float(wall.profile[:, 1].max())
-    wrapped = False
+    high = float(wall.profile[:, 1].max())
+    rows = band_height(0.0, high, float(wall.outer[:, 0].max()))
     if glass:
         tint = jitter(rng, pick(rng, ((0.74, 0.83, 0.83), (0.66, 0.76, 0.74), (0.32, 0.2, 0.1))), 0.04)
-        inside = base = clear_glass(tint, rng.uniform(0.08, 0.2))
-        outside, inside = inside, replace(inside, ior=1.0)
+        outside = base = clear_glass(tint, rng.uniform(0.08, 0.2))
+        inside = replace(base, ior=1.0)
         if chance(rng, 0.6):
-            outside = _on_glass(rng, tint, band_height(0.0, high, float(wall.outer[:, 0].max())))
-            wrapped = True
+            outside = _on_glass(rng, tint, rows)
     else:
-        outside, inside, base, wrapped = _pottery(rng, band_height(0.0, high, float(wall.outer[:, 0].max())))
+        outside, inside, base = _pottery(rng, rows)
     return (
-        Surface("outside", outside, "cylinder" if wrapped else "none", low=low, high=high),
+        Surface("outside", outside, "cylinder", low=0.0, high=high),
         Surface("inside", inside),
         Surface("base", base),
         Surface("ears", solid_color(inside.base_color[:3], inside.roughness)),
@@ -153,19 +133,19 @@ def _on_glass(rng: np.random.Generator, tint: Color, rows: int) -> Material:
     return replace(textured(picture, 0.35), transmission=1.0, transmission_map=clear)
 
 
-def _pottery(rng: np.random.Generator, rows: int) -> tuple[Material, Material, Material, bool]:
+def _pottery(rng: np.random.Generator, rows: int) -> tuple[Material, Material, Material]:
     roughness = rng.uniform(0.15, 0.4) if chance(rng, 0.6) else rng.uniform(0.65, 0.9)
     ground = jitter(rng, (0.68, 0.4, 0.27), 0.06) if chance(rng, 0.2) else glaze_color(rng)
     plain = solid_color(ground, roughness)
     base = solid_color(mix(ground, (0.7, 0.6, 0.5), 0.6), 0.85)
     if chance(rng, 0.4):
-        return plain, plain, base, False
+        return plain, plain, base
     ink = ink_on(rng, ground)
     painters = (
         lambda: bands(rng, [ground, mix(ground, ink, 0.7), pale(rng)]),
         lambda: upright_stripes(rng, [ground, ground, mix(ground, ink, 0.5)]),
         lambda: dots(rng, ground, mix(ground, ink, 0.7), rows),
-        lambda: speckled(rng, ground, mix(ground, BLACK, 0.6), rng.uniform(0.02, 0.07), rows),
+        lambda: flecked(rng, ground, rows),
         lambda: bands(rng, [ground, WHITE, ink]),
     )
-    return textured(pick(rng, painters)(), roughness), plain, base, True
+    return textured(pick(rng, painters)(), roughness), plain, base

@@ -6,9 +6,8 @@ import math
 import numpy as np
 
 from schemas.base import Array
-from workers.assets.builtin.draws import chance, pick
 from workers.assets.builtin.materials import solid_color, textured
-from workers.assets.builtin.palette import BLACK, WHITE, Color, hsv, jitter, lightness, mix, vivid
+from workers.assets.builtin.palette import BLACK, WHITE, Color, chance, hsv, jitter, lightness, mix, pick, vivid
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import TRIG_DIGITS, Solid, combine, difference, lathe, union
 from workers.assets.builtin.sweeps import bevelled_profile, prism, straight_prism
@@ -42,12 +41,10 @@ def _base(rng: np.random.Generator, size: tuple[float, float], thick: float, rad
     """The lower half: a slab with a sunken deck for the keys and a sunken touch pad."""
     width, depth = size
     slab = prism(bevelled_profile(thick, 0.12 * thick), size, radius, [CASE] * 5, 4)
-    well = _plate((DECK_WIDTH * width, DECK_DEPTH * depth), thick - 0.0012, thick + 0.01, DECK).moved(
-        y=DECK_MIDDLE * depth
-    )
+    well = _plate((DECK_WIDTH * width, DECK_DEPTH * depth), thick - 0.0012, thick + 0.01, DECK)
     pad_size = width * rng.uniform(0.28, 0.42), depth * rng.uniform(0.26, 0.32)
     pad = _plate(pad_size, thick - 0.0007, thick + 0.01, PAD).moved(y=-0.5 * depth + 0.05 * depth + 0.5 * pad_size[1])
-    return difference(slab, [combine([well, pad])])
+    return difference(slab, [combine([well.moved(y=DECK_MIDDLE * depth), pad])])
 
 
 def _plate(size: tuple[float, float], low: float, high: float, surface: int) -> Solid:
@@ -76,36 +73,23 @@ def _surfaces(
     rng: np.random.Generator, size: tuple[float, float], thick: float, hinge: Array, axes: Array
 ) -> tuple[Surface, ...]:
     width, depth = size
-    silver: tuple[Color, ...] = (
-        (0.76, 0.77, 0.78),
-        (0.62, 0.63, 0.65),
-        (0.34, 0.35, 0.37),
-        (0.12, 0.12, 0.13),
-        (0.84, 0.78, 0.72),
-    )
-    color: Color = jitter(rng, pick(rng, silver), 0.03) if chance(rng, 0.88) else mix(vivid(rng), (0.5, 0.5, 0.5), 0.4)
+    greys = ((0.76, 0.77, 0.78), (0.62, 0.63, 0.65), (0.34, 0.35, 0.37), (0.12, 0.12, 0.13))
+    if chance(rng, 0.88):
+        color = jitter(rng, pick(rng, (*greys, (0.84, 0.78, 0.72))), 0.03)
+    else:
+        color = mix(vivid(rng), (0.5, 0.5, 0.5), 0.4)
     metallic = 0.8 if chance(rng, 0.6) else 0.0
     case = solid_color(color, rng.uniform(0.35, 0.55), metallic)
     key = BLACK if chance(rng, 0.7) else mix(color, WHITE, 0.5)
-    keys = Surface(
-        "keys",
-        textured(_keyboard(rng, jitter(rng, key, 0.02), mix(color, BLACK, 0.4 if key == BLACK else 0.2)), 0.6),
-        "plane",
-        origin=(-0.5 * DECK_WIDTH * width, (DECK_MIDDLE - 0.5 * DECK_DEPTH) * depth, 0.0),
-        across=(DECK_WIDTH * width, 0.0, 0.0),
-        up=(0.0, DECK_DEPTH * depth, 0.0),
-    )
+    board = _keyboard(rng, jitter(rng, key, 0.02), mix(color, BLACK, 0.4 if key == BLACK else 0.2))
+    low, across = (DECK_MIDDLE - 0.5 * DECK_DEPTH) * depth, (DECK_WIDTH * width, 0.0, 0.0)
+    origin, up = (-0.5 * across[0], low, 0.0), (0.0, DECK_DEPTH * depth, 0.0)
+    keys = Surface("keys", textured(board, 0.6), "plane", origin=origin, across=across, up=up)
     bezel = case if chance(rng, 0.2) else solid_color(jitter(rng, BLACK, 0.02), 0.4)
     # The closed screen's picture: u along x, v from the hinge to the free edge, carried along by the turn.
-    up = -depth * axes[1]
-    origin = hinge - 0.5 * width * axes[0]
+    corner, across = hinge - 0.5 * width * axes[0], (width, 0.0, 0.0)
     screen = Surface(
-        "screen",
-        textured(_desktop(rng), 0.25),
-        "plane",
-        origin=(float(origin[0]), float(origin[1]), float(origin[2])),
-        across=(width, 0.0, 0.0),
-        up=(float(up[0]), float(up[1]), float(up[2])),
+        "screen", textured(_desktop(rng), 0.25), "plane", origin=corner, across=across, up=-depth * axes[1]
     )
     return (
         Surface("case", case),
@@ -145,10 +129,8 @@ def _desktop(rng: np.random.Generator) -> Texture:
     if kind < 0.25:
         return blank(8, 8, (0.03, 0.03, 0.035))
     hue = rng.random()
-    a, b = (
-        hsv(hue, rng.uniform(0.3, 0.8), rng.uniform(0.2, 0.5)),
-        hsv(hue + rng.uniform(-0.2, 0.2), rng.uniform(0.2, 0.7), rng.uniform(0.6, 0.95)),
-    )
+    a = hsv(hue, rng.uniform(0.3, 0.8), rng.uniform(0.2, 0.5))
+    b = hsv(hue + rng.uniform(-0.2, 0.2), rng.uniform(0.2, 0.7), rng.uniform(0.6, 0.95))
     slope = np.broadcast_to(np.linspace(1.0, 0.0, height, dtype=np.float32)[:, None], (height, width))
     picture = blend(a, b, 0.5 * slope + 0.5 * noise(rng, height, width, 3, 4))
     picture[-9:] = rgb(mix(a, BLACK, 0.6))

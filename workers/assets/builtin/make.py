@@ -18,7 +18,6 @@ from workers.assets.builtin.laptop import make_laptop
 from workers.assets.builtin.mug import make_mug
 from workers.assets.builtin.parts import Model, cut_into_parts
 from workers.assets.builtin.table import make_table
-from workers.assets.categories import TABLE
 from workers.assets.mass import solid_mass
 from workers.geometry.frames import pose
 
@@ -26,6 +25,8 @@ VERSION = 2
 """Part of the catalogue's digest: raise it with every change to a vertex or colour of any instance."""
 
 LICENCE = "CC0-1.0"
+TABLE = "table"
+"""The category of tables, which the job's categories of objects do not have."""
 
 GENERATORS: dict[str, tuple[int, Callable[[np.random.Generator], Model]]] = {
     "bottle": (0, make_bottle),
@@ -85,15 +86,8 @@ def shape_digest(shape: Shape) -> str:
     digest = hashlib.sha256()
     for part in shape.parts:
         material = part.material
-        arrays = (
-            part.vertices,
-            part.faces,
-            part.normals,
-            part.uv,
-            part.colors,
-            material.texture,
-            material.transmission_map,
-        )
+        images = material.texture, material.transmission_map
+        arrays = (part.vertices, part.faces, part.normals, part.uv, part.colors, *images)
         shapes = [None if array is None else array.shape for array in arrays]
         scalars = (material.base_color, material.metallic, material.roughness, material.transmission, material.ior)
         digest.update(repr((part.name, *scalars, shapes)).encode())

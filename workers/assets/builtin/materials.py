@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.scene.shape import Material
-from workers.assets.builtin.draws import pick
-from workers.assets.builtin.palette import BLACK, WHITE, Color, jitter, pale, vivid
+from workers.assets.builtin.palette import BLACK, WHITE, Color, jitter, pale, pick, vivid
 
 _STEELS: tuple[Color, ...] = ((0.78, 0.79, 0.8), (0.7, 0.7, 0.71), (0.86, 0.86, 0.85))
 _BRASSES: tuple[Color, ...] = ((0.83, 0.69, 0.4), (0.8, 0.56, 0.42))

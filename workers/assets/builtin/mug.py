@@ -4,14 +4,13 @@ import numpy as np
 
 from schemas.base import Array
 from workers.assets.builtin.curves import bezier, fillet, spline, squircle
-from workers.assets.builtin.draws import chance
 from workers.assets.builtin.hollow import OUTSIDE, Wall, wall_around, with_handles
 from workers.assets.builtin.materials import metal, solid_color, textured
-from workers.assets.builtin.palette import BLACK, WHITE, Color, glaze_color, ink_on, jitter, mix, pale, vivid
-from workers.assets.builtin.parts import Model, Surface, UvMapping
+from workers.assets.builtin.palette import WHITE, chance, glaze_color, ink_on, jitter, mix, pale, pick, vivid
+from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import Solid, lathe
 from workers.assets.builtin.sweeps import bend_radius, rod
-from workers.assets.builtin.textures import Texture, band_height, bands, dots, label, speckled, upright_stripes
+from workers.assets.builtin.textures import band_height, bands, dots, flecked, label, upright_stripes
 
 HANDLE = 3
 
@@ -33,25 +32,18 @@ def _body(rng: np.random.Generator) -> Wall:
         taper = rng.uniform(0.7, 1.0)
         wall = np.array([[radius * taper, bottom], [radius, height]])
     elif kind == 2:  # bellied
-        belly = radius * rng.uniform(1.05, 1.2)
-        mouth = radius * rng.uniform(0.85, 1.0)
-        wall = spline(np.array([[radius * 0.85, bottom], [belly, 0.45 * height], [mouth, height]]), 4)
+        belly, rim = radius * rng.uniform(1.05, 1.2), radius * rng.uniform(0.85, 1.0)
+        wall = spline(np.array([[radius * 0.85, bottom], [belly, 0.45 * height], [rim, height]]), 4)
     elif kind == 3:  # bell
         waist = radius * rng.uniform(0.72, 0.85)
         wall = bezier([waist, bottom], [waist, 0.55 * height], [radius * 0.9, 0.8 * height], [radius * 1.03, height], 8)
     else:  # a cup that opens from a round bottom
-        wall = bezier(
-            [radius * 0.55, bottom],
-            [radius * 0.95, bottom + 0.04 * height],
-            [radius, 0.5 * height],
-            [radius * 1.05, height],
-            9,
-        )
-    hollow = np.concatenate([[[0.0, bottom]], wall])
-    reach = rng.uniform(0.004, 0.014)
-    hollow, _ = fillet(hollow, [0.0, reach, *[0.0] * (len(hollow) - 2)], 3)
-    foot = wall[0, 0] * rng.uniform(0.72, 0.88)
-    return wall_around(hollow, thickness, foot, rng.uniform(0.003, 0.005), rng.uniform(0.0008, 0.002))
+        foot, mouth = [radius * 0.55, bottom], [radius * 1.05, height]
+        wall = bezier(foot, [radius * 0.95, bottom + 0.04 * height], [radius, 0.5 * height], mouth, 9)
+    bend = [0.0, rng.uniform(0.004, 0.014), *[0.0] * (len(wall) - 1)]
+    hollow, _ = fillet(np.concatenate([[[0.0, bottom]], wall]), bend, 3)
+    foot_radius = wall[0, 0] * rng.uniform(0.72, 0.88)
+    return wall_around(hollow, thickness, foot_radius, rng.uniform(0.003, 0.005), rng.uniform(0.0008, 0.002))
 
 
 def _handle(rng: np.random.Generator, wall: Wall) -> Solid:
@@ -89,32 +81,25 @@ def _path(rng: np.random.Generator, start: Array, out: Array, stop: Array, back:
 def _surfaces(rng: np.random.Generator, wall: Wall) -> tuple[Surface, ...]:
     low, high = float(wall.outer[0, 1]), float(wall.profile[:, 1].max())
     roughness = rng.uniform(0.15, 0.35) if chance(rng, 0.75) else rng.uniform(0.6, 0.85)
-    ground: Color = jitter(rng, WHITE, 0.03) if chance(rng, 0.35) else glaze_color(rng)
+    ground = jitter(rng, WHITE, 0.03) if chance(rng, 0.35) else glaze_color(rng)
     inside = ground if chance(rng, 0.5) else jitter(rng, WHITE, 0.03)
     body = solid_color(ground, roughness)
-    mapping: UvMapping = "none"
     if chance(rng, 0.55):
         height = band_height(low, high, wall.radius_at(0.5 * high))
-        body, mapping = textured(_picture(rng, ground, height), roughness), "cylinder"
+        painters = (
+            lambda: bands(rng, [ground, ink_on(rng, ground), pale(rng)]),
+            lambda: label(rng, ground, height),
+            lambda: dots(rng, ground, ink_on(rng, ground), height),
+            lambda: upright_stripes(rng, [ground, ground, mix(ground, ink_on(rng, ground), 0.7)]),
+            lambda: flecked(rng, ground, height),
+        )
+        body = textured(pick(rng, painters)(), roughness)
     grip = ground if chance(rng, 0.75) else vivid(rng)
     handle = metal(rng) if chance(rng, 0.06) else solid_color(grip, roughness)
     base = solid_color(mix(ground, (0.75, 0.7, 0.62), 0.6), 0.8)
     return (
-        Surface("body", body, mapping, low=low, high=high),
+        Surface("body", body, "cylinder", low=low, high=high),
         Surface("inside", solid_color(inside, roughness)),
         Surface("base", base),
         Surface("handle", handle),
     )
-
-
-def _picture(rng: np.random.Generator, ground: Color, height: int) -> Texture:
-    kind = int(rng.integers(5))
-    if kind == 0:
-        return bands(rng, [ground, ink_on(rng, ground), pale(rng)])
-    if kind == 1:
-        return label(rng, ground, height)
-    if kind == 2:
-        return dots(rng, ground, ink_on(rng, ground), height)
-    if kind == 3:
-        return upright_stripes(rng, [ground, ground, mix(ground, ink_on(rng, ground), 0.7)])
-    return speckled(rng, ground, mix(ground, BLACK, 0.6), rng.uniform(0.02, 0.07), height)

@@ -1,11 +1,12 @@
-"""Pure: colours of everyday objects, sRGB, drawn at random."""
+"""Pure: random draws from a numpy generator: choices, chances, and colours of everyday objects, sRGB."""
 
 import colorsys
+from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 
-from workers.assets.builtin.draws import chance, pick
-
+Choice = TypeVar("Choice")
 Color = tuple[float, float, float]
 """sRGB, each in [0, 1]."""
 
@@ -42,6 +43,16 @@ _WOODS: tuple[tuple[Color, Color], ...] = (
     ((0.66, 0.44, 0.28), (0.5, 0.3, 0.17)),
     ((0.5, 0.46, 0.41), (0.38, 0.34, 0.3)),
 )
+
+
+def pick(rng: np.random.Generator, choices: Sequence[Choice]) -> Choice:
+    """One of the choices, each as likely as the next."""
+    return choices[int(rng.integers(len(choices)))]
+
+
+def chance(rng: np.random.Generator, share: float) -> bool:
+    """True with this probability."""
+    return bool(rng.random() < share)
 
 
 def hsv(h: float, s: float, v: float) -> Color:

@@ -9,14 +9,12 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.scene.shape import Material, Part, Shape
-from workers.assets.builtin.solid import TRIG_DIGITS, Indices, Solid
-
-UvMapping = Literal["none", "cylinder", "plane", "box"]
+from workers.assets.builtin.solid import TRIG_DIGITS, Indices, Solid, renumber
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The material of some faces of a solid, and how its texture is mapped onto them.
+    """The material of some faces of a solid, and how its texture, if it has one, is mapped onto them.
 
     `mapping`: `cylinder` runs u once around the z axis and v from `low` to `high` in z; `plane` runs u along `across` and
     v along `up` (vectors [3] from `origin` whose lengths are one texture); `box` projects along the axis that the face
@@ -25,12 +23,12 @@ class Surface:
 
     name: str
     material: Material
-    mapping: UvMapping = "none"
+    mapping: Literal["cylinder", "plane", "box"] = "cylinder"
     low: float = 0.0
     high: float = 1.0
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    across: tuple[float, float, float] = (1.0, 0.0, 0.0)
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    origin: Sequence[float] | Array = (0.0, 0.0, 0.0)
+    across: Sequence[float] | Array = (1.0, 0.0, 0.0)
+    up: Sequence[float] | Array = (0.0, 0.0, 1.0)
     size: float = 1.0
     grain: int = 0
 
@@ -60,7 +58,7 @@ def cut_into_parts(solid: Solid, surfaces: Sequence[Surface], centre: Array, sca
     """
     vertices = (solid.vertices - centre) * scale
     across, normals_at = _face_vectors(vertices, solid.faces)
-    shaded, point = _dense(solid.smooth[:, None] * len(vertices) + solid.faces)
+    shaded, point = renumber(solid.smooth[:, None] * len(vertices) + solid.faces)
     point %= len(vertices)
     normals = normals_at(shaded, len(point))
     order = np.argsort(solid.surface, kind="stable")
@@ -72,10 +70,10 @@ def cut_into_parts(solid: Solid, surfaces: Sequence[Surface], centre: Array, sca
             corners = shaded[chosen]
             variant, coordinates = _texture_variants(surface, solid.vertices, point[corners], across[:, chosen])
             if coordinates is None:
-                index, origin = _dense(corners)
+                index, origin = renumber(corners)
                 uv = None
             else:
-                index, origin = _dense(corners * 3 + variant)
+                index, origin = renumber(corners * 3 + variant)
                 origin, which = np.divmod(origin, 3)
                 uv = coordinates(point[origin], which)
             parts.append(_part(surface, vertices[point[origin]], index, normals[origin], uv))
@@ -88,15 +86,6 @@ def _part(surface: Surface, vertices: Array, faces: Indices, normals: Array, uv:
         if array is not None:
             array.setflags(write=False)
     return Part(surface.name, vertices, corners, surface.material, normals=normals, uv=uv)
-
-
-def _dense(keys: Indices) -> tuple[Indices, Indices]:
-    """Keys [...] int64 renumbered 0, 1, 2, ... in ascending order, and the key of each number."""
-    flat = keys.ravel()
-    seen = np.zeros(int(flat.max()) + 1, dtype=np.bool_)
-    seen[flat] = True
-    number = np.cumsum(seen) - 1
-    return number[keys], np.flatnonzero(seen)
 
 
 def _face_vectors(vertices: Array, faces: Indices) -> tuple[Array, Callable[[Indices, int], Array]]:
@@ -135,6 +124,8 @@ def _texture_variants(
 
     across [3, F]: the faces' area vectors.
     """
+    if surface.material.texture is None:
+        return np.zeros_like(faces), None
     if surface.mapping == "cylinder":
         turn = _turns(vertices, faces)
         beyond = turn[faces]
@@ -150,14 +141,12 @@ def _texture_variants(
         return np.zeros_like(faces), lambda point, variant: np.stack(
             [(local[point] * axis).sum(axis=1) for axis in axes], axis=1
         )
-    if surface.mapping == "box":
-        axis = np.abs(across).argmax(axis=0)
-        low = vertices.min(axis=0)
-        sides = np.array(_SIDES[surface.grain])
-        return np.repeat(axis[:, None], 3, axis=1), lambda point, variant: np.take_along_axis(
-            (vertices[point] - low) / surface.size, sides[variant], axis=1
-        )
-    return np.zeros_like(faces), None
+    axis = np.abs(across).argmax(axis=0)
+    low = vertices.min(axis=0)
+    sides = np.array(_SIDES[surface.grain])
+    return np.repeat(axis[:, None], 3, axis=1), lambda point, variant: np.take_along_axis(
+        (vertices[point] - low) / surface.size, sides[variant], axis=1
+    )
 
 
 def _turns(vertices: Array, faces: Indices) -> Array:

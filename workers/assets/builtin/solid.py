@@ -6,6 +6,7 @@ processor. Sines and cosines are rounded to `TRIG_DIGITS`, because C libraries a
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -142,15 +143,9 @@ def _profiles(profile: Array, section: Array | None) -> Array:
         return profile[None]
     reach = np.sqrt(section[..., 0] * section[..., 0] + section[..., 1] * section[..., 1])  # [P - 2, n]
     ring = reach[int((reach.max(axis=1) - reach.min(axis=1)).argmax())]
-    columns = reach[:, [int(ring.argmax()), int(ring.argmin())]].T
-    return np.stack([_widened(profile, column) for column in columns])
-
-
-def _widened(profile: Array, factors: Array) -> Array:
-    """The profile [P, 2] with the radii between its ends times the factors [P - 2]."""
-    wide = profile.astype(np.float64)
-    wide[1:-1, 0] *= factors
-    return wide
+    profiles = np.array([profile, profile], dtype=np.float64)
+    profiles[:, 1:-1, 0] *= reach[:, [int(ring.argmax()), int(ring.argmin())]].T
+    return profiles
 
 
 def smoothing_groups(profile: Array) -> Indices:
@@ -181,12 +176,8 @@ def combine(solids: Sequence[Solid]) -> Solid:
 
 def _lofts_of(solids: Sequence[Solid]) -> tuple[Loft, ...] | None:
     """The lofts of all solids in order; None where those of one are not known."""
-    found: list[Loft] = []
-    for solid in solids:
-        if solid.lofts is None:
-            return None
-        found += solid.lofts
-    return tuple(found)
+    lofts = [solid.lofts for solid in solids if solid.lofts is not None]
+    return tuple(itertools.chain.from_iterable(lofts)) if len(lofts) == len(solids) else None
 
 
 def union(solids: Sequence[Solid]) -> Solid:
@@ -208,7 +199,7 @@ def union_at(solid: Solid, touched: Mask, apex: Array, others: Sequence[Solid], 
     size = len(solid.vertices)
     border = ~np.isin(a * size + b, b * size + a)
     fan = np.stack([b[border], a[border], np.full(int(border.sum()), size)], axis=1)
-    faces, names = _renumbered(np.concatenate([core, fan]))
+    faces, names = renumber(np.concatenate([core, fan]))
     surface = np.concatenate([solid.surface[touched], np.full(len(fan), _FAN)])
     smooth = np.concatenate([solid.smooth[touched], np.zeros(len(fan), dtype=np.int64)])
     vertices = np.concatenate([solid.vertices, apex[None]])
@@ -221,8 +212,7 @@ def union_at(solid: Solid, touched: Mask, apex: Array, others: Sequence[Solid], 
         return union([combine([solid, *beside]), *others])
     target = len(joined.vertices) + np.arange(size)
     target[rim] = at
-    faces = np.concatenate([joined.faces[kept], target[solid.faces[~touched]]])
-    faces, names = _renumbered(faces)
+    faces, names = renumber(np.concatenate([joined.faces[kept], target[solid.faces[~touched]]]))
     return Solid(
         np.concatenate([joined.vertices, solid.vertices])[names],
         faces,
@@ -232,11 +222,11 @@ def union_at(solid: Solid, touched: Mask, apex: Array, others: Sequence[Solid], 
     )
 
 
-def _renumbered(faces: Indices) -> tuple[Indices, Indices]:
-    """Faces renumbered into the vertices that they name, and the old numbers of these."""
-    used = np.zeros(int(faces.max()) + 1, dtype=np.bool_)
-    used[faces] = True
-    return (np.cumsum(used) - 1)[faces], np.flatnonzero(used)
+def renumber(keys: Indices) -> tuple[Indices, Indices]:
+    """Keys [...] int64 renumbered 0, 1, 2, ... in ascending order, and the key of each number."""
+    seen = np.zeros(int(keys.max()) + 1, dtype=np.bool_)
+    seen[keys] = True
+    return (np.cumsum(seen) - 1)[keys], np.flatnonzero(seen)
 
 
 def difference(solid: Solid, cutters: Sequence[Solid]) -> Solid:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from schemas.base import Array
-from workers.assets.builtin.curves import rounded_rectangles
+from workers.assets.builtin.curves import directions, rounded_rectangles
 from workers.assets.builtin.solid import Indices, Solid, loft, smoothing_groups
 
 
@@ -50,17 +50,9 @@ def bevelled_profile(height: float, bevel: float, bottom: float = 0.0) -> Array:
     return np.array([[bevel, bottom], [0.0, bottom + bevel], [0.0, top - bevel], [bevel, top]])
 
 
-def _tangents(path: Array, ends: tuple[Array, Array]) -> Array:
-    """[K, 2] float64: unit directions of a path [K, 2] whose first and last direction are given."""
-    tangent = np.empty_like(path)
-    tangent[1:-1] = path[2:] - path[:-2]
-    tangent[0], tangent[-1] = ends
-    return tangent / np.sqrt(tangent[:, 0] ** 2 + tangent[:, 1] ** 2)[:, None]
-
-
 def bend_radius(path: Array, ends: tuple[Array, Array]) -> float:
     """The largest half thickness, metres, of a rod along a path [K, 2] that does not fold at its tightest bend."""
-    step, turn = np.diff(path, axis=0), np.diff(_tangents(path, ends), axis=0)
+    step, turn = np.diff(path, axis=0), np.diff(directions(path, ends), axis=0)
     length, bend = (np.sqrt(v[:, 0] ** 2 + v[:, 1] ** 2) for v in (step, turn))
     return float((length / np.maximum(bend, 1e-9)).min())
 
@@ -70,7 +62,7 @@ def rod(path: Array, section: Array, surface: int, ends: tuple[Array, Array], sw
 
     ends: the unit directions (x, z) in which the path begins and ends; swell [K]: factor on the section.
     """
-    tangent = _tangents(path, ends)
+    tangent = directions(path, ends)
     factor = np.ones(len(path)) if swell is None else swell
     u, v = section[:, 0] * factor[:, None], section[:, 1] * factor[:, None]
     x = path[:, 0:1] - tangent[:, 1:2] * v

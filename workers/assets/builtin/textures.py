@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.assets.builtin.draws import chance
-from workers.assets.builtin.palette import Color, ink_on, mix, vivid
+from workers.assets.builtin.palette import BLACK, WHITE, Color, chance, ink_on, mix, pick, vivid
 
 Texture = NDArray[np.uint8]
 Plane = NDArray[np.float32]
@@ -63,6 +62,12 @@ def wood(rng: np.random.Generator, light: Color, dark: Color, planks: int = 0, s
     return blend(light, dark, share)
 
 
+def kraft(rng: np.random.Generator, color: Color) -> Texture:
+    """[128, 128, 3]: kraft cardboard with faint corrugation and fibres."""
+    share = 0.5 * noise(rng, 128, 128, 3, 64) + 0.5 * noise(rng, 128, 128, 48, 48)
+    return blend(mix(color, WHITE, 0.08), mix(color, BLACK, 0.12), share)
+
+
 def stone(rng: np.random.Generator, a: Color, b: Color, size: int = 192) -> Texture:
     """Cloudy stone with veins."""
     cloud = 0.6 * noise(rng, size, size, 6, 6) + 0.4 * noise(rng, size, size, 20, 20)
@@ -83,6 +88,11 @@ def speckled(
     picture = blank(height, width, ground)
     picture[rng.random((height, width), dtype=np.float32) < share] = rgb(spot)
     return picture
+
+
+def flecked(rng: np.random.Generator, glaze: Color, height: int) -> Texture:
+    """A glaze with dark flecks."""
+    return speckled(rng, glaze, mix(glaze, BLACK, 0.6), rng.uniform(0.02, 0.07), height)
 
 
 def bands(rng: np.random.Generator, colors: Sequence[Color], height: int = 128) -> Texture:
@@ -141,16 +151,9 @@ def draw_emblem(
     """Draws a round, square, diamond or ring-shaped emblem about (row, column), `size` its radius in pixels."""
     height, width = picture.shape[:2]
     y, x = (np.arange(height) - centre[0])[:, None] / size, (np.arange(width) - centre[1])[None] / size
-    kind = int(rng.integers(4))
-    if kind == 0:
-        inside = x * x + y * y < 1.0
-    elif kind == 1:
-        inside = np.maximum(np.abs(x) * 0.7, np.abs(y) * 1.2) < 0.9
-    elif kind == 2:
-        inside = np.abs(x) + np.abs(y) < 1.1
-    else:
-        inside = np.abs(x * x + y * y - 0.75) < 0.3
-    picture[inside] = rgb(color)
+    disc, square = x * x + y * y < 1.0, np.maximum(np.abs(x) * 0.7, np.abs(y) * 1.2) < 0.9
+    diamond, ring = np.abs(x) + np.abs(y) < 1.1, np.abs(x * x + y * y - 0.75) < 0.3
+    picture[pick(rng, (disc, square, diamond, ring))] = rgb(color)
 
 
 def label(rng: np.random.Generator, paper: Color, height: int = 128, width: int = 256, faces: int = 2) -> Texture:

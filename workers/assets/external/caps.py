@@ -12,9 +12,6 @@ from trimesh.resolvers import Resolver
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 
-LEAST_BYTES = 8
-"""No format writes a vertex or a face in fewer: `v 0 0 0` and its line end."""
-
 _PLY_ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d+)", re.MULTILINE)
 _IMAGE_KINDS = {b"\x89PNG\r\n\x1a\n": "PNG", b"\xff\xd8\xff": "JPEG"}
 _ADDRESS = re.compile(r"\s*<[^<>]* at 0x[0-9a-fA-F]+>")
@@ -25,11 +22,6 @@ def check_counts(path: Path, vertices: int, faces: int, limits: MeshLimits) -> N
     for name, count, cap in (("vertices", vertices, limits.max_vertices), ("faces", faces, limits.max_faces)):
         if count > cap:
             raise MeshError("too_large", f"{path} has {count} {name}, over max_{name} = {cap}")
-
-
-def may_be_too_large(data: bytes, limits: MeshLimits) -> bool:
-    """Whether a file is long enough to exceed the caps; a shorter one needs no counting."""
-    return len(data) > LEAST_BYTES * min(limits.max_vertices, limits.max_faces)
 
 
 def declared_counts(kind: str, data: bytes) -> tuple[int, int]:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from schemas.errors import AssetSourceError
 from schemas.job.assets import FolderSource
-from workers.assets.categories import ASSET_CATEGORIES, TABLE
+from schemas.job.job import CATEGORIES
+from workers.assets.builtin.make import TABLE
 from workers.assets.external.listing import describe_folder
 
 PYBULLET_DATA = "pybullet_data"
@@ -72,7 +73,7 @@ def _read_map(settings: FolderSource, folder: Path) -> Mapping[str, str]:
             f"It has {describe_folder(folder)}."
         )
     for pattern, category in category_map.items():
-        if category not in ASSET_CATEGORIES:
-            allowed = ", ".join(ASSET_CATEGORIES)
+        if category not in (*CATEGORIES, TABLE):
+            allowed = ", ".join((*CATEGORIES, TABLE))
             raise AssetSourceError(f"category_map: {pattern!r} is given {category!r}, which is none of {allowed}.")
     return category_map

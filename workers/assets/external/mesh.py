@@ -11,20 +11,11 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part, Shape
+from workers.assets.external import topology
 from workers.assets.external.caps import FolderResolver, check_counts
 from workers.assets.external.materials import MeshVisual, read_visual
 from workers.assets.external.reading import read_bytes, read_scene
-from workers.assets.external.topology import (
-    Bodies,
-    Indices,
-    Mask,
-    find_bodies,
-    find_collapsed,
-    find_flips,
-    find_repeated,
-    merge_points,
-    thin_volume,
-)
+from workers.assets.external.topology import Bodies, Indices, Mask
 from workers.geometry.frames import transform
 
 LARGEST_COORDINATE = 1e7
@@ -144,14 +135,14 @@ def clean_shape(path: Path, pieces: list[_Piece]) -> tuple[Shape, list[str]]:
     vertices = np.concatenate([piece.vertices for piece in pieces])
     faces = np.concatenate([piece.faces + start for piece, start in zip(pieces, starts[:-1], strict=True)])
     owner = np.repeat(np.arange(len(pieces)), [len(piece.faces) for piece in pieces])
-    point = merge_points(vertices)
-    kept = ~find_collapsed(point[faces])
-    kept[kept] = ~find_repeated(point[faces[kept]], oriented=True)
+    point = topology.merge_points(vertices)
+    kept = ~topology.find_collapsed(point[faces])
+    kept[kept] = ~topology.find_repeated(point[faces[kept]], oriented=True)
     faces, owner = faces[kept], owner[kept]
     if not len(faces):
         raise MeshError("no_faces", f"{path} has only empty faces")
     faces, owner, bodies = _unify_winding(vertices, faces, owner, point)
-    watertight = bool(bodies.closed.all()) and float(bodies.volume.sum()) > thin_volume(vertices, faces)
+    watertight = bool(bodies.closed.all()) and float(bodies.volume.sum()) > topology.thin_volume(vertices, faces)
     if not watertight:
         solid = ~_slivers(vertices, faces)
         faces, owner = faces[solid], owner[solid]
@@ -165,14 +156,14 @@ def clean_shape(path: Path, pieces: list[_Piece]) -> tuple[Shape, list[str]]:
 
 def _unify_winding(vertices: Array, faces: Indices, owner: Indices, point: Indices) -> tuple[Indices, Indices, Bodies]:
     """Faces wound consistently and outwards, without the second side of sheets; their owners; and their bodies."""
-    twins = find_repeated(point[faces], oriented=False)
+    twins = topology.find_repeated(point[faces], oriented=False)
     if twins.any():
-        bodies = find_bodies(vertices, faces, point[faces])
-        sheet = ~bodies.closed | (np.abs(bodies.volume) < thin_volume(vertices, faces))
+        bodies = topology.find_bodies(vertices, faces, point[faces])
+        sheet = ~bodies.closed | (np.abs(bodies.volume) < topology.thin_volume(vertices, faces))
         drop = twins & sheet[bodies.body]
         faces, owner = faces[~drop], owner[~drop]
-    faces = _flipped(faces, find_flips(point[faces]))
-    bodies = find_bodies(vertices, faces, point[faces])
+    faces = _flipped(faces, topology.find_flips(point[faces]))
+    bodies = topology.find_bodies(vertices, faces, point[faces])
     inwards = bodies.closed & (bodies.volume < 0) & ~_voids(vertices, faces, bodies)
     if inwards.any():
         faces = _flipped(faces, inwards[bodies.body])

@@ -1,7 +1,6 @@
 """Edge: loads an instance of a source of files as an asset: z up, metric, centred on its bounding box, weighed."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ from schemas.base import Array, frozen_array
 from schemas.errors import MeshError
 from schemas.job.assets import Assets, FolderSource, ShapeNetSource
 from schemas.scene.shape import Asset
-from workers.assets.categories import TABLE
+from workers.assets.builtin.make import TABLE
 from workers.assets.external.listing import Entry, check_unchanged, mesh_root
 from workers.assets.external.mesh import LoadedMesh, load_shape, transform_shape
 from workers.assets.external.urdf_file import load_urdf
@@ -23,19 +22,8 @@ UP_AXES: Mapping[str, Array] = {
     "z": np.eye(3),
 }
 """The rotation [3, 3] that takes a source's upward axis to z."""
-
-
 OBJECT_SCALE, TABLE_SCALE = 0.25, 1.5
 """The article's factors on ShapeNetCore's normalised units."""
-
-
-@dataclass(frozen=True, eq=False)
-class Placement:
-    """Source coordinates to the object frame: rotated by `axes` [3, 3], then times `scale` or to a diagonal in metres."""
-
-    axes: Array
-    scale: float
-    diagonal_m: float | None = None
 
 
 def load_entry(
@@ -48,30 +36,25 @@ def load_entry(
         loaded = load_urdf(path, assets.limits, folder)
     else:
         loaded = load_shape(path, assets.limits, mesh_root(settings, folder, path))
-    return place_asset(loaded, _placement(settings, category), entry, category, settings, assets)
-
-
-def _placement(settings: ShapeNetSource | FolderSource, category: str) -> Placement:
-    if isinstance(settings, ShapeNetSource):
-        return Placement(UP_AXES["y"], settings.scale or (TABLE_SCALE if category == TABLE else OBJECT_SCALE))
-    return Placement(UP_AXES[settings.up], settings.scale, None if category == TABLE else settings.diagonal_m)
+    return place_asset(loaded, entry, category, settings, assets)
 
 
 def place_asset(
-    loaded: LoadedMesh,
-    placement: Placement,
-    entry: Entry,
-    category: str,
-    settings: ShapeNetSource | FolderSource,
-    assets: Assets,
+    loaded: LoadedMesh, entry: Entry, category: str, settings: ShapeNetSource | FolderSource, assets: Assets
 ) -> Asset:
     """The asset of a cleaned shape in its source's frame; MeshError `no_size` where the shape has no extent."""
-    rotated = transform_shape(loaded.shape, pose(placement.axes, np.zeros(3)))
+    diagonal_m = None
+    if isinstance(settings, ShapeNetSource):
+        axes, scale = UP_AXES["y"], settings.scale or (TABLE_SCALE if category == TABLE else OBJECT_SCALE)
+    else:
+        axes, scale = UP_AXES[settings.up], settings.scale
+        diagonal_m = None if category == TABLE else settings.diagonal_m
+    rotated = transform_shape(loaded.shape, pose(axes, np.zeros(3)))
     lower, upper = rotated.bounds
     diagonal = float(np.linalg.norm(upper - lower))
     if diagonal == 0.0:
         raise MeshError("no_size", f"{entry.files[0].path} has no extent")
-    scale = placement.scale if placement.diagonal_m is None else placement.diagonal_m / diagonal
+    scale = scale if diagonal_m is None else diagonal_m / diagonal
     centre = 0.5 * (lower + upper) * scale
     shape = transform_shape(rotated, pose(scale * np.eye(3), -centre))
     mass = mass_properties(shape, assets.density_kg_m3, assets.shell_kg_m2)
@@ -84,7 +67,7 @@ def place_asset(
         sha256=entry.files[0].sha256,
         shape=shape,
         mass=mass,
-        T_source_to_object=frozen_array(pose(placement.axes, -centre)),
+        T_source_to_object=frozen_array(pose(axes, -centre)),
         scale=scale,
         watertight=mass.solid,
         volume_m3=mass.mass_kg / assets.density_kg_m3 if mass.solid else None,

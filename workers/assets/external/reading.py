@@ -10,7 +10,7 @@ import trimesh
 
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
-from workers.assets.external.caps import FolderResolver, check_counts, declared_counts, describe_error, may_be_too_large
+from workers.assets.external.caps import FolderResolver, check_counts, declared_counts, describe_error
 from workers.assets.external.glb_check import check_glb
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb")
@@ -65,7 +65,8 @@ def list_mesh_files(path: Path, root: Path, limits: MeshLimits) -> list[Path]:
     """
     data = read_bytes(path, limits)
     kind = path.suffix.lower()
-    if kind != ".glb" and may_be_too_large(data, limits):
+    # No format writes a vertex or a face in fewer than 8 bytes: a shorter file needs no counting.
+    if kind != ".glb" and len(data) > 8 * min(limits.max_vertices, limits.max_faces):
         check_counts(path, *declared_counts(kind, data), limits)
     resolver = FolderResolver(path, root, limits)
     names = material_files(data) if kind == ".obj" else _decode(_PLY_TEXTURE.findall(data)) if kind == ".ply" else []

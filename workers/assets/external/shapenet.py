@@ -5,7 +5,7 @@ from pathlib import Path
 
 from schemas.errors import AssetSourceError
 from schemas.job.assets import ShapeNetSource
-from workers.assets.categories import TABLE
+from workers.assets.builtin.make import TABLE
 from workers.assets.external.listing import describe_folder
 
 SYNSETS: dict[str, str] = {

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from workers.assets.builtin.bottle import BODY, CAP, LABEL, make_bottle
-from workers.assets.builtin.bottle_kinds import KINDS
+from workers.assets.builtin.bottle import BODY, CAP, KINDS, LABEL, make_bottle
 from workers.assets.builtin.make import make_model
 
 

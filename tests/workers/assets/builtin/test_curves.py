@@ -12,9 +12,11 @@ from workers.assets.builtin.curves import (
     half_circle_points,
     outward_normals,
     rounded_rectangle,
+    rounded_sections,
     spline,
     squircle,
 )
+from workers.assets.builtin.solid import circle
 
 
 def test_a_bezier_curve_goes_through_its_ends_along_its_handles_and_through_the_known_middle():
@@ -73,3 +75,10 @@ def test_a_rounded_rectangle_has_its_size_and_runs_counter_clockwise():
     assert outline.exterior.is_ccw
     assert outline.bounds == pytest.approx((-2, -1, 2, 1))
     assert outline.area == pytest.approx(8 - (4 - math.pi) * 0.25, rel=1e-3)
+
+
+def test_sections_turn_from_a_circle_into_an_outline():
+    sections = rounded_sections(squircle(16, 2), np.array([0.0, 0.25, 1.0]))
+    assert sections[0].tolist() == circle(16).tolist()
+    assert sections[2].tolist() == squircle(16, 2).tolist()
+    assert sections[1] == pytest.approx(0.75 * sections[0] + 0.25 * sections[2])

@@ -1,4 +1,4 @@
-"""Colours: in range, readable, repeatable."""
+"""Draws: picks and chances; colours in range, readable."""
 
 import numpy as np
 import pytest
@@ -28,3 +28,10 @@ def test_mixing_and_lightness_are_linear():
     assert palette.mix((0, 0, 0), (1, 1, 1), 0.25) == (0.25, 0.25, 0.25)
     assert palette.lightness((1, 1, 1)) == pytest.approx(1.0)
     assert palette.hsv(1 / 3, 1, 1) == pytest.approx((0, 1, 0))
+
+
+def test_picks_are_even_and_chances_are_what_they_say():
+    rng = np.random.default_rng(3)
+    picks = [palette.pick(rng, "abcd") for _ in range(4000)]
+    assert min(picks.count(c) for c in "abcd") > 850
+    assert sum(palette.chance(rng, 0.3) for _ in range(4000)) == pytest.approx(1200, abs=150)

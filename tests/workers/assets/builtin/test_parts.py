@@ -11,7 +11,7 @@ from workers.assets.builtin.parts import Surface, cut_into_parts, turns_about_z
 from workers.assets.builtin.solid import lathe, union
 from workers.assets.builtin.sweeps import bevelled_profile, prism
 
-PLAIN = Material()
+PLAIN, PICTURE = Material(), Material(texture=np.zeros((2, 2, 3), dtype=np.uint8))
 
 
 def cylinder(surface=(0, 1, 2), count=32):
@@ -19,7 +19,8 @@ def cylinder(surface=(0, 1, 2), count=32):
 
 
 def named(*wraps, **more):
-    return [Surface(f"s{k}", PLAIN, wrap, **more) for k, wrap in enumerate(wraps)]
+    pairs = [(PLAIN, "cylinder") if wrap == "none" else (PICTURE, wrap) for wrap in wraps]
+    return [Surface(f"s{k}", *pair, **more) for k, pair in enumerate(pairs)]
 
 
 def test_parts_share_the_very_same_points_so_that_together_they_are_closed():
@@ -44,7 +45,9 @@ def test_normals_of_a_wall_point_away_from_the_axis_and_of_a_lid_up():
 
 
 def test_a_cylinder_is_wrapped_once_with_a_seam_and_no_smear():
-    wall = cut_into_parts(cylinder(), named("none", "cylinder", "none", low=0.0, high=0.4), np.zeros(3), 1.0).parts[1]
+    wraps = named("none", "cylinder", "none", low=0.0, high=0.4)
+    base, wall, _ = cut_into_parts(cylinder(), wraps, np.zeros(3), 1.0).parts
+    assert base.uv is None  # its material has no texture
     assert wall.uv.min(axis=0) == pytest.approx([0, 0])
     assert wall.uv.max(axis=0) == pytest.approx([1, 1])
     across = wall.uv[wall.faces][:, :, 0]

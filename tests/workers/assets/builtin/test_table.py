@@ -1,10 +1,12 @@
-"""Tables: level, thick enough, and below every object that a job puts on them."""
+"""Tables: level, thick enough, below every object that a job puts on them, on bases from the ground to the top."""
 
 import numpy as np
 import pytest
 
 from tests.workers.assets.oracles import hits
 from workers.assets.builtin.make import make_model
+from workers.assets.builtin.solid import union
+from workers.assets.builtin.table import FRAME, LEG, TOP, TableSize, make_base
 
 
 @pytest.mark.parametrize("index", range(30))
@@ -24,3 +26,16 @@ def test_the_top_is_level_to_the_last_bit_of_the_right_thickness_and_under_every
     flat = solid.vertices[solid.vertices[:, 2] > top - 1e-6]
     assert len(flat) > 8
     assert set(flat[:, 2]) == {top}
+
+
+@pytest.mark.parametrize("round_top", [False, True])
+def test_a_stand_reaches_from_the_ground_into_the_top_and_stays_below_it(round_top):
+    plan = TableSize(1.2, 1.0, 0.03, 0.74, round_top)
+    for seed in range(30):
+        joined = union(make_base(np.random.default_rng(seed), plan))
+        assert joined.vertices[:, 2].min() == 0.0
+        assert plan.under < joined.vertices[:, 2].max() < plan.height
+        assert (np.abs(joined.vertices[:, 0]) <= 0.5 * plan.width).all(), seed
+        assert (np.abs(joined.vertices[:, 1]) <= 0.5 * plan.depth).all(), seed
+        assert set(joined.surface) <= {LEG, FRAME}
+        assert TOP not in joined.surface

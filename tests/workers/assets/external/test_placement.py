@@ -8,13 +8,16 @@ from schemas.job.assets import Assets, FolderSource
 from tests.workers.assets.oracles import shape_of, welded
 from workers.assets.external.listing import Entry, SourceFile
 from workers.assets.external.mesh import LoadedMesh
-from workers.assets.external.placement import UP_AXES, Placement, place_asset
+from workers.assets.external.placement import UP_AXES, place_asset
 
 
-def place(mesh, placement):
+def place(mesh, **placement):
     entry = Entry("id", (SourceFile("a.obj", 1, "0" * 64),), "MIT")
-    settings, assets = FolderSource(source="urdf", folder="."), Assets(density_kg_m3=600.0, shell_kg_m2=3.0)
-    return place_asset(LoadedMesh(shape_of(mesh), ()), placement, entry, "mug", settings, assets)
+    settings, assets = (
+        FolderSource(source="urdf", folder=".", **placement),
+        Assets(density_kg_m3=600.0, shell_kg_m2=3.0),
+    )
+    return place_asset(LoadedMesh(shape_of(mesh), ()), entry, "mug", settings, assets)
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z"])
@@ -27,7 +30,7 @@ def test_the_axis_that_points_up_becomes_z_by_a_turn(up):
 def test_an_asset_is_centred_and_its_matrix_takes_scaled_source_points_there():
     mesh = trimesh.creation.box((1, 2, 3))
     mesh.apply_translation((7, 8, 9))
-    asset = place(mesh, Placement(UP_AXES["y"], 0.1))
+    asset = place(mesh, up="y", scale=0.1)
     assert asset.shape.bounds == pytest.approx(np.array([[-0.05, -0.15, -0.1], [0.05, 0.15, 0.1]]))
     scaled = np.c_[0.1 * mesh.vertices, np.ones(8)]
     assert (asset.T_source_to_object @ scaled.T).T[:, :3] == pytest.approx(asset.shape.vertices, abs=1e-12)
@@ -37,7 +40,7 @@ def test_an_asset_is_centred_and_its_matrix_takes_scaled_source_points_there():
 
 
 def test_a_diagonal_wins_over_a_scale():
-    asset = place(trimesh.creation.box((3, 4, 12)), Placement(np.eye(3), 5.0, 0.26))
+    asset = place(trimesh.creation.box((3, 4, 12)), scale=5.0, diagonal_m=0.26)
     assert float(np.linalg.norm(asset.extents_m)) == pytest.approx(0.26, rel=1e-12)
     assert asset.scale == pytest.approx(0.02)
 
@@ -45,7 +48,7 @@ def test_a_diagonal_wins_over_a_scale():
 def test_an_open_mesh_has_no_volume_and_weighs_as_a_shell():
     mesh = trimesh.creation.box((1, 1, 1))
     mesh.update_faces(np.arange(12) > 1)
-    asset = place(mesh, Placement(np.eye(3), 1.0))
+    asset = place(mesh)
     assert not asset.watertight
     assert asset.volume_m3 is None
     assert asset.mass.mass_kg == pytest.approx(15.0)
