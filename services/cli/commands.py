@@ -12,7 +12,7 @@ from services.job.read import load_job
 
 if TYPE_CHECKING:
     from services.read.audit import Audit
-    from services.read.verify_independent import IndependentVerdict
+    from services.read.verify import IndependentVerdict
     from workers.store.store import Store
 
 Found = TypeVar("Found")
@@ -120,7 +120,7 @@ def verify(options: argparse.Namespace) -> int:
 
 
 def _verify_independently(store: "Store", count: int) -> "IndependentVerdict":
-    from services.read.verify_independent import describe_independent, verify_independently
+    from services.read.verify import describe_independent, verify_independently
 
     found = _with_progress(count, "independent", lambda progress: verify_independently(store, count, progress))
     print("\n".join(describe_independent(found)))

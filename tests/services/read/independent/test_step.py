@@ -19,7 +19,7 @@ import workers.labels.patches
 import workers.render.step
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.scene.camera import Camera, Intrinsics
-from services.read.verify_independent import describe_independent, verify_independently
+from services.read.verify import describe_independent, verify_independently
 from tests.datasets import faults_of, make_dataset
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.pipeline.fingerprint import take_fingerprint
@@ -238,9 +238,9 @@ def u_and_v_swapped_in_objects(plant: Plant, _: Any) -> None:
         (box_without_its_last_column, "bbox_xywh is"),
         (rounded_image_coordinates, "is not the pixel of the object's origin"),
         (patch_a_pixel_too_far_left, "is not the crop about"),
-        (transposed_poses_in_camposes, "camPoses.csv: the line of pose"),
-        (cx_and_cy_swapped_in_cameras, "cameras.csv: cx, cy of pose"),
-        (u_and_v_swapped_in_objects, "objects.dat: the line of pose"),
+        (transposed_poses_in_camposes, "camPoses.csv: T01, T02, T03, "),
+        (cx_and_cy_swapped_in_cameras, "cameras.csv: cx, cy in the line of pose_id"),
+        (u_and_v_swapped_in_objects, "objects.dat: u, v in the line of pose_id"),
     ],
 )
 def test_a_wrong_formula_passes_plain_verify_and_not_the_second_derivation(
