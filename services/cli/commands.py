@@ -5,14 +5,14 @@ import dataclasses
 import json
 import sys
 from collections.abc import Callable
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from services.job.read import load_job
 
 if TYPE_CHECKING:
-    from services.read.audit import Audit
-    from services.read.verify import IndependentVerdict
     from workers.store.store import Store
 
 Found = TypeVar("Found")
@@ -48,10 +48,8 @@ def run(options: argparse.Namespace) -> int:
             f'`verso query {out} "select reason, count(*) from failures group by reason"` says why',
             file=sys.stderr,
         )
-    _answer(
-        options,
-        {"ok": complete, "out": out, "digest": merged.digest, "scenes": merged.scenes, "seconds": result.seconds},
-    )
+    answer = {"out": out, "digest": merged.digest, "scenes": merged.scenes, "seconds": result.seconds}
+    _answer(options, {"ok": complete, **answer})
     return 0 if complete else 1
 
 
@@ -98,11 +96,12 @@ def status(options: argparse.Namespace) -> int:
 def verify(options: argparse.Namespace) -> int:
     """`verso verify`."""
     from services.job.record import require_job
+    from services.read.audit import audit, describe_audit
+    from services.read.verify import describe_independent, verify_independently
     from services.read.verify import verify as read_back
 
     store = _dataset(options.out)
-    scenes = require_job(store).job.scenes
-    verdict = _with_progress(scenes, "verify", lambda progress: read_back(store, progress))
+    verdict = _with_progress(require_job(store).job.scenes, "verify", partial(read_back, store))
     for fault in verdict.faults:
         print(fault)
     print(
@@ -110,40 +109,26 @@ def verify(options: argparse.Namespace) -> int:
         f"{verdict.pairs} pairs derived again: {len(verdict.faults) or 'nothing'} off"
     )
     answer, faults = dataclasses.asdict(verdict), list(verdict.faults)
-    for name, check in (("independent", _verify_independently), ("audit", _audit)):
+    checks: tuple[tuple[str, Callable, Callable], ...] = (
+        ("independent", verify_independently, describe_independent),
+        ("audit", audit, describe_audit),
+    )
+    for name, check, describe in checks:
         if count := getattr(options, name):
-            found = check(store, count)
+            found = _with_progress(count, name, partial(check, store, count))
+            print("\n".join(describe(found)))
             faults += found.faults
             answer[name] = dataclasses.asdict(found)
     _answer(options, {"ok": not faults, **answer})
     return 1 if faults else 0
 
 
-def _verify_independently(store: "Store", count: int) -> "IndependentVerdict":
-    from services.read.verify import describe_independent, verify_independently
-
-    found = _with_progress(count, "independent", lambda progress: verify_independently(store, count, progress))
-    print("\n".join(describe_independent(found)))
-    return found
-
-
-def _audit(store: "Store", count: int) -> "Audit":
-    from services.read.audit import audit, describe_audit
-
-    found = _with_progress(count, "audit", lambda progress: audit(store, count, progress))
-    print("\n".join(describe_audit(found)))
-    return found
-
-
 def _with_progress(scenes: int, what: str, work: Callable[[Callable[[Any], None]], Found]) -> Found:
     """The result of `work`, which reports how many scenes are done and what is off as it goes."""
     from services.run.progress import ProgressLine
 
-    line = ProgressLine(scenes, what)
-    try:
+    with closing(ProgressLine(scenes, what)) as line:
         return work(lambda now: line.show(now.scenes, len(now.faults)))
-    finally:
-        line.close()
 
 
 def query(options: argparse.Namespace) -> int:
