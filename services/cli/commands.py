@@ -37,17 +37,13 @@ def run(options: argparse.Namespace) -> int:
     rate = f", {result.made_now / result.seconds:.1f} scenes/s" if result.made_now else ""
     print(f"{out}: {made} scenes made, {failed} failed, in {result.seconds:.1f} s{rate}")
     print(f"dataset digest {merged.digest}")
-    if merged.scenes["environmental"]:
-        print(
-            f"verso: {merged.scenes['environmental']} scenes failed for environmental reasons: try again with --retry-failed",
-            file=sys.stderr,
-        )
+    if again := merged.scenes["environmental"]:
+        told = f"{again} scenes failed for environmental reasons: try again with --retry-failed"
+        print(f"verso: {told}", file=sys.stderr)
     elif not complete:
-        print(
-            f"verso: {share:.1%} of the scenes failed, run.max_failure_share is {job.run.max_failure_share:.1%}: "
-            f'`verso query {out} "select reason, count(*) from failures group by reason"` says why',
-            file=sys.stderr,
-        )
+        told = f"{share:.1%} of the scenes failed, run.max_failure_share is {job.run.max_failure_share:.1%}"
+        asks = f'verso query {out} "select reason, count(*) from failures group by reason"'
+        print(f"verso: {told}: `{asks}` says why", file=sys.stderr)
     answer = {"out": out, "digest": merged.digest, "scenes": merged.scenes, "seconds": result.seconds}
     _answer(options, {"ok": complete, **answer})
     return 0 if complete else 1
@@ -55,12 +51,8 @@ def run(options: argparse.Namespace) -> int:
 
 def _changes(options: argparse.Namespace) -> list[str]:
     """`key=value` of the options that set a key of the job, then those of --set."""
-    named = {
-        "scenes": options.scenes,
-        "first_scene": options.first_scene,
-        "run.workers": options.workers,
-        "run.shard_size": options.shard_size,
-    }
+    named = {"scenes": options.scenes, "first_scene": options.first_scene}
+    named |= {"run.workers": options.workers, "run.shard_size": options.shard_size}
     return [f"{key}={value}" for key, value in named.items() if value is not None] + options.changes
 
 
@@ -150,9 +142,8 @@ def replay(options: argparse.Namespace) -> int:
     for difference in result.differences:
         print(difference)
     how = "to the byte" if result.same_stack else "within tolerances, because this stack is not the one that made it"
-    print(
-        f"scene {options.scene}: {result.compared} files and tables compared {how}: {len(result.differences) or 'none'} differ"
-    )
+    differ = f"{len(result.differences) or 'none'} differ"
+    print(f"scene {options.scene}: {result.compared} files and tables compared {how}: {differ}")
     _answer(options, {"ok": not result.differences, **dataclasses.asdict(result)})
     return 1 if result.differences else 0
 

@@ -44,8 +44,8 @@ def export_scene(store: Store, scene_id: int, target: Path) -> int:
     scene = trimesh.Scene()
     for name, region_id, shape in placed:
         for number, part in enumerate(shape.parts):
-            label, look = f"{name}/{number}-{part.name}", {"vertex_normals": part.normals, "visual": _visual(part)}
-            mesh = trimesh.Trimesh(part.vertices, part.faces, process=False, **look)
+            label, look = f"{name}/{number}-{part.name}", _visual(part)
+            mesh = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=look, process=False)
             scene.add_geometry(mesh, geom_name=label, node_name=label, transform=T_world[region_id])
     data: bytes = scene.export(file_type="glb")
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -3,9 +3,10 @@
 import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 from schemas.dataset.codec import Row
-from schemas.dataset.layout import ASSETS, MANIFEST, stored_roles
+from schemas.dataset.layout import ASSETS, MANIFEST, is_shape, stored_roles
 from schemas.errors import CorruptError
 from schemas.job.job import Job
 from services.job.record import require_job
@@ -43,21 +44,17 @@ def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
     record = require_job(store)
     verdict = Verdict()
     known: set[str] = set()
-    for stored in _ranges(store, verdict):
-        digests: dict[str, str] = {}
-        faults = _check_scenes(_hashing_reader(store, digests, verdict), stored, record.job, verdict)
-        verdict.faults += [*_check_files(store, stored, digests, known, verdict), *faults]
-        progress(verdict)
+    try:
+        for stored in iter_stored(store):
+            digests: dict[str, str] = {}
+            faults = _check_scenes(_hashing_reader(store, digests, verdict), stored, record.job, verdict)
+            verdict.faults += [*_check_files(store, stored, digests, known, verdict), *faults]
+            progress(verdict)
+    except CorruptError as error:
+        verdict.faults.append(str(error))
     _check_merged(store, verdict)
     _find_strays(store, known, verdict)
     return verdict
-
-
-def _ranges(store: Store, verdict: Verdict) -> Iterator[StoredRange]:
-    try:
-        yield from iter_stored(store)
-    except CorruptError as error:
-        verdict.faults.append(str(error))
 
 
 def _hashing_reader(store: Store, digests: dict[str, str], verdict: Verdict) -> ReadFile:
@@ -79,7 +76,7 @@ def _check_files(
     """Files of the range's records that are missing or differ from their SHA-256. Reads those without a digest yet."""
     faults, read = [], _hashing_reader(store, digests, verdict)
     for entry in (entry for record in stored.records for entry in record.files):
-        if entry.path in known and entry.path.startswith(f"{ASSETS}/"):
+        if entry.path in known and is_shape(entry.path):
             continue
         known.add(entry.path)
         try:
@@ -98,7 +95,7 @@ def _check_scenes(read_file: ReadFile, stored: StoredRange, job: Job, verdict: V
     made = {row["scene_id"]: row for row in stored.rows["scenes"]}
     ended = sorted([*made, *(row["scene_id"] for row in stored.rows["failures"])])
     verdict.scenes += len(ended)
-    faults = []
+    faults, roles = [], stored_roles(job)
     if ended != list(range(stored.start, stored.stop)):
         faults.append(f"scenes {stored.start} to {stored.stop - 1}: some are missing, or both made and failed")
     try:
@@ -108,20 +105,15 @@ def _check_scenes(read_file: ReadFile, stored: StoredRange, job: Job, verdict: V
     for scene_id, scene in made.items():
         faults += check_stored_scene(scene)
         for views, objects in stored.pairs(scene_id):
-            faults += _check_pair(job, read, (scene, views, objects))
             verdict.pairs += 1
+            if set(views) != set(roles):
+                faults.append(f"scene {scene_id}: has views {sorted(views)}, and must have {sorted(roles)}")
+                continue
+            try:
+                faults += check_stored_pair(job, views, objects, scene, partial(read_image, read))
+            except (CorruptError, ValueError) as error:
+                faults.append(str(error))
     return faults
-
-
-def _check_pair(job: Job, read: ReadFile, rows: tuple[Row, dict[str, Row], list[Row]]) -> list[str]:
-    scene, views, objects = rows
-    roles = stored_roles(job)
-    if set(views) != set(roles):
-        return [f"scene {scene['scene_id']}: has views {sorted(views)}, and must have {sorted(roles)}"]
-    try:
-        return check_stored_pair(job, views, objects, scene, lambda path: read_image(read, path))
-    except (CorruptError, ValueError) as error:
-        return [str(error)]
 
 
 def _check_merged(store: Store, verdict: Verdict) -> None:
