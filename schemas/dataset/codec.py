@@ -14,10 +14,11 @@ from schemas.scene.view import ObjectLabel
 
 Row = dict[str, Any]
 
-LARGEST = ("penetration_mm", "hover_gap_mm", "residual_speed_mm_s", "equilibrium_residual")
-"""Columns of `scenes` that are the largest of its bodies'."""
-LARGEST_KNOWN = ("recheck_move_mm", "recheck_turn_deg")
-"""The same, where a body that was not released again has none."""
+LARGEST = (
+    *("penetration_mm", "hover_gap_mm", "residual_speed_mm_s", "equilibrium_residual"),
+    *("recheck_move_mm", "recheck_turn_deg"),
+)
+"""Columns of `scenes` that are the largest of its bodies'; a body that was not released again has no recheck."""
 SMALLEST = ("support_margin_mm",)
 FIRST = ("category", "instance_id", "source", "object_scale", "T_world_obj", "redraws")
 """Columns of `scenes` that are those of its first body."""
@@ -69,19 +70,17 @@ def body_columns(start: ObjectStart, rest: Settled) -> Row:
         "object_scale": start.asset.scale,
         "T_world_obj": matrix_column(rest.T_world_obj),
         "redraws": start.redraws,
-        **{name: getattr(rest, name) for name in (*LARGEST, *LARGEST_KNOWN, *SMALLEST)},
+        **{name: getattr(rest, name) for name in (*LARGEST, *SMALLEST)},
     }
 
 
 def columns_of_bodies(bodies: Sequence[Mapping[str, Any]]) -> Row:
     """The columns of `scenes` that follow from its bodies: those of the first, and of the figures the worst of all."""
+    known = {name: [body[name] for body in bodies if body[name] is not None] for name in (*LARGEST, *SMALLEST)}
     return {
         **{name: bodies[0][name] for name in FIRST},
-        **{name: max(body[name] for body in bodies) for name in LARGEST},
-        **{
-            name: max((body[name] for body in bodies if body[name] is not None), default=None) for name in LARGEST_KNOWN
-        },
-        **{name: min(body[name] for body in bodies) for name in SMALLEST},
+        **{name: max(known[name], default=None) for name in LARGEST},
+        **{name: min(known[name]) for name in SMALLEST},
     }
 
 

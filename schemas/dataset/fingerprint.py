@@ -27,9 +27,7 @@ class Fingerprint(Frozen):
     def differences(self, other: "Fingerprint") -> list[str]:
         """One line for each difference, `name: mine, theirs`."""
         mine, theirs = self.model_dump(), other.model_dump()
-        lines = [
-            f"{key}: {mine[key]}, {theirs[key]}" for key in mine if key != "libraries" and mine[key] != theirs[key]
-        ]
-        names = sorted(set(self.libraries) | set(other.libraries))
-        pairs = [(name, self.libraries.get(name, "absent"), other.libraries.get(name, "absent")) for name in names]
-        return lines + [f"{name}: {a}, {b}" for name, a, b in pairs if a != b]
+        a, b = mine.pop("libraries"), theirs.pop("libraries")
+        pairs = [(key, mine[key], theirs[key]) for key in mine]
+        pairs += [(name, a.get(name, "absent"), b.get(name, "absent")) for name in sorted({*a, *b})]
+        return [f"{name}: {ours}, {other}" for name, ours, other in pairs if ours != other]

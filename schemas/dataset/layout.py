@@ -51,19 +51,13 @@ class Image:
     pixels: PixelKind
 
 
-IMAGES: tuple[Image, ...] = (
-    Image("RGB", "input", "rgb"),
-    Image("depth", "input", "depth"),
-    Image("segment", "input", "region"),
-    Image("RGBaligned", "aligned", "rgb"),
-    Image("depthAligned", "aligned", "depth"),
-    Image("segmentAligned", "aligned", "region"),
-    Image("RGB", "mirror", "rgb"),
-    Image("depth", "mirror", "depth"),
-    Image("segment", "mirror", "region"),
-    Image("RGBprojected", "projected", "rgb"),
-    Image("depthProjected", "projected", "depth"),
-)
+_CONTENTS: dict[Role, dict[PixelKind, Content]] = {
+    "input": {"rgb": "RGB", "depth": "depth", "region": "segment"},
+    "aligned": {"rgb": "RGBaligned", "depth": "depthAligned", "region": "segmentAligned"},
+    "mirror": {"rgb": "RGB", "depth": "depth", "region": "segment"},
+    "projected": {"rgb": "RGBprojected", "depth": "depthProjected"},
+}
+IMAGES = tuple(Image(word, role, kind) for role, words in _CONTENTS.items() for kind, word in words.items())
 """(a)-(k) of the article's figure 1; each also has a patch of every object, (l)-(u)."""
 
 
@@ -140,7 +134,7 @@ def commit_path(start: int, retry: int = 0) -> str:
 def parse_commit_path(key: str) -> tuple[int, int] | None:
     """(start, retry) of a commit record's key, None where it is no such key."""
     match = re.fullmatch(rf"{COMMITS}/(\d+)(?:\.retry-(\d+))?\.json", key)
-    found = (int(match[1]), int(match[2] or 0)) if match else None
+    found = match and (int(match[1]), int(match[2] or 0))
     return found if found and commit_path(*found) == key else None
 
 

@@ -8,161 +8,113 @@ TABLES = ("scenes", "views", "objects", "assets", "failures", "timings")
 DETERMINISTIC_TABLES = ("scenes", "views", "objects", "assets", "failures")
 """Tables that are a function of job and seed: their canonical rows are in the dataset digest."""
 
-_matrix = pa.list_(pa.field("item", pa.float64(), nullable=False), 16)
-"""Row-major 4 x 4."""
+_i64, _f64, _str, _bool = pa.int64(), pa.float64(), pa.string(), pa.bool_()
 
-_file = pa.struct(
-    [pa.field("path", pa.string(), False), pa.field("bytes", pa.int64(), False), pa.field("sha256", pa.string(), False)]
-)
-_skip = pa.struct([pa.field("effect", pa.string(), False), pa.field("why", pa.string(), False)])
+
+def _columns(kind: pa.DataType, *names: str, nullable: bool = False) -> list[pa.Field]:
+    return [pa.field(name, kind, nullable) for name in names]
+
+
+def _array(kind: pa.DataType, length: int) -> pa.DataType:
+    return pa.list_(pa.field("item", kind, nullable=False), length)
+
+
+_matrix = _array(_f64, 16)
+"""Row-major 4 x 4."""
+_file = pa.struct([*_columns(_str, "path"), *_columns(_i64, "bytes"), *_columns(_str, "sha256")])
+_skip = pa.struct(_columns(_str, "effect", "why"))
+_rest = [
+    *_columns(_f64, "penetration_mm", "hover_gap_mm", "support_margin_mm", "residual_speed_mm_s"),
+    *_columns(_f64, "recheck_move_mm", "recheck_turn_deg", nullable=True),
+    *_columns(_f64, "equilibrium_residual"),
+]
+"""Quality of rest: of one object, or of the worst of a scene."""
 _body = pa.struct(
     [
-        pa.field("region_id", pa.int64(), False),
-        pa.field("category", pa.string(), False),
-        pa.field("instance_id", pa.string(), False),
-        pa.field("source", pa.string(), False),
-        pa.field("object_scale", pa.float64(), False),
-        pa.field("T_world_obj", _matrix, False),
-        pa.field("redraws", pa.int64(), False),
-        pa.field("penetration_mm", pa.float64(), False),
-        pa.field("hover_gap_mm", pa.float64(), False),
-        pa.field("support_margin_mm", pa.float64(), False),
-        pa.field("residual_speed_mm_s", pa.float64(), False),
-        pa.field("recheck_move_mm", pa.float64(), True),
-        pa.field("recheck_turn_deg", pa.float64(), True),
-        pa.field("equilibrium_residual", pa.float64(), False),
+        *_columns(_i64, "region_id"),
+        *_columns(_str, "category", "instance_id", "source"),
+        *_columns(_f64, "object_scale"),
+        *_columns(_matrix, "T_world_obj"),
+        *_columns(_i64, "redraws"),
+        *_rest,
     ]
 )
 """One object of a scene; the columns of `scenes` itself follow from these (codec.columns_of_bodies)."""
-_agreement = pa.struct([pa.field("median_mm", pa.float64(), False), pa.field("share", pa.float64(), False)])
+_agreement = pa.struct(_columns(_f64, "median_mm", "share"))
 """Input depth carried into the mirror view, compared with mirror depth: median difference, share within the bound."""
-_seconds = pa.struct([pa.field("name", pa.string(), False), pa.field("seconds", pa.float64(), False)])
+_seconds = pa.list_(pa.struct([*_columns(_str, "name"), *_columns(_f64, "seconds")]))
 
-
-def _schema(name: str, fields: list[tuple[str, pa.DataType, bool]]) -> pa.Schema:
-    meta = {b"verso_table": name.encode(), b"schema_version": str(SCHEMA_VERSION).encode()}
-    return pa.schema([pa.field(n, t, nullable) for n, t, nullable in fields], metadata=meta)
-
-
-_i64, _f64, _str, _bool = pa.int64(), pa.float64(), pa.string(), pa.bool_()
+_COLUMNS: dict[str, list[pa.Field]] = {
+    "scenes": [
+        *_columns(_i64, "scene_id"),
+        *_columns(_str, "category", "instance_id", "source", "table_id"),
+        *_columns(_f64, "object_scale"),
+        *_columns(_matrix, "T_world_obj", "T_world_table"),
+        *_columns(_str, "pose"),
+        *_columns(_i64, "redraws"),
+        *_columns(pa.list_(_str), "effects"),
+        *_columns(pa.list_(_skip), "skipped"),
+        *_rest,
+        *_columns(_f64, "settle_s"),
+        *_columns(_bool, "raycast_checked"),
+        *_columns(_str, "settings_digest"),
+        *_columns(pa.list_(_body), "bodies", nullable=True),
+    ],
+    "views": [
+        *_columns(_i64, "pose_id", "parent_id"),
+        *_columns(_str, "role"),
+        *_columns(_i64, "scene_id"),
+        *_columns(_str, "category"),
+        *_columns(_matrix, "T_world_cam"),
+        *_columns(_f64, "inclination_rad", "yaw_rad"),
+        *_columns(_i64, "width", "height"),
+        *_columns(_f64, "fx", "fy", "cx", "cy", "cx_opencv", "cy_opencv", "depth_units_per_m", "d_z_m"),
+        *_columns(pa.list_(_file), "files"),
+        *_columns(_i64, "object_pixels", nullable=True),
+        *_columns(_f64, "visible_fraction", nullable=True),
+        *_columns(_agreement, "mirror_agreement", nullable=True),
+        *_columns(_f64, "projected_filled_share", "projected_hidden_share", "patch_object_fraction", nullable=True),
+    ],
+    "objects": [
+        *_columns(_i64, "pose_id"),
+        *_columns(_str, "role"),
+        *_columns(_i64, "region_id", "scene_id"),
+        *_columns(_str, "category", "instance_id"),
+        *_columns(_i64, "u", "v"),
+        *_columns(_matrix, "T_cam_obj"),
+        *_columns(_array(_i64, 4), "bbox_xywh"),
+        *_columns(_i64, "pixels"),
+        *_columns(_f64, "visible_fraction"),
+        *_columns(_f64, "patch_object_fraction", nullable=True),
+    ],
+    "assets": [
+        *_columns(_str, "instance_id", "category", "source", "licence"),
+        *_columns(_str, "path", nullable=True),
+        *_columns(_str, "sha256"),
+        *_columns(_array(_f64, 3), "extents_m"),
+        *_columns(_f64, "volume_m3", nullable=True),
+        *_columns(_bool, "watertight"),
+        *_columns(_matrix, "T_source_to_object"),
+        *_columns(_f64, "scale"),
+        *_columns(_str, "split"),
+        *_columns(pa.list_(_str), "notes", nullable=True),
+    ],
+    "failures": [
+        *_columns(_i64, "scene_id"),
+        *_columns(_str, "category", "stage", "kind", "reason", "detail"),
+        *_columns(_i64, "attempts"),
+    ],
+    "timings": [
+        *_columns(_i64, "scene_id"),
+        *_columns(_str, "category"),
+        *_columns(_seconds, "stages", "effects"),
+        *_columns(_f64, "total_s"),
+    ],
+}
 
 SCHEMAS: dict[str, pa.Schema] = {
-    "scenes": _schema(
-        "scenes",
-        [
-            ("scene_id", _i64, False),
-            ("category", _str, False),
-            ("instance_id", _str, False),
-            ("source", _str, False),
-            ("table_id", _str, False),
-            ("object_scale", _f64, False),
-            ("T_world_obj", _matrix, False),
-            ("T_world_table", _matrix, False),
-            ("pose", _str, False),
-            ("redraws", _i64, False),
-            ("effects", pa.list_(_str), False),
-            ("skipped", pa.list_(_skip), False),
-            ("penetration_mm", _f64, False),
-            ("hover_gap_mm", _f64, False),
-            ("support_margin_mm", _f64, False),
-            ("residual_speed_mm_s", _f64, False),
-            ("recheck_move_mm", _f64, True),
-            ("recheck_turn_deg", _f64, True),
-            ("equilibrium_residual", _f64, False),
-            ("settle_s", _f64, False),
-            ("raycast_checked", _bool, False),
-            ("settings_digest", _str, False),
-            ("bodies", pa.list_(_body), True),
-        ],
-    ),
-    "views": _schema(
-        "views",
-        [
-            ("pose_id", _i64, False),
-            ("parent_id", _i64, False),
-            ("role", _str, False),
-            ("scene_id", _i64, False),
-            ("category", _str, False),
-            ("T_world_cam", _matrix, False),
-            ("inclination_rad", _f64, False),
-            ("yaw_rad", _f64, False),
-            ("width", _i64, False),
-            ("height", _i64, False),
-            ("fx", _f64, False),
-            ("fy", _f64, False),
-            ("cx", _f64, False),
-            ("cy", _f64, False),
-            ("cx_opencv", _f64, False),
-            ("cy_opencv", _f64, False),
-            ("depth_units_per_m", _f64, False),
-            ("d_z_m", _f64, False),
-            ("files", pa.list_(_file), False),
-            ("object_pixels", _i64, True),
-            ("visible_fraction", _f64, True),
-            ("mirror_agreement", _agreement, True),
-            ("projected_filled_share", _f64, True),
-            ("projected_hidden_share", _f64, True),
-            ("patch_object_fraction", _f64, True),
-        ],
-    ),
-    "objects": _schema(
-        "objects",
-        [
-            ("pose_id", _i64, False),
-            ("role", _str, False),
-            ("region_id", _i64, False),
-            ("scene_id", _i64, False),
-            ("category", _str, False),
-            ("instance_id", _str, False),
-            ("u", _i64, False),
-            ("v", _i64, False),
-            ("T_cam_obj", _matrix, False),
-            ("bbox_xywh", pa.list_(pa.field("item", _i64, nullable=False), 4), False),
-            ("pixels", _i64, False),
-            ("visible_fraction", _f64, False),
-            ("patch_object_fraction", _f64, True),
-        ],
-    ),
-    "assets": _schema(
-        "assets",
-        [
-            ("instance_id", _str, False),
-            ("category", _str, False),
-            ("source", _str, False),
-            ("licence", _str, False),
-            ("path", _str, True),
-            ("sha256", _str, False),
-            ("extents_m", pa.list_(pa.field("item", _f64, nullable=False), 3), False),
-            ("volume_m3", _f64, True),
-            ("watertight", _bool, False),
-            ("T_source_to_object", _matrix, False),
-            ("scale", _f64, False),
-            ("split", _str, False),
-            ("notes", pa.list_(_str), True),
-        ],
-    ),
-    "failures": _schema(
-        "failures",
-        [
-            ("scene_id", _i64, False),
-            ("category", _str, False),
-            ("stage", _str, False),
-            ("kind", _str, False),
-            ("reason", _str, False),
-            ("detail", _str, False),
-            ("attempts", _i64, False),
-        ],
-    ),
-    "timings": _schema(
-        "timings",
-        [
-            ("scene_id", _i64, False),
-            ("category", _str, False),
-            ("stages", pa.list_(_seconds), False),
-            ("effects", pa.list_(_seconds), False),
-            ("total_s", _f64, False),
-        ],
-    ),
+    table: pa.schema(columns, {b"verso_table": table.encode(), b"schema_version": str(SCHEMA_VERSION).encode()})
+    for table, columns in _COLUMNS.items()
 }
 
 SORT_KEYS: dict[str, tuple[str, ...]] = {

@@ -80,9 +80,8 @@ class Shape:
     def faces(self) -> NDArray[np.int32]:
         """[F, 3] int32 into `vertices`."""
         starts = np.cumsum([0] + [len(part.vertices) for part in self.parts[:-1]])
-        return np.concatenate([part.faces + start for part, start in zip(self.parts, starts, strict=True)]).astype(
-            np.int32
-        )
+        faces = [part.faces + start for part, start in zip(self.parts, starts, strict=True)]
+        return np.concatenate(faces, dtype=np.int32, casting="same_kind")
 
     @property
     def mesh(self) -> Mesh:

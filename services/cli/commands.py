@@ -5,14 +5,14 @@ import dataclasses
 import json
 import sys
 from collections.abc import Callable
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from services.job.read import load_job
 
 if TYPE_CHECKING:
-    from services.read.audit import Audit
-    from services.read.verify_independent import IndependentVerdict
     from workers.store.store import Store
 
 Found = TypeVar("Found")
@@ -37,32 +37,22 @@ def run(options: argparse.Namespace) -> int:
     rate = f", {result.made_now / result.seconds:.1f} scenes/s" if result.made_now else ""
     print(f"{out}: {made} scenes made, {failed} failed, in {result.seconds:.1f} s{rate}")
     print(f"dataset digest {merged.digest}")
-    if merged.scenes["environmental"]:
-        print(
-            f"verso: {merged.scenes['environmental']} scenes failed for environmental reasons: try again with --retry-failed",
-            file=sys.stderr,
-        )
+    if again := merged.scenes["environmental"]:
+        told = f"{again} scenes failed for environmental reasons: try again with --retry-failed"
+        print(f"verso: {told}", file=sys.stderr)
     elif not complete:
-        print(
-            f"verso: {share:.1%} of the scenes failed, run.max_failure_share is {job.run.max_failure_share:.1%}: "
-            f'`verso query {out} "select reason, count(*) from failures group by reason"` says why',
-            file=sys.stderr,
-        )
-    _answer(
-        options,
-        {"ok": complete, "out": out, "digest": merged.digest, "scenes": merged.scenes, "seconds": result.seconds},
-    )
+        told = f"{share:.1%} of the scenes failed, run.max_failure_share is {job.run.max_failure_share:.1%}"
+        asks = f'verso query {out} "select reason, count(*) from failures group by reason"'
+        print(f"verso: {told}: `{asks}` says why", file=sys.stderr)
+    answer = {"out": out, "digest": merged.digest, "scenes": merged.scenes, "seconds": result.seconds}
+    _answer(options, {"ok": complete, **answer})
     return 0 if complete else 1
 
 
 def _changes(options: argparse.Namespace) -> list[str]:
     """`key=value` of the options that set a key of the job, then those of --set."""
-    named = {
-        "scenes": options.scenes,
-        "first_scene": options.first_scene,
-        "run.workers": options.workers,
-        "run.shard_size": options.shard_size,
-    }
+    named = {"scenes": options.scenes, "first_scene": options.first_scene}
+    named |= {"run.workers": options.workers, "run.shard_size": options.shard_size}
     return [f"{key}={value}" for key, value in named.items() if value is not None] + options.changes
 
 
@@ -98,11 +88,12 @@ def status(options: argparse.Namespace) -> int:
 def verify(options: argparse.Namespace) -> int:
     """`verso verify`."""
     from services.job.record import require_job
+    from services.read.audit import audit, describe_audit
+    from services.read.verify import describe_independent, verify_independently
     from services.read.verify import verify as read_back
 
     store = _dataset(options.out)
-    scenes = require_job(store).job.scenes
-    verdict = _with_progress(scenes, "verify", lambda progress: read_back(store, progress))
+    verdict = _with_progress(require_job(store).job.scenes, "verify", partial(read_back, store))
     for fault in verdict.faults:
         print(fault)
     print(
@@ -110,40 +101,26 @@ def verify(options: argparse.Namespace) -> int:
         f"{verdict.pairs} pairs derived again: {len(verdict.faults) or 'nothing'} off"
     )
     answer, faults = dataclasses.asdict(verdict), list(verdict.faults)
-    for name, check in (("independent", _verify_independently), ("audit", _audit)):
+    checks: tuple[tuple[str, Callable, Callable], ...] = (
+        ("independent", verify_independently, describe_independent),
+        ("audit", audit, describe_audit),
+    )
+    for name, check, describe in checks:
         if count := getattr(options, name):
-            found = check(store, count)
+            found = _with_progress(count, name, partial(check, store, count))
+            print("\n".join(describe(found)))
             faults += found.faults
             answer[name] = dataclasses.asdict(found)
     _answer(options, {"ok": not faults, **answer})
     return 1 if faults else 0
 
 
-def _verify_independently(store: "Store", count: int) -> "IndependentVerdict":
-    from services.read.verify_independent import describe_independent, verify_independently
-
-    found = _with_progress(count, "independent", lambda progress: verify_independently(store, count, progress))
-    print("\n".join(describe_independent(found)))
-    return found
-
-
-def _audit(store: "Store", count: int) -> "Audit":
-    from services.read.audit import audit, describe_audit
-
-    found = _with_progress(count, "audit", lambda progress: audit(store, count, progress))
-    print("\n".join(describe_audit(found)))
-    return found
-
-
 def _with_progress(scenes: int, what: str, work: Callable[[Callable[[Any], None]], Found]) -> Found:
     """The result of `work`, which reports how many scenes are done and what is off as it goes."""
     from services.run.progress import ProgressLine
 
-    line = ProgressLine(scenes, what)
-    try:
+    with closing(ProgressLine(scenes, what)) as line:
         return work(lambda now: line.show(now.scenes, len(now.faults)))
-    finally:
-        line.close()
 
 
 def query(options: argparse.Namespace) -> int:
@@ -165,9 +142,8 @@ def replay(options: argparse.Namespace) -> int:
     for difference in result.differences:
         print(difference)
     how = "to the byte" if result.same_stack else "within tolerances, because this stack is not the one that made it"
-    print(
-        f"scene {options.scene}: {result.compared} files and tables compared {how}: {len(result.differences) or 'none'} differ"
-    )
+    differ = f"{len(result.differences) or 'none'} differ"
+    print(f"scene {options.scene}: {result.compared} files and tables compared {how}: {differ}")
     _answer(options, {"ok": not result.differences, **dataclasses.asdict(result)})
     return 1 if result.differences else 0
 

@@ -14,12 +14,6 @@ from pathlib import Path
 from schemas.errors import MachineError, VersoError
 from services.run.cores import usable_cores
 
-SCENE_BYTES = 3_500_000
-"""Approximate size on disk of a scene with one pair."""
-
-LEAST_SHM_BYTES = 200 * 2**20
-"""Ray's object store wants this much shared memory."""
-
 
 @dataclass(frozen=True)
 class Finding:
@@ -46,11 +40,9 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _python() -> Finding:
-    right = sys.version_info[:2] == (3, 11)
+    ok = sys.version_info[:2] == (3, 11) and platform.machine() == "x86_64"
     found = f"CPython {platform.python_version()} on {platform.machine()}, glibc {platform.libc_ver()[1] or 'unknown'}"
-    return Finding(
-        "python", right and platform.machine() == "x86_64", found, "use CPython 3.11 on x86-64, or docker compose"
-    )
+    return Finding("python", ok, found, "use CPython 3.11 on x86-64, or docker compose")
 
 
 def _cores() -> Finding:
@@ -59,24 +51,21 @@ def _cores() -> Finding:
 
 def _memory() -> Finding:
     available = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return Finding(
-        "memory", available > 2**30, f"{available / 2**30:.1f} GiB free", "a worker takes up to 0.7 GiB: free some"
-    )
+    found = f"{available / 2**30:.1f} GiB free"
+    return Finding("memory", available > 2**30, found, "a worker takes up to 0.7 GiB: free some")
 
 
 def _disk() -> Finding:
     free = shutil.disk_usage(Path.cwd()).free
-    return Finding(
-        "disk",
-        free > 2**30,
-        f"{free / 2**30:.0f} GiB free here, room for about {free // SCENE_BYTES:,} scenes",
-        "free some",
-    )
+    # A scene with one pair takes about 3.5 MB.
+    found = f"{free / 2**30:.0f} GiB free here, room for about {free // 3_500_000:,} scenes"
+    return Finding("disk", free > 2**30, found, "free some")
 
 
 def _shared_memory() -> Finding:
     free = shutil.disk_usage("/dev/shm").free if Path("/dev/shm").exists() else 0
-    return Finding("/dev/shm", free > LEAST_SHM_BYTES, f"{free / 2**20:.0f} MiB free", "docker run --shm-size=1g")
+    # Ray's object store wants 200 MiB.
+    return Finding("/dev/shm", free > 200 * 2**20, f"{free / 2**20:.0f} MiB free", "docker run --shm-size=1g")
 
 
 def _ray() -> Finding:
@@ -106,6 +95,5 @@ def _stack() -> Finding:
         stack = take_fingerprint(shared_renderer(), "raster")
     except VersoError as error:
         return Finding("fingerprint", False, "the canary scene could not be made", str(error))
-    return Finding(
-        "fingerprint", True, f"{stack.digest[:16]} (canary {stack.canary[:16]}, numpy up to {stack.simd.split()[-1]})"
-    )
+    found = f"{stack.digest[:16]} (canary {stack.canary[:16]}, numpy up to {stack.simd.split()[-1]})"
+    return Finding("fingerprint", True, found)

@@ -3,23 +3,22 @@
 import importlib
 import json
 import sys
-from collections.abc import Sequence
 
 from schemas.errors import VersoError
 from services.cli.environment import enter_stack_environment
 from services.cli.parser import build_parser
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: list[str] | None = None) -> int:
     """Run one command; returns 0 if complete, 1 if something is missing or wrong, 2 for wrong input."""
     if argv is None:
         enter_stack_environment()
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    if arguments[:1] == ["test"]:
+        argv = sys.argv[1:]
+    if argv[:1] == ["test"]:
         from services.cli.selftest import main as run_tests
 
-        return run_tests(arguments[1:])
-    options = build_parser().parse_args(arguments)
+        return run_tests(argv[1:])
+    options = build_parser().parse_args(argv)
     try:
         module, _, function = options.handler.partition(":")
         return int(getattr(importlib.import_module(module), function)(options) or 0)

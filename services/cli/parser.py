@@ -128,11 +128,7 @@ COMMANDS: dict[str, Command] = {
             option("--format", choices=("table", "csv", "parquet", "json"), default="table"),
         ),
     ),
-    "replay": Command(
-        "make one scene again and compare it with what is stored",
-        "data/tabletop 17",
-        (OUT, SCENE),
-    ),
+    "replay": Command("make one scene again and compare it with what is stored", "data/tabletop 17", (OUT, SCENE)),
     "scene": Command(
         "write the posed geometry of one scene",
         "data/tabletop 17 --glb scene17.glb",

@@ -18,11 +18,6 @@ from services.run.cores import usable_cores
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 
-# A test process holds a GL context, a PyBullet world and a Ray: about 1 GB. More processes gain nothing.
-MAX_PROCESSES: Final = 8
-
-PYTEST_FOUND_NO_TEST: Final = 5
-
 
 @dataclass(frozen=True)
 class Check:
@@ -67,7 +62,7 @@ def main(args: list[str]) -> int:
         status = _call(_pytest_command(asked, junit))
         tally = Tally.read(junit)
     remark = f"{tally.passed} passed, {tally.failed} failed, {tally.skipped.total()} skipped"
-    if status == PYTEST_FOUND_NO_TEST:
+    if status == 5:  # pytest's own code
         remark = "no test was found"
     checks.append(Check("pytest", status == 0, time.monotonic() - started, remark))
     print(_summary(checks, tally.skipped), flush=True)
@@ -118,7 +113,8 @@ def _pytest_command(asked: argparse.Namespace, junit: Path) -> list[str]:
     command = [sys.executable, "-m", "pytest", f"--scope={asked.scope}", f"--junitxml={junit}"]
     # One file stays in one process: its tests share what is slow to start, such as a Ray.
     one_file = len(asked.paths) == 1 and Path(asked.paths[0].split("::")[0]).is_file()
-    processes = min(usable_cores(), MAX_PROCESSES)
+    # A test process holds a GL context, a PyBullet world and a Ray: about 1 GB. More than 8 processes gain nothing.
+    processes = min(usable_cores(), 8)
     if processes > 1 and not one_file:
         command += [f"--numprocesses={processes}", "--dist=loadfile"]
     if asked.figures:

@@ -53,9 +53,8 @@ def read_tree(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
     except JobError as error:
         raise JobError(f"{path}: {error}") from error
     if not isinstance(tree, dict):
-        raise JobError(
-            f"{path}: holds {type(tree).__name__ if tree is not None else 'nothing'}, and must hold keys and values"
-        )
+        found = type(tree).__name__ if tree is not None else "nothing"
+        raise JobError(f"{path}: holds {found}, and must hold keys and values")
     for change in changes:
         change_key(tree, change)
     return tree
@@ -78,9 +77,8 @@ def validate_job(tree: dict[str, Any], name: str) -> Job:
     """A `Job` from parsed keys. Raises JobError with one line for each fault."""
     version = tree.get("verso", 1)
     if isinstance(version, int) and version > 1:
-        raise JobError(
-            f"{name}: verso: {version} is newer than this program, which reads version 1: install a newer Verso"
-        )
+        newer = f"{version} is newer than this program, which reads version 1: install a newer Verso"
+        raise JobError(f"{name}: verso: {newer}")
     try:
         return Job.model_validate(tree)
     except ValidationError as error:

@@ -41,12 +41,8 @@ def record_job(job: Job, catalogue_digest: str, folder: Path) -> JobRecord:
 
 def encode_job(record: JobRecord) -> bytes:
     """OUT/job.yaml."""
-    tree = {
-        "digest": record.digest,
-        "catalogue": record.catalogue,
-        "folder": record.folder,
-        "job": record.job.model_dump(mode="json"),
-    }
+    job = record.job.model_dump(mode="json")
+    tree = {"digest": record.digest, "catalogue": record.catalogue, "folder": record.folder, "job": job}
     return (HEADER + yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=110)).encode()
 
 
@@ -80,13 +76,11 @@ def require_job(store: Store) -> JobRecord:
 
 def refuse_foreign(store: Store) -> None:
     """Raises OutputError where a folder holds files and no job: a dataset is not mixed with other files."""
-    if store.size(JOB_FILE) is None:
-        foreign = sorted(set(store.children("")) - OWN)
-        if foreign:
-            raise OutputError(
-                f"{store.name} holds {', '.join(foreign[:3])}{' and more' if len(foreign) > 3 else ''}, and no {JOB_FILE}: "
-                "choose an empty or a new folder for --out"
-            )
+    if store.size(JOB_FILE) is None and (foreign := sorted(set(store.children("")) - OWN)):
+        raise OutputError(
+            f"{store.name} holds {', '.join(foreign[:3])}{' and more' if len(foreign) > 3 else ''}, and no {JOB_FILE}: "
+            "choose an empty or a new folder for --out"
+        )
 
 
 def adopt(store: Store, new: JobRecord) -> JobRecord:
@@ -98,10 +92,7 @@ def adopt(store: Store, new: JobRecord) -> JobRecord:
     if old.catalogue != new.catalogue and not differing:
         differing.append("  the files of the asset folders (their digest changed)")
     if differing:
-        raise OutputError(
-            f"{store.name} belongs to another job; these differ:\n"
-            + "\n".join(differing)
-            + "\nchoose another --out, or change them back"
-        )
+        lines = [f"{store.name} belongs to another job; these differ:", *differing]
+        raise OutputError("\n".join([*lines, "choose another --out, or change them back"]))
     run = new.job.run.model_copy(update={"range_size": old.job.run.range_size})
     return dataclasses.replace(new, job=new.job.model_copy(update={"run": run}))

@@ -57,9 +57,10 @@ def describe_allowed(field: FieldInfo) -> str:
     """The type and bounds of a field in a few words."""
     words = [_name(field.annotation)]
     for bound in field.metadata:
-        for kind, sign in ((Ge, ">="), (Gt, ">"), (Le, "<="), (Lt, "<")):
-            if isinstance(bound, kind):
-                words.append(f"{sign} {getattr(bound, kind.__name__.lower()):g}")
+        signs = ((Ge, ">="), (Gt, ">"), (Le, "<="), (Lt, "<"))
+        words += [
+            f"{sign} {getattr(bound, kind.__name__.lower()):g}" for kind, sign in signs if isinstance(bound, kind)
+        ]
         if isinstance(bound, MinLen):
             words.append(f"at least {bound.min_length}")
     return ", ".join(words)
@@ -70,21 +71,18 @@ def _name(annotation: Any) -> str:
     if origin is Literal:
         return ", ".join(f"`{value}`" for value in arguments)
     if origin is typing.Annotated:
-        inner = FieldInfo.from_annotation(annotation)
-        return describe_allowed(inner)
+        return describe_allowed(FieldInfo.from_annotation(annotation))
     if origin in (typing.Union, types.UnionType):
         names = ["nothing" if argument is type(None) else _name(argument) for argument in arguments]
         return " or ".join(dict.fromkeys(names))
     if origin is tuple:
         return "list" if Ellipsis in arguments else f"list of {len(arguments)} numbers"
-    if origin is dict:
+    if origin is dict or (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
         return "map"
     if annotation is Range:
         return "[low, high]"
     if annotation is Counts:
         return f"whole number or [low, high], from 1 to {MOST_OBJECTS}"
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return "map"
     return {int: "whole number", float: "number", bool: "`true` or `false`", str: "text"}[annotation]
 
 
@@ -111,11 +109,10 @@ def write_doc() -> str:
     """The whole page."""
     lines = []
     for path, field in list_keys():
-        if path.rpartition(".")[2] == "source":
-            continue
-        meaning = " ".join((field.description or "").split())
-        lines.append(f"| `{path}` | {describe_allowed(field)} | {_default(field)} | {meaning} |")
-    return HEADER + "\n".join(lines) + "\n"
+        if not path.endswith(".source"):
+            meaning = " ".join((field.description or "").split())
+            lines.append(f"| `{path}` | {describe_allowed(field)} | {_default(field)} | {meaning} |\n")
+    return HEADER + "".join(lines)
 
 
 if __name__ == "__main__":

@@ -5,11 +5,11 @@ Approximations: the scene at rest is released again with every effect of physics
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from schemas.dataset.fingerprint import Fingerprint
-from schemas.dataset.layout import ASSETS, FINGERPRINT_FILE
+from schemas.dataset.layout import FINGERPRINT_FILE, is_shape
 from schemas.errors import SceneError
 from schemas.scene.scene import SceneOutput
 from services.job.record import require_job
@@ -21,7 +21,7 @@ from workers.pipeline.fingerprint import take_fingerprint
 from workers.pipeline.make_scene import Scene, make_scene
 from workers.pipeline.rows import record_scene
 from workers.pipeline.stopwatch import Stopwatch
-from workers.plan.effects import EFFECTS, names_of_kind
+from workers.plan.effects import EFFECTS
 from workers.store.store import Store
 
 RECEIPT = frozenset({"effects", "skipped"})
@@ -60,10 +60,8 @@ def audit(store: Store, count: int, progress: Callable[[Audit], None]) -> Audit:
     record = require_job(store)
     context = open_context(record)
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
-    found = Audit(take_fingerprint(context.renderer, context.job.render.tier) == theirs)
-    for effect in EFFECTS:
-        if effect.kind != "asked":
-            found.effects[effect.name] = Tally(effect.kind)
+    tallies = {effect.name: Tally(effect.kind) for effect in EFFECTS if effect.kind != "asked"}
+    found = Audit(take_fingerprint(context.renderer, context.job.render.tier) == theirs, effects=tallies)
     for scene_id in choose_scenes(store, count, record.job.seed):
         _audit_scene(context, store, scene_id, found)
         progress(found)
@@ -74,90 +72,76 @@ def _audit_scene(context: WorkerContext, store: Store, scene_id: int, found: Aud
     stored = find_scene(store, scene_id)
     row = stored.scene(scene_id)
     assert row is not None
-    left_out = {one["effect"] for one in row["skipped"]}
-    for name in left_out & set(found.effects):
+    left_out = sorted({one["effect"] for one in row["skipped"]} & found.effects.keys())
+    for name in left_out:
         found.effects[name].skipped += 1
     found.scenes += 1
-    no_ops = frozenset(left_out & names_of_kind("no_op"))
-    approximations = left_out & names_of_kind("approximation")
-    made = _force_no_ops(context, (store, stored), scene_id, no_ops, found)
-    if made is None:
-        return
-    if approximations:
-        _release(context, made, sorted(approximations), found)
-
-
-def _force_no_ops(
-    context: WorkerContext, where: tuple[Store, StoredRange], scene_id: int, no_ops: frozenset[str], found: Audit
-) -> Scene | None:
-    """The scene with no-ops forced; None, and a fault, where it cannot be made."""
+    no_ops, approximations = (
+        [name for name in left_out if found.effects[name].kind == kind] for kind in ("no_op", "approximation")
+    )
     try:
         scene, output = make_forced(context, scene_id, no_ops)
     except SceneError as error:
-        found.faults.append(f"scene {scene_id} with {_listed(no_ops)} forced cannot be made: {error}")
-        return None
+        found.faults.append(f"scene {scene_id} with {', '.join(no_ops) or 'nothing'} forced cannot be made: {error}")
+        return
     found.forced += len(no_ops)
     found.files += len(output.files)
     found.bytes += sum(len(file.data) for file in output.files)
-    plain = None if found.same_stack else make_forced(context, scene_id, frozenset())[1]
-    differences = _differences(where, plain, output)
-    if not differences:
-        for name in no_ops:
-            found.effects[name].proven += 1
-        return scene
-    again = _differences(where, plain, make_forced(context, scene_id, frozenset())[1])
-    if again:
-        found.faults.append(f"scene {scene_id}: made again with nothing forced, it differs: {again[0]}")
-        return scene
-    for name in sorted(no_ops):
-        changed = _differences(where, plain, make_forced(context, scene_id, frozenset({name}))[1])
-        if changed:
-            found.faults.append(
-                f"scene {scene_id}, {name}: forced, it changes {len(changed)} files or tables: {changed[0]}"
-            )
-        else:
-            found.effects[name].proven += 1
-    return scene
+    plain = None if found.same_stack else make_forced(context, scene_id)[1]
+    proven = _prove_no_ops(context, lambda now: _differences(store, stored, plain, now), output, no_ops, found)
+    if approximations:
+        motion = measure_motion(context, scene)
+        found.released += 1
+        found.motion = found.motion.join(motion)
+        released = f"scene {scene_id}, {', '.join(approximations)}: released with every effect"
+        excess = motion.describe_excess()
+        found.faults += [f"{released}, {one}" for one in excess]
+        proven += [] if excess else approximations
+    for name in proven:
+        found.effects[name].proven += 1
 
 
-def make_forced(context: WorkerContext, scene_id: int, forced: frozenset[str]) -> tuple[Scene, SceneOutput]:
+def _prove_no_ops(
+    context: WorkerContext,
+    differences: Callable[[SceneOutput], list[str]],
+    output: SceneOutput,
+    no_ops: list[str],
+    found: Audit,
+) -> list[str]:
+    """The no-ops that change nothing; where the scene with all of them forced differs, each is forced by itself."""
+    if not differences(output):
+        return no_ops
+    if again := differences(make_forced(context, output.scene_id)[1]):
+        found.faults.append(f"scene {output.scene_id}: made again with nothing forced, it differs: {again[0]}")
+        return []
+    changed = {name: differences(make_forced(context, output.scene_id, [name])[1]) for name in no_ops}
+    found.faults += [
+        f"scene {output.scene_id}, {name}: forced, it changes {len(files)} files or tables: {files[0]}"
+        for name, files in changed.items()
+        if files
+    ]
+    return [name for name in no_ops if not changed[name]]
+
+
+def make_forced(context: WorkerContext, scene_id: int, forced: Iterable[str] = ()) -> tuple[Scene, SceneOutput]:
     """A scene made again with effects forced, and its output. Raises SceneError."""
-    stopwatch, context = Stopwatch(), dataclasses.replace(context, forced=forced)
+    stopwatch, context = Stopwatch(), dataclasses.replace(context, forced=frozenset(forced))
     scene = make_scene(context, scene_id, stopwatch)
     return scene, record_scene(context, scene, stopwatch)
 
 
-def _differences(where: tuple[Store, StoredRange], plain: SceneOutput | None, output: SceneOutput) -> list[str]:
+def _differences(store: Store, stored: StoredRange, plain: SceneOutput | None, output: SceneOutput) -> list[str]:
     """Differences from what is stored, or from the plain scene made here where another stack made what is stored."""
     if plain is not None:
         before, now = ({file.path: file.sha256 for file in one.files} for one in (plain, output))
         return [f"{path}: is not the same" for path in sorted({*before, *now}) if before.get(path) != now.get(path)]
-    store, stored = where
     committed = {entry.path: entry.sha256 for record in stored.records for entry in record.files}
-    assets = [file for file in output.files if file.path.startswith(f"{ASSETS}/") and file.path in committed]
+    shapes = [file for file in output.files if is_shape(file.path) and file.path in committed]
     return [
         *compare_files(store, stored, output, True),
-        *(f"{file.path}: is not the same" for file in assets if file.sha256 != committed[file.path]),
+        *(f"{file.path}: is not the same" for file in shapes if file.sha256 != committed[file.path]),
         *compare_rows(stored, output, RECEIPT),
     ]
-
-
-def _release(context: WorkerContext, scene: Scene, names: Sequence[str], found: Audit) -> None:
-    """Release the scene at rest with every effect of physics on, and measure the motion."""
-    motion = measure_motion(context, scene)
-    found.released += 1
-    found.motion = found.motion.join(motion)
-    excess = motion.describe_excess()
-    found.faults += [
-        f"scene {scene.plan.scene_id}, {_listed(names)}: released with every effect, {one}" for one in excess
-    ]
-    if not excess:
-        for name in names:
-            found.effects[name].proven += 1
-
-
-def _listed(names: Sequence[str] | frozenset[str]) -> str:
-    return ", ".join(sorted(names)) or "nothing"
 
 
 def describe_audit(found: Audit) -> Iterator[str]:

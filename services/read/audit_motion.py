@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,7 +69,12 @@ def measure_motion(context: WorkerContext, scene: Scene) -> Motion:
     found = Motion()
     for start, rest, pose in zip(scene.plan.objects, scene.settled, poses, strict=True):
         found = found.join(move_between(start.asset.shape, rest.T_world_obj, pose))
-    after = dataclasses.replace(scene.posed, things=moved_things(scene, poses))
+    at = {start.region_id: pose for start, pose in zip(scene.plan.objects, poses, strict=True)}
+    things = (
+        dataclasses.replace(thing, T_world_shape=at[thing.region_id]) if thing.region_id in at else thing
+        for thing in scene.posed.things
+    )
+    after = dataclasses.replace(scene.posed, things=tuple(things))
     for view in (view for pair in scene.pairs for view in pair.views if view.region is not None):
         changed, outside = compare_masks(context.renderer, scene.posed, after, view)
         found = found.join(Motion(pixels_changed=changed, pixels_outside=outside))
@@ -81,15 +85,6 @@ def move_between(shape: Shape, before: Pose, after: Pose) -> Motion:
     """Largest motion of a shape's points, and its turn, between two poses [4, 4]."""
     moved_m, turned_rad = motion_between(shape.vertices, before, after)
     return Motion(moved_m * 1e3, math.degrees(turned_rad))
-
-
-def moved_things(scene: Scene, poses: Sequence[Pose]) -> tuple[Placed, ...]:
-    """The things of a scene with its objects at other poses."""
-    at = {start.region_id: pose for start, pose in zip(scene.plan.objects, poses, strict=True)}
-    return tuple(
-        dataclasses.replace(thing, T_world_shape=at[thing.region_id]) if thing.region_id in at else thing
-        for thing in scene.posed.things
-    )
 
 
 def compare_masks(renderer: Renderer, before: PosedScene, after: PosedScene, view: View) -> tuple[int, int]:

@@ -47,10 +47,10 @@ class StoredRange:
 def iter_stored(store: Store) -> Iterator[StoredRange]:
     """Every committed range in order. Raises CorruptError where a table does not match its commit."""
     for group in ranges_with_retries(list_commits(store)):
-        yield read_stored(store, group[0].start, len(group))
+        yield _read_range(store, group[0].start, len(group))
 
 
-def read_stored(store: Store, start: int, commits: int) -> StoredRange:
+def _read_range(store: Store, start: int, commits: int) -> StoredRange:
     """One committed range and its retries."""
     records = []
     for retry in range(commits):
@@ -63,10 +63,8 @@ def read_stored(store: Store, start: int, commits: int) -> StoredRange:
 
 
 def choose_scenes(store: Store, count: int, seed: int) -> list[int]:
-    """`count` of the scenes that were made, or all of them, evenly over their ids."""
-    return choose_evenly(
-        [row["scene_id"] for stored in iter_stored(store) for row in stored.rows["scenes"]], count, seed
-    )
+    """`count` of the scenes that were made, or all of them, evenly over their ids; the seed sets the first."""
+    return choose_evenly([row["scene_id"] for one in iter_stored(store) for row in one.rows["scenes"]], count, seed)
 
 
 def choose_evenly(scenes: Sequence[int], count: int, seed: int) -> list[int]:
@@ -82,7 +80,7 @@ def find_scene(store: Store, scene_id: int) -> StoredRange:
     """The range that holds a scene. Raises InputError where it is not committed."""
     for group in ranges_with_retries(list_commits(store)):
         if group[0].start <= scene_id < group[0].stop:
-            return read_stored(store, group[0].start, len(group))
+            return _read_range(store, group[0].start, len(group))
     raise InputError(f"scene {scene_id} is not in {store.name}: `verso status {store.name}` tells which scenes are")
 
 
@@ -101,11 +99,8 @@ def file_reader(read: ReadFile, stored: StoredRange) -> ReadFile:
     if stored.records[0].terms.layout == "files":
         return read_committed
     members: dict[str, bytes] = {}
-    for record in stored.records:
-        for entry in record.files:
-            if entry.path.endswith(".tar"):
-                category = entry.path.partition("/")[0]
-                members.update(read_tar(category, read_committed(entry.path), entry.path))
+    for path in (entry.path for record in stored.records for entry in record.files if entry.path.endswith(".tar")):
+        members.update(read_tar(path.partition("/")[0], read_committed(path), path))
 
     def read_packed(path: str) -> bytes:
         if path not in members:

@@ -2,7 +2,7 @@
 
 import urllib.parse
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable
 from itertools import groupby
 from typing import TypeAlias
 
@@ -65,7 +65,7 @@ def _register(connection: duckdb.DuckDBPyConnection, store: Store) -> None:
     done = read_success(store)
     committed = _Committed(store) if done is None else None
     for table in TABLES:
-        parts = committed.parts(table) if committed else _merged(store, list((done or {})["files"]), table)
+        parts = committed.parts(table) if committed else _merged(store, (done or {})["files"], table)
         for number, part in enumerate(parts):
             connection.register(f"_{table}_{number}", part)
         columns = ", ".join(f'"{name}"' for name in SCHEMAS[table].names)
@@ -74,24 +74,21 @@ def _register(connection: duckdb.DuckDBPyConnection, store: Store) -> None:
         connection.execute(f"CREATE VIEW {table} AS SELECT {once} {columns} FROM ({union})")
 
 
-def _merged(store: Store, keys: Sequence[str], table: str) -> list[Rows]:
+def _merged(store: Store, keys: Iterable[str], table: str) -> list[Rows]:
     """The merged table: read lazily from a disk, as a whole from an object store."""
     folder = f"{MANIFEST}/{table}"
     keys = [key for key in keys if key.startswith(f"{folder}/")]
-    if store.root is not None:
-        partitioning = ds.partitioning(pa.schema([("category", pa.string())]), flavor="hive")
-        paths = [str(store.root / key) for key in keys]
-        base = str(store.root / folder)
-        return [
-            ds.dataset(paths, SCHEMAS[table], _FORMAT, partitioning=partitioning, partition_base_dir=base),
-        ]
-    return [pa.concat_tables([_with_category(table, key, store.read(key)) for key in keys])]
+    if store.root is None:
+        return [pa.concat_tables([_with_category(table, key, store.read(key)) for key in keys])]
+    partitioning = ds.partitioning(pa.schema([("category", pa.string())]), flavor="hive")
+    paths, base = [str(store.root / key) for key in keys], str(store.root / folder)
+    return [ds.dataset(paths, SCHEMAS[table], _FORMAT, partitioning=partitioning, partition_base_dir=base)]
 
 
 def _with_category(table: str, key: str, data: bytes) -> pa.Table:
     rows = pq.read_table(pa.BufferReader(data), page_checksum_verification=True)
     category = urllib.parse.unquote(key.split("/")[-2].removeprefix("category="))
-    column = pa.array([category] * rows.num_rows, pa.string())
+    column = pa.repeat(pa.scalar(category), rows.num_rows)
     return rows.append_column("category", column).select(SCHEMAS[table].names).cast(SCHEMAS[table])
 
 

@@ -20,13 +20,12 @@ def format_rows(rows: pa.Table, style: Format) -> bytes:
         sink = io.BytesIO()
         pq.write_table(rows, sink, compression="zstd")
         return sink.getvalue()
-    writers = {"table": _table, "csv": _csv, "json": _json}
-    return writers[style](rows).encode()
-
-
-def _records(rows: pa.Table) -> list[list[object]]:
-    columns = [column.to_pylist() for column in rows.columns]
-    return [list(record) for record in zip(*columns, strict=True)]
+    records = list(zip(*(column.to_pylist() for column in rows.columns), strict=True))
+    if style == "json":
+        named = [dict(zip(rows.column_names, record, strict=True)) for record in records]
+        return (json.dumps(named, default=str) + "\n").encode()
+    cells = [[_cell(value) for value in record] for record in records]
+    return (_csv(rows.column_names, cells) if style == "csv" else _table(rows, cells)).encode()
 
 
 def _cell(value: object) -> str:
@@ -35,33 +34,23 @@ def _cell(value: object) -> str:
     return json.dumps(value, default=str) if isinstance(value, list | dict | bool) else str(value)
 
 
-def _table(rows: pa.Table) -> str:
-    cells = [[_cut(_cell(value)) for value in record] for record in _records(rows)]
-    numeric = [pa.types.is_integer(kind) or pa.types.is_floating(kind) for kind in rows.schema.types]
+def _table(rows: pa.Table, cells: list[list[str]]) -> str:
+    cells = [[_cut(cell.replace("\n", " ")) for cell in record] for record in cells]
     widths = [max(map(len, column)) for column in zip(rows.column_names, *cells, strict=True)]
-    lines = [_line(rows.column_names, widths, numeric), "  ".join("-" * width for width in widths)]
-    lines += [_line(record, widths, numeric) for record in cells]
+    numeric = [pa.types.is_integer(kind) or pa.types.is_floating(kind) for kind in rows.schema.types]
+    signs = [f"{'>' if right else '<'}{width}" for right, width in zip(numeric, widths, strict=True)]
+    lines = [
+        "  ".join(map(format, record, signs)).rstrip()
+        for record in (rows.column_names, ["-" * width for width in widths], *cells)
+    ]
     return "\n".join([*lines, f"({rows.num_rows} row{'' if rows.num_rows == 1 else 's'})", ""])
 
 
 def _cut(text: str) -> str:
-    text = text.replace("\n", " ")
     return text if len(text) <= _WIDEST_CELL else text[: _WIDEST_CELL - 1] + "…"
 
 
-def _line(cells: list[str], widths: list[int], numeric: list[bool]) -> str:
-    padded = [c.rjust(w) if right else c.ljust(w) for c, w, right in zip(cells, widths, numeric, strict=True)]
-    return "  ".join(padded).rstrip()
-
-
-def _csv(rows: pa.Table) -> str:
+def _csv(names: list[str], cells: list[list[str]]) -> str:
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(rows.column_names)
-    writer.writerows([_cell(value) for value in record] for record in _records(rows))
+    csv.writer(text, lineterminator="\n").writerows([names, *cells])
     return text.getvalue()
-
-
-def _json(rows: pa.Table) -> str:
-    records = [dict(zip(rows.column_names, record, strict=True)) for record in _records(rows)]
-    return json.dumps(records, default=str) + "\n"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from schemas.dataset.fingerprint import Fingerprint
-from schemas.dataset.layout import FINGERPRINT_FILE
+from schemas.dataset.layout import FINGERPRINT_FILE, is_shape
 from schemas.dataset.tables import DETERMINISTIC_TABLES
 from schemas.errors import MachineError
 from schemas.scene.scene import SceneOutput
@@ -66,17 +66,11 @@ def open_context(record: JobRecord) -> WorkerContext:
 
 def compare_files(store: Store, stored: StoredRange, output: SceneOutput, same_stack: bool) -> list[str]:
     """Differences of a scene's new images from the stored ones, a sentence each."""
-    scene_files = {
-        file["path"]: file["sha256"]
-        for view in stored.rows["views"]
-        if view["scene_id"] == output.scene_id
-        for file in view["files"]
-    }
-    made = {file.path: file for file in output.files if not file.path.startswith("assets/")}
-    differences = [
-        f"{path}: only {'stored' if path in scene_files else 'made now'}"
-        for path in sorted(made.keys() ^ scene_files.keys())
-    ]
+    views = [view for view in stored.rows["views"] if view["scene_id"] == output.scene_id]
+    scene_files = {file["path"]: file["sha256"] for view in views for file in view["files"]}
+    made = {file.path: file for file in output.files if not is_shape(file.path)}
+    only = sorted(made.keys() ^ scene_files.keys())
+    differences = [f"{path}: only {'stored' if path in scene_files else 'made now'}" for path in only]
     read = file_reader(store.read, stored)
     for path in sorted(made.keys() & scene_files.keys()):
         if made[path].sha256 == scene_files[path]:
@@ -103,16 +97,13 @@ def compare_rows(stored: StoredRange, output: SceneOutput, ignored: frozenset[st
     differences = []
     for table in DETERMINISTIC_TABLES:
         made = output.rows.get(table, [])
-        if table == "assets":
-            wanted = {row["instance_id"] for row in made}
-            before = [row for row in stored.rows[table] if row["instance_id"] in wanted]
-        else:
-            before = [row for row in stored.rows[table] if row["scene_id"] == output.scene_id]
+        key = "instance_id" if table == "assets" else "scene_id"
+        wanted = {row["instance_id"] for row in made} if table == "assets" else {output.scene_id}
+        before = [row for row in stored.rows[table] if row[key] in wanted]
         now = table_of_rows(table, made).to_pylist()
         before, now = ([{k: v for k, v in row.items() if k not in ignored} for row in rows] for rows in (before, now))
         if sorted(map(repr, before)) != sorted(map(repr, now)):
-            columns = sorted(
-                {key for a, b in zip(before, now, strict=False) for key in a if repr(a[key]) != repr(b.get(key))}
-            )
+            pairs = zip(before, now, strict=False)
+            columns = sorted({name for a, b in pairs for name in a if repr(a[name]) != repr(b.get(name))})
             differences.append(f"rows of {table}: {', '.join(columns) or f'{len(before)} stored, {len(now)} made now'}")
     return differences

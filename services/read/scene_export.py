@@ -1,6 +1,5 @@
 """`verso scene`: the posed geometry of one stored scene as a GLB file."""
 
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +8,10 @@ from PIL import Image
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from schemas.base import Pose
 from schemas.dataset.codec import read_world_poses
 from schemas.errors import InputError
-from schemas.scene.plan import ScenePlan
-from schemas.scene.region import REGION_TABLE
-from schemas.scene.shape import Part, Shape
+from schemas.scene.region import REGION_FLOOR, REGION_TABLE
+from schemas.scene.shape import Part
 from services.job.record import require_job
 from services.read.dataset_reader import find_scene
 from services.read.replay import open_context
@@ -36,32 +33,24 @@ def export_scene(store: Store, scene_id: int, target: Path) -> int:
         raise InputError(f"scene {scene_id} was not made ({reason}): it has no geometry")
     context = open_context(record)
     plan = plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
-    T_world = read_world_poses(row)
+    T_world = {REGION_FLOOR: np.eye(4), **read_world_poses(row)}
+    table = plan.table.asset
+    placed = [("floor", REGION_FLOOR, plan.floor), (f"table {table.instance_id}", REGION_TABLE, table.shape)]
+    for start in plan.objects:
+        # Two objects may be of one instance: only the region id tells them apart.
+        region = f" {start.region_id}" if len(plan.objects) > 1 else ""
+        name = f"{start.asset.category} {start.asset.instance_id}{region}"
+        placed.append((name, start.region_id, start.asset.shape))
     scene = trimesh.Scene()
-    for name, shape, T in (
-        ("floor", plan.floor, np.eye(4)),
-        (f"table {plan.table.asset.instance_id}", plan.table.asset.shape, T_world[REGION_TABLE]),
-        *_objects(plan, T_world),
-    ):
+    for name, region_id, shape in placed:
         for number, part in enumerate(shape.parts):
-            label = f"{name}/{number}-{part.name}"
-            scene.add_geometry(_mesh(part), geom_name=label, node_name=label, transform=T)
+            label, look = f"{name}/{number}-{part.name}", _visual(part)
+            mesh = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=look, process=False)
+            scene.add_geometry(mesh, geom_name=label, node_name=label, transform=T_world[region_id])
     data: bytes = scene.export(file_type="glb")
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_bytes(data)
     return len(data)
-
-
-def _objects(plan: ScenePlan, T_world: Mapping[int, Pose]) -> Iterator[tuple[str, Shape, Pose]]:
-    """(name, shape, pose) of every object; with several, names end in region ids, because two may be of one instance."""
-    for start in plan.objects:
-        region = f" {start.region_id}" if len(plan.objects) > 1 else ""
-        name = f"{start.asset.category} {start.asset.instance_id}{region}"
-        yield name, start.asset.shape, T_world[start.region_id]
-
-
-def _mesh(part: Part) -> trimesh.Trimesh:
-    return trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=_visual(part), process=False)
 
 
 def _visual(part: Part) -> TextureVisuals | ColorVisuals:

@@ -81,12 +81,8 @@ def _reasons(store: Store, start: int, commits: int) -> Counter[str]:
 
 def _rate(store: Store) -> float | None:
     """Scenes a second over the latest commits, by the times of their records."""
-    times = []
-    for start, retry, key in commit_names(store):
-        written = store.modified(key)
-        if written is not None:
-            times.append((written, start, retry))
-    latest = sorted(times)[-RATE_COMMITS:]
+    times = ((store.modified(key), start, retry) for start, retry, key in commit_names(store))
+    latest = sorted((written, start, retry) for written, start, retry in times if written is not None)[-RATE_COMMITS:]
     if len(latest) < 2 or latest[-1][0] <= latest[0][0]:
         return None
     records = [read_record(store, start, retry) for _, start, retry in latest[1:]]
@@ -95,12 +91,10 @@ def _rate(store: Store) -> float | None:
 
 
 def _running(store: Store) -> list[Running]:
-    found = []
-    for folder in store.children(STAGING):
-        if not folder.isdigit():
-            continue
-        start = int(folder)
-        for attempt in attempts_at(store, start):
-            if store.size(commit_path(start, retry_of_attempt(attempt) or 0)) is None:
-                found.append(Running(start, attempt, blamed_scene(store, start, attempt)))
-    return found
+    starts = [int(folder) for folder in store.children(STAGING) if folder.isdigit()]
+    return [
+        Running(start, attempt, blamed_scene(store, start, attempt))
+        for start in starts
+        for attempt in attempts_at(store, start)
+        if store.size(commit_path(start, retry_of_attempt(attempt) or 0)) is None
+    ]

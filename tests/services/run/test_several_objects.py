@@ -14,7 +14,6 @@ import trimesh
 import services.read.verify
 from schemas.dataset.codec import Row
 from services.job.read import validate_job
-from services.read.contact_sheet import draw_sheet
 from services.read.query import query
 from services.read.replay import replay_scene
 from services.read.scene_export import export_scene
@@ -170,27 +169,6 @@ def test_two_objects_of_one_instance_share_its_row_and_its_file(tmp_path):
     assert export_scene(store, 0, tmp_path / "scene.glb") > 0
     names = trimesh.load(tmp_path / "scene.glb").graph.nodes_geometry
     assert len({name.partition("/")[0] for name in names if name.startswith("mug ")}) == 3
-
-
-def test_the_exported_scene_has_every_object_where_its_row_puts_it(made, tmp_path):
-    store, _ = made
-    export_scene(store, 1, tmp_path / "scene.glb")
-    scene = trimesh.load(tmp_path / "scene.glb")
-    (row,) = rows(store, "select bodies from scenes where scene_id = 1")
-    for body in row["bodies"]:
-        name = f"{body['category']} {body['instance_id']} {body['region_id']}"
-        nodes = [node for node in scene.graph.nodes_geometry if node.startswith(name + "/")]
-        assert nodes
-        for node in nodes:
-            np.testing.assert_allclose(scene.graph[node][0], np.reshape(body["T_world_obj"], (4, 4)), atol=1e-6)
-
-
-def test_a_sheet_paints_every_object_in_its_own_colour(made):
-    """The same scenes with one object have fewer colours in the column of input masks."""
-    sheet = draw_sheet(made[0], 1)
-    column = sheet[26:, 92 + 2 * 260 : 92 + 2 * 260 + 256].reshape(-1, 3)
-    for colour in ([230, 70, 40], [45, 110, 200], [60, 160, 70]):
-        assert (np.abs(column.astype(int) - colour).max(axis=1) < 8).sum() > 20
 
 
 def test_tars_hold_the_same_images(made, tmp_path):

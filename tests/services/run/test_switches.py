@@ -120,7 +120,7 @@ def test_an_image_that_is_switched_off_and_there_all_the_same_is_found(full, red
 
 def test_the_sheet_and_the_card_are_made_without_it(reduced):
     name, (store, digest), _, _ = reduced
-    assert draw_sheet(store, 1).ndim == 3
+    assert draw_sheet(store, 1).mode == "RGB"
     record, success = require_job(store), read_success(store)
     fingerprint = Fingerprint.model_validate_json(store.read("manifest/_fingerprint.json"))
     merged = MergeResult(digest, True, dict(success["scenes"]), dict(success["rows"]))

@@ -1,0 +1,283 @@
+"""Cameras, labels and projection of one stored pair by the definitions of Staszak and Belter 2024.
+
+Matrices are [4, 4] float64, `T_a_b` takes frame b to frame a, metres; camera frames are optical (x right, y down, z forward).
+A pixel (column, row) has its centre at (column + 0.5, row + 0.5).
+"""
+
+import hashlib
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Row = Mapping[str, Any]
+Array = NDArray[np.float64]
+
+ROUNDING = 1e-9
+"""Largest difference of poses, distances and angles (metres, radians) between two orders of the same arithmetic."""
+
+EDGE_PX = 1e-6
+"""An origin as near as this to the edge of a pixel may be counted on either side: the table's often lies on one."""
+
+FLOOR_SHARE = 2e-5
+"""Largest height of a floor pixel, as a share of its depth, beyond what rounding of stored depth explains.
+
+Depth in float32 leaves 2e-6; half a pixel at a focal length of 525 pixels is 1e-3.
+"""
+
+TIE_M = 1e-12
+"""Two projected points as near to each other as this in z are tied: which is nearer is a matter of rounding."""
+
+MOST_BROKEN_TIES = 0.25
+"""Share of tied pixels that may show another point: rounding breaks some 4 %, another rule more than half."""
+
+FLOOR, TABLE, FIRST_OBJECT = 1, 2, 3
+
+IMAGES = {
+    "input": {"rgb": "RGB", "depth": "depth", "region": "segment"},
+    "aligned": {"rgb": "RGBaligned", "depth": "depthAligned", "region": "segmentAligned"},
+    "mirror": {"rgb": "RGB", "depth": "depth", "region": "segment"},
+    "projected": {"rgb": "RGBprojected", "depth": "depthProjected"},
+}
+"""Content word of each image, by role and kind of pixel."""
+
+
+@dataclass(frozen=True)
+class StoredPair:
+    """The job's keys, the rows of one pair (views by role), and a function that reads a file by its path."""
+
+    job: Mapping[str, Any]
+    scene: Row
+    views: Mapping[str, Row]
+    objects: Sequence[Row]
+    read: Callable[[str], bytes]
+    images: dict[tuple[str, str], NDArray] = field(default_factory=dict)
+    """Decoded images by role and kind of pixel."""
+
+    def kinds(self, role: str) -> list[str]:
+        """Kinds of pixel that the job stores of a view."""
+        return [kind for kind in IMAGES[role] if kind != "rgb" or self.job["render"]["rgb"]]
+
+
+def check_images(pair: StoredPair, view: Row) -> Iterator[str]:
+    """Decode the view's images; type, size, and every file's size and digest in its row."""
+    role, size = view["role"], (view["height"], view["width"])
+    for kind in pair.kinds(role):
+        path = _path(view, kind)
+        image = pair.images[role, kind] = _decode(pair.read(path))
+        dtype, shape = (np.uint16 if kind == "depth" else np.uint8), ((*size, 3) if kind == "rgb" else size)
+        if image.dtype != dtype or image.shape != shape:
+            yield f"{path}: is {image.dtype} {image.shape}, and must be {np.dtype(dtype)} {shape}"
+    for file in view["files"]:
+        data = pair.read(file["path"])
+        if (len(data), hashlib.sha256(data).hexdigest()) != (file["bytes"], file["sha256"]):
+            yield f"{file['path']}: bytes or sha256 in views are not the file's"
+
+
+def check_camera(pair: StoredPair, view: Row) -> Iterator[str]:
+    """Ids, intrinsics in both conventions, a rigid pose, and its angles."""
+    pairs, sensor, parent = pair.job["pairs_per_scene"], pair.job["cameras"]["sensor"], view["parent_id"]
+    first = 2 * pairs * pair.scene["scene_id"]
+    if parent not in range(first, first + 2 * pairs, 2) or view["pose_id"] != parent + (view["role"] == "mirror"):
+        yield f"ids {view['pose_id']} and {parent} do not follow from scene {pair.scene['scene_id']}"
+    units = pair.job["images"]["depth_units_per_m"]
+    derived = {"cx_opencv": sensor["cx"] - 0.5, "cy_opencv": sensor["cy"] - 0.5, "depth_units_per_m": units}
+    for name, value in {**sensor, **derived}.items():
+        if view[name] != value:
+            yield f"{name} is {view[name]}, the job gives {value}"
+    T = _matrix(view, "T_world_cam")
+    R, axis = T[:3, :3], T[:3, 2]
+    if _distance(R.T @ R, np.eye(3)) > ROUNDING or np.linalg.det(R) < 0 or list(T[3]) != [0, 0, 0, 1]:
+        yield "T_world_cam is no rigid transform"
+    if abs(math.sin(view["inclination_rad"]) + axis[2]) > ROUNDING:
+        yield f"inclination_rad {view['inclination_rad']} is not the angle of the optical axis below the horizontal"
+    level = math.hypot(axis[0], axis[1])
+    direction = level * np.array([math.cos(view["yaw_rad"]), math.sin(view["yaw_rad"])])
+    if level > ROUNDING and _distance(direction, -axis[:2]) > ROUNDING:
+        yield f"yaw_rad {view['yaw_rad']} is not the direction from the table to the camera"
+
+
+def check_poses(pair: StoredPair) -> Iterator[str]:
+    """The input camera on its orbit, d_z, and from these the aligned and the mirror camera."""
+    cameras, T_in = pair.job["cameras"], _matrix(pair.views["input"], "T_world_cam")
+    orbit, axis = cameras["orbit"], T_in[:3, 2]
+    target = T_in[:3, 3] + orbit["radius_m"] * axis
+    low, high = np.sin(orbit["inclination_rad"])
+    if _distance(target[:2], np.zeros(2)) > ROUNDING or abs(T_in[2, 0]) > ROUNDING:
+        yield "the input camera does not look at the table's centre from cameras.orbit.radius_m without roll"
+    if not low - ROUNDING <= -axis[2] <= high + ROUNDING:
+        yield "the input camera's inclination is outside cameras.orbit.inclination_rad"
+    d_z = _derive_d_z(pair)
+    for role, view in pair.views.items():
+        if not abs(view["d_z_m"] - d_z) <= ROUNDING:
+            yield f"d_z_m of {role} is {view['d_z_m']}, the object's input depth gives {d_z}"
+    expected = {"aligned": T_in @ _transform(np.eye(3), cameras["depth"]["offset_m"])}
+    expected["mirror"] = expected["projected"] = _derive_mirror(T_in, d_z, cameras["mirror"]["T_z_m"])
+    for role, T in expected.items():
+        if role in pair.views and not (off := _distance(_matrix(pair.views[role], "T_world_cam"), T)) <= ROUNDING:
+            yield f"T_world_cam of {role} is off by {off:.3g} from its definition"
+
+
+def _derive_d_z(pair: StoredPair) -> float:
+    """Metres: a percentile (interpolated linearly), the median or the least of the object's stored input depth."""
+    mirror, depth = pair.job["cameras"]["mirror"], pair.images["input", "depth"]
+    z = np.sort(depth[(pair.images["input", "region"] >= FIRST_OBJECT) & (depth > 0)])
+    if not len(z):
+        return math.nan
+    percentile = {"nearest": 0.0, "median": 50.0, "percentile": mirror["percentile"]}[mirror["pivot_depth"]]
+    units = np.interp(percentile / 100.0 * (len(z) - 1), np.arange(len(z)), z)
+    return float(units / pair.job["images"]["depth_units_per_m"])
+
+
+def _derive_mirror(T_in: Array, d_z: float, T_z: float) -> Array:
+    """T_in Trans_z(d_z) Rot_x(phi) Rot_y(pi) Rot_x(-phi) Trans_z(-T_z), phi the angle of the axis below the horizontal."""
+    phi = math.atan2(-T_in[2, 2], math.hypot(T_in[0, 2], T_in[1, 2]))
+    c, s = math.cos(phi), math.sin(phi)
+    rotation_x = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    turn = rotation_x @ np.diag([-1.0, 1.0, -1.0]) @ rotation_x.T
+    return T_in @ _transform(turn, (0.0, 0.0, d_z)) @ _transform(np.eye(3), (0.0, 0.0, -T_z))
+
+
+def check_depth(pair: StoredPair, view: Row) -> Iterator[str]:
+    """Depth is z in units within the stored range, none where nothing was hit; floor pixels lie at height 0."""
+    depth, region = pair.images[view["role"], "depth"], pair.images[view["role"], "region"]
+    units, (low, high) = view["depth_units_per_m"], pair.job["images"]["depth_range_m"]
+    some = depth[depth > 0]
+    if len(some) and not (low * units - 0.5 <= some.min() and some.max() <= high * units + 0.5):
+        yield f"depth from {some.min() / units} to {some.max() / units} m is outside images.depth_range_m"
+    if (depth[region == 0] > 0).any():
+        yield "depth where the mask says that nothing was hit"
+    points, _ = _unproject(view, np.where(region == FLOOR, depth, 0))
+    if points.shape[1] and not pair.job["sensor"]["depth_noise"]:
+        up = _matrix(view, "T_world_cam")[2]
+        rounding = 0.5 / units * np.abs(up[:3] @ (points[:3] / points[2]))
+        height_m = np.abs(up @ points)
+        if (height_m - rounding > FLOOR_SHARE * points[2]).any():
+            yield f"floor pixels lie up to {height_m.max() * 1e3:.3f} mm off the floor's plane"
+
+
+def check_labels(pair: StoredPair, view: Row) -> Iterator[str]:
+    """Regions, pixel counts, boxes, object poses and image coordinates."""
+    region, scene = pair.images[view["role"], "region"], pair.scene
+    bodies = scene["bodies"] or [{"region_id": FIRST_OBJECT, "T_world_obj": scene["T_world_obj"]}]
+    poses = {body["region_id"]: _matrix(body, "T_world_obj") for body in bodies}
+    poses[TABLE] = _matrix(scene, "T_world_table")
+    labels = {row["region_id"]: row for row in pair.objects if row["role"] == view["role"]}
+    if labels.keys() != poses.keys() or not set(np.unique(region).tolist()) <= {0, FLOOR, *poses}:
+        yield f"regions are {sorted(labels)} in objects, {sorted(poses)} in scenes, {np.unique(region)} in the mask"
+        return
+    if view["object_pixels"] != np.count_nonzero(region >= FIRST_OBJECT):
+        yield f"object_pixels {view['object_pixels']} is not the number of pixels of objects"
+    for number, label in labels.items():
+        T = np.linalg.inv(_matrix(view, "T_world_cam")) @ poses[number]
+        x, y, width, height = cv2.boundingRect((region == number).astype(np.uint8))
+        for name, value in {"pixels": np.count_nonzero(region == number), "bbox_xywh": [x, y, width, height]}.items():
+            if label[name] != value:
+                yield f"region {number}: {name} is {label[name]}, the mask gives {value}"
+        if not _shows_origin(view, label, T):
+            yield f"region {number}: ({label['u']}, {label['v']}) is not the pixel of the object's origin"
+        if not _distance(_matrix(label, "T_cam_obj"), T) <= ROUNDING:
+            yield f"region {number}: T_cam_obj is not inverse(T_world_cam) T_world_obj"
+
+
+def _shows_origin(view: Row, label: Row, T_cam_obj: Array) -> bool:
+    """Whether (u, v) is the pixel of the object's origin, or (-1, -1) where that is behind the camera or outside."""
+    x, y, z = T_cam_obj[:3, 3]
+    u, v = (view["fx"] * x / z + view["cx"], view["fy"] * y / z + view["cy"]) if z > 0 else (math.nan, math.nan)
+    if (label["u"], label["v"]) == (-1, -1):
+        return not (EDGE_PX < u < view["width"] - EDGE_PX and EDGE_PX < v < view["height"] - EDGE_PX)
+    inside = 0 <= label["u"] < view["width"] and 0 <= label["v"] < view["height"]
+    return inside and max(abs(u - label["u"] - 0.5), abs(v - label["v"] - 0.5)) <= 0.5 + EDGE_PX
+
+
+def check_patches(pair: StoredPair, view: Row) -> Iterator[str]:
+    """Each patch is the crop centred on an object's (u, v), and is left out where it would leave the image."""
+    role, size = view["role"], pair.job["images"]["patch"]
+    seen_from = "mirror" if role == "projected" else role
+    labels = [row for row in pair.objects if row["role"] == seen_from and row["region_id"] >= FIRST_OBJECT]
+    stored = {file["path"] for file in view["files"]}
+    expected = {_path(view, kind) for kind in pair.kinds(role)}
+    for label in labels:
+        left, top = label["u"] - size["width"] // 2, label["v"] - size["height"] // 2
+        right, bottom = left + size["width"], top + size["height"]
+        whole = left >= 0 and top >= 0 and right <= view["width"] and bottom <= view["height"]
+        if label["u"] < 0 or label["pixels"] == 0 or not whole:
+            continue
+        suffix = f"obj{label['region_id'] - FIRST_OBJECT}" if len(labels) > 1 else ""
+        for kind in pair.kinds(role):
+            path = _path(view, kind, "patches/", suffix)
+            expected.add(path)
+            crop = pair.images[role, kind][top:bottom, left:right]
+            if path in stored and not np.array_equal(_decode(pair.read(path)), crop):
+                yield f"{path} is not the crop about ({label['u']}, {label['v']})"
+    if different := expected ^ stored:
+        yield f"the files {sorted(different)} should be there, or should not"
+
+
+def check_projection(pair: StoredPair) -> Iterator[str]:
+    """The stored input cloud in the mirror camera: pixel is floor(u, v), the nearest z wins, ties go to the lowest index."""
+    source, target = pair.views["input"], pair.views["projected"]
+    points, index = _unproject(source, pair.images["input", "depth"])
+    points = np.linalg.inv(_matrix(target, "T_world_cam")) @ _matrix(source, "T_world_cam") @ points
+    (x, y, z, _), index = points[:, points[2] > 0], index[points[2] > 0]
+    u, v = np.floor(target["fx"] * x / z + target["cx"]), np.floor(target["fy"] * y / z + target["cy"])
+    inside = (u >= 0) & (u < target["width"]) & (v >= 0) & (v < target["height"])
+    pixel, z, index = (v * target["width"] + u)[inside].astype(np.int64), z[inside], index[inside]
+    stored = pair.images["projected", "depth"].ravel()
+    nearest, lowest = np.full(stored.shape, np.inf), np.full(stored.shape, source["width"] * source["height"])
+    np.minimum.at(nearest, pixel, z)
+    tied = z - nearest[pixel] <= TIE_M
+    np.minimum.at(lowest, pixel[tied], index[tied])
+    low, high = pair.job["images"]["depth_range_m"]
+    expected = np.where((nearest > low) & (nearest < high), np.rint(nearest * target["depth_units_per_m"]), 0)
+    if wrong := np.count_nonzero(stored != expected):
+        yield f"{wrong} depth pixels are not those of the input cloud"
+    if abs(target["projected_filled_share"] - np.count_nonzero(stored) / stored.size) > ROUNDING:
+        yield f"projected_filled_share is {target['projected_filled_share']}, and not the share of pixels with depth"
+    if ("projected", "rgb") not in pair.images or pair.job["sensor"]["distortion"]:
+        return
+    colours = np.concatenate([pair.images["input", "rgb"].reshape(-1, 3), np.zeros((1, 3), np.uint8)])
+    differs = (colours[lowest] != pair.images["projected", "rgb"].reshape(-1, 3)).any(axis=1)
+    several = np.bincount(pixel[tied], minlength=stored.size) > 1
+    if plain := np.count_nonzero(differs & ~several):
+        yield f"{plain} colours are not those of the nearest points"
+    broken, ties = np.count_nonzero(differs & several), np.count_nonzero(several)
+    if broken > MOST_BROKEN_TIES * ties:
+        yield f"{broken} of {ties} ties do not go to the lowest source index"
+
+
+def _path(view: Row, kind: str, folder: str = "", suffix: str = "") -> str:
+    """`mug/depth00000.png`: the mirror camera's own images have the mirror's odd id, all others the input's."""
+    number = view["parent_id"] + (view["role"] == "mirror")
+    return f"{view['category']}/{folder}{IMAGES[view['role']][kind]}{number:05d}{suffix}.png"
+
+
+def _decode(data: bytes) -> NDArray:
+    """[H, W] or [H, W, 3] RGB; empty where the bytes are no image."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    return np.zeros(0) if image is None else image[..., ::-1] if image.ndim == 3 else image
+
+
+def _matrix(row: Row, name: str) -> Array:
+    return np.array(row[name], np.float64).reshape(4, 4)
+
+
+def _transform(R: Array, t: Sequence[float]) -> Array:
+    return np.vstack([np.column_stack([R, t]), [0.0, 0.0, 0.0, 1.0]])
+
+
+def _distance(a: Array, b: Array) -> float:
+    """Largest difference of two arrays' elements."""
+    return float(np.abs(a - b).max())
+
+
+def _unproject(view: Row, depth: NDArray) -> tuple[Array, NDArray[np.int64]]:
+    """([4, N] homogeneous points in the camera's frame of the pixels that have depth, their flat indices [N])."""
+    rows, columns = np.nonzero(depth)
+    z = depth[rows, columns] / view["depth_units_per_m"]
+    x, y = (columns + 0.5 - view["cx"]) / view["fx"] * z, (rows + 0.5 - view["cy"]) / view["fy"] * z
+    return np.stack([x, y, z, np.ones_like(z)]), rows * view["width"] + columns
