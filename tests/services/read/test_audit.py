@@ -28,8 +28,7 @@ from tests.shapes import box, shape_of
 from tests.workers.render.random_scenes import APPEARANCE, floor
 from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.pipeline.fingerprint import take_fingerprint
-from workers.plan.effect import Effect
-from workers.plan.effects import EFFECTS
+from workers.plan.effects import EFFECTS, Effect
 from workers.render.raster.gbuffer import shared_renderer
 from workers.store.local import LocalStore
 
