@@ -83,22 +83,14 @@ def load_mitsuba() -> ModuleType:
 
 @dataclass(frozen=True, eq=False)
 class TracedScene:
-    """A scene in Mitsuba, and the models that it was made from."""
+    """A scene in Mitsuba, and the key of the models that it was made from."""
 
     scene: Any
     clear: bool
     """Whether something in it lets light through."""
-    things: Sequence[Placed]
-    appearance: Appearance
-    effects: EffectPlan
-
-    def is_of(self, things: Sequence[Placed], appearance: Appearance, effects: EffectPlan) -> bool:
-        """Whether it was made from the same models."""
-        same = self.appearance is appearance and self.effects.ran == effects.ran and len(self.things) == len(things)
-        return same and all(
-            a.shape is b.shape and a.region_id == b.region_id and np.array_equal(a.T_world_shape, b.T_world_shape)
-            for a, b in zip(self.things, things, strict=True)
-        )
+    key: tuple[object, ...]
+    held: tuple[object, ...]
+    """The models whose ids the key holds."""
 
 
 class Tracer:
@@ -117,7 +109,7 @@ class Tracer:
         effects: EffectPlan,
         seed: int,
     ) -> Array:
-        """[H, W, 3] float64 linear light, the same for the same arguments, with the background where nothing is hit; `seed` < 2**32."""
+        """[H, W, 3] float64 linear light, the same for the same arguments; the background where nothing is. `seed` < 2**32."""
         built = self.build(things, appearance, effects)
         kind = "volpath" if built.clear else "path"
         bounces = render.path_bounces if effects.runs("global_illumination") else 1
@@ -131,7 +123,9 @@ class Tracer:
 
     def build(self, things: Sequence[Placed], appearance: Appearance, effects: EffectPlan) -> TracedScene:
         """The scene in Mitsuba; a mesh's id is region-REGION-THING-PART."""
-        if self._built is not None and self._built.is_of(things, appearance, effects):
+        placed = ((id(thing.shape), thing.T_world_shape.tobytes(), thing.region_id) for thing in things)
+        key = (id(appearance), effects.ran, *placed)
+        if self._built is not None and self._built.key == key:
             return self._built
         tree: dict[str, Any] = {"type": "scene", **lights_of(self._mi, appearance)}
         clear = False
@@ -142,7 +136,7 @@ class Tracer:
                 clear = clear or part.material.transmission > 0.0 or (texture is not None and texture.shape[2] == 4)
                 if len(part.faces):
                     tree[name] = make_mesh(self._mi, part, thing.T_world_shape, name)
-        self._built = TracedScene(self._mi.load_dict(tree), clear, tuple(things), appearance, effects)
+        self._built = TracedScene(self._mi.load_dict(tree), clear, key, (appearance, *things))
         return self._built
 
     def sensor(self, camera: Camera) -> Any:
