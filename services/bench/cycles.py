@@ -22,7 +22,7 @@ from workers.geometry.frames import transform
 from workers.geometry.srgb import decode_srgb
 from workers.render.pathtraced.lights import GLOW, SKY_PX, sky_directions, sky_picture
 from workers.render.pathtraced.materials import tint_of
-from workers.render.pathtraced.tracer import Tracer
+from workers.render.pathtraced.tracer import Tracer, encode_light
 from workers.render.raster.baking import LAMP_RAD
 
 SCRIPT = Path(__file__).with_name("cycles_script.py")
@@ -103,7 +103,7 @@ def trace_lap(posed: PosedScene, cameras: Sequence[Camera], render: Render, effe
     tracer = Tracer()
     wall, cpu = time.perf_counter(), time.process_time()
     for camera in cameras:
-        tracer.trace(posed.things, posed.appearance, camera, render, effects, 0)
+        encode_light(tracer.radiance(posed.things, posed.appearance, camera, render, effects, 0))
     return Lap(len(cameras), time.perf_counter() - wall, time.process_time() - cpu, {})
 
 

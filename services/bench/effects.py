@@ -22,8 +22,7 @@ from workers.assets.catalogue import open_catalogue
 from workers.physics.effects import called_for
 from workers.physics.step import settle_scene
 from workers.pipeline.context import WorkerContext, open_worker
-from workers.plan.effect import Facts
-from workers.plan.effects import PHYSICS_EFFECTS, plan_effects
+from workers.plan.effects import PHYSICS_EFFECTS, Facts, plan_effects
 from workers.plan.randomness import SceneChance
 from workers.plan.step import plan_scene
 

@@ -12,7 +12,7 @@ from schemas.scene.shape import Asset, Mesh, Shape
 from schemas.scene.view import Pair
 from workers.assets.glb import asset_glb
 from workers.geometry.srgb import SRGB_STEPS, decode_srgb, encode_srgb
-from workers.pipeline.image_files import image_boxes
+from workers.pipeline.image_files import image_boxes, object_labels
 from workers.pipeline.make_scene import Scene
 from workers.store.images import encode_png
 
@@ -55,7 +55,8 @@ def _pair(pair: Pair, job: Job) -> dict[str, object]:
     cameras = {view.role: _matrix(view.camera.T_world_cam) for view in pair.views if view.role != "projected"}
     images = []
     for view in pair.views:
-        for path, kind, box in image_boxes(view, pair, job.images.patch):
+        objects = object_labels(view, pair)
+        for path, kind, box in image_boxes(view, objects, objects[0].category, job.images.patch):
             crop = None if box is None else [box[0].start, box[0].stop, box[1].start, box[1].stop]
             images.append({"path": path, "view": view.role, "pixels": kind, "crop": crop})
     return {"cameras": cameras, "images": images}

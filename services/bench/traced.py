@@ -17,8 +17,7 @@ from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import open_worker
 from workers.pipeline.make_scene import Scene, make_scene
 from workers.pipeline.stopwatch import Stopwatch
-from workers.plan.effect import Facts
-from workers.plan.effects import plan_effects
+from workers.plan.effects import Facts, plan_effects
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.step import require_tier
 

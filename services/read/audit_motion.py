@@ -17,8 +17,7 @@ from workers.geometry.raycast import NEAR_M, edge_distance_px
 from workers.physics.step import release_again
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene
-from workers.plan.effect import Facts
-from workers.plan.effects import names_of_kind, plan_effects
+from workers.plan.effects import Facts, names_of_kind, plan_effects
 from workers.render.raster.gbuffer import Renderer
 
 RELEASE_S = 1.0

@@ -15,8 +15,7 @@ from workers.physics.fall import Outcome, StepSizes, fall
 from workers.physics.rigid_body import make_body
 from workers.physics.step import Rest, moved_by, release_again, settle_scene
 from workers.physics.stop_conditions import falls_below
-from workers.plan.effect import Facts
-from workers.plan.effects import plan_effects
+from workers.plan.effects import Facts, plan_effects
 
 RELEASE_S = 1.0
 

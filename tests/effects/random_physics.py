@@ -16,7 +16,7 @@ from schemas.scene.scene import Settled
 from tests.effects.physics_cases import on_a_bumpy_table
 from tests.effects.scenes import Setting
 from workers.geometry.frames import transform
-from workers.plan.effect import Facts
+from workers.plan.effects import Facts
 
 TOUCH_M = 1e-4
 """More than this above the table, an object falls."""

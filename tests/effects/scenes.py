@@ -20,8 +20,7 @@ from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene, make_scene
 from workers.pipeline.rows import record_scene
 from workers.pipeline.stopwatch import Stopwatch
-from workers.plan.effect import Facts
-from workers.plan.effects import is_raycast_scene
+from workers.plan.effects import Facts, is_raycast_scene
 from workers.plan.randomness import SceneChance
 from workers.plan.step import plan_scene
 from workers.render.raster.gbuffer import shared_renderer

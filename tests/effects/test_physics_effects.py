@@ -21,8 +21,7 @@ from workers.geometry.elevation import prepare_terrain
 from workers.geometry.frames import transform
 from workers.physics.placement import Ground, gap_m, placed_mesh
 from workers.physics.separation import clearances
-from workers.plan.effect import Facts
-from workers.plan.effects import PHYSICS_EFFECTS, plan_effects
+from workers.plan.effects import PHYSICS_EFFECTS, Facts, plan_effects
 
 GAP_MM = 0.1
 """The most that may be between a resting object and what it rests on, or that they may overlap."""

@@ -19,8 +19,7 @@ from tests.effects.scenes import Setting, facts_of, make, with_holes, without_te
 from workers.cameras.placement import place_aligned_camera, place_mirror_camera
 from workers.geometry.raycast import cast_view
 from workers.physics.step import settle_scene
-from workers.plan.effect import Facts
-from workers.plan.effects import EFFECTS, names_of_kind, plan_effects
+from workers.plan.effects import EFFECTS, Facts, names_of_kind, plan_effects
 
 SCENES = 200
 

@@ -18,8 +18,7 @@ from schemas.scene.scene import Placed, PosedScene
 from tests.hard_cases.case import refuse
 from tests.shapes import box, shape_of, table
 from tests.workers.render.random_scenes import APPEARANCE, VGA, floor
-from workers.cameras.pivot_depth import object_distance
-from workers.cameras.placement import place_mirror_camera
+from workers.cameras.placement import object_distance, place_mirror_camera
 from workers.geometry.camera import look_at, orbit_pose, yaw
 from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.geometry.raycast import cast_view, edge_distance_px

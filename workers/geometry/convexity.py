@@ -76,6 +76,15 @@ def triangle_corners(mesh: Mesh) -> tuple[Array, Array, Array]:
     return mesh.vertices[mesh.faces[:, 0]], mesh.vertices[mesh.faces[:, 1]], mesh.vertices[mesh.faces[:, 2]]
 
 
+def face_planes(mesh: Mesh) -> tuple[Array, Array]:
+    """(normals [F, 3], offsets [F]): unit normal n of each face, 0 where it has no area, and n . p of its points p."""
+    a, b, c = triangle_corners(mesh)
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
+    return normals, np.einsum("ij,ij->i", normals, a)
+
+
 def solid_of(mesh: Mesh) -> manifold3d.Manifold | None:
     """The solid that a welded mesh encloses, wound either way; None where the mesh is not closed, or not a manifold."""
     hold_to_one_thread()

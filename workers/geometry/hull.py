@@ -6,6 +6,7 @@ from scipy.spatial import ConvexHull
 
 from schemas.base import Array, frozen_array
 from schemas.scene.shape import Hull
+from workers.geometry.convexity import mesh_of, triangle_corners
 from workers.geometry.manifold import hold_to_one_thread
 
 THIN = 1e-4
@@ -43,9 +44,8 @@ def convex_hull(vertices: Array) -> Hull:
         solid, step = solid.simplify(step), 4.0 * step
         if solid.num_vert() <= MOST_VERTICES:
             solid = solid.hull()
-    mesh = solid.to_mesh64()
-    points = np.array(mesh.vert_properties, dtype=np.float64)
-    a, b, c = points[np.asarray(mesh.tri_verts, dtype=np.int64).T]
+    mesh = mesh_of(solid)
+    points, (a, b, c) = mesh.vertices, triangle_corners(mesh)
     across = np.cross(b - a, c - a)
     doubled = np.sqrt((across * across).sum(axis=1))
     kept = doubled > NO_AREA * float(((points.max(axis=0) - points.min(axis=0)) ** 2).sum())

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 
 import numpy as np
+import shapely
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
@@ -18,8 +19,8 @@ from schemas.base import Array
 from schemas.scene.camera import Camera
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Mesh
-from workers.geometry.camera import project_bounds
-from workers.geometry.convexity import triangle_corners
+from workers.geometry.camera import project_bounds, unproject
+from workers.geometry.convexity import face_planes
 from workers.geometry.frames import invert, transform
 
 NEAR_M = 0.05
@@ -57,9 +58,7 @@ def cast_view(things: Sequence[Placed], camera: Camera) -> tuple[Array, NDArray[
     """
     intrinsics = camera.intrinsics
     rows, columns = np.mgrid[0 : intrinsics.height, 0 : intrinsics.width]
-    rays = np.ones((rows.size, 3))
-    rays[:, 0] = (columns.ravel() + 0.5 - intrinsics.cx) / intrinsics.fx
-    rays[:, 1] = (rows.ravel() + 0.5 - intrinsics.cy) / intrinsics.fy
+    rays = unproject(rows.ravel(), columns.ravel(), np.ones(rows.size), intrinsics)
     best = _no_hits(len(rays))
     for thing in sorted(things, key=attrgetter("region_id")):
         mesh = _in_camera(thing, camera)
@@ -86,25 +85,22 @@ def first_hit(things: Sequence[Placed], origins: Array, directions: Array) -> Hi
     return best
 
 
-def edge_distance_px(
-    things: Sequence[Placed], camera: Camera, pixels: NDArray, outline_only: bool = False, chunk: int = 4_000_000
-) -> Array:
+def edge_distance_px(things: Sequence[Placed], camera: Camera, pixels: NDArray, outline_only: bool = False) -> Array:
     """Distance, pixels, from each pixel's centre to the nearest projected triangle edge of any thing; [N] float64.
 
     pixels [N, 2] are (row, column). Edges are cut at the near plane; inf where no edge is in front of the camera. With
     `outline_only`, only edges at which a mask can end count: those of a boundary, of a fold (more than two faces), and
-    those between a front-facing and a back-facing triangle. At most `chunk` distances are
-    held at once. Lines along which surfaces intersect one another are no edges.
+    those between a front-facing and a back-facing triangle. Lines along which surfaces intersect one another are no edges.
     """
-    centres = np.asarray(pixels, dtype=np.float64)[:, ::-1] + 0.5
+    centres = shapely.points(np.asarray(pixels, dtype=np.float64)[:, ::-1] + 0.5)
     nearest = np.full(len(centres), np.inf)
     for thing in things:
         mesh = _in_camera(thing, camera)
-        starts, ends = _project_edges(mesh, _edges(mesh, outline_only), camera)
-        step = max(1, chunk // max(1, len(centres)))
-        for first in range(0, len(starts), step):
-            part = slice(first, first + step)
-            np.minimum(nearest, _segment_distance(centres, starts[part], ends[part]), out=nearest)
+        edges = np.stack(_project_edges(mesh, _edges(mesh, outline_only), camera), axis=1)
+        (own, _), distance = shapely.STRtree(shapely.linestrings(edges)).query_nearest(
+            centres, return_distance=True, all_matches=False
+        )
+        nearest[own] = np.minimum(nearest[own], distance)
     return nearest
 
 
@@ -137,7 +133,7 @@ class _Caster:
         self._scene = EmbreeScene(robust=True)
         faces = np.ascontiguousarray(mesh.faces, dtype=np.int32)
         self._geometry = TriangleMesh(self._scene, mesh.vertices.astype(np.float32), faces)
-        self._normals, self._offsets = _planes(mesh)
+        self._normals, self._offsets = face_planes(mesh)
 
     def cast(self, origins: Array, directions: Array) -> tuple[Array, Array]:
         """(distance, incidence_cos), each [N] float64: distance inf and cosine 0 where the ray meets nothing."""
@@ -154,15 +150,6 @@ class _Caster:
         exact = (self._offsets[face] - np.einsum("ij,ij->i", n, o)) / np.where(steep, towards, 1.0)
         distance[hit] = np.where(steep, exact, found["tfar"][hit].astype(np.float64))
         return distance, cosine
-
-
-def _planes(mesh: Mesh) -> tuple[Array, Array]:
-    """(normals [F, 3], offsets [F]): unit normal n of each face, 0 where it has no area, and n . p of its points p."""
-    a, b, c = triangle_corners(mesh)
-    normals = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
-    return normals, np.einsum("ij,ij->i", normals, a)
 
 
 def _keep_nearer(
@@ -188,7 +175,7 @@ def _edges(mesh: Mesh, outline_only: bool) -> NDArray[np.int64]:
     pairs = np.sort(directed, axis=1)
     key, group, count = np.unique(pairs[:, 0] * len(first) + pairs[:, 1], return_inverse=True, return_counts=True)
     if outline_only:
-        front = np.repeat(_planes(mesh)[1] < 0.0, 3)
+        front = np.repeat(face_planes(mesh)[1] < 0.0, 3)
         side = np.where(front == (directed[:, 0] <= directed[:, 1]), 1, -1)
         key = key[(count != 2) | (np.bincount(group.reshape(-1), weights=side, minlength=len(key)) != 0)]
     return first[np.stack(np.divmod(key, len(first)), axis=1)]
@@ -207,12 +194,3 @@ def _project_edges(mesh: Mesh, edges: NDArray[np.int64], camera: Camera) -> tupl
         z = np.maximum(cut[:, 2], NEAR_M)
         ends.append(np.stack([k.fx * cut[:, 0] / z + k.cx, k.fy * cut[:, 1] / z + k.cy], axis=1))
     return ends[0], ends[1]
-
-
-def _segment_distance(points: Array, starts: Array, ends: Array) -> Array:
-    """[N] float64: distance from each point to the nearest of the segments."""
-    along = ends - starts
-    length2 = np.maximum((along**2).sum(axis=1), 1e-300)
-    offset = points[:, None, :] - starts
-    share = np.clip((offset * along).sum(axis=2) / length2, 0.0, 1.0)
-    return np.sqrt((((offset - share[:, :, None] * along) ** 2).sum(axis=2)).min(axis=1, initial=np.inf))

@@ -14,6 +14,7 @@ from schemas.scene.camera import Camera
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.scene import PosedScene
 from schemas.scene.view import GBuffer, Pair
+from workers.geometry.camera import unproject
 from workers.geometry.raycast import cast_view, edge_distance_px, first_hit
 
 EDGE_PX = 1.0 / 64.0
@@ -73,7 +74,7 @@ def _intersects(
     mask's own depth must be that of the thing it names.
     """
     k, R = camera.intrinsics, camera.T_world_cam[:3, :3]
-    rays = np.stack([(columns + 0.5 - k.cx) / k.fx, (rows + 0.5 - k.cy) / k.fy, np.ones(len(rows))], axis=1) @ R.T
+    rays = unproject(rows, columns, np.ones(len(rows)), k) @ R.T
     origins = np.broadcast_to(camera.position, rays.shape)
     nearest, touching = first_hit(scene.things, origins, rays), np.zeros(len(rows), bool)
     named, drawn = buffer.region[rows, columns], buffer.depth_m[rows, columns].astype(np.float64)

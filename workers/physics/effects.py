@@ -118,10 +118,6 @@ def _rolling(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> s
     return None if any(is_round(start.hull, start.asset.mass.com) for start in starts) else "nothing here is round"
 
 
-def _restitution(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> str | None:
-    return "physics.restitution is 0" if physics.restitution == 0.0 else None
-
-
 PREDICATES: dict[str, Predicate] = {
     "dynamics": _resting(lambda *_: None),
     "table_mesh": _resting(_table_mesh),
@@ -129,19 +125,8 @@ PREDICATES: dict[str, Predicate] = {
     "decomposition": _resting(_decomposition),
     "fine_step": _resting(lambda *_: None),
     "rolling_friction": _resting(_rolling),
-    "restitution": _resting(_restitution),
+    "restitution": _resting(lambda *given: None if given[2].restitution else "physics.restitution is 0"),
 }
-
-COSTS: dict[str, str] = {
-    "dynamics": "milliseconds a scene",
-    "table_mesh": "the simulation takes several times as long",
-    "object_contacts": "all objects are simulated at once, until the last rests",
-    "decomposition": "seconds for a mesh from outside, a tenth for a built-in shape, and hundreds of parts for one hull",
-    "fine_step": "up to 16 times as many steps while things move fast",
-    "rolling_friction": "three rows more for each pair in contact",
-    "restitution": "the fall is simulated for longer",
-}
-"""Cost of each where it runs."""
 
 
 def called_for(starts: Sequence[ObjectStart], table: Table, physics: Physics) -> frozenset[str]:

@@ -1,6 +1,6 @@
 """Check of stored labels: derives each again from the stored images, the rows and the job, by the producer's functions."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,18 +12,19 @@ from schemas.scene.camera import Role
 from schemas.scene.effects import EffectPlan
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.view import View
-from workers.cameras.pivot_depth import object_distance
-from workers.cameras.placement import place_aligned_camera, place_mirror_camera
+from workers.cameras.placement import object_distance, place_aligned_camera, place_mirror_camera
 from workers.geometry.camera import image_coordinates
 from workers.geometry.frames import invert
 from workers.geometry.pixels import measure_regions
 from workers.labels.agreement import compare_views
 from workers.labels.patches import patch_object_fraction
 from workers.labels.projected_view import derive_projected, projection_shares
-from workers.pipeline.check_stored_patches import ReadImage, check_patches
+from workers.pipeline.image_files import image_boxes, view_pixels
 
 ROUNDING = 1e-12
 """Largest difference of poses and distances that are computed again from the same doubles."""
+
+ReadImage = Callable[[str], NDArray]
 
 
 def check_stored_scene(scene: Row) -> list[str]:
@@ -58,7 +59,7 @@ def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], sc
             faults += _check_labels(view, scene)
             faults += _check_patch_shares(job, view, scene, objects)
             faults += _check_images(view)
-        faults += check_patches(view, stored["mirror" if role == "projected" else role], job, read, views[role])
+        faults += _check_patches(view, stored["mirror" if role == "projected" else role], job, read, views[role])
     faults += _check_cameras(job, stored, views)
     if "mirror" in stored:
         faults += _check_agreement(job, stored, views)
@@ -95,9 +96,8 @@ def _check_labels(view: View, scene: Row) -> list[str]:
     where, faults = f"pose {view.pose_id} ({view.role})", []
     T_world = read_world_poses(scene)
     if {label.region_id for label in view.labels} != set(T_world):
-        return [
-            f"{where}: objects has the regions {[label.region_id for label in view.labels]}, scenes {list(T_world)}"
-        ]
+        found = [label.region_id for label in view.labels]
+        return [f"{where}: objects has the regions {found}, scenes {list(T_world)}"]
     extents = measure_regions(view.region)
     for label in view.labels:
         pixels, box = extents[label.region_id]
@@ -119,35 +119,44 @@ def _check_patch_shares(job: Job, view: View, scene: Row, objects: list[Row]) ->
     """Compare the share of its patch that each object fills; a dataset without bodies has no such column."""
     if scene["bodies"] is None:
         return []
-    shares = {
-        row["region_id"]: row["patch_object_fraction"]
-        for row in objects
-        if (row["pose_id"], row["role"]) == (view.pose_id, view.role)
-    }
-    found = {
-        label.region_id: patch_object_fraction(view, label, job.images.patch)
-        for label in view.labels
-        if label.region_id >= REGION_FIRST_OBJECT
-    }
-    return [
-        f"pose {view.pose_id} ({view.role}), region {region}: fills {share} of its patch, objects says {shares[region]}"
-        for region, share in found.items()
-        if share != shares[region]
-    ]
+    own = [row for row in objects if (row["pose_id"], row["role"]) == (view.pose_id, view.role)]
+    shares, faults = {row["region_id"]: row["patch_object_fraction"] for row in own}, []
+    for label in view.labels:
+        told, share = shares[label.region_id], patch_object_fraction(view, label, job.images.patch)
+        if label.region_id >= REGION_FIRST_OBJECT and share != told:
+            where = f"pose {view.pose_id} ({view.role}), region {label.region_id}"
+            faults.append(f"{where}: fills {share} of its patch, objects says {told}")
+    return faults
 
 
 def _check_images(view: View) -> list[str]:
     """Compare the mask with the depth, and its regions with those of `objects`."""
     assert view.region is not None
+    where, faults = f"pose {view.pose_id} ({view.role})", []
     known = {0, 1} | {label.region_id for label in view.labels}
-    foreign = set(np.unique(view.region).tolist()) - known
-    faults = (
-        [f"pose {view.pose_id} ({view.role}): the mask has regions {sorted(foreign)} that objects lacks"]
-        if foreign
-        else []
-    )
+    if foreign := set(np.unique(view.region).tolist()) - known:
+        faults.append(f"{where}: the mask has regions {sorted(foreign)} that objects lacks")
     if (view.depth[view.region == 0] != 0).any():
-        faults.append(f"pose {view.pose_id} ({view.role}): depth where the mask says that nothing was hit")
+        faults.append(f"{where}: depth where the mask says that nothing was hit")
+    return faults
+
+
+def _check_patches(view: View, labelled: View, job: Job, read: ReadImage, row: Row) -> list[str]:
+    """Patches that are not the crop of their image, and files that are missing or too many.
+
+    `labelled` is the view that holds the labels: the mirror view for a projected one, else the view itself.
+    """
+    listed, faults = {file["path"] for file in row["files"]}, []
+    objects = [label for label in labelled.labels if label.region_id >= REGION_FIRST_OBJECT]
+    expected = set()
+    for path, kind, box in image_boxes(view, objects, row["category"], job.images.patch):
+        expected.add(path)
+        full = view_pixels(view, kind)
+        if box is not None and path in listed and full is not None and not np.array_equal(read(path), full[box]):
+            faults.append(f"{path}: is not the crop of its image")
+    if expected != listed:
+        wrong = sorted(expected ^ listed)
+        faults.append(f"pose {view.pose_id} ({view.role}): files {wrong} should be there, or should not")
     return faults
 
 
@@ -163,9 +172,8 @@ def _check_cameras(job: Job, stored: Mapping[str, View], views: Mapping[str, Row
     poses["projected"] = poses["mirror"]
     for role, camera in poses.items():
         if role in stored and _differs(camera.T_world_cam, stored[role].camera.T_world_cam):
-            faults.append(
-                f"pose {stored[role].pose_id} ({role}): T_world_cam does not follow from the input pose and d_z"
-            )
+            where = f"pose {stored[role].pose_id} ({role})"
+            faults.append(f"{where}: T_world_cam does not follow from the input pose and d_z")
     for role, row in views.items():
         if abs(row["d_z_m"] - d_z) > ROUNDING:
             faults.append(f"pose {row['pose_id']} ({role}): d_z_m is {row['d_z_m']}, the input depth gives {d_z}")

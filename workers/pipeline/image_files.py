@@ -1,6 +1,6 @@
 """The images that a view leaves, their names, and their bytes. Pure."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from numpy.typing import NDArray
 
@@ -18,17 +18,21 @@ Box = tuple[slice, slice]
 def encode_view(view: View, pair: Pair, images: Images) -> tuple[EncodedFile, ...]:
     """The view's images and their patches as PNG."""
     files = []
-    for path, kind, box in image_boxes(view, pair, images.patch):
+    objects = object_labels(view, pair)
+    for path, kind, box in image_boxes(view, objects, objects[0].category, images.patch):
         pixels = view_pixels(view, kind)
         assert pixels is not None
         files.append(encoded_file(path, encode_png(pixels if box is None else pixels[box], images.png_level)))
     return tuple(files)
 
 
-def image_boxes(view: View, pair: Pair, patch: Patch) -> Iterator[tuple[str, PixelKind, Box | None]]:
-    """Path, kind of pixels and crop (rows, columns; None for all) of each image that the view holds and of its patches."""
-    objects = object_labels(view, pair)
-    category = objects[0].category
+def image_boxes(
+    view: View, objects: Sequence[ObjectLabel], category: str, patch: Patch
+) -> Iterator[tuple[str, PixelKind, Box | None]]:
+    """Path, kind of pixels and crop (rows, columns; None for all) of each image that the view holds and of its patches.
+
+    objects: the labels that have patches. `category` is the scene's.
+    """
     for image in IMAGES:
         if image.role != view.role or view_pixels(view, image.pixels) is None:
             continue

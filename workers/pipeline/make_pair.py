@@ -8,8 +8,7 @@ from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ScenePlan
 from schemas.scene.scene import PosedScene
 from schemas.scene.view import Pair, View
-from workers.cameras.pivot_depth import object_distance
-from workers.cameras.placement import place_aligned_camera, place_mirror_camera
+from workers.cameras.placement import object_distance, place_aligned_camera, place_mirror_camera
 from workers.geometry.stored_depth import quantise_depth
 from workers.labels.agreement import compare_views
 from workers.labels.projected_view import derive_projected, projection_shares

@@ -16,8 +16,7 @@ from workers.physics.step import recheck_scene, settle_scene
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_pair import SettledScene, make_pair
 from workers.pipeline.stopwatch import Stopwatch
-from workers.plan.effect import Facts
-from workers.plan.effects import is_raycast_scene, plan_effects
+from workers.plan.effects import Facts, is_raycast_scene, plan_effects
 from workers.plan.randomness import SceneChance
 from workers.plan.step import plan_scene
 

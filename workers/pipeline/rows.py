@@ -129,15 +129,8 @@ def asset_row(asset: Asset, job: Job) -> Row:
 
 def failed_scene(scene_id: int, category: str, error: SceneError, attempts: int = 1) -> SceneOutput:
     """The output of a scene that cannot be made: no files, one row in `failures`."""
-    row: Row = {
-        "scene_id": scene_id,
-        "category": category,
-        "stage": error.stage,
-        "kind": error.kind,
-        "reason": error.reason,
-        "detail": error.detail,
-        "attempts": attempts,
-    }
+    told = {name: getattr(error, name) for name in ("stage", "kind", "reason", "detail")}
+    row: Row = {"scene_id": scene_id, "category": category, **told, "attempts": attempts}
     return SceneOutput(scene_id, (), {"failures": [row]})
 
 

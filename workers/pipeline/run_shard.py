@@ -15,9 +15,8 @@ from typing import IO
 from schemas.dataset.commit import Span
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, staging_path
-from schemas.dataset.shard import Blame, ShardOrder, ShardReport, SpanReport
+from schemas.dataset.shard import ShardOrder, ShardReport, SpanReport
 from schemas.errors import FingerprintError, SceneError
-from schemas.job.job import Job
 from schemas.job.render import Tier
 from schemas.scene.scene import SceneOutput
 from workers.assets.catalogue import Catalogue
@@ -77,7 +76,12 @@ def run_span(context: WorkerContext, store: Store, order: ShardOrder, span: Span
     with _traceback_file(store, attempt) as tracebacks:
         for scene_id in span.scene_ids:
             if scene_id in blamed:
-                output = record_blame(context.job, blamed[scene_id])
+                # Not begun, so that no worker dies in it
+                blame, category = (
+                    blamed[scene_id],
+                    choose_category(context.job, SceneChance(context.job.seed, scene_id)),
+                )
+                output = failed_scene(scene_id, category, BlamedScene(blame.reason, blame.detail), blame.attempts)
             else:
                 attempt.begin_scene(scene_id)
                 with _time_limit(context.job.run.scene_timeout_s, tracebacks):
@@ -95,14 +99,6 @@ def run_span(context: WorkerContext, store: Store, order: ShardOrder, span: Span
         conflict=result.conflict,
         made=len(span.scene_ids) - failed.total(),
         failed=dict(failed),
-    )
-
-
-def record_blame(job: Job, blame: Blame) -> SceneOutput:
-    """The row of a scene that is not tried again: it is not begun, so that no worker dies in it."""
-    error = BlamedScene(blame.reason, blame.detail)
-    return failed_scene(
-        blame.scene_id, choose_category(job, SceneChance(job.seed, blame.scene_id)), error, blame.attempts
     )
 
 

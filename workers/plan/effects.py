@@ -1,29 +1,54 @@
 """What a scene calls for: one table of effects, one entry an effect, and the plan that follows from it. Pure.
 
 The plan is made from the scene as it is drawn, before anything moves; the kinds are explained in schemas/scene/effects.py.
-To add an effect: add an entry with its kind, predicate, cost and stage, let the step that it belongs to ask the plan, and
+To add an effect: add an entry with its kind, predicate and stage, let the step that it belongs to ask the plan, and
 give it its two scenes (tests/effects/cases.py) and its proof (tests/effects/proofs.py).
 """
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from schemas.base import Array
 from schemas.dataset.layout import SWITCHES, PixelKind, is_stored
+from schemas.job.job import Job
 from schemas.job.render import Tier
 from schemas.job.run import Check
 from schemas.job.sensor import SensorEffects
 from schemas.scene.camera import Camera, Role
-from schemas.scene.effects import EffectPlan
+from schemas.scene.effects import EffectKind, EffectPlan
+from schemas.scene.plan import ScenePlan
 from schemas.scene.shape import Part
 from workers.cameras.placement import place_aligned_camera, place_mirror_camera
-from workers.geometry.frustum import is_outside_views
+from workers.geometry.camera import is_outside_views
 from workers.geometry.texels import has_holes
-from workers.physics.effects import COSTS, PREDICATES
-from workers.plan.effect import Effect, Facts, Reason
+from workers.physics.effects import PREDICATES
 from workers.plan.randomness import SceneChance, Stream
+
+
+@dataclass(frozen=True, eq=False)
+class Facts:
+    """What an effect's predicate may look at: the scene as it is drawn, before anything moves or is rendered."""
+
+    job: Job
+    plan: ScenePlan
+    raycast_checked: bool
+
+
+Reason = Callable[[Facts], str | None]
+"""Why a scene does not call for an effect; None where it does."""
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """An entry of the table of effects: its predicate, and the stage that its time is counted in."""
+
+    name: str
+    kind: EffectKind
+    skipped_because: Reason
+    stage: str
 
 
 def plan_effects(facts: Facts, forced: frozenset[str] = frozenset()) -> EffectPlan:
@@ -154,57 +179,36 @@ _NOISY_DEPTH = _where(
 
 def _of_physics(name: str) -> Effect:
     """An effect of physics, whose predicate looks at objects, table and settings alone."""
-
-    def skipped_because(facts: Facts) -> str | None:
-        return PREDICATES[name](facts.plan.objects, facts.plan.table, facts.job.physics)
-
-    return Effect(name, "asked" if name == "restitution" else "approximation", skipped_because, COSTS[name], "physics")
+    kind: EffectKind = "asked" if name == "restitution" else "approximation"
+    predicate = PREDICATES[name]
+    return Effect(name, kind, lambda f: predicate(f.plan.objects, f.plan.table, f.job.physics), "physics")
 
 
 PHYSICS_EFFECTS: tuple[Effect, ...] = tuple(_of_physics(name) for name in PREDICATES)
 
 EFFECTS: tuple[Effect, ...] = (
     *PHYSICS_EFFECTS,
-    Effect("depth_camera", "asked", _stored("aligned"), "a third view", "render"),
-    Effect("mirror", "asked", _stored("mirror"), "a second view", "render"),
-    Effect("projection", "asked", _PROJECTION, "the input's cloud in the mirror camera", "projection"),
-    Effect("splat", "asked", _first_of(_PROJECTION, _SPLAT), "several pixels a point", "projection"),
-    Effect("hidden_point_removal", "asked", _first_of(_PROJECTION, _HIDDEN_POINTS), "a normal a point", "projection"),
-    Effect("rgb", "asked", _stored("rgb"), "colour in every view", "render"),
-    Effect(
-        "shadows", "asked", _first_of(_stored("rgb"), _NOT_TRACED, _tier("raster")), "one shadow map a scene", "render"
-    ),
-    Effect("ambient_occlusion", "asked", _tier("raster"), "two level maps a scene", "render"),
-    Effect(
-        "antialiasing", "asked", _first_of(_stored("rgb"), _NOT_TRACED, _tier("raster")), "1 to 2 ms a view", "render"
-    ),
-    Effect("samples", "asked", _first_of(_tier("raster"), _SAMPLES), "three more draws of edges", "render"),
-    Effect("global_illumination", "asked", _tier("pathtraced"), "seconds a view", "render"),
-    Effect("glass", "asked", _tier("pathtraced"), "longer paths", "render"),
-    *(
-        Effect(f"sensor_{name}", "asked", _sensor(name), "an image pass", "sensor")
-        for name in SensorEffects.model_fields
-    ),
-    Effect("raycast_check", "asked", _RAYCAST, "every view cast by rays: 0.2 s", "raycast"),
-    Effect("release_again", "asked", _RAYCAST, "a second of simulation", "recheck"),
-    Effect("floor", "no_op", _floor, "a draw in each view", "render"),
-    Effect("table", "no_op", _table, "a draw in each view", "render"),
-    Effect("textures", "no_op", _first_of(_stored("rgb"), _TEXTURES), "a look-up for each fragment", "render"),
+    Effect("depth_camera", "asked", _stored("aligned"), "render"),
+    Effect("mirror", "asked", _stored("mirror"), "render"),
+    Effect("projection", "asked", _PROJECTION, "projection"),
+    Effect("splat", "asked", _first_of(_PROJECTION, _SPLAT), "projection"),
+    Effect("hidden_point_removal", "asked", _first_of(_PROJECTION, _HIDDEN_POINTS), "projection"),
+    Effect("rgb", "asked", _stored("rgb"), "render"),
+    Effect("shadows", "asked", _first_of(_stored("rgb"), _NOT_TRACED, _tier("raster")), "render"),
+    Effect("ambient_occlusion", "asked", _tier("raster"), "render"),
+    Effect("antialiasing", "asked", _first_of(_stored("rgb"), _NOT_TRACED, _tier("raster")), "render"),
+    Effect("samples", "asked", _first_of(_tier("raster"), _SAMPLES), "render"),
+    Effect("global_illumination", "asked", _tier("pathtraced"), "render"),
+    Effect("glass", "asked", _tier("pathtraced"), "render"),
+    *(Effect(f"sensor_{name}", "asked", _sensor(name), "sensor") for name in SensorEffects.model_fields),
+    Effect("raycast_check", "asked", _RAYCAST, "raycast"),
+    Effect("release_again", "asked", _RAYCAST, "recheck"),
+    Effect("floor", "no_op", _floor, "render"),
+    Effect("table", "no_op", _table, "render"),
+    Effect("textures", "no_op", _first_of(_stored("rgb"), _TEXTURES), "render"),
     # Tier flat has no such pass that could be forced, and the path tracer has it in its materials.
-    Effect(
-        "transparency",
-        "no_op",
-        _first_of(_tier("raster", "pathtraced"), _HOLES),
-        "two more draws a view",
-        "render",
-    ),
-    Effect("light_maps", "no_op", _tier("raster"), "maps of shadow and openness, once a scene", "render"),
-    Effect(
-        "exact_agreement",
-        "no_op",
-        _first_of(_stored("mirror"), _NOISY_DEPTH),
-        "the two views compared once more",
-        "check",
-    ),
+    Effect("transparency", "no_op", _first_of(_tier("raster", "pathtraced"), _HOLES), "render"),
+    Effect("light_maps", "no_op", _tier("raster"), "render"),
+    Effect("exact_agreement", "no_op", _first_of(_stored("mirror"), _NOISY_DEPTH), "check"),
 )
 """Every effect there is. A receipt names them in this order."""

@@ -12,7 +12,7 @@ from schemas.scene.camera import Camera
 from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import Placed
 from schemas.scene.view import GBuffer
-from workers.render.pathtraced.tracer import Tracer, require_mitsuba
+from workers.render.pathtraced.tracer import Tracer, encode_light, require_mitsuba
 from workers.render.raster.gbuffer import Renderer
 
 SEEDS = 2**32
@@ -38,7 +38,8 @@ def draw_view(
     drawn = renderer.draw(things, appearance, camera, render, effects)
     if render.tier != "pathtraced" or not effects.runs("rgb"):
         return drawn
-    rgb = shared_tracer().trace(things, appearance, camera, render, effects, int(rng.integers(SEEDS)))
+    seed = int(rng.integers(SEEDS))
+    rgb = encode_light(shared_tracer().radiance(things, appearance, camera, render, effects, seed))
     rgb.setflags(write=False)
     return replace(drawn, rgb=rgb)
 

@@ -19,8 +19,7 @@ from services.study.measure.rays import Box, cast_patch
 from workers.assets.appearance.draw import draw_appearance
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene
-from workers.plan.effect import Facts
-from workers.plan.effects import plan_effects
+from workers.plan.effects import Facts, plan_effects
 from workers.plan.randomness import SceneChance, Stream
 from workers.render.step import draw_view, require_tier
 

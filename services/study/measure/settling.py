@@ -17,8 +17,7 @@ from services.study.model import Setting
 from workers.geometry.frames import motion_between, transform
 from workers.physics.step import Rest, moved_by, recheck_scene, settle_scene
 from workers.pipeline.context import WorkerContext
-from workers.plan.effect import Facts
-from workers.plan.effects import plan_effects
+from workers.plan.effects import Facts, plan_effects
 from workers.plan.randomness import SceneChance
 from workers.plan.step import plan_scene
 

@@ -17,8 +17,7 @@ from workers.physics.step import settle_scene
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.run_shard import run_scene
 from workers.pipeline.stopwatch import Stopwatch
-from workers.plan.effect import Facts
-from workers.plan.effects import plan_effects
+from workers.plan.effects import Facts, plan_effects
 from workers.plan.randomness import SceneChance
 from workers.plan.step import plan_scene
 

@@ -23,8 +23,7 @@ from services.read.audit_motion import Motion
 from tests.effects.scenes import SMALL, merged
 from workers.geometry.frames import translation
 from workers.pipeline.fingerprint import take_fingerprint
-from workers.plan.effect import Effect
-from workers.plan.effects import EFFECTS
+from workers.plan.effects import EFFECTS, Effect
 from workers.render.raster.gbuffer import shared_renderer
 from workers.store.local import LocalStore
 

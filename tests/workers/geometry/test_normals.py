@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 from schemas.scene.camera import Camera, Intrinsics
+from tests.workers.labels.planes import HERE, plane_view
+from tests.workers.labels.planes import K as PLANE_K
+from workers.geometry.camera import unproject
 from workers.geometry.normals import facing_cosine, is_smooth
 
 K = Intrinsics(width=12, height=10, fx=20.0, fy=21.0, cx=6.0, cy=5.0)
@@ -51,3 +54,22 @@ def test_a_plane_is_smooth_and_a_step_is_not():
 def test_border_pixels_and_images_without_an_inner_pixel_are_not_smooth():
     assert not is_smooth(plane(), ONE, np.array([0, 11, 119]), 1.0).any()
     assert not is_smooth(np.ones((2, 9)), np.ones((2, 9), np.uint8), np.arange(18), 1.0).any()
+
+
+def test_a_surface_faces_the_side_it_is_seen_from():
+    view = plane_view("input", HERE)
+    depth = view.depth / 5000
+    everywhere = np.arange(depth.size)
+    above = facing_cosine(depth, view.region, everywhere, HERE, HERE.position + np.array([0, 0, 3.0])).reshape(120, 160)
+    below = facing_cosine(depth, view.region, everywhere, HERE, np.array([0.3, 0.2, -2.0]))
+    assert np.nanmin(above) > 0.3
+    assert np.nanmax(below) < 0
+    rows, columns = 60, 80
+    p = (
+        HERE.position
+        + HERE.T_world_cam[:3, :3]
+        @ unproject(np.array([rows]), np.array([columns]), depth[rows : rows + 1, columns], PLANE_K)[0]
+    )
+    towards = HERE.position + np.array([0, 0, 3.0]) - p
+    assert above[rows, columns] == pytest.approx(towards[2] / np.linalg.norm(towards), abs=2e-3)
+    assert np.isnan(above[0, 0])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from schemas.scene.camera import Camera, Intrinsics
-from workers.cameras.mirror import mirror_pose
+from workers.cameras.placement import mirror_pose
 from workers.geometry.camera import orbit_pose, unproject
 from workers.geometry.frames import invert
 from workers.geometry.projection import forward_project, sample_inverse_depth

@@ -8,8 +8,8 @@ from schemas.base import frozen_array
 from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Part, Shape
-from workers.geometry.camera import orbit_pose
-from workers.geometry.frames import pose, translation, uniform_rotation
+from workers.geometry.camera import orbit_pose, project
+from workers.geometry.frames import pose, transform, translation, uniform_rotation
 from workers.geometry.raycast import NEAR_M, cast_view, edge_distance_px, first_hit
 
 K = Intrinsics(width=160, height=120, fx=130.0, fy=140.0, cx=77.3, cy=62.1)
@@ -183,8 +183,13 @@ def test_an_open_border_belongs_to_the_outline_and_a_flat_diagonal_does_not():
     np.testing.assert_allclose(edge_distance_px([tile], Camera(k, EYE), pixels, outline_only=True), [7.5, 0.5])
 
 
-def test_many_pixels_and_edges_are_taken_in_pieces_with_the_same_result():
+def test_the_distance_is_that_to_the_nearest_of_all_projected_edges():
     ball = Placed(3, mesh(trimesh.creation.icosphere(3, 0.5)), translation(0.1, 0.0, 2.5))
     pixels = np.argwhere(np.ones((20, 20)))
-    whole = edge_distance_px([ball], Camera(K, EYE), pixels)
-    np.testing.assert_array_equal(whole, edge_distance_px([ball], Camera(K, EYE), pixels, chunk=1000))
+    seen = transform(ball.T_world_shape, ball.shape.vertices)
+    u, v = project(seen, K)
+    start, end = (np.stack([u, v], axis=1)[ball.shape.faces[:, k]].reshape(-1, 2) for k in ([0, 1, 2], [1, 2, 0]))
+    along, away = end - start, pixels[:, None, ::-1] + 0.5 - start
+    share = np.clip((away * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)
+    expected = np.linalg.norm(away - share[:, :, None] * along, axis=2).min(axis=1)
+    np.testing.assert_allclose(edge_distance_px([ball], Camera(K, EYE), pixels), expected, atol=1e-9)

@@ -5,7 +5,7 @@ import numpy as np
 from schemas.job.images import Images
 from schemas.scene.camera import Camera, Intrinsics, Role
 from schemas.scene.view import View
-from workers.cameras.mirror import mirror_pose
+from workers.cameras.placement import mirror_pose
 from workers.geometry.camera import orbit_pose, unproject
 from workers.geometry.stored_depth import quantise_depth
 

@@ -1,11 +1,6 @@
 """The agreement of two views of planes."""
 
-import numpy as np
-import pytest
-
-from tests.workers.labels.planes import HERE, IMAGES, THERE, K, plane_view
-from workers.geometry.camera import unproject
-from workers.geometry.normals import facing_cosine
+from tests.workers.labels.planes import HERE, IMAGES, THERE, plane_view
 from workers.labels.agreement import compare_views
 
 
@@ -29,22 +24,3 @@ def test_too_few_points_of_the_object_give_no_figure_for_it():
     assert agreement.median_mm is None
     assert agreement.points == 0
     assert agreement.scene_median_mm < 0.1
-
-
-def test_a_surface_faces_the_side_it_is_seen_from():
-    view = plane_view("input", HERE)
-    depth = view.depth / 5000
-    everywhere = np.arange(depth.size)
-    above = facing_cosine(depth, view.region, everywhere, HERE, HERE.position + np.array([0, 0, 3.0])).reshape(120, 160)
-    below = facing_cosine(depth, view.region, everywhere, HERE, np.array([0.3, 0.2, -2.0]))
-    assert np.nanmin(above) > 0.3
-    assert np.nanmax(below) < 0
-    rows, columns = 60, 80
-    p = (
-        HERE.position
-        + HERE.T_world_cam[:3, :3]
-        @ unproject(np.array([rows]), np.array([columns]), depth[rows : rows + 1, columns], K)[0]
-    )
-    towards = HERE.position + np.array([0, 0, 3.0]) - p
-    assert above[rows, columns] == pytest.approx(towards[2] / np.linalg.norm(towards), abs=2e-3)
-    assert np.isnan(above[0, 0])

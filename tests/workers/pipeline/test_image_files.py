@@ -27,13 +27,18 @@ def view_of(*labels: ObjectLabel) -> View:
     return View("input", 6, 6, CAMERA, rgb, depth, np.full((48, 64), 3, np.uint8), labels)
 
 
+def boxes_of(view: View, pair: Pair):
+    objects = object_labels(view, pair)
+    return image_boxes(view, objects, objects[0].category, IMAGES.patch)
+
+
 @pytest.fixture
 def view() -> View:
     return view_of(label(2, "table"), label(3, "mug"))
 
 
 def paths(view: View, pair: Pair) -> list[str]:
-    return [path for path, _, _ in image_boxes(view, pair, IMAGES.patch)]
+    return [path for path, _, _ in boxes_of(view, pair)]
 
 
 def test_every_image_and_patch_reads_back_as_what_the_view_holds_with_its_digest(view):
@@ -59,7 +64,7 @@ def test_a_projected_view_has_the_patches_of_the_mirror_views_objects_and_no_mas
     projected = dataclasses.replace(view, role="projected", region=None, labels=())
     pair = Pair(1.0, view, None, mirror, projected)
     assert object_labels(projected, pair) == list(mirror.labels)
-    boxes = {path: box for path, _, box in image_boxes(projected, pair, IMAGES.patch)}
+    boxes = {path: box for path, _, box in boxes_of(projected, pair)}
     assert boxes == {
         "mug/RGBprojected00006.png": None,
         "mug/patches/RGBprojected00006.png": (slice(20, 28), slice(12, 28)),

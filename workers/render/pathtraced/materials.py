@@ -15,6 +15,7 @@ from schemas.scene.effects import EffectPlan
 from schemas.scene.shape import Material, Part
 from workers.geometry.frames import transform
 from workers.geometry.srgb import SRGB_STEPS, decode_srgb
+from workers.geometry.texels import HOLE_ALPHA, has_holes
 from workers.render.raster.batches import MATTE_ROUGHNESS, texture_of
 
 Bsdf = dict[str, Any]
@@ -28,9 +29,6 @@ LEAST_WIDTH = 0.02
 
 LEAST_METAL_WIDTH = 0.12
 """Least width of a metal's lobe, whose reflections of the key light would leave fireflies on surfaces nearby."""
-
-HOLE = 0.5
-"""Texels of a smaller alpha are holes, as in the raster tier."""
 
 VERTEX_COLOR = "vertex_color"
 
@@ -68,14 +66,12 @@ def make_mesh(mi: ModuleType, part: Part, T_world_shape: Pose, name: str) -> Any
 
 def bsdf_of(mi: ModuleType, part: Part) -> Bsdf:
     """Diffuse, plastic, rough metal or a blend of them; thin glass where it transmits; a mask where texels are clear."""
-    material = part.material
-    color = _color(mi, part)
-    body = _opaque(material, color)
-    if material.transmission > 0.0:
+    body = _opaque(part.material, _color(mi, part))
+    if part.material.transmission > 0.0:
         body = _glass(mi, part, body)
     texture = texture_of(part)
-    if texture is not None and texture.shape[2] == 4 and int(texture[..., 3].min()) < 255 * HOLE:
-        solid = (texture[..., 3] >= 255 * HOLE).astype(np.float32)
+    if texture is not None and has_holes(texture):
+        solid = (texture[..., 3] >= HOLE_ALPHA).astype(np.float32)
         body = {"type": "mask", "opacity": _picture(mi, solid), "nested": body}
     return body
 

@@ -40,8 +40,6 @@ from workers.render.pathtraced.lights import lights_of
 from workers.render.pathtraced.materials import make_mesh, planned_part
 from workers.render.raster.lit_shaders import KNEE
 
-VARIANT = "scalar_rgb"
-
 NEAR_M = 0.05
 """Nearer surfaces are not seen, as in the other tiers."""
 
@@ -76,7 +74,7 @@ def load_mitsuba() -> ModuleType:
     require_mitsuba()
     try:
         mi = importlib.import_module("mitsuba")
-        mi.set_variant(VARIANT)
+        mi.set_variant("scalar_rgb")
         importlib.import_module("drjit").set_thread_count(1)
     except (ImportError, OSError) as error:
         raise InputError(f"render.tier is pathtraced, and Mitsuba does not load ({error}): {REMEDY}") from error
@@ -85,22 +83,14 @@ def load_mitsuba() -> ModuleType:
 
 @dataclass(frozen=True, eq=False)
 class TracedScene:
-    """A scene in Mitsuba, and the models that it was made from."""
+    """A scene in Mitsuba, and the key of the models that it was made from."""
 
     scene: Any
     clear: bool
     """Whether something in it lets light through."""
-    things: Sequence[Placed]
-    appearance: Appearance
-    effects: EffectPlan
-
-    def is_of(self, things: Sequence[Placed], appearance: Appearance, effects: EffectPlan) -> bool:
-        """Whether it was made from the same models."""
-        same = self.appearance is appearance and self.effects.ran == effects.ran and len(self.things) == len(things)
-        return same and all(
-            a.shape is b.shape and a.region_id == b.region_id and np.array_equal(a.T_world_shape, b.T_world_shape)
-            for a, b in zip(self.things, things, strict=True)
-        )
+    key: tuple[object, ...]
+    held: tuple[object, ...]
+    """The models whose ids the key holds."""
 
 
 class Tracer:
@@ -109,19 +99,6 @@ class Tracer:
     def __init__(self) -> None:
         self._mi = load_mitsuba()
         self._built: TracedScene | None = None
-
-    def trace(
-        self,
-        things: Sequence[Placed],
-        appearance: Appearance,
-        camera: Camera,
-        render: Render,
-        effects: EffectPlan,
-        seed: int,
-    ) -> NDArray[np.uint8]:
-        """[H, W, 3] uint8 sRGB, the same bytes for the same arguments; `seed` below 2**32."""
-        light = self.radiance(things, appearance, camera, render, effects, seed)
-        return encode_codes(tone_map(clamp_fireflies(light)))
 
     def radiance(
         self,
@@ -132,19 +109,13 @@ class Tracer:
         effects: EffectPlan,
         seed: int,
     ) -> Array:
-        """[H, W, 3] float64 linear light, with the background where nothing is hit."""
+        """[H, W, 3] float64 linear light, the same for the same arguments; the background where nothing is. `seed` < 2**32."""
         built = self.build(things, appearance, effects)
         kind = "volpath" if built.clear else "path"
         bounces = render.path_bounces if effects.runs("global_illumination") else 1
         integrator = {"type": kind, "max_depth": bounces + 1, "rr_depth": ROULETTE_DEPTH, "hide_emitters": True}
-        mi = self._mi
-        image = mi.render(
-            built.scene,
-            sensor=self.sensor(camera),
-            integrator=mi.load_dict(integrator),
-            spp=round_up_samples(render.path_samples),
-            seed=seed,
-        )
+        traced = {"sensor": self.sensor(camera), "integrator": self._mi.load_dict(integrator), "seed": seed}
+        image = self._mi.render(built.scene, spp=round_up_samples(render.path_samples), **traced)
         pixels = np.array(image, np.float64)
         covered = np.clip(pixels[..., 3:], 0.0, 1.0)
         light = pixels[..., :3] + (1.0 - covered) * np.array(appearance.background)
@@ -152,17 +123,20 @@ class Tracer:
 
     def build(self, things: Sequence[Placed], appearance: Appearance, effects: EffectPlan) -> TracedScene:
         """The scene in Mitsuba; a mesh's id is region-REGION-THING-PART."""
-        if self._built is not None and self._built.is_of(things, appearance, effects):
+        placed = ((id(thing.shape), thing.T_world_shape.tobytes(), thing.region_id) for thing in things)
+        key = (id(appearance), effects.ran, *placed)
+        if self._built is not None and self._built.key == key:
             return self._built
         tree: dict[str, Any] = {"type": "scene", **lights_of(self._mi, appearance)}
         clear = False
         for number, thing in enumerate(things):
             for piece, part in enumerate(planned_part(part, effects) for part in thing.shape.parts):
                 name = f"region-{thing.region_id}-{number}-{piece}"
-                clear = clear or lets_through(part.material)
+                texture = part.material.texture
+                clear = clear or part.material.transmission > 0.0 or (texture is not None and texture.shape[2] == 4)
                 if len(part.faces):
                     tree[name] = make_mesh(self._mi, part, thing.T_world_shape, name)
-        self._built = TracedScene(self._mi.load_dict(tree), clear, tuple(things), appearance, effects)
+        self._built = TracedScene(self._mi.load_dict(tree), clear, key, (appearance, *things))
         return self._built
 
     def sensor(self, camera: Camera) -> Any:
@@ -185,6 +159,11 @@ class Tracer:
                 "sampler": {"type": "multijitter"},
             }
         )
+
+
+def encode_light(light: Array) -> NDArray[np.uint8]:
+    """[H, W, 3] uint8 sRGB of traced light, without fireflies and through the tone curve."""
+    return encode_codes(tone_map(clamp_fireflies(light)))
 
 
 def clamp_fireflies(light: Array) -> Array:
@@ -216,12 +195,6 @@ def round_up_samples(samples: int) -> int:
     """The least number, not below `samples`, that fills a grid of nearly equal sides, as the sampler needs it."""
     side = math.isqrt(samples)
     return side * -(-samples // side)
-
-
-def lets_through(material: Any) -> bool:
-    """Whether light may cross a material: glass, and textures with an alpha channel."""
-    texture = material.texture
-    return material.transmission > 0.0 or (texture is not None and texture.shape[2] == 4)
 
 
 def square_pixels(k: Intrinsics) -> tuple[int, int, float]:

@@ -3,7 +3,7 @@
 **Shadow map.** The depth of everything but the floor as the key light sees it, `SHADOW_PX` square, fitted to the things.
 
 **Level maps.** A level is a horizontal plane: the floor, with a map around the table, and the plane that objects stand on,
-with a map around the objects. Each map is made from elevations on a grid of `LEVEL_PX` square (heightfield.py). RGBA8:
+with a map around the objects. Each map is made from elevations on a grid of `LEVEL_PX` square (occlusion.py). RGBA8:
 share of the sky seen from the level, share seen from the top of what stands there, elevation of that top in units of the
 box, and share of the key light. On the floor the last is the table's shadow, with an edge as wide as a lamp of `LAMP_RAD`
 makes it from a table's height.
@@ -21,8 +21,7 @@ from schemas.base import Array, Pose
 from schemas.scene.region import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.scene import Placed
 from workers.geometry.frames import transform
-from workers.render.raster.heightfield import column_extents
-from workers.render.raster.occlusion import sky_visibility
+from workers.render.raster.occlusion import column_extents, sky_visibility
 
 SHADOW_PX = 768
 LEVEL_PX = 56

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Array
-from schemas.scene.shape import Part, Shape
+from schemas.scene.shape import Mesh, Part, Shape
+from workers.geometry.convexity import face_planes
 from workers.geometry.srgb import SRGB_STEPS, decode_srgb
 
 COLUMNS = {"position": 3, "normal_metallic": 4, "albedo_roughness": 4, "uv": 2, "face_plane": 4}
@@ -84,7 +84,7 @@ def _pack(parts: list[Part], highest_m: float) -> Batch:
     for part in parts:
         faces, source = own_vertices(part.faces, len(part.vertices))
         vertices = _vertex_columns(part)[source]
-        vertices[faces[:, 2], -4:] = _planes(part)
+        vertices[faces[:, 2], -4:] = np.column_stack(face_planes(Mesh(part.vertices, part.faces)))
         packed.append(vertices)
         indices.append(faces + start)
         start += len(vertices)
@@ -112,12 +112,3 @@ def _vertex_columns(part: Part) -> NDArray[np.float32]:
     if part.uv is not None:
         columns[:, 11:13] = part.uv
     return columns
-
-
-def _planes(part: Part) -> Array:
-    """[F, 4] float64: unit normal and its dot product with a point of the face, part frame; 0 without area."""
-    a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
-    return np.concatenate([normals, np.einsum("ij,ij->i", normals, a)[:, None]], axis=1)

@@ -93,20 +93,16 @@ class ShapeStore:
 
     def trim(self, in_use: int) -> None:
         """Free the least recently used until the bounds hold, but not the `in_use` shapes that were fetched last."""
-        while len(self._stored) > in_use and not self._fits():
-            self._free_oldest()
-
-    def _fits(self) -> bool:
-        return len(self._stored) <= self._max_shapes and self._bytes <= self._max_bytes and self.textures.fits
-
-    def _free_oldest(self) -> None:
-        _, (_, uploaded) = self._stored.popitem(last=False)
-        self._bytes -= uploaded.bytes
-        for batch in uploaded.batches:
-            self._gl.glDeleteVertexArrays(1, [batch.vertex_array])
-            self._gl.glDeleteBuffers(2, batch.buffers)
-            if batch.texture is not None:
-                self.textures.give_back(batch.texture)
+        while len(self._stored) > in_use:
+            if len(self._stored) <= self._max_shapes and self._bytes <= self._max_bytes and self.textures.fits:
+                return
+            _, (_, uploaded) = self._stored.popitem(last=False)
+            self._bytes -= uploaded.bytes
+            for batch in uploaded.batches:
+                self._gl.glDeleteVertexArrays(1, [batch.vertex_array])
+                self._gl.glDeleteBuffers(2, batch.buffers)
+                if batch.texture is not None:
+                    self.textures.give_back(batch.texture)
 
 
 def _upload(gl: ModuleType, batch: Batch, textures: TextureStore) -> Uploaded:

@@ -7,8 +7,9 @@ import numpy as np
 from schemas.scene.camera import Intrinsics
 from workers.render.raster.buffers import UploadedShape
 from workers.render.raster.framebuffer import Framebuffer
+from workers.render.raster.lit_shaders import EMPTY_FRAGMENT
 from workers.render.raster.programs import Program
-from workers.render.raster.shaders import COUNT_FRAGMENT, COUNT_VERTEX
+from workers.render.raster.shaders import COUNT_VERTEX
 from workers.render.raster.tiles import TILE_PX
 
 
@@ -17,7 +18,7 @@ class PixelCounter:
 
     def __init__(self, gl: ModuleType) -> None:
         self._gl = gl
-        self.program = Program(gl, COUNT_VERTEX, COUNT_FRAGMENT)
+        self.program = Program(gl, COUNT_VERTEX, EMPTY_FRAGMENT)
         self._query = int(np.ravel(gl.glGenQueries(1))[0])
         self._framebuffer = Framebuffer(gl, {gl.GL_DEPTH_STENCIL_ATTACHMENT: gl.GL_DEPTH24_STENCIL8})
 

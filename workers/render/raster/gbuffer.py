@@ -11,7 +11,7 @@ The interpolated z is used only where a face is so nearly edge-on that its plane
 200 scenes against float64 rays, p99.9 falls from 0.008 to 0.0015 mm on the floor and from 0.012 to 0.003 mm on tables.
 
 **Depth test.** It compares the same z as near / z, which in float32 keeps seven digits at any distance. A depth bias for
-each region (depth_bias.py) lets the lowest region id win among coplanar faces, whatever their triangles.
+each region (`rank_regions`) lets the lowest region id win among coplanar faces, whatever their triangles.
 
 **Rows.** Row 0 of the framebuffer is the image's top row: y runs down in clip space, nothing is flipped, and window
 coordinates are image coordinates with pixel centres at +0.5. Both sides of every face are drawn.
@@ -39,19 +39,17 @@ from schemas.scene.view import GBuffer
 from workers.geometry.frames import invert
 from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_edges, smooth_edges
 from workers.render.raster.buffers import INDEX_BYTES, ShapeStore, UploadedShape
-from workers.render.raster.colour import ColourTarget
 from workers.render.raster.context import open_context
 from workers.render.raster.counting import PixelCounter
-from workers.render.raster.depth_bias import rank_regions
-from workers.render.raster.draw_calls import Draw, RenderPass, is_drawn, sort_draws
-from workers.render.raster.framebuffer import Framebuffer
+from workers.render.raster.draw_calls import Draw, RenderPass, is_drawn, rank_regions, sort_draws
+from workers.render.raster.framebuffer import ColourTarget, Framebuffer
 from workers.render.raster.light_maps import LightMaps
 from workers.render.raster.programs import NEAR_M, Program
 from workers.render.raster.shaders import Variant, label_sources
 from workers.render.raster.tiles import tiles
 
 DEPTH_BIAS = 2e-6
-"""Share of its distance, along its normal, by which each rank of depth_bias.py moves a face back in the depth test: 5
+"""Share of its distance, along its normal, by which each rank of `rank_regions` moves a face back in the depth test: 5
 micrometres at 2.5 m. A quarter of it is the least that kept 400 pairs of coplanar squares apart."""
 
 FLOOR_BIAS = 1e-5

@@ -17,7 +17,7 @@ from schemas.scene.scene import Placed
 from workers.render.raster import baking
 from workers.render.raster.baking import SHADOW_PX, Box
 from workers.render.raster.buffers import ShapeStore
-from workers.render.raster.lit_shaders import CAST_FRAGMENT, CAST_VERTEX
+from workers.render.raster.lit_shaders import CAST_VERTEX, EMPTY_FRAGMENT
 from workers.render.raster.programs import LEVEL_UNIT, SHADOW_UNIT, MapPlacement, Program
 
 UPRIGHT = 1.0 - 1e-9
@@ -44,7 +44,7 @@ class LightMaps:
 
     def __init__(self, gl: ModuleType, shapes: ShapeStore) -> None:
         self._gl, self._shapes = gl, shapes
-        self._program = Program(gl, CAST_VERTEX, CAST_FRAGMENT)
+        self._program = Program(gl, CAST_VERTEX, EMPTY_FRAGMENT)
         self._shadow = self._depth_texture()
         self._floor, self._stand, self._open = (self._texture((1.0, 1.0, 0.0, 1.0)) for _ in range(3))
         self._upload(self._open, np.full((1, 1, 4), LIT_AND_OPEN, np.uint8))
@@ -123,11 +123,15 @@ class LightMaps:
         light = self._baked.light
         level = self._baked.floor if thing.region_id == REGION_FLOOR else self._baked.stand
         level_from_shape = np.zeros((4, 4)) if level is None else level.unit_from_world @ thing.T_world_shape
-        if light is None:  # every point before the shadow map, so that light reaches it
-            return MapPlacement.of(level_from_shape, np.diag([0.0, 0.0, 0.0, 1.0]), (0.0, 1.0, 0.0))
-        return MapPlacement.of(
-            level_from_shape, light.unit_from_world @ thing.T_world_shape, baking.shadow_filter(light)
-        )
+        shadow_from_shape, softness = (
+            np.diag([0.0, 0.0, 0.0, 1.0]),
+            (0.0, 1.0, 0.0),
+        )  # before the map, where light arrives
+        if light is not None:
+            shadow_from_shape, softness = light.unit_from_world @ thing.T_world_shape, baking.shadow_filter(light)
+        matrices = (level_from_shape, shadow_from_shape, np.linalg.pinv(shadow_from_shape[:3, :3]).T)
+        on_level, on_shadow, normal = (matrix.astype(np.float32) for matrix in matrices)
+        return MapPlacement(on_level, on_shadow, normal, softness)
 
     def _cast(self, things: Sequence[Placed], clip_from_world: Pose) -> NDArray[np.float32]:
         """[SHADOW_PX, SHADOW_PX] float32: least depth of things in an orthographic view; 1 where there is none."""

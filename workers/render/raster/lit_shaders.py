@@ -133,7 +133,7 @@ uniform mat4 clip_from_shape;
 void main() { gl_Position = clip_from_shape * vec4(position, 1.0); }
 """
 
-CAST_FRAGMENT = """
+EMPTY_FRAGMENT = """
 #version 410 core
 void main() {}
 """

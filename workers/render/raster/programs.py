@@ -30,17 +30,6 @@ class MapPlacement(NamedTuple):
     shadow_normal: NDArray[np.float32]
     softness: tuple[float, float, float]
 
-    @staticmethod
-    def of(level_from_shape: Pose, shadow_from_shape: Pose, softness: tuple[float, float, float]) -> "MapPlacement":
-        """A placement from float64 matrices."""
-        normal = np.linalg.pinv(shadow_from_shape[:3, :3]).T
-        return MapPlacement(
-            level_from_shape.astype(np.float32),
-            shadow_from_shape.astype(np.float32),
-            normal.astype(np.float32),
-            softness,
-        )
-
 
 class Program:
     """A linked program; raises RuntimeError, with the compiler's log, where the driver refuses it."""

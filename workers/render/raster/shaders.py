@@ -219,11 +219,6 @@ void main() {
 }
 """
 
-COUNT_FRAGMENT = """
-#version 410 core
-void main() {}
-"""
-
 
 def label_sources(variant: Variant) -> tuple[str, str]:
     """(vertex, fragment) shader of a variant."""

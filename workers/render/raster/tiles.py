@@ -9,6 +9,7 @@ import numpy as np
 from schemas.base import Array, Pose
 from schemas.scene.camera import Intrinsics
 from schemas.scene.shape import Shape
+from workers.geometry.camera import project
 from workers.geometry.frames import transform
 from workers.render.raster.programs import NEAR_M
 
@@ -40,8 +41,7 @@ def window(vertices: Array, k: Intrinsics) -> tuple[int, int, int, int]:
         return (0, 0, 0, 0)
     if not seen.all():
         return reach
-    u = k.fx * vertices[:, 0] / vertices[:, 2] + k.cx
-    v = k.fy * vertices[:, 1] / vertices[:, 2] + k.cy
+    u, v = project(vertices, k)
     low = (math.floor(np.clip(u.min(), reach[0], reach[2])), math.floor(np.clip(v.min(), reach[1], reach[3])))
     high = (math.ceil(np.clip(u.max(), reach[0], reach[2])), math.ceil(np.clip(v.max(), reach[1], reach[3])))
     return (*low, *high)

@@ -6,8 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import workers.cameras.mirror
-import workers.cameras.pivot_depth
 import workers.cameras.placement
 import workers.geometry.camera
 import workers.geometry.pixels
@@ -38,16 +36,16 @@ def mirrored_phi(plant: Plant, _: Any) -> None:
         turn = pose(tilt @ np.diag([-1.0, 1.0, -1.0]) @ tilt.T, np.zeros(3))
         return T_world_cam @ translation(0, 0, d_z_m) @ turn @ translation(0, 0, -T_z_m)
 
-    plant(workers.cameras.mirror.mirror_pose, planted)
+    plant(workers.cameras.placement.mirror_pose, planted)
 
 
 def wrong_T_z(plant: Plant, _: Any) -> None:
-    original = workers.cameras.mirror.mirror_pose
+    original = workers.cameras.placement.mirror_pose
     plant(original, lambda T, d_z_m, T_z_m=1.3, *up: original(T, d_z_m, T_z_m + 1e-3, *up))
 
 
 def nearest_for_percentile(plant: Plant, _: Any) -> None:
-    original = workers.cameras.pivot_depth.front_distance
+    original = workers.cameras.placement.front_distance
     plant(original, lambda z, own, mirror: original(z, own, mirror.model_copy(update={"pivot_depth": "nearest"})))
 
 

@@ -17,7 +17,7 @@ from tests.services.study.measure.label_views import (
     view,
 )
 from tests.shapes import box
-from workers.cameras.mirror import mirror_pose
+from workers.cameras.placement import mirror_pose
 from workers.geometry.camera import look_at
 
 

@@ -20,6 +20,7 @@ from tests.workers.render.random_scenes import (
 )
 from workers.geometry.camera import orbit_pose
 from workers.render.pathtraced.materials import tint_of
+from workers.render.pathtraced.tracer import encode_light
 
 GLASS = Material((0.7, 0.8, 0.8, 1.0), roughness=0.1, transmission=1.0)
 RED = Material((0.9, 0.05, 0.05, 1.0), roughness=1.0)
@@ -45,7 +46,7 @@ def test_a_texture_lies_as_in_the_raster_tier(renderer, tracer):
     )
     view = camera(small(32, 32))
     drawn = renderer.draw([Placed(3, card, EYE)], look, view, *FLAT).rgb
-    seen = tracer.trace([Placed(3, card, EYE)], look, view, *paths(16), 0)
+    seen = encode_light(tracer.radiance([Placed(3, card, EYE)], look, view, *paths(16), 0))
     for v, u in ((8, 8), (8, 24), (24, 8), (24, 24)):
         assert (drawn[v, u] > 120).tolist() == (seen[v, u] > 120).tolist(), f"at {u}, {v}"
 

@@ -33,6 +33,7 @@ from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import invert, pose, rotation_about, translation
 from workers.render.pathtraced.tracer import (
     clamp_fireflies,
+    encode_light,
     require_mitsuba,
     round_up_samples,
     square_pixels,
@@ -115,11 +116,11 @@ RUN = """
 import hashlib, numpy as np
 from tests.workers.render.random_scenes import APPEARANCE, camera, orbit_and_mirror, random_things, small
 from tests.workers.render.looks import paths
-from workers.render.pathtraced.tracer import Tracer
+from workers.render.pathtraced.tracer import Tracer, encode_light
 rng = np.random.default_rng(5)
 things, height = random_things(rng)
 view = camera(small(96, 72), orbit_and_mirror(rng, height)[1].T_world_cam)
-print(hashlib.sha256(Tracer().trace(things, APPEARANCE, view, *paths(4), 77).tobytes()).hexdigest())
+print(hashlib.sha256(encode_light(Tracer().radiance(things, APPEARANCE, view, *paths(4), 77)).tobytes()).hexdigest())
 """
 
 
@@ -130,7 +131,9 @@ def test_the_same_seed_gives_the_same_bytes_here_and_in_another_process(tracer):
     view = camera(small(96, 72), orbit_and_mirror(rng, height)[1].T_world_cam)
 
     def digest(seed):
-        return hashlib.sha256(tracer.trace(things, APPEARANCE, view, *paths(4), seed).tobytes()).hexdigest()
+        return hashlib.sha256(
+            encode_light(tracer.radiance(things, APPEARANCE, view, *paths(4), seed)).tobytes()
+        ).hexdigest()
 
     first = digest(77)
     tracer._built = None

@@ -1,20 +1,29 @@
-"""Draw calls: exact no-ops that are forced do their work and change no byte; withdrawn ones are not drawn."""
+"""Draw calls: exact no-ops that are forced do their work and change no byte; withdrawn ones are not drawn. Ranks of regions."""
 
 from collections import Counter
 from unittest import mock
 
 import numpy as np
 import pytest
+import trimesh
 
 import workers.render.raster.gbuffer
+from schemas.scene.camera import Camera
+from schemas.scene.scene import Placed
+from tests.shapes import shape_of
 from tests.workers.render.looks import FLAT, FOUR, RASTER, Look, forcing, without
-from tests.workers.render.random_scenes import APPEARANCE, orbit_and_mirror, procedural_things, random_things
+from tests.workers.render.random_scenes import APPEARANCE, VGA, orbit_and_mirror, procedural_things, random_things
+from workers.geometry.camera import orbit_pose
+from workers.geometry.frames import translation
 from workers.plan.effects import names_of_kind
-from workers.render.raster.draw_calls import sort_draws
+from workers.render.raster.draw_calls import rank_regions, sort_draws
 from workers.render.raster.light_maps import LightMaps
 
 DRAWN = ("floor", "light_maps", "table", "textures", "transparency")
 """The no-ops that the renderer knows of."""
+
+CUBE = shape_of(trimesh.creation.box((0.1, 0.1, 0.1)))
+CORNERS = CUBE.vertices
 
 
 def scenes(count: int):
@@ -84,3 +93,42 @@ def test_a_pass_that_is_left_out_is_not_drawn(renderer):
     assert work(renderer, without(RASTER, "floor"))["region 1"] == 0
     assert work(renderer, without(RASTER, "table"))["region 2"] == 0
     assert work(renderer, without(RASTER, "floor", "table"))["region 3"] == plain["region 3"] > 0
+
+
+def cubes(*spots: tuple[float, float, float], first: int = 3) -> list[Placed]:
+    return [Placed(first + k, CUBE, translation(*spot)) for k, spot in enumerate(spots)]
+
+
+def ranks(things: list[Placed]) -> dict[int, int]:
+    return rank_regions(things, [CORNERS] * len(things))
+
+
+def test_a_stack_stands_back_step_by_step_and_what_stands_beside_it_does_not():
+    assert ranks(cubes((0, 0, 0), (0, 0, 0.1), (0, 0, 0.2), (1, 0, 0.2))) == {3: 0, 4: 1, 5: 2, 6: 0}
+
+
+def test_twenty_things_side_by_side_stand_back_as_far_as_one_alone():
+    plate = Placed(2, shape_of(trimesh.creation.box((9.0, 9.0, 0.1))), translation(0, 0, -0.1))
+    things = [plate, *cubes(*((0.2 * k, 0.0, 0.0) for k in range(20)))]
+    found = rank_regions(things, [plate.shape.vertices, *[CORNERS] * 20])
+    assert found == {2: 0, **dict.fromkeys(range(3, 23), 1)}
+
+
+def test_the_order_that_things_come_in_and_two_of_one_region_make_no_difference():
+    things = cubes((0, 0, 0), (0, 0, 0.1), (0, 0, 0.2))
+    again = [*things[::-1], Placed(3, CUBE, translation(5, 5, 5))]
+    assert ranks(things) == ranks(things[::-1]) == ranks(again) == {3: 0, 4: 1, 5: 2}
+    assert ranks([]) == {}
+
+
+def test_the_twentieth_of_many_is_not_lost_behind_what_it_lies_closely_over(renderer):
+    """A plate 0.05 mm above another and seen from 2.5 m hides it, however many others there are."""
+    flat = shape_of(trimesh.creation.box((0.3, 0.3, 0.001)))
+    far = cubes(*((0.2 * k - 1.0, 1.0, 0.0) for k in range(19)))
+    things = [Placed(2, flat, np.eye(4)), *far, Placed(22, flat, translation(0.0, 0.0, 0.00005))]
+    camera = Camera(VGA, orbit_pose(np.zeros(3), 0.8, 0.3, 2.5))
+    region = renderer.draw(things, APPEARANCE, camera).region
+    alone = renderer.draw(things[-1:], APPEARANCE, camera).region
+    seen = region[alone == 22]
+    assert len(seen) > 2000
+    assert (seen == 22).mean() > 0.98  # all but the plate's lower edge

@@ -3,9 +3,8 @@
 import numpy as np
 
 from schemas.scene.camera import Camera, Intrinsics
-from workers.geometry.camera import orbit_pose, project
+from workers.geometry.camera import is_outside_views, orbit_pose, project
 from workers.geometry.frames import invert, transform, uniform_rotation
-from workers.geometry.frustum import is_outside_views
 
 K = Intrinsics(width=64, height=48, fx=60.0, fy=55.0, cx=30.0, cy=26.0)
 AHEAD = Camera(K, np.eye(4))
