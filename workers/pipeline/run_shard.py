@@ -76,11 +76,8 @@ def run_span(context: WorkerContext, store: Store, order: ShardOrder, span: Span
     with _traceback_file(store, attempt) as tracebacks:
         for scene_id in span.scene_ids:
             if scene_id in blamed:
-                # Not begun, so that no worker dies in it
-                blame, category = (
-                    blamed[scene_id],
-                    choose_category(context.job, SceneChance(context.job.seed, scene_id)),
-                )
+                blame = blamed[scene_id]  # not begun, so that no worker dies in it
+                category = choose_category(context.job, SceneChance(context.job.seed, scene_id))
                 output = failed_scene(scene_id, category, BlamedScene(blame.reason, blame.detail), blame.attempts)
             else:
                 attempt.begin_scene(scene_id)
