@@ -32,6 +32,19 @@ class ShardOrder(Frozen):
     label: str = ""
     """Part of the attempts' names: the coordinator recognises its own."""
 
+    @classmethod
+    def of(cls, out: str, job: Job, job_digest: str) -> "ShardOrder":
+        """The pattern of every order of a job: without ranges and without a fingerprint."""
+        terms = CommitTerms(
+            job_digest=job_digest,
+            fingerprint="",
+            fingerprint_mode=job.run.fingerprint,
+            layout=job.output.layout,
+            first_scene=job.first_scene,
+            range_size=job.run.range_size,
+        )
+        return cls(out=out, job=job, terms=terms, spans=())
+
 
 class SpanReport(Frozen):
     """The result of one range."""

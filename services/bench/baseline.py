@@ -44,8 +44,7 @@ def load_meshes(description: dict[str, Any], folder: Path, look: str) -> dict[st
     else:
         floor.visual.face_colors = [round(255 * c) for c in given["color"]]
     loaded: dict[str, Any] = {name: trimesh.load(folder / f"{name}.glb") for name in ("table", "object")}
-    meshes = {name: scene.dump() for name, scene in loaded.items()}
-    return {**meshes, "floor": [floor]}
+    return {"floor": [floor], **{name: scene.dump() for name, scene in loaded.items()}}
 
 
 def simulate(description: dict[str, Any], folder: Path) -> NDArray:
@@ -111,7 +110,7 @@ def project(view: Images, k: dict[str, float], T_target_source: NDArray) -> Imag
     z = view["depth"].astype(np.float64)
     x, y = (u + 0.5 - k["cx"]) / k["fx"] * z, (v + 0.5 - k["cy"]) / k["fy"] * z
     valid = z > 0
-    points = np.stack([x[valid], y[valid], z[valid]], axis=1) @ T_target_source[:3, :3].T + T_target_source[:3, 3]
+    points = np.stack([x, y, z], axis=-1)[valid] @ T_target_source[:3, :3].T + T_target_source[:3, 3]
     colors = view["rgb"][valid]
     keep = points[:, 2] > 0
     points, colors = points[keep], colors[keep]

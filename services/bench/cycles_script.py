@@ -1,8 +1,8 @@
 """The script that people write today with Blender: stock bpy, Cycles on one thread of the CPU.
 
 Run by an interpreter that has `bpy`, as a process of its own. It reads one line of JSON for each scene, `{"scene": FILE,
-"samples": [1, 16]}`, renders its views with each number of samples, and answers with one line of seconds. It imports none
-of our code; cycles.py writes its input.
+"samples": 16}`, renders its views, and answers with one line, `wall_s` and `cpu_s`. It imports none of our code; traced.py
+writes its input.
 """
 
 import json
@@ -154,17 +154,15 @@ def look(scene: Any, described: dict[str, Any], T_world_cam: list[list[float]]) 
     scene.camera = placed
 
 
-def render(described: dict[str, Any], folder: Path, samples: int, out: str | None) -> tuple[float, float]:
-    """(seconds by the clock, seconds of the processor) for all views, building the scene included."""
+def render(described: dict[str, Any], folder: Path, samples: int) -> dict[str, float]:
+    """Seconds by the clock and of the processor for all views, building the scene included."""
     wall, cpu = time.perf_counter(), time.process_time()
     scene = build(described, folder)
     scene.cycles.samples = samples
-    for number, T_world_cam in enumerate(described["cameras"]):
+    for T_world_cam in described["cameras"]:
         look(scene, described, T_world_cam)
-        if out:
-            scene.render.filepath = str(Path(out) / f"cycles-{samples}-{number}.png")
-        bpy.ops.render.render(write_still=bool(out))
-    return time.perf_counter() - wall, time.process_time() - cpu
+        bpy.ops.render.render()
+    return {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
 
 
 def main() -> None:
@@ -175,9 +173,7 @@ def main() -> None:
     for line in sys.stdin:
         asked = json.loads(line)
         path = Path(asked["scene"])
-        described = json.loads(path.read_text())
-        took = {n: render(described, path.parent, n, asked.get("out")) for n in asked["samples"]}
-        print(json.dumps({"seconds": took}), file=answers)
+        print(json.dumps(render(json.loads(path.read_text()), path.parent, asked["samples"])), file=answers)
 
 
 if __name__ == "__main__":

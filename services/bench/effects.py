@@ -1,12 +1,10 @@
 """`verso bench --effects N`: time of settling by each scene's plan of effects, and with effects forced."""
 
-import argparse
-import json
-import shlex
-import sys
+import contextlib
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +15,12 @@ from schemas.errors import RunError, SceneError
 from schemas.job.job import Job
 from schemas.scene.effects import EffectPlan
 from services.bench.machine import describe_machine, pinned
-from services.bench.ratios import Spread
+from services.bench.ratios import Spread, format_spread
+from services.bench.report import describe_head
 from workers.assets.catalogue import open_catalogue
 from workers.physics.effects import called_for
 from workers.physics.step import settle_scene
-from workers.pipeline.context import WorkerContext, open_worker
+from workers.pipeline.context import open_worker
 from workers.plan.effects import PHYSICS_EFFECTS, Facts, plan_effects
 from workers.plan.randomness import SceneChance
 from workers.plan.step import plan_scene
@@ -43,70 +42,39 @@ FORCED: dict[str, frozenset[str]] = {
 """Forced effects by the variant's name; an effect's own name stands for the plan and that effect."""
 
 
-@dataclass(frozen=True, eq=False)
-class Timed:
-    """Seconds of processor by variant, [rounds, scenes]: nan where the plan has the effect, or settling failed."""
-
-    seconds: Mapping[str, Array]
-    failed: Mapping[str, int]
-
-
-def measure_effects(options: argparse.Namespace, job: Job, job_folder: Path) -> int:
-    """Time the job's first scenes and print the figures. Raises RunError where no scene settles."""
+def measure_effects(job: Job, job_folder: Path, count: int) -> dict[str, Any]:
+    """Time settling of the job's first scenes. Raises RunError where no scene settles."""
     with pinned() as core:
-        catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
-        context = open_worker(job, catalogue)
-        timed = time_settling(_draw(context, options.effects), ROUNDS)
-        figures = {
-            "ok": True,
-            "command": shlex.join(["verso", *sys.argv[1:]]),
-            "job": job.name,
-            "machine": describe_machine(context.renderer.name),
-            "core": core,
-            **summarise(timed),
-        }
-    print("\n".join(describe(figures)), flush=True)
-    if options.json:
-        print(json.dumps(figures))
-    return 0
+        context = open_worker(job, open_catalogue(job.assets, job_folder, tuple(job.categories)))
+        planned = []
+        for scene_id in range(job.first_scene, job.first_scene + count):
+            with contextlib.suppress(SceneError):
+                plan = plan_scene(job, context.catalogue, SceneChance(job.seed, scene_id))
+                planned.append(Facts(job, plan, raycast_checked=False))
+        timed = time_settling(planned, ROUNDS)
+        return {"machine": describe_machine(context.renderer.name), "core": core, **summarise(*timed)}
 
 
-def _draw(context: WorkerContext, count: int) -> list[Facts]:
-    """The first scenes as planned, without those that fail."""
-    drawn = []
-    for scene_id in range(context.job.first_scene, context.job.first_scene + count):
-        try:
-            drawn.append(
-                Facts(
-                    context.job,
-                    plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id)),
-                    raycast_checked=False,
-                )
-            )
-        except SceneError:
-            continue
-    return drawn
+def time_settling(scenes: Sequence[Facts], rounds: int) -> tuple[dict[str, Array], dict[str, int]]:
+    """Settle each scene in each variant in turn. Raises RunError where no scene settles both by plan and with all forced.
 
-
-def time_settling(scenes: Sequence[Facts], rounds: int) -> Timed:
-    """Settle each scene in each variant in turn. Raises RunError where no scene settles both by plan and with all forced."""
+    Returns by variant the seconds of processor, [rounds, scenes], nan where the plan has the effect or settling failed; and
+    how often settling failed.
+    """
     seconds = {name: np.full((rounds + 1, len(scenes)), np.nan) for name in FORCED}
     failed = dict.fromkeys(FORCED, 0)
-    for lap in range(rounds + 1):
-        for number, facts in enumerate(scenes):
-            for name, forced in FORCED.items():
-                if lap and np.isnan(seconds[name][0, number]):
-                    continue
-                plan = plan_effects(facts, forced)
-                if name in EFFECTS and name not in plan_effects(facts).skipped:
-                    continue
-                took = _settle_s(facts, plan, by_plan=name not in (WHOLE, EVERYTHING))
-                failed[name] += took is None
-                seconds[name][lap, number] = np.nan if took is None else took
+    for lap, (number, facts), name in product(range(rounds + 1), enumerate(scenes), FORCED):
+        if lap and np.isnan(seconds[name][0, number]):
+            continue
+        if name in EFFECTS and name not in plan_effects(facts).skipped:
+            continue
+        took = _settle_s(facts, plan_effects(facts, FORCED[name]), by_plan=name not in (WHOLE, EVERYTHING))
+        failed[name] += took is None
+        seconds[name][lap, number] = np.nan if took is None else took
     timed = {name: found[1:] for name, found in seconds.items()}
     if not _compared(timed).any():
         raise RunError(f"none of {len(scenes)} scenes comes to rest both by its plan and with every effect forced")
-    return Timed(timed, failed)
+    return timed, failed
 
 
 def _settle_s(facts: Facts, plan: EffectPlan, by_plan: bool) -> float | None:
@@ -127,24 +95,22 @@ def _compared(seconds: Mapping[str, Array]) -> Array:
     return ~np.any([np.isnan(seconds[name]).any(axis=0) for name in (PLAN, WHOLE, EVERYTHING)], axis=0)
 
 
-def summarise(timed: Timed) -> dict[str, Any]:
+def summarise(seconds: Mapping[str, Array], failed: Mapping[str, int]) -> dict[str, Any]:
     """Milliseconds a scene, the share of time that the plan saves, and the cost of each effect."""
-    seconds, both = timed.seconds, _compared(timed.seconds)
+    both = _compared(seconds)
     plan = seconds[PLAN][:, both]
     forced = {}
     for name in (WHOLE, EVERYTHING):
         own = seconds[name][:, both]
-        forced[name] = {
-            **_side(own),
-            "saved": asdict(Spread.of([float(1.0 - a.sum() / b.sum()) for a, b in zip(plan, own, strict=True)])),
-        }
+        saved = 1.0 - plan.sum(axis=1) / own.sum(axis=1)
+        forced[name] = {**_side(own), "saved": asdict(Spread.of(saved.tolist()))}
     return {
         "scenes": int(both.sum()),
         "rounds": len(plan),
         "plan": _side(plan),
         "forced": forced,
         "effects": {name: _cost(seconds[name], seconds[PLAN]) for name in EFFECTS},
-        "failed": dict(timed.failed),
+        "failed": dict(failed),
     }
 
 
@@ -157,27 +123,21 @@ def _side(seconds: Array) -> dict[str, float]:
 def _cost(own: Array, plan: Array) -> dict[str, Any]:
     """Extra time of a forced effect in scenes whose plan leaves it out; None where there are none."""
     both = ~(np.isnan(own) | np.isnan(plan)).any(axis=0)
-    more = [float(a.mean() * 1e3) for a in (own - plan)[:, both]] if both.any() else []
+    more = (1e3 * (own - plan)[:, both].mean(axis=1)).tolist() if both.any() else []
     return {"scenes": int(both.sum()), "more_ms": asdict(Spread.of(more)) if more else None}
 
 
 def describe(figures: dict[str, Any]) -> list[str]:
     """The figures as text, line by line."""
-    machine = figures["machine"]
     lines = [
-        f"machine    {machine['cpu']}, load {machine['load_1min']:.1f}",
-        f"command    {figures['command']}",
+        *describe_head(figures),
         f"measured   settling of {figures['scenes']} scenes, {figures['rounds']} times in each way in turn on core "
         f"{figures['core']}, caches warm; ms of processor a scene, median (mean)",
         "",
         f"{'by the plan':34} {_ms(figures['plan'])}",
     ]
     for name, side in figures["forced"].items():
-        saved = side["saved"]
-        lines.append(
-            f"{name + ' forced':34} {_ms(side)}   the plan saves {saved['median']:.1%} "
-            f"[{saved['least']:.1%} to {saved['most']:.1%}]"
-        )
+        lines.append(f"{name + ' forced':34} {_ms(side)}   the plan saves {format_spread(side['saved'], '.1%')}")
     for name, cost in figures["effects"].items():
         lines.append(f"  {'plan and ' + name:32} {_more(cost)}")
     failed = [f"{name} {count}" for name, count in figures["failed"].items() if count]

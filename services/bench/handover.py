@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.base import Pose
 from schemas.job.job import Job
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Asset, Mesh, Shape
+from schemas.scene.shape import Mesh, Shape
 from schemas.scene.view import Pair
 from workers.assets.glb import asset_glb
 from workers.geometry.srgb import SRGB_STEPS, decode_srgb, encode_srgb
@@ -31,16 +30,17 @@ def hand_over(scene: Scene, job: Job, folder: Path) -> Path:
     for name, asset in (("object", start.asset), ("table", table.asset)):
         (folder / f"{name}.glb").write_bytes(asset_glb(asset))
         (folder / f"{name}.obj").write_text(_obj(asset.shape.mesh))
-        (folder / f"{name}.urdf").write_text(_urdf(name, asset))
-    sensor = job.cameras.sensor
+        com = " ".join(f"{x:.9g}" for x in asset.mass.com)
+        urdf = URDF.format(name=name, com=com, mass=asset.mass.mass_kg, i=np.diag(asset.mass.inertia).tolist())
+        (folder / f"{name}.urdf").write_text(urdf)
+    sensor, mass, lights = job.cameras.sensor, start.asset.mass, scene.posed.appearance.lights
     described = {
-        "T_world_table": _matrix(table.T_world_table),
-        "T_world_obj": _matrix(start.T_world_obj),
-        "object": _body(start.asset),
+        "T_world_table": table.T_world_table.tolist(),
+        "T_world_obj": start.T_world_obj.tolist(),
+        # In the object's frame; the inertia is the principal moments.
+        "object": {"mass_kg": mass.mass_kg, "com": mass.com.tolist(), "inertia": np.diag(mass.inertia).tolist()},
         "floor": _floor(scene.posed.things[0], folder),
-        "lights": [
-            {"towards": light.direction.tolist(), "color": list(light.color)} for light in scene.posed.appearance.lights
-        ],
+        "lights": [{"towards": light.direction.tolist(), "color": list(light.color)} for light in lights],
         "intrinsics": {key: getattr(sensor, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
         "depth_units_per_m": job.images.depth_units_per_m,
         "pairs": [_pair(pair, job) for pair in scene.pairs],
@@ -52,7 +52,7 @@ def hand_over(scene: Scene, job: Job, folder: Path) -> Path:
 
 def _pair(pair: Pair, job: Job) -> dict[str, object]:
     """Poses of the three cameras, and the path, view, kind of pixels and crop (or none) of every image."""
-    cameras = {view.role: _matrix(view.camera.T_world_cam) for view in pair.views if view.role != "projected"}
+    cameras = {view.role: view.camera.T_world_cam.tolist() for view in pair.views if view.role != "projected"}
     images = []
     for view in pair.views:
         objects = object_labels(view, pair)
@@ -60,10 +60,6 @@ def _pair(pair: Pair, job: Job) -> dict[str, object]:
             crop = None if box is None else [box[0].start, box[0].stop, box[1].start, box[1].stop]
             images.append({"path": path, "view": view.role, "pixels": kind, "crop": crop})
     return {"cameras": cameras, "images": images}
-
-
-def _matrix(T: Pose) -> list[list[float]]:
-    return np.asarray(T).tolist()
 
 
 def _floor(placed: Placed, folder: Path) -> dict[str, object]:
@@ -84,18 +80,7 @@ def _floor(placed: Placed, folder: Path) -> dict[str, object]:
     return described | {"uv": part.uv.tolist(), "color": [*(picture.mean(axis=(0, 1)) / 255.0).tolist(), 1.0]}
 
 
-def _body(asset: Asset) -> dict[str, object]:
-    """Mass, centre of mass and principal moments of the object, in its frame."""
-    mass = asset.mass
-    return {"mass_kg": mass.mass_kg, "com": mass.com.tolist(), "inertia": np.diag(mass.inertia).tolist()}
-
-
 def _obj(mesh: Mesh) -> str:
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices]
     lines += [f"f {a} {b} {c}" for a, b, c in mesh.faces + 1]
     return "\n".join(lines) + "\n"
-
-
-def _urdf(name: str, asset: Asset) -> str:
-    com = " ".join(f"{x:.9g}" for x in asset.mass.com)
-    return URDF.format(name=name, com=com, mass=asset.mass.mass_kg, i=np.diag(asset.mass.inertia).tolist())

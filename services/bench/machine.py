@@ -26,11 +26,12 @@ def pinned(core: int | None = None) -> Iterator[int]:
 
 def describe_machine(renderer: str) -> dict[str, object]:
     """Cores, processor, OpenGL device, load and versions: the context of every figure."""
+    cpuinfo = Path("/proc/cpuinfo").read_text().splitlines()
     return {
         "cores": os.cpu_count(),
         "usable_cores": len(os.sched_getaffinity(0)),
         "threads_per_core": threads_per_core(),
-        "cpu": _processor(),
+        "cpu": next((line.partition(":")[2].strip() for line in cpuinfo if line.startswith("model name")), "unknown"),
         "memory_gib": round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30, 1),
         "gl_renderer": renderer,
         "python": platform.python_version(),
@@ -53,23 +54,3 @@ def process_age_s() -> float:
     """Seconds since this process started, to a hundredth."""
     began = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
     return time.clock_gettime(time.CLOCK_BOOTTIME) - began
-
-
-def resident_mb() -> float:
-    """Resident memory of this process, MB."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-def peak_resident_mb(status: Path = Path("/proc/self/status")) -> float:
-    """Peak resident memory of this process, MB. Not `ru_maxrss`, which a child inherits from its parent."""
-    line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
-    return int(line.split()[1]) * 1024 / 1e6
-
-
-def _processor(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
-    try:
-        lines = cpuinfo.read_text().splitlines()
-    except OSError:
-        return "unknown"
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown")

@@ -1,50 +1,48 @@
 """The rounds of the benchmark: ours, the lower bound, the script and other systems, in turn, on one core."""
 
 import tempfile
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from schemas.dataset.commit import Span
 from schemas.errors import MachineError, OutputError
 from schemas.job.job import Job
-from services.bench.encoders import Encoder, choose_encoders
 from services.bench.handover import hand_over
-from services.bench.lower_bound import committed_files, images_of, run_lower_bound
+from services.bench.lower_bound import choose_encoders, images_of, run_lower_bound
 from services.bench.machine import describe_machine, pinned, process_age_s
-from services.bench.others import Side, sides_of
+from services.bench.others import Side, SideProcess, sides_of, start_side
 from services.bench.ratios import Lap
-from services.bench.side_process import SideProcess, side_process
-from services.bench.stages import Workbench, open_workbench
+from services.bench.stages import make_in_memory, open_workbench
+from workers.pipeline.make_scene import Scene
 
 WARM_UP = 8
 """Scenes before the clock: they compile shaders, of which pyrender has one for each number of lights, and fill caches."""
 
 
-@dataclass(frozen=True)
-class Round:
-    """The same scenes made by each side, one after the other, and the bytes that our side committed."""
+@dataclass
+class Others:
+    """The sides that could be started, their processes by module, and the time that each took to its first scenes' end."""
 
-    ours: Lap
-    lower_bound: Lap
-    others: Mapping[str, Lap]
-    """By name of the side."""
-    bytes: int
+    sides: list[Side] = field(default_factory=list)
+    processes: dict[str, SideProcess] = field(default_factory=dict)
+    startup_s: dict[str, float] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+    """Optional sides that are installed but could not run, and why."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """All rounds, and by side the seconds from the start of its process to the end of its first scenes."""
+    """The laps of each side, one a round in which all make the same scenes, and the bytes that ours committed."""
 
     machine: dict[str, object]
     core: int
-    rounds: tuple[Round, ...]
+    laps: Mapping[str, list[Lap]]
+    """By the side's name; `ours` and `floor`, the lower bound, are the first two."""
+    bytes: int
     encoders: dict[str, str]
-    sides: tuple[Side, ...]
-    startup_s: Mapping[str, float]
-    left_out: Mapping[str, str]
-    """Optional sides that are installed but could not run, and why."""
+    others: Others
 
 
 @contextmanager
@@ -64,77 +62,53 @@ def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
 
     Nothing is deleted in between: for seconds afterwards ext4 searches the deleted entries whenever it makes a file.
     """
-    with pinned() as core, ExitStack() as processes:
+    with pinned() as core, ExitStack() as running:
         bench = open_workbench(job, job_folder, folder / "ours")
         warm = bench.next_span(WARM_UP)
         bench.run(warm)
         startup_s = {"ours": process_age_s()}
-        encoders = choose_encoders(images_of(committed_files(bench.store.root, bench.record(warm))))
-        sides = _Sides(bench, encoders, folder, processes)
-        given = sides.give(warm)
-        for side in sides_of(job):
-            startup_s[side.name] = sides.open(side, given)
-        rounds = tuple(sides.round(bench.next_span(count)) for count in _counts(scenes, job.run.range_size))
-    return Measured(
-        describe_machine(bench.context.renderer.name),
-        core,
-        rounds,
-        {kind: name for kind, (name, _) in encoders.items()},
-        tuple(sides.opened),
-        startup_s,
-        sides.left_out,
-    )
+        encoders = choose_encoders(images_of(bench.files(warm)))
+        given = _hand_over(make_in_memory(bench.context, warm), job, folder / "given_warm")
+        others = start_others(sides_of(job), given, folder, running)
+        laps: dict[str, list[Lap]] = {name: [] for name in ("ours", "floor", *(side.name for side in others.sides))}
+        written = 0
+        for start in range(0, scenes, job.run.range_size):
+            span = bench.next_span(min(job.run.range_size, scenes - start))
+            laps["ours"].append(bench.run(span))
+            # The input of the next side is made between the clocks.
+            files = bench.files(span)
+            written += sum(map(len, files.values()))
+            made, out = make_in_memory(bench.context, span), folder / f"lower_bound{span.start}"
+            laps["floor"].append(run_lower_bound(bench.context.renderer, made, files, encoders, out))
+            given = _hand_over(made, job, folder / f"given{span.start}")
+            for side in others.sides:
+                laps[side.name].append(others.processes[side.module].run(given, folder / side.name, side.asked))
+    others.startup_s = startup_s | others.startup_s
+    names = {kind: name for kind, (name, _) in encoders.items()}
+    return Measured(describe_machine(bench.context.renderer.name), core, laps, written, names, others)
 
 
-@dataclass(frozen=True, eq=False)
-class _Sides:
-    """Everything that is compared, and the processes of the other sides: one for each module."""
+def start_others(sides: Sequence[Side], given: list[Path], folder: Path, running: ExitStack) -> Others:
+    """Start the other systems and let each make these scenes.
 
-    bench: Workbench
-    encoders: dict[str, tuple[str, Encoder]]
-    folder: Path
-    running: ExitStack
-    processes: dict[str, SideProcess] = field(default_factory=dict)
-    opened: list[Side] = field(default_factory=list)
-    left_out: dict[str, str] = field(default_factory=dict)
-
-    def open(self, side: Side, given: list[Path]) -> float:
-        """Start a side and let it make these scenes; returns the seconds that took.
-
-        Raises MachineError where the script cannot run; an optional side that cannot is left out with the reason.
-        """
-        took = 0.0
+    Raises MachineError where the script cannot run; an optional side that cannot is left out with the reason.
+    """
+    others = Others()
+    for side in sides:
+        begun = time.perf_counter()
         try:
-            if side.module not in self.processes:
-                self.processes[side.module], took = self.running.enter_context(side_process(side.module))
-            lap = self.processes[side.module].run(given, self.folder / side.name, side.asked)
+            if side.module not in others.processes:
+                others.processes[side.module] = running.enter_context(start_side(side.module))
+            others.processes[side.module].run(given, folder / side.name, side.asked)
+            others.sides.append(side)
         except MachineError as error:
             if side.package is None:
                 raise
-            self.left_out[side.title] = str(error)
-            return took
-        self.opened.append(side)
-        return took + lap.wall_s + lap.apart_s
-
-    def round(self, span: Span) -> Round:
-        """Ours, the lower bound, the others. The input of the next side is made between their clocks."""
-        ours = self.bench.run(span)
-        files = committed_files(self.bench.store.root, self.bench.record(span))
-        out = self.folder / f"lower_bound{span.start}"
-        bound = run_lower_bound(self.bench.context.renderer, self.bench.scenes(span), files, self.encoders, out)
-        given = self.give(span)
-        others = {
-            side.name: self.processes[side.module].run(given, self.folder / side.name, side.asked)
-            for side in self.opened
-        }
-        return Round(ours, bound, others, sum(map(len, files.values())))
-
-    def give(self, span: Span) -> list[Path]:
-        """The same scenes as files for the other sides."""
-        folder, job = self.folder / f"given{span.start}", self.bench.context.job
-        return [hand_over(scene, job, folder / str(scene.plan.scene_id)) for scene in self.bench.scenes(span)]
+            others.left_out[side.title] = str(error)
+        others.startup_s[side.name] = time.perf_counter() - begun
+    return others
 
 
-def _counts(scenes: int, size: int) -> list[int]:
-    """Scenes of each round: whole ranges, and what is left."""
-    return [min(size, scenes - start) for start in range(0, scenes, size)]
+def _hand_over(scenes: Sequence[Scene], job: Job, folder: Path) -> list[Path]:
+    """The same scenes as files for the other sides."""
+    return [hand_over(scene, job, folder / str(scene.plan.scene_id)) for scene in scenes]

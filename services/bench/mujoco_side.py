@@ -39,13 +39,13 @@ CAMERA = """<camera name="{name}" {at} resolution="{width} {height}" sensorsize=
 def describe(scene: Mapping[str, Any]) -> str:
     """The scene's MJCF: table and object as meshes (in contact their convex hulls), a plane, and every camera."""
     k, body = scene["intrinsics"], scene["object"]
-    cameras = {
-        f"{role}{number}": np.array(T)
-        for number, pair in enumerate(scene["pairs"])
-        for role, T in pair["cameras"].items()
-    }
     # MuJoCo counts the principal point from the image's middle, up and to the left.
     lens = {**k, "px": k["width"] / 2 - k["cx"], "py": k["cy"] - k["height"] / 2}
+    cameras = [
+        CAMERA.format(name=f"{role}{number}", at=_at(np.array(T) @ OPTICAL_TO_OPENGL), **lens)
+        for number, pair in enumerate(scene["pairs"])
+        for role, T in pair["cameras"].items()
+    ]
     return MODEL.format(
         step_s=1.0 / STEP_HZ,
         width=k["width"],
@@ -56,9 +56,7 @@ def describe(scene: Mapping[str, Any]) -> str:
         com=" ".join(map(str, body["com"])),
         mass=body["mass_kg"],
         inertia=" ".join(map(str, body["inertia"])),
-        cameras="\n".join(
-            CAMERA.format(name=name, at=_at(T @ OPTICAL_TO_OPENGL), **lens) for name, T in cameras.items()
-        ),
+        cameras="\n".join(cameras),
     )
 
 
@@ -95,7 +93,10 @@ class Simulator:
             mujoco.mj_step(model, data)
         marks.append(time.perf_counter())
         with mujoco.Renderer(model, *size) as renderer:
-            regions = self._regions(model)
+            # By a geom's id, plus one for what is no geom.
+            regions = np.zeros(model.ngeom + 1, np.uint8)
+            for name, region in (("floor", FLOOR), ("table", TABLE), ("object", OBJECT)):
+                regions[model.geom(name).id] = region
             self._images = {model.camera(i).name: self._look(renderer, data, i, regions) for i in range(model.ncam)}
         marks.append(time.perf_counter())
         return dict(zip(("scene", "physics", "render"), np.diff(marks).tolist(), strict=True))
@@ -105,13 +106,6 @@ class Simulator:
         if asked.get("keep"):
             flat: dict[str, Any] = {f"{n}_{kind}": a for n, view in self._images.items() for kind, a in view.items()}
             np.savez(asked["keep"], **flat)
-
-    def _regions(self, model: Any) -> NDArray[np.uint8]:
-        """Region id by a geom's id, plus one for what is no geom."""
-        regions = np.zeros(model.ngeom + 1, np.uint8)
-        for name, region in (("floor", FLOOR), ("table", TABLE), ("object", OBJECT)):
-            regions[model.geom(name).id] = region
-        return regions
 
     def _look(self, renderer: Any, data: Any, camera: int, regions: NDArray[np.uint8]) -> dict[str, NDArray]:
         renderer.update_scene(data, camera=camera)

@@ -1,16 +1,24 @@
-"""The other systems that make the same scenes. A new one is a module that answers lines, and a row in `SIDES`.
+"""The other systems that make the same scenes, each in a process of its own. A new one is a module and a row in `SIDES`.
 
-Such a module is a process of its own. It says `{"ready": true}`, then reads one line of JSON for each scene (`scene`: the
-`scene.json` that handover.py wrote beside its meshes; `out`: a folder; and the items of `asked` in its row) and answers
-with one line: `wall_s`, `cpu_s`, `stages_s` by stage, and `load_s`, the seconds of reading files before its clock.
-`answer_scenes` in answers.py does that.
+Such a module says `{"ready": true}`, then reads one line of JSON for each scene (`scene`: the `scene.json` that handover.py
+wrote beside its meshes; `out`: a folder; and the items of `asked` in its row) and answers with one line: `wall_s`, `cpu_s`,
+`stages_s` by stage, and `load_s`, the seconds of reading files before its clock. `answer_scenes` in answers.py does that.
 """
 
-from collections.abc import Mapping
+import contextlib
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import IO, Any
 
+from schemas.errors import MachineError
 from schemas.job.job import Job
+from services.bench.ratios import Lap
 
 
 @dataclass(frozen=True)
@@ -74,3 +82,53 @@ def installed(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
+
+
+class SideProcess:
+    """A running script. It inherits our core and our environment, and never shares our OpenGL context."""
+
+    def __init__(self, name: str, process: subprocess.Popen[str], errors: IO[str]) -> None:
+        self._name, self._process, self._errors = name, process, errors
+        self.greeting = self.ask()
+        """The first answer, given before any question."""
+
+    def run(self, scenes: Sequence[Path], out: Path, asked: Mapping[str, str]) -> Lap:
+        """Makes these scenes, one after another, into one folder."""
+        answers = [self.ask({"scene": str(scene), "out": str(out), **asked}) for scene in scenes]
+        wall, cpu, load = (sum(answer[key] for answer in answers) for key in ("wall_s", "cpu_s", "load_s"))
+        names = dict.fromkeys(name for answer in answers for name in answer["stages_s"])
+        stages = {name: sum(answer["stages_s"].get(name, 0.0) for answer in answers) for name in names}
+        return Lap(len(scenes), wall, cpu, stages, load)
+
+    def ask(self, question: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """The next answer. Raises MachineError with the process's last lines where it died."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        line = ""
+        with contextlib.suppress(BrokenPipeError):
+            if question is not None:
+                print(json.dumps(question), file=self._process.stdin, flush=True)
+            line = self._process.stdout.readline()
+        if not line:
+            self._process.wait()
+            self._errors.seek(0)
+            last = " | ".join(self._errors.read().strip().splitlines()[-5:])
+            raise MachineError(f"{self._name} ended ({self._process.returncode}): {last}")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+
+@contextlib.contextmanager
+def start_side(name: str, command: Sequence[str] | None = None) -> Iterator[SideProcess]:
+    """A process after its first answer: the command, or without one our module `name`. Raises MachineError."""
+    command, pipe = command or [sys.executable, "-W", "ignore", "-m", name], subprocess.PIPE
+    root = Path(__file__).resolve().parents[2]
+    with tempfile.TemporaryFile("w+") as errors:
+        try:
+            process = subprocess.Popen(command, cwd=root, stdin=pipe, stdout=pipe, stderr=errors, text=True)
+        except OSError as error:
+            raise MachineError(f"{command[0]} cannot be run: {error}") from error
+        try:
+            yield SideProcess(name, process, errors)
+        finally:
+            process.kill()
+            process.communicate()

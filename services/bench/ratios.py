@@ -21,6 +21,11 @@ class Spread:
         return cls(median(figures), min(figures), max(figures))
 
 
+def format_spread(spread: Mapping[str, float], form: str = ".2f", unit: str = "") -> str:
+    """The fields of a `Spread` as text: the median, and in brackets the minimum and the maximum."""
+    return f"{spread['median']:{form}}{unit} [{spread['least']:{form}} to {spread['most']:{form}}]"
+
+
 @dataclass(frozen=True)
 class Lap:
     """One side's part of a round: its scenes, its time, and the time of each stage.
@@ -35,18 +40,10 @@ class Lap:
     stages_s: Mapping[str, float]
     apart_s: float = 0.0
 
-    @property
-    def slope_s(self) -> float:
-        """Seconds for one scene more, without start-up."""
-        return self.wall_s / self.scenes
-
-
-Slope = Callable[[Lap], float]
-
 
 def by_clock(lap: Lap) -> float:
-    """Seconds for one scene more."""
-    return lap.slope_s
+    """Seconds for one scene more, without start-up."""
+    return lap.wall_s / lap.scenes
 
 
 def by_processor(lap: Lap) -> float:
@@ -59,7 +56,7 @@ def with_loading(lap: Lap) -> float:
     return (lap.wall_s + lap.apart_s) / lap.scenes
 
 
-def slope_ratio(slow: Sequence[Lap], fast: Sequence[Lap], slope: Slope = by_clock) -> Spread:
+def slope_ratio(slow: Sequence[Lap], fast: Sequence[Lap], slope: Callable[[Lap], float] = by_clock) -> Spread:
     """How many times as many scenes `fast` makes in the same time, over pairs of laps of the same round."""
     return Spread.of([slope(a) / slope(b) for a, b in zip(slow, fast, strict=True)])
 

@@ -7,32 +7,32 @@ from typing import Any
 
 from services.bench.measure import Measured
 from services.bench.others import Side
-from services.bench.ratios import Lap, Spread, by_processor, slope_ratio, stage_table, with_loading
+from services.bench.ratios import Lap, by_clock, by_processor, format_spread, slope_ratio, stage_table, with_loading
 
 
 def summarise(measured: Measured) -> dict[str, Any]:
     """The figures of the rounds: plain numbers, milliseconds per scene, ratios of slopes."""
-    ours, bound = [one.ours for one in measured.rounds], [one.lower_bound for one in measured.rounds]
+    laps, others = measured.laps, measured.others
+    ours, bound = laps["ours"], laps["floor"]
     scenes = sum(lap.scenes for lap in ours)
     return {
         "machine": measured.machine,
         "core": measured.core,
         "scenes": scenes,
         "rounds": len(ours),
-        "bytes_per_scene": sum(one.bytes for one in measured.rounds) / scenes,
-        "startup_s": dict(measured.startup_s),
+        "bytes_per_scene": measured.bytes / scenes,
+        "startup_s": others.startup_s,
         "ours": _side(ours),
         "floor": _side(bound) | {"encoders": measured.encoders, "upload_ms": _apart(bound)},
         "times_floor": asdict(slope_ratio(ours, bound)),
         "times_floor_cpu": asdict(slope_ratio(ours, bound, by_processor)),
-        "others": {side.name: _other(side, measured, ours) for side in measured.sides},
-        "left_out": dict(measured.left_out),
+        "others": {side.name: _other(side, laps[side.name], ours) for side in others.sides},
+        "left_out": others.left_out,
     }
 
 
-def _other(side: Side, measured: Measured, ours: Sequence[Lap]) -> dict[str, Any]:
+def _other(side: Side, laps: Sequence[Lap], ours: Sequence[Lap]) -> dict[str, Any]:
     """One of the other systems; a ratio is how many times as many scenes we make in the same time."""
-    laps = [one.others[side.name] for one in measured.rounds]
     return _side(laps) | {
         "title": side.title,
         "makes": side.makes,
@@ -49,17 +49,23 @@ def _apart(laps: Sequence[Lap]) -> float:
 
 def _side(laps: Sequence[Lap]) -> dict[str, Any]:
     return {
-        "ms_per_scene": median(lap.slope_s for lap in laps) * 1e3,
-        "cpu_ms_per_scene": median(by_processor(lap) for lap in laps) * 1e3,
+        "ms_per_scene": median(map(by_clock, laps)) * 1e3,
+        "cpu_ms_per_scene": median(map(by_processor, laps)) * 1e3,
         "stages_ms": stage_table(laps),
         "stages_mean_ms": stage_table(laps, mean),
     }
 
 
+def describe_head(figures: dict[str, Any]) -> list[str]:
+    """Processor, load and command: the first lines of the shorter reports."""
+    machine = figures["machine"]
+    return [f"machine    {machine['cpu']}, load {machine['load_1min']:.1f}", f"command    {figures['command']}"]
+
+
 def describe(figures: dict[str, Any]) -> list[str]:
     """The figures as text, line by line."""
     machine = figures["machine"]
-    others: dict[str, dict[str, Any]] = figures["others"]
+    others, floor = figures["others"].values(), figures["floor"]
     threads = machine["threads_per_core"]
     lines = [
         f"machine    {machine['usable_cores']} of {machine['cores']} cores"
@@ -75,22 +81,22 @@ def describe(figures: dict[str, Any]) -> list[str]:
         + ", the first scenes included; not counted below",
         "",
         *_table("ours", figures["ours"]),
-        *_table("floor: bare passes, fastest encoder, durable writes", figures["floor"]),
-        f"  before its clock each scene's shapes go to the GPU: {figures['floor']['upload_ms']:.1f} ms a scene",
-        f"  encoders: {', '.join(f'{kind} {name}' for kind, name in figures['floor']['encoders'].items())}",
+        *_table("floor: bare passes, fastest encoder, durable writes", floor),
+        f"  before its clock each scene's shapes go to the GPU: {floor['upload_ms']:.1f} ms a scene",
+        f"  encoders: {', '.join(f'{kind} {name}' for kind, name in floor['encoders'].items())}",
     ]
-    for other in others.values():
+    for other in others:
         lines += _table(f"{other['title']} ({other['makes']})", other)
         lines.append(f"  before its clock it reads its files: {other['load_ms']:.1f} ms a scene")
     lines += ["", f"{'as many scenes as':24} {'by the clock':24} {'by processor time':24} its reading counted"]
     lines += [
-        f"  {other['title']:22} {_spread(other['ratio']):24} {_spread(other['ratio_cpu']):24} "
-        f"{_spread(other['ratio_with_loading'])}"
-        for other in others.values()
+        f"  {other['title']:22} {_times(other['ratio']):24} {_times(other['ratio_cpu']):24} "
+        f"{_times(other['ratio_with_loading'])}"
+        for other in others
     ]
-    floor = f"{_spread(figures['times_floor']):24} {_spread(figures['times_floor_cpu'])}"
-    lines += [f"{'as long as the floor':24} {floor}"]
-    lines += _describe_memory(figures["memory"]) + _describe_scaling(figures["scaling"])
+    lines += [f"{'as long as the floor':24} {_times(figures['times_floor']):24} {_times(figures['times_floor_cpu'])}"]
+    lines += _describe_memory(figures["memory"]) if figures["memory"] else []
+    lines += _describe_scaling(figures["scaling"]) if figures["scaling"] else []
     return lines + [
         f"{name:24} {figures['left_out'].get(name, found)}" for name, found in figures["other_systems"].items()
     ]
@@ -108,13 +114,11 @@ def _table(what: str, side: dict[str, Any]) -> list[str]:
     ]
 
 
-def _spread(spread: dict[str, float]) -> str:
-    return f"{spread['median']:.2f} x [{spread['least']:.2f} to {spread['most']:.2f}]"
+def _times(spread: dict[str, float]) -> str:
+    return format_spread(spread, unit=" x")
 
 
-def _describe_memory(memory: dict[str, Any] | None) -> list[str]:
-    if memory is None:
-        return []
+def _describe_memory(memory: dict[str, Any]) -> list[str]:
     settled, scenes = memory["settled_after"], memory["scenes"]
     return [
         "",
@@ -126,23 +130,17 @@ def _describe_memory(memory: dict[str, Any] | None) -> list[str]:
     ]
 
 
-def _describe_scaling(scaling: dict[str, Any] | None) -> list[str]:
-    if scaling is None:
-        return []
-    share, share_one = Spread(**scaling["ray_share"]), Spread(**scaling["ray_share_one"])
-    lines = [
+def _describe_scaling(scaling: dict[str, Any]) -> list[str]:
+    return [
         "",
         f"{scaling['workers']} at once against one     {'as many scenes':24} {'processor for a scene':24} scenes/s",
-    ]
-    for name, gain in (("through Ray", scaling["ray"]), ("plain processes", scaling["bare"])):
-        lines.append(
-            f"  {name:22} {_spread(gain['speedup']):24} {_spread(gain['inflation']):24} "
+        *(
+            f"  {name:22} {_times(gain['speedup']):24} {_times(gain['inflation']):24} "
             f"{gain['one_scenes_per_s']:.2f} and {gain['all_scenes_per_s']:.2f}, {gain['scenes']} scenes"
-        )
-    return [
-        *lines,
+            for name, gain in (("through Ray", scaling["ray"]), ("plain processes", scaling["bare"]))
+        ),
         f"  Ray gives {scaling['share_of_bare']:.1%} of what plain processes gain",
-        f"  Ray's share of time    {share_one.median:.1%} [{share_one.least:.1%} to {share_one.most:.1%}] with one worker, "
-        f"{share.median:.1%} [{share.least:.1%} to {share.most:.1%}] with {scaling['workers']}, their uneven end included; "
+        f"  Ray's share of time    {format_spread(scaling['ray_share_one'], '.1%')} with one worker, "
+        f"{format_spread(scaling['ray_share'], '.1%')} with {scaling['workers']}, their uneven end included; "
         f"shards of {scaling['shard']}",
     ]

@@ -1,105 +1,120 @@
-"""Scaling: several workers against one through the coordinator, and several plain processes against one."""
+"""Scaling: several workers against one through the coordinator, and several plain processes against one.
 
+Two processes that share nothing but the machine seldom do twice the work of one: cores share caches, memory and clock,
+and are often two threads of one core. No scheduler can gain more than plain processes do.
+"""
+
+import multiprocessing
+import os
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from schemas.dataset.commit import Span
+from schemas.dataset.shard import ShardOrder
+from schemas.errors import RunError
 from schemas.job.job import Job
-from services.bench.bare import bare_processes
-from services.bench.ratios import Lap, Spread, by_processor, idle_share
-from services.bench.stages import bench_order
+from services.bench.ratios import Lap, Spread, by_clock, by_processor, idle_share, slope_ratio
+from services.bench.stages import run_process
 from services.run.coordinator import Coordinator, Limits, Tally
 from services.run.range_planner import MAX_SHARD, group_shards
 from services.run.ray_cluster import PREFETCH, private_ray
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.store.local import LocalStore
 
-
-@dataclass(frozen=True)
-class Gain:
-    """The gain of several at once over one, over rounds.
-
-    speedup: ratio of the paces; inflation: ratio of the processor time a scene, the cost of sharing caches, memory and clock,
-    without waiting.
-    """
-
-    scenes: int
-    one_scenes_per_s: float
-    all_scenes_per_s: float
-    speedup: Spread
-    inflation: Spread
-
-    @classmethod
-    def of(cls, one: Sequence[Lap], several: Sequence[Lap]) -> "Gain":
-        """The gain from laps of one and of all, in pairs; a lap lasts from the first scene's start to the last one's end."""
-        pairs = list(zip(one, several, strict=True))
-        return cls(
-            scenes=several[0].scenes,
-            one_scenes_per_s=Spread.of([lap.scenes / lap.wall_s for lap in one]).median,
-            all_scenes_per_s=Spread.of([lap.scenes / lap.wall_s for lap in several]).median,
-            speedup=Spread.of([a.slope_s / b.slope_s for a, b in pairs]),
-            inflation=Spread.of([by_processor(b) / by_processor(a) for a, b in pairs]),
-        )
-
-
-@dataclass(frozen=True)
-class Scaling:
-    """`ray`: workers through the coordinator; `bare`: plain processes, each on a core of its own.
-
-    ray_share: the share of the slots' time without a shard, the uneven end of the last shards included; ray_share_one: the
-    same with one worker, which has no such end. share_of_bare: Ray's speed-up over that of plain processes.
-    """
-
-    workers: int
-    shard: int
-    ray: Gain
-    bare: Gain
-    ray_share: Spread
-    ray_share_one: Spread
-    share_of_bare: float
+WARM_UP = 8
+"""Scenes that each plain process makes first."""
 
 
 def measure_scaling(
     job: Job, job_folder: Path, folder: Path, workers: int, scenes: int, rounds: int = 3, shard: int = MAX_SHARD
-) -> Scaling:
+) -> dict[str, Any]:
     """One worker, all workers, one process, all processes, and again; always the same scenes, into new folders.
 
-    Everything is warm before: Ray's start, imports, the OpenGL context and its shaders are in no figure.
+    Everything is warm before: Ray's start, imports, the OpenGL context and its shaders are in no figure. `ray`: workers
+    through the coordinator; `bare`: plain processes, each on a core of its own. ray_share: the share of the slots' time
+    without a shard, the uneven end of the last shards included; ray_share_one: the same with one worker, which has no such
+    end. share_of_bare: Ray's speed-up over that of plain processes.
     """
-    catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
-    drive = _RayDrive(job, catalogue, folder, workers)
-    ray: dict[int, list[tuple[Lap, float]]] = {1: [], workers: []}
-    bare: dict[int, list[Lap]] = {1: [], workers: []}
-    each = max(1, scenes // workers)
-    with ExitStack() as running:
-        running.enter_context(private_ray(workers))
-        processes = running.enter_context(bare_processes(job, job_folder, folder, workers))
+    counts = (1, workers)
+    ray: dict[int, list[tuple[Lap, float]]] = {count: [] for count in counts}
+    bare: dict[int, list[Lap]] = {count: [] for count in counts}
+    each = Span(start=job.first_scene, stop=job.first_scene + max(1, scenes // workers))
+    drive = _RayDrive(job, open_catalogue(job.assets, job_folder, tuple(job.categories)), folder, workers)
+    with private_ray(workers), plain_processes(job, job_folder, folder, workers) as processes:
         drive.run("warm", workers, 4 * workers * job.run.range_size, job.run.range_size)
         for number in range(rounds):
-            for count in (1, workers):
+            for count in counts:
                 ray[count].append(drive.run(f"{number}-{count}", count, scenes, shard))
-            for count in (1, workers):
-                laps = processes.run(count, job.first_scene, job.first_scene + each)
-                bare[count].append(_together(laps))
-    gain = Gain.of(*([lap for lap, _ in ray[count]] for count in (1, workers)))
-    reference = Gain.of(bare[1], bare[workers])
-    return Scaling(
-        workers=workers,
-        shard=shard,
-        ray=gain,
-        bare=reference,
-        ray_share=Spread.of([idle for _, idle in ray[workers]]),
-        ray_share_one=Spread.of([idle for _, idle in ray[1]]),
-        share_of_bare=gain.speedup.median / reference.speedup.median,
-    )
+            for count in counts:
+                laps = processes.run(f"{number}-{count}", count, each)
+                # They start together, and the lap lasts until the last one's end.
+                wall_s = max(lap.wall_s for lap in laps)
+                bare[count].append(Lap(sum(lap.scenes for lap in laps), wall_s, sum(lap.cpu_s for lap in laps), {}))
+    gain = gain_of(*([lap for lap, _ in ray[count]] for count in counts))
+    reference = gain_of(bare[1], bare[workers])
+    return {
+        "workers": workers,
+        "shard": shard,
+        "ray": gain,
+        "bare": reference,
+        "ray_share": asdict(Spread.of([idle for _, idle in ray[workers]])),
+        "ray_share_one": asdict(Spread.of([idle for _, idle in ray[1]])),
+        "share_of_bare": gain["speedup"]["median"] / reference["speedup"]["median"],
+    }
 
 
-def _together(laps: Sequence[Lap]) -> Lap:
-    """One lap of processes that started together, until the last one's end."""
-    return Lap(sum(lap.scenes for lap in laps), max(lap.wall_s for lap in laps), sum(lap.cpu_s for lap in laps), {})
+def gain_of(one: Sequence[Lap], several: Sequence[Lap]) -> dict[str, Any]:
+    """The gain of several at once over one, from laps in pairs; a lap lasts from the first start to the last end.
+
+    speedup: ratio of the paces; inflation: ratio of the processor time a scene, the cost of sharing caches, memory and clock,
+    without waiting.
+    """
+    return {
+        "scenes": several[0].scenes,
+        "one_scenes_per_s": Spread.of([1.0 / by_clock(lap) for lap in one]).median,
+        "all_scenes_per_s": Spread.of([1.0 / by_clock(lap) for lap in several]).median,
+        "speedup": asdict(slope_ratio(one, several)),
+        "inflation": asdict(slope_ratio(several, one, by_processor)),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Processes:
+    """Warm processes without Ray, each a pool of one with a folder of its own and, in turn, a core of its own."""
+
+    job: Job
+    job_folder: Path
+    folder: Path
+    pools: Sequence[ProcessPoolExecutor]
+
+    def run(self, name: str, count: int, span: Span) -> list[Lap]:
+        """The first `count` of them make these scenes at the same time, all of them the same scenes."""
+        laps = [
+            pool.submit(run_process, self.job, self.job_folder, self.folder / f"bare{number}" / name, span)
+            for number, pool in enumerate(self.pools[:count])
+        ]
+        try:
+            return [lap.result() for lap in laps]
+        except BrokenProcessPool as error:
+            raise RunError("a plain process of the benchmark died; its last words stand above") from error
+
+
+@contextmanager
+def plain_processes(job: Job, job_folder: Path, folder: Path, count: int) -> Iterator[Processes]:
+    """That many processes, each of which has made its first scenes. They never load this module, and so never Ray."""
+    fresh, cores = multiprocessing.get_context("spawn"), sorted(os.sched_getaffinity(0))
+    pins = [{cores[number % len(cores)]} for number in range(count)]
+    with ExitStack() as running:
+        executors = [ProcessPoolExecutor(1, fresh, initializer=os.sched_setaffinity, initargs=(0, pin)) for pin in pins]
+        processes = Processes(job, job_folder, folder, [running.enter_context(pool) for pool in executors])
+        processes.run("warm", count, Span(start=job.first_scene, stop=job.first_scene + WARM_UP))
+        yield processes
 
 
 @dataclass(frozen=True)
@@ -121,7 +136,7 @@ class _RayDrive:
         # The other slot could start a waiting shard, so one worker gets one shard at a time.
         limits = Limits(PREFETCH * slots if slots == self.workers else slots, 1, count)
         begun = time.perf_counter()
-        Coordinator(store, bench_order(self.job, out), self.catalogue, limits, tally).run(
+        Coordinator(store, ShardOrder.of(str(out), self.job, "bench"), self.catalogue, limits, tally).run(
             group_shards(spans, shard_size)
         )
         seconds = time.perf_counter() - begun

@@ -1,10 +1,10 @@
 """Our side of the benchmark: whole scenes of a job by the production code, onto a real disk."""
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
-from schemas.dataset.commit import CommitRecord, CommitTerms, Span
+from schemas.dataset.commit import Span
 from schemas.dataset.shard import ShardOrder
 from schemas.errors import RunError, SceneError
 from schemas.job.job import Job
@@ -26,7 +26,7 @@ class Workbench:
     context: WorkerContext
     store: LocalStore
     order: ShardOrder
-    next_scene: int = field(default=0)
+    next_scene: int
 
     def next_span(self, scenes: int) -> Span:
         """The next range, of new scenes, so that no shape is cached already."""
@@ -44,21 +44,11 @@ class Workbench:
             raise RunError(f"none of the scenes {span.start} to {span.stop - 1} could be made: {report.failed}")
         return lap
 
-    def record(self, span: Span) -> CommitRecord:
-        """The range's commit record."""
+    def files(self, span: Span) -> dict[str, bytes]:
+        """The bytes of every file that the range's commit names, by path."""
         record = read_record(self.store, span.start)
         assert record is not None
-        return record
-
-    def scenes(self, span: Span) -> list[Scene]:
-        """The same scenes once more in memory, without those that fail, as input for the other sides."""
-        made = []
-        for scene_id in span.scene_ids:
-            try:
-                made.append(make_scene(self.context, scene_id, Stopwatch()))
-            except SceneError:
-                continue
-        return made
+        return {entry.path: (self.store.root / entry.path).read_bytes() for entry in record.files}
 
 
 def open_workbench(job: Job, job_folder: Path, out: Path) -> Workbench:
@@ -68,17 +58,26 @@ def open_workbench(job: Job, job_folder: Path, out: Path) -> Workbench:
     store.prepare()
     context = open_worker(job, catalogue)
     require_device(context.renderer.name, job.run.device)
-    return Workbench(context, store, bench_order(job, out), job.first_scene)
+    return Workbench(context, store, ShardOrder.of(str(out), job, "bench"), job.first_scene)
 
 
-def bench_order(job: Job, out: Path) -> ShardOrder:
-    """The order that every shard of a benchmark follows."""
-    terms = CommitTerms(
-        job_digest="bench",
-        fingerprint="bench",
-        fingerprint_mode=job.run.fingerprint,
-        layout=job.output.layout,
-        first_scene=job.first_scene,
-        range_size=job.run.range_size,
-    )
-    return ShardOrder(out=str(out), job=job, terms=terms, spans=())
+def make_in_memory(context: WorkerContext, span: Span) -> list[Scene]:
+    """The scenes that can be made, as input for the other sides. Raises RunError for none."""
+    made, reason = [], ""
+    for scene_id in span.scene_ids:
+        try:
+            made.append(make_scene(context, scene_id, Stopwatch()))
+        except SceneError as error:
+            reason = str(error)
+    if not made:
+        raise RunError(f"none of the scenes {span.start} to {span.stop - 1} could be made: {reason}")
+    return made
+
+
+def run_process(job: Job, job_folder: Path, folder: Path, span: Span) -> Lap:
+    """A plain process's part: make and commit a span into a new folder, range by range."""
+    bench, made = open_workbench(job, job_folder, folder), 0
+    wall, cpu = time.perf_counter(), time.process_time()
+    for start in range(span.start, span.stop, job.run.range_size):
+        made += bench.run(Span(start=start, stop=min(start + job.run.range_size, span.stop))).scenes
+    return Lap(made, time.perf_counter() - wall, time.process_time() - cpu, {})

@@ -1,90 +1,145 @@
-"""`verso bench --pathtraced`: the path-traced tier and, where an interpreter has `bpy`, Blender's Cycles, in turn."""
+"""`verso bench --pathtraced`: the path-traced tier and, where an interpreter has `bpy`, Blender's Cycles, in turn.
 
-import argparse
+Both get the same meshes, materials, lights, cameras and samples.
+"""
+
 import json
-import sys
+import time
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import MachineError, RunError, SceneError
+import numpy as np
+import trimesh
+
+from schemas.base import Array
+from schemas.dataset.commit import Span
+from schemas.errors import MachineError
 from schemas.job.job import Job
 from schemas.job.render import Render
-from services.bench.cycles import CyclesProcess, cycles_process, hand_over, trace_lap
+from schemas.scene.camera import Camera
+from schemas.scene.scene import PosedScene
+from schemas.scene.shape import Part
 from services.bench.machine import describe_machine, pinned
-from services.bench.ratios import Lap, Spread, by_processor, slope_ratio
+from services.bench.others import SideProcess, start_side
+from services.bench.ratios import Lap, Spread, by_processor, format_spread, slope_ratio
+from services.bench.report import describe_head
+from services.bench.stages import make_in_memory
 from workers.assets.catalogue import open_catalogue
+from workers.geometry.frames import transform
+from workers.geometry.srgb import decode_srgb
 from workers.pipeline.context import open_worker
-from workers.pipeline.make_scene import Scene, make_scene
-from workers.pipeline.stopwatch import Stopwatch
+from workers.pipeline.make_scene import Scene
 from workers.plan.effects import Facts, plan_effects
+from workers.render.pathtraced.lights import GLOW, SKY_PX, sky_directions, sky_picture
+from workers.render.pathtraced.materials import tint_of
+from workers.render.pathtraced.tracer import Tracer, encode_light
+from workers.render.raster.baking import LAMP_RAD
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.step import require_tier
 
 SAMPLES = (16, 1)
 
 
-def measure_traced(options: argparse.Namespace, job: Job, job_folder: Path, folder: Path) -> int:
-    """Time both sides on the job's first scenes, three views each, and print milliseconds a view and the ratio.
+def measure_traced(job: Job, job_folder: Path, folder: Path, count: int, python: str) -> dict[str, Any]:
+    """Time both sides on the job's first scenes, three views each; `python` runs Blender's script.
 
     Raises InputError where Mitsuba is not installed.
     """
     require_tier(Render(tier="pathtraced"))
     with pinned() as core:
-        scenes = first_scenes(job, job_folder, options.scenes)
+        job = job.model_copy(update={"render": Render(tier="raster")})
+        context = open_worker(job, open_catalogue(job.assets, job_folder, tuple(job.categories)))
+        scenes = make_in_memory(context, Span(start=job.first_scene, stop=job.first_scene + count))
         machine = describe_machine(shared_renderer().name)
         try:
-            with cycles_process(options.pathtraced) as cycles:
-                version, laps = (
-                    cycles.version,
-                    [measure_scene(s, folder / str(n), cycles) for n, s in enumerate(scenes)],
-                )
+            with start_cycles(python) as cycles:
+                version: str = cycles.greeting["version"]
+                laps = [measure_scene(scene, folder / str(number), cycles) for number, scene in enumerate(scenes)]
         except MachineError as error:
             version = f"not measured: {error}"
             laps = [measure_scene(scene, folder, None) for scene in scenes]
-    figures = {
-        "ok": True,
-        "machine": machine,
-        "core": core,
-        "scenes": len(scenes),
-        "cycles": version,
-        **summarise(laps),
-    }
-    print("\n".join(describe(figures)))
-    if options.json:
-        print(json.dumps(figures))
-    return 0
+    return {"machine": machine, "core": core, "scenes": len(scenes), "cycles": version, **summarise(laps)}
 
 
-def first_scenes(job: Job, job_folder: Path, count: int) -> list[Scene]:
-    """The first scenes that can be made, posed and with their cameras. Raises RunError for none."""
-    job = job.model_copy(update={"render": Render(tier="raster")})
-    catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
-    context = open_worker(job, catalogue)
-    made, reason = [], ""
-    for scene_id in range(job.first_scene, job.first_scene + count):
-        try:
-            made.append(make_scene(context, scene_id, Stopwatch()))
-        except SceneError as error:
-            reason = str(error)
-    if not made:
-        raise RunError(f"none of the first {count} scenes could be made: {reason}")
-    return made
+def start_cycles(python: str) -> AbstractContextManager[SideProcess]:
+    """Blender's script on our core, whose greeting has a `version`. Raises MachineError where `python` has no bpy."""
+    return start_side("Blender's script", [python, "-I", str(Path(__file__).with_name("cycles_script.py"))])
 
 
-def measure_scene(scene: Scene, folder: Path, cycles: CyclesProcess | None) -> dict[str, Lap]:
+def measure_scene(scene: Scene, folder: Path, cycles: SideProcess | None) -> dict[str, Lap]:
     """Laps over the scene's three rendered views by side and samples, such as `ours 16`, including building the scene."""
-    pair = scene.pairs[0]
-    cameras = [view.camera for view in pair.views if view.role != "projected"]
+    cameras = [view.camera for view in scene.pairs[0].views if view.role != "projected"]
     laps = {}
     handed = None if cycles is None else hand_over(scene.posed, cameras, Render(), folder)
     for samples in SAMPLES:
         render = Render(tier="pathtraced", path_samples=samples)
         effects = plan_effects(Facts(Job(name="bench", render=render), scene.plan, False))
-        laps[f"ours {samples}"] = trace_lap(scene.posed, cameras, render, effects)
-        if cycles is not None and handed is not None:
-            laps[f"cycles {samples}"] = cycles.lap(handed, len(cameras), samples)
+        tracer = Tracer()
+        wall, cpu = time.perf_counter(), time.process_time()
+        for camera in cameras:
+            encode_light(tracer.radiance(scene.posed.things, scene.posed.appearance, camera, render, effects, 0))
+        laps[f"ours {samples}"] = Lap(len(cameras), time.perf_counter() - wall, time.process_time() - cpu, {})
+        if cycles is not None:
+            took = cycles.ask({"scene": str(handed), "samples": samples})
+            laps[f"cycles {samples}"] = Lap(len(cameras), took["wall_s"], took["cpu_s"], {})
     return laps
+
+
+def hand_over(posed: PosedScene, cameras: Sequence[Camera], render: Render, folder: Path) -> Path:
+    """Write the scene for Blender's script, outside any clock. Returns the path of its description."""
+    folder.mkdir(parents=True)
+    placed = [(part, thing.T_world_shape) for thing in posed.things for part in thing.shape.parts]
+    for number, (part, T_world_shape) in enumerate(placed):
+        np.savez(folder / f"{number}.npz", **_arrays(part, T_world_shape))
+    # The sky in Blender's projection: the same columns as ours, and centred rows.
+    directions = sky_directions((np.arange(SKY_PX[1]) + 0.5) / SKY_PX[1])
+    np.save(folder / "sky.npy", sky_picture(posed.appearance, directions).astype(np.float32))
+    described = {
+        "parts": [_part(part) | {"arrays": f"{number}.npz"} for number, (part, _) in enumerate(placed)],
+        "suns": [
+            {
+                "angle_rad": LAMP_RAD,
+                "irradiance": [np.pi * (1.0 - GLOW) * c for c in light.color],
+                # A lamp shines along its -z.
+                "T_world_light": trimesh.geometry.align_vectors([0.0, 0.0, 1.0], light.direction).tolist(),
+            }
+            for light in posed.appearance.lights[:1]
+        ],
+        "sky": "sky.npy",
+        "intrinsics": cameras[0].intrinsics.model_dump(),
+        "cameras": [camera.T_world_cam.tolist() for camera in cameras],
+        "bounces": render.path_bounces,
+    }
+    path = folder / "scene.json"
+    path.write_text(json.dumps(described))
+    return path
+
+
+def _arrays(part: Part, T_world_shape: Array) -> dict[str, Any]:
+    arrays: dict[str, Any] = {
+        "vertices": transform(T_world_shape, part.vertices).astype(np.float32),
+        "faces": part.faces.astype(np.int32),
+    }
+    if part.normals is not None:
+        arrays["normals"] = part.normals @ T_world_shape[:3, :3].T
+    if part.uv is not None:
+        arrays["uv"] = part.uv.astype(np.float32)
+        if part.material.texture is not None:
+            arrays["texture"] = part.material.texture[..., :3]
+        if part.material.transmission_map is not None:
+            arrays["opaque"] = 1.0 - part.material.transmission_map.astype(np.float32) / 255.0
+    return arrays
+
+
+def _part(part: Part) -> dict[str, Any]:
+    material = part.material
+    color = decode_srgb(np.array(material.base_color[:3]))
+    tint = tint_of(part).tolist() if material.transmission > 0.0 else None
+    look = {"color": color.tolist(), "tint": tint, "metallic": material.metallic, "roughness": material.roughness}
+    return {"name": part.name, **look}
 
 
 def summarise(laps: list[dict[str, Lap]]) -> dict[str, Any]:
@@ -98,10 +153,8 @@ def summarise(laps: list[dict[str, Lap]]) -> dict[str, Any]:
 
 def describe(figures: dict[str, Any]) -> list[str]:
     """The figures as text, line by line."""
-    machine = figures["machine"]
     lines = [
-        f"machine    {machine['cpu']}, load {machine['load_1min']:.1f}",
-        f"command    verso {' '.join(sys.argv[1:])}",
+        *describe_head(figures),
         f"measured   {figures['scenes']} scenes of 3 views, each side in turn on core {figures['core']}, one thread each",
         f"Cycles     {figures['cycles']}",
         "",
@@ -113,6 +166,5 @@ def describe(figures: dict[str, Any]) -> list[str]:
             f"{who:28} {samples:>2} samples {ms['median']:8.0f} ms a view [{ms['least']:.0f} to {ms['most']:.0f}] of processor"
         )
     for samples, ratio in figures["ratio_cpu"].items():
-        spread = f"{ratio['median']:.2f} [{ratio['least']:.2f} to {ratio['most']:.2f}]"
-        lines.append(f"at {samples:>2} samples: {spread} views while Cycles makes one")
+        lines.append(f"at {samples:>2} samples: {format_spread(ratio)} views while Cycles makes one")
     return lines

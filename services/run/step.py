@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from schemas.dataset.commit import CommitTerms, Span
+from schemas.dataset.commit import Span
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
 from schemas.dataset.shard import ShardOrder
 from schemas.job.job import Job
-from services.job.record import JobRecord, adopt, encode_job, record_job, refuse_foreign
+from services.job.record import adopt, encode_job, record_job, refuse_foreign
 from services.merge.dataset_card import describe_left_out, describe_sources, write_card
 from services.merge.step import MergeResult, merge, reopen
 from services.run.coordinator import Coordinator, Limits, Tally
@@ -89,25 +89,11 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
         if spans:
             reopen(store)
             with cluster or open_ray(request.address, record.job.run.workers) as slots:
-                made_now = _make(store, _order(request.out, record), catalogue, spans, slots)
+                made_now = _make(store, ShardOrder.of(request.out, record.job, record.digest), catalogue, spans, slots)
         merged = merge(store, record.job.first_scene, record.job.stop_scene)
         write_card(store, record, catalogue, merged)
         log_event("finished", job=record.job.name, digest=merged.digest)
     return RunResult(merged, time.monotonic() - begun, made_now)
-
-
-def _order(out: str, record: JobRecord) -> ShardOrder:
-    """The pattern of every shard's order."""
-    job = record.job
-    terms = CommitTerms(
-        job_digest=record.digest,
-        fingerprint="",
-        fingerprint_mode=job.run.fingerprint,
-        layout=job.output.layout,
-        first_scene=job.first_scene,
-        range_size=job.run.range_size,
-    )
-    return ShardOrder(out=out, job=job, terms=terms, spans=())
 
 
 def _make(store: Store, order: ShardOrder, catalogue: Catalogue, spans: Sequence[Span], slots: Slots) -> int:

@@ -1,26 +1,22 @@
 """What the plan of effects saves: the figures follow from the times, and the times from settling."""
 
 import json
-from argparse import Namespace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from schemas.errors import RunError
-from schemas.job.job import Job
 from services.bench import effects
 from services.bench.effects import (
     EVERYTHING,
     FORCED,
     PLAN,
     WHOLE,
-    Timed,
     describe,
-    measure_effects,
     summarise,
     time_settling,
 )
+from services.cli.main import main
 from tests.effects.physics_scenes import facts_with
 from tests.hard_cases.bodies import cube
 from tests.hard_cases.drops import drop, level
@@ -29,7 +25,7 @@ from workers.plan.effects import names_of_kind
 
 NEVER = np.full((2, 3), np.nan)
 
-TIMED = Timed(
+TIMED = (
     {
         **dict.fromkeys(FORCED, NEVER),
         PLAN: np.array([[0.01, 0.02, 0.5], [0.02, 0.02, 0.5]]),
@@ -43,7 +39,7 @@ TIMED = Timed(
 
 
 def test_the_share_saved_is_of_the_time_of_all_scenes_that_come_to_rest_in_every_way():
-    figures = summarise(TIMED)
+    figures = summarise(*TIMED)
     assert (figures["scenes"], figures["rounds"]) == (2, 2)
     assert figures["plan"] == pytest.approx({"median_ms": 17.5, "mean_ms": 17.5})
     hulls, parts = figures["forced"][WHOLE], figures["forced"][EVERYTHING]
@@ -53,7 +49,7 @@ def test_the_share_saved_is_of_the_time_of_all_scenes_that_come_to_rest_in_every
 
 
 def test_an_effect_costs_what_it_adds_in_the_scenes_that_leave_it_out():
-    costs = summarise(TIMED)["effects"]
+    costs = summarise(*TIMED)["effects"]
     assert costs["table_mesh"]["scenes"] == 2
     assert costs["table_mesh"]["more_ms"] == pytest.approx({"median": 140.0, "least": 110.0, "most": 170.0})
     assert costs["dynamics"] == {"scenes": 0, "more_ms": None}
@@ -69,14 +65,15 @@ def test_every_approximation_is_forced_alone_and_with_the_others_once_without_de
 
 def test_settling_is_timed_in_each_way_but_not_with_an_effect_that_the_plan_has():
     timed = time_settling([facts_with(drop(cube(), level()))], rounds=2)
-    assert all(found.shape == (2, 1) for found in timed.seconds.values())
-    for name, found in timed.seconds.items():
+    seconds, failed = timed
+    assert all(found.shape == (2, 1) for found in seconds.values())
+    for name, found in seconds.items():
         if name in ("dynamics", "fine_step"):
             assert np.isnan(found).all()
         else:
             assert (found > 0.0).all()
-    assert timed.seconds[WHOLE].sum() > timed.seconds[PLAN].sum()
-    assert set(timed.failed.values()) == {0}
+    assert seconds[WHOLE].sum() > seconds[PLAN].sum()
+    assert set(failed.values()) == {0}
 
 
 def test_what_does_not_come_to_rest_is_counted_and_refused_where_nothing_does():
@@ -84,14 +81,14 @@ def test_what_does_not_come_to_rest_is_counted_and_refused_where_nothing_does():
     with pytest.raises(RunError, match="none of 1 scenes"):
         time_settling([over_nothing], rounds=1)
     timed = time_settling([over_nothing, facts_with(drop(cube(), level()))], rounds=1)
-    assert timed.failed[PLAN] == 1
-    assert summarise(timed)["scenes"] == 1
+    assert timed[1][PLAN] == 1
+    assert summarise(*timed)["scenes"] == 1
 
 
 def test_two_scenes_of_a_job_are_told_of_in_words_and_in_json(monkeypatch, capsys):
     monkeypatch.setattr(effects, "ROUNDS", 1)
-    job = Job(name="two", categories=["laptop"])
-    assert measure_effects(Namespace(effects=2, json=True), job, Path()) == 0
+    job = ["--set", "name=two", "--set", "categories=[laptop]"]
+    assert main(["bench", "--effects", "2", "--json", *job]) == 0
     *lines, answer = capsys.readouterr().out.splitlines()
     figures = json.loads(answer)
     assert (figures["job"], figures["scenes"], figures["rounds"]) == ("two", 2, 1)

@@ -10,9 +10,8 @@ import pytest
 from schemas.errors import MachineError
 from schemas.job.render import Render
 from schemas.scene.scene import PosedScene
-from services.bench.cycles import cycles_process, hand_over
 from services.bench.ratios import Lap
-from services.bench.traced import describe, summarise
+from services.bench.traced import describe, hand_over, start_cycles, summarise
 from tests.workers.render.random_scenes import APPEARANCE, camera, orbit_and_mirror, procedural_things
 from workers.geometry.frames import transform
 
@@ -26,8 +25,8 @@ def test_the_ratio_is_of_processor_time_and_says_how_many_views_ours_makes_while
     figures = summarise(laps)
     assert figures["ratio_cpu"]["16"] == pytest.approx({"median": 2.0, "least": 1.5, "most": 2.5})
     assert figures["cpu_ms_per_view"]["ours 16"] == pytest.approx({"median": 3000, "least": 2000, "most": 4000})
-    machine = {"cpu": "some", "load_1min": 0.1}
-    text = "\n".join(describe({"machine": machine, "scenes": 2, "core": 1, "cycles": "4.2.0", **figures}))
+    head = {"machine": {"cpu": "some", "load_1min": 0.1}, "command": "verso bench", "core": 1}
+    text = "\n".join(describe({**head, "scenes": 2, "cycles": "4.2.0", **figures}))
     assert "at 16 samples: 2.00 [1.50 to 2.50] views" in text
 
 
@@ -58,11 +57,11 @@ def test_blender_is_given_the_same_vertices_cameras_and_light(tmp_path):
 
 
 def test_an_interpreter_without_bpy_is_told_of_by_its_own_words():
-    with pytest.raises(MachineError, match="bpy"), cycles_process(sys.executable):
+    with pytest.raises(MachineError, match="bpy"), start_cycles(sys.executable):
         pass
 
 
 @pytest.mark.parametrize("python", [os.devnull, "/nowhere/python"])
 def test_an_interpreter_that_there_is_not_is_told_of(python):
-    with pytest.raises(MachineError, match=python), cycles_process(python):
+    with pytest.raises(MachineError, match=python), start_cycles(python):
         pass
