@@ -48,7 +48,7 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
         *(Knob(name, "physics", tuple(values)) for name, values in physics.items()),
         Knob("size", "labels", tuple(size_value(job, width) for width in WIDTHS)),
         Knob("units", "labels", tuple(_values("images.depth_units_per_m", units))),
-        Knob("front", "mirror", tuple(_pivot_depths())),
+        Knob("pivot_depth", "mirror", tuple(_pivot_depths())),
         Knob("splat", "mirror", tuple(splats)),
         Knob("sensor", "labels", tuple(sensors)),
         Knob("colour", "colour", tuple(_tiers())),
