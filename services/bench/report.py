@@ -94,7 +94,7 @@ def describe(figures: dict[str, Any]) -> list[str]:
         f"{_times(other['ratio_with_loading'])}"
         for other in others
     ]
-    lines += [f"{'as long as the lower bound':24} {_times(figures['times_floor']):24} {_times(figures['times_floor_cpu'])}"]
+    lines += [f"{'times the lower bound':24} {_times(figures['times_floor']):24} {_times(figures['times_floor_cpu'])}"]
     lines += _describe_memory(figures["memory"]) if figures["memory"] else []
     lines += _describe_scaling(figures["scaling"]) if figures["scaling"] else []
     return lines + [
