@@ -32,7 +32,6 @@ ASSETS = "assets"
 CAM_POSES = "camPoses.csv"
 CAMERAS = "cameras.csv"
 OBJECTS = "objects.dat"
-MERGED_FILES = (CAM_POSES, CAMERAS, OBJECTS)
 
 Content = Literal[
     "RGB", "depth", "segment", "RGBaligned", "depthAligned", "segmentAligned", "RGBprojected", "depthProjected"

@@ -1,7 +1,7 @@
 """Reads a job file into a `Job`. An error names the file, the key, its value and what is allowed."""
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -94,11 +94,15 @@ def describe_fault(fault: Any) -> str:
     key = ".".join(words) or "the job"
     if fault["type"] == "extra_forbidden":
         allowed = allowed_keys(words)
-        near = difflib.get_close_matches(words[-1], allowed, n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
-        return f"{key}: there is no such key; {hint}Allowed here: {', '.join(allowed) or 'nothing'}"
+        return f"{key}: there is no such key; {did_you_mean(words[-1], allowed)}Allowed here: {', '.join(allowed) or 'nothing'}"
     if fault["type"] == "missing":
         return f"{key}: is missing, and has no default"
     message = fault["msg"].removeprefix("Value error, ")
     value = repr(fault["input"])
     return f"{key}: {value if len(value) <= 80 else value[:77] + '...'}: {message[0].lower()}{message[1:]}"
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """A question with the nearest of the known words and a space behind it; empty where none is near."""
+    near = difflib.get_close_matches(word, known, n=1)
+    return f"did you mean '{near[0]}'? " if near else ""

@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from decimal import ROUND_CEILING, Context
 
 from schemas.errors import InputError, RunError
+from services.job.read import did_you_mean
 from services.study.errors import ERRORS
 from services.study.model import Figure, Row
-from services.study.words import amount, did_you_mean, listed, times, unit
+from services.study.words import amount, listed, times, unit
 
 Targets = Mapping[str, float]
 """The greatest allowed value of each error, by name of `ERRORS`, in the unit of the table: shares from 0 to 1."""

@@ -13,9 +13,8 @@ from schemas.errors import InputError
 from schemas.job.job import Job
 from schemas.job.keys import set_key
 from schemas.job.preset import PRESETS
-from services.job.read import describe_fault
+from services.job.read import describe_fault, did_you_mean
 from services.study.model import Changes, Group, Knob, Setting, Value
-from services.study.words import did_you_mean
 
 SPIN_PER_SPEED = 0.01
 """rad/s of `physics.rest.spin_rad_s` for each mm/s of `physics.rest.speed_mm_s`: their defaults' ratio."""

@@ -1,8 +1,5 @@
 """Amounts, times and sizes in words, for the sentence, the plots and the page. Pure."""
 
-import difflib
-from collections.abc import Iterable
-
 from services.study.errors import ERRORS
 
 _SPANS = ((60.0, 1.0, "s"), (5400.0, 60.0, "min"), (float("inf"), 3600.0, "h"))
@@ -70,12 +67,6 @@ def size(kilobytes: float) -> str:
 
 def _two(value: float) -> float:
     return float(f"{value:.2g}") if value < 100.0 else float(round(value))
-
-
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """A question with the nearest of the known words and a space behind it; empty where none is near."""
-    near = difflib.get_close_matches(word, known, n=1)
-    return f"did you mean '{near[0]}'? " if near else ""
 
 
 def listed(words: list[str]) -> str:

@@ -21,21 +21,6 @@ from workers.store.local import LocalStore
 pytestmark = pytest.mark.usefixtures("unflushed")
 
 
-@pytest.fixture
-def store(tmp_path):
-    store = LocalStore(tmp_path)
-    store.prepare()
-    return store
-
-
-@pytest.fixture
-def undecided(store, monkeypatch):
-    """A commit that was decided and not published: its worker died in between."""
-    with monkeypatch.context() as patch:
-        patch.setattr("workers.store.attempt.publish", lambda store, record: None)
-        return attempt_at(store, 0, 4).commit().record
-
-
 def test_a_record_reads_back_as_it_was_and_always_has_the_same_bytes(store):
     record = attempt_at(store, 0, 4).commit().record
     data = store.read(commit_path(0))

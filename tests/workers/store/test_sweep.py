@@ -4,25 +4,9 @@ from schemas.dataset.layout import STAGING
 from schemas.errors import CorruptError
 from tests.made_up_scenes import attempt_at
 from workers.store.commit import check_published
-from workers.store.local import LocalStore
 from workers.store.sweep import sweep
 
 pytestmark = pytest.mark.usefixtures("unflushed")
-
-
-@pytest.fixture
-def store(tmp_path):
-    store = LocalStore(tmp_path)
-    store.prepare()
-    return store
-
-
-@pytest.fixture
-def undecided(store, monkeypatch):
-    """A commit that was decided and not published: its worker died in between."""
-    with monkeypatch.context() as patch:
-        patch.setattr("workers.store.attempt.publish", lambda store, record: None)
-        return attempt_at(store, 0, 4).commit().record
 
 
 def test_sweeping_publishes_winners_drops_losers_and_leaves_the_undecided(store, undecided):
