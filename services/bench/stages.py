@@ -15,7 +15,7 @@ from workers.pipeline.make_scene import Scene, make_scene
 from workers.pipeline.run_shard import run_span
 from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.context import require_device
-from workers.store.commit import read_record
+from workers.store.commit import committed_files, read_record
 from workers.store.local import LocalStore
 
 
@@ -48,7 +48,9 @@ class Workbench:
         """The bytes of every file that the range's commit names, by path."""
         record = read_record(self.store, span.start)
         assert record is not None
-        return {entry.path: (self.store.root / entry.path).read_bytes() for entry in record.files}
+        return {
+            entry.path: (self.store.root / entry.path).read_bytes() for entry in committed_files(self.store, record)
+        }
 
 
 def open_workbench(job: Job, job_folder: Path, out: Path) -> Workbench:

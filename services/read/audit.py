@@ -22,6 +22,7 @@ from workers.pipeline.make_scene import Scene, make_scene
 from workers.pipeline.rows import record_scene
 from workers.pipeline.stopwatch import Stopwatch
 from workers.plan.effects import EFFECTS
+from workers.store.commit import committed_files
 from workers.store.store import Store
 
 RECEIPT = frozenset({"effects", "skipped"})
@@ -135,7 +136,7 @@ def _differences(store: Store, stored: StoredRange, plain: SceneOutput | None, o
     if plain is not None:
         before, now = ({file.path: file.sha256 for file in one.files} for one in (plain, output))
         return [f"{path}: is not the same" for path in sorted({*before, *now}) if before.get(path) != now.get(path)]
-    committed = {entry.path: entry.sha256 for record in stored.records for entry in record.files}
+    committed = {entry.path: entry.sha256 for record in stored.records for entry in committed_files(store, record)}
     shapes = [file for file in output.files if is_shape(file.path) and file.path in committed]
     return [
         *compare_files(store, stored, output, True),

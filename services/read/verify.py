@@ -24,6 +24,7 @@ from services.read.independent.derive import StoredPair
 from services.read.independent.step import check_merged, check_pair, list_underived
 from workers.pipeline.allocator import keep_freed_memory
 from workers.pipeline.check_stored import check_stored_pair, check_stored_scene
+from workers.store.commit import committed_files
 from workers.store.store import Store
 
 
@@ -75,7 +76,7 @@ def _check_files(
 ) -> list[str]:
     """Files of the range's records that are missing or differ from their SHA-256. Reads those without a digest yet."""
     faults, read = [], _hashing_reader(store, digests, verdict)
-    for entry in (entry for record in stored.records for entry in record.files):
+    for entry in (entry for record in stored.records for entry in committed_files(store, record)):
         if entry.path in known and is_shape(entry.path):
             continue
         known.add(entry.path)

@@ -94,13 +94,18 @@ def read_summary(store: Store, start: int, retry: int = 0) -> CommitSummary:
         raise CorruptError(f"{key} is not a commit record: {error!r}") from error
 
 
+def committed_files(store: Store, record: CommitRecord) -> tuple[FileEntry, ...]:
+    """Every file of a commit, sorted by path: images or tars, shapes and the range's tables."""
+    return record.files
+
+
 def publish(store: Store, record: CommitRecord) -> None:
     """Moves the record's files from staging to their final places, then removes the staging. Idempotent.
 
     Raises CorruptError naming a file that is nowhere or has the wrong size, CommitConflict where a shape that ranges
     share was published with another size by the same stack.
     """
-    for entry in record.files:
+    for entry in committed_files(store, record):
         final = store.size(entry.path) if is_shape(entry.path) else None
         if final is None:
             if not _move(store, record, entry):
@@ -110,7 +115,7 @@ def publish(store: Store, record: CommitRecord) -> None:
                 f"{entry.path} has {final} bytes, and {entry.bytes} in the range from scene {record.span.start}, "
                 f"made by {record.terms.fingerprint}: two attempts at one shape differ"
             )
-    store.sync_folders_of(entry.path for entry in record.files)
+    store.sync_folders_of(entry.path for entry in committed_files(store, record))
     for folder in _staging_folders(record):
         store.remove_tree(folder)
 
@@ -129,7 +134,7 @@ def check_published(store: Store, record: CommitRecord) -> None:
 
     A shape that a mix of stacks shares keeps the size of whichever was first.
     """
-    for entry in record.files:
+    for entry in committed_files(store, record):
         _check_final(store, entry, record.terms.fingerprint_mode == "strict" or not is_shape(entry.path))
 
 
