@@ -29,6 +29,9 @@ class Beat:
 
 DEFAULT_BEAT = Beat()
 
+UNREADABLE = "unknown"
+"""The host of a holder whose lock file cannot be read."""
+
 
 @dataclass(frozen=True)
 class Holder:
@@ -46,52 +49,134 @@ class Holder:
     beat: int = 0
 
 
+class Lock:
+    """The right to be the one coordinator of a folder. Another may take it over while this process shows no life.
+
+    What decides is the store: a claim on this holder ends its right for good, whatever the lock file says. A lock file
+    that was removed or damaged by hand is written again.
+    """
+
+    def __init__(self, store: Store, mine: Holder, beat: Beat, shown_at: float) -> None:
+        self._store = store
+        self._mine = mine
+        self._silence_s = beat.patience * beat.period_s
+        self._shown_at = shown_at
+        """When the lock file last showed life, by the clock that also counts while the machine sleeps."""
+        self._lost = False
+        self._new_holder: Holder | None = None
+        self._one_at_a_time = threading.Lock()
+
+    @property
+    def held(self) -> bool:
+        """Whether this process still has the lock. Asks the store, and shows life there. Raises MachineError."""
+        with self._one_at_a_time:
+            if not self._lost and not self._beat():
+                self._lost = True
+                self._new_holder = _claimant(self._store, self._mine) or read_holder(self._store)
+                self._give_back()
+            return not self._lost
+
+    def require_held(self) -> None:
+        """Raises RunError naming the process that took over. To be called before anything that would replace its work."""
+        if self.held:
+            return
+        by = self._new_holder
+        raise RunError(
+            f"{self._store.name} was taken over {f'by process {by.pid} on {by.host}' if by else 'by another process'} "
+            f"while this one showed no life for more than {self._silence_s:g} s: it stops here, so that it replaces nothing "
+            "newer; start again when the other has ended, what is committed stays"
+        )
+
+    def release(self) -> None:
+        """Gives the lock back, with the claims on earlier holders, unless it was lost."""
+        with self._one_at_a_time:
+            if not self._lost and _is_held_by(self._store, self._mine):
+                self._store.remove(LOCK_FILE)
+                self._store.remove_tree(LOCK_CLAIMS)
+
+    def _beat(self) -> bool:
+        """Writes the lock file anew; False where the lock was lost, even if only while this function ran."""
+        begun = _now_s()
+        found = read_holder(self._store)
+        if _claimant(self._store, self._mine) is not None or not self._may_write(found, begun):
+            return False
+        self._mine = replace(self._mine, beat=self._mine.beat + 1)
+        if found is not None:
+            self._store.write_whole(LOCK_FILE, _encode(self._mine), durable=False)
+        elif not self._store.put_if_absent(LOCK_FILE, _encode(self._mine)):
+            return False
+        if self._is_late() and _claimant(self._store, self._mine) is not None:
+            return False
+        self._shown_at = begun
+        return True
+
+    def _may_write(self, found: Holder | None, now: float) -> bool:
+        """Whether what is in the lock file is this process's to replace."""
+        if found is None:  # removed by hand, unless somebody had the time to take over, to work and to end
+            return not self._is_late()
+        ours = found.token == self._mine.token or found.host == UNREADABLE
+        return ours or _claimant(self._store, found) is not None  # written late by a holder that was replaced
+
+    def _is_late(self) -> bool:
+        return _now_s() - self._shown_at >= self._silence_s
+
+    def _give_back(self) -> None:
+        """Removes a lock file that this process wrote before it saw that the lock was lost; its holder writes it again."""
+        if _is_held_by(self._store, self._mine):
+            self._store.remove(LOCK_FILE)
+
+
 @contextlib.contextmanager
-def hold_lock(store: Store, beat: Beat = DEFAULT_BEAT) -> Iterator[None]:
+def hold_lock(store: Store, beat: Beat = DEFAULT_BEAT) -> Iterator[Lock]:
     """Holds the lock of an output folder while the context lasts.
 
     A dead holder on this machine is replaced at once, one elsewhere after `patience` periods without a heartbeat.
     Raises RunError naming a holder that lives.
     """
     mine = Holder(uuid.uuid4().hex, socket.gethostname(), os.getpid(), _machine(), _born(os.getpid()) or "")
+    shown_at = _now_s()
     while not store.put_if_absent(LOCK_FILE, _encode(mine)):
         gone = _find_gone(store, beat)
+        shown_at = _now_s()
         if gone is not None and _take_over(store, gone, mine, beat.period_s):
             break
+    lock = Lock(store, mine, beat, shown_at)
     ended = threading.Event()
     heartbeat = threading.Thread(
-        target=_show_life, args=(store, mine, beat.period_s, ended), name="lock heartbeat", daemon=True
+        target=_show_life, args=(lock, beat.period_s, ended), name="lock heartbeat", daemon=True
     )
-    heartbeat.start()
     try:
-        yield
+        heartbeat.start()
+        yield lock
     finally:
         ended.set()
-        heartbeat.join()
-        if _is_held_by(store, mine):
-            store.remove(LOCK_FILE)
+        if heartbeat.ident is not None:
+            heartbeat.join()
+        lock.release()
 
 
 def read_holder(store: Store) -> Holder | None:
     """The holder of the lock, None where it is free. A lock file that cannot be read names `unknown`."""
+    return _holder_at(store, LOCK_FILE)
+
+
+def _holder_at(store: Store, key: str) -> Holder | None:
     try:
-        data = store.read(LOCK_FILE)
+        data = store.read(key)
     except FileNotFoundError:
         return None
     try:
         return Holder(**json.loads(data))
     except (ValueError, TypeError):
-        return Holder(token=f"unreadable {data[:40]!r}", host="unknown", pid=0, machine="", born="")
+        return Holder(token=f"unreadable {data[:40]!r}", host=UNREADABLE, pid=0, machine="", born="")
 
 
-def _show_life(store: Store, mine: Holder, period_s: float, ended: threading.Event) -> None:
+def _show_life(lock: Lock, period_s: float, ended: threading.Event) -> None:
     """Writes the lock file anew in each period, until another process took the lock over."""
     while not ended.wait(period_s):
-        mine = replace(mine, beat=mine.beat + 1)
         with contextlib.suppress(Exception):  # a full disk must not end the run: the lock is only advice
-            if not _is_held_by(store, mine):
+            if not lock.held:
                 return
-            store.write_whole(LOCK_FILE, _encode(mine), durable=False)
 
 
 def _find_gone(store: Store, beat: Beat) -> Holder | None:
@@ -120,21 +205,33 @@ def _find_gone(store: Store, beat: Beat) -> Holder | None:
 def _take_over(store: Store, gone: Holder, mine: Holder, period_s: float) -> bool:
     """Replaces a holder that is gone; False where another was faster.
 
-    One contender for each holder gets the claim, and it looks again before it writes.
+    One contender for each holder gets the claim, and it looks again before and after it writes. The claim stays while
+    the lock is held: it tells the old holder, should it wake, that it was replaced.
     """
-    claim = f"{LOCK_CLAIMS}/{uuid.uuid5(uuid.NAMESPACE_OID, gone.token).hex}"
+    claim = _claim_on(gone)
     if not store.put_if_absent(claim, _encode(mine)):
         time.sleep(period_s)
         if read_holder(store) == gone:  # the process with the claim died before it wrote
             store.remove(claim)
         return False
-    try:
-        if read_holder(store) != gone:
-            return False
-        store.write_whole(LOCK_FILE, _encode(mine))
-        return True
-    finally:
+    if read_holder(store) != gone:
         store.remove(claim)
+        return False
+    store.write_whole(LOCK_FILE, _encode(mine))
+    if _claimant(store, gone) == mine:
+        return True
+    if _is_held_by(store, mine):
+        store.remove(LOCK_FILE)
+    return False
+
+
+def _claim_on(holder: Holder) -> str:
+    return f"{LOCK_CLAIMS}/{uuid.uuid5(uuid.NAMESPACE_OID, holder.token).hex}"
+
+
+def _claimant(store: Store, holder: Holder) -> Holder | None:
+    """The process that claimed the lock of `holder`, None where nobody did."""
+    return _holder_at(store, _claim_on(holder))
 
 
 def _is_held_by(store: Store, holder: Holder) -> bool:
@@ -163,3 +260,8 @@ def _born(pid: int) -> str | None:
         return None
     state, *fields = stat.rpartition(")")[2].split()
     return None if state in "ZX" else fields[18]
+
+
+def _now_s() -> float:
+    """Seconds by a clock that nobody sets and that counts while the machine sleeps."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
