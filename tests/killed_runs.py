@@ -3,13 +3,17 @@
 import contextlib
 import json
 import os
+import pty
 import signal
-import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+import uuid
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+from services.run.processes import Process, read_process
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -38,27 +42,78 @@ def deadly_scene(out: Path, scene_id: int) -> Iterator[list[int]]:
         watcher.join()
 
 
-def interrupt_at_first_commit(job: Path, out: Path) -> tuple[subprocess.Popen[str], str]:
-    """A run on one worker that gets SIGINT, it and all its processes, when it has committed something; what it said."""
+@dataclass(frozen=True)
+class EndedRun:
+    """A `verso run` that was disturbed: its exit code, what it said, and command lines of what it left running."""
+
+    code: int
+    told: str
+    left: list[str]
+
+
+def disturb_at_first_commit(
+    job: Path, out: Path, disturb: Callable[[int, int], object], timeout_s: float = 90
+) -> EndedRun:
+    """A run on one worker in a terminal of its own; once something is committed, `disturb(pid, terminal)` is called."""
+    mark = f"VERSO_TEST_MARK={uuid.uuid4().hex}"
     command = [sys.executable, "-m", "services.cli.main", "run", str(job), "--out", str(out), "--shard-size", "4"]
-    run = subprocess.Popen(
-        [*command, "--workers", "1"], cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
-    deadline = time.monotonic() + 120
-    while not list(out.glob("manifest/_commits/*.json")) and run.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.005)
-    if run.poll() is None:
-        os.killpg(run.pid, signal.SIGINT)
-    _, told = run.communicate(timeout=60)
-    return run, told
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.chdir(ROOT)
+        os.execvpe(sys.executable, [*command, "--workers", "1"], {**os.environ, **dict([mark.split("=")])})
+    said: list[bytes] = []
+    reader = threading.Thread(target=_read_terminal, args=(terminal, said))
+    reader.start()
+    try:
+        deadline = time.monotonic() + 120
+        while not list(out.glob("manifest/_commits/*.json")) and _waits(pid) and time.monotonic() < deadline:
+            time.sleep(0.005)
+        disturb(pid, terminal)
+        status = _wait_for(pid, timeout_s)
+    finally:
+        left = processes_with(mark)
+        for process in left:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process.pid, signal.SIGKILL)
+        reader.join(10)
+        os.close(terminal)
+    return EndedRun(status, b"".join(said).decode(errors="replace"), [process.name for process in left])
 
 
-def processes_of(session: int) -> list[str]:
-    """Command lines of what still runs in a session."""
+def interrupt(pid: int, terminal: int) -> None:
+    """Ctrl-C: the terminal sends SIGINT to its foreground process group."""
+    os.write(terminal, b"\x03")
+
+
+def processes_with(mark: str) -> list[Process]:
+    """Processes that have `mark` in their environment; their names are their command lines."""
     found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
+    for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
-            after_name = stat.read_text().rpartition(")")[2].split()
-            if int(after_name[3]) == session and after_name[0] != "Z":
-                found.append((stat.parent / "cmdline").read_text())
+            process = read_process(int(folder.name))
+            if process and not process.ended and mark.encode() in (folder / "environ").read_bytes().split(b"\0"):
+                line = (folder / "cmdline").read_text().replace("\0", " ")
+                found.append(replace(process, name=line))
     return found
+
+
+def _read_terminal(terminal: int, said: list[bytes]) -> None:
+    with contextlib.suppress(OSError):  # Linux ends a terminal that nobody has open by an error
+        while part := os.read(terminal, 2**16):
+            said.append(part)
+
+
+def _waits(pid: int) -> bool:
+    return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+
+
+def _wait_for(pid: int, timeout_s: float) -> int:
+    """The exit code of a child (negative: the signal). Raises TimeoutError."""
+    deadline = time.monotonic() + timeout_s
+    while _waits(pid):
+        if time.monotonic() > deadline:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+            raise TimeoutError(f"the run goes on {timeout_s:.0f} s after it was disturbed")
+        time.sleep(0.01)
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])

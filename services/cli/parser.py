@@ -2,13 +2,21 @@
 
 import argparse
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+KEPT: Final = "what is committed is kept, the same command goes on from there"
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Every command and option; `options.handler` names the function of a command as `module:function`."""
+    """Every command and option.
+
+    `options.handler` names the function of a command as `module:function`; `options.starts_ray(options)` tells whether
+    it starts Ray, `options.kept` what remains of its work where it dies, and `options.quiet` whether the terminal is
+    spared what C++ code says.
+    """
     parser = argparse.ArgumentParser(
         prog="verso",
         description="View-dependent RGB-D datasets for reconstructing objects from a single view.",
@@ -25,7 +33,8 @@ def build_parser() -> argparse.ArgumentParser:
         )
         for names, settings in (JSON, *entry.options):
             command.add_argument(*names, **settings)
-        command.set_defaults(handler=entry.handler or f"services.cli.commands:{name}")
+        handler = entry.handler or f"services.cli.commands:{name}"
+        command.set_defaults(handler=handler, starts_ray=entry.starts_ray, kept=entry.kept, quiet=entry.quiet)
     return parser
 
 
@@ -73,6 +82,9 @@ class Command:
     example: str
     options: tuple[Option, ...] = ()
     handler: str = ""
+    starts_ray: Callable[[argparse.Namespace], bool] = lambda options: False
+    kept: str = ""
+    quiet: bool = False
 
 
 JSON = option("--json", action="store_true", help="print one JSON object as the last line of standard output")
@@ -101,6 +113,9 @@ COMMANDS: dict[str, Command] = {
                 "--retry-failed", action="store_true", help="try scenes again that failed for environmental reasons"
             ),
         ),
+        starts_ray=lambda options: not options.dry_run,
+        kept=KEPT,
+        quiet=True,
     ),
     "status": Command("scenes done, failed and missing; rate; what is running", "data/tabletop", (OUT,)),
     "verify": Command(
@@ -170,6 +185,8 @@ COMMANDS: dict[str, Command] = {
             ),
         ),
         "services.bench.command:main",
+        starts_ray=lambda options: options.workers is not None,
+        kept="no figures are kept",
     ),
     "tradeoff": Command(
         "what accuracy costs in time, measured on the job's own scenes",

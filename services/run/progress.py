@@ -13,6 +13,7 @@ from typing import Any
 from tqdm import tqdm
 
 from schemas.dataset.layout import LOG_FOLDER
+from services.run.supervisor import tell
 
 LINE_EVERY_S = 60.0
 LOG_BYTES = 4 * 2**20
@@ -67,6 +68,7 @@ def event_log(out: Path | None) -> Iterator[None]:
         return
     folder = out / LOG_FOLDER
     folder.mkdir(parents=True, exist_ok=True)
+    tell(logs=str(folder))
     handler = logging.handlers.RotatingFileHandler(
         folder / "verso.jsonl", maxBytes=LOG_BYTES, backupCount=LOG_FILES - 1
     )

@@ -15,6 +15,7 @@ import ray
 
 from schemas.errors import MachineError
 from services.run.cores import usable_cores
+from services.run.supervisor import tell
 
 OBJECT_STORE_BYTES = 128 * 2**20
 """Images never cross Ray, so its shared memory can be small."""
@@ -48,6 +49,7 @@ def private_ray(workers: int) -> Iterator[Slots]:
     # Otherwise Ray asks its own workers for a token that an earlier Ray left in the home folder.
     os.environ["RAY_AUTH_MODE"] = "disabled"  # noqa: TID251 - Ray reads this setting nowhere else
     with tempfile.TemporaryDirectory(prefix="vr", ignore_cleanup_errors=True) as folder:
+        tell(folder=folder)  # the supervisor removes it where this process cannot
         settings = {
             "num_cpus": workers,
             "include_dashboard": False,

@@ -1,0 +1,128 @@
+"""Processes of this machine: who descends from whom, and ending descendants. Edge: /proc and signals."""
+
+import contextlib
+import ctypes
+import os
+import signal
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+_PR_SET_PDEATHSIG = 1
+_PR_SET_CHILD_SUBREAPER = 36
+
+GRACE_S = 3.0
+"""Time that a process gets to end by itself after SIGTERM."""
+
+KILL_S = 5.0
+"""Time that the kernel gets to remove processes after SIGKILL; one that hangs in a driver or on NFS stays longer."""
+
+_POLL_S = 0.02
+
+
+@dataclass(frozen=True)
+class Process:
+    """A process of this machine; `born` is its start in ticks since boot, because process ids are used again."""
+
+    pid: int
+    parent: int
+    born: str
+    state: str
+    """One letter of proc(5): `T` is stopped, `Z` has ended and waits for its parent."""
+    name: str
+
+    @property
+    def ended(self) -> bool:
+        """Whether only its exit status is left."""
+        return self.state in "ZX"
+
+
+def read_process(pid: int) -> Process | None:
+    """The process with this id, None where there is none."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return None
+    head, _, tail = stat.rpartition(")")
+    state, parent, *rest = tail.split()
+    return Process(pid, int(parent), rest[17], state, head.partition("(")[2])
+
+
+def descendants(pid: int) -> list[Process]:
+    """Children of a process, their children and so on, parents first; those that have ended are left out."""
+    children: defaultdict[int, list[Process]] = defaultdict(list)
+    for entry in os.listdir("/proc"):
+        if entry.isdigit() and (process := read_process(int(entry))) is not None:
+            children[process.parent].append(process)
+    found, level = [], children[pid]
+    while level:
+        found += level
+        level = [child for process in level for child in children[process.pid]]
+    return [process for process in found if not process.ended]
+
+
+def send(process: Process, number: int) -> None:
+    """Sends a signal to exactly this process; nothing where it is gone, even if its id was given out again."""
+    with contextlib.suppress(OSError), _descriptor(process.pid) as descriptor:
+        now = read_process(process.pid)
+        if now is not None and now.born == process.born:
+            signal.pidfd_send_signal(descriptor, number)
+
+
+def end_descendants() -> list[Process]:
+    """Ends everything that descends from this process: SIGTERM, then SIGKILL. Returns what even that did not end.
+
+    For a child subreaper alone, whose descendants cannot leave it.
+    """
+    for number, patience_s in ((signal.SIGTERM, GRACE_S), (signal.SIGKILL, KILL_S)):
+        deadline, told = time.monotonic() + patience_s, set[tuple[int, str]]()
+        while left := descendants(os.getpid()):
+            for process in left:
+                if (process.pid, process.born) not in told:
+                    told.add((process.pid, process.born))
+                    send(process, number)
+            reap()
+            if time.monotonic() > deadline:
+                break
+            time.sleep(_POLL_S)
+        else:
+            break
+    reap()
+    return left
+
+
+def reap() -> dict[int, int]:
+    """Wait statuses of the children that have ended, by process id."""
+    statuses: dict[int, int] = {}
+    with contextlib.suppress(ChildProcessError):
+        while (found := os.waitpid(-1, os.WNOHANG))[0]:
+            statuses[found[0]] = found[1]
+    return statuses
+
+
+def adopt_orphans() -> None:
+    """From now on, descendants of this process whose parents end become its own children."""
+    _prctl(_PR_SET_CHILD_SUBREAPER, 1)
+
+
+def die_with(parent: int, number: int) -> None:
+    """From now on, the end of this process's parent, `parent`, sends it this signal."""
+    _prctl(_PR_SET_PDEATHSIG, number)
+    if os.getppid() != parent:  # it ended before we asked
+        os.kill(os.getpid(), number)
+
+
+def _prctl(option: int, value: int) -> None:
+    if ctypes.CDLL(None, use_errno=True).prctl(option, value, 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), f"prctl {option}")
+
+
+@contextlib.contextmanager
+def _descriptor(pid: int) -> Iterator[int]:
+    descriptor = os.pidfd_open(pid)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,209 @@
+"""The supervisor: runs a command as a child, and whatever becomes of it, ends with a plain line and nothing left behind.
+
+Three processes: the one that the user started, a keeper, and the command. The keeper and the command have sessions of
+their own, so that a terminal's Ctrl-C reaches the first one alone, and Ray's processes never. The first two do the same:
+they wait, pass signals on, and end all that descends from them; so either may be killed. Nothing heavy is loaded here.
+"""
+
+import contextlib
+import json
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Final
+
+from services.run.processes import (
+    GRACE_S,
+    KILL_S,
+    adopt_orphans,
+    descendants,
+    die_with,
+    end_descendants,
+    reap,
+    send,
+)
+from services.run.verdict import Facts, judge
+
+STOPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+"""They end the command as Ctrl-C does; a second one at once."""
+
+STOP_S = 30.0
+"""Time that the command gets to end after the first of them."""
+
+LAST_WORDS = "driver.txt"
+"""The file in OUT/_logs with what Ray's C++ wrote to standard error before the command died."""
+
+_LAST_BYTES = 2**20
+
+_listeners: list[int] = []
+"""Pipes to the supervisors of this process; empty where it has none."""
+
+
+def supervise(command: Callable[[], int], kept: str, quiet: bool = True) -> int:
+    """The exit code of `command`, which runs in a child; returns there too, with the same code.
+
+    A command that dies is told in one line on standard error, with `kept`: what remains of its work. `quiet` keeps what
+    C++ code writes to standard error out of the terminal. For a process without threads.
+    """
+    words = os.memfd_create("last words") if quiet else None
+    watched = {number for number in (*STOPS, signal.SIGTSTP, signal.SIGCONT) if _is_wanted(number)}
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, watched | {signal.SIGCHLD})
+    keeper = _Layer(frozenset(watched), kept, words, signal.SIGKILL, innermost=True)
+    front = replace(keeper, dies_with_parent=signal.SIGTERM, innermost=False)
+    return front.tend(lambda: keeper.tend(lambda: _drive(command, words, mask)))
+
+
+def tell(**facts: int | bool | str) -> None:
+    """Tells the supervisors a fact (the fields of `Facts`); nothing where there is none."""
+    line = json.dumps(facts).encode() + b"\n"
+    for pipe in _listeners:
+        with contextlib.suppress(OSError):  # a supervisor that was killed
+            os.write(pipe, line)
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """One of the two processes above the command."""
+
+    watched: frozenset[signal.Signals]
+    kept: str
+    words: int | None
+    dies_with_parent: signal.Signals
+    """What its child gets when this process dies."""
+    innermost: bool
+
+    def tend(self, work: Callable[[], int]) -> int:
+        """Runs `work` in a child; its exit code, in both processes."""
+        adopt_orphans()
+        ear, mouth = os.pipe()
+        me = os.getpid()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        child = os.fork()
+        if child == 0:
+            os.close(ear)
+            _listeners.append(mouth)
+            os.setsid()
+            die_with(me, self.dies_with_parent)
+            return work()
+        os.close(mouth)
+        status, stopped_by = self._wait(child)
+        end_descendants()
+        facts = _read(ear)
+        if facts.folder is not None:
+            _remove(facts.folder)
+        code, line = judge(facts, status, stopped_by, self.kept)
+        if line is not None:
+            line += _keep_last_words(self.words, facts.logs) if stopped_by is None else ""
+            with contextlib.suppress(OSError):  # a terminal that was closed
+                print(f"verso: {line}", file=sys.stderr, flush=True)
+        tell(code=code, interrupted=False)
+        return code
+
+    def _wait(self, child: int) -> tuple[int, int | None]:
+        """The child's wait status, and the first signal that it was ended by, if any."""
+        stopped_by: int | None = None
+        deadline = float("inf")
+        patience_s = STOP_S if self.innermost else STOP_S + 2 * (GRACE_S + KILL_S)
+        while True:
+            caught = signal.sigtimedwait(self.watched | {signal.SIGCHLD}, 1.0)
+            statuses = reap()
+            if child in statuses:
+                return statuses[child], stopped_by
+            number = caught.si_signo if caught else None
+            if number in STOPS:
+                again = stopped_by is not None
+                stopped_by = stopped_by or number
+                deadline = min(deadline, time.monotonic() + patience_s)
+                os.kill(child, self._passed_on(number, again))
+            elif number in (signal.SIGTSTP, signal.SIGCONT):
+                self._suspend(child, number)
+            if time.monotonic() > deadline:
+                os.kill(child, signal.SIGKILL)
+
+    def _passed_on(self, number: int, again: bool) -> int:
+        """What the child gets for a signal: Python's interrupt for the command, the signal itself for the keeper."""
+        if not self.innermost:
+            return number
+        return signal.SIGKILL if again else signal.SIGINT
+
+    def _suspend(self, child: int, number: int) -> None:
+        """Ctrl-Z, or going on after it, of the whole tree."""
+        if self.innermost:
+            for process in descendants(os.getpid()):
+                send(process, signal.SIGSTOP if number == signal.SIGTSTP else signal.SIGCONT)
+            return
+        os.kill(child, number)
+        if number == signal.SIGTSTP:
+            os.kill(os.getpid(), signal.SIGSTOP)
+
+
+def _drive(command: Callable[[], int], words: int | None, mask: Collection[int]) -> int:
+    """Runs the command in this process, and tells its exit code once everything is said."""
+    if words is not None:
+        _split_stderr(words)
+    try:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        code = command()
+        sys.stdout.flush()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is said
+    except KeyboardInterrupt:
+        code = 1
+        tell(interrupted=True)
+    except Exception:
+        code = 1
+        traceback.print_exc()
+    tell(code=code)
+    return code
+
+
+def _split_stderr(words: int) -> None:
+    """From now on, Python's standard error is the user's as before, and descriptor 2, which C++ writes to, is `words`."""
+    users = os.dup(2)
+    sys.stderr = os.fdopen(users, "w", buffering=1, encoding=sys.stderr.encoding, errors=sys.stderr.errors)
+    os.dup2(words, 2)
+
+
+def _keep_last_words(words: int | None, logs: str | None) -> str:
+    """Writes what C++ said last to the log folder; the end of a sentence that says where, or nothing."""
+    size = 0 if words is None else os.fstat(words).st_size
+    if words is None or logs is None or size == 0:
+        return ""
+    path = Path(logs) / LAST_WORDS
+    try:
+        path.write_bytes(os.pread(words, _LAST_BYTES, max(0, size - _LAST_BYTES)))
+    except OSError:
+        return ""
+    return f" ({path} has its last words)"
+
+
+def _read(pipe: int) -> Facts:
+    """What came through the pipe so far."""
+    os.set_blocking(pipe, False)
+    data = b""
+    with contextlib.suppress(BlockingIOError):
+        while part := os.read(pipe, 2**16):
+            data += part
+    known = {field.name for field in fields(Facts)}
+    facts = Facts()
+    for line in data.splitlines():
+        with contextlib.suppress(ValueError):  # cut short by a kill
+            facts = replace(facts, **{name: value for name, value in json.loads(line).items() if name in known})
+    return facts
+
+
+def _remove(folder: str) -> None:
+    import shutil  # only where something is left
+
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_wanted(number: signal.Signals) -> bool:
+    """Whether the user did not ask to ignore the signal, as `nohup` does."""
+    return signal.getsignal(number) != signal.SIG_IGN

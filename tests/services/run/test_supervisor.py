@@ -1,0 +1,161 @@
+"""A supervised command, with plain Python in place of Ray: every end is told, and nothing is left behind."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from services.run.processes import descendants
+from services.run.supervisor import LAST_WORDS
+
+ROOT = Path(__file__).resolve().parents[3]
+
+START = """
+import os, signal, subprocess, sys, time
+from services.run.supervisor import supervise, tell
+def command():
+    {body}
+sys.exit(supervise(command, "all is kept"))
+"""
+
+FOREVER = "subprocess.Popen(['sleep', '600'], start_new_session=True); print('ready', flush=True); time.sleep(600)"
+
+
+def start(body: str) -> subprocess.Popen[str]:
+    return spawn(START.format(body=body))
+
+
+def spawn(code: str, *arguments: str) -> subprocess.Popen[str]:
+    pipe = subprocess.PIPE
+    return subprocess.Popen([sys.executable, "-c", code, *arguments], cwd=ROOT, stdout=pipe, stderr=pipe, text=True)
+
+
+def end(run: subprocess.Popen[str]) -> tuple[int, str, str]:
+    told, wrong = run.communicate(timeout=60)
+    return run.returncode, told, wrong
+
+
+@pytest.mark.parametrize("code", [0, 1, 2])
+def test_what_a_command_says_and_its_exit_code_arrive_unchanged(code):
+    body = f"print('answer'); print('verso: why', file=sys.stderr); return {code}"
+    assert end(start(body)) == (code, "answer\n", "verso: why\n")
+
+
+def test_a_bug_in_the_command_itself_shows_its_traceback():
+    code, _, wrong = end(start("raise ZeroDivisionError"))
+    assert code == 1
+    assert "ZeroDivisionError" in wrong
+    assert "verso:" not in wrong
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ("os.abort()", "crashed (SIGABRT) in Ray or in another library"),
+        ("os.kill(os.getpid(), 9)", "was killed (SIGKILL), which Linux also does where memory runs out"),
+        ("os._exit(7)", "ended without a word (exit code 7), as it does where Ray is lost"),
+    ],
+)
+def test_a_command_that_dies_is_told_in_one_line(body, words):
+    assert end(start(f"print('x', flush=True); {body}")) == (1, "x\n", f"verso: the run {words}; all is kept\n")
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [
+        (signal.SIGINT, "verso: interrupted; all is kept\n"),
+        (signal.SIGTERM, "verso: stopped by SIGTERM; all is kept\n"),
+        (signal.SIGHUP, "verso: stopped by SIGHUP; all is kept\n"),
+    ],
+)
+def test_a_signal_ends_the_command_and_all_that_it_started(number, words):
+    run = start(FOREVER)
+    assert run.stdout is not None
+    run.stdout.readline()
+    below = descendants(run.pid)
+    assert len(below) == 3  # the keeper, the command, and what it started
+    run.send_signal(number)
+    assert end(run) == (1, "", words)
+    assert not any(Path(f"/proc/{process.pid}").exists() for process in below)
+
+
+def test_a_command_that_ignores_the_interrupt_is_killed_by_a_second_one():
+    run = start("signal.signal(signal.SIGINT, signal.SIG_IGN); " + FOREVER)
+    assert run.stdout is not None
+    run.stdout.readline()
+    for _ in range(2):
+        run.send_signal(signal.SIGINT)
+        time.sleep(0.3)
+    assert end(run) == (1, "", "verso: interrupted; all is kept\n")
+
+
+@pytest.mark.parametrize("killed", [(0,), (1,), (0, 2), (1, 2), (2,)])
+def test_whichever_processes_are_killed_nothing_goes_on(killed):
+    """0 is the process that the user started, 1 the keeper, 2 the command."""
+    run = start(FOREVER)
+    assert run.stdout is not None
+    run.stdout.readline()
+    below = descendants(run.pid)
+    pids = [run.pid, *(process.pid for process in below)]
+    for number in killed:
+        os.kill(pids[number], signal.SIGKILL)
+    code, _, wrong = end(run)
+    deadline = time.monotonic() + 15
+    while left := [process.name for process in below if Path(f"/proc/{process.pid}").exists()]:
+        assert time.monotonic() < deadline, left
+        time.sleep(0.05)
+    if 0 not in killed:
+        assert (code, wrong.count("verso: "), wrong.count("; all is kept")) == (1, 1, 1)
+
+
+def test_its_temporary_folder_goes_even_where_the_command_is_killed(tmp_path):
+    folder = tmp_path / "private"
+    (folder / "below").mkdir(parents=True)
+    code, *_ = end(start(f"tell(folder={str(folder)!r}); os.kill(os.getpid(), 9)"))
+    assert code == 1
+    assert not folder.exists()
+
+
+def test_what_c_code_says_stays_out_of_the_terminal_and_is_kept_where_the_command_dies(tmp_path):
+    body = f"tell(logs={str(tmp_path)!r}); os.write(2, b'*** stack dump'); print('mine', file=sys.stderr); "
+    code, _, wrong = end(start(body + "os.abort()"))
+    assert code == 1
+    assert wrong.startswith("mine\nverso: the run crashed (SIGABRT)")
+    assert "stack dump" not in wrong
+    assert wrong.count("\n") == 2
+    assert str(tmp_path / LAST_WORDS) in wrong
+    assert (tmp_path / LAST_WORDS).read_text() == "*** stack dump"
+
+
+def test_a_signal_that_the_user_ignores_stays_ignored():
+    """As `nohup` does."""
+    script = START.format(body="print('ready', flush=True); time.sleep(1); return 0")
+    start_over = "os.execv(sys.executable, [sys.executable, '-c', sys.argv[1]])"
+    run = spawn(f"import os, signal, sys; signal.signal(signal.SIGHUP, signal.SIG_IGN); {start_over}", script)
+    assert run.stdout is not None
+    run.stdout.readline()
+    run.send_signal(signal.SIGHUP)
+    assert end(run) == (0, "", "")
+
+
+def test_suspended_means_all_of_it_and_it_goes_on_afterwards():
+    run = start("print('ready', flush=True); time.sleep(1.5); return 0")
+    assert run.stdout is not None
+    run.stdout.readline()
+    run.send_signal(signal.SIGTSTP)
+    time.sleep(0.5)
+    assert {process.state for process in descendants(run.pid)[1:]} == {"T"}
+    time.sleep(1.5)
+    assert run.poll() is None
+    run.send_signal(signal.SIGCONT)
+    assert end(run) == (0, "", "")
+
+
+def test_the_supervisor_loads_nothing_heavy():
+    code = "import sys, services.cli.main; print(sorted({'ray', 'numpy', 'pydantic', 'pyarrow'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
