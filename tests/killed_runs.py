@@ -5,6 +5,7 @@ import json
 import os
 import pty
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -42,6 +43,15 @@ def deadly_scene(out: Path, scene_id: int) -> Iterator[list[int]]:
         watcher.join()
 
 
+IN_TERMINAL = """
+import os, signal, sys
+os.setsid()
+os.close(os.open(os.ttyname(0), os.O_RDWR))  # becomes the controlling terminal
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # also where the tests were started in the background
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+
+
 @dataclass(frozen=True)
 class EndedRun:
     """A `verso run` that was disturbed: its exit code, what it said, and command lines of what it left running."""
@@ -57,27 +67,35 @@ def disturb_at_first_commit(
     """A run on one worker in a terminal of its own; once something is committed, `disturb(pid, terminal)` is called."""
     mark = f"VERSO_TEST_MARK={uuid.uuid4().hex}"
     command = [sys.executable, "-m", "services.cli.main", "run", str(job), "--out", str(out), "--shard-size", "4"]
-    pid, terminal = pty.fork()
-    if pid == 0:
-        os.chdir(ROOT)
-        os.execvpe(sys.executable, [*command, "--workers", "1"], {**os.environ, **dict([mark.split("=")])})
+    terminal, users_end = pty.openpty()
+    run = subprocess.Popen(
+        [sys.executable, "-c", IN_TERMINAL, *command, "--workers", "1"],
+        cwd=ROOT,
+        env={**os.environ, **dict([mark.split("=")])},
+        stdin=users_end,
+        stdout=users_end,
+        stderr=users_end,
+    )
+    os.close(users_end)
     said: list[bytes] = []
     reader = threading.Thread(target=_read_terminal, args=(terminal, said))
     reader.start()
     try:
         deadline = time.monotonic() + 120
-        while not list(out.glob("manifest/_commits/*.json")) and _waits(pid) and time.monotonic() < deadline:
+        while not list(out.glob("manifest/_commits/*.json")) and run.poll() is None and time.monotonic() < deadline:
             time.sleep(0.005)
-        disturb(pid, terminal)
-        status = _wait_for(pid, timeout_s)
+        disturb(run.pid, terminal)
+        run.wait(timeout_s)
     finally:
+        run.kill()
+        run.wait()
         left = processes_with(mark)
         for process in left:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process.pid, signal.SIGKILL)
         reader.join(10)
         os.close(terminal)
-    return EndedRun(status, b"".join(said).decode(errors="replace"), [process.name for process in left])
+    return EndedRun(run.returncode, b"".join(said).decode(errors="replace"), [process.name for process in left])
 
 
 def interrupt(pid: int, terminal: int) -> None:
@@ -101,19 +119,3 @@ def _read_terminal(terminal: int, said: list[bytes]) -> None:
     with contextlib.suppress(OSError):  # Linux ends a terminal that nobody has open by an error
         while part := os.read(terminal, 2**16):
             said.append(part)
-
-
-def _waits(pid: int) -> bool:
-    return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
-
-
-def _wait_for(pid: int, timeout_s: float) -> int:
-    """The exit code of a child (negative: the signal). Raises TimeoutError."""
-    deadline = time.monotonic() + timeout_s
-    while _waits(pid):
-        if time.monotonic() > deadline:
-            os.kill(pid, signal.SIGKILL)
-            os.waitpid(pid, 0)
-            raise TimeoutError(f"the run goes on {timeout_s:.0f} s after it was disturbed")
-        time.sleep(0.01)
-    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
