@@ -34,6 +34,7 @@ class LocalStore(Store):
 
     root: Path
     tar_only = False
+    fence_is_final = True
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
         self.root = Path(root)
@@ -109,6 +110,10 @@ class LocalStore(Store):
         with contextlib.suppress(FileNotFoundError):
             os.rename(self.path(staging), self.path(staging + FENCED))
             sync_path(self.path(staging).parent)
+
+    def is_fenced(self, staging: str) -> bool:
+        """Whether the attempt's folder has gone from its name."""
+        return not self.path(staging).is_dir()
 
     def read(self, key: str) -> bytes:
         """The bytes at `key`."""
