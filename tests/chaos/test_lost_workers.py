@@ -4,6 +4,7 @@ import random
 import subprocess
 import sys
 import time
+from typing import cast
 
 import pytest
 from obstore.store import MemoryStore
@@ -20,6 +21,7 @@ from services.run.range_planner import committed_ranges, plan_ranges
 from tests.bucket_faults import REQUESTS, requests
 from tests.disk_faults import unflushed
 from tests.made_up_scenes import attempt_at, small_scene, terms
+from workers.assets.catalogue import Catalogue
 from workers.store.attempt import Attempt, begin_attempt
 from workers.store.commit import check_published, publish, read_record
 from workers.store.committed_rows import list_commits
@@ -64,7 +66,8 @@ def coordinator_of(monkeypatch):
 
     def make(store) -> Coordinator:
         order = ShardOrder.of(store.name, validate_job({"name": "chaos", "scenes": 2}, "test"), "j" * 64)
-        coordinator = Coordinator(store, order, None, Limits(1, 3, 0), Tally(asked=2))
+        catalogue = cast(Catalogue, None)
+        coordinator = Coordinator(store, order, catalogue, Limits(1, 3, 0), Tally(asked=2))
         coordinator._order = order.model_copy(update={"label": LABEL})
         return coordinator
 
