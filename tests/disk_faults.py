@@ -59,7 +59,7 @@ def disk(at: int = -1, then: Callable[[], object] | None = None) -> Iterator[Dis
         for name in _STEPS:
             patch.setattr(os, name, _counted(watched, name, getattr(os, name)))
         patch.setattr(local, "open", lambda path, mode="r", **more: _open(watched, path, mode, **more), raising=False)
-        patch.setattr(file_system, "_syncfs", lambda folder: _sync_all(watched, folder))
+        patch.setattr(file_system, "_syncfs", lambda descriptor: _sync_all(watched, descriptor))
         patch.setattr(file_system, "_trusts_syncfs", lambda folder: True)
         yield watched
 
@@ -129,9 +129,9 @@ class _Writing:
         self._file.close()
 
 
-def _sync_all(watched: Disk, folder: Path) -> bool:
+def _sync_all(watched: Disk, descriptor: int) -> bool:
     if watched.step():
         raise Killed
-    for parent, _, names in os.walk(folder):
+    for parent, _, names in os.walk(os.readlink(f"/proc/self/fd/{descriptor}")):
         watched.synced |= {os.stat(os.path.join(parent, name)).st_ino for name in names}
     return True

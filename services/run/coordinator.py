@@ -19,6 +19,7 @@ from workers.pipeline.run_shard import TIMED_OUT, run_shard
 from workers.store.attempt import attempts_at, blamed_scene
 from workers.store.commit import read_summary
 from workers.store.store import Store
+from workers.store.sweep import sweep_attempt
 
 POLL_S = 0.5
 """Time of one wait for reports: Ctrl-C is seen at least this often."""
@@ -174,13 +175,17 @@ class Coordinator:
         self._blamed[scene] = Blame(scene_id=scene, reason=reason, detail=EXPLANATIONS[reason], attempts=deaths)
 
     def _find_evidence(self, span: Span) -> tuple[int | None, bool]:
-        """The scene in progress when a worker of this run died, and whether its time was up; removes its attempt."""
+        """The scene in progress when a worker of this run was lost, and whether its time was up; gives its attempt up.
+
+        The worker may live, behind a network that failed or while it is paused. So its attempt is fenced and its record
+        looked for once more before its files go; one that has won meanwhile is published.
+        """
         for name in attempts_at(self._store, span.start):
             if self._order.label not in name:
                 continue
             scene = blamed_scene(self._store, span.start, name)
             timed_out = bool(self._store.size(f"{staging_path(span.start, name)}/{TIMED_OUT}"))
-            self._store.remove_tree(staging_path(span.start, name))
+            sweep_attempt(self._store, span.start, name, given_up=True)
             if scene is not None:
                 return scene, timed_out
         return None, False

@@ -52,7 +52,8 @@ def retry_of_attempt(name: str) -> int | None:
 def attempts_at(store: Store, start: int) -> list[str]:
     """Names of the attempts that have a folder for the range at `start`, except fenced ones."""
     names = store.children(staging_path(start, "")[:-1])
-    return [name for name in names if retry_of_attempt(name) is not None and not name.endswith(FENCED)]
+    known = (name for name in names if retry_of_attempt(name) is not None and not name.endswith(FENCED))
+    return [name for name in known if not store.is_fenced(staging_path(start, name))]
 
 
 def blamed_scene(store: Store, start: int, attempt: str) -> int | None:

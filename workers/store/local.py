@@ -11,7 +11,7 @@ from typing import IO
 
 from schemas.dataset.layout import COMMITS, FENCED, RANGES, TEMPORARY, scratch_path
 from schemas.errors import OutputError
-from workers.store.file_system import explain_disk_errors, probe_folder, sync_folders, sync_path, sync_tree
+from workers.store.file_system import OpenTree, explain_disk_errors, probe_folder, sync_folders, sync_path, sync_tree
 from workers.store.store import Entry, Store, retry_if_swept
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]+://")
@@ -34,10 +34,13 @@ class LocalStore(Store):
 
     root: Path
     tar_only = False
+    fence_is_final = True
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
         self.root = Path(root)
         self.name = str(root)
+        self._open: dict[str, OpenTree] = {}
+        """By the folders of this object's attempts, each until it is durable or removed."""
 
     def path(self, key: str) -> Path:
         """Where `key` lies on disk."""
@@ -57,9 +60,11 @@ class LocalStore(Store):
         probe_folder(self.root)
 
     def open_staging(self, staging: str) -> None:
-        """Makes the folder of an attempt."""
+        """Makes the folder of an attempt, and keeps it open to hear of writes that fail."""
         with self._explained(staging):
             retry_if_swept(lambda: os.makedirs(self.path(staging)))
+            with contextlib.suppress(FileNotFoundError):  # swept already, as the attempt will notice
+                self._open[staging] = OpenTree(self.path(staging))
 
     @contextlib.contextmanager
     def stream_staged(self, staging: str, path: str) -> Iterator[IO[bytes]]:
@@ -75,11 +80,19 @@ class LocalStore(Store):
                 file = open(target, "wb")  # noqa: SIM115
             with file:
                 yield file
+                if tree := self._open.get(staging):
+                    tree.flush_file(file)
 
     def make_durable(self, staging: str) -> None:
-        """Flushes an attempt."""
+        """Flushes an attempt. Not to be repeated after an error, which is told once."""
         with self._explained(staging):
-            sync_tree(self.path(staging))
+            tree = self._open.pop(staging, None)
+            if tree is None:
+                return sync_tree(self.path(staging))
+            try:
+                tree.flush()
+            finally:
+                tree.close()
 
     def put_if_absent(self, key: str, data: bytes, staging: str | None = None) -> bool:
         """Links a finished temporary file to `key`: the one step that refuses a second writer."""
@@ -109,6 +122,10 @@ class LocalStore(Store):
         with contextlib.suppress(FileNotFoundError):
             os.rename(self.path(staging), self.path(staging + FENCED))
             sync_path(self.path(staging).parent)
+
+    def is_fenced(self, staging: str) -> bool:
+        """Whether the attempt's folder has gone from its name."""
+        return not self.path(staging).is_dir()
 
     def read(self, key: str) -> bytes:
         """The bytes at `key`."""
@@ -144,6 +161,8 @@ class LocalStore(Store):
 
     def remove_tree(self, prefix: str) -> None:
         """Removes a folder; two processes may do so at once."""
+        if tree := self._open.pop(prefix, None):
+            tree.close()
         with self._explained(prefix):
             shutil.rmtree(self.path(prefix), onerror=_ignore_missing)
 

@@ -1,7 +1,8 @@
 """A dataset in an object store: records by conditional put, everything else by plain puts, copies and deletes.
 
 An object appears whole or not at all, and a put that has returned is durable. Unlike a disk, a store cannot take a
-folder away from an attempt in one step, so an attempt is only swept when its worker is known to be dead.
+folder away from an attempt in one step: a fenced attempt that was about to commit may still do so. So its objects stay
+until another attempt has committed the range.
 """
 
 import contextlib
@@ -39,6 +40,7 @@ class ObjectStore(Store):
 
     root = None
     tar_only = True
+    fence_is_final = False
 
     def __init__(self, bucket: obstore.store.ObjectStore, name: str) -> None:
         self._bucket = bucket
@@ -93,7 +95,7 @@ class ObjectStore(Store):
         A put whose answer was lost is sent again by obstore and then refused: what is there tells whether it is ours,
         because no two callers ever put the same bytes at one key.
         """
-        if staging is not None and self.size(f"{staging}/{_BEGUN}") is None:
+        if staging is not None and self.is_fenced(staging):
             raise FileNotFoundError(f"{staging} was swept")
         try:
             with self._explained(key):
@@ -114,8 +116,12 @@ class ObjectStore(Store):
         self.remove(source)
 
     def fence(self, staging: str) -> None:
-        """Removes the mark without which an attempt does not commit. Its objects stay where they are."""
+        """Removes the mark that an attempt looks for just before it commits. Its objects stay where they are."""
         self.remove(f"{staging}/{_BEGUN}")
+
+    def is_fenced(self, staging: str) -> bool:
+        """Whether the attempt's mark is gone."""
+        return self.size(f"{staging}/{_BEGUN}") is None
 
     def read(self, key: str) -> bytes:
         """The bytes at `key`."""

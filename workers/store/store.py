@@ -39,6 +39,8 @@ class Store(Protocol):
     """The output folder on a disk of this machine, None for an object store."""
     tar_only: bool
     """True where a file for each image would be too many."""
+    fence_is_final: bool
+    """True where a fenced attempt can no longer commit; False where it still may, if it was just about to."""
 
     def prepare(self) -> None:
         """Makes the output folder and proves `put_if_absent`. Raises OutputError naming the place and a remedy."""
@@ -78,8 +80,11 @@ class Store(Protocol):
     def fence(self, staging: str) -> None:
         """Takes an attempt's folder, if there is one, out of the attempt's reach for good (to a name with FENCED on a disk).
 
-        On a disk, a fenced attempt can neither write nor commit.
+        With `fence_is_final`, a fenced attempt can neither write nor commit.
         """
+
+    def is_fenced(self, staging: str) -> bool:
+        """Whether an attempt lost its folder, or the mark in it, to `fence`."""
 
     def read(self, key: str) -> bytes:
         """The bytes at `key`. Raises FileNotFoundError."""

@@ -13,9 +13,7 @@ def sweep(store: Store, fenced: Collection[tuple[int, str]] | None = ()) -> list
     """Publishes committed ranges and removes staging that lost; returns the attempts removed.
 
     Attempts at ranges that are not committed stay, except those in `fenced`, pairs of (start, attempt) whose workers are
-    known to be dead. None means all of them: for a coordinator that holds the lock and has no worker yet. An attempt
-    that proves to be alive loses its folder before this function looks for its commit, so it cannot commit any more.
-    That holds on a disk; an object store cannot refuse the commit, so give only attempts that are dead.
+    believed to be dead. None means all of them: for a coordinator that holds the lock and has no worker yet.
     """
     removed = []
     for folder in store.children(STAGING):
@@ -25,7 +23,7 @@ def sweep(store: Store, fenced: Collection[tuple[int, str]] | None = ()) -> list
         for name in store.children(f"{STAGING}/{folder}"):
             attempt = name.removesuffix(FENCED)
             given_up = name.endswith(FENCED) or fenced is None or (start, attempt) in fenced
-            if _sweep_attempt(store, start, attempt, given_up):
+            if sweep_attempt(store, start, attempt, given_up):
                 removed.append(attempt)
         store.remove_empty(f"{STAGING}/{folder}")
     probes = [entry for entry in store.files(COMMITS) if entry.key.startswith(f"{COMMITS}/{PROBE_PREFIX}")]
@@ -34,8 +32,13 @@ def sweep(store: Store, fenced: Collection[tuple[int, str]] | None = ()) -> list
     return removed
 
 
-def _sweep_attempt(store: Store, start: int, attempt: str, given_up: bool) -> bool:
-    """Publishes or removes one attempt's folder; True where it was removed."""
+def sweep_attempt(store: Store, start: int, attempt: str, given_up: bool) -> bool:
+    """Publishes or removes one attempt's folder; True where it was removed.
+
+    An attempt at a range that is not committed is removed only where it is `given_up`, and only after it was fenced:
+    should it be alive, it cannot commit any more. A store where it still may (`fence_is_final`) keeps its files until
+    another attempt has committed the range.
+    """
     staging = staging_path(start, attempt)
     retry = retry_of_attempt(attempt)
     if retry is None:
@@ -47,6 +50,8 @@ def _sweep_attempt(store: Store, start: int, attempt: str, given_up: bool) -> bo
     record = read_record(store, start, retry)
     if record is not None and record.attempt == attempt:
         publish(store, record)
+        return False
+    if record is None and not store.fence_is_final:
         return False
     for folder in (staging, staging + FENCED):
         store.remove_tree(folder)

@@ -48,9 +48,11 @@ def many_names():
 def test_names_in_many_folders_are_flushed_by_one_syncfs(tmp_path, monkeypatch):
     store, flushed = LocalStore(tmp_path), []
     monkeypatch.setattr(file_system, "_trusts_syncfs", lambda folder: True)
-    monkeypatch.setattr(file_system, "_syncfs", lambda folder: flushed.append(folder) or True)
+    monkeypatch.setattr(
+        file_system, "_syncfs", lambda descriptor: flushed.append(os.readlink(f"/proc/self/fd/{descriptor}"))
+    )
     store.sync_folders_of(many_names())
-    assert flushed == [tmp_path]
+    assert flushed == [str(tmp_path)]
 
 
 def test_without_syncfs_every_folder_up_to_the_output_folder_is_flushed(tmp_path, monkeypatch):

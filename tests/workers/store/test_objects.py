@@ -94,12 +94,19 @@ def test_one_of_two_attempts_wins_and_the_other_leaves_nothing(store):
     assert not list(store.files(STAGING))
 
 
-def test_an_attempt_that_was_swept_does_not_commit(store):
+def test_an_attempt_that_was_swept_does_not_commit_and_its_files_stay_until_another_has(store):
     attempt = attempt_at(store, 0, 4, TAR)
-    assert sweep(store, fenced=[(0, attempt.name)]) == [attempt.name]
+    assert sweep(store, fenced=[(0, attempt.name)]) == []
+    assert attempts_at(store, 0) == []
+    assert list(store.files(STAGING))
     with pytest.raises(RunError, match="swept before it could commit"):
         attempt.commit()
     assert read_record(store, 0) is None
+    dead = attempt_at(store, 0, 4, TAR)
+    sweep(store, fenced=None)
+    assert attempt_at(store, 0, 4, TAR).commit().won
+    assert sweep(store) == [dead.name]
+    assert not list(store.files(STAGING))
 
 
 def test_the_other_layout_is_refused(store):

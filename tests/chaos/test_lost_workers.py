@@ -1,0 +1,197 @@
+"""Workers that are taken for dead and live: whatever they do meanwhile, a record never wins without its files."""
+
+import random
+import subprocess
+import sys
+import time
+from typing import cast
+
+import pytest
+from obstore.store import MemoryStore
+
+from schemas.dataset.commit import Span
+from schemas.dataset.layout import FENCED, STAGING, staging_path
+from schemas.dataset.shard import ShardOrder
+from schemas.errors import RunError
+from services.job.read import validate_job
+from services.merge.step import merge
+from services.run import coordinator as module
+from services.run.coordinator import Coordinator, Limits, Tally
+from services.run.range_planner import committed_ranges, plan_ranges
+from tests.bucket_faults import REQUESTS, requests
+from tests.disk_faults import unflushed
+from tests.made_up_scenes import attempt_at, small_scene, terms
+from workers.assets.catalogue import Catalogue
+from workers.store.attempt import Attempt, begin_attempt
+from workers.store.commit import check_published, publish, read_record
+from workers.store.committed_rows import list_commits
+from workers.store.local import LocalStore
+from workers.store.objects import ObjectStore
+from workers.store.sweep import sweep
+
+LABEL = "ours"
+TAR = terms(layout="tar", range_size=2)
+
+__all__ = ["unflushed"]
+
+WORKER = """
+import os, sys
+from schemas.dataset.commit import Span
+from schemas.errors import VersoError
+from tests.disk_faults import unflushed
+from tests.made_up_scenes import small_scene, terms
+from workers.store.attempt import begin_attempt
+from workers.store import file_system
+from workers.store.local import LocalStore
+os.fsync = file_system._syncfs = lambda place: None  # no power is lost here
+store = LocalStore(sys.argv[1])
+for start in range(0, 2 * int(sys.argv[2]), 2):
+    attempt = begin_attempt(store, Span(start=start, stop=start + 2), terms(range_size=2), sys.argv[3])
+    for scene_id in (start, start + 1):
+        attempt.begin_scene(scene_id)
+        attempt.add_scene(small_scene(scene_id))
+    print("ready", flush=True)
+    sys.stdin.readline()
+    try:
+        print(attempt.commit().won, flush=True)
+    except VersoError as error:
+        print(error, flush=True)
+"""
+
+
+@pytest.fixture
+def coordinator_of(monkeypatch):
+    """A coordinator of a store, without Ray, that knows attempts with `LABEL` as its own."""
+    monkeypatch.setattr(module.ray, "put", lambda value: value)
+
+    def make(store) -> Coordinator:
+        order = ShardOrder.of(store.name, validate_job({"name": "chaos", "scenes": 2}, "test"), "j" * 64)
+        catalogue = cast(Catalogue, None)
+        coordinator = Coordinator(store, order, catalogue, Limits(1, 3, 0), Tally(asked=2))
+        coordinator._order = order.model_copy(update={"label": LABEL})
+        return coordinator
+
+    return make
+
+
+def files_are_whole(store, record) -> bool:
+    """Whether every file that the record names is published, or staged where publishing finds it."""
+    folders = ("", *(f"{staging_path(record.span.start, record.attempt)}{end}/" for end in ("", FENCED)))
+    return all(any(store.size(folder + entry.path) == entry.bytes for folder in folders) for entry in record.files)
+
+
+@pytest.mark.parametrize("trials", [20, pytest.param(300, marks=pytest.mark.slow)])
+def test_a_worker_that_lives_and_commits_while_it_is_given_up_keeps_its_files(
+    trials, tmp_path, coordinator_of, record_figure, unflushed
+):
+    store = LocalStore(tmp_path)
+    store.prepare()
+    coordinator = coordinator_of(store)
+    chance = random.Random(1)
+    command = [sys.executable, "-c", WORKER, str(tmp_path), str(trials), LABEL]
+    committed = lost = 0
+    commit_s = 0.004
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as worker:
+        for start in range(0, 2 * trials, 2):
+            assert worker.stdout.readline() == "ready\n"
+            begun = time.perf_counter()
+            worker.stdin.write("go\n")
+            worker.stdin.flush()
+            if chance.random() < 0.1:  # let it end, to learn how long it takes
+                told = worker.stdout.readline()
+                commit_s = time.perf_counter() - begun
+                coordinator._find_evidence(Span(start=start, stop=start + 2))
+            else:
+                time.sleep(chance.uniform(0.3, 1.1) * commit_s)
+                coordinator._find_evidence(Span(start=start, stop=start + 2))
+                told = worker.stdout.readline()
+            record = read_record(store, start)
+            assert told == "True\n" or record is None or not files_are_whole(store, record)
+            committed += record is not None
+            lost += record is not None and not files_are_whole(store, record)
+    record_figure("records that won without their files", "passed" if not lost else "failed", lost, 0)
+    print(f"{trials} trials, {committed} committed, {lost} without their files")
+    assert lost == 0
+    assert 0 < committed < trials, "both outcomes are needed"
+    for start, end in plan_ranges(0, 2 * trials, 2, committed_ranges(list_commits(store))):
+        attempt_at(store, start, end, terms(range_size=2), small_scene).commit()
+    assert merge(store, 0, 2 * trials).rows["scenes"] > 0
+
+
+@pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["some", "every"])
+@pytest.mark.parametrize("gives_up", ["the coordinator", "the next run's sweep"])
+def test_on_a_store_a_worker_given_up_at_any_request_leaves_a_dataset_that_a_run_can_finish(
+    gives_up, every, coordinator_of
+):
+    store = fresh_bucket()
+    attempt = whole_attempt(store)
+    with requests(names=REQUESTS) as whole:
+        attempt.commit()
+    expected = finish(store)
+    outcomes = set()
+    points = range(whole.count) if every else (0, *range(whole.decision - 2, whole.decision + 3), whole.count - 1)
+    for at in points:
+        store = fresh_bucket()
+        attempt = whole_attempt(store)
+
+        def give_up(store=store):
+            if gives_up == "the coordinator":
+                coordinator_of(store)._find_evidence(Span(start=0, stop=2))
+            else:
+                sweep(store, fenced=None)
+
+        with requests(at, then=give_up, names=REQUESTS) as watched:
+            try:
+                outcomes.add(attempt.commit().won)
+            except RunError:
+                outcomes.add(False)
+        assert watched.count > at
+        record = read_record(store, 0)
+        assert record is None or files_are_whole(store, record), f"request {at}"
+        assert finish(store) == expected, f"request {at}"
+        assert not list(store.files(STAGING)), f"request {at}"
+    print(f"{len(points)} points")
+    assert outcomes == {True, False}
+
+
+def test_on_a_store_an_attempt_is_evidence_once(coordinator_of):
+    store = fresh_bucket()
+    begin_attempt(store, Span(start=0, stop=2), TAR, LABEL).begin_scene(1)
+    coordinator = coordinator_of(store)
+    assert coordinator._find_evidence(Span(start=0, stop=2)) == (1, False)
+    assert coordinator._find_evidence(Span(start=0, stop=2)) == (None, False)
+
+
+def test_an_attempt_that_won_before_it_was_given_up_is_published(tmp_path, coordinator_of, monkeypatch):
+    store = LocalStore(tmp_path)
+    store.prepare()
+    attempt = begin_attempt(store, Span(start=0, stop=2), terms(range_size=2), LABEL)
+    for scene_id in (0, 1):
+        attempt.add_scene(small_scene(scene_id))
+    with monkeypatch.context() as patch:
+        patch.setattr("workers.store.attempt.publish", lambda store, record: None)
+        record = attempt.commit().record
+    coordinator_of(store)._find_evidence(Span(start=0, stop=2))
+    check_published(store, record)
+    publish(store, record)
+
+
+def whole_attempt(store) -> Attempt:
+    """An attempt at the scenes 0 and 1, ready to commit."""
+    attempt = begin_attempt(store, Span(start=0, stop=2), TAR, LABEL)
+    for scene_id in (0, 1):
+        attempt.begin_scene(scene_id)
+        attempt.add_scene(small_scene(scene_id))
+    return attempt
+
+
+def fresh_bucket() -> ObjectStore:
+    return ObjectStore(MemoryStore(), "memory://")
+
+
+def finish(store: ObjectStore) -> str:
+    """What the next run does; the dataset's digest."""
+    sweep(store, fenced=None)
+    for start, end in plan_ranges(0, 4, 2, committed_ranges(list_commits(store))):
+        attempt_at(store, start, end, TAR, small_scene).commit()
+    return merge(store, 0, 4).digest
