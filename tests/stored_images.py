@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import RANGES, is_shape
-from workers.store.commit import commit_names, read_committed, read_record
+from workers.store.commit import commit_names, committed_files, read_committed, read_record
 from workers.store.store import Store
 from workers.store.tars import read_tar
 
@@ -19,7 +19,7 @@ def iter_records(store: Store) -> Iterator[CommitRecord]:
 
 def read_images(store: Store, record: CommitRecord) -> Iterator[tuple[str, bytes]]:
     """(path, bytes) of every image that a commit holds, whatever the layout."""
-    for entry in record.files:
+    for entry in committed_files(store, record):
         if is_shape(entry.path) or entry.path.startswith(f"{RANGES}/"):
             continue
         data = read_committed(store, record, entry.path)

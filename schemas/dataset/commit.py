@@ -1,22 +1,33 @@
 """A commit: the record that a range of scenes is done, and the terms that all commits of a dataset share."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from itertools import pairwise
+from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
 from schemas.base import Frozen, NonNegativeInt, PositiveInt
+from schemas.dataset.layout import is_attempt_name, is_plain_path, is_range_file, pose_of_image
 from schemas.errors import FailureKind
 
 Outcome = Literal["made", "intrinsic", "environmental"]
 """The outcome of a scene: made, or the kind of its failure."""
 
+COMMIT_VERSION = 2
+"""Of the records that this program writes. Records of version 1 list every image; later ones leave to the range's tables
+what these say."""
+
+_Digest = Annotated[str, StringConstraints(pattern=r"^[ -~]{0,128}$")]
+_SceneId = Annotated[int, Field(ge=0, le=10**15)]
+"""Pose ids, a few thousand for a scene, stay below 2**63."""
+
 
 class Span(Frozen):
     """The scenes of one commit: all of [start, stop), or those of `scenes` in a retry."""
 
-    start: NonNegativeInt
-    stop: PositiveInt
+    start: _SceneId
+    stop: _SceneId
     retry: NonNegativeInt = 0
     """0 for the range itself, k for the k-th retry of its environmental failures."""
     scenes: tuple[int, ...] = ()
@@ -27,18 +38,32 @@ class Span(Frozen):
         """Every scene of this commit, in order."""
         return self.scenes if self.retry else tuple(range(self.start, self.stop))
 
+    @property
+    def count(self) -> int:
+        """Number of scenes of this commit."""
+        return len(self.scenes) if self.retry else self.stop - self.start
+
+    @model_validator(mode="after")
+    def _check(self) -> "Span":
+        bounds = (self.start - 1, *self.scenes, self.stop)
+        if any(b <= a for a, b in pairwise(bounds)) or bool(self.scenes) != bool(self.retry) or self.stop <= self.start:
+            raise ValueError("scenes must rise from start to stop, and be named in a retry alone")
+        return self
+
 
 class CommitTerms(Frozen):
     """The settings that all commits of a dataset share; stored in every record."""
 
-    job_digest: str
-    fingerprint: str
+    job_digest: _Digest
+    fingerprint: _Digest
     """Of the stack that made the range."""
     fingerprint_mode: Literal["strict", "record"] = "strict"
     layout: Literal["files", "tar"] = "files"
     first_scene: NonNegativeInt = 0
     """Start of the first range; ranges lie on a grid of `range_size`."""
     range_size: PositiveInt = 16
+    pairs_per_scene: PositiveInt | None = None
+    """None in records of version 1."""
 
 
 class FileEntry(Frozen):
@@ -50,10 +75,14 @@ class FileEntry(Frozen):
 
 
 class TableEntry(Frozen):
-    """A table of the range: its rows and the digest of its canonical rows."""
+    """A table of the range: its rows, and in records of version 1 the digest of its canonical rows."""
 
     rows: NonNegativeInt
-    digest: str
+    digest: str = ""
+
+
+MARK = 16
+"""Characters of a scene's digest that are kept and compared."""
 
 
 class SceneMark(Frozen):
@@ -65,6 +94,9 @@ class SceneMark(Frozen):
     scene_id: NonNegativeInt
     outcome: Outcome
     digest: str
+    """Hex; records of version 1 have all 64 characters, later ones the first `MARK` of them."""
+    reason: str | None = None
+    """Of the failure; None in records of version 1."""
 
 
 class CommitRecord(Frozen):
@@ -81,9 +113,40 @@ class CommitRecord(Frozen):
     attempt: str
     terms: CommitTerms
     files: tuple[FileEntry, ...]
-    """Images (or tars), shapes and the range's tables, sorted by path."""
+    """The range's tables and tars, sorted by path; in version 1 images and shapes too (`committed_files` has them all)."""
     tables: dict[str, TableEntry]
     scenes: tuple[SceneMark, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _check(self) -> "CommitRecord":
+        span = self.span
+        if not is_attempt_name(self.attempt, span.retry):
+            raise ValueError(f"{self.attempt!r} is not the name of an attempt")
+        if len(self.scenes) != span.count or any(
+            mark.scene_id != scene for mark, scene in zip(self.scenes, span.scene_ids, strict=True)
+        ):
+            raise ValueError("the scenes are not those of the range")
+        if (foreign := foreign_path(self.files, span, self.terms.pairs_per_scene)) is not None:
+            raise ValueError(f"{foreign!r} is not a file of the range from scene {span.start}")
+        return self
+
+
+def foreign_path(files: Iterable[FileEntry], span: Span, pairs: int | None) -> str | None:
+    """A path that no commit of this span may name, None where all are its own.
+
+    Names of images must be of poses of the span's scenes: with p pairs in a scene, pose k belongs to scene k // 2p. Where
+    `pairs` is unknown, any p that fits all images will do.
+    """
+    poses = {}
+    for entry in files:
+        if not is_plain_path(entry.path):
+            return entry.path
+        if (pose := pose_of_image(entry.path)) is not None:
+            poses[pose // 2] = entry.path
+        elif not is_range_file(entry.path, span.start, span.retry):
+            return entry.path
+    pairs = pairs or max(poses, default=0) // span.stop + 1
+    return next((path for pose, path in poses.items() if not span.start <= pose // pairs < span.stop), None)
 
 
 @dataclass(frozen=True)
@@ -103,7 +166,17 @@ class CommitSummary:
     stop: int
     retry: int
     made: int
-    failed: tuple[tuple[int, FailureKind], ...]
-    """(scene id, kind), in order."""
+    failed: tuple[tuple[int, FailureKind, str | None], ...]
+    """(scene id, kind, reason), in order; the reason is None in records of version 1."""
     scenes: tuple[int, ...] = ()
     """The scenes of a retry; empty for a whole range."""
+    fingerprint: str = ""
+
+
+def summarize(record: CommitRecord) -> CommitSummary:
+    """The part of the record that planning needs."""
+    span = record.span
+    failed = tuple((one.scene_id, one.outcome, one.reason) for one in record.scenes if one.outcome != "made")
+    return CommitSummary(
+        span.start, span.stop, span.retry, span.count - len(failed), failed, span.scenes, record.terms.fingerprint
+    )

@@ -60,6 +60,16 @@ IMAGES = tuple(Image(word, role, kind) for role, words in _CONTENTS.items() for 
 """(a)-(k) of the article's figure 1; each also has a patch of every object, (l)-(u)."""
 
 
+_UNSAFE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\\]")
+_CATEGORY = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+_IMAGE = re.compile(
+    rf"{_CATEGORY.pattern}/(?:patches/)?(?:{'|'.join(sorted({image.content for image in IMAGES}))})([0-9]{{5,19}})"
+    r"(?:obj[0-9]{1,4})?\.png"
+)
+_SHAPE = re.compile(rf"{ASSETS}/{_CATEGORY.pattern}/[^/]+\.glb")
+_MERGED = re.compile(rf"{MANIFEST}/[a-z]+/category=[^/]+/part-[0-9]{{5,}}\.parquet")
+
+
 SWITCHES: dict[Role | PixelKind, str] = {
     "aligned": "cameras.depth.enabled",
     "mirror": "cameras.mirror.enabled",
@@ -120,9 +130,48 @@ def is_shape(path: str) -> bool:
     return path.startswith(f"{ASSETS}/")
 
 
+def is_plain_path(path: str) -> bool:
+    """Whether a path stays below the folder that it is joined to, and prints as one line.
+
+    Parts are neither empty nor `.` nor `..`, and hold no backslash and no control character.
+    """
+    return not _UNSAFE.search(path) and all(part not in ("", ".", "..") for part in path.split("/"))
+
+
+def is_attempt_name(name: str, retry: int) -> bool:
+    """Whether an attempt of this retry may have the name, which is one part of a path."""
+    return re.fullmatch(rf"r{retry}-[A-Za-z0-9_.-]{{1,200}}", name) is not None and not name.endswith(FENCED)
+
+
+def pose_of_image(path: str) -> int | None:
+    """The number in an image's or a patch's name, None where the path is none of one."""
+    match = _IMAGE.fullmatch(path)
+    return int(match[1]) if match and path.partition("/")[0] not in (MANIFEST, ASSETS) else None
+
+
+def is_range_file(path: str, start: int, retry: int) -> bool:
+    """Whether the path is one of this commit's tables or tars, or a shape's."""
+    if is_shape(path):
+        return _SHAPE.fullmatch(path) is not None and is_plain_path(path)
+    if path.startswith(f"{MANIFEST}/"):
+        return path == range_table_path(start, path.rpartition("/")[2].partition(".")[0], retry)
+    category = path.partition("/")[0]
+    return _CATEGORY.fullmatch(category) is not None and path == tar_path(category, start, retry)
+
+
+def is_merged_path(path: str) -> bool:
+    """Whether the merge writes a file of this name."""
+    return path in (CAM_POSES, CAMERAS, OBJECTS) or (_MERGED.fullmatch(path) is not None and is_plain_path(path))
+
+
 def range_name(start: int, retry: int = 0) -> str:
     """`0000000016`, for a retry `0000000016.retry-2`. Ten digits, so that names sort like numbers."""
     return f"{start:010d}{f'.retry-{retry}' if retry else ''}"
+
+
+def parse_range_name(name: str) -> int | None:
+    """The start that a folder of `_staging/` is named after, None where it is no such name."""
+    return int(name) if re.fullmatch("[0-9]{10,19}", name) and range_name(int(name)) == name else None
 
 
 def commit_path(start: int, retry: int = 0) -> str:
@@ -132,7 +181,7 @@ def commit_path(start: int, retry: int = 0) -> str:
 
 def parse_commit_path(key: str) -> tuple[int, int] | None:
     """(start, retry) of a commit record's key, None where it is no such key."""
-    match = re.fullmatch(rf"{COMMITS}/(\d+)(?:\.retry-(\d+))?\.json", key)
+    match = re.fullmatch(rf"{COMMITS}/([0-9]{{10,19}})(?:\.retry-([0-9]{{1,9}}))?\.json", key)
     found = match and (int(match[1]), int(match[2] or 0))
     return found if found and commit_path(*found) == key else None
 

@@ -42,6 +42,7 @@ class ShardOrder(Frozen):
             layout=job.output.layout,
             first_scene=job.first_scene,
             range_size=job.run.range_size,
+            pairs_per_scene=job.pairs_per_scene,
         )
         return cls(out=out, job=job, terms=terms, spans=())
 

@@ -1,6 +1,7 @@
 """OUT/job.yaml: the job that an output folder belongs to. Another job is refused, naming the keys."""
 
 import dataclasses
+import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,9 +56,16 @@ def read_job(store: Store) -> JobRecord | None:
     try:
         tree = yaml.safe_load(text)
         job = validate_job(tree["job"], f"{store.name}/{JOB_FILE}")
-        return JobRecord(job, tree["digest"], tree["catalogue"], tree["folder"])
-    except (yaml.YAMLError, UnicodeDecodeError, TypeError, KeyError) as error:
+        return JobRecord(job, tree["digest"], tree["catalogue"], _folder(tree["folder"]))
+    except (yaml.YAMLError, UnicodeDecodeError, TypeError, AttributeError, KeyError) as error:
         raise CorruptError(f"{store.name}/{JOB_FILE} is not a job that `verso run` wrote: {error!r}") from error
+
+
+def _folder(path: str) -> str:
+    """The path itself. Raises TypeError where it is not absolute or holds a control character."""
+    if not path.startswith("/") or any(unicodedata.category(letter) == "Cc" for letter in path):
+        raise TypeError(f"folder: {path!r} is not an absolute path")
+    return path
 
 
 def require_dataset(store: Store) -> Store:

@@ -11,8 +11,8 @@ from typing import Any
 
 import pyarrow as pa
 
-from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import MANIFEST, SUCCESS_FILE, is_shape
+from schemas.dataset.commit import CommitRecord, FileEntry
+from schemas.dataset.layout import MANIFEST, SUCCESS_FILE, is_merged_path, is_shape
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMA_VERSION, TABLES
 from schemas.errors import CorruptError, RunError
 from services.merge.poses import PoseFiles
@@ -55,10 +55,9 @@ def merge(store: Store, first_scene: int, stop_scene: int) -> MergeResult:
     with store.scratch("merge") as folder:
         with contextlib.closing(_Merging(folder)) as merging:
             for records in iter_ranges(store, first_scene, stop_scene):
-                for record in records:
-                    check_published(store, record)
+                published = [entry for record in records for entry in check_published(store, record)]
                 rows = {table: range_rows(store, records, table) for table in TABLES}
-                merging.add_range(records, rows)
+                merging.add_range(records, published, rows)
             success, files = merging.finish()
         _install(store, files)
     if commits_digest(store) != commits:
@@ -80,7 +79,8 @@ def read_success(store: Store) -> dict | None:
         success = json.loads(store.read(SUCCESS_FILE))
     except (FileNotFoundError, ValueError):
         return None
-    return success if isinstance(success, dict) and isinstance(success.get("schema_version"), int) else None
+    whole = isinstance(success, dict) and isinstance(success.get("schema_version"), int)
+    return success if whole and all(is_merged_path(path) for path in success.get("files", ())) else None
 
 
 class _Merging:
@@ -93,11 +93,15 @@ class _Merging:
         self._fingerprints: set[str] = set()
         self._scenes = Counter({"made": 0, "intrinsic": 0, "environmental": 0})
 
-    def add_range(self, records: Sequence[CommitRecord], rows: Mapping[str, pa.Table]) -> None:
-        """Takes the next range with its retries. Raises CorruptError where it does not hold each scene once."""
+    def add_range(
+        self, records: Sequence[CommitRecord], files: Sequence[FileEntry], rows: Mapping[str, pa.Table]
+    ) -> None:
+        """Takes the next range with its retries and all their files.
+
+        Raises CorruptError where it does not hold each scene once.
+        """
         self._fingerprints |= {record.terms.fingerprint for record in records}
-        for record in records:
-            self._shared.add_files((entry.path, entry.sha256) for entry in record.files if is_shape(entry.path))
+        self._shared.add_files((entry.path, entry.sha256) for entry in files if is_shape(entry.path))
         self._shared.add_assets(rows["assets"])
         self._shared.add_images(rows["views"])
         self._poses.add(rows["views"], rows["objects"])

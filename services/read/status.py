@@ -3,7 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass
 
-from schemas.dataset.layout import COMMITS, STAGING, commit_path
+from schemas.dataset.layout import COMMITS, STAGING, commit_path, parse_range_name
 from schemas.errors import OutputError
 from services.merge.step import read_success
 from services.run.lock import Holder, read_holder
@@ -91,7 +91,7 @@ def _rate(store: Store) -> float | None:
 
 
 def _running(store: Store) -> list[Running]:
-    starts = [int(folder) for folder in store.children(STAGING) if folder.isdigit()]
+    starts = [start for folder in store.children(STAGING) if (start := parse_range_name(folder)) is not None]
     return [
         Running(start, attempt, blamed_scene(store, start, attempt))
         for start in starts

@@ -150,7 +150,7 @@ class Coordinator:
         while left and self._store.size(commit_path(left[0].start, left[0].retry)) is not None:
             summary = read_summary(self._store, left[0].start, left[0].retry)
             self._tally.made += summary.made
-            self._tally.failed.update(kind for _, kind in summary.failed)
+            self._tally.failed.update(kind for _, kind, _ in summary.failed)
             left.pop(0)
         if left:
             self._count_death(left[0], error)

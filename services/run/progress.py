@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from schemas.dataset.layout import LOG_FOLDER
 from services.run.supervisor import tell
+from workers.store.file_system import refuse_link_out
 
 LINE_EVERY_S = 60.0
 LOG_BYTES = 4 * 2**20
@@ -67,6 +68,7 @@ def event_log(out: Path | None) -> Iterator[None]:
         yield
         return
     folder = out / LOG_FOLDER
+    refuse_link_out(out, f"{LOG_FOLDER}/verso.jsonl")
     folder.mkdir(parents=True, exist_ok=True)
     tell(logs=str(folder))
     handler = logging.handlers.RotatingFileHandler(

@@ -95,7 +95,7 @@ def effective_failures(group: Sequence[CommitSummary]) -> list[tuple[int, str]]:
     for one in group:
         for scene in one.scenes:
             failed.pop(scene, None)
-        failed.update(one.failed)
+        failed.update((scene, kind) for scene, kind, _ in one.failed)
     return sorted(failed.items())
 
 

@@ -7,24 +7,42 @@ import re
 import socket
 import uuid
 from collections.abc import Iterator, Mapping
+from operator import attrgetter
 
 import pyarrow as pa
 
-from schemas.dataset.commit import CommitRecord, CommitResult, CommitTerms, FileEntry, SceneMark, Span, TableEntry
-from schemas.dataset.layout import FENCED, commit_path, range_table_path, staging_path
-from schemas.dataset.tables import SCHEMA_VERSION, SCHEMAS, TABLES
+from schemas.dataset.commit import (
+    COMMIT_VERSION,
+    MARK,
+    CommitRecord,
+    CommitResult,
+    CommitTerms,
+    FileEntry,
+    SceneMark,
+    Span,
+    TableEntry,
+)
+from schemas.dataset.layout import FENCED, commit_path, is_shape, range_table_path, staging_path
+from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import OutputError, RunError
 from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
-from workers.store.canonical import rows_digest
-from workers.store.commit import compare_records, encode_record, publish, read_record
-from workers.store.manifest import check_files, encode_table, outcome_of, scene_digest, sorted_rows, table_of_rows
+from workers.store.commit import committed_files, compare_attempts, encode_record, publish, read_record
+from workers.store.manifest import (
+    check_files,
+    encode_table,
+    outcome_of,
+    scene_digest,
+    sorted_rows,
+    table_of_rows,
+    with_shape_files,
+)
 from workers.store.store import Store
 from workers.store.tars import Packing
 
 CURRENT = "_current"
 """A file in an attempt's folder that names the scene in progress, in case the worker dies."""
 
-_NAME = re.compile(r"r(\d+)-.+")
+_NAME = re.compile(r"r([0-9]{1,9})-.+")
 
 
 def begin_attempt(store: Store, span: Span, terms: CommitTerms, label: str = "") -> "Attempt":
@@ -109,7 +127,9 @@ class Attempt:
         self._files |= entries
         for table, rows in tables.items():
             self._rows[table].append(rows)
-        self._scenes.append(SceneMark(scene_id=output.scene_id, outcome=outcome, digest=scene_digest(output.rows)))
+        reason = None if outcome == "made" else str(output.rows["failures"][0]["reason"])
+        digest = scene_digest(output.rows)[:MARK]
+        self._scenes.append(SceneMark(scene_id=output.scene_id, outcome=outcome, digest=digest, reason=reason))
 
     def commit(self) -> CommitResult:
         """Decides the range and, where this attempt wins, publishes it; a loser's folder is removed.
@@ -134,22 +154,26 @@ class Attempt:
 
     def _finish(self) -> CommitRecord:
         """The record of this attempt, after the last of its files is written."""
-        tables, files = {}, {}
+        tables, entries = {}, []
         for table in TABLES:
             rows = sorted_rows(table, pa.concat_tables(self._rows[table]).combine_chunks())
+            tables[table] = TableEntry(rows=rows.num_rows)
+            if table == "assets":
+                rows = with_shape_files(rows, self._files)
+                listed = set(rows.column("path").to_pylist())
+                entries += [one for path, one in self._files.items() if is_shape(path) and path not in listed]
             file = encoded_file(range_table_path(self.span.start, table, self.span.retry), encode_table(rows))
             with self._skip_if_swept():
                 self._store.write_staged(self._staging, file.path, file.data)
-            files[file.path] = _entry_of(file)
-            tables[table] = TableEntry(rows=rows.num_rows, digest=rows_digest(table, rows))
+            entries.append(_entry_of(file))
         with self._skip_if_swept():
-            files |= {entry.path: entry for entry in self._packing.finish(self._files)}
+            entries += self._packing.finish()
         return CommitRecord(
-            schema_version=SCHEMA_VERSION,
+            schema_version=COMMIT_VERSION,
             span=self.span,
             attempt=self.name,
             terms=self._terms,
-            files=tuple(files[path] for path in sorted(files)),
+            files=tuple(sorted(entries, key=attrgetter("path"))),
             tables=tables,
             scenes=tuple(self._scenes),
         )
@@ -171,7 +195,8 @@ class Attempt:
                 f"attempt {self.name} at the range from scene {self.span.start} was swept before it could commit: "
                 "another coordinator works on this folder; stop one of them, and start again"
             )
-        return CommitResult(won=False, record=winner, conflict=compare_records(mine, winner))
+        theirs = committed_files(self._store, winner)
+        return CommitResult(False, winner, compare_attempts(mine, self._files.values(), winner, theirs))
 
     def _note(self, current: Mapping[str, object]) -> None:
         with self._skip_if_swept():

@@ -6,38 +6,23 @@ commit any more. Publishing may be repeated by any process, at any time, any num
 
 import contextlib
 import hashlib
-import json
+from collections.abc import Iterable
 
-from pydantic import ValidationError
-
-from schemas.dataset.commit import CommitRecord, CommitSummary, FileEntry
-from schemas.dataset.layout import COMMITS, FENCED, commit_path, is_shape, parse_commit_path, staging_path
-from schemas.dataset.tables import SCHEMA_VERSION
-from schemas.errors import CommitConflict, CorruptError, OutputError
+from schemas.dataset.commit import MARK, CommitRecord, CommitSummary, FileEntry, foreign_path, summarize
+from schemas.dataset.layout import (
+    COMMITS,
+    FENCED,
+    commit_path,
+    is_shape,
+    parse_commit_path,
+    range_table_path,
+    staging_path,
+)
+from schemas.errors import CommitConflict, CorruptError
+from workers.store.manifest import listed_files
+from workers.store.record import decode_record as decode_record
+from workers.store.record import encode_record as encode_record
 from workers.store.store import Store
-
-_SEAL = b',"seal":"'
-"""The last key of a record: the SHA-256 of all bytes before it."""
-
-
-def encode_record(record: CommitRecord) -> bytes:
-    """Canonical JSON with a seal that reveals damage."""
-    body = json.dumps(record.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False)
-    head = body[:-1].encode()
-    return head + _SEAL + hashlib.sha256(head).hexdigest().encode() + b'"}\n'
-
-
-def decode_record(data: bytes, name: str) -> CommitRecord:
-    """The record in a file.
-
-    Raises CorruptError naming it where it is torn, altered or foreign; OutputError where a newer version wrote it.
-    """
-    try:
-        return CommitRecord.model_validate(_unsealed(data, name))
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise CorruptError(f"{name} is not a commit record: {where}: {first['msg']}") from error
 
 
 def commit_names(store: Store) -> list[tuple[int, int, str]]:
@@ -75,28 +60,29 @@ def read_record(store: Store, start: int, retry: int = 0) -> CommitRecord | None
 
 
 def read_summary(store: Store, start: int, retry: int = 0) -> CommitSummary:
-    """The part of a record that planning needs, without its list of files. Raises as `decode_record`."""
-    key = commit_path(start, retry)
-    raw = _unsealed(store.read(key), key)
-    try:
-        span, scenes = raw["span"], raw["scenes"]
-        _check_range(key, span["start"], span["retry"])
-        failed = tuple((scene["scene_id"], scene["outcome"]) for scene in scenes if scene["outcome"] != "made")
-        return CommitSummary(
-            start=start,
-            stop=span["stop"],
-            retry=retry,
-            made=len(scenes) - len(failed),
-            failed=failed,
-            scenes=tuple(span["scenes"]),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise CorruptError(f"{key} is not a commit record: {error!r}") from error
+    """The part of a record that planning needs. Raises as `decode_record`, CorruptError where there is none."""
+    record = read_record(store, start, retry)
+    if record is None:
+        raise CorruptError(f"{commit_path(start, retry)} vanished while {store.name} was read")
+    return summarize(record)
 
 
 def committed_files(store: Store, record: CommitRecord) -> tuple[FileEntry, ...]:
-    """Every file of a commit, sorted by path: images or tars, shapes and the range's tables."""
-    return record.files
+    """Every file of a commit, sorted by path: images or tars, shapes and the range's tables.
+
+    A record of version 1 names them all. For later ones the range's `views` and `assets` are read, in place or staged.
+    Raises CorruptError naming a table that is missing, damaged, or lists a file that is not the range's own.
+    """
+    if record.schema_version == 1:
+        return record.files
+    files = {entry.path: entry for entry in record.files}
+    for table in ("assets", "views") if record.terms.layout == "files" else ("assets",):
+        path = range_table_path(record.span.start, table, record.span.retry)
+        listed = listed_files(table, read_range_file(store, record, path), path)
+        if (foreign := foreign_path(listed, record.span, record.terms.pairs_per_scene)) is not None:
+            raise CorruptError(f"{path} lists {foreign!r}, which is not a file of its range")
+        files |= {entry.path: entry for entry in listed}
+    return tuple(files[path] for path in sorted(files))
 
 
 def publish(store: Store, record: CommitRecord) -> None:
@@ -105,7 +91,8 @@ def publish(store: Store, record: CommitRecord) -> None:
     Raises CorruptError naming a file that is nowhere or has the wrong size, CommitConflict where a shape that ranges
     share was published with another size by the same stack.
     """
-    for entry in committed_files(store, record):
+    files = committed_files(store, record)
+    for entry in files:
         final = store.size(entry.path) if is_shape(entry.path) else None
         if final is None:
             if not _move(store, record, entry):
@@ -115,9 +102,20 @@ def publish(store: Store, record: CommitRecord) -> None:
                 f"{entry.path} has {final} bytes, and {entry.bytes} in the range from scene {record.span.start}, "
                 f"made by {record.terms.fingerprint}: two attempts at one shape differ"
             )
-    store.sync_folders_of(entry.path for entry in committed_files(store, record))
+    store.sync_folders_of(entry.path for entry in files)
     for folder in _staging_folders(record):
         store.remove_tree(folder)
+
+
+def read_range_file(store: Store, record: CommitRecord, path: str) -> bytes:
+    """The bytes of a file that the record itself names. Raises CorruptError where it is missing or altered."""
+    entry = next((file for file in record.files if file.path == path), None)
+    if entry is None:
+        raise CorruptError(f"the commit of the range from scene {record.span.start} names no {path}")
+    data = read_committed(store, record, path)
+    if hashlib.sha256(data).hexdigest() != entry.sha256:
+        raise CorruptError(f"{path} does not match the SHA-256 in its commit: restore it from a copy")
+    return data
 
 
 def read_committed(store: Store, record: CommitRecord, path: str) -> bytes:
@@ -129,19 +127,25 @@ def read_committed(store: Store, record: CommitRecord, path: str) -> bytes:
     raise CorruptError(f"{path} is committed and missing: restore it from a copy")
 
 
-def check_published(store: Store, record: CommitRecord) -> None:
-    """Raises CorruptError naming a file of the record that is not in its final place with its size.
+def check_published(store: Store, record: CommitRecord) -> tuple[FileEntry, ...]:
+    """Every file of the record, as `committed_files`.
 
-    A shape that a mix of stacks shares keeps the size of whichever was first.
+    Raises CorruptError naming one that is not in its final place with its size. A shape that a mix of stacks shares
+    keeps the size of whichever was first.
     """
-    for entry in committed_files(store, record):
+    files = committed_files(store, record)
+    for entry in files:
         _check_final(store, entry, record.terms.fingerprint_mode == "strict" or not is_shape(entry.path))
+    return files
 
 
-def compare_records(mine: CommitRecord, winner: CommitRecord) -> str | None:
+def compare_attempts(
+    mine: CommitRecord, my_files: Iterable[FileEntry], winner: CommitRecord, its_files: Iterable[FileEntry]
+) -> str | None:
     """How two attempts at the same scenes differ, naming both fingerprints; None where they made the same.
 
-    Scenes that failed environmentally in either are left out: a killed scene says nothing about bytes.
+    Of the files, shapes are compared; a scene's digest covers its images. Scenes that failed
+    environmentally in either are left out: a killed scene says nothing about bytes.
     """
     theirs = {scene.scene_id: scene for scene in winner.scenes}
     different = [
@@ -149,10 +153,10 @@ def compare_records(mine: CommitRecord, winner: CommitRecord) -> str | None:
         for scene in mine.scenes
         if (other := theirs.get(scene.scene_id)) is not None
         and "environmental" not in (scene.outcome, other.outcome)
-        and (scene.outcome, scene.digest) != (other.outcome, other.digest)
+        and (scene.outcome, scene.digest[:MARK]) != (other.outcome, other.digest[:MARK])
     ]
-    shapes = {entry.path: entry.sha256 for entry in winner.files if is_shape(entry.path)}
-    different += [entry.path for entry in mine.files if shapes.get(entry.path, entry.sha256) != entry.sha256]
+    shapes = {entry.path: entry.sha256 for entry in its_files if is_shape(entry.path)}
+    different += [entry.path for entry in my_files if shapes.get(entry.path, entry.sha256) != entry.sha256]
     if not different:
         return None
     return (
@@ -160,27 +164,6 @@ def compare_records(mine: CommitRecord, winner: CommitRecord) -> str | None:
         f"{winner.attempt} (committed) on fingerprint {winner.terms.fingerprint}, "
         f"{mine.attempt} on fingerprint {mine.terms.fingerprint}"
     )
-
-
-def _unsealed(data: bytes, name: str) -> dict:
-    """The JSON object of a record whose seal is whole and whose version is not newer than this program's."""
-    head, mark, seal = data.rpartition(_SEAL)
-    try:
-        raw = json.loads(data)
-    except ValueError as error:
-        raise CorruptError(
-            f"{name} is torn or not JSON ({error}): restore it from a copy, or begin a new --out"
-        ) from error
-    if not isinstance(raw, dict) or raw.get("kind") != "verso-commit" or not isinstance(raw.get("schema_version"), int):
-        raise CorruptError(f"{name} is not a commit record of this program: move it away")
-    if raw["schema_version"] > SCHEMA_VERSION:
-        raise OutputError(
-            f"{name} has schema_version {raw['schema_version']}, and this program reads up to {SCHEMA_VERSION}: "
-            "install a newer verso"
-        )
-    if not mark or seal != hashlib.sha256(head).hexdigest().encode() + b'"}\n':
-        raise CorruptError(f"{name} was altered after it was written: its seal does not match")
-    return raw
 
 
 def _check_range(key: str, start: int, retry: int) -> None:

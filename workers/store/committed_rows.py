@@ -1,6 +1,5 @@
 """Reading of committed ranges in order, and of their rows; a retry's rows replace the first ones."""
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 from operator import itemgetter
@@ -12,7 +11,7 @@ from schemas.dataset.commit import CommitRecord, CommitSummary
 from schemas.dataset.layout import COMMITS, range_table_path
 from schemas.dataset.tables import SORT_KEYS
 from schemas.errors import CorruptError, RunError
-from workers.store.commit import commit_names, read_committed, read_record, read_summary
+from workers.store.commit import commit_names, read_range_file, read_record, read_summary
 from workers.store.manifest import decode_table
 from workers.store.store import Store
 
@@ -65,13 +64,7 @@ def range_rows(store: Store, records: Sequence[CommitRecord], table: str) -> pa.
 def read_range_table(store: Store, record: CommitRecord, table: str) -> pa.Table:
     """The rows that one record committed. Raises CorruptError naming a file that is missing or altered."""
     path = range_table_path(record.span.start, table, record.span.retry)
-    entry = next((file for file in record.files if file.path == path), None)
-    if entry is None:
-        raise CorruptError(f"the commit of the range from scene {record.span.start} names no {path}")
-    data = read_committed(store, record, path)
-    if hashlib.sha256(data).hexdigest() != entry.sha256:
-        raise CorruptError(f"{path} does not match the SHA-256 in its commit: restore it from a copy")
-    return decode_table(table, data, path)
+    return decode_table(table, read_range_file(store, record, path), path)
 
 
 def _commits_by_range(store: Store) -> Iterator[tuple[int, list[int]]]:

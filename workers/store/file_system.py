@@ -88,6 +88,21 @@ class OpenTree:
         sync_path(self._folder.parent)
 
 
+def refuse_link_out(root: Path, key: str) -> None:
+    """Raises OutputError where a folder on the way to `key`, or `key` itself, is a symbolic link that leads out of `root`.
+
+    So a folder from somebody else cannot make this program write or remove elsewhere.
+    """
+    place = str(root)
+    for part in key.split("/"):
+        place += f"/{part}"
+        if os.path.islink(place) and not Path(os.path.realpath(place)).is_relative_to(os.path.realpath(root)):
+            raise OutputError(
+                f"{place} is a symbolic link that leads out of {root}, to {os.path.realpath(place)}: nothing is written "
+                "through it; put a folder in its place, or choose another --out"
+            )
+
+
 def sync_tree(folder: Path) -> None:
     """Returns when every file and folder below `folder`, and its own name, are on the disk.
 

@@ -11,7 +11,15 @@ from typing import IO
 
 from schemas.dataset.layout import COMMITS, FENCED, RANGES, TEMPORARY, scratch_path
 from schemas.errors import OutputError
-from workers.store.file_system import OpenTree, explain_disk_errors, probe_folder, sync_folders, sync_path, sync_tree
+from workers.store.file_system import (
+    OpenTree,
+    explain_disk_errors,
+    probe_folder,
+    refuse_link_out,
+    sync_folders,
+    sync_path,
+    sync_tree,
+)
 from workers.store.store import Entry, Store, retry_if_swept
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]+://")
@@ -46,11 +54,16 @@ class LocalStore(Store):
         """Where `key` lies on disk."""
         return self.root / key
 
+    def _own(self, key: str) -> Path:
+        """Where `key` lies on disk, to write or remove it. Raises OutputError where a link leads out of the folder."""
+        refuse_link_out(self.root, key)
+        return self.path(key)
+
     def prepare(self) -> None:
         """Makes the folders and probes the file system."""
         try:
             for folder in (COMMITS, RANGES, TEMPORARY):
-                os.makedirs(self.path(folder), exist_ok=True)
+                os.makedirs(self._own(folder), exist_ok=True)
                 sync_path(self.path(folder).parent)
             sync_path(self.root)
         except OSError as error:
@@ -62,7 +75,7 @@ class LocalStore(Store):
     def open_staging(self, staging: str) -> None:
         """Makes the folder of an attempt, and keeps it open to hear of writes that fail."""
         with self._explained(staging):
-            retry_if_swept(lambda: os.makedirs(self.path(staging)))
+            retry_if_swept(lambda: os.makedirs(self._own(staging)))
             with contextlib.suppress(FileNotFoundError):  # swept already, as the attempt will notice
                 self._open[staging] = OpenTree(self.path(staging))
 
@@ -104,12 +117,13 @@ class LocalStore(Store):
 
     def rename(self, source: str, target: str) -> None:
         """Moves a file; makes the target's folder where it is missing."""
+        old, new = self._own(source), self._own(target)
         with self._explained(target):
             try:
-                os.replace(self.path(source), self.path(target))
+                os.replace(old, new)
             except FileNotFoundError:
-                os.makedirs(self.path(target).parent, exist_ok=True)
-                os.replace(self.path(source), self.path(target))
+                os.makedirs(new.parent, exist_ok=True)
+                os.replace(old, new)
 
     def sync_folders_of(self, keys: Iterable[str]) -> None:
         """Flushes the folders that hold `keys`, up to the output folder."""
@@ -120,7 +134,7 @@ class LocalStore(Store):
     def fence(self, staging: str) -> None:
         """Renames an attempt's folder: from then on the attempt cannot write, nor link a record."""
         with contextlib.suppress(FileNotFoundError):
-            os.rename(self.path(staging), self.path(staging + FENCED))
+            os.rename(self._own(staging), self.path(staging + FENCED))
             sync_path(self.path(staging).parent)
 
     def is_fenced(self, staging: str) -> bool:
@@ -157,19 +171,19 @@ class LocalStore(Store):
     def remove(self, key: str) -> None:
         """Removes a file."""
         with self._explained(key), contextlib.suppress(FileNotFoundError):
-            os.unlink(self.path(key))
+            os.unlink(self._own(key))
 
     def remove_tree(self, prefix: str) -> None:
         """Removes a folder; two processes may do so at once."""
         if tree := self._open.pop(prefix, None):
             tree.close()
         with self._explained(prefix):
-            shutil.rmtree(self.path(prefix), onerror=_ignore_missing)
+            shutil.rmtree(self._own(prefix), onerror=_ignore_missing)
 
     def remove_empty(self, prefix: str) -> None:
         """Removes an empty folder."""
         with contextlib.suppress(OSError):
-            os.rmdir(self.path(prefix))
+            os.rmdir(self._own(prefix))
 
     @contextlib.contextmanager
     def scratch(self, name: str) -> Iterator[Path]:
@@ -177,7 +191,7 @@ class LocalStore(Store):
         key = f"{scratch_path(name)}/{uuid.uuid4().hex}"
         self.remove_tree(scratch_path(name))
         with self._explained(key):
-            os.makedirs(self.path(key))
+            os.makedirs(self._own(key))
         try:
             yield self.path(key)
         finally:
@@ -187,7 +201,7 @@ class LocalStore(Store):
         """Flushes a file and renames it to `key`."""
         with self._explained(key):
             sync_path(local)
-            os.makedirs(self.path(key).parent, exist_ok=True)
+            os.makedirs(self._own(key).parent, exist_ok=True)
             os.replace(local, self.path(key))
             sync_path(self.path(key).parent)
 
@@ -198,7 +212,7 @@ class LocalStore(Store):
 
         False where another file has the name. Raises FileNotFoundError where `staging` was swept.
         """
-        target = self.path(key)
+        target = self._own(key)
 
         def place_once() -> bool:
             with _temporary_file(self.path(staging or TEMPORARY), data, durable) as temporary:

@@ -3,25 +3,23 @@
 import hashlib
 import io
 import json
-import re
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from schemas.dataset.commit import FileEntry, Outcome
-from schemas.dataset.layout import is_shape
-from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, SORT_KEYS
+from schemas.dataset.layout import is_plain_path, is_shape
+from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, SHAPE_FILE_COLUMNS, SORT_KEYS
 from schemas.errors import CorruptError
 from schemas.scene.scene import SceneOutput
 
 PARQUET_OPTIONS = {"compression": "zstd", "write_page_checksum": True}
 """For every Parquet file of a dataset: a flipped bit is found when the page is read."""
-
-_UNSAFE = re.compile(r"[\x00-\x1f\x7f\\]")
 
 
 def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
@@ -76,7 +74,7 @@ def check_files(output: SceneOutput, entries: Mapping[str, FileEntry]) -> None:
     if len(entries) != len(output.files):
         raise ValueError(f"scene {output.scene_id} writes a path twice")
     for path in entries:
-        if _UNSAFE.search(path) or any(part in ("", ".", "..") for part in path.split("/")) or path[0] in "_.":
+        if not is_plain_path(path) or path[0] in "_.":
             raise ValueError(f"{path!r} is not a path that a scene may write")
     views = cast(Sequence[Mapping[str, Any]], output.rows.get("views", ()))
     listed = [(file["path"], file["bytes"], file["sha256"]) for view in views for file in view["files"]]
@@ -125,6 +123,31 @@ def encode_table(rows: pa.Table) -> bytes:
     return sink.getvalue()
 
 
+def with_shape_files(assets: pa.Table, files: Mapping[str, FileEntry]) -> pa.Table:
+    """Rows of `assets` with the columns `SHAPE_FILE_COLUMNS`, from `files` by path."""
+    found = [files.get(path) for path in assets.column("path").to_pylist()]
+    for field, name in zip(SHAPE_FILE_COLUMNS, ("bytes", "sha256"), strict=True):
+        assets = assets.append_column(field, pa.array([entry and getattr(entry, name) for entry in found], field.type))
+    return assets
+
+
+def listed_files(table: str, data: bytes, name: str) -> list[FileEntry]:
+    """The files that a range's `views` (images) or `assets` (shapes) list. Raises CorruptError as `decode_table`."""
+    columns = ["files"] if table == "views" else ["path", *(field.name for field in SHAPE_FILE_COLUMNS)]
+    try:
+        with pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True) as file:
+            rows = file.read(columns=columns)
+        if table == "views":
+            entries = pc.list_flatten(rows.column("files")).to_pylist()
+        else:
+            values = (rows.column(column).to_pylist() for column in columns)
+            keys = ("path", "bytes", "sha256")
+            entries = [dict(zip(keys, row, strict=True)) for row in zip(*values, strict=True) if row[2] is not None]
+        return [FileEntry.model_validate(entry) for entry in entries]
+    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
+        raise CorruptError(f"{name} cannot be read: {' '.join(str(error).split())[:300]}") from error
+
+
 def decode_table(table: str, data: bytes, name: str) -> pa.Table:
     """The rows of a range's Parquet bytes, in today's schema: columns added since they were written are null.
 
@@ -144,7 +167,8 @@ def _conform(table: str, rows: pa.Table, name: str) -> pa.Table:
     """
     schema = SCHEMAS[table]
     missing = [column for column in schema.names if column not in rows.column_names]
-    foreign = [column for column in rows.column_names if column not in schema.names]
+    known = {*schema.names, *(field.name for field in SHAPE_FILE_COLUMNS)}
+    foreign = [column for column in rows.column_names if column not in known]
     if missing and foreign:
         raise CorruptError(f"{name} lacks the column {missing[0]} of the table {table}, and has {foreign[0]!r}")
     for column in missing:

@@ -2,7 +2,16 @@
 
 from collections.abc import Collection
 
-from schemas.dataset.layout import COMMITS, FENCED, PROBE_PREFIX, STAGING, TEMPORARY, commit_path, staging_path
+from schemas.dataset.layout import (
+    COMMITS,
+    FENCED,
+    PROBE_PREFIX,
+    STAGING,
+    TEMPORARY,
+    commit_path,
+    parse_range_name,
+    staging_path,
+)
 from schemas.errors import CorruptError
 from workers.store.attempt import retry_of_attempt
 from workers.store.commit import publish, read_record
@@ -17,9 +26,9 @@ def sweep(store: Store, fenced: Collection[tuple[int, str]] | None = ()) -> list
     """
     removed = []
     for folder in store.children(STAGING):
-        if not folder.isdigit():
+        start = parse_range_name(folder)
+        if start is None:
             continue
-        start = int(folder)
         for name in store.children(f"{STAGING}/{folder}"):
             attempt = name.removesuffix(FENCED)
             given_up = name.endswith(FENCED) or fenced is None or (start, attempt) in fenced

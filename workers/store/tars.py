@@ -85,10 +85,9 @@ class Packing:
                 self._archives[category] = _Archive(name, self._store.stream_staged(self._staging, name))
             self._archives[category].add(member, files[path])
 
-    def finish(self, files: Mapping[str, FileEntry]) -> list[FileEntry]:
-        """The files to publish for all that were added, `files` by path. Nothing can be added afterwards."""
-        by_path = [entry for path, entry in files.items() if not self._tar or is_shape(path)]
-        return by_path + [archive.finish() for archive in self._archives.values()]
+    def finish(self) -> list[FileEntry]:
+        """The archives, finished. Nothing can be added afterwards."""
+        return [archive.finish() for archive in self._archives.values()]
 
     def close(self) -> None:
         """Closes all archives, unfinished."""

@@ -5,7 +5,7 @@ import pytest
 
 from services.bench.lower_bound import choose_encoders, encoders, images_of, kind_of, run_lower_bound, write_durably
 from services.bench.stages import make_in_memory
-from workers.store.commit import read_record
+from workers.store.commit import committed_files, read_record
 
 
 def test_the_floor_writes_the_bytes_that_ours_committed(bench, tmp_path):
@@ -21,7 +21,7 @@ def test_the_floor_writes_the_bytes_that_ours_committed(bench, tmp_path):
     assert lap.apart_s > 0, "shapes reach the GPU before the clock"
     written = {str(p.relative_to(tmp_path / "floor")): p.read_bytes() for p in (tmp_path / "floor").rglob("*.*")}
     assert written == files
-    assert sum(map(len, written.values())) == sum(entry.bytes for entry in record.files)
+    assert sum(map(len, written.values())) == sum(entry.bytes for entry in committed_files(bench.store, record))
     assert write_durably(files, tmp_path / "again") == sum(map(len, files.values()))
 
 

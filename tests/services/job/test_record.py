@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+import yaml
 
 from schemas.dataset.layout import JOB_FILE
 from schemas.errors import CorruptError, OutputError
@@ -51,5 +52,13 @@ def test_a_folder_that_is_no_dataset_is_refused(store, tmp_path):
 @pytest.mark.parametrize("text", ["- a list", "job: [", "digest: x"])
 def test_a_damaged_record_is_told(store, text):
     store.write_whole(JOB_FILE, text.encode())
+    with pytest.raises(CorruptError, match="is not a job that `verso run` wrote"):
+        require_job(store)
+
+
+@pytest.mark.parametrize("folder", ["../elsewhere", "", 5, None, ["/a"], "/a\nverso: all is well", "/a\0b"])
+def test_a_folder_that_is_no_absolute_path_is_refused(store, folder):
+    tree = yaml.safe_load(encode_job(record()))
+    store.write_whole(JOB_FILE, yaml.safe_dump(tree | {"folder": folder}).encode())
     with pytest.raises(CorruptError, match="is not a job that `verso run` wrote"):
         require_job(store)

@@ -89,7 +89,8 @@ def test_planners_with_old_views_and_other_ends_never_overlap_and_cover_all_in_t
 
 
 def summary(start, retry=0, failed=(), scenes=()):
-    return CommitSummary(start, start + 4, retry, 4 - len(failed), tuple(failed), tuple(scenes))
+    told = tuple((scene, kind, "left_table") for scene, kind in failed)
+    return CommitSummary(start, start + 4, retry, 4 - len(failed), told, tuple(scenes))
 
 
 def test_only_environmental_failures_that_still_stand_are_tried_again():

@@ -22,7 +22,7 @@ from workers.pipeline.make_scene import make_scene
 from workers.pipeline.run_shard import run_shard
 from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.gbuffer import shared_renderer
-from workers.store.commit import read_record
+from workers.store.commit import committed_files, read_record
 from workers.store.images import decode_png
 from workers.store.local import LocalStore
 
@@ -59,7 +59,7 @@ def images_of(store: LocalStore) -> dict[str, np.ndarray]:
     """Every image of the range, read back."""
     record = read_record(store, 0)
     assert record is not None
-    paths = [entry.path for entry in record.files if entry.path.endswith(".png")]
+    paths = [entry.path for entry in committed_files(store, record) if entry.path.endswith(".png")]
     return {path: decode_png(store.read(path), path) for path in paths}
 
 
@@ -145,7 +145,11 @@ def test_the_largest_image_is_made_whole(tmp_path, changes):
     assert (made, failed) == (1, {})
     record = read_record(store, 0)
     assert record is not None
-    whole = [entry.path for entry in record.files if entry.path.endswith(".png") and "/patches/" not in entry.path]
+    whole = [
+        entry.path
+        for entry in committed_files(store, record)
+        if entry.path.endswith(".png") and "/patches/" not in entry.path
+    ]
     assert len(whole) == len(IMAGES)
     for path in whole:
         assert decode_png(store.read(path), path).shape[:2] == (4096, 4096)

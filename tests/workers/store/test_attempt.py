@@ -10,7 +10,7 @@ from schemas.errors import RunError
 from schemas.scene.scene import SceneOutput, encoded_file
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene, terms, with_shapes
 from workers.store.attempt import attempts_at, begin_attempt, blamed_scene, retry_of_attempt
-from workers.store.commit import read_record
+from workers.store.commit import committed_files, read_record
 from workers.store.local import LocalStore
 from workers.store.manifest import decode_table
 
@@ -40,7 +40,7 @@ def test_a_winner_publishes_every_file_and_leaves_no_staging(store, tmp_path):
 
 def test_a_record_names_every_file_with_its_size_and_digest_and_the_rows_of_every_table(store, tmp_path):
     record = attempt_at(store, 0, 4).commit().record
-    named = {entry.path: (entry.bytes, entry.sha256) for entry in record.files}
+    named = {entry.path: (entry.bytes, entry.sha256) for entry in committed_files(store, record)}
     files = [path for path in tmp_path.rglob("*") if path.is_file() and "_commits" not in path.parts]
     on_disk = {str(path.relative_to(tmp_path)): path.read_bytes() for path in files}
     assert named == {name: (len(data), hashlib.sha256(data).hexdigest()) for name, data in on_disk.items()}
@@ -62,7 +62,10 @@ def test_the_rows_of_a_range_are_sorted_whatever_their_order_in_a_scene(store):
     assert keys == sorted(keys)
     again = attempt_at(store, 0, 4)
     assert again.commit().conflict is None
-    assert mine.tables["views"] == attempt_at(LocalStore(store.root / "b"), 0, 4).commit().record.tables["views"]
+    other = attempt_at(LocalStore(store.root / "b"), 0, 4).commit().record
+    views = range_table_path(0, "views")
+    assert {mine.files[-1].path, other.files[-1].path} == {views}
+    assert mine.files[-1] == other.files[-1]
 
 
 def test_outside_its_folder_nothing_changes_before_the_commit(store, tmp_path):
@@ -197,7 +200,7 @@ def test_a_range_that_lacks_a_scene_is_not_committed(store):
 def test_a_shape_that_two_scenes_share_is_written_once_and_must_be_the_same(store):
     attempt = attempt_at(store, 0, 4)
     record = attempt.commit().record
-    shapes = [entry.path for entry in record.files if entry.path.startswith("assets/")]
+    shapes = [entry.path for entry in committed_files(store, record) if entry.path.startswith("assets/")]
     assert len(shapes) == len(set(shapes)) < 4 + 1
     other = begin_attempt(store, Span(start=4, stop=8), terms())
     first, again = made_scene(4), made_scene(5)

@@ -1,79 +1,34 @@
-import json
+import copy
+import hashlib
 
 import pytest
 
-from schemas.dataset.layout import STAGING, commit_path
-from schemas.errors import CommitConflict, CorruptError, OutputError
+from schemas.dataset.commit import FileEntry
+from schemas.dataset.layout import RANGES, STAGING, commit_path, range_table_path
+from schemas.errors import CommitConflict, CorruptError
 from tests.made_up_scenes import attempt_at, made_scene, terms, with_shapes
-from tests.stored_images import iter_records
 from workers.store.commit import (
     check_published,
     commit_names,
-    decode_record,
-    encode_record,
+    committed_files,
     publish,
     read_committed,
     read_record,
     read_summary,
 )
+from workers.store.committed_rows import read_range_table
 from workers.store.local import LocalStore
+from workers.store.manifest import encode_table, table_of_rows
 
 pytestmark = pytest.mark.usefixtures("unflushed")
-
-
-def test_a_record_reads_back_as_it_was_and_always_has_the_same_bytes(store):
-    record = attempt_at(store, 0, 4).commit().record
-    data = store.read(commit_path(0))
-    assert decode_record(data, "x") == record
-    assert encode_record(decode_record(data, "x")) == data
-    assert json.loads(data)["span"] == {"start": 0, "stop": 4, "retry": 0, "scenes": []}
 
 
 def test_a_summary_says_what_the_record_says(store):
     attempt_at(store, 4, 8).commit()  # scene 5 fails
     summary = read_summary(store, 4)
     assert (summary.start, summary.stop, summary.retry) == (4, 8, 0)
-    assert (summary.made, summary.failed) == (3, ((5, "intrinsic"),))
-
-
-def test_every_altered_byte_of_a_record_is_found(store):
-    attempt_at(store, 0, 2).commit()
-    data = store.read(commit_path(0))
-    for position in range(0, len(data), 5):
-        damaged = bytearray(data)
-        damaged[position] ^= 1
-        with pytest.raises((CorruptError, OutputError)):
-            decode_record(bytes(damaged), "manifest/_commits/0.json")
-
-
-@pytest.mark.parametrize("damage", [b"", b"{", b"null", b"[]", b'{"a": 1}', b"\x00\x01", b'{"kind": "verso-commit"}'])
-def test_a_foreign_record_is_refused_by_name(store, damage):
-    (store.root / commit_path(0)).write_bytes(damage)
-    for read in (lambda: read_record(store, 0), lambda: read_summary(store, 0), lambda: list(iter_records(store))):
-        with pytest.raises(CorruptError, match=r"manifest/_commits/0000000000\.json"):
-            read()
-
-
-def test_a_torn_record_is_refused_by_name(store):
-    attempt_at(store, 0, 2).commit()
-    data = store.read(commit_path(0))
-    (store.root / commit_path(0)).write_bytes(data[: len(data) // 2])
-    with pytest.raises(CorruptError, match=r"0000000000.json is torn"):
-        read_record(store, 0)
-
-
-def test_a_record_of_a_newer_version_is_refused_and_one_with_more_keys_is_read(store):
-    record = attempt_at(store, 0, 2).commit().record
-    newer = record.model_copy(update={"schema_version": 2})
-    with pytest.raises(OutputError, match="schema_version 2, and this program reads up to 1: install a newer"):
-        decode_record(encode_record(newer), "x")
-
-    class More(type(record)):
-        colour: str = "red"
-
-    more = More(**record.model_dump())
-    assert b"colour" in encode_record(more)
-    assert decode_record(encode_record(more), "x") == record
+    assert (summary.made, summary.failed) == (3, ((5, "intrinsic", "left_table"),))
+    assert summary.fingerprint == "stack-a"
 
 
 def test_a_record_under_another_name_is_refused(store):
@@ -117,7 +72,7 @@ def test_what_is_decided_is_published_by_anyone_any_number_of_times(store, undec
 
 
 def test_what_is_decided_can_be_read_before_it_is_published_and_after(store, undecided):
-    entry = undecided.files[0]
+    entry = committed_files(store, undecided)[0]
     before = read_committed(store, undecided, entry.path)
     store.fence(f"{STAGING}/0000000000/{undecided.attempt}")
     assert read_committed(store, undecided, entry.path) == before
@@ -129,7 +84,7 @@ def test_what_is_decided_can_be_read_before_it_is_published_and_after(store, und
 
 
 def test_a_file_that_is_nowhere_is_told_by_name(store, undecided):
-    entry = undecided.files[3]
+    entry = next(file for file in committed_files(store, undecided) if file.path.endswith(".png"))
     store.remove(f"{STAGING}/0000000000/{undecided.attempt}/{entry.path}")
     with pytest.raises(CorruptError, match=f"{entry.path} is named by a commit and is neither staged nor published"):
         publish(store, undecided)
@@ -137,7 +92,7 @@ def test_a_file_that_is_nowhere_is_told_by_name(store, undecided):
 
 
 def test_a_staged_file_of_the_wrong_size_is_not_published(store, undecided):
-    entry = undecided.files[3]
+    entry = next(file for file in committed_files(store, undecided) if file.path.endswith(".png"))
     store.write_whole(f"{STAGING}/0000000000/{undecided.attempt}/{entry.path}", b"short")
     with pytest.raises(CorruptError, match=f"{entry.path} has 5 bytes, and its commit says {entry.bytes}"):
         publish(store, undecided)
@@ -146,9 +101,58 @@ def test_a_staged_file_of_the_wrong_size_is_not_published(store, undecided):
 
 def test_a_published_file_of_the_wrong_size_is_told_by_name(store, undecided):
     publish(store, undecided)
-    store.write_whole(undecided.files[3].path, b"short")
-    with pytest.raises(CorruptError, match=f"{undecided.files[3].path} has 5 bytes"):
+    image = committed_files(store, undecided)[-1].path
+    store.write_whole(image, b"short")
+    with pytest.raises(CorruptError, match=f"{image} has 5 bytes"):
         check_published(store, undecided)
+
+
+@pytest.mark.parametrize("layout", ["files", "tar"])
+def test_after_a_death_at_any_rename_anyone_publishes_the_rest(store, layout, monkeypatch):
+    """The tables say which images there are, and may be in place before the images are, or after."""
+    with monkeypatch.context() as patch:
+        patch.setattr("workers.store.attempt.publish", lambda store, record: None)
+        record = attempt_at(store, 0, 2, terms(layout=layout)).commit().record
+    whole = committed_files(store, record)
+    assert any(entry.path.endswith(".png") for entry in whole) == (layout == "files")
+    rename, left = store.rename, [0]
+
+    def dying(source, target):
+        if left[0] == 0:
+            raise KeyboardInterrupt
+        left[0] -= 1
+        rename(source, target)
+
+    monkeypatch.setattr(store, "rename", dying)
+    for target in [f"{RANGES}/0000000000/views.parquet", f"{RANGES}/0000000000/assets.parquet"]:
+        rename(f"{STAGING}/0000000000/{record.attempt}/{target}", target)
+    for _ in whole[2:]:
+        with pytest.raises(KeyboardInterrupt):
+            publish(store, record)
+        left[0] = 1
+        assert committed_files(store, record) == whole
+    publish(store, record)
+    assert check_published(store, record) == whole
+    found = {str(path.relative_to(store.root)) for path in store.root.rglob("*") if path.is_file()}
+    assert found == {*(entry.path for entry in whole), commit_path(0)}
+
+
+def test_a_table_that_lists_anothers_images_is_not_followed(store):
+    """Rows name the images of a compact record: they are held to its range as the record itself is."""
+    attempt_at(store, 0, 4).commit()
+    record = attempt_at(store, 4, 8, make=made_scene).commit().record
+    entries, whole = {entry.path: entry for entry in record.files}, read_range_table(store, record, "views").to_pylist()
+    for path in ("../victim", "mug/RGB00000.png", "mug/RGB00000.png\n", "manifest/_commits/0000000000.json"):
+        rows = copy.deepcopy(whole)
+        rows[0]["files"][0]["path"] = path
+        data = encode_table(table_of_rows("views", rows))
+        key = range_table_path(4, "views")
+        store.write_whole(key, data)
+        entries[key] = FileEntry(path=key, bytes=len(data), sha256=hashlib.sha256(data).hexdigest())
+        forged = record.model_copy(update={"files": tuple(entries.values())})
+        with pytest.raises(CorruptError, match=f"{key} (lists|cannot be read)") as told:
+            publish(store, forged)
+        assert str(told.value).isprintable()
 
 
 def another_shape(scene_id: int):
