@@ -118,8 +118,8 @@ SCHEMAS: dict[str, pa.Schema] = {
 }
 
 SHAPE_FILE_COLUMNS = (pa.field("file_bytes", _i64), pa.field("file_sha256", _str))
-"""More columns of `assets` in a range's own file: the size and the SHA-256 of the shape at `path`, null where there is none.
-The merged table does not have them."""
+"""More columns of `assets` in a range's own file: the size and the SHA-256 of the asset's shape, null where none is
+stored. The merged table does not have them."""
 
 SORT_KEYS: dict[str, tuple[str, ...]] = {
     "scenes": ("scene_id",),

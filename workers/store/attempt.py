@@ -32,6 +32,7 @@ from workers.store.manifest import (
     encode_table,
     outcome_of,
     scene_digest,
+    shape_paths,
     sorted_rows,
     table_of_rows,
     with_shape_files,
@@ -160,7 +161,7 @@ class Attempt:
             tables[table] = TableEntry(rows=rows.num_rows)
             if table == "assets":
                 rows = with_shape_files(rows, self._files)
-                listed = set(rows.column("path").to_pylist())
+                listed = set(shape_paths(rows))
                 entries += [one for path, one in self._files.items() if is_shape(path) and path not in listed]
             file = encoded_file(range_table_path(self.span.start, table, self.span.retry), encode_table(rows))
             with self._skip_if_swept():

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from schemas.dataset.commit import FileEntry, Outcome
-from schemas.dataset.layout import is_plain_path, is_shape
+from schemas.dataset.layout import asset_path, is_plain_path, is_shape
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, SHAPE_FILE_COLUMNS, SORT_KEYS
 from schemas.errors import CorruptError
 from schemas.scene.scene import SceneOutput
@@ -125,24 +125,31 @@ def encode_table(rows: pa.Table) -> bytes:
 
 def with_shape_files(assets: pa.Table, files: Mapping[str, FileEntry]) -> pa.Table:
     """Rows of `assets` with the columns `SHAPE_FILE_COLUMNS`, from `files` by path."""
-    found = [files.get(path) for path in assets.column("path").to_pylist()]
+    found = [files.get(path) for path in shape_paths(assets)]
     for field, name in zip(SHAPE_FILE_COLUMNS, ("bytes", "sha256"), strict=True):
         assets = assets.append_column(field, pa.array([entry and getattr(entry, name) for entry in found], field.type))
     return assets
 
 
+def shape_paths(assets: pa.Table) -> list[str]:
+    """Where the shape of each row of `assets` lies, if the range has one."""
+    names = (assets.column(name).to_pylist() for name in ("category", "instance_id"))
+    return [asset_path(category, instance_id) for category, instance_id in zip(*names, strict=True)]
+
+
 def listed_files(table: str, data: bytes, name: str) -> list[FileEntry]:
     """The files that a range's `views` (images) or `assets` (shapes) list. Raises CorruptError as `decode_table`."""
-    columns = ["files"] if table == "views" else ["path", *(field.name for field in SHAPE_FILE_COLUMNS)]
+    names = [field.name for field in SHAPE_FILE_COLUMNS]
+    columns = ["files"] if table == "views" else ["category", "instance_id", *names]
     try:
         with pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True) as file:
             rows = file.read(columns=columns)
         if table == "views":
             entries = pc.list_flatten(rows.column("files")).to_pylist()
         else:
-            values = (rows.column(column).to_pylist() for column in columns)
-            keys = ("path", "bytes", "sha256")
-            entries = [dict(zip(keys, row, strict=True)) for row in zip(*values, strict=True) if row[2] is not None]
+            sizes, digests = (rows.column(name).to_pylist() for name in names)
+            found = zip(shape_paths(rows), sizes, digests, strict=True)
+            entries = [{"path": path, "bytes": size, "sha256": sha} for path, size, sha in found if sha is not None]
         return [FileEntry.model_validate(entry) for entry in entries]
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:
         raise CorruptError(f"{name} cannot be read: {' '.join(str(error).split())[:300]}") from error
