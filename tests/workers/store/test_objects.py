@@ -199,7 +199,7 @@ def test_a_rename_that_was_ended_half_way_is_done_again(monkeypatch):
 
 def test_a_store_that_ignores_the_condition_is_refused_by_name():
     with (
-        s3_server(Bucket(conditional=False)) as bucket,
+        s3_server(Bucket(conditional="ignored")) as bucket,
         pytest.raises(
             OutputError, match=r"s3://mine does not refuse a second put .* Use a store with conditional puts"
         ),
