@@ -50,7 +50,7 @@ class Bucket:
         self.lock = threading.RLock()
 
     @contextmanager
-    def counted(self, method: str) -> Iterator[Fault | None]:
+    def counted(self, method: str, key: str) -> Iterator[Fault | None]:
         """Counts a request; yields the fault that it meets."""
         with self.lock:
             self.requests[method] += 1
@@ -87,7 +87,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _serve(self, act: Callable[[bytes], None]) -> None:
         """Does what was asked, unless a fault comes before or after."""
         data = self.rfile.read(int(self.headers.get("Content-Length", 0)))
-        with self.bucket.counted(self.command) as fault:
+        with self.bucket.counted(self.command, self._key()) as fault:
             self._dropped = fault is not None and fault.endswith("when done")
             if fault is None or self._dropped:
                 act(data)

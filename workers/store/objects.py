@@ -167,8 +167,9 @@ class ObjectStore(Store):
     def remove_tree(self, prefix: str) -> None:
         """Deletes all objects below `prefix`; the mark of an attempt goes first."""
         self.remove(f"{prefix}/{_BEGUN}")
-        for entry in self.files(prefix):
-            self.remove(entry.key)
+        if keys := [entry.key for entry in self.files(prefix)]:
+            with self._explained(prefix), contextlib.suppress(FileNotFoundError):
+                _repeat_unanswered(lambda: obstore.delete(self._bucket, keys))
 
     @contextlib.contextmanager
     def scratch(self, name: str) -> Iterator[Path]:
