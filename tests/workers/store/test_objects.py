@@ -104,7 +104,7 @@ def test_an_attempt_that_was_swept_does_not_commit_and_its_files_stay_until_anot
     dead = attempt_at(store, 0, 4, TAR)
     sweep(store, fenced=None)
     assert attempt_at(store, 0, 4, TAR).commit().won
-    assert sweep(store) == [dead.name]
+    assert dead.name in sweep(store)
     assert not list(store.files(STAGING))
 
 
