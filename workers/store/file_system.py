@@ -75,8 +75,8 @@ class OpenTree:
             file.flush()
             os.fsync(file.fileno())
 
-    def flush(self) -> None:
-        """Returns when every file and folder below, and the folder's own name, are on the disk.
+    def flush(self, root: Path) -> None:
+        """Returns when every file and folder below, and the names that lead there from `root`, are on the disk.
 
         Raises OSError where a write to this file system has failed since the folder was opened.
         """
@@ -85,7 +85,8 @@ class OpenTree:
         else:
             for folder in [*(path for path in self._folder.rglob("*") if path.is_dir()), self._folder]:
                 sync_path(folder)
-        sync_path(self._folder.parent)
+            for folder in self._folder.relative_to(root).parents:
+                sync_path(root / folder)
 
 
 def refuse_link_out(root: Path, key: str) -> None:

@@ -103,7 +103,7 @@ class LocalStore(Store):
             if tree is None:
                 return sync_tree(self.path(staging))
             try:
-                tree.flush()
+                tree.flush(self.root)
             finally:
                 tree.close()
 

@@ -8,17 +8,23 @@ until another attempt has committed the range.
 import contextlib
 import tempfile
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
 
 import obstore
-from obstore.exceptions import AlreadyExistsError, BaseError, NotSupportedError
+from obstore.exceptions import AlreadyExistsError, BaseError, GenericError, NotSupportedError
 from obstore.store import from_url
 
 from schemas.dataset.layout import PROBE_PREFIX, TEMPORARY
 from schemas.errors import MachineError, OutputError
 from workers.store.store import Entry, Store
+
+_TRIES = 3
+"""How often a conditional put or a delete is made where no answer comes."""
+
+_NOT_IMPLEMENTED = ("NotImplemented", "501 Not Implemented")
+"""In the error of a store that refuses every conditional put."""
 
 _BEGUN = "_begun"
 """A mark in an attempt's folder from its beginning until it is swept."""
@@ -54,7 +60,9 @@ class ObjectStore(Store):
         except (NotSupportedError, NotImplementedError):
             refused = False
         except (BaseError, OSError) as error:
-            raise OutputError(f"{self.name} cannot be written: {_first_line(error)}") from error
+            if not any(word in str(error) for word in _NOT_IMPLEMENTED):
+                raise OutputError(f"{self.name} cannot be written: {_first_line(error)}") from error
+            refused = False
         if not refused:
             raise OutputError(
                 f"{self.name} does not refuse a second put where the first must stand: two workers could commit one range. "
@@ -92,14 +100,14 @@ class ObjectStore(Store):
     def put_if_absent(self, key: str, data: bytes, staging: str | None = None) -> bool:
         """Puts on the condition that nothing is there.
 
-        A put whose answer was lost is sent again by obstore and then refused: what is there tells whether it is ours,
-        because no two callers ever put the same bytes at one key.
+        A put whose answer was lost is sent again, and then refused: what is there tells whether it is ours, because no
+        two callers ever put the same bytes at one key.
         """
         if staging is not None and self.is_fenced(staging):
             raise FileNotFoundError(f"{staging} was swept")
         try:
             with self._explained(key):
-                obstore.put(self._bucket, key, data, mode="create")
+                _repeat_unanswered(lambda: obstore.put(self._bucket, key, data, mode="create"))
         except AlreadyExistsError:
             return self.read(key) == data
         return True
@@ -154,13 +162,14 @@ class ObjectStore(Store):
     def remove(self, key: str) -> None:
         """Deletes an object."""
         with self._explained(key), contextlib.suppress(FileNotFoundError):
-            obstore.delete(self._bucket, key)
+            _repeat_unanswered(lambda: obstore.delete(self._bucket, key))
 
     def remove_tree(self, prefix: str) -> None:
         """Deletes all objects below `prefix`; the mark of an attempt goes first."""
         self.remove(f"{prefix}/{_BEGUN}")
-        for entry in self.files(prefix):
-            self.remove(entry.key)
+        if keys := [entry.key for entry in self.files(prefix)]:
+            with self._explained(prefix), contextlib.suppress(FileNotFoundError):
+                _repeat_unanswered(lambda: obstore.delete(self._bucket, keys))
 
     @contextlib.contextmanager
     def scratch(self, name: str) -> Iterator[Path]:
@@ -187,6 +196,17 @@ class ObjectStore(Store):
             raise
         except BaseError as error:
             raise MachineError(f"{key} in {self.name}: {_first_line(error)}") from error
+
+
+def _repeat_unanswered(request: Callable[[], object]) -> None:
+    """Makes a request again where no answer came in time, which obstore does itself for all but two kinds of requests."""
+    for _ in range(_TRIES - 1):
+        try:
+            request()
+            return
+        except GenericError:
+            continue
+    request()
 
 
 def _first_line(error: BaseException) -> str:

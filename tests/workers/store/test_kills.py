@@ -1,64 +1,27 @@
 """The commit protocol, ended or disturbed at every single step that it takes on the disk."""
 
-import hashlib
-import json
 import shutil
 from pathlib import Path
 
 import pytest
 
-from schemas.dataset.layout import STAGING
 from schemas.errors import RunError
-from services.merge.step import merge
-from services.run.range_planner import committed_ranges, plan_ranges
 from tests.disk_faults import Killed, disk, lose_power
+from tests.made_up_runs import FIRST, RANGE, STOP, broken_promises, contents, leftovers, make_dataset
 from tests.made_up_scenes import attempt_at, small_scene, terms
 from tests.stored_images import iter_records
 from workers.store.commit import check_published, publish
-from workers.store.committed_rows import list_commits
 from workers.store.local import LocalStore
 from workers.store.sweep import sweep
 
-FIRST, STOP, RANGE = 4, 7, 2
 LAYOUTS = ("files", "tar")
 SOME = 9
 """Every so many steps by default; `--all` takes each of them."""
 
 
 def work(root: Path, layout: str, stop: int = STOP) -> str:
-    """What a coordinator with one worker does: clear up, make what is missing, merge. The dataset's digest."""
-    store = LocalStore(root)
-    store.prepare()
-    sweep(store, fenced=None)
-    settings = terms(layout=layout, first_scene=FIRST, range_size=RANGE)
-    for start, end in plan_ranges(FIRST, stop, RANGE, committed_ranges(list_commits(store))):
-        attempt_at(store, start, end, settings, small_scene).commit()
-    return merge(store, FIRST, stop).digest
-
-
-def contents_of(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "nothing"
-
-
-def contents(root: Path) -> dict[str, str]:
-    """Every file and its digest, but for what names an attempt or a time."""
-    files = [path for path in root.rglob("*") if path.is_file()]
-    found = {str(path.relative_to(root)): contents_of(path) for path in files}
-    varying = ("manifest/_commits/", "manifest/timings/", "manifest/_ranges/", "_SUCCESS")
-    return {name: "" if name.startswith(varying) else digest for name, digest in found.items()}
-
-
-def leftovers(root: Path) -> list[str]:
-    return [str(path) for path in (root / STAGING).rglob("*") if path.is_file() or path.parent.name.isdigit()]
-
-
-def broken_promises(root: Path) -> list[str]:
-    """What `_SUCCESS`, if it is there, says of files and is not so."""
-    success = root / "_SUCCESS"
-    if not success.exists():
-        return []
-    files = json.loads(success.read_text())["files"]
-    return [name for name, file in files.items() if file["sha256"] != contents_of(root / name)]
+    """A run from whatever is there; the dataset's digest."""
+    return make_dataset(LocalStore(root), layout, stop).digest
 
 
 @pytest.fixture(scope="module")
