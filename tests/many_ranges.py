@@ -99,15 +99,18 @@ class ManyRanges(LocalStore):
         return super().read(key)
 
     def size(self, key: str) -> int | None:
-        """Bytes at `key`."""
-        if key.startswith((f"{COMMITS}/", f"{RANGES}/")):
-            return len(self.read(key))
+        """Bytes at `key`; a record's is not told exactly."""
+        if key.startswith(f"{COMMITS}/"):
+            return 1
+        if key.startswith(f"{RANGES}/"):
+            scene_id, table = int(key.split("/")[2]), key.rpartition("/")[2].removesuffix(".parquet")
+            return len(_template(table, fails(scene_id), _digits(scene_id)))
         if key.startswith(f"{CATEGORY}/"):
             return TAR_BYTES
         return super().size(key)
 
     def files(self, prefix: str) -> Iterator[Entry]:
-        """Every file below `prefix`; a record's size is not told exactly."""
+        """Every file below `prefix`."""
         if prefix == COMMITS:
             yield from (Entry(commit_path(scene_id), 1) for scene_id in range(self.scenes))
         else:
@@ -188,5 +191,5 @@ def _template(table: str, failed: bool, digits: int) -> bytes:
         at = rows.schema.get_field_index("files")
         rows = rows.set_column(at, rows.schema.field(at), pa.ListArray.from_arrays(files.offsets, struct_))
     sink = pa.BufferOutputStream()
-    pq.write_table(rows, sink, compression="none", use_dictionary=False, write_statistics=False)
+    pq.write_table(rows, sink, compression="none", use_dictionary=False, write_statistics=False, store_schema=False)
     return sink.getvalue().to_pybytes()
