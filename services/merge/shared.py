@@ -3,9 +3,7 @@
 SQLite keeps the rows sorted by the UTF-8 bytes of their key, on disk, with a cache of a fixed size.
 """
 
-import contextlib
 import json
-import sqlite3
 from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -15,30 +13,20 @@ import pyarrow.compute as pc
 
 from schemas.dataset.layout import is_shape
 from schemas.dataset.tables import SCHEMAS
-from schemas.errors import CommitConflict, CorruptError, MachineError
+from schemas.errors import CommitConflict, CorruptError
+from services.merge.scratch import explain_full_disk, open_scratch
 
-CACHE_KIB = 16 << 10
-"""Memory for SQLite's cache."""
-
-_SETUP = """
-PRAGMA journal_mode = OFF;
-PRAGMA synchronous = OFF;
+_TABLES = """
 CREATE TABLE assets (instance_id TEXT, row TEXT, PRIMARY KEY (instance_id, row)) WITHOUT ROWID;
-CREATE TABLE files (path TEXT, sha256 TEXT, times INTEGER, PRIMARY KEY (path, sha256)) WITHOUT ROWID;
-BEGIN;
+CREATE TABLE files (path TEXT, sha256 TEXT, times INTEGER, PRIMARY KEY (path, sha256)) WITHOUT ROWID
 """
-"""No journal and no flush: another merge begins with a new file."""
 
 
 class SharedRows:
     """Takes assets and files range by range, in any order, and gives them back sorted."""
 
     def __init__(self, folder: Path) -> None:
-        # No other process opens the file, and file locks may be missing on a network drive.
-        uri = f"{(folder / 'shared.sqlite').absolute().as_uri()}?nolock=1"
-        self._db = sqlite3.connect(uri, uri=True, isolation_level=None)
-        self._db.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
-        self._db.executescript(_SETUP)
+        self._db = open_scratch(folder / "shared.sqlite", _TABLES)
         self.images = 0
 
     def add_assets(self, rows: pa.Table) -> None:
@@ -87,21 +75,10 @@ class SharedRows:
         self._db.close()
 
     def _insert(self, what: str, rows: Iterable[tuple[str, str]]) -> None:
-        with _explained():
+        with explain_full_disk():
             self._db.executemany(f"INSERT INTO {what}", rows)
 
     def _select(self, what: str) -> Iterator[tuple]:
         """Rows by the first column, which is read in the order of the primary key: nothing is sorted in memory."""
-        with _explained():
+        with explain_full_disk():
             yield from self._db.execute(f"SELECT {what} GROUP BY 1 ORDER BY 1")
-
-
-@contextlib.contextmanager
-def _explained() -> Iterator[None]:
-    try:
-        yield
-    except sqlite3.Error as error:
-        raise MachineError(
-            f"the merge could not keep its list of files on the disk: {error}; "
-            "free some space and start again, nothing finished is lost"
-        ) from error

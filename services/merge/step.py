@@ -4,23 +4,22 @@ import contextlib
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-
-from schemas.dataset.commit import CommitRecord, FileEntry
 from schemas.dataset.layout import MANIFEST, SUCCESS_FILE, is_merged_path, is_shape
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMA_VERSION, TABLES
-from schemas.errors import CorruptError, RunError
+from schemas.errors import RunError
 from services.merge.poses import PoseFiles
+from services.merge.published import PublishedFiles
+from services.merge.reading import Block, read_blocks
 from services.merge.shared import SharedRows
 from services.merge.tables import MergedTable
 from workers.store.canonical import dataset_digest
-from workers.store.commit import check_published, commits_digest
-from workers.store.committed_rows import iter_ranges, range_rows
+from workers.store.commit import commits_digest
 from workers.store.store import Store
 from workers.store.sweep import sweep
 
@@ -53,11 +52,9 @@ def merge(store: Store, first_scene: int, stop_scene: int) -> MergeResult:
     reopen(store)
     sweep(store)
     with store.scratch("merge") as folder:
-        with contextlib.closing(_Merging(folder)) as merging:
-            for records in iter_ranges(store, first_scene, stop_scene):
-                published = [entry for record in records for entry in check_published(store, record)]
-                rows = {table: range_rows(store, records, table) for table in TABLES}
-                merging.add_range(records, published, rows)
+        with contextlib.closing(_Merging(store, folder)) as merging:
+            for block in read_blocks(store, first_scene, stop_scene):
+                merging.add(block)
             success, files = merging.finish()
         _install(store, files)
     if commits_digest(store) != commits:
@@ -79,29 +76,27 @@ def read_success(store: Store) -> dict | None:
         success = json.loads(store.read(SUCCESS_FILE))
     except (FileNotFoundError, ValueError):
         return None
-    whole = isinstance(success, dict) and isinstance(success.get("schema_version"), int)
-    return success if whole and all(is_merged_path(path) for path in success.get("files", ())) else None
+    return success if isinstance(success, dict) and isinstance(success.get("schema_version"), int) else None
 
 
 class _Merging:
     """A merge in progress: takes each range in turn, keeps files below `folder`."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, store: Store, folder: Path) -> None:
+        self._published = PublishedFiles(store, folder)
         self._tables = {table: MergedTable(table, folder) for table in TABLES}
         self._poses = PoseFiles(folder)
         self._shared = SharedRows(folder)
         self._fingerprints: set[str] = set()
         self._scenes = Counter({"made": 0, "intrinsic": 0, "environmental": 0})
 
-    def add_range(
-        self, records: Sequence[CommitRecord], files: Sequence[FileEntry], rows: Mapping[str, pa.Table]
-    ) -> None:
-        """Takes the next range with its retries and all their files.
-
-        Raises CorruptError where it does not hold each scene once.
-        """
-        self._fingerprints |= {record.terms.fingerprint for record in records}
-        self._shared.add_files((entry.path, entry.sha256) for entry in files if is_shape(entry.path))
+    def add(self, block: Block) -> None:
+        """Takes the next ranges. Raises CorruptError where a file of theirs is missing, or rows do not join."""
+        self._published.check(block)
+        for record in chain.from_iterable(block.ranges):
+            self._fingerprints.add(record.terms.fingerprint)
+            self._shared.add_files((entry.path, entry.sha256) for entry in record.files if is_shape(entry.path))
+        rows = block.rows
         self._shared.add_assets(rows["assets"])
         self._shared.add_images(rows["views"])
         self._poses.add(rows["views"], rows["objects"])
@@ -109,14 +104,10 @@ class _Merging:
             if table != "assets":
                 self._tables[table].add(rows[table])
         self._scenes.update(made=rows["scenes"].num_rows, **Counter(rows["failures"].column("kind").to_pylist()))
-        ids = [scene_id for table in ("scenes", "failures") for scene_id in rows[table].column("scene_id").to_pylist()]
-        if sorted(ids) != list(records[0].span.scene_ids):
-            raise CorruptError(f"the rows of the range from scene {records[0].span.start} do not hold each scene once")
 
     def close(self) -> None:
         """Closes every file, finished or not."""
-        parts: list[PoseFiles | SharedRows | MergedTable] = [self._poses, self._shared, *self._tables.values()]
-        for part in parts:
+        for part in (self._published, self._poses, self._shared):
             part.close()
 
     def finish(self) -> tuple[dict, dict[str, Path]]:

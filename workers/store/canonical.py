@@ -48,7 +48,7 @@ class _Stream:
         elif pa.types.is_string(self._kind):
             filled = pc.fill_null(array, "") if gaps else array
             self._lengths.update(_bytes_of(pc.binary_length(filled), "<i8"))
-            self._values.update(_text_of(filled))
+            self._values.update(text_bytes(filled))
         else:
             dtype, nothing = _PRIMITIVES[self._kind]
             self._values.update(
@@ -113,6 +113,15 @@ def dataset_digest(tables: Mapping[str, str], files: Iterable[tuple[str, str]]) 
     return total.hexdigest()
 
 
+def text_bytes(array: pa.StringArray) -> bytes:
+    """The UTF-8 bytes of all strings, one after another, without a copy for each."""
+    if not len(array):
+        return b""
+    _, offsets, data = array.buffers()
+    ends = np.frombuffer(offsets, dtype=np.int32)[array.offset : array.offset + len(array) + 1]
+    return b"" if data is None else memoryview(data)[int(ends[0]) : int(ends[-1])].tobytes()
+
+
 def _is_list(kind: pa.DataType) -> bool:
     return bool(pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind))
 
@@ -128,12 +137,3 @@ def _tag(kind: pa.DataType) -> str:
 
 def _bytes_of(array: pa.Array, dtype: str) -> bytes:
     return np.asarray(array.to_numpy(zero_copy_only=False)).astype(dtype, copy=False).tobytes()
-
-
-def _text_of(array: pa.StringArray) -> bytes:
-    """The UTF-8 bytes of all strings, one after another, without a copy for each."""
-    if not len(array):
-        return b""
-    _, offsets, data = array.buffers()
-    ends = np.frombuffer(offsets, dtype=np.int32)[array.offset : array.offset + len(array) + 1]
-    return b"" if data is None else memoryview(data)[int(ends[0]) : int(ends[-1])].tobytes()

@@ -158,7 +158,7 @@ class LocalStore(Store):
     def files(self, prefix: str) -> Iterator[Entry]:
         """Every file below `prefix`; one that vanishes meanwhile is left out."""
         for entry in self._scan(prefix):
-            key = f"{prefix}/{entry.name}"
+            key = f"{prefix}/{entry.name}" if prefix else entry.name
             if entry.is_dir(follow_symlinks=False):
                 yield from self.files(key)
             elif (size := self.size(key)) is not None:

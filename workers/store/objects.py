@@ -153,6 +153,12 @@ class ObjectStore(Store):
         entries = (Entry(meta["path"], meta["size"]) for meta in found)
         yield from sorted(entries, key=lambda entry: entry.key.split("/"))
 
+    def listing(self) -> Iterator[Entry]:
+        """Every object there is, a page at a time."""
+        with self._explained("the listing"):
+            for page in obstore.list(self._bucket):
+                yield from (Entry(meta["path"], meta["size"]) for meta in page)
+
     def children(self, prefix: str) -> list[str]:
         """Common prefixes of keys, directly below `prefix`."""
         with self._explained(prefix):

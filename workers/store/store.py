@@ -98,6 +98,10 @@ class Store(Protocol):
     def files(self, prefix: str) -> Iterator[Entry]:
         """Every file at any depth below the folder `prefix`, in the order of the keys' parts."""
 
+    def listing(self) -> Iterator[Entry]:
+        """Every file there is, in any order; of an object store a page at a time."""
+        yield from self.files("")
+
     def children(self, prefix: str) -> list[str]:
         """Names of the folders directly below `prefix`, sorted."""
 

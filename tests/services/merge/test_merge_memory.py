@@ -22,10 +22,10 @@ SCENES = 320
 
 MERGE = """
 import json, resource, sys, time
-from services.merge import shared, tables
+from services.merge import reading, scratch, tables
 from services.merge.step import merge
 from workers.store.local import LocalStore
-tables.ROWS_PER_GROUP, tables.ROWS_PER_BLOCK, shared.CACHE_KIB = json.loads(sys.argv[5])
+tables.ROWS_PER_GROUP, reading.ROWS_PER_BLOCK, scratch.CACHE_KIB = json.loads(sys.argv[5])
 warm, root, scenes = LocalStore(sys.argv[1]), LocalStore(sys.argv[2]), int(sys.argv[3])
 merge(warm, 0, int(sys.argv[4]))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -84,7 +84,7 @@ def commit_ranges(root, ranges: int) -> None:
             schema_version=1,
             span=Span(start=start, stop=start + SCENES),
             attempt="r0-made-up",
-            terms=terms(range_size=SCENES),
+            terms=terms(range_size=SCENES, layout="tar"),
             files=tuple(files),
             tables=tables,
             scenes=tuple(SceneMark(scene_id=i, outcome="made", digest="") for i in range(start, start + SCENES)),

@@ -4,9 +4,11 @@ import urllib.parse
 
 import pyarrow as pa
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from schemas.dataset.tables import SCHEMAS
-from services.merge.poses import escaped, object_lines
+from services.merge.poses import escaped, object_lines, shortest
 from tests.made_up_datasets import FIRST, STOP, plain_rows
 from tests.made_up_scenes import fails, made_scene
 
@@ -69,8 +71,15 @@ def test_objects_has_a_line_for_everything_in_a_pose_table_included(merged):
 @pytest.mark.parametrize("name", ["blue mug", "50%", "a\tb", "non\u00a0breaking", "line\nend", "plain-name_1.2"])
 def test_a_name_with_spaces_is_one_word_and_can_be_had_back(name):
     row = {**made_scene(3).rows["objects"][0], "instance_id": name}
-    (line,) = object_lines(pa.Table.from_pylist([row], schema=SCHEMAS["objects"]))
+    (line,) = object_lines(pa.Table.from_pylist([row], schema=SCHEMAS["objects"])).decode().splitlines(keepends=True)
     words = line.removesuffix("\n").split()
     assert len(words) == 22
     assert urllib.parse.unquote(words[2]) == name
     assert (escaped(name) == name) == (name == "plain-name_1.2")
+
+
+@given(st.lists(st.floats(allow_nan=False, allow_infinity=False)))
+def test_every_double_is_written_as_python_writes_it(numbers):
+    edges = [0.0, -0.0, 1.0, 1e-4, 9.999e-5, 1e10, 9999999999.999998, 1e15, 1e16, 5e-324, 1.7976931348623157e308]
+    for values in (numbers, numbers + edges):
+        assert shortest(pa.array(values, pa.float64())).to_pylist() == list(map(repr, values))

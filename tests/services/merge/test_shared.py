@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CommitConflict, CorruptError, MachineError
-from services.merge import shared as module
+from services.merge import scratch as module
 from services.merge.shared import SharedRows
 from tests.made_up_scenes import made_scene
 
@@ -86,7 +86,7 @@ def test_an_asset_comes_back_once_as_it_was_and_must_be_the_same_in_every_range(
 
 def test_a_full_disk_is_explained(shared):
     shared._db.execute("PRAGMA max_page_count = 4")
-    with pytest.raises(MachineError, match=r"disk is full; free some space"):
+    with pytest.raises(MachineError, match=r"could not write its files: .* full; free some space"):
         shared.add_files((f"{i:05d}", f"{i:064d}") for i in range(1000))
 
 

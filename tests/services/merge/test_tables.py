@@ -6,6 +6,7 @@ import pytest
 
 from schemas.dataset.tables import SCHEMAS, SORT_KEYS, TABLES
 from schemas.errors import CorruptError
+from services.merge import reading
 from services.merge import tables as merge_tables
 from services.merge.step import merge
 from tests.made_up_datasets import FIRST, STOP, dataset_at, plain_rows
@@ -54,8 +55,9 @@ def test_a_dataset_in_which_everything_failed_still_opens(tmp_path):
 
 
 def test_the_digest_does_not_depend_on_the_size_of_merged_files(merged, tmp_path, monkeypatch):
-    for name, value in (("ROWS_PER_FILE", 10), ("ROWS_PER_GROUP", 7), ("ROWS_PER_BLOCK", 3)):
+    for name, value in (("ROWS_PER_FILE", 10), ("ROWS_PER_GROUP", 7)):
         monkeypatch.setattr(merge_tables, name, value)
+    monkeypatch.setattr(reading, "ROWS_PER_BLOCK", 3)
     assert merge(dataset_at(tmp_path), FIRST, STOP) == merged[1]
     files = sorted((tmp_path / "manifest/views").glob("*/*.parquet"))
     assert max(pa.parquet.read_metadata(path).num_rows for path in files) == 10
@@ -64,18 +66,17 @@ def test_the_digest_does_not_depend_on_the_size_of_merged_files(merged, tmp_path
 
 
 @pytest.mark.parametrize("order", [[3, 4, 4], [4, 3], [3, 7, 6]], ids=["twice", "backwards", "across blocks"])
-def test_rows_that_come_twice_or_out_of_order_are_refused(tmp_path, monkeypatch, order):
-    monkeypatch.setattr(merge_tables, "ROWS_PER_BLOCK", 2)
+@pytest.mark.parametrize("block", [1, 2, 3])
+def test_rows_that_come_twice_or_out_of_order_are_refused(tmp_path, block, order):
     table = merge_tables.MergedTable("scenes", tmp_path)
+    rows = table_of_rows("scenes", [made_scene(scene_id).rows["scenes"][0] for scene_id in order])
 
     def add_all():
-        for scene_id in order:
-            table.add(table_of_rows("scenes", made_scene(scene_id).rows["scenes"]))
-        table.finish(["mug"])
+        for start in range(0, len(order), block):
+            table.add(rows.slice(start, block))
 
     with pytest.raises(CorruptError, match=r"scenes: the key \(scene_id\) = .* comes after .* the ranges do not join"):
         add_all()
-    table.close()
 
 
 def test_scenes_whose_pose_ids_collide_are_refused(tmp_path):

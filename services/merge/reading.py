@@ -1,0 +1,172 @@
+"""Reading of committed ranges for the merge: several at a time, in order, in blocks of ranges whose rows are joined."""
+
+import functools
+import hashlib
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import pyarrow as pa
+
+from schemas.dataset.commit import CommitRecord
+from schemas.dataset.layout import range_table_path
+from schemas.dataset.tables import SCHEMAS, TABLES
+from schemas.errors import CorruptError
+from workers.store.committed_rows import iter_ranges, range_rows
+from workers.store.manifest import conform, decode_rows
+from workers.store.store import Store
+
+RANGES_PER_BLOCK = 128
+ROWS_PER_BLOCK = 4_096
+"""A block ends with either of them, rows of all tables counted: small enough for memory, large enough to be fast."""
+
+AT_ONCE = 16
+"""Ranges that are read at once from an object store, where each request waits. A disk is read one by one."""
+
+A = TypeVar("A")
+B = TypeVar("B")
+Range = Sequence[CommitRecord]
+"""A range's record, followed by its retries."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Consecutive ranges, and the rows of every table in their order."""
+
+    ranges: Sequence[Range]
+    rows: Mapping[str, pa.Table]
+
+
+@dataclass(frozen=True)
+class _Read:
+    """A range as it was read: tables that have rows, as Parquet bytes, or decoded where a retry replaced some."""
+
+    records: Range
+    tables: Mapping[str, bytes | pa.Table]
+
+    @property
+    def rows(self) -> int:
+        """Of all tables; those of retries are counted with what they replace."""
+        return sum(entry.rows for record in self.records for entry in record.tables.values())
+
+
+def read_blocks(store: Store, first_scene: int, stop_scene: int) -> Iterator[Block]:
+    """All ranges of [first_scene, stop_scene) in order; of an object store some are read ahead.
+
+    Raises as `iter_ranges`, and CorruptError naming a table that is missing or altered, or a range that does not hold
+    each of its scenes once.
+    """
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        ranges = iter_ranges(store, first_scene, stop_scene)
+        spread = functools.partial(map_ahead, pool) if store.root is None else map
+        block: list[_Read] = []
+        rows = 0
+        for read in spread(lambda records: _read_range(store, records), ranges):
+            block.append(read)
+            rows += read.rows
+            if len(block) >= RANGES_PER_BLOCK or rows >= ROWS_PER_BLOCK:
+                yield _joined(block)
+                block, rows = [], 0
+        if block:
+            yield _joined(block)
+
+
+def map_ahead(pool: ThreadPoolExecutor, function: Callable[[A], B], items: Iterable[A], ahead: int = 2) -> Iterator[B]:
+    """The results of `function`, in the order of `items`; at most `AT_ONCE` times `ahead` of them are kept."""
+    window = ahead * AT_ONCE
+    waiting: deque[Future[B]] = deque()
+    try:
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            if len(waiting) >= window:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+def _read_range(store: Store, records: Range) -> _Read:
+    if len(records) > 1:
+        return _Read(records, {table: range_rows(store, records, table) for table in TABLES})
+    (record,) = records
+    return _Read(records, {table: _read_table(store, record, table) for table in TABLES if record.tables[table].rows})
+
+
+def _read_table(store: Store, record: CommitRecord, table: str) -> bytes:
+    """The bytes of a published file. Raises CorruptError naming one that is missing or altered."""
+    path = range_table_path(record.span.start, table, record.span.retry)
+    entry = next((file for file in record.files if file.path == path), None)
+    if entry is None:
+        raise CorruptError(f"the commit of the range from scene {record.span.start} names no {path}")
+    try:
+        data = store.read(path)
+    except FileNotFoundError as error:
+        raise CorruptError(f"{path} is named by a commit and is neither staged nor published") from error
+    if hashlib.sha256(data).hexdigest() != entry.sha256:
+        raise CorruptError(f"{path} does not match the SHA-256 in its commit: restore it from a copy")
+    return data
+
+
+def _joined(block: Sequence[_Read]) -> Block:
+    """The block's rows, table by table. Raises CorruptError where a range does not hold each scene once."""
+    ranges = [read.records for read in block]
+    name = f"a table of the ranges from scene {ranges[0][0].span.start}"
+    tables = {}
+    for table in TABLES:
+        parts = [(read.records, _decoded(read, table)) for read in block if table in read.tables]
+        tables[table] = _concatenated(table, [rows for _, rows in parts], name)
+        _check_spans(table, tables[table], parts)
+    ids = np.concatenate([tables[table].column("scene_id").to_numpy() for table in ("scenes", "failures")])
+    spans = [records[0].span for records in ranges]
+    wrong = np.setxor1d(ids, np.arange(spans[0].start, spans[-1].stop)).tolist() or _repeated(ids)
+    if wrong:
+        raise _not_each_once(next(span.start for span in reversed(spans) if span.start <= wrong[0]))
+    return Block(ranges, tables)
+
+
+def _decoded(read: _Read, table: str) -> pa.Table:
+    """A range's rows in the schema that they were written in. Raises CorruptError where there are more or fewer."""
+    data = read.tables[table]
+    if isinstance(data, pa.Table):
+        return data
+    span, awaited = read.records[0].span, read.records[0].tables[table].rows
+    path = range_table_path(span.start, table, span.retry)
+    rows = decode_rows(data, path)
+    if len(rows) != awaited:
+        raise CorruptError(f"{path} has {len(rows)} rows, and its commit says {awaited}")
+    return rows
+
+
+def _concatenated(table: str, parts: Sequence[pa.Table], name: str) -> pa.Table:
+    """Rows in today's schema, in one piece. Ranges are nearly always of one schema, so it is adapted once."""
+    if not parts:
+        return SCHEMAS[table].empty_table()
+    if any(part.schema != parts[0].schema for part in parts):
+        parts = [conform(table, part, name) for part in parts]
+    return conform(table, pa.concat_tables(parts), name).combine_chunks()
+
+
+def _check_spans(table: str, rows: pa.Table, parts: Sequence[tuple[Range, pa.Table]]) -> None:
+    """Raises CorruptError where a row is of a scene outside its range."""
+    if "scene_id" not in rows.column_names or not parts:
+        return
+    counts = [len(rows) for _, rows in parts]
+    spans = np.repeat([(records[0].span.start, records[0].span.stop) for records, _ in parts], counts, axis=0)
+    ids = rows.column("scene_id").to_numpy()
+    outside = np.flatnonzero((ids < spans[:, 0]) | (ids >= spans[:, 1]))
+    if len(outside):
+        raise _not_each_once(int(spans[outside[0], 0]))
+
+
+def _repeated(ids: np.ndarray) -> list[int]:
+    values, counts = np.unique(ids, return_counts=True)
+    return values[counts > 1].tolist()
+
+
+def _not_each_once(start: int) -> CorruptError:
+    return CorruptError(f"the rows of the range from scene {start} do not hold each scene once")
