@@ -140,7 +140,12 @@ class Coordinator:
         except RayTaskError as error:
             if isinstance(error.cause, VersoError):
                 raise error.cause from error
-            raise RunError(f"a worker raised an error that is a bug:\n{error}") from error
+            log_event("bug", logging.ERROR, range=spans[0].start, traceback=str(error))
+            said = next(iter(str(error.cause).splitlines()), "")
+            raise RunError(
+                f"a worker raised an error that is a bug, with the scenes from {spans[0].start}: "
+                f"{type(error.cause).__name__}: {said}; what is committed is kept, {self._store.name}/_logs has the traceback"
+            ) from error
         except RayError as error:
             return self._handle_death(spans, error, ref in self._stalled)
         finally:
@@ -148,6 +153,9 @@ class Coordinator:
         self._tally.add(report)
         for span in report.spans:
             log_event("range committed", range=span.start, **span.model_dump(include={"stop", "won", "made", "failed"}))
+            for bug in span.bugs:
+                log_event("bug", logging.ERROR, range=span.start, error=bug)
+                say(bug)
         if self._tally.conflicts:
             raise CommitConflict(self._tally.conflicts[0])
         if self._tally.failed.total() > self._limits.failures:
