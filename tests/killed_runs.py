@@ -19,10 +19,18 @@ from services.run.processes import Process, read_process
 ROOT = Path(__file__).resolve().parents[1]
 
 
-@contextlib.contextmanager
-def deadly_scene(out: Path, scene_id: int) -> Iterator[list[int]]:
+def deadly_scene(out: Path, scene_id: int) -> contextlib.AbstractContextManager[list[int]]:
     """While this lasts, whichever process begins the scene is killed; yields the pids."""
-    killed: list[int] = []
+    return disturbed_scene(out, scene_id, signal.SIGKILL)
+
+
+@contextlib.contextmanager
+def disturbed_scene(out: Path, scene_id: int | None, number: int, most: int = 1000) -> Iterator[list[int]]:
+    """While this lasts, whichever process begins the scene (None: commits) gets the signal, at most `most` of them.
+
+    Yields their pids.
+    """
+    disturbed: list[int] = []
     over = threading.Event()
 
     def watch() -> None:
@@ -30,14 +38,15 @@ def deadly_scene(out: Path, scene_id: int) -> Iterator[list[int]]:
             with contextlib.suppress(OSError, ValueError):  # folders come and go while we look
                 for note in out.glob("_staging/*/*/_current"):
                     pid = int(note.parent.name.split("-")[-2])
-                    if pid not in killed and json.loads(note.read_text()).get("scene_id") == scene_id:
-                        os.kill(pid, signal.SIGKILL)
-                        killed.append(pid)
+                    new = pid not in disturbed and len(disturbed) < most
+                    if new and json.loads(note.read_text()).get("scene_id") == scene_id:
+                        os.kill(pid, number)
+                        disturbed.append(pid)
 
     watcher = threading.Thread(target=watch)
     watcher.start()
     try:
-        yield killed
+        yield disturbed
     finally:
         over.set()
         watcher.join()

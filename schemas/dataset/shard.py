@@ -58,6 +58,8 @@ class SpanReport(Frozen):
     made: int
     failed: dict[str, int]
     """Failures by `kind: reason`."""
+    bugs: tuple[str, ...] = ()
+    """Scenes that ended in an error nobody expected: the scene, what is in it, and the error, each in one line."""
 
 
 class ShardReport(Frozen):

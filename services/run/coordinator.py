@@ -1,6 +1,7 @@
 """The coordinator: gives shards to Ray, a limited number at a time, reads every report and counts the attempts."""
 
 import logging
+import signal
 import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
@@ -8,15 +9,19 @@ from dataclasses import dataclass, field
 
 import ray
 from ray.exceptions import OutOfMemoryError, RayError, RayTaskError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from schemas.dataset.commit import Span
 from schemas.dataset.layout import commit_path, staging_path
 from schemas.dataset.shard import Blame, Reason, ShardOrder, ShardReport
 from schemas.errors import CommitConflict, RunError, VersoError
-from services.run.progress import log_event
+from services.run.processes import Process, send
+from services.run.progress import log_event, say
+from services.run.stalls import Stall
+from services.run.watchdog import Watchdog, end_worker_here, find_own_workers
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.run_shard import TIMED_OUT, run_shard
-from workers.store.attempt import attempts_at, blamed_scene
+from workers.store.attempt import attempts_at, blamed_scene, host_part, retry_of_attempt
 from workers.store.commit import read_summary
 from workers.store.store import Store
 from workers.store.sweep import sweep_attempt
@@ -69,6 +74,7 @@ class Limits:
 
 
 _run_shard = ray.remote(num_cpus=1, max_retries=0)(run_shard)
+_end_worker = ray.remote(num_cpus=0, max_retries=0)(end_worker_here)
 
 
 class Coordinator:
@@ -85,6 +91,8 @@ class Coordinator:
         self._tally = tally
         self._again: deque[tuple[Span, ...]] = deque()
         self._running: dict[ray.ObjectRef, tuple[Span, ...]] = {}
+        self._stalled: set[ray.ObjectRef] = set()
+        """Shards whose workers the watchdog ended."""
         self._deaths: Counter[tuple[str, int]] = Counter()
         """By ("scene", id), or ("range", start) where no scene was begun."""
         self._blamed: dict[int, Blame] = {}
@@ -96,11 +104,14 @@ class Coordinator:
         many scenes fail. On KeyboardInterrupt, committed ranges stay and running shards are ended.
         """
         try:
-            while self._fill_slots(shards):
-                ready, _ = ray.wait(list(self._running), num_returns=1, timeout=POLL_S)
-                for ref in ready:
-                    self._collect(ref, self._running.pop(ref))
-                progress(self._tally)
+            with Watchdog(self._store, self._order.label, self._order.job.run.scene_timeout_s) as watchdog:
+                while self._fill_slots(shards):
+                    ready, _ = ray.wait(list(self._running), num_returns=1, timeout=POLL_S)
+                    for ref in ready:
+                        self._collect(ref, self._running.pop(ref))
+                    for stall in watchdog.take_stalls():
+                        self._end_stalled(stall)
+                    progress(self._tally)
         except BaseException:
             self._cancel()
             raise
@@ -129,12 +140,22 @@ class Coordinator:
         except RayTaskError as error:
             if isinstance(error.cause, VersoError):
                 raise error.cause from error
-            raise RunError(f"a worker raised an error that is a bug:\n{error}") from error
+            log_event("bug", logging.ERROR, range=spans[0].start, traceback=str(error))
+            said = next(iter(str(error.cause).splitlines()), "")
+            raise RunError(
+                f"a worker raised an error that is a bug, with the scenes from {spans[0].start}: "
+                f"{type(error.cause).__name__}: {said}; what is committed is kept, {self._store.name}/_logs has the traceback"
+            ) from error
         except RayError as error:
-            return self._handle_death(spans, error)
+            return self._handle_death(spans, error, ref in self._stalled)
+        finally:
+            self._stalled.discard(ref)
         self._tally.add(report)
         for span in report.spans:
             log_event("range committed", range=span.start, **span.model_dump(include={"stop", "won", "made", "failed"}))
+            for bug in span.bugs:
+                log_event("bug", logging.ERROR, range=span.start, error=bug)
+                say(bug)
         if self._tally.conflicts:
             raise CommitConflict(self._tally.conflicts[0])
         if self._tally.failed.total() > self._limits.failures:
@@ -144,7 +165,45 @@ class Coordinator:
                 'run.max_failure_share allows: see `verso query OUT "select * from failures"`'
             )
 
-    def _handle_death(self, spans: tuple[Span, ...], error: RayError) -> None:
+    def _end_stalled(self, stall: Stall) -> None:
+        """Says that a worker shows no progress, and ends it: what follows is the same as after any other death."""
+        own = {process.pid: process for process in find_own_workers()}
+        if stall.attempt is None:
+            return self._end_stopped(stall.idle_s, list(own.values()))
+        start, retry = stall.attempt.start, retry_of_attempt(stall.attempt.name)
+        ref = next((ref for ref, spans in self._running.items() if (start, retry) in _keys(spans)), None)
+        if ref is None:
+            return
+        self._stalled.add(ref)
+        pid, host = stall.attempt.pid, stall.attempt.host
+        log_event("worker stalled", logging.WARNING, range=start, scene=stall.scene_id, pid=pid, host=host)
+        doing = "committing" if stall.scene_id is None else f"scene {stall.scene_id}"
+        stopped = ", which was stopped by a signal" if pid in own and own[pid].stopped else ""
+        say(
+            f"range from {start}, {doing}: no progress for {stall.idle_s:.0f} s by process {pid} on {host}{stopped}: "
+            "it is ended, and the range is made again"
+        )
+        if pid in own:
+            send(own[pid], signal.SIGKILL)
+            return
+        for node in _nodes_called(host):
+            _end_worker.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)).remote(pid)
+
+    def _end_stopped(self, idle_s: float, own: list[Process]) -> None:
+        """Says that no worker has begun a range for a long time, and ends those that were stopped by a signal."""
+        stopped = [process for process in own if process.stopped]
+        named = ", ".join(str(process.pid) for process in stopped)
+        log_event("nothing begun", logging.WARNING, seconds=round(idle_s), stopped=named)
+        why = (
+            f"process {named} was stopped by a signal and is ended"
+            if stopped
+            else "Ray has started none: see `ray status`"
+        )
+        say(f"no worker has begun a range for {idle_s:.0f} s: {why}")
+        for process in stopped:
+            send(process, signal.SIGKILL)
+
+    def _handle_death(self, spans: tuple[Span, ...], error: RayError, stalled: bool = False) -> None:
         """Counts the ranges that a dead worker committed, then gives out the others again, one by one."""
         left = list(spans)
         while left and self._store.size(commit_path(left[0].start, left[0].retry)) is not None:
@@ -153,13 +212,15 @@ class Coordinator:
             self._tally.failed.update(kind for _, kind, _ in summary.failed)
             left.pop(0)
         if left:
-            self._count_death(left[0], error)
+            self._count_death(left[0], error, stalled)
         self._again.extend((span,) for span in left)
 
-    def _count_death(self, span: Span, error: RayError) -> None:
+    def _count_death(self, span: Span, error: RayError, stalled: bool) -> None:
         """Counts a death against the scene in progress. Raises RunError where workers die before they begin a scene."""
         scene, timed_out = self._find_evidence(span)
-        reason: Reason = "time" if timed_out else "memory" if isinstance(error, OutOfMemoryError) else "killed"
+        reason: Reason = (
+            "time" if timed_out or stalled else "memory" if isinstance(error, OutOfMemoryError) else "killed"
+        )
         message = " ".join(str(error).split())[:300]
         log_event("worker lost", logging.WARNING, range=span.start, scene=scene, reason=reason, error=message)
         key = ("range", span.start) if scene is None else ("scene", scene)
@@ -169,8 +230,8 @@ class Coordinator:
             return
         if scene is None:
             raise RunError(
-                f"the worker for the scenes from {span.start} died {deaths} times before it began one "
-                f"({message}): see `verso doctor`"
+                f"the worker for the scenes from {span.start} died {deaths} times before it began one or while it committed "
+                f"({reason}: {message}): see `verso doctor`"
             )
         self._blamed[scene] = Blame(scene_id=scene, reason=reason, detail=EXPLANATIONS[reason], attempts=deaths)
 
@@ -189,3 +250,13 @@ class Coordinator:
             if scene is not None:
                 return scene, timed_out
         return None, False
+
+
+def _keys(spans: tuple[Span, ...]) -> list[tuple[int, int]]:
+    return [(span.start, span.retry) for span in spans]
+
+
+def _nodes_called(host: str) -> list[str]:
+    """Ids of the cluster's nodes whose host has this name, as attempts are named."""
+    nodes = [node for node in ray.nodes() if node["Alive"]]
+    return [node["NodeID"] for node in nodes if host_part(node["NodeManagerHostname"]) == host]

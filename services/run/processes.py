@@ -38,6 +38,11 @@ class Process:
         """Whether only its exit status is left."""
         return self.state in "ZX"
 
+    @property
+    def stopped(self) -> bool:
+        """Whether a signal stopped it, as SIGSTOP does."""
+        return self.state in "Tt"
+
 
 def read_process(pid: int) -> Process | None:
     """The process with this id, None where there is none."""

@@ -61,6 +61,11 @@ class ProgressLine:
             self._bar.close()
 
 
+def say(line: str) -> None:
+    """Prints a message while a bar may be shown."""
+    tqdm.write(f"verso: {line}", file=sys.stderr)
+
+
 @contextmanager
 def event_log(out: Path | None) -> Iterator[None]:
     """Within the block `log_event` writes to OUT/_logs/verso.jsonl, rotated; nowhere without an `out` on a disk."""

@@ -15,11 +15,12 @@ from typing import IO
 from schemas.dataset.commit import Span
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, staging_path
-from schemas.dataset.shard import ShardOrder, ShardReport, SpanReport
-from schemas.errors import FingerprintError, SceneError
+from schemas.dataset.shard import Blame, ShardOrder, ShardReport, SpanReport
+from schemas.errors import FingerprintError, SceneError, VersoError
 from schemas.job.render import Tier
 from schemas.scene.scene import SceneOutput
 from workers.assets.catalogue import Catalogue
+from workers.pipeline.bugs import UnexpectedError, explain, keep_traceback, name_scene
 from workers.pipeline.context import WorkerContext, open_worker
 from workers.pipeline.fingerprint import take_fingerprint
 from workers.pipeline.make_scene import make_scene
@@ -46,7 +47,7 @@ class BlamedScene(SceneError):
 
 
 def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
-    """Make and commit every range of the order. A scene that cannot be made is a row; any other error propagates."""
+    """Make and commit every range of the order. A scene that cannot be made is a row; errors of the stack propagate."""
     begun, cpu = time.perf_counter(), time.process_time()
     require_tier(order.job.render)
     context = open_worker(order.job, catalogue)
@@ -69,23 +70,21 @@ def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
 
 
 def run_span(context: WorkerContext, store: Store, order: ShardOrder, span: Span, total: Stopwatch) -> SpanReport:
-    """Make one range and commit it."""
+    """Make one range and commit it. A scene that ends in an error nobody expected is a row too, and is reported."""
     blamed = {blame.scene_id: blame for blame in order.blamed}
     attempt = begin_attempt(store, span, order.terms, order.label)
     failed: Counter[str] = Counter()
+    bugs: list[str] = []
     with _traceback_file(store, attempt) as tracebacks:
         for scene_id in span.scene_ids:
-            if scene_id in blamed:
-                blame = blamed[scene_id]  # not begun, so that no worker dies in it
-                category = choose_category(context.job, SceneChance(context.job.seed, scene_id))
-                output = failed_scene(scene_id, category, BlamedScene(blame.reason, blame.detail), blame.attempts)
-            else:
-                attempt.begin_scene(scene_id)
-                with _time_limit(context.job.run.scene_timeout_s, tracebacks):
-                    output = run_scene(context, scene_id, total)
-            failed.update(f"{row['kind']}: {row['reason']}" for row in output.rows.get("failures", ()))
-            with total.stage("write"):
+            try:
+                output = _attempt_scene(context, attempt, scene_id, tracebacks, total, blamed.get(scene_id))
+            except UnexpectedError as error:
+                where = keep_traceback(store, scene_id, error.__cause__ or error)
+                bugs.append(f"{name_scene(context, scene_id)}: {error.detail}{where}")
+                output = failed_scene(scene_id, _category(context, scene_id), error)
                 attempt.add_scene(output)
+            failed.update(f"{row['kind']}: {row['reason']}" for row in output.rows.get("failures", ()))
     with total.stage("commit"):
         result = attempt.commit()
     return SpanReport(
@@ -96,12 +95,43 @@ def run_span(context: WorkerContext, store: Store, order: ShardOrder, span: Span
         conflict=result.conflict,
         made=len(span.scene_ids) - failed.total(),
         failed=dict(failed),
+        bugs=tuple(bugs),
     )
+
+
+def _attempt_scene(
+    context: WorkerContext,
+    attempt: Attempt,
+    scene_id: int,
+    tracebacks: IO[str],
+    total: Stopwatch,
+    blame: Blame | None,
+) -> SceneOutput:
+    """One scene, made or refused, and written. Raises UnexpectedError; then nothing of it is written."""
+    if blame is not None:  # not begun, so that no worker dies in it
+        category = _category(context, scene_id)
+        output = failed_scene(scene_id, category, BlamedScene(blame.reason, blame.detail), blame.attempts)
+        attempt.add_scene(output)
+        return output
+    attempt.begin_scene(scene_id)
+    try:
+        with _time_limit(context.job.run.scene_timeout_s, tracebacks):
+            output = run_scene(context, scene_id, total)
+    except VersoError:
+        raise
+    except Exception as error:
+        raise explain(error) from error
+    try:
+        with total.stage("write"):
+            attempt.add_scene(output)
+    except (ValueError, TypeError, KeyError) as error:  # checked before the first byte is written
+        raise explain(error) from error
+    return output
 
 
 def run_scene(context: WorkerContext, scene_id: int, total: Stopwatch) -> SceneOutput:
     """One scene: made, or a row that says why not."""
-    category = choose_category(context.job, SceneChance(context.job.seed, scene_id))
+    category = _category(context, scene_id)
     stopwatch = Stopwatch()
     try:
         output = record_scene(context, make_scene(context, scene_id, stopwatch), stopwatch)
@@ -109,6 +139,10 @@ def run_scene(context: WorkerContext, scene_id: int, total: Stopwatch) -> SceneO
         output = failed_scene(scene_id, category, error)
     total.add(stopwatch)
     return replace(output, rows={**output.rows, "timings": [timing_row(scene_id, category, stopwatch)]})
+
+
+def _category(context: WorkerContext, scene_id: int) -> str:
+    return choose_category(context.job, SceneChance(context.job.seed, scene_id))
 
 
 @cache

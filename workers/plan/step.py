@@ -14,7 +14,7 @@ from schemas.scene.plan import ObjectStart, ScenePlan, Table
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.shape import Asset, Hull, Mesh
 from workers.assets.appearance.draw import draw_appearance
-from workers.assets.catalogue import Catalogue
+from workers.assets.catalogue import Catalogue, InstanceRef
 from workers.assets.step import choose_object, choose_table, load_asset
 from workers.geometry.camera import orbit_pose
 from workers.geometry.elevation import sample_elevation
@@ -31,13 +31,18 @@ RECESS_M = 0.05
 
 def plan_scene(job: Job, catalogue: Catalogue, chance: SceneChance) -> ScenePlan:
     """Everything about a scene that chance decides. Raises MeshError where an asset is unfit, StartError as `draw_scene`."""
-    assets = []
+    objects, table = choose_assets(job, catalogue, chance)
+    assets = [load_asset(catalogue, ref) for ref in objects]
+    return draw_scene(job, chance, load_asset(catalogue, table), *assets)
+
+
+def choose_assets(job: Job, catalogue: Catalogue, chance: SceneChance) -> tuple[list[InstanceRef], InstanceRef]:
+    """The instances of a scene, before any is loaded: its objects in order, and its table."""
+    objects = []
     for number in range(count_objects(job, chance)):
         category = choose_category(job, chance, number)
-        ref = choose_object(catalogue, category, chance.object_stream(Stream.OBJECT, number))
-        assets.append(load_asset(catalogue, ref))
-    table = load_asset(catalogue, choose_table(catalogue, chance.stream(Stream.TABLE)))
-    return draw_scene(job, chance, table, *assets)
+        objects.append(choose_object(catalogue, category, chance.object_stream(Stream.OBJECT, number)))
+    return objects, choose_table(catalogue, chance.stream(Stream.TABLE))
 
 
 def count_objects(job: Job, chance: SceneChance) -> int:

@@ -56,10 +56,15 @@ def begin_attempt(store: Store, span: Span, terms: CommitTerms, label: str = "")
         raise OutputError(
             f"{store.name} is an object store, which needs output.layout: tar; the job says {terms.layout}"
         )
-    host = re.sub(r"[^A-Za-z0-9_.]", "_", socket.gethostname())
+    host = host_part(socket.gethostname())
     name = "-".join(part for part in (f"r{span.retry}", label, host, str(os.getpid()), uuid.uuid4().hex[:12]) if part)
     store.open_staging(staging_path(span.start, name))
     return Attempt(store, span, terms, name)
+
+
+def host_part(host: str) -> str:
+    """A host's name as a part of an attempt's name, where `-` separates parts."""
+    return re.sub(r"[^A-Za-z0-9_.]", "_", host)
 
 
 def retry_of_attempt(name: str) -> int | None:
