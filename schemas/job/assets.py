@@ -88,7 +88,7 @@ class SplitShares(Frozen):
 
 
 class MeshLimits(Frozen):
-    """Caps on meshes from outside: one that is over a cap is skipped and counted."""
+    """Caps on meshes from outside: one that is over a cap is left out and counted."""
 
     max_file_mb: Positive = 256.0
     """Largest mesh file, MB."""
@@ -98,6 +98,20 @@ class MeshLimits(Frozen):
     """Most faces."""
     max_texture_px: PositiveInt = 8192
     """Longest side of a texture, pixels."""
+    max_textures_mpx: Positive = 128.0
+    """Most pixels, millions, of all textures of an asset; those beyond are left out."""
+    max_asset_mb: Positive = 512.0
+    """Most bytes, MB, of a mesh or URDF and all files that it refers to."""
+    max_nodes: PositiveInt = 4096
+    """Most parts of a mesh, nodes of a GLB's tree, and links, joints or visuals of a URDF."""
+    min_size_m: Positive = 0.001
+    """Smallest bounding-box diagonal of an object or table, metres, after scaling."""
+    max_size_m: Positive = 20.0
+    """Largest bounding-box diagonal of an object or table, metres, after scaling."""
+    max_cpu_s: Positive = 30.0
+    """Most processor time for reading an asset, seconds."""
+    max_memory_mb: Annotated[int, Field(ge=1024)] = 2048
+    """Most memory for reading an asset, MiB."""
 
 
 class Assets(Frozen):

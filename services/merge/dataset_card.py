@@ -83,8 +83,9 @@ def describe_sources(catalogue: Catalogue) -> list[str]:
 
 
 def describe_left_out(catalogue: Catalogue) -> list[str]:
-    """One line for each folder with files that were left out: how many, and why."""
+    """One line for each folder with files that were left out: how many, and why, with the first of them."""
     return [
         f"left out of {folder}: {', '.join(f'{count} {reason}' for reason, count in reasons.items())}"
+        + (f"; {'; '.join(examples)}" if (examples := catalogue.examples(folder)) else "")
         for folder, reasons in catalogue.skipped.items()
     ]

@@ -55,7 +55,7 @@ def describe_plan(request: RunRequest) -> list[str]:
     """Lines that tell what a run would do, without doing any of it."""
     job = request.job
     require_tier(job.render)
-    catalogue = open_catalogue(job.assets, request.job_folder, tuple(job.categories))
+    catalogue = _open_catalogue(request)
     return [
         f"job {job.name}: scenes {job.first_scene} to {job.stop_scene - 1}, {job.pairs_per_scene} pair(s) each, seed {job.seed}",
         f"categories: {', '.join(f'{name} {weight:g}' for name, weight in sorted(job.categories.items()))}",
@@ -71,7 +71,7 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     """
     begun = time.monotonic()
     require_tier(request.job.render)
-    catalogue = open_catalogue(request.job.assets, request.job_folder, tuple(request.job.categories))
+    catalogue = _open_catalogue(request)
     store = open_store(request.out)
     for line in describe_left_out(catalogue):
         print(f"verso: {line}", file=sys.stderr)
@@ -94,6 +94,23 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
         write_card(store, record, catalogue, merged)
         log_event("finished", job=record.job.name, digest=merged.digest)
     return RunResult(merged, time.monotonic() - begun, made_now)
+
+
+def _open_catalogue(request: RunRequest) -> Catalogue:
+    """The job's catalogue; shows how many files are listed and checked, which takes long where there are many new ones."""
+    job, lines = request.job, dict[str, ProgressLine]()
+
+    def watch(what: str, done: int, asked: int) -> None:
+        if what not in lines:
+            lines[what] = ProgressLine(asked, f"assets {what}", "file")
+        lines[what].expect(asked)
+        lines[what].show(done)
+
+    try:
+        return open_catalogue(job.assets, request.job_folder, tuple(job.categories), watch)
+    finally:
+        for line in lines.values():
+            line.close()
 
 
 def _make(store: Store, order: ShardOrder, catalogue: Catalogue, spans: Sequence[Span], slots: Slots) -> int:

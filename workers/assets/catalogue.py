@@ -2,21 +2,23 @@
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from schemas.errors import AssetSourceError, MeshError
+import numpy as np
+
+from schemas.errors import AssetSourceError
 from schemas.job.assets import Assets, FolderSource, MeshLimits, ProceduralSource, ShapeNetSource, SplitShares
 from schemas.scene.shape import Asset
 from workers.assets.builtin.make import TABLE, VERSION, instance_id, make_asset
 from workers.assets.external.folder import find_files
-from workers.assets.external.listing import Listing, read_listing
-from workers.assets.external.placement import load_entry
+from workers.assets.external.listing import Listing
+from workers.assets.external.opening import Watch, check_listing, ignore, load_asset_file, read_listing
 from workers.assets.external.shapenet import find_models
-
-PROBES = 3
-"""Meshes of a source and category that are loaded to test it when a catalogue is opened; one must be usable."""
+from workers.assets.external.verdicts import USUAL_FOLDER, Verdicts
 
 AnySource = ProceduralSource | ShapeNetSource | FolderSource
 
@@ -36,7 +38,8 @@ class Catalogue:
     """Every asset that a job can choose from. It pickles small; choosing needs no files, loading does.
 
     objects, tables: a listing for each source, None for a procedural one; skipped: how many instances were left out,
-    by source folder and reason; digest: SHA-256 of everything that the choice and the shapes depend on.
+    by source folder and reason; digest: SHA-256 of everything that the choice and the shapes depend on. Files that cannot
+    be read are known from the start and never drawn.
     """
 
     assets: Assets
@@ -51,9 +54,21 @@ class Catalogue:
         for number, (settings, listing) in enumerate(self._sources(category)):
             if isinstance(settings, ProceduralSource):
                 offers.append((number, settings, settings.instances))
-            elif listing is not None and (entries := listing.entries.get(category)):
-                offers.append((number, settings, len(entries)))
+            elif listing is not None and (count := listing.count(category)):
+                offers.append((number, settings, count))
         return offers
+
+    def draw(self, number: int, category: str, rng: np.random.Generator) -> InstanceRef:
+        """One of a source's instances of a category, uniformly. A refused one is drawn again: the others stay as they are."""
+        settings, listing = self._sources(category)[number]
+        if isinstance(settings, ProceduralSource):
+            return self.refer(number, category, int(rng.integers(settings.instances)))
+        assert listing is not None
+        refused, count = listing.refused.get(category, frozenset()), len(listing.entries[category])
+        index = int(rng.integers(count))
+        while index in refused:
+            index = int(rng.integers(count))
+        return self.refer(number, category, index)
 
     def settings(self, ref: InstanceRef) -> AnySource:
         """The settings of the source of an instance."""
@@ -67,13 +82,19 @@ class Catalogue:
         assert listing is not None
         return InstanceRef(number, category, index, listing.entries[category][index].instance_id)
 
+    def examples(self, folder: str) -> tuple[str, ...]:
+        """Sentences on the first files that were left out of a source's folder."""
+        listings = (listing for listing in (*self.objects, *self.tables) if listing is not None)
+        return next((x.examples for x in listings if x.examples and str(x.folder) == folder), ())
+
     def load(self, ref: InstanceRef) -> Asset:
-        """An instance, made or read; MeshError where its mesh is refused or has changed."""
+        """An instance, made, or read in a limited process; MeshError where its mesh is refused or has changed."""
         settings, listing = self._sources(ref.category)[ref.source]
         if isinstance(settings, ProceduralSource):
             return make_asset(ref.category, settings, ref.index, self.assets.density_kg_m3)
         assert listing is not None
-        return load_entry(settings, listing.folder, listing.entries[ref.category][ref.index], ref.category, self.assets)
+        entry = listing.entries[ref.category][ref.index]
+        return load_asset_file(settings, listing.folder, entry, ref.category, self.assets)
 
     def _sources(self, category: str) -> list[tuple[AnySource, Listing | None]]:
         if category == TABLE:
@@ -82,28 +103,48 @@ class Catalogue:
 
 
 def list_source(
-    settings: AnySource, job_folder: Path, categories: Collection[str], limits: MeshLimits
+    settings: AnySource, job_folder: Path, categories: Collection[str], limits: MeshLimits, watch: Watch = ignore
 ) -> Listing | None:
     """What a source of files offers, None for built-in shapes; AssetSourceError where the folder cannot be used."""
     if isinstance(settings, ProceduralSource):
         return None
     if isinstance(settings, ShapeNetSource):
-        return read_listing(settings, *find_models(settings, job_folder, categories), limits)
-    return read_listing(settings, *find_files(settings, job_folder, categories), limits)
+        return read_listing(settings, *find_models(settings, job_folder, categories), limits, watch)
+    return read_listing(settings, *find_files(settings, job_folder, categories), limits, watch)
 
 
-def open_catalogue(assets: Assets, job_folder: Path, categories: Collection[str]) -> Catalogue:
-    """Lists every source; raises AssetSourceError where a folder cannot be used or no source has a category.
+def open_catalogue(
+    assets: Assets, job_folder: Path, categories: Collection[str], watch: Watch = ignore, kept: Verdicts | None = None
+) -> Catalogue:
+    """Lists every source and finds out which files can be read, or looks that up in `kept` (default: the user's cache).
 
-    Cost: every mesh and texture of the categories asked for is read to hash it, about two seconds a gigabyte where
-    disks allow; nothing for procedural sources. Workers take the opened catalogue and read only what they load.
+    `watch` is told now and then how far it is. Raises AssetSourceError where a folder cannot be used, no source has a
+    category, or a source has nothing of it that can be read.
+
+    Cost: every mesh and texture of the categories asked for is read to hash it, about two seconds a gigabyte where disks
+    allow, and once for ever to see whether it can be used; nothing for procedural sources. Workers take the opened
+    catalogue and read only what they load.
     """
-    objects = tuple(list_source(source, job_folder, categories, assets.limits) for source in assets.objects)
-    tables = tuple(list_source(source, job_folder, (TABLE,), assets.limits) for source in assets.tables)
+
+    def open_source(settings: AnySource, wanted: Collection[str]) -> Listing | None:
+        listing = list_source(settings, job_folder, wanted, assets.limits, watch)
+        if isinstance(settings, ProceduralSource) or listing is None:
+            return None
+        return check_listing(settings, listing, assets, verdicts, watch)
+
+    external = any(not isinstance(source, ProceduralSource) for source in (*assets.objects, *assets.tables))
+    verdicts = kept or Verdicts(USUAL_FOLDER if external else None)
+    objects = tuple(open_source(source, categories) for source in assets.objects)
+    tables = tuple(open_source(source, (TABLE,)) for source in assets.tables)
     _refuse_ambiguous(assets)
-    skipped = {str(x.folder): dict(x.skipped) for x in (*objects, *tables) if x is not None and x.skipped}
+    skipped: dict[str, Counter[str]] = {}
+    for listing in (*objects, *tables):
+        if listing is not None and listing.skipped:
+            skipped.setdefault(str(listing.folder), Counter()).update(listing.skipped)
     digest = _digest(assets, objects, tables, categories)
-    catalogue = Catalogue(assets, objects, tables, digest, skipped)
+    catalogue = Catalogue(
+        assets, objects, tables, digest, {folder: dict(reasons) for folder, reasons in skipped.items()}
+    )
     for category in (*sorted(categories), TABLE):
         _check_offered(catalogue, category)
     return catalogue
@@ -123,6 +164,10 @@ def _refuse_ambiguous(assets: Assets) -> None:
 
 def _check_offered(catalogue: Catalogue, category: str) -> None:
     offers = catalogue.offers(category)
+    for listing in catalogue.tables if category == TABLE else catalogue.objects:
+        if listing is not None and listing.entries.get(category) and not listing.count(category):
+            most = f"none of {len(listing.entries[category])} meshes for {category!r} in {listing.folder} can be used"
+            raise AssetSourceError(f"{most}: {'; '.join(listing.examples)}")
     where = "assets.tables" if category == TABLE else "assets.objects"
     if not offers:
         listings = catalogue.tables if category == TABLE else catalogue.objects
@@ -132,9 +177,6 @@ def _check_offered(catalogue: Catalogue, category: str) -> None:
             f"no source in {where} offers {category!r}: {'; '.join(seen)}.{hint} Add `- source: procedural` there, "
             + (f"or leave {category!r} out of `categories`." if category != TABLE else "or a folder that has tables.")
         )
-    for number, settings, count in offers:
-        if not isinstance(settings, ProceduralSource):
-            _probe(catalogue, number, category, count)
 
 
 def _describe(listing: Listing) -> str:
@@ -145,18 +187,6 @@ def _describe(listing: Listing) -> str:
     return f"{listing.folder} has {found}" + (f" (skipped: {left})" if left else "")
 
 
-def _probe(catalogue: Catalogue, number: int, category: str, count: int) -> None:
-    """AssetSourceError where the first few meshes of a source are all refused."""
-    errors = []
-    for index in range(min(PROBES, count)):
-        try:
-            catalogue.load(catalogue.refer(number, category, index))
-            return
-        except MeshError as error:
-            errors.append(str(error))
-    raise AssetSourceError(f"none of the first {len(errors)} meshes for {category!r} can be used: {'; '.join(errors)}")
-
-
 def _digest(
     assets: Assets, objects: tuple[Listing | None, ...], tables: tuple[Listing | None, ...], categories: Collection[str]
 ) -> str:
@@ -165,12 +195,14 @@ def _digest(
     for settings, listing in zip((*assets.objects, *assets.tables), (*objects, *tables), strict=True):
         # The folder's path is left out: the same files elsewhere are the same catalogue.
         plain = settings.model_dump(mode="json", exclude={"folder"})
-        files = None
+        files: dict[str, Any] | None = None
         if listing is not None:
             files = {
                 category: [(e.instance_id, e.licence, [(f.path, f.size, f.sha256) for f in e.files]) for e in entries]
                 for category, entries in listing.entries.items()
             }
+            if any(listing.refused.values()):
+                files["refused"] = {category: sorted(numbers) for category, numbers in listing.refused.items()}
         record.append({"settings": plain, "generator": VERSION if listing is None else None, "files": files})
     scalars = assets.model_dump(mode="json", exclude={"objects", "tables"})
     whole = {"sources": record, "objects": len(objects), "categories": sorted(categories), "assets": scalars}

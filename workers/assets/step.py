@@ -18,7 +18,7 @@ CACHE_BYTES = 256 * 1024 * 1024
 
 
 def choose_object(catalogue: Catalogue, category: str, rng: np.random.Generator) -> InstanceRef:
-    """An instance of the category: a source by weight among those that have it, then one of its instances uniformly."""
+    """An instance of the category: a source by weight among those that have it, then one that is fit uniformly."""
     offers = catalogue.offers(category)
     if not offers:
         raise AssetSourceError(f"no source offers {category!r}")
@@ -29,7 +29,7 @@ def choose_object(catalogue: Catalogue, category: str, rng: np.random.Generator)
         if share < 0.0:
             chosen = offer
             break
-    return catalogue.refer(chosen[0], category, int(rng.integers(chosen[2])))
+    return catalogue.draw(chosen[0], category, rng)
 
 
 def choose_table(catalogue: Catalogue, rng: np.random.Generator) -> InstanceRef:

@@ -13,6 +13,7 @@ from schemas.job.assets import Assets, FolderSource, MeshLimits, ProceduralSourc
 from schemas.job.job import CATEGORIES
 from tests.workers.assets.oracles import CUBE, write
 from workers.assets.catalogue import list_source, open_catalogue, split_of
+from workers.assets.external.verdicts import Verdicts
 from workers.assets.step import choose_object, choose_table, load_asset
 
 BUILT_IN = ProceduralSource(source="procedural")
@@ -108,19 +109,39 @@ def test_a_missing_folder_is_refused_when_the_catalogue_opens(tmp_path):
 def test_a_folder_whose_meshes_are_all_broken_is_refused_when_the_catalogue_opens(tmp_path):
     for k in range(4):
         write(tmp_path / "things" / f"mug{k}.obj", "v 0 0 0\n")
-    with pytest.raises(AssetSourceError, match=r"none of the first 3 meshes for 'mug' can be used: .*no_faces"):
+    with pytest.raises(AssetSourceError, match=r"none of 4 meshes for 'mug' in .*mug0.obj \(no_faces: "):
         opened(tmp_path, objects=(folder(),))
 
 
-def test_a_bad_mesh_among_good_ones_fails_when_it_is_loaded(tmp_path):
-    write(tmp_path / "things" / "mug0.obj", CUBE)
-    write(tmp_path / "things" / "mug1.obj", "v 0 0 0\n")
-    catalogue = opened(tmp_path, objects=(folder(),))
-    rng = np.random.default_rng(0)
-    refs = {ref.index: ref for ref in (choose_object(catalogue, "mug", rng) for _ in range(50))}
-    assert load_asset(catalogue, refs[0]).watertight
+def test_a_bad_mesh_among_good_ones_is_known_at_once_and_never_drawn_and_moves_no_other_draw(tmp_path):
+    for k in range(4):
+        write(tmp_path / "things" / f"mug{k}.obj", CUBE + "#" * k)
+    before = opened(tmp_path, objects=(folder(),))
+    write(tmp_path / "things" / "mug2.obj", "v 0 0 0\n")
+    after = opened(tmp_path, objects=(folder(),))
+    assert (before.skipped, after.skipped) == ({}, {str(tmp_path / "things"): {"no_faces": 1}})
+    assert [catalogue.offers("mug")[0][2] for catalogue in (before, after)] == [4, 3]
+    assert before.digest != after.digest
+    draws = []
+    for seed in range(200):
+        one, two = (choose_object(catalogue, "mug", np.random.default_rng(seed)) for catalogue in (before, after))
+        assert two == one or one.index == 2
+        draws.append(two.index)
+    # A binomial of 200 draws at 1/3 has a standard deviation of 6.7.
+    counts = np.bincount(draws, minlength=4)
+    assert counts[2] == 0 and counts[[0, 1, 3]] == pytest.approx(np.full(3, 200 / 3), abs=5 * 6.7)
+    assert load_asset(after, after.refer(0, "mug", 1)).watertight
     with pytest.raises(MeshError, match="no_faces"):
-        load_asset(catalogue, refs[1])
+        load_asset(after, after.refer(0, "mug", 2))
+
+
+def test_how_far_the_opening_is_is_told(tmp_path):
+    for k in range(3):
+        write(tmp_path / "things" / f"mug{k}.obj", CUBE + "#" * k)
+    told = []
+    assets = Assets(objects=(folder(),))
+    open_catalogue(assets, tmp_path, ("mug",), lambda *step: told.append(step), Verdicts(None))
+    assert told == [("listed", 3, 3), ("checked", 3, 3)]
 
 
 def test_what_was_left_out_is_counted_by_reason(tmp_path):

@@ -4,6 +4,7 @@ import io
 import re
 import struct
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import Image
@@ -14,6 +15,10 @@ from schemas.job.assets import MeshLimits
 
 _PLY_ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d+)", re.MULTILINE)
 _IMAGE_KINDS = {b"\x89PNG\r\n\x1a\n": "PNG", b"\xff\xd8\xff": "JPEG"}
+LONGEST_NAME = 1024
+"""Letters of a file name that are looked at."""
+MOST_NOTES = 20
+"""Notes that are kept of an asset: they are stored in the dataset."""
 _ADDRESS = re.compile(r"\s*<[^<>]* at 0x[0-9a-fA-F]+>")
 
 
@@ -24,6 +29,12 @@ def check_counts(path: Path, vertices: int, faces: int, limits: MeshLimits) -> N
             raise MeshError("too_large", f"{path} has {count} {name}, over max_{name} = {cap}")
 
 
+def check_nodes(path: Path, count: int, what: str, limits: MeshLimits) -> None:
+    """MeshError `too_large` where an asset has more nodes, or parts, or links than the cap."""
+    if count > limits.max_nodes:
+        raise MeshError("too_large", f"{path} has {count} {what}, over max_nodes = {limits.max_nodes}")
+
+
 def declared_counts(kind: str, data: bytes) -> tuple[int, int]:
     """Vertices and faces that a file declares, found without parsing it; (0, 0) where it declares none."""
     if kind == ".obj":
@@ -32,7 +43,8 @@ def declared_counts(kind: str, data: bytes) -> tuple[int, int]:
         counts = {name: int(count) for name, count in _PLY_ELEMENT.findall(data[: data.find(b"end_header")][:65536])}
         if any(count > len(data) for count in counts.values()):
             raise MeshError(
-                "unreadable", f"the PLY header promises {max(counts.values())} elements in {len(data)} bytes"
+                "unreadable",
+                f"the PLY header promises {min(max(counts.values()), 10**18)} elements in {len(data)} bytes",
             )
         return counts.get(b"vertex", 0), counts.get(b"face", 0)
     if kind == ".stl" and len(data) >= 84 and len(data) == 84 + 50 * struct.unpack_from("<I", data, 80)[0]:
@@ -53,6 +65,32 @@ def find_inside(root: Path, *candidates: Path) -> Path | None:
     return None
 
 
+@dataclass
+class Budget:
+    """What one asset has read so far, with all files that it refers to: bytes, and pixels of textures."""
+
+    limits: MeshLimits
+    size: int = 0
+    pixels: int = 0
+
+    def take_file(self, size: int) -> str | None:
+        """Counts a file; why it may not be read, None where it may."""
+        self.size += size
+        cap = self.limits.max_asset_mb
+        return f"is over max_asset_mb = {cap:g} with the files before it" if self.size > cap * 1e6 else None
+
+    def take_image(self, data: bytes) -> str | None:
+        """Counts the pixels of a PNG or JPEG; why it may not be decoded, None where it may."""
+        size, why = open_image(data, self.limits)
+        if why is not None:
+            return why
+        pixels = size[0] * size[1]
+        if self.pixels + pixels > self.limits.max_textures_mpx * 1e6:
+            return f"is over max_textures_mpx = {self.limits.max_textures_mpx:g} with the textures before it"
+        self.pixels += pixels
+        return None
+
+
 class FolderResolver(Resolver):
     """Hands trimesh the material files and PNG or JPEG textures of one folder, and nothing else.
 
@@ -60,10 +98,11 @@ class FolderResolver(Resolver):
     leaves a note in `notes`, and the mesh is loaded without it.
     """
 
-    def __init__(self, mesh: Path, root: Path, limits: MeshLimits) -> None:
+    def __init__(self, mesh: Path, root: Path, limits: MeshLimits, budget: Budget | None = None) -> None:
         self.folder = mesh.parent
         self.root = root.resolve()
         self.limits = limits
+        self.budget = budget or Budget(limits)
         self.notes: list[str] = []
 
     def get(self, key: str) -> bytes:
@@ -74,19 +113,24 @@ class FolderResolver(Resolver):
             raise self._refuse(name, "is missing")
         if path.stat().st_size > self.limits.max_file_mb * 1e6:
             raise self._refuse(name, f"is larger than max_file_mb = {self.limits.max_file_mb:g}")
+        if (why := self.budget.take_file(path.stat().st_size)) is not None:
+            raise self._refuse(name, why)
         data = path.read_bytes()
-        if path.suffix.lower() != ".mtl" and (why := image_fault(data, self.limits)) is not None:
+        if path.suffix.lower() != ".mtl" and (why := self.budget.take_image(data)) is not None:
             raise self._refuse(name, why)
         return data
 
     def find(self, name: str) -> Path | None:
         """The file of a name, relative to the mesh or else beside it; None where there is none below `root`."""
         name = name.strip().replace("\\", "/")
+        if len(name) > LONGEST_NAME:
+            return None
         return find_inside(self.root, self.folder / name, self.folder / Path(name).name)
 
     def _refuse(self, name: str, why: str) -> FileNotFoundError:
-        self.notes.append(f"{name} {why}: plain base colour used")
-        return FileNotFoundError(name)
+        if len(self.notes) < MOST_NOTES:
+            self.notes.append(one_line(f"{name:.{LONGEST_NAME}} {why}: plain base colour used"))
+        return FileNotFoundError(f"{name:.80}")
 
     def write(self, name: str, data: object) -> None:
         """Refused: reading never writes."""
@@ -106,18 +150,25 @@ def describe_error(error: Exception) -> str:
     return _ADDRESS.sub("", repr(error))
 
 
-def image_fault(data: bytes, limits: MeshLimits) -> str | None:
-    """Why these bytes may not be a texture; None for a PNG or JPEG, by its first bytes, of a size within the cap."""
+def one_line(text: str, most: int = 1000) -> str:
+    """The text as one line that can be stored: no control characters, no half of a surrogate pair, not too long."""
+    plain = "".join(c if c.isprintable() or c == " " else " " for c in text[: most + 1])
+    plain = plain.encode("utf-8", "replace").decode()
+    return plain if len(text) <= most else f"{plain[:most]} ..."
+
+
+def open_image(data: bytes, limits: MeshLimits) -> tuple[tuple[int, int], str | None]:
+    """Width and height, and why these bytes may not be a texture; None for a PNG or JPEG of a size within the cap."""
     kind = next((kind for magic, kind in _IMAGE_KINDS.items() if data.startswith(magic)), None)
     if kind is None:
-        return "is not a PNG or JPEG file"
+        return (0, 0), "is not a PNG or JPEG file"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(data), formats=(kind,)) as image:
-                largest = max(image.size)
+                size = image.size
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
-        return f"cannot be opened ({describe_error(error)})"
-    return (
-        f"has {largest} px, over max_texture_px = {limits.max_texture_px}" if largest > limits.max_texture_px else None
-    )
+        return (0, 0), f"cannot be opened ({describe_error(error)})"
+    if max(size) > limits.max_texture_px:
+        return size, f"has {max(size)} px, over max_texture_px = {limits.max_texture_px}"
+    return size, None

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import MeshError
-from schemas.job.assets import MeshLimits
-from workers.assets.external.caps import FolderResolver, check_counts, describe_error, image_fault
+from workers.assets.external.caps import Budget, FolderResolver, check_counts, check_nodes, describe_error
 
 
 def check_glb(path: Path, data: bytes, resolver: FolderResolver) -> bytes:
@@ -18,36 +17,39 @@ def check_glb(path: Path, data: bytes, resolver: FolderResolver) -> bytes:
         if magic != b"glTF" or kind != b"JSON" or not isinstance(tree, dict):
             raise ValueError("no glTF header")
         counts = [int(accessor["count"]) for accessor in tree.get("accessors", [])]
-        declared = _drawn_counts(tree, counts)
+        vertices, faces, parts = _drawn_counts(tree, counts)
         children = [int(child) for node in tree.get("nodes", []) for child in node.get("children", [])]
-        faults = _image_faults(tree, data[20 + length + 8 :], resolver.limits)
-    except (struct.error, ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError) as error:
+        faults = _image_faults(tree, data[20 + length + 8 :], resolver.budget)
+    except (struct.error, ArithmeticError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise MeshError(
             "unreadable", f"{path} is not a glb file that can be read: {describe_error(error):.200}"
         ) from error
     if len(set(children)) != len(children):
         raise MeshError("unreadable", f"{path}: a node has two parents")
     if min(counts, default=0) < 0 or sum(counts) > len(data):
-        raise MeshError("unreadable", f"{path} promises {sum(counts)} elements in {len(data)} bytes")
-    check_counts(path, *declared, resolver.limits)
+        raise MeshError("unreadable", f"{path} promises {min(sum(counts), 10**18)} elements in {len(data)} bytes")
+    check_nodes(path, max(len(tree.get("nodes", [])), parts), "nodes or parts", resolver.limits)
+    check_counts(path, vertices, faces, resolver.limits)
     if not faults:
         return data
     resolver.notes += faults
     return _without_images(tree, data[20 + length :])
 
 
-def _drawn_counts(tree: dict[str, Any], counts: list[int]) -> tuple[int, int]:
-    """Vertices and faces of a glTF tree, counting a mesh each time that a node shows it."""
+def _drawn_counts(tree: dict[str, Any], counts: list[int]) -> tuple[int, int, int]:
+    """Vertices, faces and primitives of a glTF tree, counting a mesh each time that a node shows it."""
     of_mesh = []
     for mesh in tree.get("meshes", []):
         primitives = [(p["attributes"]["POSITION"], p.get("indices")) for p in mesh["primitives"]]
         vertices = sum(counts[position] for position, _ in primitives)
-        of_mesh.append((vertices, sum(counts[p if indices is None else indices] // 3 for p, indices in primitives)))
+        faces = sum(counts[p if indices is None else indices] // 3 for p, indices in primitives)
+        of_mesh.append((vertices, faces, len(primitives)))
     shown = [of_mesh[node["mesh"]] for node in tree.get("nodes", []) if "mesh" in node]
-    return sum(vertices for vertices, _ in shown), sum(faces for _, faces in shown)
+    vertices, faces, parts = (sum(counts) for counts in zip((0, 0, 0), *shown, strict=True))
+    return vertices, faces, parts
 
 
-def _image_faults(tree: dict[str, Any], binary: bytes, limits: MeshLimits) -> list[str]:
+def _image_faults(tree: dict[str, Any], binary: bytes, budget: Budget) -> list[str]:
     faults = []
     for number, image in enumerate(tree.get("images", [])):
         if "bufferView" not in image:
@@ -55,7 +57,7 @@ def _image_faults(tree: dict[str, Any], binary: bytes, limits: MeshLimits) -> li
             continue
         view = tree["bufferViews"][image["bufferView"]]
         start = int(view.get("byteOffset", 0))
-        if (why := image_fault(binary[start : start + int(view["byteLength"])], limits)) is not None:
+        if (why := budget.take_image(binary[start : start + int(view["byteLength"])])) is not None:
             faults.append(f"image {number} {why}: plain base colour used")
     return faults
 

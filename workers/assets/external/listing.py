@@ -1,7 +1,6 @@
 """Edge: the instances that a folder of files offers, with the SHA-256 of every file."""
 
 import hashlib
-from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,46 +34,41 @@ class Entry:
 
 @dataclass(frozen=True)
 class Listing:
-    """What a source of files offers: entries by category in a fixed order; how many were skipped, by reason."""
+    """What a source of files offers: entries by category in a fixed order.
+
+    refused: the numbers of entries whose content cannot be used, by category: they are never drawn, and their places stay,
+    so that leaving them out moves no other draw. skipped: how many candidates are refused or could not be listed, by reason;
+    examples: a sentence on the first of them.
+    """
 
     folder: Path
     entries: Mapping[str, tuple[Entry, ...]]
     skipped: Mapping[str, int] = field(default_factory=dict)
+    refused: Mapping[str, frozenset[int]] = field(default_factory=dict)
+    examples: tuple[str, ...] = ()
+
+    def count(self, category: str) -> int:
+        """How many entries of a category can be used."""
+        return len(self.entries.get(category, ())) - len(self.refused.get(category, ()))
 
 
-def read_listing(
-    settings: ShapeNetSource | FolderSource, folder: Path, candidates: Mapping[str, Iterable[Path]], limits: MeshLimits
-) -> Listing:
-    """Hashes every candidate and the files that it refers to; counts and skips those that are refused.
-
-    Takes about two seconds for each gigabyte, where disks allow.
-    """
-    stated = settings.licence
-    licences = list_licences(folder) if stated == UNKNOWN and isinstance(settings, FolderSource) else []
-    entries, skipped = {}, Counter[str]()
-    for category, paths in candidates.items():
-        found = []
-        for path in paths:
-            try:
-                files = hash_files(_list_files(settings, folder, path, limits), folder)
-            except MeshError as error:
-                skipped[error.reason] += 1
-            else:
-                found.append(
-                    Entry(_instance_id(settings, files[0]), files, find_licence(path, folder, stated, licences))
-                )
-        entries[category] = tuple(found)
-    return Listing(folder, entries, dict(sorted(skipped.items())))
-
-
-def _list_files(
+def list_files(
     settings: ShapeNetSource | FolderSource, folder: Path, path: Path, limits: MeshLimits
-) -> Iterable[Path]:
-    """A candidate and every file that it refers to, each once; MeshError where one of them is refused."""
+) -> tuple[Path, ...]:
+    """A candidate and every file that it refers to, each once; MeshError where one of them, or all together, is refused."""
     if path.suffix.lower() == ".urdf":
-        meshes = [find_mesh(name, path, folder) for name in mesh_names(parse_urdf(path))]
-        return dict.fromkeys([path, *(file for mesh in meshes for file in list_mesh_files(mesh, folder, limits))])
-    return list_mesh_files(path, mesh_root(settings, folder, path), limits)
+        meshes = dict.fromkeys(find_mesh(name, path, folder) for name in mesh_names(parse_urdf(path, limits)))
+        files = [path, *(file for mesh in meshes for file in list_mesh_files(mesh, folder, limits))]
+    else:
+        files = list_mesh_files(path, mesh_root(settings, folder, path), limits)
+    files = list(dict.fromkeys(files))
+    size, cap = sum(file.stat().st_size for file in files), limits.max_asset_mb
+    if size > cap * 1e6:
+        raise MeshError("too_large", f"{path} and its files have {size / 1e6:.1f} MB, over max_asset_mb = {cap:g}")
+    for file in files:
+        if not str(file).isprintable():
+            raise MeshError("name", f"{file!s:.200} has a name that is not printable UTF-8, so no table can hold it")
+    return tuple(files)
 
 
 def mesh_root(settings: ShapeNetSource | FolderSource, folder: Path, mesh: Path) -> Path:
@@ -84,7 +78,7 @@ def mesh_root(settings: ShapeNetSource | FolderSource, folder: Path, mesh: Path)
     return mesh.parent.parent if mesh.parent.name == "models" else mesh.parent
 
 
-def _instance_id(settings: ShapeNetSource | FolderSource, file: SourceFile) -> str:
+def instance_id_of(settings: ShapeNetSource | FolderSource, file: SourceFile) -> str:
     """Synset and model in ShapeNetCore; else the path as one word and eight digits of a digest of file and settings."""
     if isinstance(settings, ShapeNetSource):
         return "-".join(Path(file.path).parts[:2])

@@ -12,7 +12,7 @@ from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Part, Shape
 from workers.assets.external import topology
-from workers.assets.external.caps import FolderResolver, check_counts
+from workers.assets.external.caps import Budget, FolderResolver, check_counts, check_nodes
 from workers.assets.external.materials import MeshVisual, read_visual
 from workers.assets.external.reading import read_bytes, read_scene
 from workers.assets.external.topology import Bodies, Indices, Mask
@@ -41,15 +41,19 @@ class _Piece:
     visual: MeshVisual
 
 
-def load_shape(path: Path, limits: MeshLimits, root: Path | None = None) -> LoadedMesh:
+def load_shape(path: Path, limits: MeshLimits, root: Path | None = None, budget: Budget | None = None) -> LoadedMesh:
     """A mesh file's shape: finite, in range, no doubled or empty faces, wound outwards where it is closed.
 
     Material files and textures are looked for below `root` (default: the mesh's own folder) and nowhere else; a
-    missing or refused one leaves the plain base colour and a note. Raises MeshError with one of the reasons `missing`,
-    `format`, `too_large`, `unreadable`, `index_out_of_range`, `not_finite`, `no_faces`.
+    missing or refused one leaves the plain base colour and a note. `budget` counts what a whole asset reads. Raises
+    MeshError with one of the reasons `missing`, `format`, `too_large`, `unreadable`, `index_out_of_range`, `not_finite`,
+    `no_faces`.
     """
-    resolver = FolderResolver(path, root or path.parent, limits)
-    scene = read_scene(path, read_bytes(path, limits), resolver)
+    resolver = FolderResolver(path, root or path.parent, limits, budget)
+    data = read_bytes(path, limits)
+    if (why := resolver.budget.take_file(len(data))) is not None:
+        raise MeshError("too_large", f"{path} {why}")
+    scene = read_scene(path, data, resolver)
     pieces, notes = _pieces(path, scene, limits)
     shape, mended = clean_shape(path, pieces)
     return LoadedMesh(shape, tuple(dict.fromkeys([*resolver.notes, *notes, *mended])))
@@ -73,6 +77,7 @@ def _pieces(path: Path, scene: trimesh.Scene, limits: MeshLimits) -> tuple[list[
     shown = [(scene.graph[node], node) for node in scene.graph.nodes_geometry]
     meshes = [(matrix, scene.geometry[name]) for (matrix, name), _ in shown]
     meshes = [(matrix, mesh) for matrix, mesh in meshes if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    check_nodes(path, len(meshes), "parts", limits)
     check_counts(path, sum(len(m.vertices) for _, m in meshes), sum(len(m.faces) for _, m in meshes), limits)
     pieces: list[_Piece] = []
     notes: list[str] = []

@@ -7,9 +7,10 @@ import numpy as np
 
 from schemas.base import Array, frozen_array
 from schemas.errors import MeshError
-from schemas.job.assets import Assets, FolderSource, ShapeNetSource
+from schemas.job.assets import Assets, FolderSource, MeshLimits, ShapeNetSource
 from schemas.scene.shape import Asset
 from workers.assets.builtin.make import TABLE
+from workers.assets.external.caps import MOST_NOTES, one_line
 from workers.assets.external.listing import Entry, check_unchanged, mesh_root
 from workers.assets.external.mesh import LoadedMesh, load_shape, transform_shape
 from workers.assets.external.urdf_file import load_urdf
@@ -42,7 +43,7 @@ def load_entry(
 def place_asset(
     loaded: LoadedMesh, entry: Entry, category: str, settings: ShapeNetSource | FolderSource, assets: Assets
 ) -> Asset:
-    """The asset of a cleaned shape in its source's frame; MeshError `no_size` where the shape has no extent."""
+    """The asset of a cleaned shape in its source's frame; MeshError `no_size` or `size` where its extent is not allowed."""
     diagonal_m = None
     if isinstance(settings, ShapeNetSource):
         axes, scale = UP_AXES["y"], settings.scale or (TABLE_SCALE if category == TABLE else OBJECT_SCALE)
@@ -54,7 +55,10 @@ def place_asset(
     diagonal = float(np.linalg.norm(upper - lower))
     if diagonal == 0.0:
         raise MeshError("no_size", f"{entry.files[0].path} has no extent")
+    if not np.isfinite(diagonal):
+        raise MeshError("not_finite", f"{entry.files[0].path} is too large for floating-point numbers")
     scale = scale if diagonal_m is None else diagonal_m / diagonal
+    _check_size(entry.files[0].path, scale * diagonal, assets.limits)
     centre = 0.5 * (lower + upper) * scale
     shape = transform_shape(rotated, pose(scale * np.eye(3), -centre))
     mass = mass_properties(shape, assets.density_kg_m3, assets.shell_kg_m2)
@@ -72,5 +76,16 @@ def place_asset(
         watertight=mass.solid,
         volume_m3=mass.mass_kg / assets.density_kg_m3 if mass.solid else None,
         shareable=settings.copy_assets,
-        notes=loaded.notes,
+        notes=tuple(one_line(note) for note in loaded.notes[:MOST_NOTES]),
     )
+
+
+def _check_size(name: str, diagonal_m: float, limits: MeshLimits) -> None:
+    """MeshError `size` where a body is so small or large that nothing about it could be simulated or seen."""
+    for over, word, key, cap in (
+        (diagonal_m < limits.min_size_m, "under", "min_size_m", limits.min_size_m),
+        (diagonal_m > limits.max_size_m, "over", "max_size_m", limits.max_size_m),
+    ):
+        if over:
+            remedy = "set `scale` (0.001 for millimetres) or `diagonal_m` of its source"
+            raise MeshError("size", f"{name} is {diagonal_m:.3g} m across, {word} {key} = {cap:g}: {remedy}")

@@ -13,7 +13,7 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Material, Part, Shape
-from workers.assets.external.caps import check_counts, find_inside
+from workers.assets.external.caps import LONGEST_NAME, Budget, check_counts, check_nodes, find_inside
 from workers.assets.external.materials import DEFAULT
 from workers.assets.external.mesh import LoadedMesh, load_shape, transform_shape
 from workers.geometry.frames import pose
@@ -24,7 +24,11 @@ SEGMENTS = 48
 """Facets around a URDF's cylinders and spheres."""
 
 
-def parse_urdf(path: Path) -> ElementTree.Element:
+MOST_JOINTS_ABOVE = 256
+"""Joints between a link and its root: the pose of a link is the product of all of theirs."""
+
+
+def parse_urdf(path: Path, limits: MeshLimits) -> ElementTree.Element:
     """The root element; MeshError `missing`, `too_large` or `unreadable`. Documents with a DTD or entities are refused."""
     try:
         if path.stat().st_size > MAX_URDF_BYTES:
@@ -41,43 +45,66 @@ def parse_urdf(path: Path) -> ElementTree.Element:
         raise MeshError("unreadable", f"{path} is not XML: {error}") from error
     if robot.tag != "robot":
         raise MeshError("unreadable", f"{path} is not a URDF: its root is <{robot.tag:.40}>")
+    for what in ("link", "joint", "link/visual"):
+        check_nodes(path, len(robot.findall(what)), f"{what.rpartition('/')[2]}s", limits)
     return robot
 
 
 def mesh_names(robot: ElementTree.Element) -> list[str]:
-    """The file names of the meshes of all visuals, in their order."""
-    return [mesh.get("filename", "") for mesh in robot.iterfind("link/visual/geometry/mesh")]
+    """The file names of the meshes of all visuals, each once, in their order."""
+    return list(dict.fromkeys(mesh.get("filename", "") for mesh in robot.iterfind("link/visual/geometry/mesh")))
 
 
 def find_mesh(name: str, urdf: Path, root: Path) -> Path:
     """The file of a mesh name inside `root`; MeshError `missing`."""
-    bare = re.sub(r"^(package|file|model)://", "", name.strip().replace("\\", "/"))
+    bare = re.sub(r"^(package|file|model)://", "", name[: LONGEST_NAME + 1].strip().replace("\\", "/"))
     tail = bare.split("/", 1)[-1]
     found = find_inside(root.resolve(), urdf.parent / bare, root / bare, root / tail, urdf.parent / tail)
     if found is None:
-        raise MeshError("missing", f"{urdf} names the mesh {name!r}, which is not inside {root}")
+        raise MeshError("missing", f"{urdf} names the mesh {name!r:.200}, which is not inside {root}")
     return found
 
 
 def load_urdf(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
     """All visuals of all links, joints at zero, in the frame of the first root link, metres; MeshError as load_shape."""
-    robot = parse_urdf(path)
+    robot = parse_urdf(path, limits)
+    meshes = _Meshes(path, root, limits)
     colors = {m.get("name", ""): _color(path, m) for m in robot.iterfind("material")}
     parts: list[Part] = []
     notes: list[str] = []
+    vertices = faces = 0
     for link, T_root_link in _link_poses(path, robot):
         for visual in link.iterfind("visual"):
-            loaded = _load_visual(path, root, visual, limits)
+            loaded = _load_visual(path, visual, meshes)
             notes += loaded.notes
             material = visual.find("material")
             color = None if material is None else _color(path, material) or colors.get(material.get("name", ""))
             shape = transform_shape(loaded.shape, T_root_link @ _origin(path, visual))
             parts += [_colored(part, color) for part in shape.parts]
-            check_counts(path, sum(len(p.vertices) for p in parts), sum(len(p.faces) for p in parts), limits)
+            vertices += sum(len(part.vertices) for part in shape.parts)
+            faces += sum(len(part.faces) for part in shape.parts)
+            check_nodes(path, len(parts), "parts", limits)
+            check_counts(path, vertices, faces, limits)
     if not parts:
         raise MeshError("no_faces", f"{path} has no visual geometry")
     named = tuple(replace(part, name=f"part{number}") for number, part in enumerate(parts))
     return LoadedMesh(Shape(named), tuple(dict.fromkeys(notes)))
+
+
+class _Meshes:
+    """The meshes of a URDF, each read once however often it is named."""
+
+    def __init__(self, urdf: Path, root: Path, limits: MeshLimits) -> None:
+        self._urdf, self._root, self._limits = urdf, root, limits
+        self._budget = Budget(limits)
+        self._loaded: dict[str, LoadedMesh] = {}
+
+    def load(self, name: str) -> LoadedMesh:
+        """The mesh of this name in its own frame; MeshError."""
+        if name not in self._loaded:
+            mesh = find_mesh(name, self._urdf, self._root)
+            self._loaded[name] = load_shape(mesh, self._limits, self._root, self._budget)
+        return self._loaded[name]
 
 
 def _colored(part: Part, color: tuple[float, ...] | None) -> Part:
@@ -102,22 +129,23 @@ def _link_poses(path: Path, robot: ElementTree.Element) -> list[tuple[ElementTre
     placed = []
     for link in robot.iterfind("link"):
         name, T = link.get("name", ""), np.eye(4)
-        for _ in range(len(joints) + 1):
+        for _ in range(MOST_JOINTS_ABOVE + 1):
             if name not in joints:
                 break
             name, step = joints[name]
             T = step @ T
         else:
-            raise MeshError("unreadable", f"{path}: the joints above link {link.get('name')!r} go round in a circle")
+            above = f"{path}: the joints above link {link.get('name')!r:.80}"
+            raise MeshError("unreadable", f"{above} go round in a circle, or are more than {MOST_JOINTS_ABOVE}")
         placed.append((link, T))
     return placed
 
 
-def _load_visual(path: Path, root: Path, visual: ElementTree.Element, limits: MeshLimits) -> LoadedMesh:
+def _load_visual(path: Path, visual: ElementTree.Element, meshes: _Meshes) -> LoadedMesh:
     """One visual's geometry in its own frame."""
     for kind in visual.iterfind("geometry/*"):
         if kind.tag == "mesh":
-            loaded = load_shape(find_mesh(kind.get("filename", ""), path, root), limits, root=root)
+            loaded = meshes.load(kind.get("filename", ""))
             scale = _numbers(path, kind.get("scale", "1 1 1"), 3)
             if 0.0 in scale:
                 raise MeshError("no_size", f"{path} scales a mesh by {scale}")

@@ -24,7 +24,7 @@ class Parts(NamedTuple):
     """Vertices [N, 3] float64, metres, of each convex part of a body, and how they were made.
 
     convex: every piece of the body is; coacd: by CoACD; pieces: CoACD failed, and they are the hulls of the pieces; lofts:
-    from the making of a built-in shape.
+    from the making of a built-in shape; none: there are none, because CoACD took too long.
     """
 
     clouds: tuple[Array, ...]
@@ -91,13 +91,14 @@ def _read(path: Path) -> Parts | None:
     if hashlib.sha256(data[DIGEST_BYTES:]).digest() != data[:DIGEST_BYTES]:
         return None
     with np.load(io.BytesIO(data[DIGEST_BYTES:])) as stored:
-        clouds = np.split(stored["vertices"], np.cumsum(stored["counts"])[:-1])
+        counts = stored["counts"]
+        clouds = np.split(stored["vertices"], np.cumsum(counts)[:-1]) if len(counts) else []
         return Parts(tuple(frozen_array(cloud) for cloud in clouds), str(stored["method"]))
 
 
 def _write(folder: Path, key: str, parts: Parts) -> None:
     content, counts = io.BytesIO(), [len(cloud) for cloud in parts.clouds]
-    np.savez(content, method=parts.method, vertices=np.concatenate(parts.clouds), counts=counts)
+    np.savez(content, method=parts.method, vertices=np.concatenate([np.empty((0, 3)), *parts.clouds]), counts=counts)
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=folder, prefix=f".{key}.", delete=False) as file:
         try:

@@ -17,6 +17,9 @@ With CoACD's own search depth the mug takes 142 s and has 47 parts.
 """
 
 import json
+import math
+import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -60,8 +63,18 @@ LIBRARIES = ("coacd", "manifold3d", "numpy", "scipy")
 
 NOT_INSTALLED = "the package `{}` is not installed, or cannot be loaded: set Verso up again with `./verso test`"
 
-LONGEST_S = 300
-"""Time limit: on some broken meshes CoACD never ends. The slowest that did end took a tenth of this."""
+LONGEST_S = 60
+"""Processor time for all pieces of a mesh: on some broken meshes CoACD never ends. The slowest that did end took half of it.
+
+Half of the default `run.scene_timeout_s`, so that a mesh without an end is a failure of that mesh, the same in every run.
+Where a job sets a shorter time, the worker is killed first, which is a failure of the machine, as for any slow scene.
+"""
+
+MEMORY_MB = 2048
+"""Address space of CoACD, MiB; where it is not enough CoACD gives up."""
+
+NO_PARTS = "none"
+"""The method of a body that has no parts within `LONGEST_S`, which is kept too."""
 
 _CACHE = PartsCache()
 
@@ -86,10 +99,15 @@ def decompose(mesh: Mesh, digest: str, threshold: float = THRESHOLD, folder: Pat
     """Convex parts of a mesh: all within its hull, and together with the hull's vertices. Connected pieces are cut apart.
 
     The same arguments give the same bytes in every process, so results are kept in memory and in `folder` (None: nowhere).
-    Raises MachineError if CoACD is missing or was killed from outside, MeshError `no_convex_parts` if it does not end.
+    Raises MachineError if CoACD is missing or was killed from outside, MeshError `no_convex_parts` if it does not end in
+    `LONGEST_S`: that is kept as parts are.
     """
     key = key_of(_version(), repr(threshold), digest, mesh.vertices.tobytes(), mesh.faces.tobytes())
-    return _CACHE.get(key, folder, lambda: _decompose(mesh, threshold))
+    parts = _CACHE.get(key, folder, lambda: _decompose(mesh, threshold))
+    if parts.method == NO_PARTS:
+        detail = f"CoACD found no convex parts in {LONGEST_S} s of processor time: make the mesh simpler or mend it"
+        raise MeshError("no_convex_parts", detail)
+    return parts
 
 
 @cache
@@ -111,12 +129,24 @@ def _decompose(mesh: Mesh, threshold: float) -> Parts:
         return Parts((frozen_array(convex_hull(mesh.vertices).vertices),), "convex")
     if len(pieces) > MOST_PIECES:
         pieces = [welded]
-    made = [_parts_of(piece, threshold) for piece in pieces]
+    stop_s, made = _children_s() + LONGEST_S, []
+    for piece in pieces:
+        try:
+            made.append(_parts_of(piece, threshold, stop_s))
+        except subprocess.TimeoutExpired:
+            return Parts((), NO_PARTS)
     method = max((method for method, _ in made), key=("convex", "coacd", "pieces").index)
     return Parts(tuple(frozen_array(cloud) for _, clouds in made for cloud in clouds), method)
 
 
-def _parts_of(piece: Mesh, threshold: float) -> tuple[str, list[Array]]:
+def _children_s() -> float:
+    """Processor seconds of all processes that this one has started and that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _parts_of(piece: Mesh, threshold: float, stop_s: float) -> tuple[str, list[Array]]:
+    """How a piece was cut, and its parts. Raises TimeoutExpired where `_children_s` would come to `stop_s`."""
     if len(piece.vertices) < 4:
         return "convex", [piece.vertices]
     hull, solid = convex_hull(piece.vertices), solid_of(piece)
@@ -124,25 +154,24 @@ def _parts_of(piece: Mesh, threshold: float) -> tuple[str, list[Array]]:
         return "convex", [hull.vertices]
     options = {**OPTIONS, **(OPEN if solid is None else CLOSED), "threshold": threshold}
     size = float(np.linalg.norm(np.ptp(hull.vertices, axis=0)))
-    cut = _run(piece if solid is None else mesh_of(solid.simplify(SIMPLER * size)), options)
+    cut = _run(piece if solid is None else mesh_of(solid.simplify(SIMPLER * size)), options, stop_s - _children_s())
     fitted = _fit(cut, hull.vertices, hull.normals)
     return ("coacd", fitted) if fitted else ("pieces", [hull.vertices])
 
 
-def _run(mesh: Mesh, options: dict[str, object]) -> list[Array]:
-    """CoACD's parts of a mesh; none where it gives up."""
+def _run(mesh: Mesh, options: dict[str, object], cpu_s: float) -> list[Array]:
+    """CoACD's parts of a mesh; none where it gives up. Raises TimeoutExpired after `cpu_s` of processor time, at least one."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         np.savez(folder / "request.npz", vertices=mesh.vertices, faces=mesh.faces, options=json.dumps(options))
         script = Path(__file__).with_name("coacd_process.py")
-        try:
-            done = subprocess.run([sys.executable, "-P", str(script), name], capture_output=True, timeout=LONGEST_S)
-        except subprocess.TimeoutExpired as error:
-            detail = f"CoACD found no convex parts in {LONGEST_S} s: make the mesh simpler or mend it"
-            raise MeshError("no_convex_parts", detail) from error
+        limits = [str(max(1, math.ceil(cpu_s))), str(MEMORY_MB)]
+        done = subprocess.run([sys.executable, "-P", str(script), name, *limits], capture_output=True)
+        if done.returncode == -signal.SIGXCPU:
+            raise subprocess.TimeoutExpired(done.args, cpu_s)
         if done.returncode == MISSING:
             raise MachineError(NOT_INSTALLED.format("coacd"))
-        if done.returncode in (-2, -9, -15):
+        if done.returncode in (-signal.SIGINT, -signal.SIGKILL, -signal.SIGTERM):
             raise MachineError("CoACD was killed from outside, perhaps for want of memory: use fewer workers")
         if done.returncode != 0:
             return []

@@ -13,7 +13,7 @@ from PIL import Image
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from tests.workers.assets.oracles import CUBE, textured_cube, write
-from workers.assets.external.caps import FolderResolver, check_counts, declared_counts, image_fault
+from workers.assets.external.caps import FolderResolver, check_counts, declared_counts, open_image
 from workers.assets.external.mesh import load_shape
 
 
@@ -53,8 +53,9 @@ def test_names_with_backslashes_and_folders_that_do_not_exist_are_found_beside_t
 
 
 def test_a_picture_that_cannot_be_read_says_why():
-    assert "not a PNG or JPEG" in str(image_fault(b"BM123", MeshLimits()))
-    assert "cannot be opened" in str(image_fault(b"\x89PNG\r\n\x1a\n" + bytes(np.zeros(9, np.uint8)), MeshLimits()))
+    assert "not a PNG or JPEG" in str(open_image(b"BM123", MeshLimits())[1])
+    torn = b"\x89PNG\r\n\x1a\n" + bytes(9)
+    assert "cannot be opened" in str(open_image(torn, MeshLimits())[1])
 
 
 def test_a_texture_comes_along_with_its_coordinates_right_way_up(tmp_path):

@@ -5,7 +5,6 @@ import pickle
 import pytest
 
 from schemas.errors import MeshError
-from schemas.job.assets import FolderSource, MeshLimits
 from tests.workers.assets.oracles import CUBE, write
 from workers.assets.external.listing import (
     Entry,
@@ -14,7 +13,6 @@ from workers.assets.external.listing import (
     find_licence,
     hash_files,
     list_licences,
-    read_listing,
 )
 
 
@@ -37,17 +35,6 @@ def test_a_message_names_the_first_things_of_a_folder(tmp_path):
     for name in "gfedcba":
         write(tmp_path / name, "")
     assert describe_folder(tmp_path) == "a, b, c, d, e and 2 more"
-
-
-def test_refused_candidates_are_counted_by_reason_and_others_keep_their_order(tmp_path):
-    for name in ("c.obj", "d.obj", "b.obj"):
-        write(tmp_path / name, CUBE)
-    settings = FolderSource(source="urdf", folder=".", licence="MIT")
-    candidates = {"mug": [tmp_path / name for name in ("none.obj", "d.obj", "b.obj")], "can": [tmp_path / "a.dae"]}
-    listing = read_listing(settings, tmp_path, candidates, MeshLimits())
-    found = {name: [entry.files[0].path for entry in entries] for name, entries in listing.entries.items()}
-    assert found == {"mug": ["d.obj", "b.obj"], "can": []}
-    assert list(listing.skipped.items()) == [("format", 1), ("missing", 1)]
 
 
 def test_the_nearest_licence_file_is_named_unless_the_user_states_one(tmp_path):

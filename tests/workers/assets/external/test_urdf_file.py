@@ -133,4 +133,4 @@ def test_the_caps_hold_for_all_visuals_together(tmp_path):
 def test_what_is_no_urdf_is_refused(tmp_path):
     for text in ("<sdf/>", "no xml", "<robot>"):
         with pytest.raises(MeshError):
-            parse_urdf(write(tmp_path / "x.urdf", text))
+            parse_urdf(write(tmp_path / "x.urdf", text), MeshLimits())

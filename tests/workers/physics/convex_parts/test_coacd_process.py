@@ -27,7 +27,9 @@ def test_an_l_is_cut_into_parts_within_its_bounds(tmp_path):
     faces = np.array([*sides, *(f[::-1] for f in cap), *([6 + v for v in f] for f in cap)], np.int32)
     assert trimesh.Trimesh(vertices, faces).volume > 2.9
     np.savez(tmp_path / "request.npz", vertices=vertices, faces=faces, options=json.dumps(OPTIONS))
-    done = subprocess.run([sys.executable, "-P", coacd_process.__file__, str(tmp_path)], capture_output=True)
+    done = subprocess.run(
+        [sys.executable, "-P", coacd_process.__file__, str(tmp_path), "60", "4096"], capture_output=True
+    )
     assert done.returncode == 0, done.stderr
     with np.load(tmp_path / "parts.npz") as parts:
         assert len(parts["counts"]) >= 2 and parts["counts"].sum() == len(parts["vertices"])

@@ -10,13 +10,15 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 
-from schemas.errors import MachineError
+from schemas.errors import MachineError, MeshError
 from schemas.job.assets import ProceduralSource
+from schemas.job.run import Run
 from schemas.scene.shape import Mesh
 from workers.assets.builtin.make import make_asset
 from workers.geometry.convexity import components, concavity_m, weld
 from workers.geometry.hull import convex_hull
 from workers.physics.convex_parts import step as module
+from workers.physics.convex_parts.parts_cache import PartsCache
 from workers.physics.convex_parts.step import decompose
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -147,6 +149,55 @@ def test_where_coacd_gives_up_the_hulls_of_the_pieces_serve(monkeypatch):
     parts = decompose(Mesh(mesh.vertices, mesh.faces[2:]), "gives up", folder=None)
     assert parts.method == "pieces"
     assert ConvexHull(parts.clouds[0]).volume == pytest.approx(0.2 * 0.2 * 0.05, rel=1e-6)
+
+
+def slow_mesh(monkeypatch):
+    """An open tray, cut so finely that CoACD takes minutes, with a second of processor time for it."""
+    monkeypatch.setattr(module, "OPEN", {"preprocess_mode": "on", "preprocess_resolution": 1000})
+    monkeypatch.setattr(module, "LONGEST_S", 1)
+    monkeypatch.setattr(module, "_CACHE", PartsCache())
+    return Mesh(tray().vertices, tray().faces[2:])
+
+
+def test_a_mesh_whose_parts_take_too_much_processor_time_is_refused_and_the_refusal_is_kept(monkeypatch, tmp_path):
+    mesh = slow_mesh(monkeypatch)
+    begun = module._children_s()
+    with pytest.raises(MeshError, match=r"no_convex_parts: .* in 1 s of processor time") as refused:
+        decompose(mesh, "endless", folder=tmp_path)
+    assert refused.value.kind == "intrinsic"
+    assert 0.9 < module._children_s() - begun < 2.5
+    assert len(list(tmp_path.iterdir())) == 1
+    monkeypatch.setattr(module, "_CACHE", PartsCache())
+    monkeypatch.setattr(module, "_run", lambda *_: pytest.fail("tried once more"))
+    with pytest.raises(MeshError, match="no_convex_parts"):
+        decompose(mesh, "endless", folder=tmp_path)
+
+
+def test_a_mesh_in_many_pieces_has_no_more_time_than_one_in_one(monkeypatch):
+    mesh = slow_mesh(monkeypatch)
+    monkeypatch.setattr(module, "LONGEST_S", 2)
+    shifts = [np.array([k, 0.0, 0.0]) for k in range(5)]
+    many = Mesh(
+        np.concatenate([mesh.vertices + shift for shift in shifts]),
+        np.concatenate([mesh.faces + k * len(mesh.vertices) for k in range(5)]).astype(np.int32),
+    )
+    begun = module._children_s()
+    with pytest.raises(MeshError, match="no_convex_parts"):
+        decompose(many, "many", folder=None)
+    assert module._children_s() - begun < 4
+
+
+def test_parts_are_looked_for_in_half_of_a_scene_s_time():
+    assert Run().scene_timeout_s >= 2 * module.LONGEST_S
+
+
+def test_where_coacd_has_too_little_memory_the_hulls_of_the_pieces_serve(monkeypatch):
+    """With 400 MiB it can be loaded and cuts an L, but has no room for 400 voxels along each axis."""
+    monkeypatch.setattr(module, "MEMORY_MB", 400)
+    assert decompose(angle_iron(), "enough memory", folder=None).method == "coacd"
+    monkeypatch.setattr(module, "OPEN", {"preprocess_mode": "on", "preprocess_resolution": 400})
+    mesh = tray()
+    assert decompose(Mesh(mesh.vertices, mesh.faces[2:]), "no memory", folder=None).method == "pieces"
 
 
 @pytest.mark.parametrize(("code", "message"), [(3, "not installed"), (-9, "killed")])

@@ -1,0 +1,120 @@
+"""What the process that reads files from outside is asked: to list an asset's files, to check it, to load it."""
+
+import errno
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import TypeAdapter
+from scipy.spatial import QhullError
+
+from schemas.errors import MeshError
+from schemas.job.assets import Assets, FolderSource, ShapeNetSource
+from schemas.scene.shape import Asset
+from workers.assets.builtin.make import TABLE
+from workers.assets.external.asset_bytes import pack_asset
+from workers.assets.external.caps import describe_error, one_line
+from workers.assets.external.listing import Entry, SourceFile, hash_files, list_files
+from workers.assets.external.placement import load_entry
+from workers.geometry.hull import convex_hull
+
+ANSWER, REFUSAL = b"+", b"-"
+"""The first byte of an answer."""
+
+_SETTINGS: TypeAdapter[ShapeNetSource | FolderSource] = TypeAdapter(ShapeNetSource | FolderSource)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One question about one asset of a source: its files by the `path` of the first, or a verdict or all of an `entry`."""
+
+    kind: Literal["list", "check", "load"]
+    path: Path
+    category: str = ""
+    entry: Entry | None = None
+
+
+@dataclass(frozen=True)
+class Request:
+    """Tasks about one source, whose folder is `folder`; `assets` has the limits and the densities."""
+
+    settings: ShapeNetSource | FolderSource
+    folder: Path
+    assets: Assets
+    tasks: tuple[Task, ...]
+
+
+def encode_request(request: Request) -> bytes:
+    """The request as JSON, with the limits that the process sets."""
+    limits = request.assets.limits
+    tasks = [{**asdict(task), "path": str(task.path)} for task in request.tasks]
+    tree = {
+        "memory_mb": limits.max_memory_mb,
+        "cpu_s": limits.max_cpu_s,
+        "settings": request.settings.model_dump(mode="json"),
+        "folder": str(request.folder),
+        "assets": Assets(
+            limits=limits, density_kg_m3=request.assets.density_kg_m3, shell_kg_m2=request.assets.shell_kg_m2
+        ).model_dump(mode="json"),
+        "tasks": tasks,
+    }
+    return json.dumps(tree).encode()
+
+
+def open_request(tree: dict[str, Any]) -> Request:
+    """The request of `encode_request`'s JSON."""
+    tasks = []
+    for task in tree["tasks"]:
+        entry = task["entry"]
+        if entry is not None:
+            entry = Entry(entry["instance_id"], tuple(SourceFile(**file) for file in entry["files"]), entry["licence"])
+        tasks.append(Task(task["kind"], Path(task["path"]), task["category"], entry))
+    settings = _SETTINGS.validate_python(tree["settings"])
+    return Request(settings, Path(tree["folder"]), Assets.model_validate(tree["assets"]), tuple(tasks))
+
+
+def answer_task(request: Request, number: int) -> bytes:
+    """`ANSWER` with what was asked for, or `REFUSAL` with reason, detail and kind as JSON. Raises MemoryError alone."""
+    task = request.tasks[number]
+    try:
+        return ANSWER + _answer(request, task)
+    except MeshError as error:
+        return _refusal(error)
+    except MemoryError:
+        raise
+    except OSError as error:
+        if error.errno in (errno.ENOMEM, errno.EFBIG):
+            raise MemoryError from error
+        return _refusal(MeshError("unreadable", f"{task.path} cannot be read: {describe_error(error)}"))
+    except Exception as error:  # whatever a stranger's bytes made a library raise, it is they that are refused
+        return _refusal(MeshError("unreadable", f"{task.path} cannot be read: {describe_error(error)}"))
+
+
+def _refusal(error: MeshError) -> bytes:
+    return REFUSAL + json.dumps([error.reason, one_line(error.detail), error.kind]).encode()
+
+
+def _answer(request: Request, task: Task) -> bytes:
+    if task.kind == "list":
+        files = hash_files(
+            list_files(request.settings, request.folder, task.path, request.assets.limits), request.folder
+        )
+        return json.dumps([[file.path, file.size, file.sha256] for file in files]).encode()
+    assert task.entry is not None
+    asset = load_entry(request.settings, request.folder, task.entry, task.category, request.assets)
+    if task.kind == "load":
+        return pack_asset(asset)
+    check_fit(asset, task.path)
+    return b""
+
+
+def check_fit(asset: Asset, path: Path) -> None:
+    """MeshError `no_hull` where an object has no convex hull, which is what it collides and is placed by."""
+    if asset.category == TABLE:
+        return
+    try:
+        convex_hull(asset.shape.vertices)
+    except (QhullError, ValueError) as error:
+        why = describe_error(error).split("\\n", 1)[0]
+        raise MeshError("no_hull", f"{path} has too few points apart for a body: {why:.120}") from error
