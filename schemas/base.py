@@ -1,5 +1,6 @@
 """The base of every configuration model, and the value types that they share."""
 
+import unicodedata
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -42,11 +43,27 @@ def _ordered(value: Range) -> Range:
 Interval = Annotated[Range, AfterValidator(_ordered)]
 """A `Range` whose ends are in order."""
 
+
+def _plain(value: str) -> str:
+    if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in value):
+        raise ValueError("holds a control character: write it without")
+    return value
+
+
+Text = Annotated[str, Field(max_length=1000), AfterValidator(_plain)]
+"""Words of the user's, which travel into messages, tables and file names: one line."""
+
+Folder = Annotated[str, Field(max_length=4000), AfterValidator(_plain)]
+"""A path, not longer than Linux takes."""
+
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 PositiveInt = Annotated[int, Field(ge=1)]
 NonNegativeInt = Annotated[int, Field(ge=0)]
+Weight = Annotated[float, Field(gt=0, le=1e12)]
+"""A share of the sum of all weights, which must not overflow."""
+Seed = Annotated[int, Field(ge=0, le=10**18)]
 
 
 def frozen_array(values: object, dtype: type = np.float64) -> NDArray:

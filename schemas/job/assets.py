@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from schemas.base import Frozen, NonNegativeInt, Positive, PositiveInt, Share
+from schemas.base import Folder, Frozen, Positive, PositiveInt, Seed, Share, Text, Weight
 
 
 class ProceduralSource(Frozen):
@@ -13,11 +13,11 @@ class ProceduralSource(Frozen):
 
     source: Literal["procedural"]
     """Which kind of source this is."""
-    weight: Positive = 1.0
+    weight: Weight = 1.0
     """Share of this source among the sources that offer a scene's category."""
-    seed: NonNegativeInt = 0
+    seed: Seed = 0
     """Seed of the shapes; instance n of a category is the same in every dataset with this seed."""
-    instances: PositiveInt = 1_000_000
+    instances: Annotated[int, Field(ge=1, le=10**12)] = 1_000_000
     """Number of distinct instances of each category."""
     size: Literal["article", "metric"] = "article"
     """`article`: bounding-box diagonal `diagonal_m`; `metric`: the true size of such an object. Tables are metric."""
@@ -30,13 +30,13 @@ class ShapeNetSource(Frozen):
 
     source: Literal["shapenet"]
     """Which kind of source this is."""
-    weight: Positive = 1.0
+    weight: Weight = 1.0
     """Share of this source among the sources that offer a scene's category."""
-    folder: str
+    folder: Folder
     """The folder that holds the synset folders (02876657, ...), relative to the job file."""
     scale: Positive | None = None
     """Multiplies the normalised units; default 0.25 for objects and 1.5 for tables, as in the article."""
-    licence: str = "ShapeNet terms of use: non-commercial research"
+    licence: Text = "ShapeNet terms of use: non-commercial research"
     """Licence of these shapes, for the `assets` table."""
     copy_assets: bool = False
     """Whether the cleaned shapes may be written into the dataset."""
@@ -47,11 +47,11 @@ class FolderSource(Frozen):
 
     source: Literal["urdf"]
     """Which kind of source this is."""
-    weight: Positive = 1.0
+    weight: Weight = 1.0
     """Share of this source among the sources that offer a scene's category."""
-    folder: str
+    folder: Folder
     """A folder relative to the job file, or `pybullet_data` for the meshes inside that package."""
-    category_map: dict[str, str] = Field(default_factory=dict)
+    category_map: dict[Folder, Text] = Field(default_factory=dict)
     """Category by file pattern (glob relative to `folder`); the first match wins. Empty: the map that is built in for
     `pybullet_data`."""
     up: Literal["x", "y", "z"] = "z"
@@ -60,7 +60,7 @@ class FolderSource(Frozen):
     """Multiplies the source's coordinates: 0.001 for millimetres."""
     diagonal_m: Positive | None = None
     """Resize every object to this bounding-box diagonal; None keeps its own size."""
-    licence: str = "unknown"
+    licence: Text = "unknown"
     """Licence of these shapes, for the `assets` table."""
     copy_assets: bool = False
     """Whether the cleaned shapes may be written into the dataset."""
@@ -117,9 +117,9 @@ class MeshLimits(Frozen):
 class Assets(Frozen):
     """Where objects and tables come from; sources are mixed by weight."""
 
-    objects: tuple[Source, ...] = Field(default=(ProceduralSource(source="procedural"),), min_length=1)
+    objects: tuple[Source, ...] = Field(default=(ProceduralSource(source="procedural"),), min_length=1, max_length=100)
     """Sources of objects."""
-    tables: tuple[Source, ...] = Field(default=(ProceduralSource(source="procedural"),), min_length=1)
+    tables: tuple[Source, ...] = Field(default=(ProceduralSource(source="procedural"),), min_length=1, max_length=100)
     """Sources of tables."""
     split: SplitShares = SplitShares()
     """Shares of instances in train, val and test."""

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from schemas.base import Frozen, NonNegativeInt, Positive, PositiveInt
+from schemas.base import Frozen, NonNegativeInt, PositiveInt, Seed, Weight
 from schemas.job.assets import Assets
 from schemas.job.cameras import Cameras
 from schemas.job.images import Images
@@ -21,6 +21,9 @@ from schemas.job.start import ONE_OBJECT, ObjectCount, Start
 Category = Literal["bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box"]
 CATEGORIES: tuple[Category, ...] = ("bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box")
 
+MOST_SCENE_IDS = 10**10
+"""Ids of scenes have ten digits in the names of ranges, which sort like numbers."""
+
 
 class Job(Frozen):
     """A whole job file."""
@@ -31,7 +34,7 @@ class Job(Frozen):
     """Names the dataset; the default output folder is data/<name>."""
     preset: PresetName = "balanced"
     """Defaults of keys that are not given: `fast` and `exact` trade errors for time as measured in docs/tradeoff."""
-    seed: NonNegativeInt = 0
+    seed: Seed = 0
     """Seed of all that is random in a scene."""
     scenes: PositiveInt = 64
     """Number of scenes; more than before extends a dataset."""
@@ -41,7 +44,7 @@ class Job(Frozen):
     """Input and mirror poses of each scene."""
     objects_per_scene: ObjectCount = ONE_OBJECT
     """Number of objects on the table; from a range each number is equally likely. The scene's category is the first object's."""
-    categories: dict[Category, Positive] = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)
+    categories: dict[Category, Weight] = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)
     """Weights of the categories; a list of names means equal weights."""
     assets: Assets = Assets()
     """Where shapes come from."""
@@ -73,10 +76,20 @@ class Job(Frozen):
     @classmethod
     def _from_list(cls, value: object) -> object:
         if isinstance(value, list):
-            if len(set(map(str, value))) != len(value):
-                raise ValueError(f"{value} names a category twice")
+            if not all(isinstance(name, str) for name in value):
+                raise ValueError("must be a list of names, or names with weights")
+            if len(set(value)) != len(value):
+                raise ValueError("names a category twice")
             return dict.fromkeys(value, 1.0)
         return value
+
+    @model_validator(mode="after")
+    def _has_ids(self) -> "Job":
+        if self.stop_scene > MOST_SCENE_IDS:
+            raise ValueError(
+                f"first_scene + scenes is {self.stop_scene}, and names of files have room for ids below {MOST_SCENE_IDS}"
+            )
+        return self
 
     @model_validator(mode="after")
     def _agrees(self) -> "Job":

@@ -1,8 +1,13 @@
 """The `check`, `output` and `run` branches of a job: what is checked, how files are laid out, how the work is driven."""
 
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from schemas.base import Frozen, Positive, PositiveInt, Share
+
+RangeSize = Annotated[int, Field(ge=1, le=100_000)]
+"""A worker keeps the rows of a whole range, some kilobytes a scene."""
 
 
 class Check(Frozen):
@@ -25,11 +30,11 @@ class Output(Frozen):
 class Run(Frozen):
     """Workers, shards, ranges and limits. None of these keys changes a byte of the dataset."""
 
-    workers: PositiveInt | None = None
+    workers: Annotated[int, Field(ge=1, le=100_000)] | None = None
     """None: the cores that this container may use, or the cluster's."""
     shard_size: PositiveInt | None = None
     """Scenes in a Ray task; rounded up to whole ranges. None: 64, and fewer where that would leave workers idle."""
-    range_size: PositiveInt = 16
+    range_size: RangeSize = 16
     """Scenes in a commit; recorded at the first run."""
     max_failure_share: Share = 0.01
     """Above this share of failed scenes the run exits 1, and stops early once that is certain."""

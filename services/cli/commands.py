@@ -20,9 +20,9 @@ Found = TypeVar("Found")
 
 def run(options: argparse.Namespace) -> int:
     """`verso run`."""
+    job = load_job(options.job, _changes(options))
     from services.run.step import RunRequest, describe_plan, run_job
 
-    job = load_job(options.job, _changes(options))
     out = options.out or f"data/{job.name}"
     absolute = out if "://" in out else str(Path(out).resolve())
     request = RunRequest(job, options.job.parent, absolute, options.address, options.retry_failed)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from services.cli.arguments import Parser, read_address, read_count, read_index, read_path, read_place
+
 KEPT: Final = "what is committed is kept, the same command goes on from there"
 
 
@@ -17,7 +19,7 @@ def build_parser() -> argparse.ArgumentParser:
     it starts Ray, `options.kept` what remains of its work where it dies, and `options.quiet` whether the terminal is
     spared what C++ code says.
     """
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="verso",
         description="View-dependent RGB-D datasets for reconstructing objects from a single view.",
         epilog="`verso COMMAND --help` explains a command and gives an example.",
@@ -47,20 +49,6 @@ def _version() -> str:
         return "verso (a checkout that is not installed)"
 
 
-def read_index(text: str) -> int:
-    """A whole number from 0 up. Raises argparse.ArgumentTypeError."""
-    if not text.isdigit():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 up")
-    return int(text)
-
-
-def read_count(text: str) -> int:
-    """A whole number from 1 up. Raises argparse.ArgumentTypeError."""
-    if not read_index(text):
-        raise argparse.ArgumentTypeError(f"{text} is not a whole number from 1 up")
-    return int(text)
-
-
 Option = tuple[tuple[str, ...], dict[str, Any]]
 
 
@@ -88,8 +76,8 @@ class Command:
 
 
 JSON = option("--json", action="store_true", help="print one JSON object as the last line of standard output")
-JOB = option("job", type=Path, metavar="JOB.yaml")
-OUT = option("out", metavar="OUT")
+JOB = option("job", type=read_path, metavar="JOB.yaml")
+OUT = option("out", type=read_place, metavar="OUT")
 SCENE = option("scene", type=read_index, metavar="SCENE")
 SET = option("--set", action="append", default=[], metavar="KEY=VALUE", dest="changes", help="change a key of the job")
 
@@ -99,13 +87,16 @@ COMMANDS: dict[str, Command] = {
         "deploy/jobs/tabletop.yaml --scenes 128 --set start.pose=tumbled",
         (
             JOB,
-            option("--out", metavar="DIR", help="output folder (default: data/<job name>)"),
+            option("--out", type=read_place, metavar="DIR", help="output folder (default: data/<job name>)"),
             number("--scenes", "how many scenes; more than before extends the dataset"),
             option("--first-scene", type=read_index, metavar="N", help="id of the first scene"),
             number("--workers", "default: the cores this container may use, or the cluster's"),
             number("--shard-size", "scenes in a Ray task, rounded up to whole ranges"),
             option(
-                "--address", metavar="HOST:PORT", help="a Ray cluster that runs already (default: a private Ray here)"
+                "--address",
+                type=read_address,
+                metavar="HOST:PORT",
+                help="a Ray cluster that runs already (default: a private Ray here)",
             ),
             SET,
             option("--dry-run", action="store_true", help="check everything and say what would be done"),
@@ -147,7 +138,7 @@ COMMANDS: dict[str, Command] = {
     "scene": Command(
         "write the posed geometry of one scene",
         "data/tabletop 17 --glb scene17.glb",
-        (OUT, SCENE, option("--glb", type=Path, required=True, metavar="FILE")),
+        (OUT, SCENE, option("--glb", type=read_path, required=True, metavar="FILE")),
     ),
     "test": Command(
         "lint, types, layer rules and tests",
@@ -159,11 +150,11 @@ COMMANDS: dict[str, Command] = {
         "time by stage on one core, beside the script that people write today and the least that is possible",
         "deploy/jobs/tabletop.yaml --scenes 64 --memory 2000 --workers 2",
         (
-            option("job", type=Path, metavar="JOB.yaml", nargs="?", help="default: a job of built-in shapes"),
+            option("job", type=read_path, metavar="JOB.yaml", nargs="?", help="default: a job of built-in shapes"),
             number("--scenes", "how many scenes each side makes", 48),
             option(
                 "--folder",
-                type=Path,
+                type=read_path,
                 metavar="DIR",
                 default=Path("data"),
                 help="on the disk to measure (default: data)",
@@ -193,7 +184,7 @@ COMMANDS: dict[str, Command] = {
         "deploy/jobs/tabletop.yaml --out data/tradeoff --target penetration_mm=0.1,depth_mm=0.5",
         (
             JOB,
-            option("--out", type=Path, required=True, metavar="DIR", help="goes on there where it stopped"),
+            option("--out", type=read_path, required=True, metavar="DIR", help="goes on there where it stopped"),
             option(
                 "--target",
                 metavar="ERROR=MOST,...",

@@ -5,79 +5,98 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import ValidationError
 
 from schemas.errors import JobError
 from schemas.job.job import Job
 from schemas.job.keys import set_key
+from services.job.bounded_yaml import MOST_LEVELS, parse_yaml
+from services.job.plain_line import plain_line
 from services.job.reference import allowed_keys
 
+MOST_BYTES = 250_000
+"""Longest job file; the longest example has 2,000 bytes."""
 
-class _StrictLoader(yaml.SafeLoader):
-    """A safe YAML loader that refuses a key written twice, where YAML's own keeps the last."""
+MOST_KEYS = 20_000
+"""Most keys and values of a job file: half of what a text may have, because filling in defaults adds more."""
 
+MOST_KEY_CHARACTERS = 400
+"""Longest path of a key in `--set`."""
 
-def _mapping(loader: _StrictLoader, node: yaml.MappingNode) -> dict[Any, Any]:
-    seen: set[Any] = set()
-    for key_node, _ in node.value:
-        key = loader.construct_object(key_node)
-        if not isinstance(key, str):
-            raise JobError(f"line {key_node.start_mark.line + 1}: the key {key!r} is not a word")
-        if key in seen:
-            raise JobError(f"line {key_node.start_mark.line + 1}: the key '{key}' is written twice")
-        seen.add(key)
-    return loader.construct_mapping(node, deep=True)
-
-
-_StrictLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
+MOST_FAULTS = 20
+"""Most faults that one message tells."""
 
 
 def load_job(path: Path, changes: Sequence[str] = ()) -> Job:
     """Read a job file and apply `path.to.key=value` changes. Raises JobError."""
-    return validate_job(read_tree(path, changes), str(path))
+    name = plain_line(str(path), 300)
+    job = validate_job(read_tree(path, changes), name)
+    _check_homes(job, name)
+    return job
+
+
+def _check_homes(job: Job, name: str) -> None:
+    """Raises JobError for a folder that begins with the name of a user whom this machine does not know."""
+    for branch in ("objects", "tables"):
+        for number, source in enumerate(getattr(job.assets, branch)):
+            try:
+                Path(getattr(source, "folder", "")).expanduser()
+            except RuntimeError as error:
+                key = f"assets.{branch}.{number}.folder"
+                raise JobError(f"{name}: {key}: {plain_line(repr(source.folder))}: there is no such user") from error
 
 
 def read_tree(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
     """The keys of a job file with `path.to.key=value` changes, without defaults. Raises JobError."""
+    name = plain_line(str(path), 300)
     try:
-        text = path.read_text(encoding="utf-8")
+        tree = parse_yaml(_read_text(path), MOST_KEYS)
     except FileNotFoundError as error:
-        raise JobError(f"{path}: no such file; the examples are in deploy/jobs/") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise JobError(f"{path}: cannot be read as text: {error}") from error
-    try:
-        tree = yaml.load(text, Loader=_StrictLoader)
-    except yaml.YAMLError as error:
-        raise JobError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+        raise JobError(f"{name}: no such file; the examples are in deploy/jobs/") from error
+    except (OSError, ValueError) as error:
+        raise JobError(f"{name}: cannot be read as UTF-8 text: {plain_line(str(error), 200)}") from error
     except JobError as error:
-        raise JobError(f"{path}: {error}") from error
+        raise JobError(f"{name}: {error}") from error
     if not isinstance(tree, dict):
         found = type(tree).__name__ if tree is not None else "nothing"
-        raise JobError(f"{path}: holds {found}, and must hold keys and values")
+        raise JobError(f"{name}: holds {found}, and must hold keys and values")
+    if sum(map(len, changes)) > MOST_BYTES:
+        raise JobError(f"--set: the changes have over {MOST_BYTES} characters: put them into the job file")
     for change in changes:
         change_key(tree, change)
     return tree
 
 
+def _read_text(path: Path) -> str:
+    """The text of a file, of which no more is read than a job file may have. Raises OSError, ValueError, JobError."""
+    with path.open("rb") as file:
+        data = file.read(MOST_BYTES + 1)
+    if len(data) > MOST_BYTES:
+        raise JobError(f"has over {MOST_BYTES} bytes, and no job needs as many")
+    return data.decode("utf-8-sig")
+
+
 def change_key(tree: dict[str, Any], change: str) -> None:
     """Apply one `path.to.key=value` in place; the value is read as YAML. Raises JobError."""
     path, equals, text = change.partition("=")
+    name = f"--set {plain_line(change, 120)}"
     if not equals or not path:
-        raise JobError(f"--set {change}: write it as path.to.key=value, for example --set physics.step_hz=480")
+        raise JobError(f"{name}: write it as path.to.key=value, for example --set physics.step_hz=480")
+    if len(path) > MOST_KEY_CHARACTERS or path.count(".") >= MOST_LEVELS:
+        raise JobError(
+            f"{name}: there is no such key: none has over {MOST_LEVELS} parts or {MOST_KEY_CHARACTERS} characters"
+        )
     try:
-        set_key(tree, path, yaml.load(text, Loader=_StrictLoader))
-    except yaml.YAMLError as error:
-        raise JobError(f"--set {change}: the value is not YAML: {' '.join(str(error).split())}") from error
-    except ValueError as error:
-        raise JobError(f"--set {change}: {error}") from error
+        set_key(tree, path, parse_yaml(text))
+    except (JobError, ValueError) as error:
+        raise JobError(f"{name}: {plain_line(str(error), 300)}") from error
 
 
 def validate_job(tree: dict[str, Any], name: str) -> Job:
     """A `Job` from parsed keys. Raises JobError with one line for each fault."""
     version = tree.get("verso", 1)
     if isinstance(version, int) and version > 1:
-        newer = f"{version} is newer than this program, which reads version 1: install a newer Verso"
+        newer = f"{plain_line(str(version))} is newer than this program, which reads version 1: install a newer Verso"
         raise JobError(f"{name}: verso: {newer}")
     try:
         return Job.model_validate(tree)
@@ -85,21 +104,23 @@ def validate_job(tree: dict[str, Any], name: str) -> Job:
         faults = error.errors()
         # An invalid item of a list makes the list itself count as too short: that line would confuse.
         told = [fault for fault in faults if fault["type"] != "too_short" or len(faults) == 1]
-        raise JobError("\n".join(f"{name}: {describe_fault(fault)}" for fault in told)) from error
+        lines = [f"{name}: {describe_fault(fault)}" for fault in told[:MOST_FAULTS]]
+        if len(told) > MOST_FAULTS:
+            lines.append(f"{name}: and {len(told) - MOST_FAULTS} faults more")
+        raise JobError("\n".join(lines)) from error
 
 
 def describe_fault(fault: Any) -> str:
     """One line: the key's path, its value, and what is allowed."""
-    words = [str(part) for part in fault["loc"] if part not in ("procedural", "shapenet", "urdf", "[key]")]
-    key = ".".join(words) or "the job"
+    words = [plain_line(str(part)) for part in fault["loc"] if part not in ("procedural", "shapenet", "urdf", "[key]")]
+    key = plain_line(".".join(words), 200) or "the job"
     if fault["type"] == "extra_forbidden":
         allowed = allowed_keys(words)
         return f"{key}: there is no such key; {did_you_mean(words[-1], allowed)}Allowed here: {', '.join(allowed) or 'nothing'}"
     if fault["type"] == "missing":
         return f"{key}: is missing, and has no default"
-    message = fault["msg"].removeprefix("Value error, ")
-    value = repr(fault["input"])
-    return f"{key}: {value if len(value) <= 80 else value[:77] + '...'}: {message[0].lower()}{message[1:]}"
+    message = plain_line(fault["msg"].removeprefix("Value error, "), 300)
+    return f"{key}: {plain_line(repr(fault['input']))}: {message[:1].lower()}{message[1:]}"
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

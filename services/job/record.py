@@ -8,10 +8,10 @@ from pathlib import Path
 import yaml
 
 from schemas.dataset.layout import JOB_FILE, LOCK_FILE, LOG_FOLDER, MANIFEST, STAGING
-from schemas.errors import CorruptError, OutputError
+from schemas.errors import CorruptError, JobError, OutputError
 from schemas.job.identity import compare_jobs, job_digest
 from schemas.job.job import Job
-from services.job.read import validate_job
+from services.job.read import parse_yaml, validate_job
 from workers.store.store import Store
 
 OWN = {MANIFEST, STAGING, LOCK_FILE, LOG_FOLDER}
@@ -50,14 +50,15 @@ def encode_job(record: JobRecord) -> bytes:
 def read_job(store: Store) -> JobRecord | None:
     """The job that a folder belongs to, None where it has none. Raises CorruptError."""
     try:
-        text = store.read(JOB_FILE).decode()
+        tree = parse_yaml(store.read(JOB_FILE).decode())
     except FileNotFoundError:
         return None
+    except (JobError, UnicodeDecodeError) as error:
+        raise CorruptError(f"{store.name}/{JOB_FILE} is not a job that `verso run` wrote: {error}") from error
     try:
-        tree = yaml.safe_load(text)
         job = validate_job(tree["job"], f"{store.name}/{JOB_FILE}")
         return JobRecord(job, tree["digest"], tree["catalogue"], _folder(tree["folder"]))
-    except (yaml.YAMLError, UnicodeDecodeError, TypeError, AttributeError, KeyError) as error:
+    except (TypeError, AttributeError, KeyError) as error:
         raise CorruptError(f"{store.name}/{JOB_FILE} is not a job that `verso run` wrote: {error!r}") from error
 
 

@@ -93,7 +93,7 @@ def test_a_ray_that_does_not_answer_is_told_at_once(capsys, tmp_path):
     assert "127.0.0.1:1" in text
     assert "ray start" in text
     code, text = told(capsys, "run", TABLETOP, "--address", "nonsense", "--out", str(tmp_path / "out"))
-    assert code == 1
+    assert code == 2
     assert "HOST:PORT" in text
 
 

@@ -113,3 +113,96 @@ def test_a_count_of_objects_is_a_number_or_a_range_and_is_written_as_it_was(tmp_
     dumped = job.model_dump(mode="json")
     assert dumped["objects_per_scene"] == told
     assert Job.model_validate(dumped) == job
+
+
+HOSTILE_KEYS = [
+    ("name: a\ncategories: [[mug]]", ["categories: [['mug']]", "list of names"]),
+    ("name: a\ncategories: [{a: b}]", ["categories", "list of names"]),
+    ('name: a\nassets: {objects: [{source: urdf, folder: "a\\0b"}]}', ["assets.objects.0.folder", "'a\\x00b'"]),
+    (
+        "name: a\nassets: {objects: [{source: urdf, folder: ~nobody7/b}]}",
+        ["assets.objects.0.folder", "~nobody7/b", "user"],
+    ),
+    (
+        "name: a\nassets: {tables: [{source: shapenet, folder: ~nobody7}]}",
+        ["assets.tables.0.folder", "~nobody7", "user"],
+    ),
+    (f"name: a\nassets: {{objects: [{{source: urdf, folder: {'x' * 9000}}}]}}", ["assets.objects.0.folder", "4000"]),
+    ('name: a\nassets: {objects: [{source: urdf, folder: ., licence: "\\e[31m"}]}', ["objects.0.licence", "control"]),
+    ('name: a\nassets: {objects: [{source: "\\e[31m"}]}', ["assets.objects.0", "\\x1b[31m"]),
+    ('name: "\\e[31mred"', ["name", "'\\x1b[31mred'"]),
+    ('name: a\n"\\e[31mred": 3', ["\\x1b[31mred", "no such key"]),
+    (f"name: a\n{'k' * 900}: 3", ["kkk...", "no such key"]),
+    (f"name: {'a' * 9000}", ["name", "aaa...", "pattern"]),
+    (f"name: a\nassets: {{objects: [{'{source: procedural},' * 101}]}}", ["assets.objects", "100 items"]),
+    ("name: a\nscenes: 1" + "0" * 30, ["first_scene + scenes", "10000000000"]),
+    ("name: a\nfirst_scene: 9999999999\nscenes: 2", ["first_scene + scenes is 10000000001"]),
+    ("name: a\nseed: 1" + "0" * 30, ["seed", "less than or equal"]),
+    ("name: a\nphysics: {friction: 1.0e+400}", ["physics.friction", "finite"]),
+    ("name: a\nverso: 1" + "0" * 50, ["verso", "newer"]),
+    (f"name: a\n#{'x' * 400_000}", ["250000 bytes"]),
+    ("name: a\nassets: {objects: [{source: procedural, weight: 1.0e+308}]}", ["assets.objects.0.weight", "1e+308"]),
+]
+
+
+@pytest.mark.parametrize(("text", "words"), HOSTILE_KEYS)
+def test_a_hostile_value_is_told_in_a_line_that_a_terminal_can_show(tmp_path, text, words):
+    message = fault(tmp_path, text)
+    assert "job.yaml" in message
+    assert all(word in message for word in words), message
+    assert message.isprintable() and len(message) < 700 + len(str(tmp_path)), message
+
+
+def test_thousands_of_faults_are_told_by_the_first_twenty(tmp_path):
+    message = fault(tmp_path, "name: a\n" + "".join(f"k{i}: 1\n" for i in range(9000)))
+    assert len(message.splitlines()) == 21
+    assert message.splitlines()[-1].endswith("and 8980 faults more")
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        ("name: a".encode("utf-16"), "UTF-8"),
+        (b"name: \xe9", "UTF-8"),
+        (b"name: a\0b", "not YAML"),
+    ],
+)
+def test_a_file_that_is_no_text_is_told(tmp_path, data, words):
+    (tmp_path / "job.yaml").write_bytes(data)
+    with pytest.raises(JobError, match=words):
+        load_job(tmp_path / "job.yaml")
+
+
+def test_a_byte_order_mark_is_no_part_of_the_first_key(tmp_path):
+    (tmp_path / "job.yaml").write_bytes("\ufeffname: a\r\nscenes: 3\r\n".encode())
+    assert load_job(tmp_path / "job.yaml").scenes == 3
+
+
+@pytest.mark.parametrize("path", ["/dev/zero", "/proc/self/mem", "."])
+def test_what_is_no_job_file_is_told_and_not_read_for_ever(path):
+    with pytest.raises(JobError) as caught:
+        load_job(Path(path))
+    assert len(str(caught.value)) < 200
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("seed=" + "9" * 100_000, ["seed=999", "100000 characters"]),
+        ("categories=" + "[" * 2_000, ["categories=[[[", "levels deep"]),
+        (".".join("a" * 2_000) + "=1", ["a.a.a", "no such key"]),
+        ("start." + "x" * 10_000 + ".y=1", ["start.xxx", "no such key"]),
+        ("name=a\udcff", ["name=a\\udcff"]),
+        ("\x1b[31m=3", ["\\x1b[31m"]),
+        ("start={a: *b}", ["'*b'"]),
+        ('assets.objects=[{source: urdf, folder: "a\\0b"}]', ["assets.objects.0.folder", "control"]),
+        ("assets.objects=[{source: urdf, folder: ~nobody7}]", ["assets.objects.0.folder", "user"]),
+        ("run.workers=1" + "0" * 40, ["run.workers"]),
+        ("assets.objects." + "9" * 300 + "=1", ["assets.objects"]),
+        ("licence=" + "x" * 300_000, ["250000 characters"]),
+    ],
+)
+def test_a_hostile_change_is_told_in_a_line(tmp_path, change, words):
+    message = fault(tmp_path, "name: a\nassets: {objects: [{source: procedural}]}", change)
+    assert all(word in message for word in words), message
+    assert message.isprintable() and len(message) < 700 + len(str(tmp_path)), message

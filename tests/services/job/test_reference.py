@@ -20,7 +20,7 @@ def test_every_key_is_documented_and_the_page_is_current():
         ("images.projection.splat", "whole number, >= 1, <= 15"),
         ("start.offset_m", "[low, high]"),
         ("cameras.depth.offset_m", "list of 3 numbers"),
-        ("run.workers", "whole number, >= 1 or nothing"),
+        ("run.workers", "whole number, >= 1, <= 100000 or nothing"),
         ("assets.objects[urdf].up", "`x`, `y`, `z`"),
     ],
 )

@@ -27,7 +27,10 @@ def locate_folder(name: str, job_folder: Path) -> Path:
         if spec is None or not spec.submodule_search_locations:
             raise AssetSourceError("the package pybullet_data is not installed: `pip install pybullet` brings it")
         return Path(spec.submodule_search_locations[0]).resolve()
-    return (job_folder / Path(name).expanduser()).resolve()
+    try:
+        return (job_folder / Path(name).expanduser()).resolve()
+    except RuntimeError as error:
+        raise AssetSourceError(f"{name}: there is no such user, or no home folder") from error
 
 
 def find_files(

@@ -6,6 +6,7 @@ from pathlib import Path
 from schemas.errors import AssetSourceError
 from schemas.job.assets import ShapeNetSource
 from workers.assets.builtin.make import TABLE
+from workers.assets.external.folder import locate_folder
 from workers.assets.external.listing import describe_folder
 
 SYNSETS: dict[str, str] = {
@@ -31,7 +32,7 @@ def find_models(
 
     Raises AssetSourceError where the folder is not ShapeNetCore's.
     """
-    folder = (job_folder / Path(settings.folder).expanduser()).resolve()
+    folder = locate_folder(settings.folder, job_folder)
     if not folder.is_dir():
         raise AssetSourceError(
             f"{folder} is not a folder. Set `folder` of the shapenet source to your copy of ShapeNetCore: the folder "
