@@ -7,7 +7,7 @@ import http.client
 import json
 import sys
 
-import grpc
+import grpc  # type: ignore[import-untyped]
 
 RUNS = json.dumps({"entrypoint": sys.argv[1]})
 GRPC_CALLS = (

@@ -69,4 +69,8 @@ def _address(digits: str) -> str:
     raw = b"".join(struct.pack("=I", int(digits[k : k + 8], 16)) for k in range(0, len(digits), 8))
     if len(raw) == 4:
         return socket.inet_ntoa(raw)
-    return socket.inet_ntoa(raw[12:]) if raw.startswith(bytes(10) + b"\xff\xff") else socket.inet_ntop(socket.AF_INET6, raw)
+    return (
+        socket.inet_ntoa(raw[12:])
+        if raw.startswith(bytes(10) + b"\xff\xff")
+        else socket.inet_ntop(socket.AF_INET6, raw)
+    )

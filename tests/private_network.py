@@ -155,5 +155,3 @@ def describe_frame(frame: bytes) -> str:
         return f"IP protocol {protocol} to {target}"
     (port,) = struct.unpack_from("!H", frame, start + 2)
     return f"{'TCP' if protocol == socket.IPPROTO_TCP else 'UDP'} to {target}:{port}"
-
-

@@ -68,7 +68,11 @@ def attack(network, tmp_path_factory) -> Attack:
     victim = folder / "victim"
     with network.watch() as frames:
         run = subprocess.Popen(
-            network.command(command(folder / "out")), cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            network.command(command(folder / "out")),
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
         )
         caller = subprocess.Popen(
             network.command([sys.executable, str(ROOT / "tests" / "callers_without_token.py"), f"touch {victim}"]),
@@ -122,7 +126,9 @@ def is_worker(listener: Listener) -> bool:
 
 def scan(run: subprocess.Popen) -> list[int]:
     """Tries each port from outside, while the coordinator is held, so that nothing ends meanwhile."""
-    coordinator = next(pid for pid in tree_of(run.pid) if b"services.cli.main" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    coordinator = next(
+        pid for pid in tree_of(run.pid) if b"services.cli.main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    )
     os.kill(coordinator, signal.SIGSTOP)
     try:
         return open_ports(HOST_LAN, range(1, 65536))
