@@ -5,16 +5,20 @@ import os
 import shutil
 import socket
 import sys
-import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, MutableMapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import ray
+from ray._private import ray_constants, utils
+from ray._private.node import Node
+from ray._raylet import AuthenticationTokenLoader, Config  # type: ignore[attr-defined]
 
 from schemas.errors import MachineError
 from services.run.cores import usable_cores
+from services.run.ray_environment import NOT_INHERITED, private_environment
+from services.run.ray_folder import private_folder
 from services.run.supervisor import tell
 
 OBJECT_STORE_BYTES = 128 * 2**20
@@ -44,22 +48,76 @@ def open_ray(address: str | None, workers: int | None) -> contextlib.AbstractCon
 def private_ray(workers: int) -> Iterator[Slots]:
     """A private Ray with `workers` slots, shut down when the block ends.
 
-    Never joins another Ray on this machine, contacts no other host and opens no dashboard.
+    Never joins another Ray on this machine and contacts no other host. Its processes listen on loopback and on sockets in
+    a folder that no other user can enter, and answer those that show its token, which no file and no log holds.
     """
-    # Otherwise Ray asks its own workers for a token that an earlier Ray left in the home folder.
-    os.environ["RAY_AUTH_MODE"] = "disabled"  # noqa: TID251 - Ray reads this setting nowhere else
-    with tempfile.TemporaryDirectory(prefix="vr", ignore_cleanup_errors=True) as folder:
-        tell(folder=folder)  # the supervisor removes it where this process cannot
+    with private_folder() as folder, _kept_private():
+        tell(folder=str(folder.parent))  # the supervisor removes it where this process cannot
         settings = {
             "num_cpus": workers,
             "include_dashboard": False,
             "object_store_memory": OBJECT_STORE_BYTES,
-            "_temp_dir": folder,
-            "_plasma_directory": _object_store_folder(folder),
+            "_temp_dir": str(folder),
+            "_plasma_directory": _object_store_folder(str(folder)),
             "_node_ip_address": "127.0.0.1",
+            "_system_config": {"enable_metrics_collection": False},  # they would be served without asking for the token
         }
         with _connection("local", **settings):
             yield Slots(workers, PREFETCH * workers)
+
+
+@contextlib.contextmanager
+def _kept_private() -> Iterator[None]:
+    """Makes Ray's next start in this process a private one; afterwards the user's own settings count again.
+
+    `ray.init` has no setting that keeps these from starting:
+
+    - the dashboard's process, which is there without a dashboard too, for usage statistics alone. It asks the metadata
+      services of three clouds, even where the statistics are off;
+    - the autoscaler and the log monitor, which have nothing to do here. The first serves metrics to anyone;
+    - the servers of its agent, through which jobs are submitted. Without the dashboard's packages the agent has none.
+    """
+    environ = os.environ  # noqa: TID251 - Ray and its processes read these settings nowhere else
+    mine = private_environment()
+    before = {name: environ.get(name) for name in (*mine, *NOT_INHERITED)}
+    replacements: list[tuple[Any, str, Any]] = [
+        (ray_constants, "ENABLE_RAY_CLUSTER", False),  # read from the environment when Ray was imported
+        (Node, "start_api_server", _note_that_there_is_no_dashboard),
+        (Node, "start_monitor", lambda node: None),
+        (Node, "start_log_monitor", lambda node: None),
+        (utils, "get_dashboard_dependency_error", lambda: ImportError("a private Ray has no dashboard")),
+    ]
+    with contextlib.ExitStack() as undo:
+        undo.callback(_read_authentication_again)
+        undo.callback(_set_variables, environ, before)
+        _set_variables(environ, {**dict.fromkeys(NOT_INHERITED), **mine})
+        for module, name, value in replacements:
+            undo.callback(setattr, module, name, getattr(module, name))
+            setattr(module, name, value)
+        _read_authentication_again()
+        yield
+
+
+def _note_that_there_is_no_dashboard(node: Node, **_: Any) -> None:
+    """What the dashboard's process does where it serves nothing; Ray's agent would ask for the address every second."""
+    node._webui_url = ""
+    address, namespace = ray_constants.DASHBOARD_ADDRESS, ray_constants.KV_NAMESPACE_DASHBOARD
+    node.get_gcs_client().internal_kv_put(address.encode(), b"none", True, namespace)
+
+
+def _set_variables(environ: MutableMapping[str, str], values: Mapping[str, str | None]) -> None:
+    """Sets the variables, and removes those whose value is None."""
+    for name, value in values.items():
+        if value is None:
+            environ.pop(name, None)
+        else:
+            environ[name] = value
+
+
+def _read_authentication_again() -> None:
+    """Ray's core keeps the mode from its import, and the token from its first use."""
+    Config.initialize("")
+    AuthenticationTokenLoader.instance().reset_cache()
 
 
 def _object_store_folder(temporary: str) -> str:
