@@ -13,11 +13,11 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.dataset.commit import CommitRecord, FileEntry, SceneMark, Span, TableEntry
+from schemas.dataset.commit import COMMIT_VERSION, CommitRecord, FileEntry, SceneMark, Span, TableEntry
 from schemas.dataset.layout import COMMITS, RANGES, commit_path, image_path, range_table_path, tar_path
-from schemas.dataset.tables import SCHEMA_VERSION, TABLES
+from schemas.dataset.tables import TABLES
 from tests.made_up_scenes import failed_scene, made_scene, terms
-from workers.store.commit import encode_record
+from workers.store.record import encode_record
 from workers.store.local import LocalStore
 from workers.store.manifest import sorted_rows, table_of_rows
 from workers.store.store import Entry
@@ -25,7 +25,7 @@ from workers.store.store import Entry
 PAIRS = 5
 CATEGORY = "mug"
 TAR_BYTES = 10_240
-TERMS = terms(layout="tar", range_size=1)
+TERMS = terms(layout="tar", range_size=1, pairs_per_scene=PAIRS)
 _PATTERN = 6
 """A scene of which every id is found in the bytes; others take its place there."""
 
@@ -54,12 +54,12 @@ def record_of(scene_id: int, tables: dict[str, bytes]) -> CommitRecord:
         files[tar_path(CATEGORY, scene_id)] = (TAR_BYTES, "0" * 64)
     rows = _rows(not made)
     return CommitRecord(
-        schema_version=SCHEMA_VERSION,
+        schema_version=COMMIT_VERSION,
         span=Span(start=scene_id, stop=scene_id + 1),
         attempt="r0-made-up",
         terms=TERMS,
         files=tuple(FileEntry(path=path, bytes=size, sha256=sha) for path, (size, sha) in sorted(files.items())),
-        tables={table: TableEntry(rows=rows[table].num_rows, digest="0" * 64) for table in TABLES},
+        tables={table: TableEntry(rows=rows[table].num_rows) for table in TABLES},
         scenes=(SceneMark(scene_id=scene_id, outcome="made" if made else "intrinsic", digest="0" * 64),),
     )
 

@@ -1,15 +1,14 @@
 """Whether every file that commits name is in its final place with its size: asked of a disk, looked up in a store's listing."""
 
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
-import pyarrow as pa
 import pyarrow.compute as pc
 
-from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import is_shape, range_table_path
+from schemas.dataset.commit import CommitRecord, FileEntry
+from schemas.dataset.layout import RANGES, is_shape, pose_of_image
 from schemas.errors import CorruptError
 from services.merge.reading import Block
 from services.merge.scratch import explain_full_disk, open_scratch
@@ -35,8 +34,9 @@ class PublishedFiles:
         Tables that have rows were read already, with their checksums. A shape that a mix of stacks shares keeps the size
         of whichever was first.
         """
-        records = list(chain.from_iterable(block.ranges))
-        for path, size, exact in chain(*map(_named, records), _images(records, block.rows["views"])):
+        named = ((entry.path, entry.bytes, _is_exact(record, entry.path)) for record, entry in unread(block))
+        images = ((path, size, True) for path, size in stored_images(block))
+        for path, size, exact in chain(named, images):
             found = self._size(path)
             if found is None:
                 raise CorruptError(f"{path} is named by a commit and is neither staged nor published")
@@ -55,22 +55,32 @@ class PublishedFiles:
         return row[0] if row else None
 
 
-def _named(record: CommitRecord) -> Iterator[tuple[str, int, bool]]:
-    """(path, bytes, whether they must agree) of tars, shapes and tables without rows."""
-    strict = record.terms.fingerprint_mode == "strict"
-    read = {
-        range_table_path(record.span.start, table, record.span.retry)
-        for table, entry in record.tables.items()
-        if entry.rows
-    }
-    for entry in record.files:
-        if entry.path not in read and not entry.path.endswith(".png"):
-            yield entry.path, entry.bytes, strict or not is_shape(entry.path)
+def unread(block: Block) -> Iterator[tuple[CommitRecord, FileEntry]]:
+    """Tars, shapes and tables without rows."""
+    for record, entry in block.files:
+        folder, _, name = entry.path.rpartition("/")
+        table = name.removesuffix(".parquet")
+        if not folder.startswith(RANGES) or not record.tables[table].rows:
+            yield record, entry
 
 
-def _images(records: Iterable[CommitRecord], views: pa.Table) -> Iterator[tuple[str, int, bool]]:
-    """The same of images that are files of their own."""
-    if any(record.terms.layout == "files" for record in records):
-        files = pc.list_flatten(views.column("files"))
-        for path, size in zip(*(pc.struct_field(files, name).to_pylist() for name in ("path", "bytes")), strict=True):
-            yield path, size, True
+def stored_images(block: Block) -> Iterator[tuple[str, int]]:
+    """(path, bytes) of the images that are files of their own.
+
+    Raises CorruptError where a view lists what is no image, or one of another scene.
+    """
+    terms = block.ranges[0][0].terms
+    if terms.layout != "files":
+        return
+    listed = block.rows["views"].column("files").combine_chunks()
+    scenes = block.rows["views"].column("scene_id").combine_chunks().take(pc.list_parent_indices(listed)).to_pylist()
+    files = listed.flatten()
+    for path, size, scene in zip(files.field("path").to_pylist(), files.field("bytes").to_pylist(), scenes, strict=True):
+        pose = pose_of_image(path)
+        if pose is None or (terms.pairs_per_scene and pose // (2 * terms.pairs_per_scene) != scene):
+            raise CorruptError(f"the views of scene {scene} list {path!r}, which is not an image of that scene")
+        yield path, size
+
+
+def _is_exact(record: CommitRecord, path: str) -> bool:
+    return record.terms.fingerprint_mode == "strict" or not is_shape(path)

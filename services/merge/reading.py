@@ -11,10 +11,11 @@ from typing import TypeVar
 import numpy as np
 import pyarrow as pa
 
-from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import range_table_path
-from schemas.dataset.tables import SCHEMAS, TABLES
+from schemas.dataset.commit import CommitRecord, FileEntry, Span
+from schemas.dataset.layout import asset_path, is_range_file, pose_of_image, range_table_path
+from schemas.dataset.tables import SCHEMAS, SHAPE_FILE_COLUMNS, TABLES
 from schemas.errors import CorruptError
+from workers.store.commit import committed_files
 from workers.store.committed_rows import iter_ranges, range_rows
 from workers.store.manifest import conform, decode_rows
 from workers.store.store import Store
@@ -34,17 +35,23 @@ Range = Sequence[CommitRecord]
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive ranges, and the rows of every table in their order."""
+    """Consecutive ranges, the files that they name, and the rows of every table in their order."""
 
     ranges: Sequence[Range]
+    files: Sequence[tuple[CommitRecord, FileEntry]]
+    """Tars, shapes and tables, each with the record that names it; images are in the rows of `views`."""
     rows: Mapping[str, pa.Table]
 
 
 @dataclass(frozen=True)
 class _Read:
-    """A range as it was read: tables that have rows, as Parquet bytes, or decoded where a retry replaced some."""
+    """A range as it was read: the files of each record, and the tables that have rows.
+
+    These are Parquet bytes, or decoded rows where a retry replaced some.
+    """
 
     records: Range
+    files: Sequence[Sequence[FileEntry]]
     tables: Mapping[str, bytes | pa.Table]
 
     @property
@@ -74,9 +81,10 @@ def read_blocks(store: Store, first_scene: int, stop_scene: int) -> Iterator[Blo
             yield _joined(block)
 
 
-def map_ahead(pool: ThreadPoolExecutor, function: Callable[[A], B], items: Iterable[A], ahead: int = 2) -> Iterator[B]:
-    """The results of `function`, in the order of `items`; at most `AT_ONCE` times `ahead` of them are kept."""
-    window = ahead * AT_ONCE
+def map_ahead(
+    pool: ThreadPoolExecutor, function: Callable[[A], B], items: Iterable[A], window: int = 2 * AT_ONCE
+) -> Iterator[B]:
+    """The results of `function`, in the order of `items`; at most `window` of them are under way or wait."""
     waiting: deque[Future[B]] = deque()
     try:
         for item in items:
@@ -92,9 +100,11 @@ def map_ahead(pool: ThreadPoolExecutor, function: Callable[[A], B], items: Itera
 
 def _read_range(store: Store, records: Range) -> _Read:
     if len(records) > 1:
-        return _Read(records, {table: range_rows(store, records, table) for table in TABLES})
+        files = [committed_files(store, record) for record in records]
+        return _Read(records, files, {table: range_rows(store, records, table) for table in TABLES})
     (record,) = records
-    return _Read(records, {table: _read_table(store, record, table) for table in TABLES if record.tables[table].rows})
+    tables = {table: _read_table(store, record, table) for table in TABLES if record.tables[table].rows}
+    return _Read(records, [record.files], tables)
 
 
 def _read_table(store: Store, record: CommitRecord, table: str) -> bytes:
@@ -115,18 +125,32 @@ def _read_table(store: Store, record: CommitRecord, table: str) -> bytes:
 def _joined(block: Sequence[_Read]) -> Block:
     """The block's rows, table by table. Raises CorruptError where a range does not hold each scene once."""
     ranges = [read.records for read in block]
-    name = f"a table of the ranges from scene {ranges[0][0].span.start}"
+    files = [
+        (record, entry)
+        for read in block
+        for record, entries in zip(read.records, read.files, strict=True)
+        for entry in entries
+        if pose_of_image(entry.path) is None
+    ]
     tables = {}
     for table in TABLES:
         parts = [(read.records, _decoded(read, table)) for read in block if table in read.tables]
+        if table == "assets":
+            files += [(records[0], entry) for records, rows in parts for entry in _shapes(rows)]
+        name = f"a table `{table}` of the ranges from scene {ranges[0][0].span.start}"
         tables[table] = _concatenated(table, [rows for _, rows in parts], name)
         _check_spans(table, tables[table], parts)
-    ids = np.concatenate([tables[table].column("scene_id").to_numpy() for table in ("scenes", "failures")])
-    spans = [records[0].span for records in ranges]
-    wrong = np.setxor1d(ids, np.arange(spans[0].start, spans[-1].stop)).tolist() or _repeated(ids)
+    _check_scenes([records[0].span for records in ranges], tables)
+    return Block(ranges, files, tables)
+
+
+def _check_scenes(spans: Sequence[Span], rows: Mapping[str, pa.Table]) -> None:
+    """Raises CorruptError where a scene of the spans was neither made nor failed, or both."""
+    ids = np.concatenate([rows[table].column("scene_id").to_numpy() for table in ("scenes", "failures")])
+    values, counts = np.unique(ids, return_counts=True)
+    wrong = [*np.setxor1d(values, np.arange(spans[0].start, spans[-1].stop)), *values[counts > 1]]
     if wrong:
         raise _not_each_once(next(span.start for span in reversed(spans) if span.start <= wrong[0]))
-    return Block(ranges, tables)
 
 
 def _decoded(read: _Read, table: str) -> pa.Table:
@@ -140,6 +164,20 @@ def _decoded(read: _Read, table: str) -> pa.Table:
     if len(rows) != awaited:
         raise CorruptError(f"{path} has {len(rows)} rows, and its commit says {awaited}")
     return rows
+
+
+def _shapes(assets: pa.Table) -> Iterator[FileEntry]:
+    """The shapes that a range made, where its own table of assets lists them. Raises CorruptError as `committed_files`."""
+    names = ["category", "instance_id", *(field.name for field in SHAPE_FILE_COLUMNS)]
+    if not set(names) <= set(assets.column_names):
+        return
+    for category, instance_id, size, sha256 in zip(*(assets.column(n).to_pylist() for n in names), strict=True):
+        path = asset_path(category, instance_id)
+        if sha256 is None:
+            continue
+        if not is_range_file(path, 0, 0):
+            raise CorruptError(f"a row of assets lists {path!r}, which is not the name of a shape")
+        yield FileEntry(path=path, bytes=size, sha256=sha256)
 
 
 def _concatenated(table: str, parts: Sequence[pa.Table], name: str) -> pa.Table:
@@ -161,11 +199,6 @@ def _check_spans(table: str, rows: pa.Table, parts: Sequence[tuple[Range, pa.Tab
     outside = np.flatnonzero((ids < spans[:, 0]) | (ids >= spans[:, 1]))
     if len(outside):
         raise _not_each_once(int(spans[outside[0], 0]))
-
-
-def _repeated(ids: np.ndarray) -> list[int]:
-    values, counts = np.unique(ids, return_counts=True)
-    return values[counts > 1].tolist()
 
 
 def _not_each_once(start: int) -> CorruptError:

@@ -76,7 +76,8 @@ def read_success(store: Store) -> dict | None:
         success = json.loads(store.read(SUCCESS_FILE))
     except (FileNotFoundError, ValueError):
         return None
-    return success if isinstance(success, dict) and isinstance(success.get("schema_version"), int) else None
+    whole = isinstance(success, dict) and isinstance(success.get("schema_version"), int)
+    return success if whole and all(is_merged_path(path) for path in success.get("files", ())) else None
 
 
 class _Merging:
@@ -93,9 +94,8 @@ class _Merging:
     def add(self, block: Block) -> None:
         """Takes the next ranges. Raises CorruptError where a file of theirs is missing, or rows do not join."""
         self._published.check(block)
-        for record in chain.from_iterable(block.ranges):
-            self._fingerprints.add(record.terms.fingerprint)
-            self._shared.add_files((entry.path, entry.sha256) for entry in record.files if is_shape(entry.path))
+        self._fingerprints.update(record.terms.fingerprint for record in chain.from_iterable(block.ranges))
+        self._shared.add_files((entry.path, entry.sha256) for _, entry in block.files if is_shape(entry.path))
         rows = block.rows
         self._shared.add_assets(rows["assets"])
         self._shared.add_images(rows["views"])

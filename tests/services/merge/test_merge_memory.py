@@ -13,7 +13,7 @@ from schemas.dataset.commit import CommitRecord, FileEntry, SceneMark, Span, Tab
 from schemas.dataset.layout import commit_path, range_table_path
 from schemas.dataset.tables import SCHEMAS, TABLES
 from tests.made_up_scenes import made_scene, terms
-from workers.store.commit import encode_record
+from workers.store.record import encode_record
 from workers.store.local import LocalStore
 from workers.store.manifest import encode_table, sorted_rows, table_of_rows
 

@@ -40,7 +40,7 @@ def test_no_more_is_read_ahead_than_was_said():
         return item
 
     with ThreadPoolExecutor(3) as pool:
-        for item in map_ahead(pool, work, range(50), ahead=2):
+        for item in map_ahead(pool, work, range(50), window=6):
             taken.append(item)
     assert taken == list(range(50))
     assert max(lead) <= 7  # six, and the one that is handed on
