@@ -1,7 +1,8 @@
 """The `assets` branch of a job: where objects and tables come from."""
 
 import math
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -112,6 +113,16 @@ class MeshLimits(Frozen):
     """Most processor time for reading an asset, seconds."""
     max_memory_mb: Annotated[int, Field(ge=1024)] = 2048
     """Most memory for reading an asset, MiB."""
+
+
+FIRST_LIMITS = frozenset({"max_file_mb", "max_vertices", "max_faces", "max_texture_px"})
+"""Limits that are part of every digest; a later one only where it is not at its default, so that older digests hold."""
+
+
+def deciding_limits(limits: Mapping[str, Any]) -> dict[str, Any]:
+    """Of the limits by their names, those that digests cover."""
+    fields = MeshLimits.model_fields
+    return {name: value for name, value in limits.items() if name in FIRST_LIMITS or value != fields[name].default}
 
 
 class Assets(Frozen):

@@ -11,7 +11,15 @@ from typing import Any
 import numpy as np
 
 from schemas.errors import AssetSourceError
-from schemas.job.assets import Assets, FolderSource, MeshLimits, ProceduralSource, ShapeNetSource, SplitShares
+from schemas.job.assets import (
+    Assets,
+    FolderSource,
+    MeshLimits,
+    ProceduralSource,
+    ShapeNetSource,
+    SplitShares,
+    deciding_limits,
+)
 from schemas.scene.shape import Asset
 from workers.assets.builtin.make import TABLE, VERSION, instance_id, make_asset
 from workers.assets.external.folder import find_files
@@ -205,6 +213,7 @@ def _digest(
                 files["refused"] = {category: sorted(numbers) for category, numbers in listing.refused.items()}
         record.append({"settings": plain, "generator": VERSION if listing is None else None, "files": files})
     scalars = assets.model_dump(mode="json", exclude={"objects", "tables"})
+    scalars["limits"] = deciding_limits(scalars["limits"])
     whole = {"sources": record, "objects": len(objects), "categories": sorted(categories), "assets": scalars}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
 

@@ -101,8 +101,7 @@ def _piece(path: Path, name: str, mesh: trimesh.Trimesh, matrix: Pose, visual: M
     used = np.zeros(len(vertices), dtype=np.bool_)
     used[faces] = True
     vertices = transform(matrix, np.where(used[:, None], vertices, 0.0))
-    if (largest := float(np.abs(vertices[used]).max())) > LARGEST_COORDINATE:
-        raise MeshError("not_finite", f"{path} has a coordinate of {largest:g}, over {LARGEST_COORDINATE:g}")
+    check_coordinates(path, vertices[used])
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]
     normals = _file_normals(mesh, matrix)
@@ -111,6 +110,13 @@ def _piece(path: Path, name: str, mesh: trimesh.Trimesh, matrix: Pose, visual: M
         visual = replace(visual, colors=np.repeat(visual.face_colors, 3, axis=0), face_colors=None)
         faces = np.arange(3 * len(faces)).reshape(-1, 3)
     return _Piece(name, vertices, faces, normals, visual)
+
+
+def check_coordinates(path: Path, vertices: Array) -> None:
+    """MeshError `not_finite` where a coordinate of vertices [V, 3] is none, or over `LARGEST_COORDINATE`."""
+    largest = float(np.abs(vertices).max())
+    if not largest <= LARGEST_COORDINATE:
+        raise MeshError("not_finite", f"{path} has a coordinate of {largest:g}, over {LARGEST_COORDINATE:g}")
 
 
 def _file_normals(mesh: trimesh.Trimesh, matrix: Pose) -> Array | None:

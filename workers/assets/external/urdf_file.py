@@ -15,7 +15,7 @@ from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Material, Part, Shape
 from workers.assets.external.caps import LONGEST_NAME, Budget, check_counts, check_nodes, find_inside
 from workers.assets.external.materials import DEFAULT
-from workers.assets.external.mesh import LoadedMesh, load_shape, transform_shape
+from workers.assets.external.mesh import LoadedMesh, check_coordinates, load_shape, transform_shape
 from workers.geometry.frames import pose
 
 _DECLARATION = re.compile(rb"^\s*<\?xml[^>]*\?>")
@@ -81,6 +81,8 @@ def load_urdf(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
             color = None if material is None else _color(path, material) or colors.get(material.get("name", ""))
             shape = transform_shape(loaded.shape, T_root_link @ _origin(path, visual))
             parts += [_colored(part, color) for part in shape.parts]
+            for part in shape.parts:
+                check_coordinates(path, part.vertices)
             vertices += sum(len(part.vertices) for part in shape.parts)
             faces += sum(len(part.faces) for part in shape.parts)
             check_nodes(path, len(parts), "parts", limits)
