@@ -19,16 +19,9 @@ LABEL_TABLES = ("scenes", "views", "objects", "assets")
 """The tables that labels repeat."""
 
 SCENE_COLUMNS = (
-    "scene_id",
-    "category",
-    "instance_id",
-    "source",
-    "table_id",
-    "object_scale",
-    "T_world_obj",
-    "T_world_table",
+    *("scene_id", "category", "instance_id", "source", "table_id", "object_scale", "T_world_obj", "T_world_table"),
+    *("pose", "settings_digest"),
 )
-SCENE_COLUMNS += ("pose", "settings_digest")
 BODY_COLUMNS = ("region_id", "category", "instance_id", "source", "object_scale", "T_world_obj")
 ASSET_COLUMNS = ("category", "source", "licence", "split", "sha256", "extents_m")
 NOT_OF_A_VIEW = frozenset({"files", "scene_id", "category"})
