@@ -21,8 +21,11 @@ from schemas.scene.scene import SceneOutput
 PARQUET_OPTIONS = {"compression": "zstd", "write_page_checksum": True}
 """For every Parquet file that users read: a flipped bit is found when the page is read."""
 _RANGE_OPTIONS: dict[str, Any] = {
-    **{"compression": "lz4", "write_page_checksum": True},
-    **{"use_dictionary": False, "write_statistics": False, "store_schema": False},
+    "compression": "lz4",
+    "write_page_checksum": True,
+    "use_dictionary": False,
+    "write_statistics": False,
+    "store_schema": False,
 }
 """For the few rows of a range: a third of the bytes and of the time of reading them with the options above."""
 
