@@ -24,7 +24,7 @@ class Output(Frozen):
     """How files are laid out."""
 
     layout: Literal["files", "tar"] = "files"
-    """`tar`: one tar for each range and category, required on object stores."""
+    """`tar`: one tar for each range and category, with images and labels; required on object stores."""
 
 
 class Run(Frozen):

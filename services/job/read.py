@@ -112,7 +112,7 @@ def validate_job(tree: dict[str, Any], name: str) -> Job:
 
 def describe_fault(fault: Any) -> str:
     """One line: the key's path, its value, and what is allowed."""
-    words = [plain_line(str(part)) for part in fault["loc"] if part not in ("procedural", "shapenet", "urdf", "[key]")]
+    words = [plain_line(str(part)) for part in _written(fault["loc"])]
     key = plain_line(".".join(words), 200) or "the job"
     if fault["type"] == "extra_forbidden":
         allowed = allowed_keys(words)
@@ -121,6 +121,12 @@ def describe_fault(fault: Any) -> str:
         return f"{key}: is missing, and has no default"
     message = plain_line(fault["msg"].removeprefix("Value error, "), 300)
     return f"{key}: {plain_line(repr(fault['input']))}: {message[:1].lower()}{message[1:]}"
+
+
+def _written(place: Sequence[str | int]) -> list[str | int]:
+    """The parts of a place that the job file has: not the kind that follows a source's position, nor the mark of a key."""
+    parts = [part for before, part in zip((None, *place), place, strict=False) if not isinstance(before, int)]
+    return parts[:-1] if parts[-1:] == ["[key]"] else parts
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

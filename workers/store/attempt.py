@@ -128,8 +128,9 @@ class Attempt:
         for path in self._files.keys() & entries.keys():
             if self._files[path] != entries[path]:
                 raise ValueError(f"{path} was written twice with different bytes")
+        new = {file.path: file.data for file in output.files if file.path not in self._files}
         with self._skip_if_swept():
-            self._packing.add({file.path: file.data for file in output.files if file.path not in self._files})
+            self._packing.add(new, tables)
         self._files |= entries
         for table, rows in tables.items():
             self._rows[table].append(rows)

@@ -1,8 +1,8 @@
 """Files of a range in the output folder: each by itself, or images in a tar archive for each range and category.
 
 `mug/RGB00042.png` is the member `00042.RGB.png` of `mug/<start>.tar`, its patch `mug/patches/RGB00042.png` the member
-`00042.RGB.patch.png`, and with several objects `00042.RGB.patch.obj1.png`. The pose id comes first, up to a point, so
-tools that group members by it (WebDataset among them) see one sample for each pose.
+`00042.RGB.patch.png`, and with several objects `00042.RGB.patch.obj1.png`. The labels of the pose are `00042.json`. The pose
+id comes first, up to a point, so tools that group members by it (WebDataset among them) see one sample for each pose.
 """
 
 import contextlib
@@ -11,11 +11,15 @@ import io
 import re
 import tarfile
 from collections.abc import Iterator, Mapping
+from itertools import groupby
 from typing import IO, cast
+
+import pyarrow as pa
 
 from schemas.dataset.commit import FileEntry, Span
 from schemas.dataset.layout import IMAGES, Content, image_path, is_shape, patch_path, tar_path
 from schemas.errors import CorruptError
+from workers.store.pose_labels import LABEL_TABLES, Rows, decode_label, encode_label, label_differences, pose_labels
 from workers.store.store import Store
 
 _PATH = re.compile(
@@ -24,6 +28,7 @@ _PATH = re.compile(
 _MEMBER = re.compile(
     r"(?P<pose>\d{5}|[1-9]\d{5,})\.(?P<content>[A-Za-z]+)(?P<patch>\.patch)?(?:\.obj(?P<object>0|[1-9]\d*))?\.png"
 )
+_LABEL = re.compile(r"(?P<pose>\d{5}|[1-9]\d{5,})\.json", re.ASCII)
 _CONTENTS: list[str] = list(dict.fromkeys(image.content for image in IMAGES))
 
 
@@ -48,13 +53,57 @@ def member_order(path: str) -> tuple[int, int, bool, int]:
     return int(found["pose"]), _CONTENTS.index(found["content"]), bool(found["patch"]), int(found["object"] or 0)
 
 
+def label_member(pose_id: int) -> str:
+    """The name of the member that holds a pose's labels."""
+    return f"{pose_id:05d}.json"
+
+
 def read_tar(category: str, data: bytes, name: str) -> Iterator[tuple[str, bytes]]:
-    """(image path, bytes) of every member, in order. Raises CorruptError naming the archive where it is damaged."""
+    """(image path, bytes) of every image, in order. Raises CorruptError naming the archive where it is damaged."""
+    return ((path, content) for path, _, content in _read_members(category, data, name) if path)
+
+
+def read_labels(category: str, data: bytes, name: str) -> Iterator[tuple[int, bytes]]:
+    """(pose id, JSON) of every pose, in order; none in archives of earlier versions. Raises CorruptError as `read_tar`."""
+    return ((pose_id, content) for path, pose_id, content in _read_members(category, data, name) if not path)
+
+
+def check_labels(category: str, data: bytes, name: str, rows: Rows) -> list[str]:
+    """How the labels in an archive differ from the rows of its range, a sentence for each pose.
+
+    `rows` are those of all the range's scenes. Raises CorruptError as `read_tar`.
+    """
+    derived = pose_labels(rows)
+    stored, imaged = {}, set()
+    for path, pose_id, content in _read_members(category, data, name):
+        if path:
+            imaged.add(pose_id)
+        else:
+            stored[pose_id] = content
+    if not stored:
+        return []  # an earlier version wrote it
+    faults = [f"{name}: the labels of pose {pose_id} are missing" for pose_id in sorted(imaged - stored.keys())]
+    for pose_id, content in stored.items():
+        where = f"{name}: {label_member(pose_id)}"
+        if (category, pose_id) not in derived:
+            faults.append(f"{where}: has labels of a pose that the tables do not have")
+        elif different := list(label_differences(decode_label(content, where), derived[category, pose_id])):
+            faults.append(f"{where}: differs from the tables at {', '.join(different[:3])}")
+    return faults
+
+
+def _read_members(category: str, data: bytes, name: str) -> Iterator[tuple[str, int, bytes]]:
+    """(image path, empty for labels; pose id; bytes) of every member, in order."""
     try:
         with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as archive:
             for header in archive:
-                file = archive.extractfile(header)
-                yield path_of(category, header.name), file.read() if file else b""
+                label = _LABEL.fullmatch(header.name)
+                path = "" if label else path_of(category, header.name)
+                pose_id = int(label["pose"]) if label else member_order(path)[0]
+                file = archive.extractfile(header) if header.isreg() else None
+                if file is None:
+                    raise ValueError(f"{header.name} is no file")
+                yield path, pose_id, file.read()
     except (tarfile.TarError, ValueError, EOFError) as error:
         raise CorruptError(f"{name} is not a whole archive of images: {error}") from error
 
@@ -69,21 +118,24 @@ class Packing:
         self._tar = tar
         self._archives: dict[str, _Archive] = {}
 
-    def add(self, files: Mapping[str, bytes]) -> None:
-        """Stores the files of one scene by path; images go into archives in their fixed order.
+    def add(self, files: Mapping[str, bytes], tables: Mapping[str, pa.Table]) -> None:
+        """Stores the files of one scene by path; images go into archives in their fixed order, and labels after them.
 
-        Raises FileNotFoundError where the attempt's folder was swept, ValueError where a name has no place here.
+        `tables` are the scene's rows. Raises FileNotFoundError where the attempt's folder was swept, ValueError where a
+        name has no place here.
         """
         images = [path for path in files if self._tar and not is_shape(path)]
         for path, data in files.items():
             if not self._tar or is_shape(path):
                 self._store.write_staged(self._staging, path, data)
-        for path in sorted(images, key=member_order):
-            category, member = member_of(path)
+        labels = pose_labels({table: tables[table].to_pylist() for table in LABEL_TABLES}) if images else {}
+        for (category, pose_id), paths in groupby(sorted(images, key=member_order), key=_sample_of):
             if category not in self._archives:
                 name = tar_path(category, self._span.start, self._span.retry)
                 self._archives[category] = _Archive(name, self._store.stream_staged(self._staging, name))
-            self._archives[category].add(member, files[path])
+            for path in paths:
+                self._archives[category].add(member_of(path)[1], files[path])
+            self._archives[category].add(label_member(pose_id), encode_label(labels[category, pose_id]))
 
     def finish(self) -> list[FileEntry]:
         """The archives, finished. Nothing can be added afterwards."""
@@ -124,6 +176,11 @@ class _Archive:
         self._file.write(data)
         self._bytes += len(data)
         self._sha256.update(data)
+
+
+def _sample_of(path: str) -> tuple[str, int]:
+    """(category, pose id) of an image."""
+    return member_of(path)[0], member_order(path)[0]
 
 
 def _match(pattern: re.Pattern[str], name: str) -> re.Match[str]:

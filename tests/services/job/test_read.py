@@ -56,6 +56,13 @@ def test_every_example_is_a_job(path):
         ("name: a\nverso: 2", ["verso", "2", "newer"]),
         ("name: a\nseed: 1\nseed: 2", ["line 3", "'seed'", "twice"]),
         ("scenes: 3", ["name", "missing"]),
+        ("name: a\nurdf: 3", ["urdf: there is no such key"]),
+        (
+            "name: a\nassets: {objects: [{source: urdf, folder: ., urdf: 3}]}",
+            ["assets.objects.0.urdf: there is no such key"],
+        ),
+        ("name: a\nassets: {objects: [{source: urdf, folder: 3}]}", ["assets.objects.0.folder: 3"]),
+        ("name: a\ncameras: {depth: {offset_m: [0, 0, x]}}", ["cameras.depth.offset_m.2: 'x'"]),
         ("- a\n- b", ["list", "keys and values"]),
         ("", ["nothing"]),
         ("name: [", ["not YAML"]),

@@ -1,16 +1,19 @@
 import io
+import json
 import tarfile
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.dataset.layout import IMAGES, image_path, patch_path, tar_path
+from schemas.dataset.layout import IMAGES, file_pose_id, image_path, patch_path, tar_path
 from schemas.errors import CorruptError
 from tests.made_up_scenes import attempt_at, made_scene, scene, terms
 from tests.stored_images import read_images
 from workers.store.local import LocalStore
-from workers.store.tars import member_of, path_of, read_tar
+from workers.store.manifest import table_of_rows
+from workers.store.pose_labels import LABEL_TABLES
+from workers.store.tars import check_labels, member_of, path_of, read_labels, read_tar
 
 pytestmark = pytest.mark.usefixtures("unflushed")
 
@@ -100,9 +103,132 @@ def test_members_have_no_time_or_owner_and_are_sorted_by_pose(store, tmp_path):
         }
         poses = [int(m.name.split(".")[0]) for m in members]
         assert poses == sorted(poses)
-        assert [m.name for m in members][:4] == [
-            f"{poses[0]:05d}.{n}.png" for n in ("RGB", "RGB.patch", "depth", "depth.patch")
-        ]
+        first = [m.name for m in members if int(m.name.split(".")[0]) == poses[0]]
+        assert first[:4] == [f"{poses[0]:05d}.{n}.png" for n in ("RGB", "RGB.patch", "depth", "depth.patch")]
+        assert [name for name in first if name.endswith(".json")] == first[-1:] == [f"{poses[0]:05d}.json"]
+
+
+def train_samples(path):
+    """Samples as WebDataset groups them, with nothing but the standard library: members by what stands before the first point."""
+    samples = {}
+    with tarfile.open(path) as archive:
+        for member in archive:
+            key, _, ending = member.name.partition(".")
+            samples.setdefault(key, {})[ending] = archive.extractfile(member).read()
+    return samples
+
+
+def test_a_tar_alone_is_enough_to_train_from(store, tmp_path):
+    attempt_at(store, 0, 8, TAR).commit()
+    found = 0
+    for path in tmp_path.glob("*/*.tar"):
+        for key, sample in train_samples(path).items():
+            label = json.loads(sample["json"])
+            scene_id = int(key) // 2
+            rows = made_scene(scene_id).rows
+            by_role = {
+                row["role"]: row for row in rows["views"] if file_pose_id(row["role"], row["parent_id"]) == int(key)
+            }
+            assert label["pose_id"] == int(key)
+            assert label["views"].keys() == by_role.keys()
+            view = label["views"]["mirror" if int(key) % 2 else "input"]
+            row = by_role["mirror" if int(key) % 2 else "input"]
+            assert sample["RGB.png"] and sample["depth.png"]
+            assert view["T_world_cam"] == row["T_world_cam"] and view["fx"] == row["fx"]
+            assert view["objects"][1]["bbox_xywh"] == [1, 2, 3, 4]
+            assert (
+                view["objects"][1]["instance_id"] == label["scene"]["instance_id"] == rows["scenes"][0]["instance_id"]
+            )
+            assert label["scene"]["T_world_obj"] == rows["scenes"][0]["T_world_obj"]
+            assert label["split"] == "train"
+            found += 1
+    assert found == 2 * 7  # scene 5 fails
+
+
+def forged(path, member, change):
+    """An archive with one member changed, or left out where `change` gives None."""
+    out = io.BytesIO()
+    with tarfile.open(path) as archive, tarfile.open(fileobj=out, mode="w") as other:
+        for header in archive:
+            data = archive.extractfile(header).read()
+            data = change(data) if header.name == member else data
+            if data is not None:
+                header.size = len(data)
+                other.addfile(header, io.BytesIO(data))
+    return out.getvalue()
+
+
+def range_rows_of(scene_ids):
+    made = [made_scene(scene_id).rows for scene_id in scene_ids]
+    return {
+        table: table_of_rows(table, [row for rows in made for row in rows[table]]).to_pylist() for table in LABEL_TABLES
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda data: data, None),
+        (
+            lambda data: data.replace(b'"fx":525.0', b'"fx":525.5'),
+            "differs from the tables at views.aligned.fx, views.input.fx",
+        ),
+        (lambda data: data.replace(b'"fx":525.0', b'"fx":525'), "differs from the tables at views.aligned.fx"),
+        (lambda data: data.replace(b",-0.0,", b",0.0,"), "differs from the tables at scene.T_world_obj.12"),
+        (lambda data: data.replace(b'"split":"train",', b'"split":"test",'), "split"),
+        (lambda data: data.replace(b'"patch_object_fraction":null,', b""), None),
+        (
+            lambda data: data.replace(b'"parent_id"', b'"parent_ie"'),
+            "differs from the tables at views.aligned.parent_id",
+        ),
+        (lambda data: None, "the labels of pose 0 are missing"),
+        (lambda data: data[:-9], "00000.json is no label"),
+        (lambda data: b"[]", "00000.json is no label"),
+    ],
+)
+def test_labels_that_differ_from_the_tables_are_told_by_pose_and_key(store, tmp_path, change, told):
+    attempt_at(store, 0, 4, TAR).commit()
+    category = made_scene(0).rows["scenes"][0]["category"]
+    data = forged(tmp_path / category / "0000000000.tar", "00000.json", change)
+    try:
+        faults = check_labels(category, data, "here.tar", range_rows_of(range(4)))
+    except CorruptError as error:
+        faults = [str(error)]
+    if told is None:
+        assert faults == []
+    else:
+        assert len(faults) == 1 and "here.tar" in faults[0] and told in faults[0], faults
+
+
+def test_labels_of_a_pose_that_the_tables_do_not_have_are_told(store, tmp_path):
+    attempt_at(store, 0, 4, TAR).commit()
+    (path,) = tmp_path.glob(f"{made_scene(0).rows['scenes'][0]['category']}/*.tar")
+    faults = check_labels(path.parent.name, path.read_bytes(), "here.tar", range_rows_of(range(1, 4)))
+    assert faults[0] == "here.tar: 00000.json: has labels of a pose that the tables do not have"
+
+
+def test_a_tar_of_an_earlier_version_has_no_labels_and_nothing_is_off(store, tmp_path):
+    attempt_at(store, 0, 1, TAR).commit()
+    (path,) = tmp_path.glob("*/*.tar")
+    out = io.BytesIO()
+    with tarfile.open(path) as archive, tarfile.open(fileobj=out, mode="w") as other:
+        for header in archive:
+            if header.name.endswith(".png"):
+                other.addfile(header, archive.extractfile(header))
+    category = path.parent.name
+    assert check_labels(category, out.getvalue(), "here.tar", range_rows_of(range(1))) == []
+    assert list(read_labels(category, out.getvalue(), "here.tar")) == []
+    assert dict(read_tar(category, out.getvalue(), "x")) == dict(read_tar(category, path.read_bytes(), "x"))
+
+
+def test_a_member_that_is_no_file_is_told(store):
+    out = io.BytesIO()
+    with tarfile.open(fileobj=out, mode="w") as archive:
+        link = tarfile.TarInfo("00000.RGB.png")
+        link.type, link.linkname = tarfile.SYMTYPE, "00001.RGB.png"
+        archive.addfile(link)
+    with pytest.raises(CorruptError, match=r"00000.RGB.png is no file"):
+        list(read_tar("mug", out.getvalue(), "here.tar"))
 
 
 def test_images_of_a_range_without_tars_are_read_alike(store):
