@@ -65,6 +65,7 @@ def status(options: argparse.Namespace) -> int:
     """`verso status`."""
     from services.job.record import require_job
     from services.read.status import read_status
+    from services.run.lock import shows_life
 
     store = _dataset(options.out)
     job = require_job(store).job
@@ -75,13 +76,15 @@ def status(options: argparse.Namespace) -> int:
         print(f"  failed, {reason}: {count}")
     if now.scenes_per_s:
         print(f"  rate: {now.scenes_per_s:.2f} scenes/s")
+    lives = now.holder is not None and shows_life(store, now.holder)
     for one in now.running:
         doing = "between scenes" if one.scene_id is None else f"scene {one.scene_id}"
-        print(f"  running: range from {one.start}, {doing} ({one.attempt})")
+        print(f"  {'running' if lives else 'was running'}: range from {one.start}, {doing} ({one.attempt})")
     if now.holder is not None:
-        print(f"  held by process {now.holder.pid} on {now.holder.host}")
+        gone = "" if lives else ", which is gone: start the run again, what is committed is kept"
+        print(f"  held by process {now.holder.pid} on {now.holder.host}{gone}")
     print(f"  digest: {now.digest}" if now.digest else "  not merged: run the job again to finish it")
-    _answer(options, {"ok": now.digest is not None, **dataclasses.asdict(now)})
+    _answer(options, {"ok": now.digest is not None, "lives": lives, **dataclasses.asdict(now)})
     return 0 if now.digest else 1
 
 

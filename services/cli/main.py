@@ -47,6 +47,13 @@ def _run(options: argparse.Namespace) -> int:
         return error.exit_code
     except BrokenPipeError:
         return 1
+    except OSError as error:
+        from workers.store.file_system import remedy_of
+
+        if (remedy := remedy_of(error)) is None:
+            raise
+        print(f"verso: {error.filename or 'a file'}: {remedy}", file=sys.stderr)
+        return 1
 
 
 if __name__ == "__main__":

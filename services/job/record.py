@@ -17,6 +17,9 @@ from workers.store.store import Store
 OWN = {MANIFEST, STAGING, LOCK_FILE, LOG_FOLDER}
 """What a run makes before it writes the job file: a folder with only these is no foreign one."""
 
+NOBODYS = {"lost+found"}
+"""What a new file system holds at its top."""
+
 HEADER = """\
 # The job as it was run, every default filled in. Written by the first run on this folder; `verso run` on the same
 # folder goes on where it stopped, and refuses a job that differs in anything but `scenes` (more of them) and `run`.
@@ -85,7 +88,7 @@ def require_job(store: Store) -> JobRecord:
 
 def refuse_foreign(store: Store) -> None:
     """Raises OutputError where a folder holds files and no job: a dataset is not mixed with other files."""
-    if store.size(JOB_FILE) is None and (foreign := sorted(set(store.children("")) - OWN)):
+    if store.size(JOB_FILE) is None and (foreign := sorted(set(store.names("")) - OWN - NOBODYS)):
         raise OutputError(
             f"{store.name} holds {', '.join(foreign[:3])}{' and more' if len(foreign) > 3 else ''}, and no {JOB_FILE}: "
             "choose an empty or a new folder for --out"

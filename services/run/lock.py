@@ -160,6 +160,17 @@ def read_holder(store: Store) -> Holder | None:
     return _holder_at(store, LOCK_FILE)
 
 
+def shows_life(store: Store, holder: Holder, beat: Beat = DEFAULT_BEAT) -> bool:
+    """Whether a holder lives: by its process on this machine, elsewhere by a heartbeat that changes within the patience."""
+    if holder.machine and holder.machine == _machine():
+        return _born(holder.pid) == holder.born
+    for _ in range(beat.patience):
+        time.sleep(beat.period_s)
+        if read_holder(store) != holder:
+            return True
+    return False
+
+
 def _holder_at(store: Store, key: str) -> Holder | None:
     try:
         data = store.read(key)
@@ -181,19 +192,12 @@ def _show_life(lock: Lock, period_s: float, ended: threading.Event) -> None:
 
 def _find_gone(store: Store, beat: Beat) -> Holder | None:
     """The holder if it is dead or shows no life, None if the lock is free. Raises RunError where it lives."""
-    first = now = read_holder(store)
+    first = read_holder(store)
     if first is None:
         return None
-    on_this_machine = bool(first.machine) and first.machine == _machine()
-    if on_this_machine and _born(first.pid) != first.born:
+    if not shows_life(store, first, beat):
         return first
-    if not on_this_machine:
-        for _ in range(beat.patience):
-            time.sleep(beat.period_s)
-            if (now := read_holder(store)) != first:
-                break
-        else:
-            return first
+    now = read_holder(store)
     if now is None:
         return None
     raise RunError(

@@ -16,6 +16,7 @@ from services.merge.dataset_card import describe_left_out, describe_sources, wri
 from services.merge.step import MergeResult, merge, reopen
 from services.run.coordinator import Coordinator, Limits, Tally
 from services.run.lock import hold_lock
+from services.run.out_folder import explain_lost_folder
 from services.run.progress import ProgressLine, event_log, log_event
 from services.run.range_planner import MAX_SHARD, choose_shard_size, group_shards, plan_spans
 from services.run.ray_cluster import Slots, open_ray
@@ -77,7 +78,7 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
         print(f"verso: {line}", file=sys.stderr)
     refuse_foreign(store)
     store.prepare()
-    with hold_lock(store), event_log(store.root):
+    with explain_lost_folder(store.root), hold_lock(store), event_log(store.root):
         record = adopt(store, record_job(request.job, catalogue.digest, request.job_folder))
         sweep(store, fenced=None)
         commits = list_commits(store)

@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import errno
 import os
+import pwd
 import re
 import uuid
 import weakref
@@ -31,8 +32,9 @@ _FEW_FOLDERS = 3
 _REMEDIES = {
     errno.ENOSPC: "the disk is full; free some space and start again, nothing finished is lost",
     errno.EDQUOT: "the disk quota is used up; free some space and start again, nothing finished is lost",
-    errno.EROFS: "the file system is read-only",
+    errno.EROFS: "the file system is mounted read-only",
     errno.EACCES: "permission denied",
+    errno.EPERM: "permission denied",
     errno.EIO: "the disk reports an input/output error; check it before going on",
 }
 
@@ -190,6 +192,8 @@ def _probe_once(root: Path) -> None:
     except FileNotFoundError:
         raise
     except OSError as error:
+        if error.errno in _REMEDIES and (step == "writing a file" or error.errno != errno.EPERM):
+            raise OutputError(f"{root} cannot be written: {remedy_of(error)}; or choose another --out") from error
         raise OutputError(
             f"{root} is on a file system of type {file_system_of(root)} that fails at {step} "
             f"({error.strerror or error}): commits there would not be safe. "
@@ -201,6 +205,21 @@ def _probe_once(root: Path) -> None:
                 os.unlink(path)
 
 
+def remedy_of(error: OSError) -> str | None:
+    """What a user can do about it, where something can be done; says which user has no permission."""
+    remedy = _REMEDIES.get(error.errno or 0)
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return f"{remedy} for user {_user()}: have its owner allow it"
+    return remedy
+
+
+def _user() -> str:
+    number = os.geteuid()
+    with contextlib.suppress(KeyError):  # a container's user often has no name
+        return f"{pwd.getpwuid(number).pw_name} ({number})"
+    return str(number)
+
+
 @contextlib.contextmanager
 def explain_disk_errors(what: str) -> Iterator[None]:
     """Turns an OSError that a user can mend into a MachineError: `what` happened, why, and what to do."""
@@ -208,5 +227,5 @@ def explain_disk_errors(what: str) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in _REMEDIES:
-            raise MachineError(f"{what}: {_REMEDIES[error.errno]}") from error
+            raise MachineError(f"{what}: {remedy_of(error)}") from error
         raise

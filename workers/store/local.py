@@ -16,6 +16,7 @@ from workers.store.file_system import (
     explain_disk_errors,
     probe_folder,
     refuse_link_out,
+    remedy_of,
     sync_folders,
     sync_path,
     sync_tree,
@@ -67,9 +68,8 @@ class LocalStore(Store):
                 sync_path(self.path(folder).parent)
             sync_path(self.root)
         except OSError as error:
-            raise OutputError(
-                f"{self.name} cannot be written: {error.strerror or error}; choose another --out"
-            ) from error
+            why = remedy_of(error) or error.strerror or error
+            raise OutputError(f"{self.name} cannot be written: {why}; or choose another --out") from error
         probe_folder(self.root)
 
     def open_staging(self, staging: str) -> None:
@@ -167,6 +167,10 @@ class LocalStore(Store):
     def children(self, prefix: str) -> list[str]:
         """Folders directly below `prefix`."""
         return [entry.name for entry in self._scan(prefix) if entry.is_dir(follow_symlinks=False)]
+
+    def names(self, prefix: str) -> list[str]:
+        """Everything directly below `prefix`."""
+        return [entry.name for entry in self._scan(prefix)]
 
     def remove(self, key: str) -> None:
         """Removes a file."""

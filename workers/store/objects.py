@@ -165,6 +165,13 @@ class ObjectStore(Store):
             found = obstore.list_with_delimiter(self._bucket, prefix)["common_prefixes"]
         return sorted(path.rpartition("/")[2] for path in found)
 
+    def names(self, prefix: str) -> list[str]:
+        """Objects and common prefixes of keys, directly below `prefix`."""
+        with self._explained(prefix):
+            found = obstore.list_with_delimiter(self._bucket, prefix)
+        objects = [meta["path"] for meta in found["objects"]]
+        return sorted(path.rpartition("/")[2] for path in [*objects, *found["common_prefixes"]])
+
     def remove(self, key: str) -> None:
         """Deletes an object."""
         with self._explained(key), contextlib.suppress(FileNotFoundError):

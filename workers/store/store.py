@@ -105,6 +105,9 @@ class Store(Protocol):
     def children(self, prefix: str) -> list[str]:
         """Names of the folders directly below `prefix`, sorted."""
 
+    def names(self, prefix: str) -> list[str]:
+        """Names of the files and folders directly below `prefix`, sorted."""
+
     def remove(self, key: str) -> None:
         """Removes a file, if there is one."""
 
