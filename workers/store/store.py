@@ -93,6 +93,12 @@ class Store(Protocol):
     def files(self, prefix: str) -> Iterator[Entry]:
         """Every file at any depth below the folder `prefix`, in the order of the keys' parts."""
 
+    def names(self, prefix: str, sizes: bool = False) -> Iterator[tuple[str, int]]:
+        """(name, bytes) of everything directly below the folder `prefix`, one at a time, in any order.
+
+        Bytes are 0 unless `sizes` asks for them: a listing without is several times as fast on a disk.
+        """
+
     def children(self, prefix: str) -> list[str]:
         """Names of the folders directly below `prefix`, sorted."""
 
