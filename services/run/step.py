@@ -88,7 +88,7 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
         made_now = 0
         with contextlib.closing(LedgerKeeper(store, ledger)) as keeper:
             if plan.scenes:
-                order = _order(store, request.out, record, ledger)
+                order = order_pattern(store, request.out, record, ledger)
                 with cluster or open_ray(request.address, record.job.run.workers) as slots:
                     made_now = _make(store, order, catalogue, plan, slots, keeper)
         if store.size(JOB_FILE) is None or store.read(JOB_FILE) != encode_job(record):
@@ -99,7 +99,7 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     return RunResult(merged, time.monotonic() - begun, made_now)
 
 
-def _order(store: Store, out: str, record: JobRecord, ledger: Ledger) -> ShardOrder:
+def order_pattern(store: Store, out: str, record: JobRecord, ledger: Ledger) -> ShardOrder:
     """The pattern of all orders. A new folder gets its job.yaml at once, a finished one a moment before a new commit."""
     order = ShardOrder.of(out, record.job, record.digest)
     text = encode_job(record)
