@@ -232,7 +232,7 @@ def _asset(category: str, instance: str, shapes: bool) -> dict[str, object]:
         "category": category,
         "source": "procedural",
         "licence": "CC0-1.0",
-        "path": asset_path(category, instance) if shapes else None,
+        "path": f"models/{instance}.obj" if shapes else None,
         "sha256": hashlib.sha256(instance.encode()).hexdigest(),
         "extents_m": [0.1, 0.2, 1 / 3],
         "volume_m3": None,

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
 from schemas.base import Frozen, NonNegativeInt, PositiveInt
-from schemas.dataset.layout import is_attempt_name, is_plain_path, is_range_file, pose_of_image
+from schemas.dataset.layout import MAX_RETRIES, MAX_SCENE, is_attempt_name, is_plain_path, is_range_file, pose_of_image
 from schemas.errors import FailureKind
 
 Outcome = Literal["made", "intrinsic", "environmental"]
@@ -19,8 +19,7 @@ COMMIT_VERSION = 2
 what these say."""
 
 _Digest = Annotated[str, StringConstraints(pattern=r"^[ -~]{0,128}$")]
-_SceneId = Annotated[int, Field(ge=0, le=10**15)]
-"""Pose ids, a few thousand for a scene, stay below 2**63."""
+_SceneId = Annotated[int, Field(ge=0, le=MAX_SCENE)]
 
 
 class Span(Frozen):
@@ -28,7 +27,7 @@ class Span(Frozen):
 
     start: _SceneId
     stop: _SceneId
-    retry: NonNegativeInt = 0
+    retry: Annotated[int, Field(ge=0, lt=MAX_RETRIES)] = 0
     """0 for the range itself, k for the k-th retry of its environmental failures."""
     scenes: tuple[int, ...] = ()
     """The scenes of a retry, in order; empty for a whole range."""
@@ -171,12 +170,21 @@ class CommitSummary:
     scenes: tuple[int, ...] = ()
     """The scenes of a retry; empty for a whole range."""
     fingerprint: str = ""
+    job_digest: str = ""
 
 
 def summarize(record: CommitRecord) -> CommitSummary:
     """The part of the record that planning needs."""
     span = record.span
     failed = tuple((one.scene_id, one.outcome, one.reason) for one in record.scenes if one.outcome != "made")
+    terms = record.terms
     return CommitSummary(
-        span.start, span.stop, span.retry, span.count - len(failed), failed, span.scenes, record.terms.fingerprint
+        start=span.start,
+        stop=span.stop,
+        retry=span.retry,
+        made=span.count - len(failed),
+        failed=failed,
+        scenes=span.scenes,
+        fingerprint=terms.fingerprint,
+        job_digest=terms.job_digest,
     )

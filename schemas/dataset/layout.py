@@ -28,10 +28,17 @@ COMMITS = "manifest/_commits"
 RANGES = "manifest/_ranges"
 FINGERPRINT_FILE = "manifest/_fingerprint.json"
 """The first worker's stack; a job with `fingerprint: strict` refuses every other."""
+LEDGER_FILE = "manifest/_ledger.parquet"
+"""A summary of the commits that the coordinator keeps, so that not every record is read again; only a cache."""
 ASSETS = "assets"
 CAM_POSES = "camPoses.csv"
 CAMERAS = "cameras.csv"
 OBJECTS = "objects.dat"
+
+MAX_SCENE = 10**15
+"""Scene ids are at most this, so that pose ids, a few thousand for a scene, stay below 2**63."""
+MAX_RETRIES = 1 << 13
+_PLAIN_COMMIT = len("0000000000.json")
 
 Content = Literal[
     "RGB", "depth", "segment", "RGBaligned", "depthAligned", "segmentAligned", "RGBprojected", "depthProjected"
@@ -179,11 +186,14 @@ def commit_path(start: int, retry: int = 0) -> str:
     return f"{COMMITS}/{range_name(start, retry)}.json"
 
 
-def parse_commit_path(key: str) -> tuple[int, int] | None:
-    """(start, retry) of a commit record's key, None where it is no such key."""
-    match = re.fullmatch(rf"{COMMITS}/([0-9]{{10,19}})(?:\.retry-([0-9]{{1,9}}))?\.json", key)
+def parse_commit_name(name: str) -> tuple[int, int] | None:
+    """(start, retry) of the name of a commit record's file, None where it is no such name."""
+    if len(name) == _PLAIN_COMMIT and name.endswith(".json") and name[:10].isdecimal() and name.isascii():
+        return int(name[:10]), 0  # nearly all of them, a million times
+    match = re.fullmatch(r"([0-9]{10,16})(?:\.retry-([0-9]{1,4}))?\.json", name)
     found = match and (int(match[1]), int(match[2] or 0))
-    return found if found and commit_path(*found) == key else None
+    inside = found and found[0] <= MAX_SCENE and found[1] < MAX_RETRIES
+    return found if found and inside and commit_path(*found) == f"{COMMITS}/{name}" else None
 
 
 def range_table_path(start: int, table: str, retry: int = 0) -> str:

@@ -3,7 +3,7 @@
 from typing import Literal
 
 from schemas.base import Frozen
-from schemas.dataset.commit import CommitTerms, Span
+from schemas.dataset.commit import CommitSummary, CommitTerms, Span
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.job.job import Job
 
@@ -20,6 +20,13 @@ class Blame(Frozen):
     attempts: int
 
 
+class JobChange(Frozen):
+    """A job.yaml to be replaced just before the first commit of an extension: until then, what is there holds."""
+
+    before: str
+    after: str
+
+
 class ShardOrder(Frozen):
     """Everything that a worker needs to make one shard."""
 
@@ -29,6 +36,8 @@ class ShardOrder(Frozen):
     """`terms.fingerprint` is filled in by the worker with its own."""
     spans: tuple[Span, ...]
     blamed: tuple[Blame, ...] = ()
+    job_change: JobChange | None = None
+    """None where job.yaml is what it will be."""
     label: str = ""
     """Part of the attempts' names: the coordinator recognises its own."""
 
@@ -60,6 +69,8 @@ class SpanReport(Frozen):
     """Failures by `kind: reason`."""
     bugs: tuple[str, ...] = ()
     """Scenes that ended in an error nobody expected: the scene, what is in it, and the error, each in one line."""
+    commit: CommitSummary | None = None
+    """What the valid record says, for the ledger."""
 
 
 class ShardReport(Frozen):

@@ -83,9 +83,12 @@ def status(options: argparse.Namespace) -> int:
     if now.holder is not None:
         gone = "" if lives else ", which is gone: start the run again, what is committed is kept"
         print(f"  held by process {now.holder.pid} on {now.holder.host}{gone}")
+    for line in now.lost:
+        print(f"  {line}")
     print(f"  digest: {now.digest}" if now.digest else "  not merged: run the job again to finish it")
-    _answer(options, {"ok": now.digest is not None, "lives": lives, **dataclasses.asdict(now)})
-    return 0 if now.digest else 1
+    whole = now.digest is not None and not now.missing and not now.lost
+    _answer(options, {"ok": whole, "lives": lives, **dataclasses.asdict(now)})
+    return 0 if whole else 1
 
 
 def verify(options: argparse.Namespace) -> int:

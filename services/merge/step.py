@@ -10,7 +10,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from schemas.dataset.layout import MANIFEST, SUCCESS_FILE, is_shape
+from schemas.dataset.layout import MANIFEST, SUCCESS_FILE, is_merged_path, is_shape
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMA_VERSION, TABLES
 from schemas.errors import RunError
 from services.merge.poses import PoseFiles

@@ -2,18 +2,20 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
+from schemas.dataset.ledger import Ledger
 from schemas.dataset.tables import DETERMINISTIC_TABLES
 from schemas.errors import CorruptError, InputError
-from services.run.range_planner import ranges_with_retries
-from workers.store.commit import read_record
-from workers.store.committed_rows import list_commits, range_rows
+from workers.store.commit import code_of, list_codes, split_code
+from workers.store.committed_rows import iter_committed, range_rows, read_range
 from workers.store.images import decode_png
+from workers.store.ledger import list_commits
 from workers.store.store import Store
 from workers.store.tars import read_tar
 
@@ -46,41 +48,69 @@ class StoredRange:
 
 def iter_stored(store: Store) -> Iterator[StoredRange]:
     """Every committed range in order. Raises CorruptError where a table does not match its commit."""
-    for group in ranges_with_retries(list_commits(store)):
-        yield _read_range(store, group[0].start, len(group))
+    for records in iter_committed(store):
+        yield read_stored(store, records)
 
 
-def _read_range(store: Store, start: int, commits: int) -> StoredRange:
-    """One committed range and its retries."""
-    records = []
-    for retry in range(commits):
-        record = read_record(store, start, retry)
-        if record is None:
-            raise CorruptError(f"the commit of the range from scene {start} vanished")
-        records.append(record)
+def read_stored(store: Store, records: Sequence[CommitRecord]) -> StoredRange:
+    """One committed range with its retries. Raises as `iter_stored`."""
     rows = {table: range_rows(store, records, table).to_pylist() for table in DETERMINISTIC_TABLES}
-    return StoredRange(start, records[0].span.stop, tuple(records), rows)
+    return StoredRange(records[0].span.start, records[0].span.stop, tuple(records), rows)
 
 
 def choose_scenes(store: Store, count: int, seed: int) -> list[int]:
     """`count` of the scenes that were made, or all of them, evenly over their ids; the seed sets the first."""
-    return choose_evenly([row["scene_id"] for one in iter_stored(store) for row in one.rows["scenes"]], count, seed)
+    return choose_evenly(MadeScenes(list_commits(store)), count, seed)
+
+
+class MadeScenes(Sequence[int]):
+    """The ids of all scenes that were made, in order, without a list of them."""
+
+    def __init__(self, ledger: Ledger) -> None:
+        self._ranges = ledger.ranges
+        self._before = np.append(0, np.cumsum(self._ranges[:, 1] - self._ranges[:, 0]))
+        failed = ledger.failures.column("scene_id").to_numpy()
+        at = np.searchsorted(self._ranges[:, 0], failed, side="right") - 1
+        gone = self._before[at] + failed - self._ranges[at, 0]
+        self._shift = gone - np.arange(len(gone))
+        """[F] how many scenes were made before each that failed."""
+
+    def __len__(self) -> int:
+        return int(self._before[-1]) - len(self._shift)
+
+    @overload
+    def __getitem__(self, index: int) -> int: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[int]: ...
+
+    def __getitem__(self, index: int | slice) -> int | list[int]:
+        if isinstance(index, slice):
+            return [self[at] for at in range(*index.indices(len(self)))]
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        place = index + int(np.searchsorted(self._shift, index, side="right"))
+        at = int(np.searchsorted(self._before, place, side="right")) - 1
+        return int(self._ranges[at, 0]) + place - int(self._before[at])
 
 
 def choose_evenly(scenes: Sequence[int], count: int, seed: int) -> list[int]:
-    """`count` of the scenes, or all of them, evenly over their ids; the seed sets the first."""
-    ordered = sorted(scenes)
-    if count >= len(ordered):
-        return ordered
+    """`count` of the scenes, which are in order, or all of them, evenly over their ids; the seed sets the first."""
+    if count >= len(scenes):
+        return list(scenes)
     first = float(np.random.default_rng(seed).random())
-    return [ordered[int((i + first) * len(ordered) / count)] for i in range(count)]
+    return [scenes[int((i + first) * len(scenes) / count)] for i in range(count)]
 
 
 def find_scene(store: Store, scene_id: int) -> StoredRange:
     """The range that holds a scene. Raises InputError where it is not committed."""
-    for group in ranges_with_retries(list_commits(store)):
-        if group[0].start <= scene_id < group[0].stop:
-            return _read_range(store, group[0].start, len(group))
+    codes = list_codes(store)
+    before = codes[: int(np.searchsorted(codes, code_of(scene_id + 1, 0)))]
+    if len(before):
+        start, _ = split_code(before[-1])
+        retries = [split_code(code)[1] for code in before[np.searchsorted(before, code_of(start, 0)) :]]
+        records = read_range(store, start, retries)
+        if scene_id < records[0].span.stop:
+            return read_stored(store, records)
     raise InputError(f"scene {scene_id} is not in {store.name}: `verso status {store.name}` tells which scenes are")
 
 

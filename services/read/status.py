@@ -3,18 +3,22 @@
 from collections import Counter
 from dataclasses import dataclass
 
+import pyarrow.compute as pc
+
 from schemas.dataset.layout import COMMITS, STAGING, commit_path, parse_range_name
+from schemas.dataset.ledger import Ledger
 from schemas.errors import OutputError
 from services.merge.step import read_success
 from services.run.lock import Holder, read_holder
-from services.run.range_planner import effective_failures, ranges_with_retries
+from services.run.losses import find_lost
 from workers.store.attempt import attempts_at, blamed_scene, retry_of_attempt
-from workers.store.commit import commit_names, read_record
-from workers.store.committed_rows import list_commits, range_rows
+from workers.store.ledger import list_commits
 from workers.store.store import Store
 
 RATE_COMMITS = 64
 """Number of latest commits that the rate is computed from."""
+RATE_LOOKS = 256
+"""Number of records whose times are asked for, twice: the latest are among them unless many ranges finish out of order."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,8 @@ class Status:
     running: tuple[Running, ...]
     holder: Holder | None
     """The coordinator that holds the lock."""
+    lost: tuple[str, ...] = ()
+    """Commits that were there and are gone, a line each."""
 
 
 def read_status(store: Store, first_scene: int, stop_scene: int) -> Status:
@@ -50,44 +56,43 @@ def read_status(store: Store, first_scene: int, stop_scene: int) -> Status:
 
     Raises OutputError where there is no dataset, CorruptError for a damaged record.
     """
-    summaries = list_commits(store)
-    if not summaries and not store.children(STAGING):
+    ledger = list_commits(store)
+    if not ledger.rows.num_rows and not ledger.lost and not store.children(STAGING):
         raise OutputError(f"{store.name} holds no dataset: there is nothing in {COMMITS}")
-    failed: Counter[str] = Counter()
-    committed = 0
-    for group in ranges_with_retries(summaries):
-        committed += group[0].stop - group[0].start
-        if effective_failures(group):
-            failed.update(_reasons(store, group[0].start, len(group)))
+    failures = ledger.failures
+    told = pc.binary_join_element_wise(failures.column("kind"), failures.column("reason"), ": ")
+    failed = Counter(told.to_pylist())
     asked = stop_scene - first_scene
     return Status(
         asked=asked,
-        made=committed - failed.total(),
+        made=ledger.committed - failed.total(),
         failed=dict(sorted(failed.items())),
-        missing=asked - committed,
-        scenes_per_s=_rate(store),
+        missing=asked - ledger.committed,
+        scenes_per_s=_rate(store, ledger),
         digest=(read_success(store) or {}).get("digest"),
         running=tuple(_running(store)),
         holder=read_holder(store),
+        lost=tuple(find_lost(store, ledger)),
     )
 
 
-def _reasons(store: Store, start: int, commits: int) -> Counter[str]:
-    records = [record for retry in range(commits) if (record := read_record(store, start, retry)) is not None]
-    rows = range_rows(store, records, "failures")
-    kinds, reasons = rows.column("kind").to_pylist(), rows.column("reason").to_pylist()
-    return Counter(f"{kind}: {reason}" for kind, reason in zip(kinds, reasons, strict=True))
+def _rate(store: Store, ledger: Ledger) -> float | None:
+    """Scenes a second over the latest commits, by the times of their records.
 
-
-def _rate(store: Store) -> float | None:
-    """Scenes a second over the latest commits, by the times of their records."""
-    times = ((store.modified(key), start, retry) for start, retry, key in commit_names(store))
-    latest = sorted((written, start, retry) for written, start, retry in times if written is not None)[-RATE_COMMITS:]
+    The latest are looked for among those that the kept summary does not have yet, and those of the last ranges.
+    """
+    scenes = {}
+    for at in {
+        *ledger.unkept[-RATE_LOOKS:].tolist(),
+        *range(max(0, len(ledger.start) - RATE_LOOKS), len(ledger.start)),
+    }:
+        key = commit_path(int(ledger.start[at]), int(ledger.retry[at]))
+        if (written := store.modified(key)) is not None:
+            scenes[written, key] = ledger.count(at)
+    latest = sorted(scenes)[-RATE_COMMITS:]
     if len(latest) < 2 or latest[-1][0] <= latest[0][0]:
         return None
-    records = [read_record(store, start, retry) for _, start, retry in latest[1:]]
-    scenes = sum(len(record.scenes) for record in records if record is not None)
-    return scenes / (latest[-1][0] - latest[0][0])
+    return sum(scenes[one] for one in latest[1:]) / (latest[-1][0] - latest[0][0])
 
 
 def _running(store: Store) -> list[Running]:

@@ -11,7 +11,7 @@ import ray
 from ray.exceptions import OutOfMemoryError, RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from schemas.dataset.commit import Span
+from schemas.dataset.commit import CommitSummary, Span
 from schemas.dataset.layout import commit_path, staging_path
 from schemas.dataset.shard import Blame, Reason, ShardOrder, ShardReport
 from schemas.errors import CommitConflict, RunError, VersoError
@@ -22,7 +22,7 @@ from services.run.watchdog import Watchdog, end_worker_here, find_own_workers
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.run_shard import TIMED_OUT, run_shard
 from workers.store.attempt import attempts_at, blamed_scene, host_part, retry_of_attempt
-from workers.store.commit import read_summary
+from workers.store.ledger import read_summary
 from workers.store.store import Store
 from workers.store.sweep import sweep_attempt
 
@@ -45,6 +45,8 @@ class Tally:
     made: int = 0
     failed: Counter[str] = field(default_factory=Counter)
     conflicts: list[str] = field(default_factory=list)
+    commits: list[CommitSummary] = field(default_factory=list)
+    """Those of this run that nobody has taken yet."""
     shard_wall_s: float = 0.0
     shard_cpu_s: float = 0.0
 
@@ -62,6 +64,12 @@ class Tally:
                 self.conflicts.append(span.conflict)
             self.made += span.made
             self.failed.update(span.failed)
+            self.commits += [span.commit] if span.commit else []
+
+    def take_commits(self) -> list[CommitSummary]:
+        """The commits since the last call."""
+        commits, self.commits = self.commits, []
+        return commits
 
 
 @dataclass(frozen=True)
@@ -210,6 +218,7 @@ class Coordinator:
             summary = read_summary(self._store, left[0].start, left[0].retry)
             self._tally.made += summary.made
             self._tally.failed.update(kind for _, kind, _ in summary.failed)
+            self._tally.commits.append(summary)
             left.pop(0)
         if left:
             self._count_death(left[0], error, stalled)

@@ -2,9 +2,16 @@
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import groupby
+from operator import itemgetter
 
-from schemas.dataset.commit import CommitSummary, Span
+import numpy as np
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from schemas.dataset.commit import Span
+from schemas.dataset.ledger import Ledger
 from schemas.errors import OutputError
 from schemas.job.job import Job
 
@@ -12,17 +19,30 @@ MAX_SHARD = 64
 """Scenes in a shard of a large job: seconds of work for each millisecond that Ray takes to hand it out."""
 
 
-def plan_spans(job: Job, commits: Sequence[CommitSummary], retry_failed: bool) -> list[Span]:
+@dataclass(frozen=True)
+class SpanPlan:
+    """The spans that are still to be made, in order, and the number of their scenes. Spans are made one at a time, once."""
+
+    scenes: int
+    ranges: Iterable[tuple[int, int]]
+    retries: Sequence[Span] = ()
+
+    def __iter__(self) -> Iterator[Span]:
+        yield from (Span(start=start, stop=stop) for start, stop in self.ranges)
+        yield from self.retries
+
+
+def plan_spans(job: Job, ledger: Ledger, retry_failed: bool) -> SpanPlan:
     """The missing ranges, and with `retry_failed` the scenes to try again. Raises as `plan_ranges`."""
-    ranges = plan_ranges(job.first_scene, job.stop_scene, job.run.range_size, committed_ranges(commits))
-    spans = [Span(start=start, stop=stop) for start, stop in ranges]
-    return spans + plan_retries(commits) if retry_failed else spans
+    ranges = plan_ranges(job.first_scene, job.stop_scene, job.run.range_size, committed_ranges(ledger))
+    retries = plan_retries(ledger) if retry_failed else []
+    return SpanPlan(job.scenes - ledger.committed + sum(span.count for span in retries), ranges, retries)
 
 
 def plan_ranges(
-    first_scene: int, stop_scene: int, range_size: int, committed: Iterable[tuple[int, int]]
-) -> list[tuple[int, int]]:
-    """The missing ranges [start, stop), in order. `committed` may be out of date: planners never conflict.
+    first_scene: int, stop_scene: int, range_size: int, committed: NDArray[np.int64] | Sequence[tuple[int, int]]
+) -> Iterator[tuple[int, int]]:
+    """The missing ranges [start, stop), in order, one at a time. `committed`, [N, 2] in any order, may be out of date.
 
     Grid lines lie at first_scene + k * range_size. No range crosses one. Within a cell, the only starts that are ever
     planned are the cell's own line and the stop of a committed range. A range ends at the next line or at stop_scene,
@@ -31,33 +51,53 @@ def plan_ranges(
     Ranges cannot overlap, even if planners have old views and other values of stop_scene: a record is put only if
     absent, so one start has one range for ever. In a cell, the first committed range can only begin at the line (no stop
     existed before it), and each later one begins where one of them stops. So they form a single chain without overlap,
-    and no range leaves its cell. An old view lacks the end of a chain: it plans a start that is taken, and loses the
-    put.
+    no range leaves its cell, and the chain ends at the cell's largest stop. An old view lacks the
+    end of a chain: it plans a start that is taken, and loses the put.
 
     Raises OutputError where scenes outside [first_scene, stop_scene) are committed: fewer scenes than committed is
     refused; and where committed ranges do not lie on this grid.
     """
     if range_size < 1 or stop_scene <= first_scene:
         raise ValueError(f"no ranges of {range_size} scenes in [{first_scene}, {stop_scene})")
-    stops = dict(committed)
-    _check_grid(first_scene, stop_scene, range_size, stops)
-    missing = []
-    for line in range(first_scene, stop_scene, range_size):
-        start, end = line, min(line + range_size, stop_scene)
-        while start in stops:
-            start = stops[start]
-        if start < end:
-            missing.append((start, end))
-    return missing
+    ranges = np.asarray(committed, np.int64).reshape(-1, 2)
+    ranges = ranges[np.argsort(ranges[:, 0])]
+    _check_grid(first_scene, stop_scene, range_size, ranges)
+    return _missing(first_scene, stop_scene, range_size, ranges)
 
 
-def plan_retries(summaries: Sequence[CommitSummary]) -> list[Span]:
+def _missing(
+    first_scene: int, stop_scene: int, range_size: int, ranges: NDArray[np.int64]
+) -> Iterator[tuple[int, int]]:
+    """The ranges that are missing on a grid that is checked; only cells that lack something take any time."""
+    cells = (ranges[:, 0] - first_scene) // range_size
+    last = np.append(cells[1:] != cells[:-1], True)[: len(cells)]
+    cells, ends = cells[last], ranges[last, 1]  # in a cell, the range that starts last stops last
+    lines = np.minimum(first_scene + (cells + 1) * range_size, stop_scene)
+    following = np.append(cells[1:], math.ceil((stop_scene - first_scene) / range_size))[: len(cells)]
+    gaps = np.flatnonzero((ends < lines) | (following != cells + 1))
+    begun = int(cells[0]) if len(cells) else math.ceil((stop_scene - first_scene) / range_size)
+
+    def whole(cell: int, stop_cell: int) -> Iterator[tuple[int, int]]:
+        for start in range(first_scene + cell * range_size, first_scene + stop_cell * range_size, range_size):
+            yield start, min(start + range_size, stop_scene)
+
+    yield from whole(0, begun)
+    for at in gaps:
+        if ends[at] < lines[at]:
+            yield int(ends[at]), int(lines[at])
+        yield from whole(int(cells[at]) + 1, int(following[at]))
+
+
+def plan_retries(ledger: Ledger) -> list[Span]:
     """One span for each range that still has environmental failures, with those scenes alone."""
+    failed = ledger.failures
+    failed = failed.filter(pc.equal(failed.column("kind"), "environmental"))
+    pairs = zip(failed.column("start").to_pylist(), failed.column("scene_id").to_pylist(), strict=True)
     spans = []
-    for group in ranges_with_retries(summaries):
-        scenes = tuple(scene for scene, kind in effective_failures(group) if kind == "environmental")
-        if scenes:
-            spans.append(Span(start=group[0].start, stop=group[0].stop, retry=group[-1].retry + 1, scenes=scenes))
+    for start, group in groupby(pairs, key=itemgetter(0)):
+        at = int(np.searchsorted(ledger.start, start, side="right")) - 1
+        scenes = tuple(scene for _, scene in group)
+        spans.append(Span(start=start, stop=int(ledger.stop[at]), retry=int(ledger.retry[at]) + 1, scenes=scenes))
     return spans
 
 
@@ -66,51 +106,37 @@ def choose_shard_size(scenes: int, slots: int) -> int:
     return min(MAX_SHARD, math.ceil(scenes / (2 * slots)))
 
 
-def group_shards(spans: Sequence[Span], shard_size: int) -> Iterator[tuple[Span, ...]]:
+def group_shards(spans: Iterable[Span], shard_size: int) -> Iterator[tuple[Span, ...]]:
     """Whole ranges in order, grouped until they hold at least `shard_size` scenes. Made one at a time, on demand."""
     shard: list[Span] = []
     for span in spans:
         shard.append(span)
-        if sum(len(one.scene_ids) for one in shard) >= shard_size:
+        if sum(one.count for one in shard) >= shard_size:
             yield tuple(shard)
             shard = []
     if shard:
         yield tuple(shard)
 
 
-def committed_ranges(summaries: Iterable[CommitSummary]) -> list[tuple[int, int]]:
-    """(start, stop) of every committed range, in order."""
-    return [(one.start, one.stop) for one in summaries if one.retry == 0]
+def committed_ranges(ledger: Ledger) -> NDArray[np.int64]:
+    """[R, 2] start and stop of every committed range, in order."""
+    return ledger.ranges
 
 
-def ranges_with_retries(summaries: Iterable[CommitSummary]) -> list[list[CommitSummary]]:
-    """The commits of each range: itself, then its retries in order."""
-    ordered = sorted(summaries, key=lambda one: (one.start, one.retry))
-    return [list(group) for _, group in groupby(ordered, key=lambda one: one.start)]
-
-
-def effective_failures(group: Sequence[CommitSummary]) -> list[tuple[int, str]]:
-    """(scene id, kind) of the scenes of one range that failed, after all its retries, in order."""
-    failed: dict[int, str] = {}
-    for one in group:
-        for scene in one.scenes:
-            failed.pop(scene, None)
-        failed.update((scene, kind) for scene, kind, _ in one.failed)
-    return sorted(failed.items())
-
-
-def _check_grid(first_scene: int, stop_scene: int, range_size: int, stops: dict[int, int]) -> None:
-    last = max(stops.values(), default=first_scene)
-    if min(stops, default=first_scene) < first_scene or last > stop_scene:
+def _check_grid(first_scene: int, stop_scene: int, range_size: int, ranges: NDArray[np.int64]) -> None:
+    if not len(ranges):
+        return
+    start, stop = ranges.T
+    if start.min() < first_scene or stop.max() > stop_scene:
         raise OutputError(
-            f"scenes {min(stops)} to {last - 1} are committed, more than the job's {first_scene} to {stop_scene - 1}: "
-            "fewer scenes than committed are refused, ask for at least as many or choose another --out"
+            f"scenes {start.min()} to {stop.max() - 1} are committed, more than the job's {first_scene} to "
+            f"{stop_scene - 1}: fewer scenes than committed are refused, ask for at least as many or choose another --out"
         )
-    known_stops = set(stops.values())
-    for start, stop in stops.items():
-        line = first_scene + (start - first_scene) // range_size * range_size
-        if stop <= start or stop > line + range_size or (start != line and start not in known_stops):
-            raise OutputError(
-                f"the committed range [{start}, {stop}) does not fit ranges of {range_size} scenes from {first_scene}: "
-                "a dataset keeps the range_size of its first run"
-            )
+    line = first_scene + (start - first_scene) // range_size * range_size
+    wrong = (stop <= start) | (stop > line + range_size) | ((start != line) & ~np.isin(start, stop))
+    if wrong.any():
+        at = int(np.flatnonzero(wrong)[0])
+        raise OutputError(
+            f"the committed range [{start[at]}, {stop[at]}) does not fit ranges of {range_size} scenes from {first_scene}: "
+            "a dataset keeps the range_size of its first run"
+        )

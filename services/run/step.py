@@ -3,26 +3,27 @@
 import contextlib
 import sys
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from schemas.dataset.commit import Span
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
-from schemas.dataset.shard import ShardOrder
+from schemas.dataset.ledger import Ledger
+from schemas.dataset.shard import JobChange, ShardOrder
+from schemas.errors import FingerprintError
 from schemas.job.job import Job
-from services.job.record import adopt, encode_job, record_job, refuse_foreign
+from services.job.record import JobRecord, adopt, encode_job, record_job, refuse_foreign
 from services.merge.dataset_card import describe_left_out, describe_sources, write_card
-from services.merge.step import MergeResult, merge, reopen
+from services.merge.step import MergeResult, merge
 from services.run.coordinator import Coordinator, Limits, Tally
 from services.run.lock import hold_lock
+from services.run.losses import find_lost
 from services.run.out_folder import explain_lost_folder
 from services.run.progress import ProgressLine, event_log, log_event
-from services.run.range_planner import MAX_SHARD, choose_shard_size, group_shards, plan_spans
+from services.run.range_planner import MAX_SHARD, SpanPlan, choose_shard_size, group_shards, plan_spans
 from services.run.ray_cluster import Slots, open_ray
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.render.step import require_tier
-from workers.store.committed_rows import list_commits
+from workers.store.ledger import LedgerKeeper, list_commits
 from workers.store.local import open_store
 from workers.store.store import Store
 from workers.store.sweep import sweep
@@ -81,16 +82,18 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     with explain_lost_folder(store.root), hold_lock(store), event_log(store.root):
         record = adopt(store, record_job(request.job, catalogue.digest, request.job_folder))
         sweep(store, fenced=None)
-        commits = list_commits(store)
-        spans = plan_spans(record.job, commits, request.retry_failed)
-        store.write_whole(JOB_FILE, encode_job(record))
-        if not commits:
-            store.remove(FINGERPRINT_FILE)  # of a run that never made anything
+        ledger = list_commits(store)
+        for line in find_lost(store, ledger):
+            print(f"verso: {line}", file=sys.stderr)
+        plan = plan_spans(record.job, ledger, request.retry_failed)
         made_now = 0
-        if spans:
-            reopen(store)
-            with cluster or open_ray(request.address, record.job.run.workers) as slots:
-                made_now = _make(store, ShardOrder.of(request.out, record.job, record.digest), catalogue, spans, slots)
+        with contextlib.closing(LedgerKeeper(store, ledger)) as keeper:
+            if plan.scenes:
+                order = order_pattern(store, request.out, record, ledger)
+                with cluster or open_ray(request.address, record.job.run.workers) as slots:
+                    made_now = _make(store, order, catalogue, plan, slots, keeper)
+        if store.size(JOB_FILE) is None or store.read(JOB_FILE) != encode_job(record):
+            store.write_whole(JOB_FILE, encode_job(record))
         merged = merge(store, record.job.first_scene, record.job.stop_scene)
         write_card(store, record, catalogue, merged)
         log_event("finished", job=record.job.name, digest=merged.digest)
@@ -114,14 +117,49 @@ def _open_catalogue(request: RunRequest) -> Catalogue:
             line.close()
 
 
-def _make(store: Store, order: ShardOrder, catalogue: Catalogue, spans: Sequence[Span], slots: Slots) -> int:
+def order_pattern(store: Store, out: str, record: JobRecord, ledger: Ledger) -> ShardOrder:
+    """The pattern of all orders. A new folder gets its job.yaml at once, a finished one a moment before a new commit."""
+    order = ShardOrder.of(out, record.job, record.digest)
+    text = encode_job(record)
+    change = None
+    if store.size(JOB_FILE) is None:
+        store.write_whole(JOB_FILE, text)
+    elif (before := store.read(JOB_FILE)) != text:
+        change = JobChange(before=before.decode(), after=text.decode())
+    if not ledger.rows.num_rows and not ledger.lost:
+        store.remove(FINGERPRINT_FILE)  # of a run that never made anything
+    terms = order.terms.model_copy(update={"fingerprint": _committed_stack(store, record.job, ledger)})
+    return order.model_copy(update={"job_change": change, "terms": terms})
+
+
+def _committed_stack(store: Store, job: Job, ledger: Ledger) -> str:
+    """The fingerprint that every worker of a strict job must have; empty where none is committed or any may come.
+
+    Raises FingerprintError where the commits have several.
+    """
+    stacks = ledger.fingerprints if job.run.fingerprint == "strict" else []
+    if len(stacks) > 1:
+        raise FingerprintError(
+            f"the commits of {store.name} were made by {len(stacks)} stacks ({', '.join(one[:12] for one in stacks[:3])}), "
+            "and run.fingerprint is strict: set it to record to go on"
+        )
+    return stacks[0] if stacks else ""
+
+
+def _make(
+    store: Store, order: ShardOrder, catalogue: Catalogue, plan: SpanPlan, slots: Slots, keeper: LedgerKeeper
+) -> int:
     """Makes the ranges, and shows how many scenes are done. The number of scenes made."""
     job = order.job
-    tally = Tally(asked=sum(len(span.scene_ids) for span in spans))
+    tally = Tally(asked=plan.scenes)
     log_event("started", job=job.name, scenes=tally.asked, slots=slots.running)
     limits = Limits(slots.in_flight, job.run.max_attempts, int(job.run.max_failure_share * job.scenes))
-    shards = group_shards(spans, job.run.shard_size or choose_shard_size(tally.asked, slots.running))
+    shards = group_shards(plan, job.run.shard_size or choose_shard_size(tally.asked, slots.running))
     with contextlib.closing(ProgressLine(tally.asked, job.name)) as line:
-        coordinator = Coordinator(store, order, catalogue, limits, tally)
-        coordinator.run(shards, lambda now: line.show(now.done, now.failed.total()))
+
+        def follow(now: Tally) -> None:
+            line.show(now.done, now.failed.total())
+            keeper.add(now.take_commits())
+
+        Coordinator(store, order, catalogue, limits, tally).run(shards, follow)
     return tally.made

@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import cache
 from typing import IO
 
-from schemas.dataset.commit import Span
+from schemas.dataset.commit import Span, summarize
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, staging_path
 from schemas.dataset.shard import Blame, ShardOrder, ShardReport, SpanReport
@@ -86,7 +86,7 @@ def run_span(context: WorkerContext, store: Store, order: ShardOrder, span: Span
                 attempt.add_scene(output)
             failed.update(f"{row['kind']}: {row['reason']}" for row in output.rows.get("failures", ()))
     with total.stage("commit"):
-        result = attempt.commit()
+        result = attempt.commit(order.job_change)
     return SpanReport(
         start=span.start,
         stop=span.stop,
@@ -96,6 +96,7 @@ def run_span(context: WorkerContext, store: Store, order: ShardOrder, span: Span
         made=len(span.scene_ids) - failed.total(),
         failed=dict(failed),
         bugs=tuple(bugs),
+        commit=summarize(result.record),
     )
 
 
@@ -151,15 +152,39 @@ def _fingerprint(tier: Tier) -> Fingerprint:
 
 
 def _join_stack(store: Store, mine: Fingerprint, order: ShardOrder) -> None:
-    """The first worker of a dataset writes its fingerprint down; every other must have the same, if the job is strict."""
+    """The first worker of a dataset writes its fingerprint down; every other must have the same, if the job is strict.
+
+    `order.terms.fingerprint` is the digest that the commits have, if there are any: it holds without the file too.
+    """
+    committed = order.terms.fingerprint
+    if committed not in ("", mine.digest):
+        raise FingerprintError(
+            f"the stack on {socket.gethostname()} has fingerprint {mine.digest[:12]}, the dataset's commits have "
+            f"{committed[:12]}{_differences(store, mine)}. Use the same stack (the image is one), or set run.fingerprint: record"
+        )
     if store.size(FINGERPRINT_FILE) is None:
         store.put_if_absent(FINGERPRINT_FILE, mine.model_dump_json(indent=1).encode())
+    elif committed and mine != _written_down(store):
+        store.write_whole(FINGERPRINT_FILE, mine.model_dump_json(indent=1).encode())  # it was damaged, or another's
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
     if order.terms.fingerprint_mode == "strict" and mine != theirs:
         raise FingerprintError(
             f"the stack on {socket.gethostname()} has fingerprint {mine.digest[:12]}, the dataset's is {theirs.digest[:12]}: "
             f"{'; '.join(mine.differences(theirs))}. Use the same stack (the image is one), or set run.fingerprint: record"
         )
+
+
+def _differences(store: Store, mine: Fingerprint) -> str:
+    """What differs from the stack that is written down, if it is."""
+    theirs = _written_down(store)
+    return f": {'; '.join(mine.differences(theirs))}" if theirs and theirs != mine else ""
+
+
+def _written_down(store: Store) -> Fingerprint | None:
+    try:
+        return Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
+    except (FileNotFoundError, ValueError):
+        return None
 
 
 @contextmanager

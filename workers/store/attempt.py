@@ -22,7 +22,16 @@ from schemas.dataset.commit import (
     Span,
     TableEntry,
 )
-from schemas.dataset.layout import FENCED, commit_path, is_shape, range_table_path, staging_path
+from schemas.dataset.layout import (
+    FENCED,
+    JOB_FILE,
+    SUCCESS_FILE,
+    commit_path,
+    is_shape,
+    range_table_path,
+    staging_path,
+)
+from schemas.dataset.shard import JobChange
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import OutputError, RunError
 from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
@@ -65,6 +74,16 @@ def begin_attempt(store: Store, span: Span, terms: CommitTerms, label: str = "")
 def host_part(host: str) -> str:
     """A host's name as a part of an attempt's name, where `-` separates parts."""
     return re.sub(r"[^A-Za-z0-9_.]", "_", host)
+
+
+def reopen(store: Store, job_change: JobChange | None = None) -> None:
+    """Makes a finished dataset an unfinished one, just before it gets another commit. Anyone may, any number of times."""
+    with contextlib.suppress(FileNotFoundError):
+        if job_change is not None and store.read(JOB_FILE) == job_change.before.encode():
+            store.write_whole(JOB_FILE, job_change.after.encode())
+    if store.size(SUCCESS_FILE) is not None:
+        store.remove(SUCCESS_FILE)
+        store.sync_folders_of([SUCCESS_FILE])
 
 
 def retry_of_attempt(name: str) -> int | None:
@@ -138,9 +157,10 @@ class Attempt:
         digest = scene_digest(output.rows)[:MARK]
         self._scenes.append(SceneMark(scene_id=output.scene_id, outcome=outcome, digest=digest, reason=reason))
 
-    def commit(self) -> CommitResult:
+    def commit(self, job_change: JobChange | None = None) -> CommitResult:
         """Decides the range and, where this attempt wins, publishes it; a loser's folder is removed.
 
+        Just before the decision, `_SUCCESS` goes and job.yaml is changed: an attempt that fails earlier leaves both.
         Raises ValueError where a scene of the range is missing, RunError where the attempt was swept although nobody
         has committed the range.
         """
@@ -149,7 +169,7 @@ class Attempt:
             raise ValueError(f"the range from {self.span.start} lacks scenes {first}: it cannot be committed")
         self._note({})
         record = self._finish()
-        if not self._put(record):
+        if not self._put(record, job_change):
             return self._concede(record)
         publish(self._store, record)
         return CommitResult(won=True, record=record)
@@ -185,12 +205,13 @@ class Attempt:
             scenes=tuple(self._scenes),
         )
 
-    def _put(self, record: CommitRecord) -> bool:
+    def _put(self, record: CommitRecord, job_change: JobChange | None) -> bool:
         """Puts the record if absent; True where it is now this attempt's."""
         key = commit_path(self.span.start, self.span.retry)
         with self._skip_if_swept():
             if not self.fenced and self._store.size(key) is None:
                 self._store.make_durable(self._staging)
+                reopen(self._store, job_change)
                 return self._store.put_if_absent(key, encode_record(record), self._staging)
         return False
 

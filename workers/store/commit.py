@@ -6,15 +6,20 @@ commit any more. Publishing may be repeated by any process, at any time, any num
 
 import contextlib
 import hashlib
-from collections.abc import Iterable
+from array import array
+from collections.abc import Iterable, Sequence
 
-from schemas.dataset.commit import MARK, CommitRecord, CommitSummary, FileEntry, foreign_path, summarize
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.dataset.commit import MARK, CommitRecord, FileEntry, foreign_path
 from schemas.dataset.layout import (
     COMMITS,
     FENCED,
+    MAX_RETRIES,
     commit_path,
     is_shape,
-    parse_commit_path,
+    parse_commit_name,
     range_table_path,
     staging_path,
 )
@@ -30,21 +35,45 @@ def commit_names(store: Store) -> list[tuple[int, int, str]]:
 
     Raises CorruptError naming a file that does not belong there.
     """
-    found = []
-    for key, _ in store.files(COMMITS):
-        if key.rpartition("/")[2].startswith("."):
-            continue
-        name = parse_commit_path(key)
-        if name is None:
-            raise CorruptError(f"{key} in {store.name} is not a commit of this program: move it away")
-        found.append((*name, key))
-    return sorted(found)
+    return [(start, retry, commit_path(start, retry)) for start, retry in map(split_code, list_codes(store))]
+
+
+def list_codes(store: Store) -> NDArray[np.int64]:
+    """[N] codes of every commit record, ascending, eight bytes each. Raises as `commit_names`."""
+    return np.sort(_codes_and_sizes(store, sizes=False)[0])
+
+
+def code_of(start: int, retry: int) -> int:
+    """A number that sorts like (start, retry)."""
+    return start * MAX_RETRIES + retry
+
+
+def split_code(code: int) -> tuple[int, int]:
+    """(start, retry)."""
+    start, retry = divmod(int(code), MAX_RETRIES)
+    return start, retry
 
 
 def commits_digest(store: Store) -> str:
     """A digest that tells one set of commits from another: a record never changes, so keys and sizes are enough."""
-    lines = [f"{key} {store.size(key)}\n" for _, _, key in commit_names(store)]
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
+    codes, sizes = _codes_and_sizes(store, sizes=True)
+    digest = hashlib.sha256()
+    for at in np.argsort(codes):
+        digest.update(f"{commit_path(*split_code(codes[at]))} {sizes[at]}\n".encode())
+    return digest.hexdigest()
+
+
+def _codes_and_sizes(store: Store, sizes: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    codes, found = array("q"), array("q")
+    for name, size in store.scan(COMMITS, sizes):
+        if name.startswith("."):
+            continue
+        commit = parse_commit_name(name)
+        if commit is None:
+            raise CorruptError(f"{COMMITS}/{name} in {store.name} is not a commit of this program: move it away")
+        codes.append(code_of(*commit))
+        found.append(size)
+    return np.asarray(codes), np.asarray(found)
 
 
 def read_record(store: Store, start: int, retry: int = 0) -> CommitRecord | None:
@@ -59,12 +88,20 @@ def read_record(store: Store, start: int, retry: int = 0) -> CommitRecord | None
     return record
 
 
-def read_summary(store: Store, start: int, retry: int = 0) -> CommitSummary:
-    """The part of a record that planning needs. Raises as `decode_record`, CorruptError where there is none."""
+def require_record(store: Store, start: int, retry: int = 0) -> CommitRecord:
+    """The record of a range that is committed. Raises as `decode_record`, CorruptError where there is none."""
     record = read_record(store, start, retry)
     if record is None:
         raise CorruptError(f"{commit_path(start, retry)} vanished while {store.name} was read")
-    return summarize(record)
+    return record
+
+
+def check_retries(start: int, retries: Sequence[int]) -> None:
+    """Raises CorruptError where one of a range's retries is there and one before it is not."""
+    if list(retries) != list(range(len(retries))):
+        raise CorruptError(
+            f"{COMMITS} has retries {list(retries)} of the range from scene {start}, and must have all from 0: restore it"
+        )
 
 
 def committed_files(store: Store, record: CommitRecord) -> tuple[FileEntry, ...]:

@@ -2,18 +2,33 @@
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
-from operator import itemgetter
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from schemas.dataset.commit import CommitRecord, CommitSummary
-from schemas.dataset.layout import COMMITS, range_table_path
+from schemas.dataset.commit import CommitRecord
+from schemas.dataset.layout import range_table_path
 from schemas.dataset.tables import SORT_KEYS
-from schemas.errors import CorruptError, RunError
-from workers.store.commit import commit_names, read_range_file, read_record, read_summary
+from schemas.errors import RunError
+from workers.store.commit import check_retries, list_codes, read_range_file, require_record, split_code
+from workers.store.ledger import list_commits as list_commits
 from workers.store.manifest import decode_table
 from workers.store.store import Store
+
+
+def iter_committed(store: Store) -> Iterator[list[CommitRecord]]:
+    """The records of every committed range, followed by its retries, in order.
+
+    Raises CorruptError for a damaged or missing record, OutputError for one of a newer version.
+    """
+    for start, codes in groupby(list_codes(store), key=lambda code: split_code(code)[0]):
+        yield read_range(store, start, [split_code(code)[1] for code in codes])
+
+
+def read_range(store: Store, start: int, retries: Sequence[int]) -> list[CommitRecord]:
+    """The records of one range. Raises as `iter_committed`."""
+    check_retries(start, retries)
+    return [require_record(store, start, retry) for retry in retries]
 
 
 def iter_ranges(store: Store, first_scene: int, stop_scene: int) -> Iterator[list[CommitRecord]]:
@@ -22,26 +37,18 @@ def iter_ranges(store: Store, first_scene: int, stop_scene: int) -> Iterator[lis
     Raises RunError naming scenes that nobody committed, or that are committed beyond the end.
     """
     awaited = first_scene
-    for start, retries in _commits_by_range(store):
+    for records in iter_committed(store):
+        start, stop = records[0].span.start, records[0].span.stop
         if start != awaited:
             raise RunError(
                 _gap(awaited, min(start, stop_scene)) if start > awaited else _beyond(start, first_scene, stop_scene)
             )
-        records = [record for retry in retries if (record := read_record(store, start, retry)) is not None]
-        awaited = records[0].span.stop
+        awaited = stop
         if awaited > stop_scene:
             raise RunError(_beyond(awaited - 1, first_scene, stop_scene))
         yield records
     if awaited < stop_scene:
         raise RunError(_gap(awaited, stop_scene))
-
-
-def list_commits(store: Store) -> list[CommitSummary]:
-    """Every committed range in order, each followed by its retries.
-
-    Raises CorruptError for a damaged or missing record, OutputError for one of a newer version.
-    """
-    return [read_summary(store, start, retry) for start, retries in _commits_by_range(store) for retry in retries]
 
 
 def range_rows(store: Store, records: Sequence[CommitRecord], table: str) -> pa.Table:
@@ -65,17 +72,6 @@ def read_range_table(store: Store, record: CommitRecord, table: str) -> pa.Table
     """The rows that one record committed. Raises CorruptError naming a file that is missing or altered."""
     path = range_table_path(record.span.start, table, record.span.retry)
     return decode_table(table, read_range_file(store, record, path), path)
-
-
-def _commits_by_range(store: Store) -> Iterator[tuple[int, list[int]]]:
-    """The start of each range, and its retries. Raises CorruptError where one is missing."""
-    for start, names in groupby(commit_names(store), key=itemgetter(0)):
-        retries = [retry for _, retry, _ in names]
-        if retries != list(range(len(retries))):
-            raise CorruptError(
-                f"{COMMITS} has retries {retries} of the range from scene {start}, and must have all from 0: restore it"
-            )
-        yield start, retries
 
 
 def _gap(start: int, stop: int) -> str:

@@ -164,6 +164,13 @@ class LocalStore(Store):
             elif (size := self.size(key)) is not None:
                 yield Entry(key, size)
 
+    def scan(self, prefix: str, sizes: bool = False) -> Iterator[tuple[str, int]]:
+        """Names, and sizes if asked; one that vanishes meanwhile may be left out."""
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(self.path(prefix)) as entries:
+            for entry in entries:
+                with contextlib.suppress(FileNotFoundError):
+                    yield entry.name, entry.stat().st_size if sizes else 0
+
     def children(self, prefix: str) -> list[str]:
         """Folders directly below `prefix`."""
         return [entry.name for entry in self._scan(prefix) if entry.is_dir(follow_symlinks=False)]

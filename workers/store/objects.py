@@ -159,6 +159,12 @@ class ObjectStore(Store):
             for page in obstore.list(self._bucket):
                 yield from (Entry(meta["path"], meta["size"]) for meta in page)
 
+    def scan(self, prefix: str, sizes: bool = False) -> Iterator[tuple[str, int]]:
+        """Names and sizes, page by page."""
+        with self._explained(prefix):
+            for page in obstore.list(self._bucket, prefix):
+                yield from ((meta["path"].removeprefix(f"{prefix}/"), meta["size"]) for meta in page)
+
     def children(self, prefix: str) -> list[str]:
         """Common prefixes of keys, directly below `prefix`."""
         with self._explained(prefix):

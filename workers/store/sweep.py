@@ -35,9 +35,9 @@ def sweep(store: Store, fenced: Collection[tuple[int, str]] | None = ()) -> list
             if sweep_attempt(store, start, attempt, given_up):
                 removed.append(attempt)
         store.remove_empty(f"{STAGING}/{folder}")
-    probes = [entry for entry in store.files(COMMITS) if entry.key.startswith(f"{COMMITS}/{PROBE_PREFIX}")]
-    for entry in [*probes, *store.files(TEMPORARY)]:
-        store.remove(entry.key)  # a living process writes its temporary file again
+    probes = [f"{COMMITS}/{name}" for name, _ in store.scan(COMMITS) if name.startswith(PROBE_PREFIX)]
+    for key in [*probes, *(entry.key for entry in store.files(TEMPORARY))]:
+        store.remove(key)  # a living process writes its temporary file again
     return removed
 
 

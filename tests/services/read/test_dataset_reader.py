@@ -13,7 +13,7 @@ def test_scenes_are_chosen_evenly_and_by_seed():
     chosen = choose_evenly(ids, 8, 5)
     assert len(set(chosen)) == 8
     assert set(np.diff(chosen)) == {25}
-    assert chosen == choose_evenly(ids[::-1], 8, 5) != choose_evenly(ids, 8, 6)
+    assert chosen == choose_evenly(tuple(ids), 8, 5) != choose_evenly(ids, 8, 6)
     assert choose_evenly(ids, 500, 5) == ids
     assert choose_evenly([], 3, 5) == []
 

@@ -1,12 +1,18 @@
+import json
 import os
+from pathlib import Path
 
 import pytest
 
 from schemas.errors import OutputError
+from schemas.job.job import Job
+from services.cli.main import main
+from services.job.record import encode_job, record_job
 from services.merge.step import merge
 from services.read.status import read_status
 from services.run.lock import hold_lock
 from tests.made_up_scenes import attempt_at, failed_scene, scene
+from workers.store.ledger import list_commits, save_rows
 from workers.store.local import LocalStore
 
 pytestmark = pytest.mark.usefixtures("unflushed")
@@ -63,6 +69,39 @@ def test_a_finished_dataset_has_its_digest(store):
     digest = merge(store, 0, 4).digest
     status = read_status(store, 0, 4)
     assert (status.digest, status.missing, status.running) == (digest, 0, ())
+
+
+def test_the_rate_asks_few_records_for_their_time(store, monkeypatch):
+    for start in range(0, 80, 4):
+        attempt_at(store, start, start + 4, make=lambda i: failed_scene(i)).commit()
+    save_rows(store, list_commits(store).rows)
+    attempt_at(store, 84, 88).commit()
+    attempt_at(store, 80, 84).commit()
+    asked = []
+    modified = store.modified
+    monkeypatch.setattr(store, "modified", lambda key: asked.append(key) or modified(key))
+    monkeypatch.setattr("services.read.status.RATE_LOOKS", 4)
+    assert read_status(store, 0, 100).scenes_per_s > 0
+    assert sorted(asked) == [f"manifest/_commits/{start:010d}.json" for start in (72, 76, 80, 84)]
+
+
+def test_what_is_lost_is_told_and_a_finished_dataset_is_not_whole_then(store, capsys):
+    for start in (0, 4):
+        attempt_at(store, start, start + 4).commit()
+    merge(store, 0, 8)
+    store.write_whole(
+        "job.yaml", encode_job(record_job(Job.model_validate({"name": "a", "scenes": 8}), "c", Path("/")))
+    )
+    assert main(["status", str(store.root)]) == 0
+    (store.root / "manifest/_commits/0000000004.json").unlink()
+    capsys.readouterr()
+    assert main(["status", str(store.root), "--json"]) == 1
+    out = capsys.readouterr().out
+    assert (
+        "the commits of scenes 4 to 7 of the finished dataset are lost; restore it from a copy, or run the job" in out
+    )
+    answer = json.loads(out.splitlines()[-1])
+    assert (answer["ok"], answer["missing"], len(answer["lost"])) == (False, 4, 1)
 
 
 def test_a_folder_without_a_dataset_is_told(tmp_path):

@@ -1,36 +1,35 @@
+import itertools
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.dataset.commit import CommitSummary, Span
-from schemas.errors import CorruptError, OutputError
+from schemas.dataset.ledger import Ledger, join_rows, rows_of
+from schemas.errors import OutputError
+from schemas.job.job import Job
 from services.run.range_planner import (
     choose_shard_size,
     committed_ranges,
-    effective_failures,
     group_shards,
     plan_ranges,
     plan_retries,
+    plan_spans,
 )
-from tests.made_up_scenes import attempt_at, failed_scene, made_scene
-from workers.store.committed_rows import list_commits
-from workers.store.local import LocalStore
-
-pytestmark = pytest.mark.usefixtures("unflushed")
 
 
 def test_ranges_lie_on_the_grid_and_the_last_is_cut_short():
-    assert plan_ranges(5, 14, 4, []) == [(5, 9), (9, 13), (13, 14)]
+    assert list(plan_ranges(5, 14, 4, [])) == [(5, 9), (9, 13), (13, 14)]
 
 
 def test_an_extension_begins_at_the_last_stop_and_ends_at_the_next_line():
-    assert plan_ranges(0, 12, 4, [(0, 4), (4, 6)]) == [(6, 8), (8, 12)]
-    assert plan_ranges(0, 7, 4, [(0, 4), (4, 6)]) == [(6, 7)]
-    assert plan_ranges(0, 6, 4, [(0, 4), (4, 6)]) == []
+    assert list(plan_ranges(0, 12, 4, [(0, 4), (4, 6)])) == [(6, 8), (8, 12)]
+    assert list(plan_ranges(0, 7, 4, [(0, 4), (4, 6)])) == [(6, 7)]
+    assert list(plan_ranges(0, 6, 4, [(0, 4), (4, 6)])) == []
 
 
 def test_gaps_are_filled():
-    assert plan_ranges(0, 12, 4, [(4, 8)]) == [(0, 4), (8, 12)]
+    assert list(plan_ranges(0, 12, 4, [(4, 8)])) == [(0, 4), (8, 12)]
 
 
 def test_fewer_scenes_than_committed_are_refused():
@@ -72,14 +71,14 @@ def test_planners_with_old_views_and_other_ends_never_overlap_and_cover_all_in_t
             view = log[: seen[me]]
             if view and max(stop for _, stop in view) > stops[me]:
                 continue  # refused: fewer scenes than committed
-            missing = plan_ranges(first, stops[me], size, view)
+            missing = list(plan_ranges(first, stops[me], size, view))
             if missing:
                 start, stop = data.draw(st.sampled_from(missing), "range")
                 if start not in taken:
                     taken[start] = stop
                     log.append((start, stop))
     end = max([*stops, *taken.values()])
-    while missing := plan_ranges(first, end, size, log):
+    while missing := list(plan_ranges(first, end, size, log)):
         for start, stop in missing:
             assert start not in taken
             taken[start] = stop
@@ -88,9 +87,44 @@ def test_planners_with_old_views_and_other_ends_never_overlap_and_cover_all_in_t
     assert sorted(scenes) == list(range(first, end))
 
 
-def summary(start, retry=0, failed=(), scenes=()):
+def listed_ranges(first: int, stop: int, size: int, committed: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The same plan as a plain list over every cell: what the lazy one must give."""
+    stops, missing = dict(committed), []
+    for line in range(first, stop, size):
+        start, end = line, min(line + size, stop)
+        while start in stops:
+            start = stops[start]
+        if start < end:
+            missing.append((start, end))
+    return missing
+
+
+@given(st.data())
+def test_the_lazy_plan_is_that_of_a_list_over_every_cell(data):
+    first, size = data.draw(st.integers(0, 5), "first"), data.draw(st.integers(1, 6), "range size")
+    stop = first + data.draw(st.integers(1, 40), "scenes")
+    committed = []
+    for line in range(first, stop, size):
+        inner = data.draw(
+            st.lists(st.integers(line + 1, min(line + size, stop)), unique=True, max_size=3), f"cuts {line}"
+        )
+        committed += itertools.pairwise([line, *sorted(inner)])
+    shuffled = data.draw(st.permutations(committed), "order")
+    assert list(plan_ranges(first, stop, size, shuffled)) == listed_ranges(first, stop, size, committed)
+
+
+def test_a_plan_of_a_thousand_million_scenes_is_made_on_demand():
+    """The list took 12 GB."""
+    job = Job.model_validate({"name": "large", "scenes": 10**9})
+    plan = plan_spans(job, Ledger(join_rows([rows_of([summary(16 * 40_000_000 - 16, stop=16 * 40_000_000)])])), False)
+    assert plan.scenes == 10**9 - 16
+    shards = group_shards(plan, choose_shard_size(plan.scenes, 2))
+    assert [span.start for span in next(shards)] == [0, 16, 32, 48]
+
+
+def summary(start, retry=0, failed=(), scenes=(), stop=None):
     told = tuple((scene, kind, "left_table") for scene, kind in failed)
-    return CommitSummary(start, start + 4, retry, 4 - len(failed), told, tuple(scenes))
+    return CommitSummary(start, stop or start + 4, retry, 4 - len(failed), told, tuple(scenes))
 
 
 def test_only_environmental_failures_that_still_stand_are_tried_again():
@@ -101,29 +135,16 @@ def test_only_environmental_failures_that_still_stand_are_tried_again():
         summary(4, retry=1, scenes=(5,), failed=[(5, "intrinsic")]),
         summary(8, failed=[(9, "environmental")]),
     ]
-    spans = plan_retries(summaries)
+    ledger = Ledger(join_rows([rows_of(summaries)]))
+    spans = plan_retries(ledger)
     assert [(span.start, span.stop, span.retry, span.scenes) for span in spans] == [(0, 4, 2, (3,)), (8, 12, 1, (9,))]
     assert spans[0].scene_ids == (3,)
-    assert effective_failures(summaries[:2]) == [(2, "intrinsic"), (3, "environmental")]
-    assert committed_ranges(summaries) == [(0, 4), (4, 8), (8, 12)]
-
-
-def test_commits_are_listed_with_their_retries_and_a_missing_retry_is_told(tmp_path):
-    store = LocalStore(tmp_path)
-    store.prepare()
-    attempt_at(store, 4, 8, make=made_scene).commit()
-    attempt_at(store, 0, 4, make=lambda i: failed_scene(i, "environmental")).commit()
-    attempt_at(store, 0, 4, retry=1, scenes=(1, 2), make=made_scene).commit()
-    listed = list_commits(store)
-    assert [(one.start, one.retry, one.made, len(one.failed)) for one in listed] == [
-        (0, 0, 0, 4),
-        (0, 1, 2, 0),
-        (4, 0, 4, 0),
-    ]
-    assert plan_retries(listed)[0].scenes == (0, 3)
-    (tmp_path / "manifest/_commits/0000000000.json").unlink()
-    with pytest.raises(CorruptError, match=r"retries \[1\] of the range from scene 0"):
-        list_commits(store)
+    assert ledger.failures.column("scene_id").to_pylist() == [2, 3, 5, 9]
+    assert committed_ranges(ledger).tolist() == [[0, 4], [4, 8], [8, 12]]
+    plan = plan_spans(
+        Job.model_validate({"name": "a", "scenes": 14, "run": {"range_size": 4}}), ledger, retry_failed=True
+    )
+    assert (plan.scenes, [span.start for span in plan]) == (4, [12, 0, 8])
 
 
 @pytest.mark.parametrize(("size", "grouped"), [(1, [1, 1, 1, 1]), (4, [1, 1, 1, 1]), (5, [2, 2]), (100, [4])])

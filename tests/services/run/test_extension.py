@@ -1,0 +1,139 @@
+"""Extensions that are refused before their first new commit leave a finished dataset as it was; those that begin reopen it."""
+
+import contextlib
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from schemas.dataset.commit import Span
+from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, SUCCESS_FILE
+from schemas.dataset.shard import ShardOrder
+from schemas.errors import FingerprintError, MachineError
+from services.job.read import validate_job
+from services.job.record import record_job, require_job
+from services.run.step import RunRequest, order_pattern, run_job
+from tests.datasets import SMALL, make_dataset
+from workers.assets.catalogue import open_catalogue
+from workers.pipeline import run_shard as module
+from workers.pipeline.run_shard import run_shard
+from workers.store.ledger import list_commits
+from workers.store.local import LocalStore
+
+KEPT = (JOB_FILE, SUCCESS_FILE, FINGERPRINT_FILE, "DATASET.md", "camPoses.csv")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("finished") / "out")[0]
+
+
+@pytest.fixture
+def finished(made, tmp_path):
+    """A finished dataset of two scenes."""
+    shutil.copytree(made.root, tmp_path / "out")
+    return LocalStore(tmp_path / "out")
+
+
+def kept(store: LocalStore) -> dict[str, bytes]:
+    return {key: store.read(key) for key in KEPT if store.size(key) is not None}
+
+
+def larger(store: LocalStore, **run) -> RunRequest:
+    return RunRequest(validate_job({**SMALL, "scenes": 3, "run": run}, "test"), Path(), str(store.root))
+
+
+def order_of(store: LocalStore, **run) -> tuple[ShardOrder, object]:
+    """The order of the third scene as the coordinator gives it, and the catalogue."""
+    request = larger(store, **run)
+    catalogue = open_catalogue(request.job.assets, Path(), tuple(request.job.categories))
+    record = record_job(request.job, catalogue.digest, Path())
+    pattern = order_pattern(store, request.out, record, list_commits(store))
+    return pattern.model_copy(update={"spans": (Span(start=2, stop=3),)}), catalogue
+
+
+def test_where_ray_does_not_start_a_finished_dataset_stays_finished(finished):
+    @contextlib.contextmanager
+    def no_ray():
+        raise MachineError("Ray did not start")
+        yield
+
+    before = kept(finished)
+    with pytest.raises(MachineError, match="Ray did not start"):
+        run_job(larger(finished), no_ray())
+    assert kept(finished) == before
+    assert require_job(finished).job.scenes == 2
+
+
+def test_a_worker_that_fails_in_its_first_scene_leaves_it_finished(finished, monkeypatch):
+    def full(*args):
+        raise MachineError("the disk is full")
+
+    before = kept(finished)
+    monkeypatch.setattr(LocalStore, "make_durable", full)
+    with pytest.raises(MachineError, match="the disk is full"):
+        run_shard(*order_of(finished))
+    assert kept(finished) == before
+
+
+def test_the_first_new_commit_reopens_it_and_writes_the_larger_job(finished, monkeypatch):
+    seen = []
+    whole = LocalStore.put_if_absent
+
+    def put(store, key, data, staging=None):
+        seen.append((key, store.size(SUCCESS_FILE), require_job(store).job.scenes))
+        return whole(store, key, data, staging)
+
+    monkeypatch.setattr(LocalStore, "put_if_absent", put)
+    run_shard(*order_of(finished))
+    assert seen == [("manifest/_commits/0000000002.json", None, 3)]
+
+
+def test_an_older_order_does_not_make_a_later_job_smaller(finished):
+    order, catalogue = order_of(finished)
+    tree = {**SMALL, "scenes": 5}
+    larger_still = RunRequest(validate_job(tree, "test"), Path(), str(finished.root))
+    record = record_job(larger_still.job, catalogue.digest, Path())
+    change = order_pattern(finished, larger_still.out, record, list_commits(finished)).job_change
+    finished.write_whole(JOB_FILE, change.after.encode())
+    run_shard(order, catalogue)
+    assert require_job(finished).job.scenes == 5
+
+
+def another_stack(monkeypatch):
+    mine = module._fingerprint("raster")
+    monkeypatch.setattr(module, "_fingerprint", lambda tier: mine.model_copy(update={"simd": "other"}))
+    return mine
+
+
+@pytest.mark.parametrize("gone", [True, False], ids=["without the file", "with the file of the other stack"])
+def test_another_stack_is_refused_by_what_the_commits_say(finished, monkeypatch, gone):
+    mine = another_stack(monkeypatch)
+    finished.remove(FINGERPRINT_FILE)
+    if not gone:
+        finished.write_whole(FINGERPRINT_FILE, module._fingerprint("raster").model_dump_json().encode())
+    before = kept(finished)
+    with pytest.raises(FingerprintError, match=f"the dataset's commits have {mine.digest[:12]}"):
+        run_shard(*order_of(finished))
+    assert kept(finished) == before
+    run_shard(*order_of(finished, fingerprint="record"))
+
+
+def test_a_lost_or_damaged_fingerprint_file_is_written_again_by_the_same_stack(finished):
+    whole = json.loads(finished.read(FINGERPRINT_FILE))
+    for damaged in (None, b"{", b"[]"):
+        if damaged is None:
+            finished.remove(FINGERPRINT_FILE)
+        else:
+            finished.write_whole(FINGERPRINT_FILE, damaged)
+        order, _ = order_of(finished)
+        module._join_stack(finished, module._fingerprint("raster"), order)
+        assert json.loads(finished.read(FINGERPRINT_FILE)) == whole
+
+
+def test_a_strict_job_does_not_go_on_where_the_commits_have_two_stacks(finished, monkeypatch):
+    another_stack(monkeypatch)
+    run_shard(*order_of(finished, fingerprint="record"))
+    with pytest.raises(FingerprintError, match=r"made by 2 stacks .* set it to record to go on"):
+        order_of(finished)

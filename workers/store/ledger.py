@@ -1,0 +1,158 @@
+"""The kept summary of all commits: names come from a listing, rows from one file, and only what it lacks from records.
+
+The holder of the lock rewrites the file now and then; workers never do. It is a cache: a file that is torn, or was made
+for another dataset, is not used. A commit that it names and nobody finds is told as lost.
+"""
+
+import contextlib
+import io
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from schemas.dataset.commit import CommitSummary, summarize
+from schemas.dataset.layout import LEDGER_FILE, MAX_RETRIES, range_table_path
+from schemas.dataset.ledger import LEDGER_SCHEMA, Ledger, join_rows, rows_of
+from schemas.errors import MachineError
+from workers.store.commit import check_retries, list_codes, read_range_file, require_record, split_code
+from workers.store.manifest import PARQUET_OPTIONS, decode_table
+from workers.store.store import Store
+
+_BATCH = 4_096
+"""Records that are read before their rows are packed into columns."""
+_AT_ONCE = 16
+"""Requests to an object store at once."""
+_SAMPLES = 4
+"""Records that a kept summary is compared with: one of another dataset has another job digest in all of them."""
+SAVE_EACH = 1_024
+"""Fewest commits that make the holder of the lock write the summary again."""
+SAVE_SHARE = 0.1
+"""Share of all commits by which they grow before the summary is written again: so all writing is a few times its size."""
+
+
+def list_commits(store: Store) -> Ledger:
+    """Every commit of the dataset.
+
+    Raises CorruptError for a damaged or missing record that is not in the kept summary, OutputError for one of a newer
+    version.
+    """
+    codes = list_codes(store)
+    _check_all_retries(codes)
+    kept = _read_kept(store, codes)
+    known = np.asarray(kept.column("start")) * MAX_RETRIES + np.asarray(kept.column("retry"))
+    lost = tuple(split_code(code) for code in np.setdiff1d(known, codes, assume_unique=True))
+    if lost:
+        kept = kept.filter(pa.array(np.isin(known, codes)))
+    unread = np.setdiff1d(codes, known, assume_unique=True)
+    parts = [kept]
+    summaries = _read_all(store, map(split_code, unread))
+    while batch := list(islice(summaries, _BATCH)):
+        parts.append(rows_of(batch))
+    return Ledger(join_rows(parts), lost, np.searchsorted(codes, unread))
+
+
+def read_summary(store: Store, start: int, retry: int = 0) -> CommitSummary:
+    """The summary of a record; the reasons that a record of version 1 lacks come from its table of failures."""
+    record = require_record(store, start, retry)
+    summary = summarize(record)
+    if all(reason is not None for _, _, reason in summary.failed):
+        return summary
+    path = range_table_path(start, "failures", retry)
+    rows = decode_table("failures", read_range_file(store, record, path), path).to_pylist()
+    reasons = {row["scene_id"]: row["reason"] for row in rows}
+    return replace(summary, failed=tuple((scene, kind, reasons.get(scene, "")) for scene, kind, _ in summary.failed))
+
+
+def save_rows(store: Store, rows: pa.Table) -> None:
+    """Writes the kept summary: for the holder of the lock alone."""
+    sink = io.BytesIO()
+    pq.write_table(rows, sink, **PARQUET_OPTIONS)
+    store.write_whole(LEDGER_FILE, sink.getvalue())
+
+
+class LedgerKeeper:
+    """Adds new commits to the kept summary, and writes it when enough have come. For the holder of the lock alone."""
+
+    def __init__(self, store: Store, ledger: Ledger) -> None:
+        self._store = store
+        self._parts = [ledger.rows]
+        self._count = ledger.rows.num_rows
+        self._unkept = len(ledger.unkept) + len(ledger.lost)
+        self._waiting: list[CommitSummary] = []
+        self._save_if_due()
+
+    def add(self, summaries: Iterable[CommitSummary]) -> None:
+        """Takes new commits; those of records of version 1 are left to the next listing."""
+        self._waiting += [one for one in summaries if None not in {reason for _, _, reason in one.failed}]
+        if len(self._waiting) >= _BATCH or self._unkept + len(self._waiting) >= SAVE_EACH:
+            self._pack()
+            self._save_if_due()
+
+    def close(self) -> None:
+        """Writes what is not written."""
+        self._pack()
+        if self._unkept:
+            self._save()
+
+    def _pack(self) -> None:
+        self._parts.append(rows_of(self._waiting))
+        self._count += len(self._waiting)
+        self._unkept += len(self._waiting)
+        self._waiting = []
+
+    def _save_if_due(self) -> None:
+        if self._unkept >= max(SAVE_EACH, SAVE_SHARE * self._count):
+            self._save()
+
+    def _save(self) -> None:
+        self._parts = [join_rows(self._parts)]
+        with contextlib.suppress(MachineError):  # a full disk stops the run where data are written, not here
+            save_rows(self._store, self._parts[0])
+        self._unkept = 0
+
+
+def _check_all_retries(codes: NDArray[np.int64]) -> None:
+    start, retry = np.divmod(codes, MAX_RETRIES)
+    awaited = np.where(start[1:] == start[:-1], retry[:-1] + 1, 0)
+    if (broken := np.flatnonzero(retry != np.append(np.zeros(len(codes[:1]), np.int64), awaited))).size:
+        at = start[broken[0]]
+        check_retries(int(at), retry[start == at].tolist())
+
+
+def _read_kept(store: Store, codes: NDArray[np.int64]) -> pa.Table:
+    """The rows of the kept summary; none where it is missing, torn, or of other commits than those that are there."""
+    none = LEDGER_SCHEMA.empty_table()
+    try:
+        with pq.ParquetFile(
+            pa.BufferReader(store.read(LEDGER_FILE)),
+            page_checksum_verification=True,
+            read_dictionary=["fingerprint", "job_digest"],
+        ) as file:
+            rows = file.read().select(LEDGER_SCHEMA.names).cast(LEDGER_SCHEMA)
+    except (pa.ArrowException, OSError, ValueError, KeyError):
+        return none
+    rows = join_rows([rows])
+    known = np.asarray(rows.column("start")) * MAX_RETRIES + np.asarray(rows.column("retry"))
+    shared = np.intersect1d(known, codes, assume_unique=True)
+    for code in shared[np.linspace(0, len(shared) - 1, min(_SAMPLES, len(shared))).astype(int)]:
+        row = rows.slice(int(np.searchsorted(known, code)), 1)
+        if row.to_pylist() != rows_of([read_summary(store, *split_code(code))]).to_pylist():
+            return none
+    return rows
+
+
+def _read_all(store: Store, commits: Iterable[tuple[int, int]]) -> Iterator[CommitSummary]:
+    """The summaries of these records, in order; several requests at once where each takes its time."""
+    if store.root is not None:
+        yield from (read_summary(store, start, retry) for start, retry in commits)
+        return
+    commits = iter(commits)
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        while batch := list(islice(commits, _BATCH)):
+            yield from pool.map(lambda commit: read_summary(store, *commit), batch)
