@@ -126,9 +126,8 @@ def is_worker(listener: Listener) -> bool:
 
 def scan(run: subprocess.Popen) -> list[int]:
     """Tries each port from outside, while the coordinator is held, so that nothing ends meanwhile."""
-    coordinator = next(
-        pid for pid in tree_of(run.pid) if b"services.cli.main" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    )
+    ours = [pid for pid in tree_of(run.pid) if b"services.cli.main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    coordinator = ours[-1]  # below its supervisors
     os.kill(coordinator, signal.SIGSTOP)
     try:
         return open_ports(HOST_LAN, range(1, 65536))
