@@ -14,6 +14,7 @@ import ray
 from ray._private import ray_constants, utils
 from ray._private.node import Node
 from ray._raylet import AuthenticationTokenLoader, Config  # type: ignore[attr-defined]
+from ray.exceptions import RayError
 
 from schemas.errors import MachineError
 from services.run.cores import usable_cores
@@ -134,14 +135,18 @@ def _object_store_folder(temporary: str) -> str:
 def cluster_ray(address: str, workers: int | None) -> Iterator[Slots]:
     """A running cluster: as many slots as it has cores, or `workers` where that is less.
 
-    Raises MachineError where no Ray answers at the address.
+    The user's own settings of authentication (RAY_AUTH_MODE, RAY_AUTH_TOKEN) count. Raises MachineError where no Ray
+    answers at the address, or where it wants another token.
     """
     _check_reachable(address)
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(_connection(address))
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            raise MachineError(f"--address {address}: {error}") from error
+        except (ConnectionError, RuntimeError, ValueError, RayError) as error:
+            raise MachineError(
+                f"--address {address}: {' '.join(str(error).split())}; a cluster that asks for a token needs "
+                "RAY_AUTH_MODE=token and its RAY_AUTH_TOKEN here too"
+            ) from error
         cores = int(ray.cluster_resources().get("CPU", 0))
         if cores < 1:
             raise MachineError(f"--address {address}: the cluster has no CPU to run on")

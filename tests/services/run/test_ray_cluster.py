@@ -3,6 +3,7 @@
 import os
 import socket
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -31,6 +32,20 @@ def test_an_address_where_nothing_answers_is_refused_at_once():
         address = f"127.0.0.1:{unused.getsockname()[1]}"
         with pytest.raises(MachineError, match=f"{address}: no Ray answers there"), open_ray(address, None):
             pass
+
+
+def test_a_cluster_whose_token_is_missing_is_told_in_one_line(tmp_path):
+    """In a process of its own, because Ray reads the mode when it is imported."""
+    mine = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
+    mine |= {"RAY_AUTH_MODE": "token", "HOME": str(tmp_path)}
+    program = "import sys; from services.run.ray_cluster import open_ray; open_ray(sys.argv[1], None).__enter__()"
+    with socket.create_server(("127.0.0.1", 0)) as cluster:
+        address = f"127.0.0.1:{cluster.getsockname()[1]}"
+        run = [sys.executable, "-c", program, address]
+        done = subprocess.run(run, cwd=ROOT, env=mine, capture_output=True, text=True, check=False)
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith(f"schemas.errors.MachineError: --address {address}: ")
+    assert last.endswith("needs RAY_AUTH_MODE=token and its RAY_AUTH_TOKEN here too")
 
 
 def test_ray_is_started_in_one_place():
