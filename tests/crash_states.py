@@ -2,8 +2,8 @@
 
 A program's steps on the disk are recorded once. Played back up to any of them, they tell what was flushed: by an fsync
 of a file its bytes, by an fsync of a folder the names in it, by a syncfs everything. Whatever was not may be lost or
-torn, with two limits that every file system with a journal keeps: a renamed file is never lost under both names, and
-the changes of one name apply in order.
+torn, with three limits that every file system with a journal keeps: a renamed file is never lost under both names, a
+renamed folder never has two names, and the changes of one name apply in order.
 """
 
 import random
@@ -132,7 +132,8 @@ class Disk:
     def _kept(self, folder: Folder, loss: Loss, decided: dict[int, bool]) -> list[Change]:
         def keeps(change: Change) -> bool:
             if id(change) not in decided:
-                decided[id(change)] = loss.keeps(change)
+                arrives = change.twin is not None and isinstance(change.twin[1].node, Folder)
+                decided[id(change)] = arrives or loss.keeps(change)  # a renamed folder never has two names
                 decided[id(change)] &= all(keeps(needed) for _, needed in _needed_by(change))
             return decided[id(change)]
 

@@ -120,7 +120,7 @@ class _Writing:
     def __init__(self, file, write) -> None:
         self._file = file
         self.write = write
-        self.flush, self.fileno = file.flush, file.fileno
+        self.close, self.flush, self.fileno = file.close, file.flush, file.fileno
 
     def __enter__(self):
         return self

@@ -80,7 +80,7 @@ class _Written:
 
     def __init__(self, file: Any, tell: Callable[[bytes], object]) -> None:
         self._file, self._tell = file, tell
-        self.fileno, self.flush = file.fileno, file.flush
+        self.close, self.flush, self.fileno = file.close, file.flush, file.fileno
 
     def write(self, data: bytes) -> int:
         half = len(data) // 2

@@ -9,6 +9,7 @@ from schemas.dataset.commit import CommitTerms
 from schemas.dataset.layout import STAGING
 from schemas.scene.scene import SceneOutput
 from services.merge.step import MergeResult, merge
+from services.run.lock import Lock
 from services.run.range_planner import committed_ranges, plan_ranges, plan_retries
 from tests.made_up_scenes import attempt_at, small_scene, terms
 from workers.store.committed_rows import list_commits
@@ -28,6 +29,7 @@ def make_dataset(
     stop: int = STOP,
     make: Callable[[int], SceneOutput] = small_scene,
     retry: bool = False,
+    lock: Lock | None = None,
 ) -> MergeResult:
     """Clears up, makes what is missing, tries failures again where asked to, and merges."""
     store.prepare()
@@ -37,7 +39,7 @@ def make_dataset(
     for span in plan_retries(list_commits(store)) if retry else ():
         again = {"retry": span.retry, "scenes": span.scenes}
         attempt_at(store, span.start, span.stop, settings_of(layout), make, **again).commit()
-    return merge(store, FIRST, stop)
+    return merge(store, FIRST, stop, *([lock.require_held] if lock else []))
 
 
 def contents_of(path: Path) -> str:

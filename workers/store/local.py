@@ -91,10 +91,15 @@ class LocalStore(Store):
                     with contextlib.suppress(FileExistsError):
                         os.mkdir(self.path(staging) / folder)
                 file = open(target, "wb")  # noqa: SIM115
-            with file:
+            try:
                 yield file
                 if tree := self._open.get(staging):
                     tree.flush_file(file)
+            except BaseException:
+                with contextlib.suppress(OSError):  # its last bytes do not fit either, and nobody wants them
+                    file.close()
+                raise
+            file.close()
 
     def make_durable(self, staging: str) -> None:
         """Flushes an attempt. Not to be repeated after an error, which is told once."""
@@ -201,10 +206,10 @@ class LocalStore(Store):
         """A folder under `_staging/`, on the file system of its files' final names; an earlier one of the name goes."""
         key = f"{scratch_path(name)}/{uuid.uuid4().hex}"
         self.remove_tree(scratch_path(name))
-        with self._explained(key):
-            os.makedirs(self._own(key))
         try:
-            yield self.path(key)
+            with self._explained(f"a file of the {name}"):
+                os.makedirs(self._own(key))
+                yield self.path(key)
         finally:
             self.remove_tree(key)
 

@@ -173,7 +173,11 @@ class _Archive:
             raise GeneratorExit  # ends the stream, which is not stored then
 
     def _write(self, data: bytes) -> None:
-        self._file.write(data)
+        try:
+            self._file.write(data)
+        except OSError:
+            with self._open:
+                raise  # by way of the stream, which says what to do
         self._bytes += len(data)
         self._sha256.update(data)
 

@@ -10,12 +10,9 @@ import pytest
 from schemas.dataset.layout import LOCK_FILE
 from schemas.errors import RunError
 from services.run import lock as module
-from services.run.lock import Beat, hold_lock, read_holder
+from services.run.lock import hold_lock, read_holder
+from tests.lost_locks import FAST, STILL, taken_over
 from workers.store.local import LocalStore
-
-FAST = Beat(period_s=0.02, patience=3)
-STILL = Beat(period_s=0.02 * 3600, patience=1)
-"""A heartbeat that does not come while a test lasts."""
 
 
 @pytest.fixture
@@ -23,17 +20,6 @@ def store(tmp_path):
     store = LocalStore(tmp_path)
     store.prepare()
     return store
-
-
-@contextlib.contextmanager
-def taken_over(store):
-    """Another machine finds the holder silent and takes the lock over; yields its lock."""
-    with contextlib.ExitStack() as stack:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(module, "_machine", lambda: "another")
-            patch.setattr(module.socket, "gethostname", lambda: "far")
-            theirs = stack.enter_context(hold_lock(store, FAST))
-        yield theirs
 
 
 @contextlib.contextmanager

@@ -1,0 +1,133 @@
+"""Whole runs on a real Ray whose processes are killed at random times, one after another, until a dataset is done."""
+
+import contextlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.killed_runs import ROOT, processes_with
+
+pytestmark = pytest.mark.ray
+
+KILLS = {"ci": 4, "all": 50}
+ACTORS = {
+    "driver": "services.cli.main",
+    "worker": "ray::",
+    "raylet": "raylet/raylet",
+    "gcs": "gcs_server",
+}
+"""A part of the command line of each kind of process."""
+
+JOB = """
+name: small
+seed: 11
+scenes: 24
+cameras: {sensor: {width: 160, height: 120, fx: 131.25, fy: 131.25, cx: 80.0, cy: 60.0}}
+images: {patch: {width: 32, height: 24}}
+check: {raycast_share: 0.1, mirror_agreement_mm: 5.0}
+run: {range_size: 2, shard_size: 4}
+"""
+
+
+@dataclass
+class Run:
+    """A `verso run` in a process of its own, with everything that it started."""
+
+    process: subprocess.Popen
+    mark: str
+
+    def actors(self) -> list[tuple[str, int]]:
+        """The kind and id of every process that it has at this moment and that may be killed."""
+        found = processes_with(self.mark)
+        return [(kind, one.pid) for kind, part in ACTORS.items() for one in found if part in one.name]
+
+    def wait(self, timeout_s: float) -> int | None:
+        """Its exit code; None where it goes on after `timeout_s`."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            return self.process.wait(timeout_s)
+        return None
+
+
+@contextlib.contextmanager
+def running(job: Path, out: Path) -> Iterator[Run]:
+    """A run on two workers; what is left of it in the end is killed."""
+    mark = f"VERSO_TEST_MARK={uuid.uuid4().hex}"
+    command = [sys.executable, "-m", "services.cli.main", "run", str(job), "--out", str(out), "--workers", "2"]
+    with open(out.with_suffix(".txt"), "ab") as told:
+        process = subprocess.Popen(
+            command,
+            cwd=ROOT,
+            env={**os.environ, **dict([mark.split("=")])},
+            stdout=subprocess.DEVNULL,
+            stderr=told,
+            start_new_session=True,
+        )
+    try:
+        yield Run(process, mark)
+    finally:
+        process.kill()
+        process.wait()
+        for left in processes_with(mark):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(left.pid, signal.SIGKILL)
+
+
+def digest_of(out: Path) -> str | None:
+    success = out / "_SUCCESS"
+    return json.loads(success.read_text())["digest"] if success.exists() else None
+
+
+def decided(out: Path) -> dict[str, tuple[int, int]]:
+    """Inode and time of each commit record: another value means that it was written again."""
+    found = {path.name: path.stat() for path in out.glob("manifest/_commits/*.json")}
+    return {name: (stat.st_ino, stat.st_mtime_ns) for name, stat in found.items()}
+
+
+def finish_once(job: Path, out: Path) -> tuple[str | None, float]:
+    begun = time.monotonic()
+    with running(job, out) as run:
+        assert run.wait(400) == 0, out.with_suffix(".txt").read_text()[-2000:]
+    return digest_of(out), time.monotonic() - begun
+
+
+@pytest.mark.timeout(7200)
+def test_runs_killed_at_random_make_one_dataset_and_nothing_twice(tmp_path, request, record_figure):
+    wanted = int(os.environ.get("VERSO_TEST_KILLS", KILLS.get(request.config.getoption("--scope"), 0)))
+    if not wanted:
+        pytest.skip("slow: runs with --ci")
+    job = tmp_path / "job.yaml"
+    job.write_text(JOB)
+    digest, whole_s = finish_once(job, tmp_path / "whole")
+    assert digest
+    chance = random.Random(wanted)
+    kills: Counter[str] = Counter()
+    finished = 0
+    while kills.total() < wanted:
+        out = tmp_path / f"out{finished}"
+        for _ in range(3):
+            before = decided(out)
+            with running(job, out) as run:
+                time.sleep(chance.uniform(0.1, 0.9) * whole_s)
+                actor, pid = chance.choice(run.actors())
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+                kills[actor] += 1
+                assert run.wait(400) is not None, f"a run goes on 400 s after its {actor} was killed"
+            assert before.items() <= decided(out).items(), "a commit was written again"
+        before = decided(out)
+        assert finish_once(job, out)[0] == digest
+        assert before.items() <= decided(out).items(), "a commit was written again"
+        finished += 1
+        print(f"{kills.total()} kills: {dict(kills)}, {finished} datasets, {whole_s:.0f} s a run", flush=True)
+    record_figure("runs killed at random", "passed", kills.total())
