@@ -55,7 +55,8 @@ def mutated_tree(dice: random.Random, tree: Any) -> Any:
     for _ in range(dice.randint(1, 4)):
         places = list(_places(tree))
         if places:
-            _mutate(dice, *dice.choice(places), places)
+            branch, key = dice.choice(places)
+            _mutate(dice, branch, key, places)
     return tree
 
 

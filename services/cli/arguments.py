@@ -6,7 +6,7 @@ import unicodedata
 from pathlib import Path
 from typing import Final, NoReturn
 
-from services.job.plain_line import plain_line
+from schemas.plain_line import plain_line
 
 MOST_PATH_CHARACTERS: Final = 4000
 """Longest name of a file or folder that Linux takes, but for some bytes."""

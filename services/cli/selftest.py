@@ -1,7 +1,9 @@
 """`verso test`: runs lint, types, layer rules and tests, and lists what was skipped and why."""
 
 import argparse
+import contextlib
 import importlib.util
+import json
 import os
 import subprocess
 import sys
@@ -14,9 +16,19 @@ from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree
 
+from services.cli.skips import Machine, Skip, read_expected, stale, unexpected
 from services.run.cores import usable_cores
 
 ROOT: Final = Path(__file__).resolve().parents[2]
+
+EXPECTED_SKIPS: Final = "tests/expected_skips.txt"
+
+CORE_SECONDS: Final = {"default": 900, "ci": 1500, "all": 7200}
+"""What a whole run takes by scope, in seconds of one core: measured on two cores of a Xeon at 2.1 GHz, and doubled. Said
+before the first run on a machine; later ones say how long the last one took."""
+
+LAST_RUN: Final = Path(sys.prefix, "verso-test-seconds.json")
+"""Seconds of the last whole run by scope and number of processes."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +43,12 @@ class Check:
 
 @dataclass(frozen=True)
 class Tally:
-    """Counts of tests by outcome, and of skipped tests by reason."""
+    """Numbers of tests by outcome, every test that was skipped, with its reason, and the reasons of known failures."""
 
     passed: int
     failed: int
-    skipped: Counter[str]
+    skips: tuple[Skip, ...] = ()
+    known: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, junit: Path) -> "Tally":
@@ -43,10 +56,19 @@ class Tally:
         try:
             cases = list(ElementTree.parse(junit).iter("testcase"))
         except (OSError, ElementTree.ParseError):
-            return cls(0, 0, Counter())
+            return cls(0, 0)
         failed = sum(case.find("failure") is not None or case.find("error") is not None for case in cases)
-        skips = [skip for case in cases if (skip := case.find("skipped")) is not None]
-        return cls(len(cases) - failed - len(skips), failed, Counter(skip.get("message", "") for skip in skips))
+        left = [(case, skip) for case in cases if (skip := case.find("skipped")) is not None]
+        known = tuple(skip.get("message", "") for _, skip in left if skip.get("type") == "pytest.xfail")
+        skips = tuple(
+            (_node_of(case), skip.get("message", "")) for case, skip in left if skip.get("type") != "pytest.xfail"
+        )
+        return cls(len(cases) - failed - len(left), failed, skips, known)
+
+
+def _node_of(case: ElementTree.Element) -> str:
+    """`tests/test_a.py::test_b`."""
+    return f"{case.get('classname', '').replace('.', '/')}.py::{case.get('name', '')}"
 
 
 def main(args: list[str]) -> int:
@@ -55,18 +77,60 @@ def main(args: list[str]) -> int:
     if reason := _missing_tools() or _missing_paths(asked.paths):
         print(f"verso test: {reason}", file=sys.stderr)
         return 2
+    whole, began = not (asked.paths or asked.matching), time.monotonic()
+    if whole:
+        print(f"verso test: {expected_duration(asked.scope, _processes())}", flush=True)
     checks = [] if asked.paths else [_run_check(name, command) for name, command in _static_checks().items()]
     with tempfile.TemporaryDirectory(prefix="verso-test-") as folder:
         junit = Path(folder, "junit.xml")
         started = time.monotonic()
         status = _call(_pytest_command(asked, junit))
         tally = Tally.read(junit)
-    remark = f"{tally.passed} passed, {tally.failed} failed, {tally.skipped.total()} skipped"
+    remark = f"{tally.passed} passed, {tally.failed} failed, {len(tally.skips)} skipped"
     if status == 5:  # pytest's own code
         remark = "no test was found"
     checks.append(Check("pytest", status == 0, time.monotonic() - started, remark))
-    print(_summary(checks, tally.skipped), flush=True)
+    notes: list[str] = []
+    if whole and status in (0, 1):
+        skips, notes = check_skips(tally.skips, asked.scope)
+        checks += [skips] if asked.scope != "default" else []
+        _keep_duration(asked.scope, time.monotonic() - began)
+    print(_summary(checks, tally, notes), flush=True)
     return 0 if all(check.passed for check in checks) else 1
+
+
+def check_skips(skips: Sequence[Skip], scope: str) -> tuple[Check, list[str]]:
+    """Whether every skip is expected on this machine; a line for each that is not, and for each stale expectation."""
+    expected = read_expected((ROOT / EXPECTED_SKIPS).read_text())
+    machine = Machine(scope, ROOT)
+    strange = unexpected(skips, expected, machine)
+    told = [f"  not expected, {number} x {test}: {reason}" for (test, reason), number in sorted(strange.items())]
+    unused = stale(skips, expected, machine)
+    told += [f"  expected and not skipped: {line.condition} | {line.tests} | {line.reason}" for line in unused]
+    remark = f"{strange.total()} not in {EXPECTED_SKIPS}, {len(unused)} of its lines without use here"
+    return Check("skips", not strange, 0.0, remark), told
+
+
+def expected_duration(scope: str, processes: int) -> str:
+    """How long a whole run takes, in words: as the last one here, or by the figure that was measured."""
+    last = _last_runs().get(f"{scope} {processes}")
+    seconds = last or CORE_SECONDS[scope] / processes
+    source = "as the last time" if last else "as measured elsewhere"
+    cores = f"{processes} core{'s' * (processes > 1)}"
+    return f"about {max(1, round(seconds / 60))} minutes on {cores}, {source}"
+
+
+def _last_runs() -> dict[str, float]:
+    try:
+        runs = json.loads(LAST_RUN.read_text())
+        return {name: float(seconds) for name, seconds in runs.items()}
+    except (OSError, ValueError, AttributeError, TypeError):
+        return {}
+
+
+def _keep_duration(scope: str, seconds: float) -> None:
+    with contextlib.suppress(OSError):  # the figure is a service, and no result
+        LAST_RUN.write_text(json.dumps(_last_runs() | {f"{scope} {_processes()}": round(seconds, 1)}) + "\n")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -113,8 +177,7 @@ def _pytest_command(asked: argparse.Namespace, junit: Path) -> list[str]:
     command = [sys.executable, "-m", "pytest", f"--scope={asked.scope}", f"--junitxml={junit}"]
     # One file stays in one process: its tests share what is slow to start, such as a Ray.
     one_file = len(asked.paths) == 1 and Path(asked.paths[0].split("::")[0]).is_file()
-    # A test process holds a GL context, a PyBullet world and a Ray: about 1 GB. More than 8 processes gain nothing.
-    processes = min(usable_cores(), 8)
+    processes = _processes()
     if processes > 1 and not one_file:
         command += [f"--numprocesses={processes}", "--dist=loadfile"]
     if asked.figures:
@@ -122,6 +185,11 @@ def _pytest_command(asked: argparse.Namespace, junit: Path) -> list[str]:
     if asked.matching:
         command += ["-k", asked.matching]
     return command + [os.path.abspath(path) for path in asked.paths]
+
+
+def _processes() -> int:
+    """A test process holds a GL context, a PyBullet world and a Ray: about 1 GB. More than 8 processes gain nothing."""
+    return min(usable_cores(), 8)
 
 
 def _run_check(name: str, command: list[str]) -> Check:
@@ -135,12 +203,17 @@ def _call(command: list[str]) -> int:
     return subprocess.run(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False).returncode
 
 
-def _summary(checks: Sequence[Check], skipped: Counter[str]) -> str:
+def _summary(checks: Sequence[Check], tally: Tally, notes: Sequence[str]) -> str:
     lines = ["", "verso test:"]
     for check in checks:
         verdict = "ok" if check.passed else "FAILED"
         lines.append(f"  {check.name:<12} {verdict:<7} {check.seconds:6.1f} s  {check.remark}".rstrip())
-    if skipped:
-        lines.append("skipped, and why:")
-        lines += [f"  {number:>4} x {reason}" for reason, number in skipped.most_common()]
+    for title, reasons in (
+        ("skipped, and why:", [reason for _, reason in tally.skips]),
+        ("known failures, and why:", list(tally.known)),
+    ):
+        counted = [f"  {number:>4} x {reason}" for reason, number in Counter(reasons).most_common()]
+        lines += [title, *counted] if counted else []
+    if notes:
+        lines += [f"compared with {EXPECTED_SKIPS}:", *notes]
     return "\n".join(lines)

@@ -10,8 +10,8 @@ from pydantic import ValidationError
 from schemas.errors import JobError
 from schemas.job.job import Job
 from schemas.job.keys import set_key
+from schemas.plain_line import plain_line
 from services.job.bounded_yaml import MOST_LEVELS, parse_yaml
-from services.job.plain_line import plain_line
 from services.job.reference import allowed_keys
 
 MOST_BYTES = 250_000

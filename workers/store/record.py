@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from schemas.dataset.commit import COMMIT_VERSION, MARK, CommitRecord
 from schemas.errors import CorruptError, OutputError
+from schemas.plain_line import plain_line
 
 _SEAL = b',"seal":"'
 """The last key of a record: the SHA-256 of all bytes before it."""
@@ -49,9 +50,9 @@ def decode_record(data: bytes, name: str) -> CommitRecord:
         return CommitRecord.model_validate(_expanded(raw) if "marks" in raw else raw)
     except ValidationError as error:
         first = error.errors()[0]
-        where = "".join(f"{part}: " for part in (".".join(map(str, first["loc"])),) if part)
-        told = " ".join(first["msg"].removeprefix("Value error, ").split())
-        raise CorruptError(f"{name} is not a commit record: {where}{told[:300]}") from error
+        where = plain_line("".join(f"{part}: " for part in (".".join(map(str, first["loc"])),) if part), 100)
+        told = plain_line(first["msg"].removeprefix("Value error, "), 300)
+        raise CorruptError(f"{name} is not a commit record: {where}{told}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CorruptError(f"{name} is not a commit record: {error!r}"[:300]) from error
 

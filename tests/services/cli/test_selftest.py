@@ -1,7 +1,6 @@
 import json
 import shutil
 import sys
-from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -41,7 +40,9 @@ def project(tmp_path, monkeypatch):
     (tmp_path / "services").symlink_to(selftest.ROOT / "services")
     monkeypatch.setattr(selftest, "ROOT", tmp_path)
     monkeypatch.setattr(selftest, "_static_checks", lambda: {"static": [sys.executable, "-c", "print('checked')"]})
-    monkeypatch.setattr(selftest, "usable_cores", lambda: 2)
+    monkeypatch.setattr(selftest, "usable_cores", lambda: 1)  # more would only take longer
+    monkeypatch.setattr(selftest, "LAST_RUN", tmp_path / "seconds.json")
+    (tmp_path / "tests" / "expected_skips.txt").write_text("not --all | * | slow: *\n")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -63,6 +64,65 @@ def test_all_runs_the_slow_tests_too(project, capfd):
     write_suite(project, measured=3)
     assert selftest.main(["--all"]) == 0
     assert "5 passed, 0 failed, 0 skipped" in capfd.readouterr().out
+
+
+def test_the_first_line_says_how_long_it_takes_and_the_next_run_knows_it(project, capfd):
+    write_suite(project, measured=3)
+    assert selftest.main([]) == 0
+    out = capfd.readouterr().out
+    assert out.startswith("verso test: about 15 minutes on 1 core, as measured elsewhere\n== static")
+    (seconds,) = json.loads(selftest.LAST_RUN.read_text()).values()
+    assert 0 < seconds < 300
+    selftest.LAST_RUN.write_text('{"default 1": 420}')
+    assert selftest.expected_duration("default", 1) == "about 7 minutes on 1 core, as the last time"
+    selftest.LAST_RUN.write_text("[torn")
+    assert selftest.expected_duration("default", 2) == "about 8 minutes on 2 cores, as measured elsewhere"
+
+
+def test_a_part_of_the_tests_says_and_keeps_no_duration(project, capfd):
+    write_suite(project, measured=3)
+    assert selftest.main(["-k", "passes"]) == 0
+    assert "minutes" not in capfd.readouterr().out
+    assert not selftest.LAST_RUN.exists()
+
+
+SKIPS = """
+import pytest
+
+@pytest.mark.skip(reason="the moon is full")
+def test_moon():
+    pass
+"""
+
+
+def test_a_skip_that_is_not_expected_fails_in_ci_and_is_told_elsewhere(project, capfd):
+    (project / "tests" / "test_moon.py").write_text(SKIPS)
+    assert selftest.main(["--ci"]) == 1
+    out = capfd.readouterr().out
+    assert "skips        FAILED" in out
+    assert "not expected, 1 x tests/test_moon.py::test_moon: the moon is full" in out
+    assert selftest.main([]) == 0
+    assert "not expected, 1 x tests/test_moon.py::test_moon: the moon is full" in capfd.readouterr().out
+
+
+def test_an_expected_skip_passes_in_ci_and_a_line_of_no_use_is_told(project, capfd):
+    (project / "tests" / "test_moon.py").write_text(SKIPS)
+    (project / "tests" / "expected_skips.txt").write_text(
+        "# why\nalways | tests/test_moon.py::* | the moon is *\nalways | tests/test_sun.py::* | the sun is full\n"
+    )
+    assert selftest.main(["--ci"]) == 0
+    out = capfd.readouterr().out
+    assert "skips        ok" in out and "0 not in tests/expected_skips.txt, 1 of its lines without use here" in out
+    assert "expected and not skipped: always | tests/test_sun.py::* | the sun is full" in out
+
+
+def test_a_known_failure_is_no_skip(project, capfd):
+    suite = "import pytest\n@pytest.mark.xfail(reason='not understood')\ndef test_wrong():\n    assert []\n"
+    (project / "tests" / "test_known.py").write_text(suite)
+    assert selftest.main([]) == 0
+    out = capfd.readouterr().out
+    assert "0 passed, 0 failed, 0 skipped" in out
+    assert "known failures, and why:\n     1 x not understood" in out
 
 
 def test_a_failing_test_is_1(project, capfd):
@@ -111,6 +171,7 @@ def test_outside_a_checkout_it_says_where_the_tests_are(tmp_path, monkeypatch, c
 
 def test_figures_of_all_processes_come_in_one_list_and_a_failed_case_says_so(project, monkeypatch):
     write_suite(project, measured=9)
+    monkeypatch.setattr(selftest, "usable_cores", lambda: 2)
     elsewhere = project / "elsewhere"
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
@@ -123,6 +184,6 @@ def test_figures_of_all_processes_come_in_one_list_and_a_failed_case_says_so(pro
 
 
 def test_a_run_that_died_before_writing_counts_nothing(tmp_path):
-    assert selftest.Tally.read(tmp_path / "absent.xml") == selftest.Tally(0, 0, Counter())
+    assert selftest.Tally.read(tmp_path / "absent.xml") == selftest.Tally(0, 0)
     (tmp_path / "torn.xml").write_text("<testsuites><testsu")
-    assert selftest.Tally.read(tmp_path / "torn.xml") == selftest.Tally(0, 0, Counter())
+    assert selftest.Tally.read(tmp_path / "torn.xml") == selftest.Tally(0, 0)
