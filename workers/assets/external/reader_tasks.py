@@ -80,19 +80,21 @@ def answer_task(request: Request, number: int) -> bytes:
     try:
         return ANSWER + _answer(request, task)
     except MeshError as error:
-        return _refusal(error)
+        return _refusal(error, task.path)
     except MemoryError:
         raise
     except OSError as error:
         if error.errno in (errno.ENOMEM, errno.EFBIG):
             raise MemoryError from error
-        return _refusal(MeshError("unreadable", f"{task.path} cannot be read: {describe_error(error)}"))
+        return _refusal(MeshError("unreadable", f"{task.path} cannot be read: {describe_error(error)}"), task.path)
     except Exception as error:  # whatever a stranger's bytes made a library raise, it is they that are refused
-        return _refusal(MeshError("unreadable", f"{task.path} cannot be read: {describe_error(error)}"))
+        return _refusal(MeshError("unreadable", f"{task.path} cannot be read: {describe_error(error)}"), task.path)
 
 
-def _refusal(error: MeshError) -> bytes:
-    return REFUSAL + json.dumps([error.reason, one_line(error.detail), error.kind]).encode()
+def _refusal(error: MeshError, path: Path) -> bytes:
+    """The refusal, which names the file."""
+    detail = error.detail if path.name in error.detail else f"{path}: {error.detail}"
+    return REFUSAL + json.dumps([error.reason, one_line(detail), error.kind]).encode()
 
 
 def _answer(request: Request, task: Task) -> bytes:
