@@ -75,7 +75,9 @@ def stored_images(block: Block) -> Iterator[tuple[str, int]]:
     listed = block.rows["views"].column("files").combine_chunks()
     scenes = block.rows["views"].column("scene_id").combine_chunks().take(pc.list_parent_indices(listed)).to_pylist()
     files = listed.flatten()
-    for path, size, scene in zip(files.field("path").to_pylist(), files.field("bytes").to_pylist(), scenes, strict=True):
+    for path, size, scene in zip(
+        files.field("path").to_pylist(), files.field("bytes").to_pylist(), scenes, strict=True
+    ):
         pose = pose_of_image(path)
         if pose is None or (terms.pairs_per_scene and pose // (2 * terms.pairs_per_scene) != scene):
             raise CorruptError(f"the views of scene {scene} list {path!r}, which is not an image of that scene")

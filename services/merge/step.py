@@ -52,7 +52,10 @@ def merge(store: Store, first_scene: int, stop_scene: int) -> MergeResult:
     reopen(store)
     sweep(store)
     with store.scratch("merge") as folder:
-        with contextlib.closing(PublishedFiles(store, folder)) as published, contextlib.closing(Merging(folder)) as merging:
+        with (
+            contextlib.closing(PublishedFiles(store, folder)) as published,
+            contextlib.closing(Merging(folder)) as merging,
+        ):
             for block in read_blocks(store, first_scene, stop_scene):
                 published.check(block)
                 merging.add(block)

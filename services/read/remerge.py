@@ -43,6 +43,7 @@ class Remerge:
             return
         files = [(one.records[0], entry) for one in waiting for entry in one.files if pose_of_image(entry.path) is None]
         rows = {
-            table: pa.concat_tables([one.rows[table] for one in waiting if one.rows]).combine_chunks() for table in TABLES
+            table: pa.concat_tables([one.rows[table] for one in waiting if one.rows]).combine_chunks()
+            for table in TABLES
         }
         self._merging.add(Block([one.records for one in waiting], files, rows))

@@ -13,9 +13,9 @@ from schemas.dataset.commit import CommitRecord, FileEntry, SceneMark, Span, Tab
 from schemas.dataset.layout import commit_path, range_table_path
 from schemas.dataset.tables import SCHEMAS, TABLES
 from tests.made_up_scenes import made_scene, terms
-from workers.store.record import encode_record
 from workers.store.local import LocalStore
 from workers.store.manifest import encode_table, sorted_rows, table_of_rows
+from workers.store.record import encode_record
 
 SCENES = 320
 """In a range; 13 rows and 22 files each."""
