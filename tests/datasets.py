@@ -3,12 +3,15 @@
 from pathlib import Path
 from typing import Any
 
-from schemas.dataset.commit import CommitTerms, Span
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
+from schemas.dataset.shard import ShardOrder
+from schemas.job.job import Job
 from services.job.read import validate_job
 from services.job.record import encode_job, record_job
+from services.merge.dataset_card import write_card
 from services.merge.step import merge
 from services.read.verify import verify
+from services.run.range_planner import plan_spans
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import open_worker
 from workers.pipeline.fingerprint import take_fingerprint
@@ -37,24 +40,30 @@ def overlaid(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def make_dataset(out: Path, **changes: Any) -> tuple[LocalStore, str]:
-    """(the finished dataset of `SMALL` with these changes, as one range; its digest)."""
-    job = validate_job(overlaid(SMALL, changes), "test")
+    """(the finished dataset of `SMALL` with these changes, as one run would leave it; its digest)."""
+    return run_here(validate_job(overlaid(SMALL, changes), "test"), out)
+
+
+def run_here(job: Job, out: Path) -> tuple[LocalStore, str]:
+    """(the finished dataset of a job, as one run would leave it; its digest)."""
     catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
     context = open_worker(job, catalogue)
     store = LocalStore(out)
     store.prepare()
-    store.write_whole(JOB_FILE, encode_job(record_job(job, catalogue.digest, Path())))
+    record = record_job(job, catalogue.digest, Path())
+    store.write_whole(JOB_FILE, encode_job(record))
     fingerprint = take_fingerprint(context.renderer, job.render.tier)
-    store.put_if_absent(FINGERPRINT_FILE, fingerprint.model_dump_json().encode())
-    terms = CommitTerms(
-        job_digest="j" * 64, fingerprint=fingerprint.digest, range_size=job.scenes, layout=job.output.layout
-    )
-    attempt = begin_attempt(store, Span(start=0, stop=job.scenes), terms)
-    for scene_id in attempt.span.scene_ids:
-        attempt.begin_scene(scene_id)
-        attempt.add_scene(run_scene(context, scene_id, Stopwatch()))
-    attempt.commit()
-    return store, merge(store, 0, job.scenes).digest
+    store.put_if_absent(FINGERPRINT_FILE, fingerprint.model_dump_json(indent=1).encode())
+    terms = ShardOrder.of(str(out), job, record.digest).terms.model_copy(update={"fingerprint": fingerprint.digest})
+    for span in plan_spans(job, [], False):
+        attempt = begin_attempt(store, span, terms)
+        for scene_id in span.scene_ids:
+            attempt.begin_scene(scene_id)
+            attempt.add_scene(run_scene(context, scene_id, Stopwatch()))
+        attempt.commit()
+    merged = merge(store, job.first_scene, job.stop_scene)
+    write_card(store, record, catalogue, merged)
+    return store, merged.digest
 
 
 def faults_of(store: LocalStore) -> list[str]:

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from schemas.errors import InputError, RunError, VersoError
 from services.job.read import load_job
 
 if TYPE_CHECKING:
@@ -64,12 +65,14 @@ def _answer(options: argparse.Namespace, answer: dict) -> None:
 def status(options: argparse.Namespace) -> int:
     """`verso status`."""
     from services.job.record import require_job
+    from services.read.damage import explain_damage
     from services.read.status import read_status
     from services.run.lock import shows_life
 
     store = _dataset(options.out)
-    job = require_job(store).job
-    now = read_status(store, job.first_scene, job.stop_scene)
+    with explain_damage(store):
+        job = require_job(store).job
+        now = read_status(store, job.first_scene, job.stop_scene)
     done = now.made + sum(now.failed.values())
     print(f"{options.out}: {done} of {now.asked} scenes done, {now.missing} missing")
     for reason, count in sorted(now.failed.items()):
@@ -93,18 +96,21 @@ def status(options: argparse.Namespace) -> int:
 
 def verify(options: argparse.Namespace) -> int:
     """`verso verify`."""
-    from services.job.record import require_job
     from services.read.audit import audit, describe_audit
-    from services.read.verify import describe_independent, verify_independently
+    from services.read.damage import explain_damage
     from services.read.verify import verify as read_back
+    from services.read.verify_independent import describe_independent, verify_independently
 
-    store = _dataset(options.out)
-    verdict = _with_progress(require_job(store).job.scenes, "verify", partial(read_back, store))
+    store = _committed(options.out)
+    verdict = _with_progress(_scenes_asked(store), "verify", partial(read_back, store))
     for fault in verdict.faults:
         print(fault)
+    if verdict.untold:
+        print(f"and {verdict.untold} more")
+    off = len(verdict.faults) + verdict.untold
     print(
         f"{options.out}: {verdict.files} files ({verdict.bytes / 1e6:.1f} MB), {verdict.scenes} scenes, labels of "
-        f"{verdict.pairs} pairs derived again: {len(verdict.faults) or 'nothing'} off"
+        f"{verdict.pairs} pairs derived again: {off or 'nothing'} off"
     )
     answer, faults = dataclasses.asdict(verdict), list(verdict.faults)
     checks: tuple[tuple[str, Callable, Callable], ...] = (
@@ -113,12 +119,30 @@ def verify(options: argparse.Namespace) -> int:
     )
     for name, check, describe in checks:
         if count := getattr(options, name):
-            found = _with_progress(count, name, partial(check, store, count))
+            try:
+                with explain_damage(store):
+                    found = _with_progress(count, name, partial(check, store, count))
+            except RunError as error:
+                if not faults:
+                    raise
+                print(f"--{name} {count} was not possible: {error}")
+                continue
             print("\n".join(describe(found)))
             faults += found.faults
             answer[name] = dataclasses.asdict(found)
     _answer(options, {"ok": not faults, **answer})
     return 1 if faults else 0
+
+
+def _scenes_asked(store: "Store") -> int:
+    """Scenes of a dataset's job; 0 where job.yaml is damaged."""
+    from services.job.record import read_job
+
+    try:
+        record = read_job(store)
+    except VersoError:
+        return 0
+    return record.job.scenes if record else 0
 
 
 def _with_progress(scenes: int, what: str, work: Callable[[Callable[[Any], None]], Found]) -> Found:
@@ -142,23 +166,52 @@ def query(options: argparse.Namespace) -> int:
 
 def replay(options: argparse.Namespace) -> int:
     """`verso replay`."""
+    from services.read.damage import explain_damage
     from services.read.replay import replay_scene
 
-    result = replay_scene(_dataset(options.out), options.scene)
+    if options.repair:
+        return _repair(options)
+    if len(options.scene) != 1:
+        raise InputError(f"one scene is replayed at a time: verso replay {options.out} SCENE, or --repair for all")
+    (scene_id,) = options.scene
+    store = _dataset(options.out)
+    with explain_damage(store):
+        result = replay_scene(store, scene_id)
     for difference in result.differences:
         print(difference)
     how = "to the byte" if result.same_stack else "within tolerances, because this stack is not the one that made it"
     differ = f"{len(result.differences) or 'none'} differ"
-    print(f"scene {options.scene}: {result.compared} files and tables compared {how}: {differ}")
+    print(f"scene {scene_id}: {result.compared} files and tables compared {how}: {differ}")
     _answer(options, {"ok": not result.differences, **dataclasses.asdict(result)})
     return 1 if result.differences else 0
 
 
+def _repair(options: argparse.Namespace) -> int:
+    """`verso replay --repair`."""
+    from services.read.damage import explain_damage
+    from services.read.repair import repair
+
+    store = _committed(options.out)
+    with explain_damage(store):
+        found = _with_progress(_scenes_asked(store), "verify", partial(repair, store, options.scene))
+    verdict = found.verdict
+    print(
+        "\n".join([*found.done, *found.left, *verdict.faults, *([f"and {verdict.untold} more"] * bool(verdict.untold))])
+    )
+    off = len(verdict.faults) + verdict.untold
+    print(f"{options.out}: {len(found.done)} files put back or written again; {off or 'nothing'} off")
+    _answer(options, {"ok": not off, "done": found.done, "left": found.left, "faults": verdict.faults})
+    return 1 if off else 0
+
+
 def scene(options: argparse.Namespace) -> int:
     """`verso scene`."""
+    from services.read.damage import explain_damage
     from services.read.scene_export import export_scene
 
-    size = export_scene(_dataset(options.out), options.scene, options.glb)
+    store = _dataset(options.out)
+    with explain_damage(store):
+        size = export_scene(store, options.scene, options.glb)
     print(f"{options.glb}: {size / 1e6:.2f} MB, world frame, z up, metres")
     _answer(options, {"ok": True, "file": str(options.glb), "bytes": size})
     return 0
@@ -170,3 +223,12 @@ def _dataset(out: str) -> "Store":
     from workers.store.local import open_store
 
     return require_dataset(open_store(out))
+
+
+def _committed(out: str) -> "Store":
+    """The store of an output folder, also of one that lost its job.yaml. Raises OutputError where it is none."""
+    from schemas.dataset.layout import COMMITS
+    from workers.store.local import open_store
+
+    store = open_store(out)
+    return store if next(iter(store.files(COMMITS)), None) is not None else _dataset(out)

@@ -134,7 +134,19 @@ COMMANDS: dict[str, Command] = {
             option("--format", choices=("table", "csv", "parquet", "json"), default="table"),
         ),
     ),
-    "replay": Command("make one scene again and compare it with what is stored", "data/tabletop 17", (OUT, SCENE)),
+    "replay": Command(
+        "make one scene again and compare it with what is stored, or put back what was lost",
+        "data/tabletop 17` or `verso replay data/tabletop --repair",
+        (
+            OUT,
+            option("scene", type=read_index, metavar="SCENE", nargs="*"),
+            option(
+                "--repair",
+                action="store_true",
+                help="put back what is missing or damaged (with SCENEs: in their ranges) where it comes out as it was",
+            ),
+        ),
+    ),
     "scene": Command(
         "write the posed geometry of one scene",
         "data/tabletop 17 --glb scene17.glb",

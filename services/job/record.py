@@ -12,6 +12,7 @@ from schemas.errors import CorruptError, JobError, OutputError
 from schemas.job.identity import compare_jobs, job_digest
 from schemas.job.job import Job
 from services.job.read import parse_yaml, validate_job
+from services.job.seal import is_sealed, seal
 from workers.store.store import Store
 
 OWN = {MANIFEST, STAGING, LOCK_FILE, LOG_FOLDER}
@@ -24,8 +25,16 @@ HEADER = """\
 # The job as it was run, every default filled in. Written by the first run on this folder; `verso run` on the same
 # folder goes on where it stopped, and refuses a job that differs in anything but `scenes` (more of them) and `run`.
 # `digest` covers what the dataset is: all other keys and the files of the asset folders (`catalogue`). `folder` is where
-# the job file lay: relative asset folders start there.
+# the job file lay: relative asset folders start there. `seal` is the SHA-256 of all bytes above it.
 """
+
+SEAL = "seal: "
+"""Begins the last line of job.yaml; files of earlier versions have none."""
+
+MAX_BYTES = 1 << 20
+"""Larger than any job: what is larger was not written by a run."""
+
+REMEDY = "restore it from a copy"
 
 
 @dataclass(frozen=True)
@@ -47,22 +56,54 @@ def encode_job(record: JobRecord) -> bytes:
     """OUT/job.yaml."""
     job = record.job.model_dump(mode="json")
     tree = {"digest": record.digest, "catalogue": record.catalogue, "folder": record.folder, "job": job}
-    return (HEADER + yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=110)).encode()
+    return seal(HEADER + yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=110), SEAL)
 
 
 def read_job(store: Store) -> JobRecord | None:
-    """The job that a folder belongs to, None where it has none. Raises CorruptError."""
+    """The job that a folder belongs to, None where it has none. Raises CorruptError with one line."""
+    data = _read_bytes(store)
+    return None if data is None else decode_job(data, f"{store.name}/{JOB_FILE}")
+
+
+def decode_job(data: bytes, name: str) -> JobRecord:
+    """The job in the bytes of a job.yaml, sealed or not. Raises CorruptError naming the file, with one line."""
+    if len(data) > MAX_BYTES:
+        raise CorruptError(f"{name} has {len(data)} bytes, and a job has less than {MAX_BYTES}: {REMEDY}")
     try:
-        tree = parse_yaml(store.read(JOB_FILE).decode())
+        tree = parse_yaml(data.decode())
+        job = validate_job(tree["job"], name)
+        record = JobRecord(job, tree["digest"], tree["catalogue"], _folder(tree["folder"]))
+        if wrong := [name for name in ("digest", "catalogue", "folder") if not isinstance(tree[name], str)]:
+            raise TypeError(f"{wrong[0]} is no text")
+    except JobError as error:
+        told = str(error).splitlines()[0].removeprefix(f"{name}: ")
+        raise CorruptError(f"{name} is not a job that `verso run` wrote: {told}; {REMEDY}") from error
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        told = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise CorruptError(f"{name} is not a job that `verso run` wrote: {told}; {REMEDY}") from error
+    return record
+
+
+def is_job_sealed(data: bytes) -> bool:
+    """Whether the bytes of a job.yaml are those that a run of this version wrote."""
+    return is_sealed(data, SEAL)
+
+
+def is_job_unsealed(data: bytes) -> bool:
+    """Whether the keys of a job.yaml are written as an earlier version wrote them, without a seal."""
+    tree = parse_yaml(data.decode())
+    body = yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=110)
+    return list(tree) == ["digest", "catalogue", "folder", "job"] and data.endswith(body.encode())
+
+
+def _read_bytes(store: Store) -> bytes | None:
+    """The bytes of job.yaml, None where there is none. Raises CorruptError where it is no file that can be read."""
+    try:
+        return store.read(JOB_FILE)
     except FileNotFoundError:
         return None
-    except (JobError, UnicodeDecodeError) as error:
-        raise CorruptError(f"{store.name}/{JOB_FILE} is not a job that `verso run` wrote: {error}") from error
-    try:
-        job = validate_job(tree["job"], f"{store.name}/{JOB_FILE}")
-        return JobRecord(job, tree["digest"], tree["catalogue"], _folder(tree["folder"]))
-    except (TypeError, AttributeError, KeyError) as error:
-        raise CorruptError(f"{store.name}/{JOB_FILE} is not a job that `verso run` wrote: {error!r}") from error
+    except OSError as error:
+        raise CorruptError(f"{store.name}/{JOB_FILE} cannot be read: {error.strerror or error}; {REMEDY}") from error
 
 
 def _folder(path: str) -> str:

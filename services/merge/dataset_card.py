@@ -5,6 +5,7 @@ from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE, stored_roles
 from schemas.job.assets import ProceduralSource
 from services.job.record import JobRecord
+from services.job.seal import is_sealed, seal
 from services.merge.step import MergeResult
 from workers.assets.catalogue import Catalogue
 from workers.store.store import Store
@@ -14,11 +15,19 @@ ARTICLE = (
     "(2024) 110569, https://doi.org/10.1016/j.dib.2024.110569, CC BY"
 )
 
+SEAL = ("<!-- SHA-256 of the text above: ", " -->\n")
+"""The ends of the card's last line; cards of earlier versions have none."""
+
+
+def is_card_sealed(data: bytes) -> bool:
+    """Whether the bytes of a card are those that a run of this version wrote."""
+    return is_sealed(data, *SEAL)
+
 
 def write_card(store: Store, record: JobRecord, catalogue: Catalogue, merged: MergeResult) -> None:
     """Writes DATASET.md."""
     fingerprint = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
-    store.write_whole(README_FILE, describe_dataset(record, catalogue, merged, fingerprint).encode())
+    store.write_whole(README_FILE, seal(describe_dataset(record, catalogue, merged, fingerprint), *SEAL))
 
 
 def describe_dataset(record: JobRecord, catalogue: Catalogue, merged: MergeResult, fingerprint: Fingerprint) -> str:
@@ -26,7 +35,7 @@ def describe_dataset(record: JobRecord, catalogue: Catalogue, merged: MergeResul
     job = record.job
     libraries = "\n".join(f"| {name} | {version} |" for name, version in sorted(fingerprint.libraries.items()))
     sources = "\n".join(f"- {line}" for line in describe_sources(catalogue))
-    counts = ", ".join(f"{count} {outcome}" for outcome, count in merged.scenes.items())
+    counts = ", ".join(f"{merged.scenes[outcome]} {outcome}" for outcome in ("made", "intrinsic", "environmental"))
     return f"""# {job.name}
 
 View-dependent RGB-D pairs for reconstructing objects from a single view: what a camera sees, and what the camera on the

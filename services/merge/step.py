@@ -52,15 +52,19 @@ def merge(store: Store, first_scene: int, stop_scene: int) -> MergeResult:
     reopen(store)
     sweep(store)
     with store.scratch("merge") as folder:
-        with contextlib.closing(_Merging(store, folder)) as merging:
+        with (
+            contextlib.closing(PublishedFiles(store, folder)) as published,
+            contextlib.closing(Merging(folder)) as merging,
+        ):
             for block in read_blocks(store, first_scene, stop_scene):
+                published.check(block)
                 merging.add(block)
             success, files = merging.finish()
         _install(store, files)
     if commits_digest(store) != commits:
         raise RunError("ranges were committed while they were merged: another coordinator works here; start again")
     if not success["scenes"]["environmental"]:
-        store.write_whole(SUCCESS_FILE, json.dumps(success | asked, sort_keys=True, indent=1).encode() + b"\n")
+        store.write_whole(SUCCESS_FILE, encode_success(success | asked))
     return _result(success)
 
 
@@ -70,21 +74,34 @@ def reopen(store: Store) -> None:
     store.sync_folders_of([SUCCESS_FILE])
 
 
+def encode_success(success: Mapping[str, object]) -> bytes:
+    """The bytes of `_SUCCESS`."""
+    return json.dumps(success, sort_keys=True, indent=1).encode() + b"\n"
+
+
 def read_success(store: Store) -> dict | None:
     """The contents of `_SUCCESS`, None where there is none or it is not whole."""
     try:
         success = json.loads(store.read(SUCCESS_FILE))
     except (FileNotFoundError, ValueError):
         return None
-    whole = isinstance(success, dict) and isinstance(success.get("schema_version"), int)
-    return success if whole and all(is_merged_path(path) for path in success.get("files", ())) else None
+    return success if _is_whole(success) else None
 
 
-class _Merging:
+def _is_whole(success: object) -> bool:
+    """Whether the keys that readers of `_SUCCESS` use are of their types, and its files those that a merge writes."""
+    kinds = {"schema_version": int, "digest": str, "files": dict, "scenes": dict, "rows": dict}
+    if not isinstance(success, dict) or any(not isinstance(success.get(key), kind) for key, kind in kinds.items()):
+        return False
+    files = success["files"].items()
+    named = all(is_merged_path(path) and isinstance(file, dict) and "bytes" in file for path, file in files)
+    return named and "environmental" in success["scenes"]
+
+
+class Merging:
     """A merge in progress: takes each range in turn, keeps files below `folder`."""
 
-    def __init__(self, store: Store, folder: Path) -> None:
-        self._published = PublishedFiles(store, folder)
+    def __init__(self, folder: Path) -> None:
         self._tables = {table: MergedTable(table, folder) for table in TABLES}
         self._poses = PoseFiles(folder)
         self._shared = SharedRows(folder)
@@ -92,8 +109,7 @@ class _Merging:
         self._scenes = Counter({"made": 0, "intrinsic": 0, "environmental": 0})
 
     def add(self, block: Block) -> None:
-        """Takes the next ranges. Raises CorruptError where a file of theirs is missing, or rows do not join."""
-        self._published.check(block)
+        """Takes the next ranges. Raises CorruptError where rows do not join."""
         self._fingerprints.update(record.terms.fingerprint for record in chain.from_iterable(block.ranges))
         self._shared.add_files((entry.path, entry.sha256) for _, entry in block.files if is_shape(entry.path))
         rows = block.rows
@@ -107,7 +123,7 @@ class _Merging:
 
     def close(self) -> None:
         """Closes every file, finished or not."""
-        for part in (self._published, self._poses, self._shared):
+        for part in (self._poses, self._shared):
             part.close()
 
     def finish(self) -> tuple[dict, dict[str, Path]]:

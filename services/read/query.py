@@ -2,9 +2,9 @@
 
 import urllib.parse
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import groupby
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import duckdb
 import pyarrow as pa
@@ -12,10 +12,11 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import COMMITS, MANIFEST, STAGING, range_name, range_table_path
+from schemas.dataset.layout import COMMITS, MANIFEST, STAGING, SUCCESS_FILE, range_name, range_table_path
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError, InputError, OutputError
 from services.merge.step import read_success
+from services.read.damage import explain_damage
 from workers.store.commit import commit_names, read_record
 from workers.store.committed_rows import range_rows
 from workers.store.store import Store
@@ -44,7 +45,7 @@ def query(store: Store, sql: str) -> pa.Table:
     the first try's. Raises InputError with the database's message where the SQL is wrong, OutputError where there is no
     dataset, CorruptError where a file is damaged.
     """
-    with duckdb.connect(":memory:", config=dict(_LOCKED)) as connection:
+    with explain_damage(store), duckdb.connect(":memory:", config=dict(_LOCKED)) as connection:
         _register(connection, store)
         connection.execute("SET lock_configuration = true")
         try:
@@ -65,7 +66,7 @@ def _register(connection: duckdb.DuckDBPyConnection, store: Store) -> None:
     done = read_success(store)
     committed = _Committed(store) if done is None else None
     for table in TABLES:
-        parts = committed.parts(table) if committed else _merged(store, (done or {})["files"], table)
+        parts = committed.parts(table) if committed else _merged(store, _merged_files(store, done), table)
         for number, part in enumerate(parts):
             connection.register(f"_{table}_{number}", part)
         columns = ", ".join(f'"{name}"' for name in SCHEMAS[table].names)
@@ -74,18 +75,30 @@ def _register(connection: duckdb.DuckDBPyConnection, store: Store) -> None:
         connection.execute(f"CREATE VIEW {table} AS SELECT {once} {columns} FROM ({union})")
 
 
+def _merged_files(store: Store, success: Mapping[str, Any] | None) -> list[str]:
+    """The merged files that `_SUCCESS` names. Raises CorruptError where it does not name a file of each table."""
+    files = (success or {}).get("files")
+    if isinstance(files, dict) and all(
+        any(key.startswith(f"{MANIFEST}/{table}/") for key in files) for table in TABLES
+    ):
+        return list(files)
+    told = f"{SUCCESS_FILE} in {store.name} does not name its merged files"
+    raise CorruptError(f"{told}: `verso replay {store.name} --repair` writes it again")
+
+
 def _merged(store: Store, keys: Iterable[str], table: str) -> list[Rows]:
     """The merged table: read lazily from a disk, as a whole from an object store."""
     folder = f"{MANIFEST}/{table}"
     keys = [key for key in keys if key.startswith(f"{folder}/")]
     if store.root is None:
-        return [pa.concat_tables([_with_category(table, key, store.read(key)) for key in keys])]
+        return [pa.concat_tables([read_merged(table, key, store.read(key)) for key in keys])]
     partitioning = ds.partitioning(pa.schema([("category", pa.string())]), flavor="hive")
     paths, base = [str(store.root / key) for key in keys], str(store.root / folder)
     return [ds.dataset(paths, SCHEMAS[table], _FORMAT, partitioning=partitioning, partition_base_dir=base)]
 
 
-def _with_category(table: str, key: str, data: bytes) -> pa.Table:
+def read_merged(table: str, key: str, data: bytes) -> pa.Table:
+    """The rows in the bytes of one merged file, with the category that its folder names."""
     rows = pq.read_table(pa.BufferReader(data), page_checksum_verification=True)
     category = urllib.parse.unquote(key.split("/")[-2].removeprefix("category="))
     column = pa.repeat(pa.scalar(category), rows.num_rows)

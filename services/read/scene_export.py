@@ -9,7 +9,7 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from schemas.dataset.codec import read_world_poses
-from schemas.errors import InputError
+from schemas.errors import InputError, OutputError
 from schemas.scene.region import REGION_FLOOR, REGION_TABLE
 from schemas.scene.shape import Part
 from services.job.record import require_job
@@ -24,7 +24,7 @@ def export_scene(store: Store, scene_id: int, target: Path) -> int:
     """Write floor, table and objects where the stored rows put them; returns the bytes written.
 
     World frame, z up, metres, as everywhere in a dataset. Shapes come from the job's sources; poses from the manifest.
-    Raises InputError where the scene was not made.
+    Raises InputError where the scene was not made, OutputError where the file cannot be written.
     """
     record, stored = require_job(store), find_scene(store, scene_id)
     row = stored.scene(scene_id)
@@ -48,8 +48,11 @@ def export_scene(store: Store, scene_id: int, target: Path) -> int:
             mesh = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=look, process=False)
             scene.add_geometry(mesh, geom_name=label, node_name=label, transform=T_world[region_id])
     data: bytes = scene.export(file_type="glb")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.write_bytes(data)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(data)
+    except OSError as error:
+        raise OutputError(f"{target} cannot be written: {error.strerror or error}; choose another --glb") from error
     return len(data)
 
 

@@ -1,189 +1,189 @@
-"""`verso verify`: every file against its checksum, and every label against derivations from the stored images."""
+"""`verso verify`: proves that a folder is exactly its dataset: every scene asked, every file and label, and nothing else.
 
-import hashlib
+Ranges are read one by one, and what they share is kept in a temporary folder: memory does not grow with the dataset.
+"""
+
+import contextlib
+import errno
+import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
-from schemas.dataset.codec import Row
-from schemas.dataset.layout import ASSETS, MANIFEST, is_shape, stored_roles
-from schemas.errors import CorruptError
-from schemas.job.job import Job
-from services.job.record import require_job
-from services.merge.step import read_success
-from services.read.dataset_reader import (
-    ReadFile,
-    StoredRange,
-    choose_scenes,
-    file_reader,
-    find_scene,
-    iter_stored,
-    read_image,
+from schemas.dataset.layout import (
+    CAM_POSES,
+    CAMERAS,
+    FINGERPRINT_FILE,
+    JOB_FILE,
+    OBJECTS,
+    README_FILE,
+    SUCCESS_FILE,
+    commit_path,
 )
-from services.read.independent.derive import StoredPair
-from services.read.independent.step import check_merged, check_pair, list_underived
+from schemas.errors import CommitConflict, CorruptError, MachineError
+from services.read.path_index import PathIndex
+from services.read.remerge import Remerge
+from services.read.stray_files import Known, tell_strays
+from services.read.verdict import COPY, Verdict
+from services.read.verify_finished import (
+    Success,
+    check_card,
+    check_merged,
+    check_success,
+    check_told,
+    read_stored_success,
+)
+from services.read.verify_job import StoredJob, Terms, check_fingerprint, check_terms, read_stored_job
+from services.read.verify_range import RangeCheck, read_records
+from services.read.verify_span import Spans, commit_groups
 from workers.pipeline.allocator import keep_freed_memory
-from workers.pipeline.check_stored import check_stored_pair, check_stored_scene
-from workers.store.commit import committed_files
+from workers.store.commit import commits_digest
 from workers.store.store import Store
+
+TOP_FILES = (JOB_FILE, README_FILE, SUCCESS_FILE, FINGERPRINT_FILE, CAM_POSES, CAMERAS, OBJECTS)
+"""Files with one place each; whether they are whole is checked by name."""
 
 
 @dataclass
-class Verdict:
-    """Counts of what was read, and the faults, a sentence each."""
+class Ranges:
+    """What reading the ranges found."""
 
-    files: int = 0
-    bytes: int = 0
-    scenes: int = 0
-    pairs: int = 0
-    faults: list[str] = field(default_factory=list)
+    spans: Spans
+    terms: Terms
+    mergeable: bool = True
+    """Whether the rows of every range went into the merge."""
+    staged: int = 0
+    """Files that are committed and not published."""
 
 
 def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
-    """Read everything back. Raises OutputError where the folder is no dataset."""
+    """Reads everything back. Raises OutputError where a newer version wrote it, MachineError where TMPDIR is full."""
     keep_freed_memory()
-    record = require_job(store)
-    verdict = Verdict()
-    known: set[str] = set()
-    try:
-        for stored in iter_stored(store):
-            digests: dict[str, str] = {}
-            faults = _check_scenes(_hashing_reader(store, digests, verdict), stored, record.job, verdict)
-            verdict.faults += [*_check_files(store, stored, digests, known, verdict), *faults]
-            progress(verdict)
-    except CorruptError as error:
-        verdict.faults.append(str(error))
-    _check_merged(store, verdict)
-    _find_strays(store, known, verdict)
+    verdict = Verdict(store.name)
+    with _temporary_folder() as folder, contextlib.closing(PathIndex(folder)) as index:
+        job, success = read_stored_job(store, verdict), read_stored_success(store, verdict)
+        with contextlib.closing(Remerge(folder)) as merging:
+            check = RangeCheck(store, job.record, job.digest, index, verdict)
+            found = _read_ranges(store, _spans(job, success, verdict), check, merging, progress)
+            check_terms(job, found.terms, verdict)
+            check_fingerprint(store, found.terms, verdict)
+            remade = _merge_again(merging, found, verdict)
+        _check_finished(store, job, success, found, remade, index, verdict)
+        index.add_all(TOP_FILES)
+        lost = sorted([*found.spans.gaps, *found.spans.unreadable])
+        pairs = job.record.job.pairs_per_scene if job.record else 1
+        tell_strays(store, Known(index, success.data is None, tuple(lost), 2 * pairs), verdict)
     return verdict
 
 
-def _hashing_reader(store: Store, digests: dict[str, str], verdict: Verdict) -> ReadFile:
-    """Reads files of the store, counts them, and keeps the SHA-256 of each: every file is read and hashed once."""
-
-    def read(path: str) -> bytes:
-        data = store.read(path)
-        digests[path] = hashlib.sha256(data).hexdigest()
-        verdict.files += 1
-        verdict.bytes += len(data)
-        return data
-
-    return read
+def _spans(job: StoredJob, success: Success, verdict: Verdict) -> Spans:
+    """The scenes that must be there: by job.yaml, or by `_SUCCESS` where job.yaml is damaged."""
+    asked = (job.record.job.first_scene, job.record.job.stop_scene) if job.record else None
+    if success.asked and not job.whole:
+        asked = success.asked
+    range_size = job.record.job.run.range_size if job.record else 16
+    return Spans(asked, range_size, success.data is not None, verdict)
 
 
-def _check_files(
-    store: Store, stored: StoredRange, digests: dict[str, str], known: set[str], verdict: Verdict
-) -> list[str]:
-    """Files of the range's records that are missing or differ from their SHA-256. Reads those without a digest yet."""
-    faults, read = [], _hashing_reader(store, digests, verdict)
-    for entry in (entry for record in stored.records for entry in committed_files(store, record)):
-        if entry.path in known and is_shape(entry.path):
+def _read_ranges(
+    store: Store, spans: Spans, check: RangeCheck, merging: Remerge, progress: Callable[[Verdict], None]
+) -> Ranges:
+    """Reads every range in order, and merges it again."""
+    found = Ranges(spans, Terms())
+    for start, retries in commit_groups(store):
+        records = read_records(store, start, retries, check.verdict)
+        check.index.add_all(commit_path(start, retry) for retry in retries)
+        spans.take(start, records)
+        if not records:
             continue
-        known.add(entry.path)
-        try:
-            if entry.path not in digests:
-                read(entry.path)
-        except FileNotFoundError:
-            faults.append(f"{entry.path}: is committed and missing")
-            continue
-        if digests[entry.path] != entry.sha256:
-            faults.append(f"{entry.path}: does not match the SHA-256 in its commit")
-    return faults
-
-
-def _check_scenes(read_file: ReadFile, stored: StoredRange, job: Job, verdict: Verdict) -> list[str]:
-    """Count the range's scenes, and derive every pair's labels again."""
-    made = {row["scene_id"]: row for row in stored.rows["scenes"]}
-    ended = sorted([*made, *(row["scene_id"] for row in stored.rows["failures"])])
-    verdict.scenes += len(ended)
-    faults, roles = [], stored_roles(job)
-    if ended != list(range(stored.start, stored.stop)):
-        faults.append(f"scenes {stored.start} to {stored.stop - 1}: some are missing, or both made and failed")
-    try:
-        read = file_reader(read_file, stored)
-    except CorruptError as error:
-        return [*faults, str(error)]
-    for scene_id, scene in made.items():
-        faults += check_stored_scene(scene)
-        for views, objects in stored.pairs(scene_id):
-            verdict.pairs += 1
-            if set(views) != set(roles):
-                faults.append(f"scene {scene_id}: has views {sorted(views)}, and must have {sorted(roles)}")
-                continue
+        for record in records:
+            found.terms.take(record)
+        one = check.check(records)
+        found.staged += one.staged
+        if one.rows is None:
+            spans.spoil(start, records[0].span.stop)
+        elif found.mergeable and spans.fits:
             try:
-                faults += check_stored_pair(job, views, objects, scene, partial(read_image, read))
-            except (CorruptError, ValueError) as error:
-                faults.append(str(error))
-    return faults
-
-
-def _check_merged(store: Store, verdict: Verdict) -> None:
-    """Compare the merged files with `_SUCCESS`."""
-    digests: dict[str, str] = {}
-    read = _hashing_reader(store, digests, verdict)
-    for path, file in (read_success(store) or {"files": {}})["files"].items():
-        try:
-            read(path)
-        except FileNotFoundError:
-            verdict.faults.append(f"{path}: is merged and missing")
-            continue
-        if digests[path] != file["sha256"]:
-            verdict.faults.append(f"{path}: does not match the SHA-256 in _SUCCESS")
-
-
-def _find_strays(store: Store, known: set[str], verdict: Verdict) -> None:
-    """Find images that no commit names."""
-    for folder in store.children(""):
-        if folder.startswith(("_", ".")) or folder in (MANIFEST, ASSETS):
-            continue
-        for entry in store.files(folder):
-            if entry.key not in known:
-                verdict.faults.append(f"{entry.key}: is in no commit")
-
-
-@dataclass
-class IndependentVerdict:
-    """Counts of what was derived, what has no second derivation for this job, and the faults, a sentence each."""
-
-    scenes: int = 0
-    pairs: int = 0
-    underived: list[str] = field(default_factory=list)
-    faults: list[str] = field(default_factory=list)
-
-
-def verify_independently(
-    store: Store, count: int, progress: Callable[[IndependentVerdict], None]
-) -> IndependentVerdict:
-    """Derive the labels of `count` scenes a second time. Raises OutputError where the folder is no dataset."""
-    record = require_job(store)
-    job = record.job.model_dump(mode="json")
-    found = IndependentVerdict(underived=list_underived(job))
-    views: list[Row] = []
-    objects: list[Row] = []
-    for scene_id in choose_scenes(store, count, record.job.seed):
-        stored = find_scene(store, scene_id)
-        scene, read = stored.scene(scene_id), file_reader(store.read, stored)
-        assert scene is not None
-        for pair_views, pair_objects in stored.pairs(scene_id):
-            try:
-                found.faults += check_pair(StoredPair(job, scene, pair_views, pair_objects, read))
+                merging.add(one)
             except CorruptError as error:
-                found.faults.append(str(error))
-            views += pair_views.values()
-            objects += pair_objects
-            found.pairs += 1
-        found.scenes += 1
-        progress(found)
-    if read_success(store) is not None:
-        found.faults += check_merged(store.read, views, objects)
+                found.mergeable = False
+                check.verdict.tell(str(error), COPY)
+        progress(check.verdict)
+    spans.finish()
     return found
 
 
-def describe_independent(found: IndependentVerdict) -> Iterator[str]:
-    """Every fault, what was derived and what was not, line by line."""
-    yield from found.faults
-    yield (
-        f"labels of {found.pairs} pairs of {found.scenes} scenes derived from the article's definitions: "
-        f"{len(found.faults) or 'nothing'} off"
-    )
-    yield from (f"  {line}" for line in found.underived)
+def _merge_again(merging: Remerge, found: Ranges, verdict: Verdict) -> tuple[dict[str, Any], dict[str, Path]] | None:
+    """`_SUCCESS` and the merged files as the commits give them; None where not every range can be read."""
+    if not (found.mergeable and found.spans.whole):
+        return None
+    try:
+        return merging.finish()
+    except (CorruptError, CommitConflict) as error:
+        verdict.tell(str(error), COPY)
+        return None
+
+
+def _check_finished(
+    store: Store,
+    job: StoredJob,
+    success: Success,
+    found: Ranges,
+    remade: tuple[dict[str, Any], dict[str, Path]] | None,
+    index: PathIndex,
+    verdict: Verdict,
+) -> None:
+    """Compares what the merge wrote with what the commits give, or says that the dataset is not finished."""
+    if remade is not None:
+        index.add_all(remade[1])
+    index.add_all(success.files)
+    if success.data is None:
+        _tell_unfinished(found, remade and remade[0], verdict)
+        return
+    if found.staged:
+        verdict.tell(f"{found.staged} committed files are in _staging, and not in their places", verdict.run_again)
+    digest = success.told.get("digest")
+    if remade is None:
+        check_told(store, success, verdict)
+    else:
+        expected, files = remade
+        first, stop = found.spans.asked or (0, 0)
+        entries = check_merged(store, success, files, verdict)
+        commits = success.told.get("commits")
+        with contextlib.suppress(CorruptError):  # a foreign file among the commits is told as a stray
+            commits = commits_digest(store)
+        asked = {"first_scene": first, "stop_scene": stop, "commits": commits}
+        check_success(success, {**expected, "files": entries, **asked}, verdict)
+        digest = expected["digest"]
+    if isinstance(digest, str):
+        check_card(store, digest, job.sealed, verdict)
+
+
+def _tell_unfinished(found: Ranges, remade: dict[str, Any] | None, verdict: Verdict) -> None:
+    """Says why there is no `_SUCCESS`, which is a fault: a dataset is whole or it is not."""
+    missing = f"{SUCCESS_FILE}: is missing, not finished:"
+    if remade is None:
+        asked = found.spans.asked
+        told = f"{found.spans.done} of {asked[1] - asked[0]} scenes" if asked else f"{found.spans.done} scenes"
+        verdict.tell(f"{missing} {told} are committed", verdict.run_again)
+    elif again := remade["scenes"]["environmental"]:
+        told = f"{again} scenes failed for environmental reasons"
+        verdict.tell(f"{missing} {told}", f"{verdict.run_again} --retry-failed")
+    else:
+        told = "every scene is committed, and they were not merged, or the file was removed"
+        verdict.tell(f"{missing} {told}", f"{verdict.run_again}, or {verdict.repair}", "merge")
+
+
+@contextlib.contextmanager
+def _temporary_folder() -> Iterator[Path]:
+    """A folder for what the ranges share. Raises MachineError where it is full."""
+    with tempfile.TemporaryDirectory(prefix="verso-verify-") as folder:
+        try:
+            yield Path(folder)
+        except OSError as error:
+            if error.errno != errno.ENOSPC:
+                raise
+            raise MachineError(
+                f"{folder} is full: verify keeps the merged tables there; set TMPDIR to a folder with more room"
+            ) from error

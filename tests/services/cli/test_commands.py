@@ -41,7 +41,7 @@ def test_verify_exits_1_where_a_file_is_gone(capsys, tmp_path):
     next(tmp_path.glob("*/depth0*.png")).unlink()
     code, lines, told = answer(capsys, "verify", store.name)
     assert (code, told["ok"]) == (1, False)
-    assert any(line.endswith("is committed and missing") for line in lines)
+    assert any("is committed and missing: `verso replay" in line for line in lines)
 
 
 def test_query_replay_and_scene(made, capsys, tmp_path):

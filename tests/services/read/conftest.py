@@ -1,9 +1,20 @@
-"""A dataset that every test of reading may share, because none changes it."""
+"""Datasets that every test of reading may share, because none changes them, and a copy for those that do."""
+
+import shutil
+from pathlib import Path
 
 import pytest
 
 from tests.datasets import make_dataset
 from workers.store.local import LocalStore
+
+TINY = {
+    "scenes": 3,
+    "run": {"range_size": 1},
+    "categories": ["box", "can"],
+    "cameras": {"sensor": {"width": 64, "height": 48, "fx": 52.5, "fy": 52.5, "cx": 32.0, "cy": 24.0}},
+    "images": {"patch": {"width": 16, "height": 12}},
+}
 
 
 @pytest.fixture(scope="package")
@@ -11,3 +22,22 @@ def three_objects(tmp_path_factory) -> LocalStore:
     """One finished scene of three objects."""
     changes = {"scenes": 1, "objects_per_scene": 3, "categories": ["box", "camera", "bottle"]}
     return make_dataset(tmp_path_factory.mktemp("three"), **changes)[0]
+
+
+@pytest.fixture(scope="package")
+def tiny(tmp_path_factory) -> LocalStore:
+    """Three ranges of one scene, finished."""
+    return make_dataset(tmp_path_factory.mktemp("tiny"), **TINY)[0]
+
+
+@pytest.fixture(scope="package")
+def packed(tmp_path_factory) -> LocalStore:
+    """The same in tars."""
+    return make_dataset(tmp_path_factory.mktemp("packed"), output={"layout": "tar"}, **TINY)[0]
+
+
+@pytest.fixture
+def copy(tiny, tmp_path) -> Path:
+    """A copy of `tiny` that a test may damage."""
+    shutil.copytree(tiny.root, tmp_path / "copy")
+    return tmp_path / "copy"

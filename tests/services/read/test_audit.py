@@ -11,15 +11,13 @@ import pytest
 
 import workers.pipeline.make_pair
 import workers.plan.effects
-from schemas.dataset.commit import Span
-from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
-from services.bench.stages import open_workbench
+from schemas.dataset.layout import FINGERPRINT_FILE
 from services.cli.main import main
 from services.job.read import validate_job
-from services.job.record import encode_job, record_job
 from services.read import audit_motion
 from services.read.audit import Audit, audit, describe_audit
 from services.read.audit_motion import Motion
+from tests.datasets import run_here
 from tests.effects.scenes import SMALL, merged
 from workers.geometry.frames import translation
 from workers.pipeline.fingerprint import take_fingerprint
@@ -32,12 +30,7 @@ JOB = validate_job(merged(SMALL, {"scenes": 4, "categories": ["can", "box"]}), "
 
 def dataset(out: Path) -> LocalStore:
     """Four scenes, made in this process."""
-    bench = open_workbench(JOB, Path(), out)
-    fingerprint = take_fingerprint(bench.context.renderer, JOB.render.tier)
-    bench.store.write_whole(JOB_FILE, encode_job(record_job(JOB, bench.context.catalogue.digest, Path())))
-    bench.store.write_whole(FINGERPRINT_FILE, fingerprint.model_dump_json().encode())
-    bench.run(Span(start=0, stop=4))
-    return bench.store
+    return run_here(JOB, out)[0]
 
 
 @pytest.fixture(scope="module")

@@ -3,15 +3,15 @@
 import contextlib
 import json
 import re
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import trimesh
 
-import services.read.verify
+import services.read.verify_range
 from schemas.dataset.codec import Row
 from services.job.read import validate_job
 from services.read.query import query
@@ -21,7 +21,7 @@ from services.read.verify import verify
 from services.run.ray_cluster import Slots, private_ray
 from services.run.step import RunRequest, run_job
 from tests.datasets import SMALL, faults_of, images_of, make_dataset, overlaid
-from workers.store.images import decode_png, encode_png
+from workers.store.images import decode_png
 from workers.store.local import LocalStore
 from workers.store.tars import read_tar
 
@@ -209,36 +209,48 @@ def test_a_scene_that_has_one_object_by_chance_is_the_scene_of_a_job_with_one(tm
 )
 def test_rows_that_disagree_are_found(made, monkeypatch, damage, told):
     """Rows are changed on their way from the file, so that checksums still hold."""
-    original = services.read.verify.iter_stored
+    original = services.read.verify_range.range_rows
 
-    def damaged(store):
-        for stored in original(store):
-            body = stored.rows["scenes"][0]["bodies"]
-            if damage == "objects.patch_object_fraction":
-                row = next(row for row in stored.rows["objects"] if row["patch_object_fraction"])
-                row["patch_object_fraction"] += 0.01
-            elif damage.endswith("T_world_obj"):
-                body[1]["T_world_obj"][3] += 1e-6
-            elif damage.endswith("penetration_mm"):
-                body[1]["penetration_mm"] += 1.0
-            elif damage.endswith("instance_id"):
-                body[0]["instance_id"] = "another"
-            else:
-                body[2]["region_id"] = 9
-            yield stored
+    def damaged(store, records, table):
+        rows = original(store, records, table)
+        if table not in ("scenes", "objects"):
+            return rows
+        changed = rows.to_pylist()
+        if damage == f"{table}.patch_object_fraction":
+            row = next(row for row in changed if row["patch_object_fraction"])
+            row["patch_object_fraction"] += 0.01
+        elif table == "scenes":
+            change_bodies(changed[0]["bodies"], damage)
+        return pa.Table.from_pylist(changed, rows.schema)
 
-    monkeypatch.setattr(services.read.verify, "iter_stored", damaged)
+    monkeypatch.setattr(services.read.verify_range, "range_rows", damaged)
     assert any(told in fault for fault in verify(made[0], lambda _: None).faults)
 
 
-def test_a_mask_with_two_objects_swapped_is_found(made, tmp_path):
-    """The file is replaced together with nothing else: its checksum is told, and so are its labels."""
-    shutil.copytree(made[0].root, tmp_path / "copy")
-    (victim,) = (tmp_path / "copy").glob("*/segment00000.png")
-    mask = decode_png(victim.read_bytes())
-    swapped = np.where(mask == 3, 4, np.where(mask == 4, 3, mask)).astype(np.uint8)
-    victim.write_bytes(encode_png(swapped))
-    faults = "\n".join(faults_of(LocalStore(tmp_path / "copy")))
+def change_bodies(bodies: list[dict], damage: str) -> None:
+    """Changes one value of a scene's bodies."""
+    if damage.endswith("T_world_obj"):
+        bodies[1]["T_world_obj"][3] += 1e-6
+    elif damage.endswith("penetration_mm"):
+        bodies[1]["penetration_mm"] += 1.0
+    elif damage.endswith("instance_id"):
+        bodies[0]["instance_id"] = "another"
+    elif damage.endswith("region_id"):
+        bodies[2]["region_id"] = 9
+
+
+def test_a_mask_with_two_objects_swapped_is_found(made, monkeypatch):
+    """The mask is changed on its way from the file, so that its checksum still holds."""
+    original = services.read.verify_range.read_image
+
+    def swapped(read, path):
+        mask = original(read, path)
+        if not path.endswith("/segment00000.png") or "patches" in path:
+            return mask
+        return np.where(mask == 3, 4, np.where(mask == 4, 3, mask)).astype(np.uint8)
+
+    monkeypatch.setattr(services.read.verify_range, "read_image", swapped)
+    faults = "\n".join(faults_of(made[0]))
     assert "region 3: the mask has" in faults and "region 4: the mask has" in faults
 
 

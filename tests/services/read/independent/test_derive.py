@@ -13,7 +13,7 @@ import workers.geometry.projection
 import workers.labels.patches
 import workers.render.step
 from schemas.scene.camera import Camera, Intrinsics
-from services.read.verify import verify_independently
+from services.read.verify_independent import verify_independently
 from tests.datasets import faults_of, make_dataset
 from workers.geometry.frames import pose, rotation_about, translation
 

@@ -1,0 +1,53 @@
+"""Verifying takes as much memory for many ranges as for few."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests import many_ranges
+
+VERIFY = """
+import json, sys
+from pathlib import Path
+from services.merge import shared, tables
+from services.read import path_index
+from services.read.verify import verify
+from workers.store.local import LocalStore
+path_index.CACHE_KIB = shared.CACHE_KIB = int(sys.argv[2])
+tables.ROWS_PER_GROUP = int(sys.argv[3])
+found = verify(LocalStore(sys.argv[1]), lambda now: None)
+(peak,) = [line.split()[1] for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")]
+parts = dict(found.parts)
+print(json.dumps({"parts": parts, "scenes": found.scenes, "files": found.files, "peak_mib": int(peak) / 1024}))
+"""
+
+
+def measure(folder: Path, ranges: int, cache_kib: int = 16 << 10, rows: int = 8_192) -> dict:
+    """What verifying took: ranges of one scene, six tables and a damaged tar, all merged again; no job.yaml, so no labels."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(many_ranges, "COMMIT_VERSION", 1)  # such a record names its files by itself
+        many_ranges.write_ranges(folder, ranges)
+    command = [sys.executable, "-c", VERIFY, str(folder), str(cache_kib), str(rows)]
+    figures = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    assert figures["scenes"] == ranges
+    assert figures["parts"] == {"job": 2, "file": ranges - (ranges + 499) // 1000, "merge": 1}
+    return figures
+
+
+def test_ten_times_the_ranges_take_little_more_memory(tmp_path):
+    few, many = (measure(tmp_path / str(ranges), ranges, 512, 64) for ranges in (20, 200))
+    assert many["files"] == 10 * few["files"]
+    assert many["peak_mib"] - few["peak_mib"] < 24
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_ten_thousand_ranges_take_little_more_memory_than_a_thousand(tmp_path, record_figure):
+    few, many = (measure(tmp_path / str(ranges), ranges) for ranges in (1_000, 10_000))
+    record_figure("verify_peak_mib[1000 ranges]", "passed", few["peak_mib"], 1024.0)
+    record_figure("verify_peak_mib[10000 ranges]", "passed", many["peak_mib"], 1024.0)
+    assert many["peak_mib"] - few["peak_mib"] < 128
+    assert many["peak_mib"] < 1024
