@@ -18,6 +18,7 @@ from workers.pipeline.fingerprint import take_fingerprint
 from workers.pipeline.run_shard import run_scene
 from workers.pipeline.stopwatch import Stopwatch
 from workers.store.attempt import begin_attempt
+from workers.store.ledger import list_commits
 from workers.store.local import LocalStore
 
 SMALL: dict[str, Any] = {
@@ -55,7 +56,7 @@ def run_here(job: Job, out: Path) -> tuple[LocalStore, str]:
     fingerprint = take_fingerprint(context.renderer, job.render.tier)
     store.put_if_absent(FINGERPRINT_FILE, fingerprint.model_dump_json(indent=1).encode())
     terms = ShardOrder.of(str(out), job, record.digest).terms.model_copy(update={"fingerprint": fingerprint.digest})
-    for span in plan_spans(job, [], False):
+    for span in plan_spans(job, list_commits(store), False):
         attempt = begin_attempt(store, span, terms)
         for scene_id in span.scene_ids:
             attempt.begin_scene(scene_id)

@@ -146,12 +146,15 @@ class _Handler(BaseHTTPRequestHandler):
                     return self._error(501, "NotImplemented")
                 if bucket.conditional == "kept" and key in bucket.objects:
                     return self._error(412, "PreconditionFailed")
+            found = _tag(bucket.objects[key]) if key in bucket.objects else ""
+            if bucket.conditional == "kept" and self.headers.get("If-Match", found) != found:
+                return self._error(412, "PreconditionFailed")
             if not bucket.store(key, data):
                 return self._error(403, "QuotaExceeded")
             if bucket.lose_answers_of and bucket.lose_answers_of in key:
                 bucket.lose_answers_of = ""
                 return self._error(503, "SlowDown")
-        return self._answer(200, ETag=f'"{hashlib.md5(data).hexdigest()}"')
+        return self._answer(200, ETag=_tag(data))
 
     def _copy(self, source: str, key: str) -> None:
         data = self.bucket.objects.get(source)
@@ -159,8 +162,7 @@ class _Handler(BaseHTTPRequestHandler):
             return self._error(404, "NoSuchKey")
         if not self.bucket.store(key, data):
             return self._error(403, "QuotaExceeded")
-        tag = hashlib.md5(data).hexdigest()
-        body = f'<CopyObjectResult><ETag>"{tag}"</ETag><LastModified>{_ISO}</LastModified></CopyObjectResult>'
+        body = f"<CopyObjectResult><ETag>{_tag(data)}</ETag><LastModified>{_ISO}</LastModified></CopyObjectResult>"
         return self._answer(200, body.encode())
 
     def _get(self, _: bytes) -> None:
@@ -170,7 +172,7 @@ class _Handler(BaseHTTPRequestHandler):
         data = self.bucket.objects.get(self._key())
         if data is None:
             return self._error(404, "NoSuchKey")
-        return self._answer(200, data, Last_Modified=_DATE, ETag=f'"{hashlib.md5(data).hexdigest()}"')
+        return self._answer(200, data, Last_Modified=_DATE, ETag=_tag(data))
 
     def _delete(self, _: bytes) -> None:
         with self.bucket.lock:
@@ -212,16 +214,20 @@ class _Handler(BaseHTTPRequestHandler):
                 if delimiter and delimiter in rest:
                     folders.add(prefix + rest.split(delimiter)[0] + delimiter)
                 else:
-                    keys.append((key, len(data)))
+                    keys.append((key, data))
         contents = "".join(
-            f"<Contents><Key>{escape(key)}</Key><Size>{size}</Size><LastModified>{_ISO}</LastModified>"
-            f'<ETag>"0"</ETag></Contents>'
-            for key, size in keys
+            f"<Contents><Key>{escape(key)}</Key><Size>{len(data)}</Size><LastModified>{_ISO}</LastModified>"
+            f"<ETag>{_tag(data)}</ETag></Contents>"
+            for key, data in keys
         )
         common = "".join(
             f"<CommonPrefixes><Prefix>{escape(folder)}</Prefix></CommonPrefixes>" for folder in sorted(folders)
         )
         return f"<ListBucketResult><IsTruncated>false</IsTruncated>{contents}{common}</ListBucketResult>".encode()
+
+
+def _tag(data: bytes) -> str:
+    return f'"{hashlib.md5(data).hexdigest()}"'
 
 
 class _Server(ThreadingHTTPServer):

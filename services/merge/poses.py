@@ -1,5 +1,6 @@
 """The article's own tables camPoses.csv, cameras.csv and objects.dat, written in blocks of lines (dataset.md section 1)."""
 
+import contextlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,9 +39,10 @@ class PoseFiles:
         self._files[OBJECTS].write(object_lines(objects))
 
     def close(self) -> None:
-        """Closes the files."""
-        for file in self._files.values():
-            file.close()
+        """Closes all files, also where one cannot write its rest."""
+        with contextlib.ExitStack() as closing:
+            for file in self._files.values():
+                closing.callback(file.close)
 
 
 def cam_pose_lines(views: pa.Table) -> bytes:

@@ -1,14 +1,35 @@
-"""Scratch tables of a merge: SQLite files with a cache of a fixed size, and what a full disk says to a user."""
+"""The folder of a merge, its SQLite files with a cache of a fixed size, and what a full disk says to a user."""
 
 import contextlib
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
-from schemas.errors import MachineError
+from schemas.errors import MachineError, RunError
+from workers.store.store import Store
 
 CACHE_KIB = 16 << 10
 """Memory for SQLite's cache."""
+
+
+@contextlib.contextmanager
+def merge_folder(store: Store) -> Iterator[Path]:
+    """An empty folder for the files of a merge; that of an earlier merge goes first, wherever that merge is.
+
+    Raises MachineError where a file in it cannot be written, RunError where it is taken away in turn.
+    """
+    folder: Path | None = None
+    try:
+        with explain_full_disk(), store.scratch("merge") as folder:
+            yield folder
+    except (MachineError, FileNotFoundError) as error:
+        if store.root is not None and not store.root.is_dir():
+            raise MachineError(f"{store.name} was removed while it was merged") from error
+        if folder is not None and isinstance(error, FileNotFoundError):
+            raise RunError(
+                f"{folder} was removed while it was in use: another coordinator merges here; start again when it has ended"
+            ) from error
+        raise
 
 
 def open_scratch(path: Path, tables: str) -> sqlite3.Connection:
@@ -24,9 +45,11 @@ def open_scratch(path: Path, tables: str) -> sqlite3.Connection:
 
 @contextlib.contextmanager
 def explain_full_disk() -> Iterator[None]:
-    """Turns an error of SQLite or of writing a file into a MachineError."""
+    """Turns an error of SQLite or of writing a file into a MachineError. A file that is gone stays FileNotFoundError."""
     try:
         yield
+    except FileNotFoundError:
+        raise
     except (sqlite3.Error, OSError) as error:
         reason = error.strerror or error if isinstance(error, OSError) else error
         raise MachineError(

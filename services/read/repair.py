@@ -12,7 +12,7 @@ from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, RANGES, commit_pa
 from schemas.errors import CorruptError, VersoError
 from services.job.record import encode_job, record_job
 from services.merge.dataset_card import write_card
-from services.merge.step import merge, reopen
+from services.merge.step import merge
 from services.read.remake import Maker
 from services.read.verdict import COPY, Verdict
 from services.read.verify import verify
@@ -24,6 +24,7 @@ from services.run.lock import hold_lock
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.fingerprint import take_fingerprint
 from workers.render.raster.gbuffer import shared_renderer
+from workers.store.attempt import reopen
 from workers.store.commit import committed_files, read_committed
 from workers.store.store import Store
 

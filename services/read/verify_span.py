@@ -5,14 +5,14 @@ from itertools import groupby
 from operator import itemgetter
 
 from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import COMMITS, commit_path, parse_commit_path
+from schemas.dataset.layout import COMMITS, commit_path, parse_commit_name
 from services.read.verdict import COPY, MOST_FAULTS, Verdict
 from workers.store.store import Store
 
 
 def commit_groups(store: Store) -> Iterator[tuple[int, list[int]]]:
     """(start, retries) of every range that has a commit record, in order. Other files are left to the search for strays."""
-    names = sorted(name for key, _ in store.files(COMMITS) if (name := parse_commit_path(key)) is not None)
+    names = sorted(name for file, _ in store.scan(COMMITS) if (name := parse_commit_name(file)) is not None)
     for start, group in groupby(names, key=itemgetter(0)):
         yield start, [retry for _, retry in group]
 

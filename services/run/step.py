@@ -79,7 +79,7 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
         print(f"verso: {line}", file=sys.stderr)
     refuse_foreign(store)
     store.prepare()
-    with explain_lost_folder(store.root), hold_lock(store), event_log(store.root):
+    with explain_lost_folder(store.root), hold_lock(store) as lock, event_log(store.root):
         record = adopt(store, record_job(request.job, catalogue.digest, request.job_folder))
         sweep(store, fenced=None)
         ledger = list_commits(store)
@@ -94,7 +94,7 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
                     made_now = _make(store, order, catalogue, plan, slots, keeper)
         if store.size(JOB_FILE) is None or store.read(JOB_FILE) != encode_job(record):
             store.write_whole(JOB_FILE, encode_job(record))
-        merged = merge(store, record.job.first_scene, record.job.stop_scene)
+        merged = merge(store, record.job.first_scene, record.job.stop_scene, lock.require_held)
         write_card(store, record, catalogue, merged)
         log_event("finished", job=record.job.name, digest=merged.digest)
     return RunResult(merged, time.monotonic() - begun, made_now)

@@ -21,7 +21,7 @@ from workers.store.file_system import (
     sync_path,
     sync_tree,
 )
-from workers.store.store import Entry, Store, retry_if_swept
+from workers.store.store import Entry, Store, Version, retry_if_swept
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]+://")
 
@@ -205,21 +205,37 @@ class LocalStore(Store):
     def scratch(self, name: str) -> Iterator[Path]:
         """A folder under `_staging/`, on the file system of its files' final names; an earlier one of the name goes."""
         key = f"{scratch_path(name)}/{uuid.uuid4().hex}"
-        self.remove_tree(scratch_path(name))
+        self._take_away(scratch_path(name))
         try:
             with self._explained(f"a file of the {name}"):
                 os.makedirs(self._own(key))
                 yield self.path(key)
         finally:
             self.remove_tree(key)
+            self.remove_empty(scratch_path(name))
 
-    def install(self, local: Path, key: str) -> None:
+    def _take_away(self, prefix: str) -> None:
+        """Removes a folder that another process may be using: first its name in one step, then its contents."""
+        with contextlib.suppress(FileNotFoundError):
+            os.rename(self._own(prefix), self.path(f"{prefix}.{uuid.uuid4().hex}"))
+        parent, _, name = prefix.rpartition("/")
+        for other in self.children(parent):
+            if other.startswith(f"{name}."):
+                self.remove_tree(f"{parent}/{other}")
+
+    def install(self, local: Path, key: str, over: Version | None = None) -> Version | None:
         """Flushes a file and renames it to `key`."""
         with self._explained(key):
             sync_path(local)
             os.makedirs(self._own(key).parent, exist_ok=True)
             os.replace(local, self.path(key))
             sync_path(self.path(key).parent)
+        return None
+
+    def withdraw(self, key: str, folder: Path) -> None:
+        """Renames a file into a scratch folder."""
+        with self._explained(key):
+            os.replace(self._own(key), folder / uuid.uuid4().hex)
 
     def _place(
         self, name_it: Callable, key: str, data: bytes, staging: str | None = None, durable: bool = True

@@ -8,23 +8,35 @@ until another attempt has committed the range.
 import contextlib
 import tempfile
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING, TypeVar
 
 import obstore
-from obstore.exceptions import AlreadyExistsError, BaseError, GenericError, NotSupportedError
+from obstore.exceptions import AlreadyExistsError, BaseError, GenericError, NotSupportedError, PreconditionError
 from obstore.store import from_url
 
 from schemas.dataset.layout import PROBE_PREFIX, TEMPORARY
-from schemas.errors import MachineError, OutputError
-from workers.store.store import Entry, Store
+from schemas.errors import MachineError, OutputError, RunError
+from workers.store.store import Entry, Store, Version
+
+if TYPE_CHECKING:
+    from obstore import PutMode, PutResult
+
+T = TypeVar("T")
 
 _TRIES = 3
 """How often a conditional put or a delete is made where no answer comes."""
 
 _NOT_IMPLEMENTED = ("NotImplemented", "501 Not Implemented")
 """In the error of a store that refuses every conditional put."""
+
+CONDITIONAL_BYTES = 64 << 20
+"""Larger files are put in parts, which cannot be made conditional."""
+
+_AT_ONCE = 16
+"""Requests at once."""
 
 _BEGUN = "_begun"
 """A mark in an attempt's folder from its beginning until it is swept."""
@@ -196,10 +208,43 @@ class ObjectStore(Store):
         with tempfile.TemporaryDirectory(prefix=f"verso-{name}-") as folder:
             yield Path(folder)
 
-    def install(self, local: Path, key: str) -> None:
-        """Puts a local file, in parts where it is large."""
-        with self._explained(key):
-            obstore.put(self._bucket, key, local)
+    def install(self, local: Path, key: str, over: Version | None = None) -> Version | None:
+        """Puts a local file on the condition that nothing else is there; where it is large, in parts, having asked before."""
+        size = local.stat().st_size
+        try:
+            with self._explained(key):
+                if size <= CONDITIONAL_BYTES:
+                    put = self._put_over(local.read_bytes(), key, over)
+                elif self.versions((), (key,)).get(key) == over:
+                    put = obstore.put(self._bucket, key, local)
+                else:
+                    raise _replaced(key)
+                return Version(size, put["e_tag"])
+        except (AlreadyExistsError, PreconditionError, FileNotFoundError) as error:
+            found = self.versions((), (key,)).get(key)
+            if found is None or found.bytes != size or self.read(key) != local.read_bytes():
+                raise _replaced(key) from error
+            return None  # an answer was lost, or another put the same
+
+    def _put_over(self, data: bytes, key: str, over: Version | None) -> "PutResult":
+        mode: PutMode = "create" if over is None else {"e_tag": over.tag}
+        try:
+            return _repeat_unanswered(lambda: obstore.put(self._bucket, key, data, mode=mode, use_multipart=False))
+        except NotImplementedError:  # the client of a folder knows no condition but absence
+            return obstore.put(self._bucket, key, data)
+
+    def versions(self, folders: Iterable[str], keys: Iterable[str]) -> dict[str, Version]:
+        """Sizes and entity tags, from one listing for each folder and one request for each key, at once."""
+        with ThreadPoolExecutor(_AT_ONCE) as pool:
+            listed = [pool.submit(self._listed, folder) for folder in folders]
+            single = [pool.submit(self._head, key) for key in keys]
+            found = [meta for future in listed for meta in future.result()]
+            found += [meta for future in single if (meta := future.result()) is not None]
+        return {meta["path"]: Version(meta["size"], meta["e_tag"]) for meta in found}
+
+    def _listed(self, folder: str) -> "Sequence[obstore.ObjectMeta]":
+        with self._explained(folder):
+            return obstore.list(self._bucket, folder).collect()
 
     def _head(self, key: str) -> "obstore.ObjectMeta | None":
         with contextlib.suppress(FileNotFoundError), self._explained(key):
@@ -211,21 +256,24 @@ class ObjectStore(Store):
         """Turns an error of the store into a MachineError that names it; a refused conditional put stays as it is."""
         try:
             yield
-        except AlreadyExistsError:
+        except (AlreadyExistsError, PreconditionError):
             raise
         except BaseError as error:
             raise MachineError(f"{key} in {self.name}: {_first_line(error)}") from error
 
 
-def _repeat_unanswered(request: Callable[[], object]) -> None:
+def _replaced(key: str) -> RunError:
+    return RunError(
+        f"{key} was replaced while this process was about to: another coordinator works here; start again when it has ended"
+    )
+
+
+def _repeat_unanswered(request: Callable[[], T]) -> T:
     """Makes a request again where no answer came in time, which obstore does itself for all but two kinds of requests."""
     for _ in range(_TRIES - 1):
-        try:
-            request()
-            return
-        except GenericError:
-            continue
-    request()
+        with contextlib.suppress(GenericError):
+            return request()
+    return request()
 
 
 def _first_line(error: BaseException) -> str:

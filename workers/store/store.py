@@ -30,6 +30,14 @@ class Entry(NamedTuple):
     bytes: int
 
 
+class Version(NamedTuple):
+    """A file as it is now."""
+
+    bytes: int
+    tag: str | None
+    """Of an object: differs for every content. None on a disk."""
+
+
 class Store(Protocol):
     """A place that holds a dataset. Every write raises MachineError where the place is full or broken."""
 
@@ -98,6 +106,12 @@ class Store(Protocol):
     def files(self, prefix: str) -> Iterator[Entry]:
         """Every file at any depth below the folder `prefix`, in the order of the keys' parts."""
 
+    def versions(self, folders: Iterable[str], keys: Iterable[str]) -> dict[str, Version]:
+        """By key: every file at any depth below the folders, and those of `keys` that are there."""
+        entries = [entry for folder in folders for entry in self.files(folder)]
+        single = ((key, self.size(key)) for key in keys)
+        return {key: Version(size, None) for key, size in (*entries, *single) if size is not None}
+
     def listing(self) -> Iterator[Entry]:
         """Every file there is, in any order; of an object store a page at a time."""
         yield from self.files("")
@@ -127,5 +141,13 @@ class Store(Protocol):
     def scratch(self, name: str) -> contextlib.AbstractContextManager[Path]:
         """An empty folder on a local disk whose files `install` can move into place; removed afterwards."""
 
-    def install(self, local: Path, key: str) -> None:
-        """Moves a finished local file to `key` in one step, durably, replacing what was there."""
+    def install(self, local: Path, key: str, over: Version | None = None) -> Version | None:
+        """Moves a finished file of a scratch folder to `key` in one step, durably, replacing what was there.
+
+        Raises FileNotFoundError where the scratch folder was taken away (a disk), RunError where there is something else
+        than `over`, None for nothing (an object store). An object's version comes back where it is surely this call's.
+        """
+
+    def withdraw(self, key: str, folder: Path) -> None:
+        """Takes a file away, if there is one: on a disk into a scratch folder, which must still be there."""
+        self.remove(key)

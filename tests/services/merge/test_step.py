@@ -6,9 +6,10 @@ import pytest
 
 from schemas.dataset.layout import STAGING
 from schemas.errors import CommitConflict, CorruptError, RunError
-from services.merge.step import merge, read_success, reopen
+from services.merge.step import merge, read_success
 from tests.made_up_datasets import FIRST, STOP, dataset_at
 from tests.made_up_scenes import attempt_at, made_scene, terms, with_shapes
+from workers.store.attempt import reopen
 from workers.store.local import LocalStore
 
 pytestmark = pytest.mark.usefixtures("unflushed")
@@ -112,16 +113,3 @@ def test_two_stacks_that_make_one_asset_differently_are_merged_where_a_mix_is_al
         attempt_at(store, start, start + 4, terms(fingerprint=name, fingerprint_mode="record"), make).commit()
     assert merge(store, 0, 8).complete
     assert json.loads((tmp_path / "_SUCCESS").read_text())["fingerprints"] == ["stack-a", "stack-b"]
-
-
-def test_a_commit_that_arrives_during_the_merge_is_noticed(tmp_path, monkeypatch):
-    store = dataset_at(tmp_path, 0, 8)
-    from services.merge import step as module
-
-    def late(store, files):
-        attempt_at(store, 8, 12).commit()
-
-    monkeypatch.setattr(module, "_install", late)
-    with pytest.raises(RunError, match="committed while they were merged"):
-        merge(store, 0, 8)
-    assert read_success(store) is None

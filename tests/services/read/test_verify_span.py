@@ -4,10 +4,10 @@ import shutil
 
 import pytest
 
-from services.merge.step import reopen
 from services.read.verdict import Verdict
 from services.read.verify_span import Spans, commit_groups
 from tests.datasets import faults_of
+from workers.store.attempt import reopen
 from workers.store.local import LocalStore
 
 

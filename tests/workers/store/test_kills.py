@@ -109,7 +109,9 @@ def test_swept_by_another_coordinator_at_any_step_an_attempt_commits_all_or_noth
 
 @some_or_every
 @pytest.mark.parametrize("dies", [False, True], ids=["lives", "dies once it has decided"])
-def test_an_attempt_that_commits_while_it_is_swept_commits_all_or_nothing(dies, stride, undisturbed, tmp_path, monkeypatch):
+def test_an_attempt_that_commits_while_it_is_swept_commits_all_or_nothing(
+    dies, stride, undisturbed, tmp_path, monkeypatch
+):
     settings = terms(first_scene=FIRST, range_size=RANGE)
     outcomes = set()
     step = 0
