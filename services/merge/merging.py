@@ -50,9 +50,8 @@ class Merging:
             self.add(block)
 
     def close(self) -> None:
-        """Closes every file, finished or not."""
-        for part in (self._poses, self._shared):
-            part.close()
+        """Closes what is open, finished or not."""
+        self._shared.close()
 
     def finish(self) -> tuple[dict, dict[str, Path]]:
         """The contents of `_SUCCESS`, and the finished files by key."""
@@ -62,7 +61,6 @@ class Merging:
         for rows in self._shared.assets(mixed):
             self._tables["assets"].add(rows)
         categories = sorted(self._tables["scenes"].categories | self._tables["failures"].categories)
-        self._poses.close()
         files = self._poses.paths
         for table in self._tables.values():
             files = files | table.finish(categories)

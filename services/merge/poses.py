@@ -1,6 +1,5 @@
 """The article's own tables camPoses.csv, cameras.csv and objects.dat, written in blocks of lines (dataset.md section 1)."""
 
-import contextlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,25 +23,23 @@ PLAIN_FROM, PLAIN_BELOW = 1e-4, 1e10
 
 
 class PoseFiles:
-    """The three files in `folder`, open for writing; takes whole ranges in order."""
+    """The three files in `folder`; takes whole ranges in order. A file is open only while it is written."""
 
     def __init__(self, folder: Path) -> None:
         self.paths = {name: folder / name for name in (CAM_POSES, CAMERAS, OBJECTS)}
-        self._files = {name: open(path, "wb") for name, path in self.paths.items()}  # noqa: SIM115
-        self._files[CAM_POSES].write((",".join(["id", "parent_id", *_ELEMENTS]) + "\n").encode())
-        self._files[CAMERAS].write((",".join([*_CAMERA_COLUMNS, *_ELEMENTS]) + "\n").encode())
+        self._append(CAM_POSES, (",".join(["id", "parent_id", *_ELEMENTS]) + "\n").encode())
+        self._append(CAMERAS, (",".join([*_CAMERA_COLUMNS, *_ELEMENTS]) + "\n").encode())
+        self._append(OBJECTS, b"")
 
     def add(self, views: pa.Table, objects: pa.Table) -> None:
         """Takes the next ranges' rows of both tables."""
-        self._files[CAM_POSES].write(cam_pose_lines(views))
-        self._files[CAMERAS].write(camera_lines(views))
-        self._files[OBJECTS].write(object_lines(objects))
+        self._append(CAM_POSES, cam_pose_lines(views))
+        self._append(CAMERAS, camera_lines(views))
+        self._append(OBJECTS, object_lines(objects))
 
-    def close(self) -> None:
-        """Closes all files, also where one cannot write its rest."""
-        with contextlib.ExitStack() as closing:
-            for file in self._files.values():
-                closing.callback(file.close)
+    def _append(self, name: str, lines: bytes) -> None:
+        with open(self.paths[name], "ab") as file:
+            file.write(lines)
 
 
 def cam_pose_lines(views: pa.Table) -> bytes:

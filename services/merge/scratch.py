@@ -38,8 +38,12 @@ def open_scratch(path: Path, tables: str) -> sqlite3.Connection:
     uri = f"{path.absolute().as_uri()}?nolock=1"
     with explain_full_disk():
         connection = sqlite3.connect(uri, uri=True, isolation_level=None)
-        connection.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
-        connection.executescript(f"PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF; {tables}; BEGIN;")
+        try:
+            connection.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
+            connection.executescript(f"PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF; {tables}; BEGIN;")
+        except sqlite3.Error:
+            connection.close()
+            raise
     return connection
 
 

@@ -32,6 +32,8 @@ _FEW_FOLDERS = 3
 _REMEDIES = {
     errno.ENOSPC: "the disk is full; free some space and start again, nothing finished is lost",
     errno.EDQUOT: "the disk quota is used up; free some space and start again, nothing finished is lost",
+    errno.EFBIG: "a file may not grow beyond the limit of this shell (ulimit -f); raise it and start again",
+    errno.EMFILE: "this process may not open more files; raise `ulimit -n` and start again",
     errno.EROFS: "the file system is mounted read-only",
     errno.EACCES: "permission denied",
     errno.EPERM: "permission denied",

@@ -23,7 +23,7 @@ from workers.store.objects import ObjectStore
 
 VIEWS = {4: 8, 6: 10}
 """Rows of views by the number of scenes, of which number 5 fails."""
-SOME = 16
+SOME = 24
 """Every so many steps by default; `--all` takes each of them."""
 some_or_every = pytest.mark.parametrize(
     "stride", [SOME, pytest.param(1, marks=pytest.mark.slow)], ids=["some", "every"]
