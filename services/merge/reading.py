@@ -16,7 +16,7 @@ from schemas.dataset.layout import asset_path, is_range_file, pose_of_image, ran
 from schemas.dataset.tables import SCHEMAS, SHAPE_FILE_COLUMNS, TABLES
 from schemas.errors import CorruptError
 from workers.store.commit import committed_files
-from workers.store.committed_rows import iter_ranges, range_rows
+from workers.store.committed_rows import Spread, iter_ranges, range_rows
 from workers.store.manifest import conform, decode_rows
 from workers.store.store import Store
 
@@ -65,8 +65,8 @@ def read_blocks(store: Store, first_scene: int, stop_scene: int) -> Iterator[Blo
     """
     joining = Joining()
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        ranges = iter_ranges(store, first_scene, stop_scene)
-        spread = functools.partial(map_ahead, pool) if store.root is None else map
+        spread: Spread = functools.partial(map_ahead, pool) if store.root is None else map
+        ranges = iter_ranges(store, first_scene, stop_scene, spread)
         for read in spread(lambda records: _read_range(store, records), ranges):
             yield from joining.add(read)
     yield from joining.finish()

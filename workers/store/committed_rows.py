@@ -1,7 +1,9 @@
 """Reading of committed ranges in order, and of their rows; a retry's rows replace the first ones."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
+from operator import itemgetter
+from typing import Protocol, TypeVar
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -15,14 +17,25 @@ from workers.store.ledger import list_commits as list_commits
 from workers.store.manifest import decode_table
 from workers.store.store import Store
 
+A = TypeVar("A")
+B = TypeVar("B")
 
-def iter_committed(store: Store) -> Iterator[list[CommitRecord]]:
+
+class Spread(Protocol):
+    """Calls a function for each item and gives the results in order, as `map` does; it may call ahead, several at once."""
+
+    def __call__(self, function: Callable[[A], B], items: Iterable[A], /) -> Iterator[B]:
+        """The results in order."""
+
+
+def iter_committed(store: Store, spread: Spread = map) -> Iterator[list[CommitRecord]]:
     """The records of every committed range, followed by its retries, in order.
 
     Raises CorruptError for a damaged or missing record, OutputError for one of a newer version.
     """
-    for start, codes in groupby(list_codes(store), key=lambda code: split_code(code)[0]):
-        yield read_range(store, start, [split_code(code)[1] for code in codes])
+    ranges = groupby(map(split_code, list_codes(store)), key=itemgetter(0))
+    groups = ((start, [retry for _, retry in names]) for start, names in ranges)
+    return spread(lambda group: read_range(store, *group), groups)
 
 
 def read_range(store: Store, start: int, retries: Sequence[int]) -> list[CommitRecord]:
@@ -31,13 +44,13 @@ def read_range(store: Store, start: int, retries: Sequence[int]) -> list[CommitR
     return [require_record(store, start, retry) for retry in retries]
 
 
-def iter_ranges(store: Store, first_scene: int, stop_scene: int) -> Iterator[list[CommitRecord]]:
+def iter_ranges(store: Store, first_scene: int, stop_scene: int, spread: Spread = map) -> Iterator[list[CommitRecord]]:
     """The records of each range, followed by its retries, in order: exactly the scenes [first_scene, stop_scene).
 
     Raises RunError naming scenes that nobody committed, or that are committed beyond the end.
     """
     awaited = first_scene
-    for records in iter_committed(store):
+    for records in iter_committed(store, spread):
         start, stop = records[0].span.start, records[0].span.stop
         if start != awaited:
             raise RunError(
