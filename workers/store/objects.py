@@ -105,9 +105,8 @@ class ObjectStore(Store):
         """A temporary file on the local disk, put as one object in the end."""
         with tempfile.TemporaryFile() as file:
             yield file
-            file.seek(0)
             with self._explained(path):
-                obstore.put(self._bucket, f"{staging}/{path}", file)
+                self._put_file(f"{staging}/{path}", file)
 
     def put_if_absent(self, key: str, data: bytes, staging: str | None = None) -> bool:
         """Puts on the condition that nothing is there.
@@ -128,6 +127,18 @@ class ObjectStore(Store):
         """Puts an object over what was there."""
         with self._explained(key):
             obstore.put(self._bucket, key, data)
+
+    def _put_file(self, key: str, file: IO[bytes]) -> None:
+        """Puts a file, in parts where it is large; again where the store no longer knows of the parts.
+
+        It has joined them then, and the answer was lost.
+        """
+        for _ in range(_TRIES):
+            file.seek(0)
+            with contextlib.suppress(FileNotFoundError):
+                obstore.put(self._bucket, key, file)
+                return
+        raise MachineError(f"{key} in {self.name}: the store lost the parts of an upload {_TRIES} times")
 
     def rename(self, source: str, target: str) -> None:
         """Copies, then deletes: a kill in between leaves both, and a second call deletes the first."""

@@ -5,6 +5,7 @@ from collections.abc import Collection
 from schemas.dataset.layout import (
     COMMITS,
     FENCED,
+    LOCK_CLAIMS,
     PROBE_PREFIX,
     STAGING,
     TEMPORARY,
@@ -22,12 +23,15 @@ def sweep(store: Store, fenced: Collection[tuple[int, str]] | None = ()) -> list
     """Publishes committed ranges and removes staging that lost; returns the attempts removed.
 
     Attempts at ranges that are not committed stay, except those in `fenced`, pairs of (start, attempt) whose workers are
-    believed to be dead. None means all of them: for a coordinator that holds the lock and has no worker yet.
+    believed to be dead. None means all of them, and the files of a merge that was killed: for a coordinator that holds
+    the lock and has no worker yet.
     """
     removed = []
     for folder in store.children(STAGING):
         start = parse_range_name(folder)
         if start is None:
+            if fenced is None and f"{STAGING}/{folder}" not in (TEMPORARY, LOCK_CLAIMS):
+                store.remove_tree(f"{STAGING}/{folder}")
             continue
         for name in store.children(f"{STAGING}/{folder}"):
             attempt = name.removesuffix(FENCED)
