@@ -136,7 +136,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "replay": Command(
         "make one scene again and compare it with what is stored, or put back what was lost",
-        "data/tabletop 17` or `verso replay data/tabletop --repair",
+        "data/tabletop 17",
         (
             OUT,
             option("scene", type=read_index, metavar="SCENE", nargs="*"),

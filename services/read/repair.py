@@ -57,8 +57,7 @@ def repair(store: Store, scenes: Collection[int], progress: Callable[[Verdict], 
 
 def _needs_merge(verdict: Verdict) -> bool:
     """Whether all that is wrong is what a merge writes; files that belong nowhere are not in its way."""
-    parts = verdict.parts
-    return bool(parts["merge"] or parts["card"]) and not (parts["commit"] or parts["file"] or parts["job"])
+    return bool({"merge", "card"} & verdict.parts.keys()) and not {"commit", "file", "job"} & verdict.parts.keys()
 
 
 def _merge_again(store: Store, found: Repair) -> None:
@@ -66,12 +65,12 @@ def _merge_again(store: Store, found: Repair) -> None:
     assert record is not None
     job = record.job
     try:
-        if found.verdict.parts["merge"]:
+        if "merge" in found.verdict.parts:
             reopen(store)
         merged = merge(store, job.first_scene, job.stop_scene)
-        if found.verdict.parts["merge"]:
+        if "merge" in found.verdict.parts:
             found.done.append(f"_SUCCESS and the merged files: written again from the commits, digest {merged.digest}")
-        if found.verdict.parts["card"]:
+        if "card" in found.verdict.parts:
             catalogue = open_catalogue(job.assets, Path(record.folder), tuple(job.categories))
             write_card(store, record, catalogue, merged)
             found.done.append("DATASET.md: written again")

@@ -66,8 +66,7 @@ class Known:
 def tell_strays(store: Store, known: Known, verdict: Verdict) -> None:
     """Tells of everything that no commit names."""
     if store.root is None:
-        for entry in store.files(""):
-            key = entry.key.lstrip("/")
+        for key, _ in store.listing():
             if key.partition("/")[0] not in FREE and not _belongs(key, known):
                 _tell_file(store, key, verdict)
         return

@@ -1,6 +1,5 @@
 """The result of `verso verify`: counts of what was read, and faults, each a line with the file and what to do."""
 
-from collections import Counter
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -26,12 +25,12 @@ class Verdict:
     faults: list[str] = field(default_factory=list)
     untold: int = 0
     """Faults beyond `MOST_FAULTS`."""
-    parts: Counter[Part] = field(default_factory=Counter)
+    parts: dict[Part, int] = field(default_factory=dict)
     """Faults by the part that they are in."""
 
     def tell(self, what: str, remedy: str, part: Part = "commit") -> None:
         """Adds a fault as one line: what is wrong with which file, and what to do."""
-        self.parts[part] += 1
+        self.parts[part] = self.parts.get(part, 0) + 1
         if self.parts[part] <= MOST_FAULTS:
             self.faults.append(f"{printable(what)}: {remedy}")
         else:

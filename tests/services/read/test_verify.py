@@ -3,11 +3,14 @@
 from collections import Counter
 from pathlib import Path
 
+import obstore
 import pytest
+from obstore.store import MemoryStore
 
 from services.read.verify import verify
 from tests.datasets import faults_of, make_dataset
 from workers.store.local import LocalStore
+from workers.store.objects import ObjectStore
 
 
 @pytest.fixture(params=["files", "tar"])
@@ -55,3 +58,20 @@ def test_a_missing_file_a_stray_and_a_changed_table_are_told(store):
     assert f"{name}: is committed and missing" in faults
     assert f"{path.parent.name}/stray.png: is in no commit" in faults
     assert "cameras.csv: does not match the SHA-256 in _SUCCESS" in faults
+
+
+def test_a_dataset_in_an_object_store_is_read_back_as_on_a_disk(packed):
+    bucket = MemoryStore()
+    for path in (path for path in Path(packed.root).rglob("*") if path.is_file() and "_staging" not in path.parts):
+        obstore.put(bucket, path.relative_to(packed.root).as_posix(), path)
+    store = ObjectStore(bucket, "memory://dataset")
+    assert verify(store, lambda _: None).faults == []
+    store.write_whole("box/stray.png", b"x")
+    store.remove("camPoses.csv")
+    store.remove("manifest/_ranges/0000000001/objects.parquet")
+    told = verify(store, lambda _: None).faults
+    assert [fault.partition(": `verso")[0].partition(": move")[0] for fault in told] == [
+        "manifest/_ranges/0000000001/objects.parquet: is committed and missing",
+        "camPoses.csv: is merged and missing",
+        "box/stray.png: is in no commit",
+    ]
