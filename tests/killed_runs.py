@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from services.run.processes import Process, read_process
+from services.run.processes import Process, descendants, read_process, send
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -71,9 +71,12 @@ class EndedRun:
 
 
 def disturb_at_first_commit(
-    job: Path, out: Path, disturb: Callable[[int, int], object], timeout_s: float = 90
+    job: Path, out: Path, disturb: Callable[[int, int], object], timeout_s: float = 90, patience_s: float = 0.0
 ) -> EndedRun:
-    """A run on one worker in a terminal of its own; once something is committed, `disturb(pid, terminal)` is called."""
+    """A run on one worker in a terminal of its own; once something is committed, `disturb(pid, terminal)` is called.
+
+    What it left is looked for when it has ended, and again until nothing is left or the patience ends.
+    """
     mark = f"VERSO_TEST_MARK={uuid.uuid4().hex}"
     command = [sys.executable, "-m", "services.cli.main", "run", str(job), "--out", str(out), "--shard-size", "4"]
     terminal, users_end = pty.openpty()
@@ -98,7 +101,9 @@ def disturb_at_first_commit(
     finally:
         run.kill()
         run.wait()
-        left = processes_with(mark)
+        patient = time.monotonic() + patience_s
+        while (left := processes_with(mark)) and time.monotonic() < patient:
+            time.sleep(0.05)
         for process in left:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process.pid, signal.SIGKILL)
@@ -112,6 +117,22 @@ def interrupt(pid: int, terminal: int) -> None:
     os.write(terminal, b"\x03")
 
 
+def kill_processes(title: str, number: int) -> Callable[[int, int], None]:
+    """Sends a signal to those below the run whose command line begins with, or whose program ends in, `title`."""
+
+    def disturb(pid: int, terminal: int) -> None:
+        matching = [process for process in descendants(pid) if _is_called(title, _command_line(process.pid))]
+        assert matching, title
+        for process in matching:
+            send(process, number)
+
+    return disturb
+
+
+def _is_called(title: str, line: str) -> bool:
+    return line.startswith(title) or line.partition(" ")[0].endswith(title)
+
+
 def processes_with(mark: str) -> list[Process]:
     """Processes that have `mark` in their environment; their names are their command lines."""
     found = []
@@ -119,9 +140,14 @@ def processes_with(mark: str) -> list[Process]:
         with contextlib.suppress(OSError):
             process = read_process(int(folder.name))
             if process and not process.ended and mark.encode() in (folder / "environ").read_bytes().split(b"\0"):
-                line = (folder / "cmdline").read_text().replace("\0", " ")
-                found.append(replace(process, name=line))
+                found.append(replace(process, name=_command_line(process.pid)))
     return found
+
+
+def _command_line(pid: int) -> str:
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " ")
+    return ""
 
 
 def _read_terminal(terminal: int, said: list[bytes]) -> None:

@@ -4,7 +4,6 @@ import contextlib
 import os
 import shutil
 import socket
-import sys
 from collections.abc import Iterator, Mapping, MutableMapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from schemas.errors import MachineError
 from services.run.cores import usable_cores
 from services.run.ray_environment import NOT_INHERITED, private_environment
 from services.run.ray_folder import private_folder
-from services.run.supervisor import tell
+from services.run.supervisor import core_stderr, tell
 
 OBJECT_STORE_BYTES = 128 * 2**20
 """Images never cross Ray, so its shared memory can be small."""
@@ -50,7 +49,8 @@ def private_ray(workers: int) -> Iterator[Slots]:
     """A private Ray with `workers` slots, shut down when the block ends.
 
     Never joins another Ray on this machine and contacts no other host. Its processes listen on loopback and on sockets in
-    a folder that no other user can enter, and answer those that show its token, which no file and no log holds.
+    a folder that no other user can enter, and answer those that show its token, which no file and no log holds. Raises
+    MachineError where Ray does not start.
     """
     with private_folder() as folder, _kept_private():
         tell(folder=str(folder.parent))  # the supervisor removes it where this process cannot
@@ -63,7 +63,14 @@ def private_ray(workers: int) -> Iterator[Slots]:
             "_node_ip_address": "127.0.0.1",
             "_system_config": {"enable_metrics_collection": False},  # they would be served without asking for the token
         }
-        with _connection("local", **settings):
+        with contextlib.ExitStack() as stack:
+            try:
+                stack.enter_context(_connection("local", **settings))
+            except Exception as error:  # Ray raises plain ones, after half a minute where the machine is overloaded
+                said = next(iter(str(error).splitlines()), type(error).__name__)
+                raise MachineError(
+                    f"Ray did not start on this machine ({said}): see `verso doctor`, or start again when less is running here"
+                ) from error
             yield Slots(workers, PREFETCH * workers)
 
 
@@ -158,12 +165,14 @@ def cluster_ray(address: str, workers: int | None) -> Iterator[Slots]:
 def _connection(address: str, **settings: Any) -> Iterator[None]:
     """A connection to a Ray, shut down when the block ends.
 
-    Ray's messages about dead workers go to standard error: standard output is for the command's answer. Ray puts the
+    Ray's messages about dead workers go where its C++ core writes (to the user, or to a supervisor, which keeps them for
+    the logs), because standard output is for the command's answer, and what they mean is told by us. Ray puts the
     current folder first on its workers' search path. It is the project's for that moment, because the packages have
     generic names: a `services` folder in the user's working folder must not be found instead.
     """
-    with contextlib.redirect_stdout(sys.stderr):
-        with contextlib.chdir(Path(__file__).resolve().parents[2]):
+    with core_stderr() as stream, contextlib.redirect_stdout(stream):
+        # While it starts, Ray asks Python to dump its stack to standard error where it crashes.
+        with contextlib.chdir(Path(__file__).resolve().parents[2]), contextlib.redirect_stderr(stream):
             ray.init(address=address, log_to_driver=False, configure_logging=False, **settings)
         try:
             yield

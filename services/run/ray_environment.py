@@ -15,6 +15,9 @@ def private_environment() -> dict[str, str]:
         # 127.0.0.1 by the machine's own address, and most of its processes listen on all of them.
         "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
         "RAY_USAGE_STATS_ENABLED": "0",
+        # A GCS of this machine that is gone does not come back, as a cluster's may: its clients end after this time, which
+        # is 60 s otherwise. So do the agents of a Ray whose other processes were killed.
+        "RAY_gcs_rpc_server_reconnect_timeout_s": "15",
     }
 
 

@@ -12,10 +12,10 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Final
+from typing import IO
 
 from services.run.processes import (
     GRACE_S,
@@ -27,16 +27,13 @@ from services.run.processes import (
     reap,
     send,
 )
-from services.run.verdict import Facts, judge
-
-STOPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
-"""They end the command as Ctrl-C does; a second one at once."""
+from services.run.verdict import STOPS, Facts, judge
 
 STOP_S = 30.0
-"""Time that the command gets to end after the first of them."""
+"""Time that the command gets to end after the first signal that stops it; a second one ends it at once."""
 
 LAST_WORDS = "driver.txt"
-"""The file in OUT/_logs with what Ray's C++ wrote to standard error before the command died."""
+"""The file in OUT/_logs with what Ray said in the command's process, where that is anything."""
 
 _LAST_BYTES = 2**20
 
@@ -59,12 +56,19 @@ def supervise(command: Callable[[], int], kept: str, quiet: bool = True) -> int:
     return front.tend(lambda: keeper.tend(lambda: _drive(command, words, mask)))
 
 
-def tell(**facts: int | bool | str) -> None:
+def tell(**facts: int | str | None) -> None:
     """Tells the supervisors a fact (the fields of `Facts`); nothing where there is none."""
     line = json.dumps(facts).encode() + b"\n"
     for pipe in _listeners:
         with contextlib.suppress(OSError):  # a supervisor that was killed
             os.write(pipe, line)
+
+
+@contextlib.contextmanager
+def core_stderr() -> Iterator[IO[str]]:
+    """Descriptor 2 as a text stream: where C++ code writes, which a quiet supervisor keeps out of the terminal."""
+    with open(2, "w", buffering=1, encoding="utf-8", errors="backslashreplace", closefd=False) as stream:
+        yield stream
 
 
 @dataclass(frozen=True)
@@ -99,11 +103,12 @@ class _Layer:
         if facts.folder is not None:
             _remove(facts.folder)
         code, line = judge(facts, status, stopped_by, self.kept)
+        where = _keep_last_words(self.words, facts.logs)
         if line is not None:
-            line += _keep_last_words(self.words, facts.logs) if stopped_by is None else ""
+            line += where if stopped_by is None else ""
             with contextlib.suppress(OSError):  # a terminal that was closed
                 print(f"verso: {line}", file=sys.stderr, flush=True)
-        tell(code=code, interrupted=False)
+        tell(code=code, ended_by=None)
         return code
 
     def _wait(self, child: int) -> tuple[int, int | None]:
@@ -155,7 +160,10 @@ def _drive(command: Callable[[], int], words: int | None, mask: Collection[int])
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is said
     except KeyboardInterrupt:
         code = 1
-        tell(interrupted=True)
+        tell(ended_by=signal.SIGINT)
+    except SystemExit:  # how Ray answers SIGTERM; the command line raises none of its own from here on
+        code = 1
+        tell(ended_by=signal.SIGTERM)
     except Exception:
         code = 1
         traceback.print_exc()
@@ -177,7 +185,9 @@ def _keep_last_words(words: int | None, logs: str | None) -> str:
         return ""
     path = Path(logs) / LAST_WORDS
     try:
-        path.write_bytes(os.pread(words, _LAST_BYTES, max(0, size - _LAST_BYTES)))
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o644)
+        with open(file, "wb") as kept:
+            kept.write(os.pread(words, _LAST_BYTES, max(0, size - _LAST_BYTES)))
     except OSError:
         return ""
     return f" ({path} has its last words)"

@@ -28,7 +28,13 @@ def test_a_command_that_told_its_code_needs_no_line_however_its_process_ended(co
 def test_a_signal_is_named_whether_the_command_ended_in_order_or_crashed(stopped_by, words):
     for status in (1 << 8, signal.SIGABRT, signal.SIGKILL):
         assert judge(Facts(), status, stopped_by, KEPT) == (1, words)
-        assert judge(Facts(code=1, interrupted=True), status, stopped_by, KEPT) == (1, words)
+        assert judge(Facts(code=1, ended_by=signal.SIGINT), status, stopped_by, KEPT) == (1, words)
+
+
+def test_a_signal_that_reached_the_command_alone_is_named_too():
+    assert judge(Facts(code=1, ended_by=signal.SIGTERM), 1 << 8, None, KEPT) == (1, "stopped by SIGTERM; all is kept")
+    assert judge(Facts(), signal.SIGTERM, None, KEPT) == (1, "stopped by SIGTERM; all is kept")
+    assert judge(Facts(), signal.SIGINT, None, KEPT) == (1, "interrupted; all is kept")
 
 
 @pytest.mark.parametrize(
