@@ -89,10 +89,14 @@ def called_for(facts: Facts) -> set[str]:
     return {name for name, wants in wanted.items() if wants}
 
 
-def test_the_plan_chooses_rightly_on_two_hundred_random_scenes():
+HALF_OR_ALL = [pytest.param(SCENES // 2, id="100"), pytest.param(SCENES, id="200", marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("scenes", HALF_OR_ALL)
+def test_the_plan_chooses_rightly_on_random_scenes(scenes):
     """Nothing that a scene needs is left out, and what none needs is, but for a few whose pictures pass close by."""
     left_out, idle = Counter[str](), Counter[str]()
-    for number in range(SCENES):
+    for number in range(scenes):
         try:
             facts = facts_of(random_setting(number))
         except SceneError:
@@ -103,15 +107,16 @@ def test_the_plan_chooses_rightly_on_two_hundred_random_scenes():
             assert plan.runs(name) or name not in wanted, f"scene {number} needs {name}"
             left_out[name] += not plan.runs(name)
             idle[name] += plan.runs(name) and name not in wanted
-    assert all(left_out[name] >= 8 for name in NO_OPS), left_out
+    assert all(left_out[name] >= scenes / 25 for name in NO_OPS), left_out
     assert all(idle[name] == 0 for name in NO_OPS if name not in ("floor", "table"))
     assert idle["floor"] <= left_out["floor"] and idle["table"] <= left_out["table"], (idle, left_out)
 
 
-def test_the_plan_chooses_effects_of_physics_rightly_on_two_hundred_random_scenes():
+@pytest.mark.parametrize("scenes", HALF_OR_ALL)
+def test_the_plan_chooses_effects_of_physics_rightly_on_random_scenes(scenes):
     """Nothing that a scene needs as it begins is left out; more is only called for where objects come near one another."""
     left_out, idle, seen = Counter[str](), Counter[str](), 0
-    for number in range(SCENES):
+    for number in range(scenes):
         try:
             facts = facts_of(random_physics(number))
         except SceneError:
@@ -122,8 +127,8 @@ def test_the_plan_chooses_effects_of_physics_rightly_on_two_hundred_random_scene
             assert plan.runs(name) or name not in wanted, f"scene {number} needs {name}"
             left_out[name] += not plan.runs(name)
             idle[name] += plan.runs(name) and name not in wanted
-    assert seen >= 0.8 * SCENES
-    assert all(left_out[name] >= 40 for name in PHYSICS), left_out
+    assert seen >= 0.8 * scenes
+    assert all(left_out[name] >= scenes / 5 for name in PHYSICS), left_out
     assert idle["dynamics"] == idle["fine_step"] == 0
     assert all(idle[name] <= 0.25 * seen for name in PHYSICS), idle
 
