@@ -20,7 +20,6 @@ from tests.made_up_scenes import failed_scene, made_scene, terms
 from workers.store.local import LocalStore
 from workers.store.manifest import sorted_rows, table_of_rows
 from workers.store.record import encode_record
-from workers.store.store import Entry
 
 PAIRS = 5
 CATEGORY = "mug"
@@ -109,12 +108,12 @@ class ManyRanges(LocalStore):
             return TAR_BYTES
         return super().size(key)
 
-    def files(self, prefix: str) -> Iterator[Entry]:
-        """Every file below `prefix`."""
+    def names(self, prefix: str, sizes: bool = False) -> Iterator[tuple[str, int]]:
+        """Everything directly below `prefix`."""
         if prefix == COMMITS:
-            yield from (Entry(commit_path(scene_id), 1) for scene_id in range(self.scenes))
+            yield from ((commit_path(scene_id).rpartition("/")[2], 1) for scene_id in range(self.scenes))
         else:
-            yield from super().files(prefix)
+            yield from super().names(prefix, sizes)
 
     def _tables(self, scene_id: int) -> dict[str, bytes]:
         if self._last[0] != scene_id:
