@@ -32,8 +32,9 @@ _SAMPLES = 4
 """Records that a kept summary is compared with: one of another dataset has another job digest in all of them."""
 SAVE_EACH = 1_024
 """Fewest commits that make the holder of the lock write the summary again."""
-SAVE_SHARE = 0.1
-"""Share of all commits by which they grow before the summary is written again: so all writing is a few times its size."""
+SAVE_SHARE = 0.02
+"""Share of all commits by which they grow before the summary is written again: all writing together is fifty times its size,
+and after a kill at most this share of the records is read again."""
 
 
 def list_commits(store: Store) -> Ledger:

@@ -1,4 +1,5 @@
 import itertools
+import tracemalloc
 
 import pytest
 from hypothesis import given
@@ -115,11 +116,15 @@ def test_the_lazy_plan_is_that_of_a_list_over_every_cell(data):
 
 def test_a_plan_of_a_thousand_million_scenes_is_made_on_demand():
     """The list took 12 GB."""
+    tracemalloc.start()
     job = Job.model_validate({"name": "large", "scenes": 10**9})
     plan = plan_spans(job, Ledger(join_rows([rows_of([summary(16 * 40_000_000 - 16, stop=16 * 40_000_000)])])), False)
     assert plan.scenes == 10**9 - 16
     shards = group_shards(plan, choose_shard_size(plan.scenes, 2))
     assert [span.start for span in next(shards)] == [0, 16, 32, 48]
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**20
 
 
 def summary(start, retry=0, failed=(), scenes=(), stop=None):

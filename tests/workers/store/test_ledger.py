@@ -1,3 +1,5 @@
+import itertools
+
 import pyarrow as pa
 import pytest
 
@@ -148,20 +150,21 @@ def summary(number: int) -> CommitSummary:
 
 
 def test_the_keeper_writes_when_enough_has_come_and_at_the_end(store, monkeypatch):
-    """Every tenth part: for n commits, so about ten times their number of rows is written in all."""
+    """By a fiftieth each time, so that all writing together is some fifty times the last."""
     monkeypatch.setattr(module, "SAVE_EACH", 8)
     written = []
     monkeypatch.setattr(module, "save_rows", lambda store, rows: written.append(rows.num_rows))
     keeper = LedgerKeeper(store, list_commits(store))
-    for number in range(400):
+    for number in range(2_000):
         keeper.add([summary(number)])
     keeper.close()
     assert written[0] == 8
-    assert written[-1] == 400
-    assert len(written) < 40
-    assert sum(written) < 14 * 400
+    assert written[-1] == 2_000
+    assert len(written) < 150
+    assert sum(written) < 60 * 2_000
+    assert all(later - earlier <= max(8, 0.03 * later) for earlier, later in itertools.pairwise(written))
     keeper.close()
-    assert written[-2] < 400
+    assert written[-2] < 2_000, "nothing new, nothing written"
 
 
 def test_a_full_disk_stops_no_keeper(store, monkeypatch):
