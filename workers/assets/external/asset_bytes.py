@@ -1,7 +1,7 @@
 """Pure: an asset as bytes and back, without pickle, because they come from a process that has read a stranger's file.
 
-A line of JSON, then the arrays one after another, each aligned to 16 bytes. Floats come back bit by bit, and arrays in the
-memory order that they had, on which the last bits of sums depend.
+A block of JSON, then one for each array, each aligned to 16 bytes. Floats come back bit by bit, and arrays in the memory
+order that they had, on which the last bits of sums depend.
 """
 
 import json
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from schemas.base import frozen_array
 from schemas.errors import MeshError
 from schemas.scene.shape import Asset, MassProperties, Material, Part, Shape
+from workers.assets.external.reader_process import ALIGNMENT
 
-ALIGNMENT = 16
 _KINDS = ("float64", "int32", "uint8")
 _PLAIN = (
     "instance_id",
@@ -37,7 +37,7 @@ class _Writer:
 
     def __init__(self) -> None:
         self.heads: list[list[Any]] = []
-        self.blocks: list[bytes] = []
+        self.blocks: list[memoryview] = []
         self._numbers: dict[int, int] = {}
 
     def add(self, array: NDArray | None) -> int | None:
@@ -45,15 +45,15 @@ class _Writer:
             return None
         if id(array) not in self._numbers:
             order = "F" if array.flags.f_contiguous and not array.flags.c_contiguous else "C"
-            data = array.tobytes(order)  # type: ignore[arg-type]
+            flat = np.ascontiguousarray(array.T if order == "F" else array)
             self._numbers[id(array)] = len(self.heads)
             self.heads.append([str(array.dtype), list(array.shape), order])
-            self.blocks += [data, b"\0" * (-len(data) % ALIGNMENT)]
+            self.blocks.append(flat.reshape(-1).view(np.uint8).data)
         return self._numbers[id(array)]
 
 
-def pack_asset(asset: Asset) -> bytes:
-    """The asset's bytes. Built-in shapes have fields that files have not, and are not packed."""
+def pack_asset(asset: Asset) -> list[bytes | memoryview]:
+    """The asset's blocks of bytes. Built-in shapes have fields that files have not, and are not packed."""
     writer = _Writer()
     parts = [
         {
@@ -76,15 +76,19 @@ def pack_asset(asset: Asset) -> bytes:
         "T_source_to_object": asset.T_source_to_object.tolist(),
         "arrays": writer.heads,
     }
-    return b"".join([json.dumps(tree).encode() + b"\n", *writer.blocks])
+    text = json.dumps(tree).encode()
+    return [len(text).to_bytes(ALIGNMENT, "little"), text, *writer.blocks]
 
 
-def unpack_asset(data: bytes) -> Asset:
-    """The asset of `pack_asset`'s bytes. Raises MeshError `unreadable` where they are not such, or its arrays do not fit."""
+def unpack_asset(data: memoryview) -> Asset:
+    """The asset of `pack_asset`'s blocks, each aligned, in one; its arrays are views of them.
+
+    Raises MeshError `unreadable` where the blocks are not such, or the arrays do not fit.
+    """
     try:
-        end = data.index(b"\n")
-        tree = json.loads(data[:end])
-        arrays = _arrays(tree["arrays"], memoryview(data)[end + 1 :])
+        stop = ALIGNMENT + int.from_bytes(data[:ALIGNMENT], "little")
+        tree = json.loads(bytes(data[ALIGNMENT:stop]))
+        arrays = _arrays(tree["arrays"], data[stop + -stop % ALIGNMENT :])
         parts = tuple(_part(part, arrays) for part in tree["parts"])
         mass_kg, com, inertia, solid = tree["mass"]
         return Asset(
@@ -105,7 +109,7 @@ def _arrays(heads: list[list[Any]], data: memoryview) -> list[NDArray]:
             raise ValueError(f"an array of {kind}")
         count = math.prod(shape)
         flat = np.frombuffer(data, dtype=kind, count=count, offset=start)
-        array = np.array(flat.reshape(shape, order=order))
+        array = flat.reshape(shape, order=order)
         array.setflags(write=False)
         arrays.append(array)
         start += array.nbytes + -array.nbytes % ALIGNMENT

@@ -56,7 +56,7 @@ def read_listing(
             skipped[answer.reason] += 1
             examples += [_describe(task.path, folder, answer)][: EXAMPLES - len(examples)]
         else:
-            files = tuple(SourceFile(*file) for file in json.loads(answer))
+            files = tuple(SourceFile(*file) for file in json.loads(bytes(answer).rstrip(b"\0")))
             licence = find_licence(task.path, folder, stated, licences)
             entries[task.category].append(Entry(instance_id_of(settings, files[0]), files, licence))
     found = {category: tuple(listed) for category, listed in entries.items()}

@@ -2,22 +2,23 @@
 
 import atexit
 import json
+import mmap
 import os
 import queue
 import signal
+import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
 from schemas.errors import MachineError, MeshError
 from schemas.job.assets import MeshLimits
-from workers.assets.external.reader_process import LENGTH, NO_MEMORY, receive, send
+from workers.assets.external.reader_process import NO_MEMORY, read_answers, send
 from workers.assets.external.reader_tasks import ANSWER, Request, Task, encode_request
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -47,9 +48,10 @@ class Reader:
     def __init__(self) -> None:
         self.last = Usage(0, 0.0, 0)
         self._process: subprocess.Popen[bytes] | None = None
+        self._socket: socket.socket | None = None
         self._lock = threading.Lock()
 
-    def ask(self, request: Request) -> Iterator[bytes | MeshError]:
+    def ask(self, request: Request) -> Iterator[memoryview | MeshError]:
         """For each task what it answers, or why its file is refused, in their order.
 
         Raises MachineError where the process cannot be started, or was killed from outside.
@@ -67,15 +69,12 @@ class Reader:
     def close(self) -> None:
         """Ends the process."""
         process, self._process = self._process, None
-        if process is not None:
-            assert process.stdin is not None and process.stdout is not None
-            with suppress(OSError):
-                process.stdin.close()
-            process.stdout.close()
+        if process is not None and self._socket is not None:
+            self._socket.close()
             process.kill()
             process.wait()
 
-    def _exchange(self, request: Request) -> list[bytes | MeshError]:
+    def _exchange(self, request: Request) -> list[memoryview | MeshError]:
         """Answers up to the task in which the child ended; `last` says how."""
         data = encode_request(request)
         with self._lock:
@@ -86,42 +85,36 @@ class Reader:
                     self.close()
         raise MachineError("the process that reads meshes ends at once: see the lines above, and `verso doctor`")
 
-    def _try(self, data: bytes) -> list[bytes | MeshError]:
-        process = self._process or self._start()
-        assert process.stdin is not None and process.stdout is not None
-        send(process.stdin.fileno(), data)
-        head = receive(process.stdout.fileno())
-        body = None if head is None else receive(process.stdout.fileno())
-        if head is None or body is None:
+    def _try(self, data: bytes) -> list[memoryview | MeshError]:
+        if self._process is None or self._socket is None:
+            self._start()
+        assert self._socket is not None
+        send(self._socket, data)
+        head, files, _, _ = socket.recv_fds(self._socket, 4096, 1)
+        if not files:
             raise BrokenPipeError
-        tree = json.loads(head)
+        with open(files[0], "rb") as answers:
+            tree, size = json.loads(head), os.fstat(answers.fileno()).st_size
+            body = memoryview(mmap.mmap(answers.fileno(), size, access=mmap.ACCESS_READ) if size else b"")
         self.last = Usage(tree["exit"], tree["cpu_s"], tree["rss_kb"])
         if self.last.exit in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP):
             raise MachineError("a process that reads meshes was killed from outside, perhaps for want of memory")
-        return [_open_answer(answer) for answer in _split(body)]
+        return [_open_answer(kind, blocks) for kind, blocks in read_answers(body)]
 
-    def _start(self) -> subprocess.Popen[bytes]:
+    def _start(self) -> None:
         script = Path(__file__).with_name("reader_process.py")
         command = [sys.executable, "-P", str(script), str(ROOT)]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        return self._process
+        self._socket, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(command, stdin=theirs.fileno(), stdout=subprocess.DEVNULL)
 
 
-def _split(body: bytes) -> Iterator[bytes]:
-    """The whole frames; one that a child did not finish is left out."""
-    at = 0
-    while at + LENGTH <= len(body):
-        start, at = at + LENGTH, at + LENGTH + int.from_bytes(body[at : at + LENGTH], "little")
-        if at <= len(body):
-            yield body[start:at]
-
-
-def _open_answer(answer: bytes) -> bytes | MeshError:
-    if answer[:1] == ANSWER:
-        return answer[1:]
-    reason, detail, kind = json.loads(answer[1:])
+def _open_answer(kind: bytes, blocks: memoryview) -> memoryview | MeshError:
+    if kind == ANSWER:
+        return blocks
+    reason, detail, kind_of_failure = json.loads(bytes(blocks).rstrip(b"\0"))
     error = MeshError(reason, detail)
-    error.kind = kind
+    error.kind = kind_of_failure
     return error
 
 
@@ -137,7 +130,7 @@ def _describe_end(used: Usage, path: Path, limits: MeshLimits) -> MeshError:
     return MeshError("unreadable", f"{path} crashes the process that reads it ({how})")
 
 
-def ask_all(request: Request, watch: Watch) -> Iterator[tuple[Task, bytes | MeshError]]:
+def ask_all(request: Request, watch: Watch) -> Iterator[tuple[Task, memoryview | MeshError]]:
     """Every task, all of one kind, with its answer, in their order, by as many processes as are worth it."""
     tasks = request.tasks
     if not tasks:
@@ -150,7 +143,7 @@ def ask_all(request: Request, watch: Watch) -> Iterator[tuple[Task, bytes | Mesh
     for reader in readers:
         free.put(reader)
 
-    def ask(batch: Request) -> list[tuple[Task, bytes | MeshError]]:
+    def ask(batch: Request) -> list[tuple[Task, memoryview | MeshError]]:
         reader = free.get()
         try:
             return list(zip(batch.tasks, reader.ask(batch), strict=True))

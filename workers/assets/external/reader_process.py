@@ -1,8 +1,8 @@
 """The process that reads files from outside: a server that forks a child with limits for every batch of files.
 
-A script, started by `workers.assets.external.reader`, which speaks to it through pipes: a request in, a header and the
-answers out, each preceded by its length in eight bytes. The child writes its answers into a file in memory, so that those
-before the one in which it ended are kept. It ends by itself where nothing is asked for `IDLE_S`.
+A script, started by `workers.assets.external.reader`, which speaks to it through a socket: a request in, preceded by its
+length; out, how the child ended and a file in memory. The child has written its answers into that file, so that those
+before the one in which it ended are kept, and nothing large is copied. Ends by itself where nothing is asked for `IDLE_S`.
 """
 
 import ctypes
@@ -13,9 +13,10 @@ import os
 import resource
 import select
 import signal
+import socket
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from math import ceil
@@ -27,7 +28,11 @@ NO_MEMORY = 12
 IDLE_S = 300
 """After this long without a request the process ends; the next request starts another."""
 
-LENGTH = 8
+ALIGNMENT = 16
+"""Bytes to which the blocks of an answer are aligned."""
+
+Answer = tuple[bytes, Sequence[bytes | memoryview]]
+"""One letter that says what kind of answer it is, and its blocks of bytes."""
 
 PR_SET_PDEATHSIG = 1
 """The option of prctl(2) by which a child ends with its parent."""
@@ -44,22 +49,23 @@ def main(root: str) -> None:
     """Serves until its input ends. `root` is the folder that holds the project's packages."""
     sys.path.insert(0, root)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the worker that asks decides when to stop
+    from PIL import Image
+
     from workers.assets.external.reader_tasks import answer_task, open_request
 
-    out = os.dup(1)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    Image.preinit()
     gc.collect()
     gc.freeze()  # a child's collector would copy every page of what was imported
-    with suppress(BrokenPipeError):
-        while select.select([0], [], [], IDLE_S)[0] and (data := receive(0)) is not None:
+    with suppress(BrokenPipeError, ConnectionResetError), socket.socket(fileno=0) as asker:
+        while select.select([asker], [], [], IDLE_S)[0] and (data := receive(asker)) is not None:
             tree = json.loads(data)
             request = open_request(tree)
-            work = partial(_work, Limits(tree["memory_mb"], tree["cpu_s"]), partial(answer_task, request), out)
-            _serve(work, len(request.tasks), out)
+            work = partial(_work, Limits(tree["memory_mb"], tree["cpu_s"]), partial(answer_task, request), asker)
+            _serve(work, len(request.tasks), asker)
 
 
-def _serve(work: Callable[[int, int], NoReturn], count: int, out: int) -> None:
-    """Sends how a child that does the work ended, what it used, and its answers."""
+def _serve(work: Callable[[int, int], NoReturn], count: int, asker: socket.socket) -> None:
+    """Sends how a child that does the work ended, what it used, and the file with its answers."""
     with open(os.memfd_create("answers"), "rb") as answers:
         sink = answers.fileno()
         child = os.fork()
@@ -71,29 +77,24 @@ def _serve(work: Callable[[int, int], NoReturn], count: int, out: int) -> None:
             "cpu_s": used.ru_utime + used.ru_stime,
             "rss_kb": used.ru_maxrss,
         }
-        send(out, json.dumps(head).encode())
-        size = os.fstat(sink).st_size
-        os.write(out, size.to_bytes(LENGTH, "little"))
-        at = 0
-        while at < size:
-            at += os.sendfile(out, sink, at, size - at)
+        socket.send_fds(asker, [json.dumps(head).encode()], [sink])
 
 
-def _work(limits: Limits, answer: Callable[[int], bytes], out: int, count: int, sink: int) -> NoReturn:
+def _work(limits: Limits, answer: Callable[[int], Answer], asker: socket.socket, count: int, sink: int) -> NoReturn:
     """In the child: answers every task under the limits, and exits."""
     code = 1
     try:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        os.dup2(1, 2)
-        os.close(0)
-        os.close(out)
+        for standard in (1, 2):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), standard)
+        asker.close()
         for limit in (resource.RLIMIT_AS, resource.RLIMIT_FSIZE):
             resource.setrlimit(limit, (limits.memory_mb << 20, limits.memory_mb << 20))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         for number in range(count):
             # Processor time, so that the verdict is the same on a busy machine; for each task alone, not for the batch.
             resource.setrlimit(resource.RLIMIT_CPU, (ceil(time.process_time() + limits.cpu_s), resource.RLIM_INFINITY))
-            send(sink, answer(number))
+            write_answer(sink, answer(number))
         code = 0
     except MemoryError:
         code = NO_MEMORY
@@ -103,29 +104,40 @@ def _work(limits: Limits, answer: Callable[[int], bytes], out: int, count: int, 
         os._exit(code)
 
 
-def send(to: int, data: bytes) -> None:
-    """Writes a length and the bytes."""
-    os.write(to, len(data).to_bytes(LENGTH, "little"))
-    view = memoryview(data)
-    while view:
-        view = view[os.write(to, view) :]
+def write_answer(sink: int, answer: Answer) -> None:
+    """Appends an answer: its length and kind, and its blocks, each aligned to `ALIGNMENT`."""
+    kind, blocks = answer
+    lengths = [len(block) + -len(block) % ALIGNMENT for block in blocks]
+    head = sum(lengths).to_bytes(8, "little") + kind.ljust(ALIGNMENT - 8)
+    for block, length in ((head, ALIGNMENT), *zip(blocks, lengths, strict=True)):
+        for data in (memoryview(block), memoryview(bytes(length - len(block)))):
+            while data:
+                data = data[os.write(sink, data) :]
 
 
-def receive(source: int) -> bytes | None:
-    """What `send` wrote; None where the other side is gone."""
-    head = _read(source, LENGTH)
-    return None if head is None else _read(source, int.from_bytes(head, "little"))
+def read_answers(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
+    """Kind and blocks of each answer that `write_answer` wrote whole."""
+    at = 0
+    while at + ALIGNMENT <= len(data):
+        start, stop = at + ALIGNMENT, at + ALIGNMENT + int.from_bytes(data[at : at + 8], "little")
+        if stop <= len(data):
+            yield bytes(data[at + 8 : start]).rstrip(), data[start:stop]
+        at = stop
 
 
-def _read(source: int, count: int) -> bytes | None:
-    blocks = []
-    while count:
-        block = os.read(source, min(count, 1 << 24))
-        if not block:
-            return None
-        blocks.append(block)
-        count -= len(block)
-    return b"".join(blocks)
+def send(to: socket.socket, data: bytes) -> None:
+    """Sends a length and the bytes."""
+    to.sendall(len(data).to_bytes(8, "little") + data)
+
+
+def receive(source: socket.socket) -> bytes | None:
+    """What `send` sent; None where the other side is gone."""
+    head = source.recv(8, socket.MSG_WAITALL)
+    if len(head) < 8:
+        return None
+    size = int.from_bytes(head, "little")
+    data = source.recv(size, socket.MSG_WAITALL)
+    return data if len(data) == size else None
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import errno
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,10 +18,11 @@ from workers.assets.external.asset_bytes import pack_asset
 from workers.assets.external.caps import describe_error, one_line
 from workers.assets.external.listing import Entry, SourceFile, hash_files, list_files
 from workers.assets.external.placement import load_entry
+from workers.assets.external.reader_process import Answer
 from workers.geometry.hull import convex_hull
 
 ANSWER, REFUSAL = b"+", b"-"
-"""The first byte of an answer."""
+"""The kinds of answers."""
 
 _SETTINGS: TypeAdapter[ShapeNetSource | FolderSource] = TypeAdapter(ShapeNetSource | FolderSource)
 
@@ -74,11 +76,11 @@ def open_request(tree: dict[str, Any]) -> Request:
     return Request(settings, Path(tree["folder"]), Assets.model_validate(tree["assets"]), tuple(tasks))
 
 
-def answer_task(request: Request, number: int) -> bytes:
+def answer_task(request: Request, number: int) -> Answer:
     """`ANSWER` with what was asked for, or `REFUSAL` with reason, detail and kind as JSON. Raises MemoryError alone."""
     task = request.tasks[number]
     try:
-        return ANSWER + _answer(request, task)
+        return ANSWER, _answer(request, task)
     except MeshError as error:
         return _refusal(error, task.path)
     except MemoryError:
@@ -91,24 +93,24 @@ def answer_task(request: Request, number: int) -> bytes:
         return _refusal(MeshError("unreadable", f"{task.path} cannot be read: {describe_error(error)}"), task.path)
 
 
-def _refusal(error: MeshError, path: Path) -> bytes:
+def _refusal(error: MeshError, path: Path) -> Answer:
     """The refusal, which names the file."""
     detail = error.detail if path.name in error.detail else f"{path}: {error.detail}"
-    return REFUSAL + json.dumps([error.reason, one_line(detail), error.kind]).encode()
+    return REFUSAL, [json.dumps([error.reason, one_line(detail), error.kind]).encode()]
 
 
-def _answer(request: Request, task: Task) -> bytes:
+def _answer(request: Request, task: Task) -> Sequence[bytes | memoryview]:
     if task.kind == "list":
         files = hash_files(
             list_files(request.settings, request.folder, task.path, request.assets.limits), request.folder
         )
-        return json.dumps([[file.path, file.size, file.sha256] for file in files]).encode()
+        return [json.dumps([[file.path, file.size, file.sha256] for file in files]).encode()]
     assert task.entry is not None
     asset = load_entry(request.settings, request.folder, task.entry, task.category, request.assets)
     if task.kind == "load":
         return pack_asset(asset)
     check_fit(asset, task.path)
-    return b""
+    return []
 
 
 def check_fit(asset: Asset, path: Path) -> None:

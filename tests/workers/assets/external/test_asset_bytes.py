@@ -9,6 +9,7 @@ from schemas.base import frozen_array
 from schemas.errors import MeshError
 from schemas.scene.shape import Asset, MassProperties, Material, Part, Shape
 from workers.assets.external.asset_bytes import pack_asset, unpack_asset
+from workers.assets.external.reader_process import ALIGNMENT
 
 PICTURE = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
 VERTICES = np.asfortranarray(np.random.default_rng(0).random((4, 3)))
@@ -18,6 +19,11 @@ def part(texture=None, **more):
     faces = frozen_array([[0, 1, 2], [0, 2, 3]], np.int32)
     material = Material((0.1, 1 / 3, 0.3, 1.0), 0.2, 0.7, texture)
     return Part("a", frozen_array(VERTICES), faces, material, **more)
+
+
+def packed(sent):
+    """The blocks as they arrive: each aligned, in one."""
+    return memoryview(b"".join(bytes(block) + bytes(-len(block) % ALIGNMENT) for block in pack_asset(sent)))
 
 
 def asset():
@@ -31,7 +37,7 @@ def asset():
 
 def test_an_asset_comes_back_bit_by_bit_in_its_memory_order_with_its_shared_texture():
     sent = asset()
-    back = unpack_asset(pack_asset(sent))
+    back = unpack_asset(packed(sent))
     assert (back.mass.mass_kg, back.scale, back.notes, back.shape.closed) == (0.1 + 0.2, 1 / 3, ("a note",), True)
     assert back.mass.inertia.tobytes() == sent.mass.inertia.tobytes()
     one, two, three = back.shape.parts
@@ -44,8 +50,10 @@ def test_an_asset_comes_back_bit_by_bit_in_its_memory_order_with_its_shared_text
 
 
 def changed(**change):
-    head, _, rest = pack_asset(asset()).partition(b"\n")
-    return json.dumps(json.loads(head) | change).encode() + b"\n" + rest
+    _, text, *rest = pack_asset(asset())
+    text = json.dumps(json.loads(text) | change).encode()
+    blocks = [len(text).to_bytes(ALIGNMENT, "little"), text, *rest]
+    return memoryview(b"".join(bytes(block) + bytes(-len(block) % ALIGNMENT) for block in blocks))
 
 
 NAMED_TWICE = [["float64", [4, 3], "C"], ["int32", [2, 3], "C"]]
@@ -54,9 +62,9 @@ NAMED_TWICE = [["float64", [4, 3], "C"], ["int32", [2, 3], "C"]]
 @pytest.mark.parametrize(
     "data",
     [
-        b"",
-        b"{}\n",
-        pack_asset(asset())[:-20],
+        memoryview(b""),
+        memoryview(bytes(64)),
+        packed(asset())[:-20],
         changed(parts=[{"name": "a"}]),
         changed(arrays=[["object", [1], "C"]]),
         changed(arrays=[["float64", [1 << 60], "C"]]),
@@ -76,4 +84,4 @@ def test_arrays_are_checked_again(harm):
     values.setflags(write=True)
     values[0, 0] = np.nan if harm == "nan" else 9
     with pytest.raises(MeshError, match="makes no sense"):
-        unpack_asset(pack_asset(bad))
+        unpack_asset(packed(bad))

@@ -4,43 +4,44 @@ import ctypes
 import errno
 import faulthandler
 import json
-import os
 import resource
 import signal
-import threading
+import socket
 import time
-from functools import partial
 
 import pytest
 
-from workers.assets.external.reader_process import LENGTH, NO_MEMORY, Limits, _serve, _work, receive, send
+from workers.assets.external.reader_process import (
+    NO_MEMORY,
+    Limits,
+    _serve,
+    _work,
+    read_answers,
+    receive,
+    send,
+    write_answer,
+)
 
 
 def serve(answer, count=1, memory_mb=4096, cpu_s=20.0):
     """How a child that answers `count` tasks ended, and its answers."""
-    source, out = os.pipe()
-    made = {}
+    asked, asker = socket.socketpair()
+    with asked, asker:
 
-    def listen():
-        made["head"], body = json.loads(receive(source)), receive(source)
-        made["answers"] = []
-        while body:
-            size = int.from_bytes(body[:LENGTH], "little")
-            made["answers"].append(body[LENGTH : LENGTH + size])
-            body = body[LENGTH + size :]
+        def work(*given):
+            asked.close()
+            _work(Limits(memory_mb, cpu_s), lambda number: (b"+", [answer(number)]), asker, *given)
 
-    listener = threading.Thread(target=listen)
-    listener.start()
-    _serve(partial(_work, Limits(memory_mb, cpu_s), answer, out), count, out)
-    listener.join()
-    os.close(source)
-    os.close(out)
-    return made["head"], made["answers"]
+        _serve(work, count, asker)
+        head, files, _, _ = socket.recv_fds(asked, 4096, 1)
+    with open(files[0], "rb") as answers:
+        answers.seek(0)
+        return json.loads(head), [bytes(blocks).rstrip(b"\0") for _, blocks in read_answers(memoryview(answers.read()))]
 
 
 def test_answers_come_back_in_their_order_with_what_they_cost():
-    head, answers = serve(lambda number: bytes([number]) * 3, count=3)
-    assert (head["exit"], answers) == (0, [b"\0\0\0", b"\1\1\1", b"\2\2\2"])
+    head, answers = serve(lambda number: b"abc"[number : number + 1] * 3, count=3)
+    assert (head["exit"], answers) == (0, [b"aaa", b"bbb", b"ccc"])
     assert head["cpu_s"] < 5 and head["rss_kb"] > 1000
 
 
@@ -76,7 +77,7 @@ def test_memory_ends_a_task():
 def test_answers_may_not_grow_without_bounds():
     def answer(number):
         resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
-        return bytes(600 << 10)
+        return b"a" * (600 << 10)
 
     head, answers = serve(answer, count=3)
     assert head["exit"] == NO_MEMORY and [len(one) for one in answers[:1]] == [600 << 10]
@@ -113,9 +114,22 @@ def test_errors_of_the_system_tell_memory_from_others(number, code):
 
 
 def test_a_message_is_read_whole_or_not_at_all():
-    source, to = os.pipe()
-    send(to, b"abc")
-    os.write(to, b"\0\0")
-    os.close(to)
-    assert (receive(source), receive(source)) == (b"abc", None)
-    os.close(source)
+    source, to = socket.socketpair()
+    with source, to:
+        send(to, b"abc")
+        to.sendall(b"\5" + bytes(7) + b"ab")
+        to.shutdown(socket.SHUT_WR)
+        assert (receive(source), receive(source), receive(source)) == (b"abc", None, None)
+
+
+@pytest.mark.parametrize("cut", [0, 1, 16, 17, 60])
+def test_blocks_are_aligned_and_an_answer_that_was_not_finished_is_left_out(tmp_path, cut):
+    path = tmp_path / "answers"
+    with path.open("wb") as file:
+        for _ in range(2):
+            write_answer(file.fileno(), (b"-", [b"abc", memoryview(b"0123456789abcdefg")]))
+    data = path.read_bytes()
+    assert len(data) == 2 * (16 + 16 + 32)
+    whole = b"abc".ljust(16, b"\0") + b"0123456789abcdefg".ljust(32, b"\0")
+    found = [(kind, bytes(blocks)) for kind, blocks in read_answers(memoryview(data[: len(data) - cut]))]
+    assert found == [(b"-", whole)] * (1 if cut else 2)

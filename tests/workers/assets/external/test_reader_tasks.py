@@ -34,7 +34,8 @@ def test_a_request_comes_back_as_it_was(tmp_path, settings):
 def answer(folder, text, kind="check", name="a.obj", category="mug"):
     path = write(folder / name, text)
     entry = Entry("id", hash_files([path], folder), "MIT")
-    return answer_task(Request(SETTINGS, folder, Assets(), (Task(kind, path, category, entry),)), 0)
+    letter, blocks = answer_task(Request(SETTINGS, folder, Assets(), (Task(kind, path, category, entry),)), 0)
+    return letter + b"".join(blocks)
 
 
 def test_a_file_is_listed_with_its_digest(tmp_path):

@@ -38,15 +38,21 @@ def box() -> trimesh.Trimesh:
     return trimesh.creation.box((0.1, 0.2, 0.3))
 
 
+def exported(kind: str, **more: str) -> bytes:
+    data = box().export(file_type=kind, **more)
+    assert isinstance(data, bytes | str)
+    return data.encode() if isinstance(data, str) else data
+
+
 def textured_ply() -> bytes:
-    text = box().export(file_type="ply", encoding="ascii")
-    assert isinstance(text, bytes)
-    return text.replace(b"element vertex", b"comment TextureFile skin.png\nelement vertex", 1)
+    return exported("ply", encoding="ascii").replace(
+        b"element vertex", b"comment TextureFile skin.png\nelement vertex", 1
+    )
 
 
 def coloured_ply() -> bytes:
-    mesh = box()
-    mesh.visual.vertex_colors = np.random.default_rng(1).integers(0, 255, (8, 4), dtype=np.uint8)
+    colors = np.random.default_rng(1).integers(0, 255, (8, 4), dtype=np.uint8)
+    mesh = trimesh.Trimesh(box().vertices, box().faces, vertex_colors=colors, process=False)
     data = mesh.export(file_type="ply")
     assert isinstance(data, bytes)
     return data
@@ -88,8 +94,8 @@ SEEDS: Mapping[str, Files] = {
     "obj_jpg": {"a.obj": textured_obj("skin.jpg"), "skin.mtl": material("skin.jpg"), "skin.jpg": picture("JPEG")},
     "ply": {"a.ply": textured_ply(), **_SKIN},
     "ply_binary": {"a.ply": coloured_ply()},
-    "stl": {"a.stl": box().export(file_type="stl")},
-    "stl_ascii": {"a.stl": box().export(file_type="stl_ascii").encode()},
+    "stl": {"a.stl": exported("stl")},
+    "stl_ascii": {"a.stl": exported("stl_ascii")},
     "glb": {"a.glb": textured_glb()},
     "urdf": {
         "a.urdf": URDF,

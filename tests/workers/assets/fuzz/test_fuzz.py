@@ -44,7 +44,8 @@ def read(reader: Reader, folder: Path, files: dict[str, bytes], what: str) -> tu
     for name, data in files.items():
         write(folder / name, data)
     path, begun, rss = folder / next(iter(files)), time.monotonic(), 0
-    entry, answer = None, b""
+    entry: Entry | None = None
+    answer: memoryview | MeshError = memoryview(b"")
     for kind in ("list", "check", "load"):
         request = Request(SETTINGS, folder, Assets(), (Task(kind, path, "mug", entry),))
         (answer,) = reader.ask(request)
@@ -53,8 +54,9 @@ def read(reader: Reader, folder: Path, files: dict[str, bytes], what: str) -> tu
             check_refusal(answer, folder, what)
             return Trial(what, answer.reason, time.monotonic() - begun, rss), None
         if kind == "list":
-            entry = Entry("a", tuple(SourceFile(*file) for file in json.loads(answer)), "MIT")
+            entry = Entry("a", tuple(SourceFile(*file) for file in json.loads(bytes(answer).rstrip(b"\0"))), "MIT")
             assert all((folder / file.path).resolve().is_relative_to(folder.resolve()) for file in entry.files), what
+    assert isinstance(answer, memoryview)
     asset = unpack_asset(answer)
     check_asset(asset, what)
     return Trial(what, "read", time.monotonic() - begun, rss), asset
