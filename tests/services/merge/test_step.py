@@ -9,7 +9,6 @@ from schemas.errors import CommitConflict, CorruptError, RunError
 from services.merge.step import merge, read_success
 from tests.made_up_datasets import FIRST, STOP, dataset_at
 from tests.made_up_scenes import attempt_at, made_scene, terms, with_shapes
-from workers.store.attempt import reopen
 from workers.store.local import LocalStore
 
 pytestmark = pytest.mark.usefixtures("unflushed")
