@@ -1,18 +1,14 @@
 """A merge in progress: takes committed ranges in order, and writes the merged files into a folder."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 
-import pyarrow as pa
-
-from schemas.dataset.commit import CommitRecord, FileEntry
 from schemas.dataset.layout import is_shape
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMA_VERSION, TABLES
 from services.merge.install import file_entry
 from services.merge.poses import PoseFiles
-from services.merge.reading import Block, Joining, RangeRead
+from services.merge.reading import Block
 from services.merge.shared import SharedRows
 from services.merge.tables import MergedTable
 from workers.store.canonical import dataset_digest
@@ -22,7 +18,6 @@ class Merging:
     """Takes every range in turn; keeps files below `folder`, which must be empty."""
 
     def __init__(self, folder: Path) -> None:
-        self._joining = Joining()
         self._tables = {table: MergedTable(table, folder) for table in TABLES}
         self._poses = PoseFiles(folder)
         self._shared = SharedRows(folder)
@@ -42,21 +37,12 @@ class Merging:
                 self._tables[table].add(rows[table])
         self._scenes.update(made=rows["scenes"].num_rows, **Counter(rows["failures"].column("kind").to_pylist()))
 
-    def add_range(
-        self, records: Sequence[CommitRecord], files: Sequence[FileEntry], rows: Mapping[str, pa.Table]
-    ) -> None:
-        """Takes the next range by itself: its records, their files, and the rows of each table. Raises as `add`."""
-        for block in self._joining.add(RangeRead(records, [files, *([] for _ in records[1:])], rows)):
-            self.add(block)
-
     def close(self) -> None:
         """Closes what is open, finished or not."""
         self._shared.close()
 
     def finish(self) -> tuple[dict, dict[str, Path]]:
         """The contents of `_SUCCESS`, and the finished files by key."""
-        for block in self._joining.finish():
-            self.add(block)
         mixed = len(self._fingerprints) > 1
         for rows in self._shared.assets(mixed):
             self._tables["assets"].add(rows)

@@ -44,7 +44,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class RangeRead:
+class _RangeRead:
     """A range as it was read: the files of each record, and the tables that have rows, as Parquet bytes or decoded."""
 
     records: Range
@@ -63,34 +63,19 @@ def read_blocks(store: Store, first_scene: int, stop_scene: int) -> Iterator[Blo
     Raises as `iter_ranges`, and CorruptError naming a table that is missing or altered, or a range that does not hold
     each of its scenes once.
     """
-    joining = Joining()
     with ThreadPoolExecutor(AT_ONCE) as pool:
         spread: Spread = functools.partial(map_ahead, pool) if store.root is None else map
         ranges = iter_ranges(store, first_scene, stop_scene, spread)
+        block: list[_RangeRead] = []
+        rows = 0
         for read in spread(lambda records: _read_range(store, records), ranges):
-            yield from joining.add(read)
-    yield from joining.finish()
-
-
-class Joining:
-    """Takes ranges one by one and gives them back in blocks. Raises CorruptError where one does not hold each scene once."""
-
-    def __init__(self) -> None:
-        self._reads: list[RangeRead] = []
-        self._rows = 0
-
-    def add(self, read: RangeRead) -> Iterator[Block]:
-        """Takes the next range; gives the block that is full with it."""
-        self._reads.append(read)
-        self._rows += read.rows
-        if len(self._reads) >= RANGES_PER_BLOCK or self._rows >= ROWS_PER_BLOCK:
-            yield from self.finish()
-
-    def finish(self) -> Iterator[Block]:
-        """Gives the ranges that are left."""
-        reads, self._reads, self._rows = self._reads, [], 0
-        if reads:
-            yield _joined(reads)
+            block.append(read)
+            rows += read.rows
+            if len(block) >= RANGES_PER_BLOCK or rows >= ROWS_PER_BLOCK:
+                yield _joined(block)
+                block, rows = [], 0
+        if block:
+            yield _joined(block)
 
 
 def map_ahead(
@@ -110,13 +95,13 @@ def map_ahead(
             future.cancel()
 
 
-def _read_range(store: Store, records: Range) -> RangeRead:
+def _read_range(store: Store, records: Range) -> _RangeRead:
     if len(records) > 1:
         files = [committed_files(store, record) for record in records]
-        return RangeRead(records, files, {table: range_rows(store, records, table) for table in TABLES})
+        return _RangeRead(records, files, {table: range_rows(store, records, table) for table in TABLES})
     (record,) = records
     tables = {table: _read_table(store, record, table) for table in TABLES if record.tables[table].rows}
-    return RangeRead(records, [record.files], tables)
+    return _RangeRead(records, [record.files], tables)
 
 
 def _read_table(store: Store, record: CommitRecord, table: str) -> bytes:
@@ -134,7 +119,7 @@ def _read_table(store: Store, record: CommitRecord, table: str) -> bytes:
     return data
 
 
-def _joined(block: Sequence[RangeRead]) -> Block:
+def _joined(block: Sequence[_RangeRead]) -> Block:
     """The block's rows, table by table. Raises CorruptError where a range does not hold each scene once."""
     ranges = [read.records for read in block]
     files = [
@@ -165,7 +150,7 @@ def _check_scenes(spans: Sequence[Span], rows: Mapping[str, pa.Table]) -> None:
         raise _not_each_once(next(span.start for span in reversed(spans) if span.start <= wrong[0]))
 
 
-def _decoded(read: RangeRead, table: str) -> pa.Table:
+def _decoded(read: _RangeRead, table: str) -> pa.Table:
     """A range's rows in the schema that they were written in. Raises CorruptError where there are more or fewer."""
     data = read.tables[table]
     if isinstance(data, pa.Table):

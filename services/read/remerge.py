@@ -7,8 +7,8 @@ import pyarrow as pa
 
 from schemas.dataset.layout import pose_of_image
 from schemas.dataset.tables import TABLES
+from services.merge.merging import Merging
 from services.merge.reading import RANGES_PER_BLOCK, ROWS_PER_BLOCK, Block
-from services.merge.step import Merging
 from services.read.verify_range import ReadRange
 
 

@@ -12,13 +12,9 @@ import pytest
 
 from schemas.dataset.layout import STAGING
 from schemas.errors import MachineError
-from services.merge.merging import Merging
-from services.merge.reading import read_blocks
 from services.merge.step import merge
 from tests.disk_faults import disk
 from tests.made_up_datasets import FIRST, STOP, dataset_at
-from workers.store.committed_rows import iter_ranges, range_rows
-from workers.store.local import LocalStore
 
 pytestmark = pytest.mark.usefixtures("unflushed")
 
@@ -112,21 +108,3 @@ def test_a_disk_that_is_full_says_so_and_the_merge_can_be_done_when_it_has_room(
     assert all(told[:4])
     assert not told[-1]
     assert merge(store, FIRST, STOP) == merged[1]
-
-
-def test_ranges_given_one_by_one_merge_like_blocks(merged, tmp_path):
-    store = dataset_at(tmp_path)
-    successes = []
-    for one_by_one in (False, True):
-        with LocalStore(tmp_path).scratch("merge") as folder, contextlib.closing(Merging(folder)) as merging:
-            if one_by_one:
-                for records in iter_ranges(store, FIRST, STOP):
-                    files = [entry for record in records for entry in record.files]
-                    tables = ("scenes", "views", "objects", "assets", "failures", "timings")
-                    merging.add_range(records, files, {table: range_rows(store, records, table) for table in tables})
-            else:
-                for block in read_blocks(store, FIRST, STOP):
-                    merging.add(block)
-            successes.append(merging.finish()[0])
-    assert successes[0]["tables"] == successes[1]["tables"]
-    assert successes[0]["digest"] == merged[1].digest

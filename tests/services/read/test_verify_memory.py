@@ -12,11 +12,11 @@ from tests import many_ranges
 VERIFY = """
 import json, sys
 from pathlib import Path
-from services.merge import shared, tables
+from services.merge import scratch, tables
 from services.read import path_index
 from services.read.verify import verify
 from workers.store.local import LocalStore
-path_index.CACHE_KIB = shared.CACHE_KIB = int(sys.argv[2])
+path_index.CACHE_KIB = scratch.CACHE_KIB = int(sys.argv[2])
 tables.ROWS_PER_GROUP = int(sys.argv[3])
 found = verify(LocalStore(sys.argv[1]), lambda now: None)
 (peak,) = [line.split()[1] for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")]
