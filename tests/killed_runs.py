@@ -117,6 +117,13 @@ def interrupt(pid: int, terminal: int) -> None:
     os.write(terminal, b"\x03")
 
 
+def chain_of(pid: int) -> list[int]:
+    """Process ids of a supervised command at work: its own, its keeper's, its driver's (the one with children)."""
+    below = descendants(pid)
+    parents = {process.parent for process in below}
+    return [pid, below[0].pid, *(one.pid for one in below if one.parent == below[0].pid and one.pid in parents)]
+
+
 def kill_processes(title: str, number: int) -> Callable[[int, int], None]:
     """Sends a signal to those below the run whose command line begins with, or whose program ends in, `title`."""
 

@@ -6,7 +6,7 @@ import os
 import signal
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,14 +56,17 @@ def read_process(pid: int) -> Process | None:
 
 
 def descendants(pid: int) -> list[Process]:
-    """Children of a process, their children and so on, parents first; those that have ended are left out."""
+    """Children of a process, their children and so on; those that have ended are left out.
+
+    Parents first, and of one generation's the older first.
+    """
     children: defaultdict[int, list[Process]] = defaultdict(list)
     for entry in os.listdir("/proc"):
         if entry.isdigit() and (process := read_process(int(entry))) is not None:
             children[process.parent].append(process)
     found, level = [], children[pid]
     while level:
-        found += level
+        found += sorted(level, key=lambda process: int(process.born))
         level = [child for process in level for child in children[process.pid]]
     return [process for process in found if not process.ended]
 
@@ -76,14 +79,29 @@ def send(process: Process, number: int) -> None:
             signal.pidfd_send_signal(descriptor, number)
 
 
+def marked(mark: str) -> list[Process]:
+    """Processes whose environment, as they were started, has the line `mark`; without this one."""
+    found = []
+    for entry in os.listdir("/proc"):
+        with contextlib.suppress(OSError):
+            if entry.isdigit() and mark.encode() in Path(f"/proc/{entry}/environ").read_bytes().split(b"\0"):
+                found.append(read_process(int(entry)))
+    return [process for process in found if process and not process.ended and process.pid != os.getpid()]
+
+
 def end_descendants() -> list[Process]:
-    """Ends everything that descends from this process: SIGTERM, then SIGKILL. Returns what even that did not end.
+    """Ends everything that descends from this process, as `end_all`.
 
     For a child subreaper alone, whose descendants cannot leave it.
     """
+    return end_all(lambda: descendants(os.getpid()))
+
+
+def end_all(find: Callable[[], list[Process]]) -> list[Process]:
+    """Ends what `find` finds, until it finds nothing more: SIGTERM, then SIGKILL. Returns what even that did not end."""
     for number, patience_s in ((signal.SIGTERM, GRACE_S), (signal.SIGKILL, KILL_S)):
         deadline, told = time.monotonic() + patience_s, set[tuple[int, str]]()
-        while left := descendants(os.getpid()):
+        while left := find():
             for process in left:
                 if (process.pid, process.born) not in told:
                     told.add((process.pid, process.born))

@@ -2,7 +2,8 @@
 
 Three processes: the one that the user started, a keeper, and the command. The keeper and the command have sessions of
 their own, so that a terminal's Ctrl-C reaches the first one alone, and Ray's processes never. The first two do the same:
-they wait, pass signals on, and end all that descends from them; so either may be killed. Nothing heavy is loaded here.
+they wait, pass signals on, and end all that descends from them; so either may be killed. A fourth process sleeps until all
+three are gone, and then ends what carries the run's mark. Nothing heavy is loaded here.
 """
 
 import contextlib
@@ -12,6 +13,7 @@ import signal
 import sys
 import time
 import traceback
+import uuid
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -23,7 +25,9 @@ from services.run.processes import (
     adopt_orphans,
     descendants,
     die_with,
+    end_all,
     end_descendants,
+    marked,
     reap,
     send,
 )
@@ -36,6 +40,9 @@ LAST_WORDS = "driver.txt"
 """The file in OUT/_logs with what Ray said in the command's process, where that is anything."""
 
 _LAST_BYTES = 2**20
+
+MARK = "VERSO_RUN"
+"""The environment variable that all processes of one run have in common."""
 
 _listeners: list[int] = []
 """Pipes to the supervisors of this process; empty where it has none."""
@@ -51,7 +58,10 @@ def supervise(command: Callable[[], int], kept: str, quiet: bool = True) -> int:
     watched = {number for number in (*STOPS, signal.SIGTSTP, signal.SIGCONT) if _is_wanted(number)}
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, watched | {signal.SIGCHLD})
-    keeper = _Layer(frozenset(watched), kept, words, signal.SIGKILL, innermost=True)
+    mark = uuid.uuid4().hex
+    os.environ[MARK] = mark  # noqa: TID251 - what the command starts inherits it, and is known by it
+    last = os.pipe()
+    keeper = _Layer(frozenset(watched), kept, words, signal.SIGKILL, innermost=True, last=last)
     front = replace(keeper, dies_with_parent=signal.SIGTERM, innermost=False)
     return front.tend(lambda: keeper.tend(lambda: _drive(command, words, mask)))
 
@@ -81,6 +91,8 @@ class _Layer:
     dies_with_parent: signal.Signals
     """What its child gets when this process dies."""
     innermost: bool
+    last: tuple[int, int]
+    """The pipe whose end, when nobody can write to it any more, wakes the last process."""
 
     def tend(self, work: Callable[[], int]) -> int:
         """Runs `work` in a child; its exit code, in both processes."""
@@ -92,11 +104,13 @@ class _Layer:
         child = os.fork()
         if child == 0:
             os.close(ear)
-            _listeners.append(mouth)
+            _listeners[:] = [*_listeners, mouth] if _listeners else [self.last[1], mouth]
             os.setsid()
             die_with(me, self.dies_with_parent)
             return work()
         os.close(mouth)
+        if self.innermost:
+            _start_last(self.last)
         status, stopped_by = self._wait(child)
         end_descendants()
         facts = _read(ear)
@@ -149,6 +163,25 @@ class _Layer:
             os.kill(os.getpid(), signal.SIGSTOP)
 
 
+def _start_last(pipe: tuple[int, int]) -> None:
+    """Starts the process that outlives a kill of all others, and then ends what carries the run's mark."""
+    if os.fork():
+        return
+    os.setsid()
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for number in range(3):
+        os.dup2(nowhere, number)
+    for writer in {pipe[1], *_listeners}:
+        os.close(writer)
+    facts = _read(pipe[0], to_its_end=True)
+    line = f"{MARK}={os.environ[MARK]}"  # noqa: TID251 - set by `supervise`
+    end_all(lambda: marked(line))
+    if facts.folder is not None:
+        _remove(facts.folder)
+    os._exit(0)
+
+
 def _drive(command: Callable[[], int], words: int | None, mask: Collection[int]) -> int:
     """Runs the command in this process, and tells its exit code once everything is said."""
     if words is not None:
@@ -193,9 +226,9 @@ def _keep_last_words(words: int | None, logs: str | None) -> str:
     return f" ({path} has its last words)"
 
 
-def _read(pipe: int) -> Facts:
-    """What came through the pipe so far."""
-    os.set_blocking(pipe, False)
+def _read(pipe: int, to_its_end: bool = False) -> Facts:
+    """What came through the pipe so far, or until nobody can write to it any more."""
+    os.set_blocking(pipe, to_its_end)
     data = b""
     with contextlib.suppress(BlockingIOError):
         while part := os.read(pipe, 2**16):

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from services.run.processes import descendants
-from tests.killed_runs import EndedRun, disturb_at_first_commit, kill_processes
+from tests.killed_runs import EndedRun, chain_of, disturb_at_first_commit, kill_processes
 
 pytestmark = pytest.mark.ray
 
@@ -79,10 +78,10 @@ def test_a_signal_to_the_command_is_one_line(tmp_path, folder, number):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "words"),
-    [(signal.SIGKILL, "was killed (SIGKILL)"), (signal.SIGTERM, "SIG"), (signal.SIGABRT, "crashed")],
+    [(signal.SIGKILL, "was killed (SIGKILL)"), (signal.SIGTERM, "verso: "), (signal.SIGABRT, "crashed")],
 )
 def test_the_death_of_the_driver_is_one_line(tmp_path, folder, number, words):
-    run = disturbed(tmp_path, lambda pid, terminal: os.kill(descendants(pid)[1].pid, number))
+    run = disturbed(tmp_path, lambda pid, terminal: os.kill(chain_of(pid)[2], number))
     line = line_of(run)
     assert words in line
     assert KEPT in line
@@ -93,11 +92,10 @@ def test_the_death_of_the_driver_is_one_line(tmp_path, folder, number, words):
 @pytest.mark.parametrize("killed", [1, 2, 3])
 def test_what_remains_after_a_kill_of_the_command_its_keeper_and_its_driver_ends_by_itself(tmp_path, folder, killed):
     def kill(pid: int, terminal: int) -> None:
-        for target in [pid, *(process.pid for process in descendants(pid))][:killed]:
+        for target in chain_of(pid)[:killed]:
             os.kill(target, signal.SIGKILL)
 
     run = disturbed(tmp_path, kill, patience_s=30)
     assert run.code == -signal.SIGKILL
     assert run.left == []
-    if killed < 3:
-        assert list(folder.iterdir()) == []
+    assert list(folder.iterdir()) == []

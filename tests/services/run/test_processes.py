@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from services.run.processes import descendants, read_process, send
+from services.run.processes import descendants, marked, read_process, send
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -42,6 +42,16 @@ def test_orphans_in_other_sessions_stopped_and_stubborn_ones_are_ended(tmp_path)
     finally:
         outsider.kill()
         outsider.wait()
+
+
+def test_processes_are_known_by_a_line_of_their_environment():
+    child = subprocess.Popen(["sleep", "600"], env={"ONE": "run"})
+    try:
+        assert [process.pid for process in marked("ONE=run")] == [child.pid]
+        assert marked("ONE=ru") == marked("NE=run") == []
+    finally:
+        child.kill()
+        child.wait()
 
 
 def test_a_process_id_that_was_given_out_again_is_left_alone():

@@ -11,6 +11,7 @@ import pytest
 
 from services.run.processes import descendants
 from services.run.supervisor import LAST_WORDS
+from tests.killed_runs import chain_of
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -77,7 +78,7 @@ def test_a_signal_ends_the_command_and_all_that_it_started(number, words):
     assert run.stdout is not None
     run.stdout.readline()
     below = descendants(run.pid)
-    assert len(below) == 3  # the keeper, the command, and what it started
+    assert len(below) == 4  # the keeper, the command, the last process, and what the command started
     run.send_signal(number)
     assert end(run) == (1, "", words)
     assert not any(Path(f"/proc/{process.pid}").exists() for process in below)
@@ -93,14 +94,14 @@ def test_a_command_that_ignores_the_interrupt_is_killed_by_a_second_one():
     assert end(run) == (1, "", "verso: interrupted; all is kept\n")
 
 
-@pytest.mark.parametrize("killed", [(0,), (1,), (0, 2), (1, 2), (2,)])
+@pytest.mark.parametrize("killed", [(0,), (1,), (0, 2), (1, 2), (2,), (0, 1, 2)])
 def test_whichever_processes_are_killed_nothing_goes_on(killed):
     """0 is the process that the user started, 1 the keeper, 2 the command."""
     run = start(FOREVER)
     assert run.stdout is not None
     run.stdout.readline()
     below = descendants(run.pid)
-    pids = [run.pid, *(process.pid for process in below)]
+    pids = chain_of(run.pid)
     for number in killed:
         os.kill(pids[number], signal.SIGKILL)
     code, _, wrong = end(run)
@@ -112,12 +113,21 @@ def test_whichever_processes_are_killed_nothing_goes_on(killed):
         assert (code, wrong.count("verso: "), wrong.count("; all is kept")) == (1, 1, 1)
 
 
-def test_its_temporary_folder_goes_even_where_the_command_is_killed(tmp_path):
+@pytest.mark.parametrize("killed", [(2,), (0, 1, 2)])
+def test_its_temporary_folder_goes_whichever_processes_are_killed(tmp_path, killed):
     folder = tmp_path / "private"
     (folder / "below").mkdir(parents=True)
-    code, *_ = end(start(f"tell(folder={str(folder)!r}); os.kill(os.getpid(), 9)"))
-    assert code == 1
-    assert not folder.exists()
+    run = start(f"tell(folder={str(folder)!r}); " + FOREVER)
+    assert run.stdout is not None
+    run.stdout.readline()
+    pids = chain_of(run.pid)
+    for number in killed:
+        os.kill(pids[number], signal.SIGKILL)
+    end(run)
+    deadline = time.monotonic() + 15
+    while folder.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 def test_what_c_code_says_stays_out_of_the_terminal_and_is_kept_where_the_command_dies(tmp_path):
