@@ -16,6 +16,7 @@ from schemas.dataset.layout import (
     CAMERAS,
     FINGERPRINT_FILE,
     JOB_FILE,
+    LEDGER_FILE,
     OBJECTS,
     README_FILE,
     SUCCESS_FILE,
@@ -25,7 +26,7 @@ from schemas.errors import CommitConflict, CorruptError, MachineError
 from services.read.path_index import PathIndex
 from services.read.remerge import Remerge
 from services.read.stray_files import Known, tell_strays
-from services.read.verdict import COPY, Verdict
+from services.read.verdict import COPY, Verdict, describe_os_error
 from services.read.verify_finished import (
     Success,
     check_card,
@@ -39,9 +40,10 @@ from services.read.verify_range import RangeCheck, read_records
 from services.read.verify_span import Spans, commit_groups
 from workers.pipeline.allocator import keep_freed_memory
 from workers.store.commit import commits_digest
+from workers.store.ledger import read_kept_rows
 from workers.store.store import Store
 
-TOP_FILES = (JOB_FILE, README_FILE, SUCCESS_FILE, FINGERPRINT_FILE, CAM_POSES, CAMERAS, OBJECTS)
+TOP_FILES = (JOB_FILE, README_FILE, SUCCESS_FILE, FINGERPRINT_FILE, LEDGER_FILE, CAM_POSES, CAMERAS, OBJECTS)
 """Files with one place each; whether they are whole is checked by name."""
 
 
@@ -70,6 +72,7 @@ def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
             check_fingerprint(store, found.terms, verdict)
             remade = _merge_again(merging, found, verdict)
         _check_finished(store, job, success, found, remade, index, verdict)
+        _check_ledger(store, verdict)
         index.add_all(TOP_FILES)
         lost = sorted([*found.spans.gaps, *found.spans.unreadable])
         pairs = job.record.job.pairs_per_scene if job.record else 1
@@ -158,6 +161,24 @@ def _check_finished(
         digest = expected["digest"]
     if isinstance(digest, str):
         check_card(store, digest, job.sealed, verdict)
+
+
+def _check_ledger(store: Store, verdict: Verdict) -> None:
+    """The kept summary of the commits: as it was written, and every retry that it names is there, as ranges were checked."""
+    try:
+        rows = read_kept_rows(store)
+    except CorruptError as error:
+        what, _, remedy = str(error).partition(": ")
+        verdict.tell(what, remedy)
+        return
+    except OSError as error:
+        verdict.tell(f"{LEDGER_FILE}: {describe_os_error(error)}", "remove it, the next run writes it again")
+        return
+    if rows is None:
+        return
+    for start, retry in zip(rows.column("start").to_numpy(), rows.column("retry").to_numpy(), strict=True):
+        if retry and store.size(commit_path(int(start), int(retry))) is None:
+            verdict.tell(f"{commit_path(int(start), int(retry))}: is missing, {LEDGER_FILE} names it", COPY)
 
 
 def _tell_unfinished(found: Ranges, remade: dict[str, Any] | None, verdict: Verdict) -> None:

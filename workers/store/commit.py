@@ -58,8 +58,9 @@ def commits_digest(store: Store) -> str:
     """A digest that tells one set of commits from another: a record never changes, so keys and sizes are enough."""
     codes, sizes = _codes_and_sizes(store, sizes=True)
     digest = hashlib.sha256()
-    for at in np.argsort(codes):
-        digest.update(f"{commit_path(*split_code(codes[at]))} {sizes[at]}\n".encode())
+    order = np.argsort(codes)
+    for code, size in zip(codes[order].tolist(), sizes[order].tolist(), strict=True):
+        digest.update(f"{commit_path(*split_code(code))} {size}\n".encode())
     return digest.hexdigest()
 
 

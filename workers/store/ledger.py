@@ -5,6 +5,7 @@ for another dataset, is not used. A commit that it names and nobody finds is tol
 """
 
 import contextlib
+import hashlib
 import io
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from schemas.dataset.commit import CommitSummary, summarize
 from schemas.dataset.layout import LEDGER_FILE, MAX_RETRIES, range_table_path
 from schemas.dataset.ledger import LEDGER_SCHEMA, Ledger, join_rows, rows_of
-from schemas.errors import MachineError
+from schemas.errors import CorruptError, MachineError
 from workers.store.commit import check_retries, list_codes, read_range_file, require_record, split_code
 from workers.store.manifest import PARQUET_OPTIONS, decode_table
 from workers.store.store import Store
@@ -74,7 +75,8 @@ def save_rows(store: Store, rows: pa.Table) -> None:
     """Writes the kept summary: for the holder of the lock alone."""
     sink = io.BytesIO()
     pq.write_table(rows, sink, **PARQUET_OPTIONS)
-    store.write_whole(LEDGER_FILE, sink.getvalue())
+    data = sink.getvalue()
+    store.write_whole(LEDGER_FILE, hashlib.sha256(data).hexdigest().encode() + b"\n" + data)
 
 
 class LedgerKeeper:
@@ -126,19 +128,33 @@ def _check_all_retries(codes: NDArray[np.int64]) -> None:
         check_retries(int(at), retry[start == at].tolist())
 
 
+def read_kept_rows(store: Store) -> pa.Table | None:
+    """The rows of the kept summary as they were written, None where there is none. Raises CorruptError where it is damaged."""
+    try:
+        seal, _, data = store.read(LEDGER_FILE).partition(b"\n")
+    except FileNotFoundError:
+        return None
+    if seal != hashlib.sha256(data).hexdigest().encode():
+        raise CorruptError(f"{LEDGER_FILE} is damaged: remove it, the next run writes it again")
+    try:
+        names = ["fingerprint", "job_digest"]
+        with pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True, read_dictionary=names) as file:
+            return join_rows([file.read().select(LEDGER_SCHEMA.names).cast(LEDGER_SCHEMA)])
+    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
+        raise CorruptError(
+            f"{LEDGER_FILE} cannot be read ({error}): remove it, the next run writes it again"
+        ) from error
+
+
 def _read_kept(store: Store, codes: NDArray[np.int64]) -> pa.Table:
-    """The rows of the kept summary; none where it is missing, torn, or of other commits than those that are there."""
+    """The rows of the kept summary; none where it is missing, damaged, or of other commits than those that are there."""
     none = LEDGER_SCHEMA.empty_table()
     try:
-        with pq.ParquetFile(
-            pa.BufferReader(store.read(LEDGER_FILE)),
-            page_checksum_verification=True,
-            read_dictionary=["fingerprint", "job_digest"],
-        ) as file:
-            rows = file.read().select(LEDGER_SCHEMA.names).cast(LEDGER_SCHEMA)
-    except (pa.ArrowException, OSError, ValueError, KeyError):
+        rows = read_kept_rows(store)
+    except CorruptError:
+        rows = None
+    if rows is None:
         return none
-    rows = join_rows([rows])
     known = np.asarray(rows.column("start")) * MAX_RETRIES + np.asarray(rows.column("retry"))
     shared = np.intersect1d(known, codes, assume_unique=True)
     for code in shared[np.linspace(0, len(shared) - 1, min(_SAMPLES, len(shared))).astype(int)]:

@@ -4,11 +4,14 @@ from collections import Counter
 from pathlib import Path
 
 import obstore
+import pyarrow as pa
 import pytest
 from obstore.store import MemoryStore
 
+from schemas.dataset.ledger import LEDGER_SCHEMA, join_rows
 from services.read.verify import verify
 from tests.datasets import faults_of, make_dataset
+from workers.store.ledger import list_commits, save_rows
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 
@@ -75,3 +78,17 @@ def test_a_dataset_in_an_object_store_is_read_back_as_on_a_disk(packed):
         "camPoses.csv: is merged and missing",
         "box/stray.png: is in no commit",
     ]
+
+
+def test_the_kept_summary_of_the_commits_belongs_there_and_is_checked(copy):
+    store = LocalStore(copy)
+    rows = list_commits(store).rows
+    save_rows(store, rows)
+    assert faults_of(store) == []
+    retry = {**rows.to_pylist()[1], "retry": 1, "scenes": [1]}
+    save_rows(store, join_rows([rows, pa.Table.from_pylist([retry], LEDGER_SCHEMA)]))
+    (fault,) = faults_of(store)
+    assert fault.startswith("manifest/_commits/0000000001.retry-1.json: is missing, manifest/_ledger names it: restore")
+    (copy / "manifest/_ledger").write_bytes(store.read("manifest/_ledger")[:-1])
+    (fault,) = faults_of(store)
+    assert fault == "manifest/_ledger is damaged: remove it, the next run writes it again"

@@ -55,6 +55,15 @@ def test_a_retry_that_is_gone_is_told_by_the_digest_of_the_commits(finished):
     assert line.startswith("the commits are not those that the finished dataset was merged from: ")
 
 
+def test_of_very_many_commits_the_counts_of_scenes_are_compared(finished, monkeypatch):
+    monkeypatch.setattr(losses, "DIGEST_UP_TO", 3)
+    assert find_lost(finished) == []
+    success = json.loads(finished.read(SUCCESS_FILE))
+    success["scenes"]["made"] += 1
+    finished.write_whole(SUCCESS_FILE, json.dumps(success).encode())
+    assert find_lost(finished)[0].startswith("the commits are not those that the finished dataset was merged from: ")
+
+
 def test_where_all_commits_are_gone_few_lines_tell_it(finished, monkeypatch):
     monkeypatch.setattr(losses, "MOST_TOLD", 3)
     save_rows(finished, list_commits(finished).rows)

@@ -10,7 +10,7 @@ from schemas.errors import CorruptError, MachineError
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, terms
 from workers.store import ledger as module
 from workers.store.commit import committed_files, read_record
-from workers.store.ledger import LedgerKeeper, list_commits, read_summary, save_rows
+from workers.store.ledger import LedgerKeeper, list_commits, read_kept_rows, read_summary, save_rows
 from workers.store.record import seal_record
 
 pytestmark = pytest.mark.usefixtures("unflushed")
@@ -105,13 +105,17 @@ def test_where_every_commit_is_gone_each_is_lost(filled):
     assert len(list_commits(filled).lost) == 5
 
 
-def test_every_cut_and_flip_of_the_kept_summary_hides_nothing(filled):
+def test_every_cut_and_flip_of_the_kept_summary_is_found_and_hides_nothing(filled):
     whole = list_commits(filled).rows.to_pylist()
+    assert read_kept_rows(filled) is None
     save_rows(filled, list_commits(filled).rows)
+    assert read_kept_rows(filled).to_pylist() == whole
     data = filled.read(LEDGER_FILE)
     for at in range(0, len(data), 41):
         for damaged in (data[:at], data[:at] + bytes([data[at] ^ 4]) + data[at + 1 :]):
             filled.write_whole(LEDGER_FILE, damaged)
+            with pytest.raises(CorruptError, match="manifest/_ledger is damaged: remove it"):
+                read_kept_rows(filled)
             assert list_commits(filled).rows.to_pylist() == whole, at
 
 
