@@ -12,12 +12,15 @@ import pyarrow.parquet as pq
 from schemas.dataset.layout import CAM_POSES, CAMERAS, MANIFEST, OBJECTS, SUCCESS_FILE, is_merged_path
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import VersoError
-from services.merge.reading import AT_ONCE, map_ahead
+from services.merge.reading import map_ahead
 from workers.store.manifest import PARQUET_OPTIONS
 from workers.store.store import Store, Version
 
 _FOLDERS = tuple(f"{MANIFEST}/{table}" for table in TABLES)
 _SINGLE = (CAM_POSES, CAMERAS, OBJECTS)
+
+AT_ONCE = 4
+"""Files that are put at once into an object store; each is in memory meanwhile."""
 
 
 def file_entry(path: Path) -> dict[str, object]:
@@ -73,7 +76,7 @@ class Installation:
                 store.withdraw(key, self._folder)
                 store.remove_empty(key.rpartition("/")[0])
         with ThreadPoolExecutor(AT_ONCE) as pool:
-            spread = functools.partial(map_ahead, pool) if store.root is None else map
+            spread = functools.partial(map_ahead, pool, window=AT_ONCE) if store.root is None else map
             for _ in spread(
                 lambda item: self._put(item[0], item[1], before.get(item[0])), {**emptied, **files}.items()
             ):

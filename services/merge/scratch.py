@@ -8,6 +8,8 @@ from pathlib import Path
 from schemas.errors import MachineError, RunError
 from workers.store.store import Store
 
+SCRATCH = "merge"
+"""The name of the folder."""
 CACHE_KIB = 16 << 10
 """Memory for SQLite's cache."""
 
@@ -20,7 +22,7 @@ def merge_folder(store: Store) -> Iterator[Path]:
     """
     folder: Path | None = None
     try:
-        with explain_full_disk(), store.scratch("merge") as folder:
+        with explain_full_disk(), store.scratch(SCRATCH) as folder:
             yield folder
     except (MachineError, FileNotFoundError) as error:
         if store.root is not None and not store.root.is_dir():

@@ -31,7 +31,7 @@ from services.merge.install import Installation, sizes_agree
 from services.merge.merging import Merging
 from services.merge.published import PublishedFiles
 from services.merge.reading import read_blocks
-from services.merge.scratch import merge_folder
+from services.merge.scratch import SCRATCH, merge_folder
 from workers.store.commit import commits_digest
 from workers.store.store import Store
 from workers.store.sweep import sweep
@@ -65,6 +65,7 @@ def merge(
     commits = commits_digest(store)
     asked = {"first_scene": first_scene, "stop_scene": stop_scene, "commits": commits}
     if (done := _merged_already(store, asked)) is not None:
+        store.drop_scratch(SCRATCH)
         return _result(done)
 
     def require_unchanged() -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from schemas.dataset.layout import COMMITS, FENCED, RANGES, TEMPORARY, scratch_path
+from schemas.dataset.layout import COMMITS, FENCED, RANGES, STAGING, TEMPORARY, scratch_path
 from schemas.errors import OutputError
 from workers.store.file_system import (
     OpenTree,
@@ -205,7 +205,7 @@ class LocalStore(Store):
     def scratch(self, name: str) -> Iterator[Path]:
         """A folder under `_staging/`, on the file system of its files' final names; an earlier one of the name goes."""
         key = f"{scratch_path(name)}/{uuid.uuid4().hex}"
-        self._take_away(scratch_path(name))
+        self.drop_scratch(name)
         try:
             with self._explained(f"a file of the {name}"):
                 os.makedirs(self._own(key))
@@ -214,14 +214,14 @@ class LocalStore(Store):
             self.remove_tree(key)
             self.remove_empty(scratch_path(name))
 
-    def _take_away(self, prefix: str) -> None:
-        """Removes a folder that another process may be using: first its name in one step, then its contents."""
+    def drop_scratch(self, name: str) -> None:
+        """Takes the folder away from whoever uses it: first its name, in one step, then its contents."""
+        prefix = scratch_path(name)
         with contextlib.suppress(FileNotFoundError):
             os.rename(self._own(prefix), self.path(f"{prefix}.{uuid.uuid4().hex}"))
-        parent, _, name = prefix.rpartition("/")
-        for other in self.children(parent):
-            if other.startswith(f"{name}."):
-                self.remove_tree(f"{parent}/{other}")
+        for other in self.children(STAGING):
+            if f"{STAGING}/{other}".startswith(f"{prefix}."):
+                self.remove_tree(f"{STAGING}/{other}")
 
     def install(self, local: Path, key: str, over: Version | None = None) -> Version | None:
         """Flushes a file and renames it to `key`."""

@@ -20,6 +20,7 @@ from obstore.store import from_url
 from schemas.dataset.layout import PROBE_PREFIX, TEMPORARY
 from schemas.errors import MachineError, OutputError, RunError
 from workers.store.store import Entry, Store, Version
+from workers.store.temporary_folder import remove_abandoned, temporary_folder
 
 if TYPE_CHECKING:
     from obstore import PutMode, PutResult
@@ -216,8 +217,12 @@ class ObjectStore(Store):
     @contextlib.contextmanager
     def scratch(self, name: str) -> Iterator[Path]:
         """A temporary folder of this machine."""
-        with tempfile.TemporaryDirectory(prefix=f"verso-{name}-") as folder:
-            yield Path(folder)
+        with temporary_folder(name) as folder:
+            yield folder
+
+    def drop_scratch(self, name: str) -> None:
+        """Removes those of processes of this machine that were killed."""
+        remove_abandoned(name)
 
     def install(self, local: Path, key: str, over: Version | None = None) -> Version | None:
         """Puts a local file on the condition that nothing else is there; where it is large, in parts, having asked before."""

@@ -141,6 +141,9 @@ class Store(Protocol):
     def scratch(self, name: str) -> contextlib.AbstractContextManager[Path]:
         """An empty folder on a local disk whose files `install` can move into place; removed afterwards."""
 
+    def drop_scratch(self, name: str) -> None:
+        """Removes what killed processes left of scratch folders of this name; on a disk, those in use too."""
+
     def install(self, local: Path, key: str, over: Version | None = None) -> Version | None:
         """Moves a finished file of a scratch folder to `key` in one step, durably, replacing what was there.
 

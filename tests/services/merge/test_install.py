@@ -17,6 +17,7 @@ from services.merge import install, reading
 from services.merge.step import merge, read_success
 from tests.disk_faults import disk
 from tests.made_up_scenes import attempt_at, failed_scene, small_scene, terms
+from tests.s3_server import Bucket, s3_server
 from workers.store import objects
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
@@ -222,3 +223,20 @@ def test_a_commit_that_arrives_during_the_merge_is_noticed(far, tmp_path, monkey
     with pytest.raises(RunError, match="committed while they were merged"):
         merge(store, 0, 4)
     assert read_success(store) is None
+
+
+def test_an_object_store_is_asked_for_each_file_of_a_range_once_and_many_at_a_time():
+    asked = {}
+    for ranges in (4, 16):
+        held = Bucket()
+        with s3_server(held) as bucket:
+            store = ObjectStore(bucket, "s3://mine")
+            store.prepare()
+            for start in range(0, 2 * ranges, 2):
+                attempt_at(store, start, start + 2, terms(layout="tar", range_size=2), small_scene).commit()
+            held.requests.clear()
+            held.delay_s = 0.02
+            merge(store, 0, 2 * ranges)
+            asked[ranges] = held.requests.total()
+    assert asked[16] - asked[4] <= 12 * 7  # a record and up to six tables
+    assert held.most_at_once > 8

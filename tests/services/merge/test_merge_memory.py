@@ -116,3 +116,36 @@ def test_merging_a_million_rows_takes_little_more_memory_than_few(tmp_path, reco
     record_figure("merge_rows_per_s", "passed", rows / figures["seconds"])
     record_figure("merge_grown_mib", "passed", figures["grown_kib"] / 1024, 192.0)
     assert figures["grown_kib"] / 1024 < 192.0
+
+
+MANY = """
+import json, sys
+from pathlib import Path
+from services.merge.step import merge
+from tests.many_ranges import ManyRanges
+
+class Watched(ManyRanges):
+    rss_mib = {}
+
+    def _tables(self, scene_id):
+        if scene_id * 20 % self.scenes == 0:
+            pages = int(Path("/proc/self/statm").read_text().split()[1])
+            self.rss_mib[scene_id] = pages * 4096 / 2**20
+        return super()._tables(scene_id)
+
+store = Watched(Path(sys.argv[1]), int(sys.argv[2]))
+store.prepare()
+result = merge(store, 0, store.scenes)
+print(json.dumps({"rows": result.rows, "rss_mib": list(store.rss_mib.values())}))
+"""
+
+
+@pytest.mark.slow
+def test_merging_many_ranges_takes_as_much_memory_at_the_end_as_at_the_beginning(tmp_path, record_figure):
+    """Measured once by hand with 100,000 ranges (docs/scale.md); each range kept 5 kB of memory before."""
+    command = [sys.executable, "-c", MANY, str(tmp_path), "20000"]
+    figures = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    assert figures["rows"]["views"] == 10 * (20_000 - 20)
+    early, late = figures["rss_mib"][2], figures["rss_mib"][-1]
+    record_figure("merge_grown_mib_in_18000_ranges", "passed", late - early, 48.0)
+    assert late - early < 48.0

@@ -1,4 +1,5 @@
 import dataclasses
+import weakref
 
 import pyarrow as pa
 import pyarrow.dataset as ds
@@ -87,3 +88,12 @@ def test_scenes_whose_pose_ids_collide_are_refused(tmp_path):
 
     with pytest.raises(CorruptError, match="views: the key"):
         merge(dataset_at(tmp_path, 0, 8, make=colliding), 0, 8)
+
+
+def test_rows_that_there_are_not_are_not_kept(tmp_path):
+    table = merge_tables.MergedTable("failures", tmp_path)
+    rows = SCHEMAS["failures"].empty_table()
+    kept = weakref.ref(rows)
+    table.add(rows)
+    del rows
+    assert kept() is None
