@@ -1,4 +1,4 @@
-"""Whole runs on a real Ray whose processes are killed at random times, one after another, until a dataset is done."""
+"""Whole runs on a real Ray whose processes are killed at random times, or stopped, until a dataset is done."""
 
 import contextlib
 import json
@@ -60,10 +60,11 @@ class Run:
 
 
 @contextlib.contextmanager
-def running(job: Path, out: Path) -> Iterator[Run]:
-    """A run on two workers; what is left of it in the end is killed."""
+def running(job: Path, out: Path, *inside: str) -> Iterator[Run]:
+    """A run on two workers, `inside` another command; what is left of it in the end is killed."""
     mark = f"VERSO_TEST_MARK={uuid.uuid4().hex}"
-    command = [sys.executable, "-m", "services.cli.main", "run", str(job), "--out", str(out), "--workers", "2"]
+    verso = [sys.executable, "-m", "services.cli.main"]
+    command = [*inside, *verso, "run", str(job), "--out", str(out), "--workers", "2"]
     with open(out.with_suffix(".txt"), "ab") as told:
         process = subprocess.Popen(
             command,
@@ -94,9 +95,9 @@ def decided(out: Path) -> dict[str, tuple[int, int]]:
     return {name: (stat.st_ino, stat.st_mtime_ns) for name, stat in found.items()}
 
 
-def finish_once(job: Path, out: Path) -> tuple[str | None, float]:
+def finish_once(job: Path, out: Path, *inside: str) -> tuple[str | None, float]:
     begun = time.monotonic()
-    with running(job, out) as run:
+    with running(job, out, *inside) as run:
         assert run.wait(400) == 0, out.with_suffix(".txt").read_text()[-2000:]
     return digest_of(out), time.monotonic() - begun
 
@@ -119,7 +120,9 @@ def test_runs_killed_at_random_make_one_dataset_and_nothing_twice(tmp_path, requ
             before = decided(out)
             with running(job, out) as run:
                 time.sleep(chance.uniform(0.1, 0.9) * whole_s)
-                actor, pid = chance.choice(run.actors())
+                if not (found := run.actors()):
+                    break  # it has ended
+                actor, pid = chance.choice(found)
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
                 kills[actor] += 1
@@ -131,3 +134,42 @@ def test_runs_killed_at_random_make_one_dataset_and_nothing_twice(tmp_path, requ
         finished += 1
         print(f"{kills.total()} kills: {dict(kills)}, {finished} datasets, {whole_s:.0f} s a run", flush=True)
     record_figure("runs killed at random", "passed", kills.total())
+
+
+STOPPED_S = 13.0
+"""Longer than the lock of a coordinator elsewhere is waited for."""
+
+ELSEWHERE = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
+"""In a namespace of processes of its own, a run takes the lock's holder for one on another machine."""
+
+
+@pytest.mark.root
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("actor", ACTORS)
+def test_a_run_with_stopped_processes_and_one_that_takes_over_make_one_dataset(actor, tmp_path):
+    job, out = tmp_path / "job.yaml", tmp_path / "out"
+    job.write_text(JOB)
+    with running(job, out) as run:
+        while not decided(out):
+            assert run.wait(0.05) is None, out.with_suffix(".txt").read_text()[-2000:]
+        before = decided(out)
+        stopped = [pid for kind, pid in run.actors() if kind == actor]
+        assert stopped
+        for pid in stopped:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGSTOP)
+        if actor == "driver":
+            digest, _ = finish_once(job, out, *ELSEWHERE)
+        else:
+            time.sleep(STOPPED_S)
+        for pid in stopped:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGCONT)
+        code = run.wait(400)
+        assert code is not None, "the run goes on 400 s after its processes were stopped"
+    print(f"{actor}: the stopped run ended with {code}: {out.with_suffix('.txt').read_text().splitlines()[-1:]}")
+    if actor != "driver":
+        digest, _ = finish_once(job, out)
+    assert before.items() <= decided(out).items(), "a commit was written again"
+    assert digest == digest_of(out) == finish_once(job, tmp_path / "whole")[0]
