@@ -11,6 +11,7 @@ from typing import Literal
 
 from schemas.dataset.layout import (
     COMMITS,
+    LEDGER_FILE,
     LOCK_FILE,
     LOG_FOLDER,
     MANIFEST,
@@ -26,8 +27,8 @@ from services.read.path_index import PathIndex
 from services.read.verdict import MOVE, Verdict
 from workers.store.store import Store
 
-FREE = frozenset({LOCK_FILE, LOG_FOLDER, STAGING})
-"""What writers keep beside the dataset."""
+FREE = frozenset({LEDGER_FILE, LOCK_FILE, LOG_FOLDER, STAGING})
+"""What writers keep beside the dataset: no byte of it counts."""
 
 FRAME = frozenset({MANIFEST, COMMITS, RANGES})
 """Folders that a run makes before it makes anything else."""
@@ -67,7 +68,7 @@ def tell_strays(store: Store, known: Known, verdict: Verdict) -> None:
     """Tells of everything that no commit names."""
     if store.root is None:
         for key, _ in store.listing():
-            if key.partition("/")[0] not in FREE and not _belongs(key, known):
+            if not FREE & {key, key.partition("/")[0]} and not _belongs(key, known):
                 _tell_file(store, key, verdict)
         return
     for kind, key in _walk(store.root, ""):

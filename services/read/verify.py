@@ -65,7 +65,7 @@ def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
     verdict = Verdict(store.name)
     with _temporary_folder() as folder, contextlib.closing(PathIndex(folder)) as index:
         job, success = read_stored_job(store, verdict), read_stored_success(store, verdict)
-        with contextlib.closing(Remerge(folder)) as merging:
+        with contextlib.closing(Remerge(_made(folder / "merged"))) as merging:
             check = RangeCheck(store, job.record, job.digest, index, verdict)
             found = _read_ranges(store, _spans(job, success, verdict), check, merging, progress)
             check_terms(job, found.terms, verdict)
@@ -194,6 +194,11 @@ def _tell_unfinished(found: Ranges, remade: dict[str, Any] | None, verdict: Verd
     else:
         told = "every scene is committed, and they were not merged, or the file was removed"
         verdict.tell(f"{missing} {told}", f"{verdict.run_again}, or {verdict.repair}", "merge")
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
 
 
 @contextlib.contextmanager

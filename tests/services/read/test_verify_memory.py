@@ -12,12 +12,17 @@ from tests import many_ranges
 VERIFY = """
 import json, sys
 from pathlib import Path
+<<<<<<< HEAD
 from services.merge import scratch, tables
 from services.read import path_index
 from services.read.verify import verify
 from workers.store.local import LocalStore
 path_index.CACHE_KIB = scratch.CACHE_KIB = int(sys.argv[2])
 tables.ROWS_PER_GROUP = int(sys.argv[3])
+=======
+from services.read.verify import verify
+from workers.store.local import LocalStore
+>>>>>>> d268804 (Merge again by the merge's own joining of ranges, and let the ledger's cache be)
 found = verify(LocalStore(sys.argv[1]), lambda now: None)
 (peak,) = [line.split()[1] for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")]
 parts = dict(found.parts)
@@ -25,22 +30,16 @@ print(json.dumps({"parts": parts, "scenes": found.scenes, "files": found.files, 
 """
 
 
-def measure(folder: Path, ranges: int, cache_kib: int = 16 << 10, rows: int = 8_192) -> dict:
+def measure(folder: Path, ranges: int) -> dict:
     """What verifying took: ranges of one scene, six tables and a damaged tar, all merged again; no job.yaml, so no labels."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(many_ranges, "COMMIT_VERSION", 1)  # such a record names its files by itself
         many_ranges.write_ranges(folder, ranges)
-    command = [sys.executable, "-c", VERIFY, str(folder), str(cache_kib), str(rows)]
+    command = [sys.executable, "-c", VERIFY, str(folder)]
     figures = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     assert figures["scenes"] == ranges
     assert figures["parts"] == {"job": 2, "file": ranges - (ranges + 499) // 1000, "merge": 1}
     return figures
-
-
-def test_ten_times_the_ranges_take_little_more_memory(tmp_path):
-    few, many = (measure(tmp_path / str(ranges), ranges, 512, 64) for ranges in (20, 200))
-    assert many["files"] == 10 * few["files"]
-    assert many["peak_mib"] - few["peak_mib"] < 24
 
 
 @pytest.mark.slow
