@@ -71,6 +71,28 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if reason := why_skip({marker.name for marker in item.iter_markers()}, config.getoption("--scope")):
             item.add_marker(pytest.mark.skip(reason=reason))
+    items.sort(key=_place_of)
+
+
+LONGEST_FIRST = (
+    "services/study/test_command.py",
+    "services/run/test_step.py",
+    "services/run/test_several_objects.py",
+    "effects/test_random_scenes.py",
+    "services/cli/test_selftest.py",
+    "effects/test_physics_effects.py",
+    "services/bench/test_command.py",
+    "test_energy_minimum.py",
+)
+"""Files of a minute or so: a process that begins one last works on alone."""
+
+
+def _place_of(item: pytest.Item) -> int:
+    """Sorts the tests of long files before all others, and leaves every other order as it is."""
+    path = item.path.as_posix()
+    return next(
+        (place for place, name in enumerate(LONGEST_FIRST) if path.endswith(f"tests/{name}")), len(LONGEST_FIRST)
+    )
 
 
 # ---------------------------------------------------------------------------------------------- figures

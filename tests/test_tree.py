@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from tests.conftest import LONGEST_FIRST
+
 ROOT = Path(__file__).resolve().parents[1]
 MAX_LINES = 300
 
@@ -33,3 +35,7 @@ def test_every_module_has_a_mirrored_test_or_a_reason():
     }
     assert without == set(TESTED_ELSEWHERE)
     assert all(TESTED_ELSEWHERE.values())
+
+
+def test_every_file_that_is_to_run_first_is_there():
+    assert [name for name in LONGEST_FIRST if not (ROOT / "tests" / name).is_file()] == []

@@ -179,7 +179,8 @@ def _pytest_command(asked: argparse.Namespace, junit: Path) -> list[str]:
     one_file = len(asked.paths) == 1 and Path(asked.paths[0].split("::")[0]).is_file()
     processes = _processes()
     if processes > 1 and not one_file:
-        command += [f"--numprocesses={processes}", "--dist=loadfile"]
+        # Files go out in the order of tests/conftest.py, the longest first, and not by their number of tests.
+        command += [f"--numprocesses={processes}", "--dist=loadfile", "--no-loadscope-reorder"]
     if asked.figures:
         command.append(f"--figures={asked.figures.absolute()}")
     if asked.matching:

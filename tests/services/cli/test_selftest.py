@@ -55,7 +55,10 @@ def test_all_passing_is_0_and_skips_are_explained(project, capfd):
     write_suite(project, measured=3)
     assert selftest.main([]) == 0
     out = capfd.readouterr().out
+    assert out.startswith("verso test: about 15 minutes on 1 core, as measured elsewhere\n== static")
     assert "checked" in out
+    (seconds,) = json.loads(selftest.LAST_RUN.read_text()).values()
+    assert 0 < seconds < 300
     assert "4 passed, 0 failed, 1 skipped" in out
     assert "   1 x slow: runs with --all" in out
 
@@ -66,24 +69,15 @@ def test_all_runs_the_slow_tests_too(project, capfd):
     assert "5 passed, 0 failed, 0 skipped" in capfd.readouterr().out
 
 
-def test_the_first_line_says_how_long_it_takes_and_the_next_run_knows_it(project, capfd):
-    write_suite(project, measured=3)
-    assert selftest.main([]) == 0
-    out = capfd.readouterr().out
-    assert out.startswith("verso test: about 15 minutes on 1 core, as measured elsewhere\n== static")
-    (seconds,) = json.loads(selftest.LAST_RUN.read_text()).values()
-    assert 0 < seconds < 300
+def test_the_duration_is_that_of_the_last_run_here_or_the_measured_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(selftest, "LAST_RUN", tmp_path / "seconds.json")
+    assert selftest.expected_duration("default", 1) == "about 15 minutes on 1 core, as measured elsewhere"
     selftest.LAST_RUN.write_text('{"default 1": 420}')
     assert selftest.expected_duration("default", 1) == "about 7 minutes on 1 core, as the last time"
-    selftest.LAST_RUN.write_text("[torn")
     assert selftest.expected_duration("default", 2) == "about 8 minutes on 2 cores, as measured elsewhere"
-
-
-def test_a_part_of_the_tests_says_and_keeps_no_duration(project, capfd):
-    write_suite(project, measured=3)
-    assert selftest.main(["-k", "passes"]) == 0
-    assert "minutes" not in capfd.readouterr().out
-    assert not selftest.LAST_RUN.exists()
+    for torn in ("[torn", "[]", '{"default 2": "x"}'):
+        selftest.LAST_RUN.write_text(torn)
+        assert selftest.expected_duration("default", 2) == "about 8 minutes on 2 cores, as measured elsewhere"
 
 
 SKIPS = """
@@ -92,17 +86,26 @@ import pytest
 @pytest.mark.skip(reason="the moon is full")
 def test_moon():
     pass
+
+@pytest.mark.xfail(reason="not understood")
+def test_wrong():
+    assert []
 """
 
 
-def test_a_skip_that_is_not_expected_fails_in_ci_and_is_told_elsewhere(project, capfd):
+def test_a_skip_that_is_not_expected_fails_in_ci(project, capfd):
     (project / "tests" / "test_moon.py").write_text(SKIPS)
     assert selftest.main(["--ci"]) == 1
     out = capfd.readouterr().out
     assert "skips        FAILED" in out
     assert "not expected, 1 x tests/test_moon.py::test_moon: the moon is full" in out
-    assert selftest.main([]) == 0
-    assert "not expected, 1 x tests/test_moon.py::test_moon: the moon is full" in capfd.readouterr().out
+
+
+def test_a_skip_that_is_not_expected_is_told_where_it_does_not_fail(project):
+    skips = [("tests/test_moon.py::test_moon", "the moon is full")]
+    check, told = selftest.check_skips(skips, "default")
+    assert not check.passed
+    assert told[0] == "  not expected, 1 x tests/test_moon.py::test_moon: the moon is full"
 
 
 def test_an_expected_skip_passes_in_ci_and_a_line_of_no_use_is_told(project, capfd):
@@ -114,14 +117,7 @@ def test_an_expected_skip_passes_in_ci_and_a_line_of_no_use_is_told(project, cap
     out = capfd.readouterr().out
     assert "skips        ok" in out and "0 not in tests/expected_skips.txt, 1 of its lines without use here" in out
     assert "expected and not skipped: always | tests/test_sun.py::* | the sun is full" in out
-
-
-def test_a_known_failure_is_no_skip(project, capfd):
-    suite = "import pytest\n@pytest.mark.xfail(reason='not understood')\ndef test_wrong():\n    assert []\n"
-    (project / "tests" / "test_known.py").write_text(suite)
-    assert selftest.main([]) == 0
-    out = capfd.readouterr().out
-    assert "0 passed, 0 failed, 0 skipped" in out
+    assert "0 passed, 0 failed, 1 skipped" in out  # a known failure is no skip
     assert "known failures, and why:\n     1 x not understood" in out
 
 
@@ -149,7 +145,9 @@ def test_a_path_narrows_to_its_tests_and_skips_the_checks(project, capfd):
 def test_an_expression_narrows_by_name(project, capfd):
     write_suite(project, measured=9)
     assert selftest.main(["-k", "passes"]) == 0
-    assert "1 passed, 0 failed" in capfd.readouterr().out
+    out = capfd.readouterr().out
+    assert "1 passed, 0 failed" in out
+    assert "minutes" not in out and not selftest.LAST_RUN.exists()  # a part of the tests tells nothing of the whole
 
 
 def test_finding_no_test_is_not_success(project, capfd):
