@@ -1,8 +1,11 @@
 """The sources that the card names; the card of whole datasets is in tests/services/run/test_switches.py."""
 
+from pathlib import Path
+
 from schemas.job.assets import Assets
 from services.merge.dataset_card import describe_left_out, describe_sources
 from workers.assets.catalogue import Catalogue
+from workers.assets.external.listing import Listing
 
 OBJECTS = [
     {"source": "procedural", "weight": 2.0, "seed": 7},
@@ -20,3 +23,12 @@ def test_every_source_is_named_with_its_weight_and_licence_and_what_was_left_out
     ]
     assert lines[2].startswith("tables, weight 1: made from seed")
     assert lines[3:] == ["left out of meshes: 2 too large, 1 torn"] == describe_left_out(catalogue)
+
+
+def test_the_first_files_that_were_left_out_are_named():
+    listing = Listing(
+        Path("/meshes"), {}, {"no_faces": 4}, examples=("a.obj (no_faces: has no triangles)", "b.obj (...)")
+    )
+    catalogue = Catalogue(Assets(), (listing,), (None,), "d" * 64, {"/meshes": {"no_faces": 4}})
+    said = "left out of /meshes: 4 no_faces; a.obj (no_faces: has no triangles); b.obj (...)"
+    assert describe_left_out(catalogue) == [said]

@@ -2,7 +2,6 @@
 
 import atexit
 import json
-import mmap
 import os
 import queue
 import signal
@@ -15,6 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+
+import numpy as np
 
 from schemas.errors import MachineError, MeshError
 from schemas.job.assets import MeshLimits
@@ -94,12 +95,15 @@ class Reader:
         if not files:
             raise BrokenPipeError
         with open(files[0], "rb") as answers:
-            tree, size = json.loads(head), os.fstat(answers.fileno()).st_size
-            body = memoryview(mmap.mmap(answers.fileno(), size, access=mmap.ACCESS_READ) if size else b"")
+            # Not mapped: each cached asset would hold a file descriptor.
+            body = np.empty(os.fstat(answers.fileno()).st_size, dtype=np.uint8)
+            answers.seek(0)
+            answers.readinto(body.data)
+        tree = json.loads(head)
         self.last = Usage(tree["exit"], tree["cpu_s"], tree["rss_kb"])
         if self.last.exit in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP):
             raise MachineError("a process that reads meshes was killed from outside, perhaps for want of memory")
-        return [_open_answer(kind, blocks) for kind, blocks in read_answers(body)]
+        return [_open_answer(kind, blocks) for kind, blocks in read_answers(body.data.toreadonly())]
 
     def _start(self) -> None:
         script = Path(__file__).with_name("reader_process.py")

@@ -1,5 +1,7 @@
 """A source of files as it is opened: listed, checked once, loaded in a limited process."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -65,6 +67,19 @@ def test_an_asset_read_by_another_process_is_the_one_that_is_read_here(tmp_path)
         assert one.vertices.strides == two.vertices.strides and not one.vertices.flags.writeable
         assert (one.faces == two.faces).all() and one.faces.dtype == two.faces.dtype
         assert (one.material.texture == two.material.texture).all()
+
+
+def test_an_asset_holds_no_open_file_and_its_arrays_cannot_be_written(tmp_path):
+    write(tmp_path / "a.obj", CUBE)
+    (entry,) = listed(tmp_path, "a.obj").entries["mug"]
+    files = len(list(Path("/proc/self/fd").iterdir()))
+    assets = [load_asset_file(SETTINGS, tmp_path, entry, "mug", Assets()) for _ in range(5)]
+    assert len(list(Path("/proc/self/fd").iterdir())) == files
+    for array in (assets[0].shape.parts[0].vertices, assets[0].shape.parts[0].faces):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+        with pytest.raises(ValueError, match="cannot set WRITEABLE"):
+            array.setflags(write=True)
 
 
 def test_a_file_that_changes_after_it_was_listed_is_refused_when_it_is_loaded(tmp_path):
