@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-FREE = ("_logs/", "_lock.json", "_staging/", "manifest/_ledger.parquet")
+FREE = ("_logs/", "_lock.json", "_staging/")
 FEW = 4
 """A kind with at most this many files has every one of them damaged."""
 

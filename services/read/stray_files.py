@@ -11,7 +11,6 @@ from typing import Literal
 
 from schemas.dataset.layout import (
     COMMITS,
-    LEDGER_FILE,
     LOCK_FILE,
     LOG_FOLDER,
     MANIFEST,
@@ -27,7 +26,7 @@ from services.read.path_index import PathIndex
 from services.read.verdict import MOVE, Verdict
 from workers.store.store import Store
 
-FREE = frozenset({LEDGER_FILE, LOCK_FILE, LOG_FOLDER, STAGING})
+FREE = frozenset({LOCK_FILE, LOG_FOLDER, STAGING})
 """What writers keep beside the dataset: no byte of it counts."""
 
 FRAME = frozenset({MANIFEST, COMMITS, RANGES})

@@ -49,7 +49,7 @@ def test_folders_links_and_devices_are_named(copy):
 
 
 def test_what_writers_keep_is_free(copy):
-    for path in ("_logs/a/b.jsonl", "_staging/0000000000/r0-x/y", "_lock.json", "manifest/_ledger.parquet"):
+    for path in ("_logs/a/b.jsonl", "_staging/0000000000/r0-x/y", "_lock.json"):
         (copy / path).parent.mkdir(parents=True, exist_ok=True)
         (copy / path).touch()
     assert faults_of(LocalStore(copy)) == []

@@ -20,10 +20,9 @@ def transposed_poses_in_camposes(plant: Plant, _: Any) -> None:
     original = services.merge.poses.cam_pose_lines
 
     def planted(views):
-        for line in original(views):
-            words = line.rstrip("\n").split(",")
-            matrix = np.array(words[2:]).reshape(4, 4).T
-            yield ",".join([*words[:2], *matrix.ravel()]) + "\n"
+        rows = [line.split(",") for line in original(views).decode().splitlines()]
+        turned = [[*words[:2], *np.array(words[2:]).reshape(4, 4).T.ravel()] for words in rows]
+        return "".join(",".join(words) + "\n" for words in turned).encode()
 
     plant(original, planted)
 
@@ -32,10 +31,8 @@ def cx_and_cy_swapped_in_cameras(plant: Plant, _: Any) -> None:
     original = services.merge.poses.camera_lines
 
     def planted(views):
-        for line in original(views):
-            words = line.split(",")
-            words[7], words[8] = words[8], words[7]
-            yield ",".join(words)
+        rows = [line.split(",") for line in original(views).decode().splitlines()]
+        return "".join(",".join([*words[:7], words[8], words[7], *words[9:]]) + "\n" for words in rows).encode()
 
     plant(original, planted)
 
@@ -44,10 +41,8 @@ def u_and_v_swapped_in_objects(plant: Plant, _: Any) -> None:
     original = services.merge.poses.object_lines
 
     def planted(objects):
-        for line in original(objects):
-            words = line.split(" ")
-            words[4], words[5] = words[5], words[4]
-            yield " ".join(words)
+        rows = [line.split(" ") for line in original(objects).decode().splitlines()]
+        return "".join(" ".join([*words[:4], words[5], words[4], *words[6:]]) + "\n" for words in rows).encode()
 
     plant(original, planted)
 
