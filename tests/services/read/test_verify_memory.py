@@ -12,17 +12,8 @@ from tests import many_ranges
 VERIFY = """
 import json, sys
 from pathlib import Path
-<<<<<<< HEAD
-from services.merge import scratch, tables
-from services.read import path_index
 from services.read.verify import verify
 from workers.store.local import LocalStore
-path_index.CACHE_KIB = scratch.CACHE_KIB = int(sys.argv[2])
-tables.ROWS_PER_GROUP = int(sys.argv[3])
-=======
-from services.read.verify import verify
-from workers.store.local import LocalStore
->>>>>>> d268804 (Merge again by the merge's own joining of ranges, and let the ledger's cache be)
 found = verify(LocalStore(sys.argv[1]), lambda now: None)
 (peak,) = [line.split()[1] for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")]
 parts = dict(found.parts)
