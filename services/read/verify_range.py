@@ -22,6 +22,7 @@ from workers.pipeline.check_stored import check_stored_pair, check_stored_scene
 from workers.store.commit import committed_files, read_committed, read_record
 from workers.store.committed_rows import range_rows
 from workers.store.store import Store
+from workers.store.tars import check_labels
 
 
 @dataclass
@@ -169,16 +170,24 @@ class RangeCheck:
         if ended != list(span.scene_ids):
             what = f"{commit_path(span.start)}: some of its scenes {span.start} to {span.stop - 1} have no row, or two"
             self.verdict.tell(what, COPY)
-        if self._job is None or {record.terms.job_digest for record in records} != {self._job_digest}:
+        job = self._job
+        if job is None or {record.terms.job_digest for record in records} != {self._job_digest}:
             return []
+        faults: list[tuple[int, str]] = []
+
+        def read_file(path: str) -> bytes:
+            data = self._read(found, path, digests)
+            if path.endswith(".tar"):
+                off = check_labels(path.partition("/")[0], data, path, rows)
+                faults.extend((pose_id // (2 * job.pairs_per_scene), fault) for pose_id, fault in off)
+            return data
 
         try:
-            read = file_reader(lambda path: self._read(found, path, digests), stored)
+            read = file_reader(read_file, stored)
         except (CorruptError, OSError):
             return []  # the archive is told by its digest
-        faults = []
         for scene_id, scene in made.items():
-            faults += [(scene_id, fault) for fault in _check_scene(self._job, stored, scene, read)]
+            faults += [(scene_id, fault) for fault in _check_scene(job, stored, scene, read)]
             self.verdict.pairs += len({row["parent_id"] for row in rows["views"] if row["scene_id"] == scene_id})
         return faults
 

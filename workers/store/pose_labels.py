@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from schemas.dataset.layout import file_pose_id
-from schemas.errors import CorruptError
 
 Rows = Mapping[str, Sequence[Mapping[str, Any]]]
 """Rows by table, with the values that Arrow gives: a double that happens to be whole is still a float."""
@@ -30,7 +29,10 @@ NOT_OF_AN_OBJECT = frozenset({"pose_id", "role", "scene_id"})
 
 
 def pose_labels(rows: Rows) -> dict[tuple[str, int], dict[str, Any]]:
-    """The label of every pose of one or more scenes, by category and the id in the names of its files."""
+    """The label of every pose of one or more scenes, by category and the id in the names of its files.
+
+    A view whose scene has no row is left out.
+    """
     scenes = {row["scene_id"]: row for row in rows["scenes"]}
     assets = {row["instance_id"]: row for row in rows["assets"]}
     objects = defaultdict(list)
@@ -38,7 +40,9 @@ def pose_labels(rows: Rows) -> dict[tuple[str, int], dict[str, Any]]:
         objects[row["pose_id"], row["role"]].append(row)
     labels: dict[tuple[str, int], dict[str, Any]] = {}
     for view in rows["views"]:
-        scene, pose_id = scenes[view["scene_id"]], file_pose_id(view["role"], view["parent_id"])
+        scene, pose_id = scenes.get(view["scene_id"]), file_pose_id(view["role"], view["parent_id"])
+        if scene is None:
+            continue
         key = (view["category"], pose_id)
         label = labels.setdefault(key, {"pose_id": pose_id, "views": {}, **_of_scene(scene, assets)})
         own = sorted(objects[view["pose_id"], view["role"]], key=lambda row: row["region_id"])
@@ -69,14 +73,14 @@ def encode_label(label: Mapping[str, Any]) -> bytes:
     return text.encode() + b"\n"
 
 
-def decode_label(data: bytes, name: str) -> dict[str, Any]:
-    """A stored label. Raises CorruptError naming it."""
+def decode_label(data: bytes) -> dict[str, Any]:
+    """A stored label. Raises ValueError."""
     try:
         label = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise CorruptError(f"{name} is no label: {str(error)[:200]}") from error
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
     if not isinstance(label, dict):
-        raise CorruptError(f"{name} is no label: it holds no keys")
+        raise ValueError("it holds no keys")
     return label
 
 

@@ -19,6 +19,7 @@ import pyarrow as pa
 from schemas.dataset.commit import FileEntry, Span
 from schemas.dataset.layout import IMAGES, Content, image_path, is_shape, patch_path, tar_path
 from schemas.errors import CorruptError
+from schemas.plain_line import plain_line
 from workers.store.pose_labels import LABEL_TABLES, Rows, decode_label, encode_label, label_differences, pose_labels
 from workers.store.store import Store
 
@@ -68,12 +69,12 @@ def read_labels(category: str, data: bytes, name: str) -> Iterator[tuple[int, by
     return ((pose_id, content) for path, pose_id, content in _read_members(category, data, name) if not path)
 
 
-def check_labels(category: str, data: bytes, name: str, rows: Rows) -> list[str]:
-    """How the labels in an archive differ from the rows of its range, a sentence for each pose.
+def check_labels(category: str, data: bytes, name: str, rows: Rows) -> list[tuple[int, str]]:
+    """(pose id, how its labels differ from the rows of the range) of every pose in an archive whose labels are off.
 
-    `rows` are those of all the range's scenes. Raises CorruptError as `read_tar`.
+    `rows` are those of all the range's scenes. An archive of an earlier version has no labels, and nothing is off. Raises
+    CorruptError as `read_tar`.
     """
-    derived = pose_labels(rows)
     stored, imaged = {}, set()
     for path, pose_id, content in _read_members(category, data, name):
         if path:
@@ -81,15 +82,24 @@ def check_labels(category: str, data: bytes, name: str, rows: Rows) -> list[str]
         else:
             stored[pose_id] = content
     if not stored:
-        return []  # an earlier version wrote it
-    faults = [f"{name}: the labels of pose {pose_id} are missing" for pose_id in sorted(imaged - stored.keys())]
+        return []
+    derived = pose_labels(rows)
+    faults = [(pose_id, f"{name}: {label_member(pose_id)} is missing") for pose_id in sorted(imaged - stored.keys())]
     for pose_id, content in stored.items():
-        where = f"{name}: {label_member(pose_id)}"
-        if (category, pose_id) not in derived:
-            faults.append(f"{where}: has labels of a pose that the tables do not have")
-        elif different := list(label_differences(decode_label(content, where), derived[category, pose_id])):
-            faults.append(f"{where}: differs from the tables at {', '.join(different[:3])}")
+        if fault := _label_fault(content, derived.get((category, pose_id))):
+            faults.append((pose_id, f"{name}: {label_member(pose_id)} {fault}"))
     return faults
+
+
+def _label_fault(content: bytes, derived: Mapping[str, object] | None) -> str:
+    """How a stored label differs from the tables'; empty where it does not."""
+    if derived is None:
+        return "is of a pose that the tables do not have"
+    try:
+        different = list(label_differences(decode_label(content), derived))
+    except ValueError as error:
+        return f"is no label: {plain_line(str(error))}"
+    return f"differs from the tables at {', '.join(map(plain_line, different[:3]))}" if different else ""
 
 
 def _read_members(category: str, data: bytes, name: str) -> Iterator[tuple[str, int, bytes]]:

@@ -7,8 +7,9 @@ from services.read.path_index import PathIndex
 from services.read.verdict import Verdict
 from services.read.verify_job import read_stored_job
 from services.read.verify_range import RangeCheck, read_records
-from tests.datasets import faults_of
+from tests.datasets import faults_of, make_dataset
 from workers.store.local import LocalStore
+from workers.store.pose_labels import encode_label
 
 
 def test_a_range_is_counted_and_its_rows_are_kept(tiny, tmp_path):
@@ -61,3 +62,18 @@ def test_files_that_are_committed_and_not_yet_published_are_read_where_they_lie(
     told = "\n".join(faults_of(LocalStore(copy)))
     assert "committed files are in _staging, and not in their places: run the job again" in told
     assert "is committed and missing" not in told
+
+
+def test_labels_in_an_archive_that_differ_from_the_tables_are_told_although_every_digest_holds(tmp_path, monkeypatch):
+    def wrong(label: dict) -> bytes:
+        return encode_label(label).replace(b'"split":"', b'"split":"no ')
+
+    with monkeypatch.context() as patch:
+        patch.setattr("workers.store.tars.encode_label", wrong)
+        store, _ = make_dataset(tmp_path / "wrong", scenes=1, output={"layout": "tar"})
+    told = faults_of(store)
+    assert len(told) == 2
+    assert ".tar: 00000.json differs from the tables at assets." in told[0]
+    assert "verso replay" in told[0]
+    store, _ = make_dataset(tmp_path / "right", scenes=1, output={"layout": "tar"})
+    assert faults_of(store) == []

@@ -181,30 +181,28 @@ def range_rows_of(scene_ids):
             lambda data: data.replace(b'"parent_id"', b'"parent_ie"'),
             "differs from the tables at views.aligned.parent_id",
         ),
-        (lambda data: None, "the labels of pose 0 are missing"),
-        (lambda data: data[:-9], "00000.json is no label"),
-        (lambda data: b"[]", "00000.json is no label"),
+        (lambda data: None, "is missing"),
+        (lambda data: data[:-9], "is no label: "),
+        (lambda data: b"[]", "is no label: "),
     ],
 )
 def test_labels_that_differ_from_the_tables_are_told_by_pose_and_key(store, tmp_path, change, told):
     attempt_at(store, 0, 4, TAR).commit()
     category = made_scene(0).rows["scenes"][0]["category"]
     data = forged(tmp_path / category / "0000000000.tar", "00000.json", change)
-    try:
-        faults = check_labels(category, data, "here.tar", range_rows_of(range(4)))
-    except CorruptError as error:
-        faults = [str(error)]
+    faults = check_labels(category, data, "here.tar", range_rows_of(range(4)))
     if told is None:
         assert faults == []
     else:
-        assert len(faults) == 1 and "here.tar" in faults[0] and told in faults[0], faults
+        ((pose_id, fault),) = faults
+        assert pose_id == 0 and fault.startswith("here.tar: 00000.json ") and told in fault, fault
 
 
 def test_labels_of_a_pose_that_the_tables_do_not_have_are_told(store, tmp_path):
     attempt_at(store, 0, 4, TAR).commit()
     (path,) = tmp_path.glob(f"{made_scene(0).rows['scenes'][0]['category']}/*.tar")
     faults = check_labels(path.parent.name, path.read_bytes(), "here.tar", range_rows_of(range(1, 4)))
-    assert faults[0] == "here.tar: 00000.json: has labels of a pose that the tables do not have"
+    assert faults[0] == (0, "here.tar: 00000.json is of a pose that the tables do not have")
 
 
 def test_a_tar_of_an_earlier_version_has_no_labels_and_nothing_is_off(store, tmp_path):
