@@ -104,7 +104,7 @@ class MeshLimits(Frozen):
     max_asset_mb: Positive = 512.0
     """Most bytes, MB, of a mesh or URDF and all files that it refers to."""
     max_nodes: PositiveInt = 4096
-    """Most parts of a mesh, nodes of a GLB's tree, and links, joints or visuals of a URDF."""
+    """Most parts of a mesh, files that it reads, nodes of a GLB's tree, and links, joints or visuals of a URDF."""
     min_size_m: Positive = 0.001
     """Smallest bounding-box diagonal of an object or table, metres, after scaling."""
     max_size_m: Positive = 20.0

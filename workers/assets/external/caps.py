@@ -67,14 +67,16 @@ def find_inside(root: Path, *candidates: Path) -> Path | None:
 
 @dataclass
 class Budget:
-    """What one asset has read so far, with all files that it refers to: bytes, and pixels of textures."""
+    """What one asset has read so far, with all files that it refers to: files, bytes, and pixels of textures."""
 
     limits: MeshLimits
+    files: int = 0
     size: int = 0
     pixels: int = 0
 
     def take_file(self, size: int) -> str | None:
         """Counts a file; why it may not be read, None where it may."""
+        self.files += 1
         self.size += size
         cap = self.limits.max_asset_mb
         return f"is over max_asset_mb = {cap:g} with the files before it" if self.size > cap * 1e6 else None
@@ -108,8 +110,11 @@ class FolderResolver(Resolver):
     def get(self, key: str) -> bytes:
         """The bytes of a file; raises FileNotFoundError where it is missing or refused."""
         name = str(key).strip().replace("\\", "/")
+        if self.budget.files >= self.limits.max_nodes:
+            raise self._refuse(name, f"is one of more than max_nodes = {self.limits.max_nodes} files")
         path = self.find(name)
         if path is None:
+            self.budget.files += 1
             raise self._refuse(name, "is missing")
         if path.stat().st_size > self.limits.max_file_mb * 1e6:
             raise self._refuse(name, f"is larger than max_file_mb = {self.limits.max_file_mb:g}")

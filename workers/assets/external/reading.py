@@ -4,6 +4,7 @@ import io
 import re
 import warnings
 from collections.abc import Iterable
+from itertools import islice
 from pathlib import Path
 
 import trimesh
@@ -70,11 +71,16 @@ def list_mesh_files(path: Path, root: Path, limits: MeshLimits) -> list[Path]:
         check_counts(path, *declared_counts(kind, data), limits)
     resolver = FolderResolver(path, root, limits)
     names = material_files(data) if kind == ".obj" else _decode(_PLY_TEXTURE.findall(data)) if kind == ".ply" else []
-    found = [file for name in names if (file := resolver.find(name)) is not None]
+    found = _find(resolver, names)
     for material in [file for file in found if file.suffix.lower() == ".mtl"]:
-        textures = _decode(_MAP_KD.findall(material.read_bytes()))
-        found += [file for name in textures if (file := resolver.find(name)) is not None]
+        found += _find(resolver, _decode(_MAP_KD.findall(material.read_bytes())))
     return list(dict.fromkeys([path, *found]))
+
+
+def _find(resolver: FolderResolver, names: Iterable[str]) -> list[Path]:
+    """The files of as many different names as an asset may read."""
+    first = islice(dict.fromkeys(names), resolver.limits.max_nodes)
+    return [file for name in first if (file := resolver.find(name)) is not None]
 
 
 def material_files(data: bytes) -> list[str]:

@@ -144,6 +144,16 @@ def test_a_mesh_that_a_urdf_names_a_thousand_times_is_read_once(tmp_path, monkey
     assert len(read) == 1
 
 
+@pytest.mark.parametrize("text", ["map_Kd skin.png\n" * 100_000, "".join(f"map_Kd {k}.png\n" for k in range(100_000))])
+def test_a_material_file_that_names_pictures_without_end_is_read_for_as_long_as_a_mesh_may_have_parts(tmp_path, text):
+    """Took 30 s of processor time and more."""
+    textured_cube(tmp_path, more=text)
+    Image.new("RGB", (8, 8)).save(tmp_path / "skin.png")
+    catalogue = opened(tmp_path, "cube.obj", limits=MeshLimits(max_cpu_s=8))
+    asset, _ = scene_of(catalogue, "cube.obj")
+    assert len(asset.notes) <= 20
+
+
 def test_all_textures_of_an_asset_together_have_a_cap(tmp_path):
     """Each is within `max_texture_px`; without the cap, a hundred like them took 9.8 GB."""
     materials = "".join(f"newmtl m{k}\nKd 1 1 1\nmap_Kd skin{k}.png\n" for k in range(4))

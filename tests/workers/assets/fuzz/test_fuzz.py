@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +22,7 @@ SEED = 20260101
 QUICK, ALL = 60, 3600
 SETTINGS = FolderSource(source="urdf", folder=".")
 MOST_S, MOST_KB = 60.0, 2 << 20
+"""Processor seconds and memory of listing, checking and loading an asset."""
 REASONS = {
     "format", "index_out_of_range", "missing", "name", "no_faces", "no_hull", "no_size", "not_finite", "size",
     "too_large", "too_slow", "unreadable",
@@ -35,7 +35,7 @@ class Trial:
 
     what: str
     outcome: str
-    wall_s: float
+    cpu_s: float
     rss_kb: int
 
 
@@ -43,23 +43,23 @@ def read(reader: Reader, folder: Path, files: dict[str, bytes], what: str) -> tu
     """A mutant's files written below a folder, listed, checked and loaded as the catalogue does."""
     for name, data in files.items():
         write(folder / name, data)
-    path, begun, rss = folder / next(iter(files)), time.monotonic(), 0
+    path, cpu, rss = folder / next(iter(files)), 0.0, 0
     entry: Entry | None = None
     answer: memoryview | MeshError = memoryview(b"")
     for kind in ("list", "check", "load"):
         request = Request(SETTINGS, folder, Assets(), (Task(kind, path, "mug", entry),))
         (answer,) = reader.ask(request)
-        rss = max(rss, reader.last.rss_kb)
+        cpu, rss = cpu + reader.last.cpu_s, max(rss, reader.last.rss_kb)
         if isinstance(answer, MeshError):
             check_refusal(answer, folder, what)
-            return Trial(what, answer.reason, time.monotonic() - begun, rss), None
+            return Trial(what, answer.reason, cpu, rss), None
         if kind == "list":
             entry = Entry("a", tuple(SourceFile(*file) for file in json.loads(bytes(answer).rstrip(b"\0"))), "MIT")
             assert all((folder / file.path).resolve().is_relative_to(folder.resolve()) for file in entry.files), what
     assert isinstance(answer, memoryview)
     asset = unpack_asset(answer)
     check_asset(asset, what)
-    return Trial(what, "read", time.monotonic() - begun, rss), asset
+    return Trial(what, "read", cpu, rss), asset
 
 
 def check_refusal(error: MeshError, folder: Path, what: str) -> None:
@@ -98,7 +98,7 @@ def run(tmp_path: Path, indices: range) -> list[Trial]:
         trial, _ = read(shared_reader(), folder, dict(files), f"{index}: {what}")
         shutil.rmtree(folder)
         trials.append(trial)
-    assert max(trial.wall_s for trial in trials) < MOST_S
+    assert max(trial.cpu_s for trial in trials) < MOST_S
     assert max(trial.rss_kb for trial in trials) < MOST_KB
     return trials
 
@@ -114,11 +114,11 @@ def test_some_mutants_are_read_or_refused_and_nothing_else(tmp_path):
 def test_thousands_of_mutants_are_read_or_refused_and_nothing_else(tmp_path, part, capsys):
     step = ALL // 12
     trials = run(tmp_path, range(part * step, (part + 1) * step))
-    slowest, largest = max(trials, key=lambda t: t.wall_s), max(trials, key=lambda t: t.rss_kb)
+    slowest, largest = max(trials, key=lambda t: t.cpu_s), max(trials, key=lambda t: t.rss_kb)
     outcomes = sorted({t.outcome for t in trials}, key=lambda o: -sum(t.outcome == o for t in trials))
     counts = ", ".join(f"{sum(t.outcome == o for t in trials)} {o}" for o in outcomes)
     with capsys.disabled():
-        print(f"\n{len(trials)} mutants: {counts}; slowest {slowest.wall_s:.1f} s ({slowest.what});", end=" ")
+        print(f"\n{len(trials)} mutants: {counts}; slowest {slowest.cpu_s:.1f} s ({slowest.what});", end=" ")
         print(f"largest {largest.rss_kb / 1024:.0f} MiB ({largest.what})")
 
 
