@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from schemas.dataset.fingerprint import Fingerprint
-from schemas.dataset.layout import FINGERPRINT_FILE, is_shape
+from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, is_shape
 from schemas.dataset.tables import DETERMINISTIC_TABLES
-from schemas.errors import MachineError
+from schemas.errors import CorruptError, MachineError
+from schemas.job.identity import job_digest
 from schemas.scene.scene import SceneOutput
 from services.job.record import JobRecord, require_job
 from services.read.dataset_reader import StoredRange, file_reader, find_scene
@@ -42,8 +43,15 @@ class Replay:
 
 
 def replay_scene(store: Store, scene_id: int) -> Replay:
-    """Make one scene again and compare its files and rows: to the byte on the same stack, within tolerances on another."""
+    """Make one scene again and compare its files and rows: to the byte on the same stack, within tolerances on another.
+
+    Raises CorruptError where job.yaml is not the job of the scene's commit.
+    """
     record, stored = require_job(store), find_scene(store, scene_id)
+    if job_digest(record.job, record.catalogue) not in {one.terms.job_digest for one in stored.records}:
+        raise CorruptError(
+            f"{store.name}/{JOB_FILE} is not the job that scene {scene_id} was made from: restore it from a copy"
+        )
     context = open_context(record)
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
     same_stack = take_fingerprint(context.renderer, context.job.render.tier) == theirs

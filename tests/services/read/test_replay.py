@@ -5,12 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+from schemas.errors import CorruptError
 from services.job.record import require_job
 from services.read.dataset_reader import find_scene
 from services.read.replay import compare_files, compare_rows, open_context, replay_scene
 from workers.pipeline.run_shard import run_scene
 from workers.pipeline.stopwatch import Stopwatch
 from workers.store.images import decode_png, encode_png
+from workers.store.local import LocalStore
 
 
 @pytest.fixture(scope="module")
@@ -47,3 +49,10 @@ def test_another_stack_may_differ_in_few_pixels_and_the_same_in_none(three_objec
     assert len(compare_files(three_objects, stored, now, same_stack=True)) == 1
     assert len(compare_files(three_objects, stored, now, same_stack=False)) == told
     assert compare_files(three_objects, stored, dataclasses.replace(output, files=files[1:]), True)
+
+
+def test_a_job_that_was_changed_is_told_and_no_scene_is_made_from_it(copy):
+    job = copy / "job.yaml"
+    job.write_text(job.read_text().replace("seed: 11\n", "seed: 12\n"))
+    with pytest.raises(CorruptError, match=r"job\.yaml is not the job that scene 1 was made from"):
+        replay_scene(LocalStore(copy), 1)
