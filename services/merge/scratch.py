@@ -20,16 +20,16 @@ def merge_folder(store: Store) -> Iterator[Path]:
 
     Raises MachineError where a file in it cannot be written, RunError where it is taken away in turn.
     """
-    folder: Path | None = None
     try:
         with explain_full_disk(), store.scratch(SCRATCH) as folder:
             yield folder
     except (MachineError, FileNotFoundError) as error:
         if store.root is not None and not store.root.is_dir():
             raise MachineError(f"{store.name} was removed while it was merged") from error
-        if folder is not None and isinstance(error, FileNotFoundError):
+        if isinstance(error, FileNotFoundError):
             raise RunError(
-                f"{folder} was removed while it was in use: another coordinator merges here; start again when it has ended"
+                f"{error.filename or SCRATCH} was removed while {store.name} was merged: another coordinator merges here; "
+                "start again when it has ended"
             ) from error
         raise
 

@@ -26,9 +26,8 @@ VIEWS = {4: 8, 6: 10}
 """Rows of views by the number of scenes, of which number 5 fails."""
 SOME = 24
 """Every so many steps by default; `--all` takes each of them."""
-some_or_every = pytest.mark.parametrize(
-    "stride", [SOME, pytest.param(1, marks=pytest.mark.slow)], ids=["some", "every"]
-)
+_EVERY = pytest.param(1, marks=[pytest.mark.slow, pytest.mark.timeout(1800)], id="every")
+some_or_every = pytest.mark.parametrize("stride", [pytest.param(SOME, id="some"), _EVERY])
 
 
 def first_try(scene_id):
