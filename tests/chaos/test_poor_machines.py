@@ -20,6 +20,7 @@ MAY_READ_IT = {
     "services/run/progress.py": "the time of an event, to be logged",
     "workers/store/local.py": "when a file was written, for the rate",
     "workers/store/objects.py": "when an object was put, for the rate",
+    "workers/store/temporary_folder.py": "how long ago an unlocked folder was made, which a set clock only leaves longer",
 }
 """Nothing is decided by these, so a clock may be set while a run goes on."""
 

@@ -33,8 +33,9 @@ def many_triangles(path, count):
 
 
 def test_processor_time_and_memory_are_verdicts_on_the_file_and_the_files_beside_it_are_read(tmp_path):
-    good, slow = write(tmp_path / "good.obj", CUBE), many_triangles(tmp_path / "slow.obj", 400_000)
-    answers = list(shared_reader().ask(request(tmp_path, good, slow, good, kind="check", max_cpu_s=1.0)))
+    good, slow = write(tmp_path / "good.obj", CUBE), many_triangles(tmp_path / "slow.obj", 1_400_000)
+    limits = {"max_cpu_s": 1.0, "max_vertices": 2_000_000, "max_faces": 2_000_000}
+    answers = list(shared_reader().ask(request(tmp_path, good, slow, good, kind="check", **limits)))
     assert [isinstance(answer, MeshError) for answer in answers] == [False, True, False]
     assert (answers[1].reason, answers[1].kind) == ("too_slow", "intrinsic")
     assert "slow.obj takes more than assets.limits.max_cpu_s = 1 s of processor time" in answers[1].detail
