@@ -30,6 +30,7 @@ from pathlib import Path
 import manifold3d
 import numpy as np
 import shapely
+from scipy.spatial import QhullError
 
 from schemas.base import Array, frozen_array
 from schemas.errors import MachineError, MeshError
@@ -70,6 +71,9 @@ Half of the default `run.scene_timeout_s`, so that a mesh without an end is a fa
 Where a job sets a shorter time, the worker is killed first, which is a failure of the machine, as for any slow scene.
 """
 
+SCRAP = 1e-3
+"""Thickness of a loose triangle, as a share of its distance from the middle of the mesh."""
+
 MEMORY_MB = 2048
 """Address space of CoACD, MiB; where it is not enough CoACD gives up."""
 
@@ -105,7 +109,7 @@ def decompose(mesh: Mesh, digest: str, threshold: float = THRESHOLD, folder: Pat
     key = key_of(_version(), repr(threshold), digest, mesh.vertices.tobytes(), mesh.faces.tobytes())
     parts = _CACHE.get(key, folder, lambda: _decompose(mesh, threshold))
     if parts.method == NO_PARTS:
-        detail = f"CoACD found no convex parts in {LONGEST_S} s of processor time: make the mesh simpler or mend it"
+        detail = f"CoACD found no convex parts in {LONGEST_S} s of processor time, or none with a volume: mend the mesh"
         raise MeshError("no_convex_parts", detail)
     return parts
 
@@ -130,13 +134,33 @@ def _decompose(mesh: Mesh, threshold: float) -> Parts:
     if len(pieces) > MOST_PIECES:
         pieces = [welded]
     stop_s, made = _children_s() + LONGEST_S, []
+    middle = 0.5 * (welded.vertices.min(axis=0) + welded.vertices.max(axis=0))
     for piece in pieces:
         try:
-            made.append(_parts_of(piece, threshold, stop_s))
+            if _has_hull(piece.vertices):
+                made.append(_parts_of(piece, threshold, stop_s))
+            else:
+                made.append(("convex", [_wedge(piece.vertices, middle)]))
         except subprocess.TimeoutExpired:
             return Parts((), NO_PARTS)
     method = max((method for method, _ in made), key=("convex", "coacd", "pieces").index)
-    return Parts(tuple(frozen_array(cloud) for _, clouds in made for cloud in clouds), method)
+    bodies = [cloud for _, clouds in made for cloud in clouds if _has_hull(cloud)]
+    return Parts(tuple(frozen_array(cloud) for cloud in bodies), method if bodies else NO_PARTS)
+
+
+def _has_hull(points: Array) -> bool:
+    """Whether points [N, 3] have a convex hull: a single triangle has none, nor have points in a line but for rounding."""
+    try:
+        convex_hull(points)
+    except (QhullError, ValueError):
+        return False
+    return True
+
+
+def _wedge(points: Array, middle: Array) -> Array:
+    """The points of a scrap and one a little nearer to the middle [3] of the mesh, hence within its hull."""
+    centre = points.mean(axis=0)
+    return np.concatenate([points, [centre + SCRAP * (middle - centre)]])
 
 
 def _children_s() -> float:
@@ -147,8 +171,6 @@ def _children_s() -> float:
 
 def _parts_of(piece: Mesh, threshold: float, stop_s: float) -> tuple[str, list[Array]]:
     """How a piece was cut, and its parts. Raises TimeoutExpired where `_children_s` would come to `stop_s`."""
-    if len(piece.vertices) < 4:
-        return "convex", [piece.vertices]
     hull, solid = convex_hull(piece.vertices), solid_of(piece)
     if is_convex_surface(piece, solid):
         return "convex", [hull.vertices]

@@ -151,6 +151,28 @@ def test_where_coacd_gives_up_the_hulls_of_the_pieces_serve(monkeypatch):
     assert ConvexHull(parts.clouds[0]).volume == pytest.approx(0.2 * 0.2 * 0.05, rel=1e-6)
 
 
+SCRAPS = {
+    "triangle": [(0, 0, 0.2), (0.01, 0, 0.2), (0, 0.01, 0.2)],
+    "needle": [(0, 0, 0.2), (0.1, 1e-8, 0.2), (0.05, 0, 0.2 + 1e-8), (0.02, 1e-8, 0.2 - 1e-8)],
+    "dust": [(0, 0, 0.2), (1e-15, 0, 0.2), (0, 1e-15, 0.2), (0, 0, 0.2 + 1e-15)],
+}
+
+
+@pytest.mark.parametrize("scrap", SCRAPS)
+def test_a_loose_scrap_beside_a_body_has_a_part_with_a_hull_or_none(scrap):
+    """A part without a hull ended the whole job: a body is built of the hulls of its parts."""
+    body, points = angle_iron(), np.array(SCRAPS[scrap])
+    start = len(body.vertices)
+    faces = [(start, start + 1, start + 2), *([(start, start + 1, start + 3)] if len(points) > 3 else [])]
+    mesh = Mesh(np.concatenate([body.vertices, points]), np.concatenate([body.faces, np.array(faces, dtype=np.int32)]))
+    parts = decompose(mesh, scrap, folder=None)
+    assert len(parts.clouds) >= 2
+    hull = ConvexHull(mesh.vertices, qhull_options="Qt")
+    for cloud in parts.clouds:
+        convex_hull(cloud)
+        assert (cloud @ hull.equations[:, :3].T + hull.equations[:, 3]).max() < 1e-7
+
+
 def slow_mesh(monkeypatch):
     """An open tray, cut so finely that CoACD takes minutes, with a second of processor time for it."""
     monkeypatch.setattr(module, "OPEN", {"preprocess_mode": "on", "preprocess_resolution": 1000})
