@@ -2,10 +2,17 @@
 
 import contextlib
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from schemas.errors import MachineError, VersoError
+from schemas.errors import CorruptError, MachineError, RunError, VersoError
+
+REMOVAL_S = 3.0
+"""Time for a removal to end: its first missing file is met before its last one is gone."""
+
+LOOKS_LOST = (CorruptError, RunError, FileNotFoundError)
+"""What a run meets in a folder that is just being removed."""
 
 
 @contextlib.contextmanager
@@ -22,7 +29,12 @@ def explain_lost_folder(root: Path | None) -> Iterator[None]:
     try:
         yield
     except (VersoError, OSError) as error:
-        if lost := _how_lost(folder, root):
+        lost = _how_lost(folder, root)
+        deadline = time.monotonic() + REMOVAL_S
+        while lost is None and type(error) in LOOKS_LOST and time.monotonic() < deadline:
+            time.sleep(0.1)  # whoever removes it may not be done
+            lost = _how_lost(folder, root)
+        if lost:
             raise MachineError(f"{root} was {lost} while the run worked in it: {_REMEDIES[lost]}") from error
         raise
     finally:
