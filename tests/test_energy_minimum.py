@@ -53,15 +53,16 @@ def test_a_cube_stands_on_its_face_and_not_on_its_edge_or_corner():
     assert not is_energy_minimum(cube, np.eye(4), np.array([0.0501, 0, 0])), "centre of mass beyond the edge"
 
 
+@pytest.mark.parametrize("scenes", [12, pytest.param(24, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("pose_of_start", ["upright", "tumbled"])
-def test_what_settles_on_a_level_top_is_least_in_energy(pose_of_start, tmp_path):
+def test_what_settles_on_a_level_top_is_least_in_energy(pose_of_start, scenes, tmp_path):
     job = Job.model_validate({"name": "t", "start": {"pose": pose_of_start}})
     catalogue = open_catalogue(job.assets, tmp_path, tuple(job.categories))
     found = []
-    for scene_id in range(24):
+    for scene_id in range(scenes):
         plan = draw(job, catalogue, scene_id)
         start, rest = plan.objects[0], settle_single(plan.objects[0], plan.table, job.physics)
         if rest.support == "flat_top":
             vertices = start.asset.shape.vertices
             found.append(is_energy_minimum(vertices, rest.T_world_obj, start.asset.mass.com))
-    assert len(found) >= 18 and all(found)
+    assert len(found) >= 0.75 * scenes and all(found)

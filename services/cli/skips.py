@@ -47,6 +47,7 @@ CONDITIONS: Final[dict[str, Callable[[Machine], bool]]] = {
     "no Docker": lambda machine: _fails("docker", "info"),
     "no vfat": lambda machine: _no_loop("mkfs.vfat"),
     "no ext4": lambda machine: _no_loop("mkfs.ext4"),
+    "no tmpfs": lambda machine: _fails("unshare", "--mount", "mount", "-t", "tmpfs", "none", "/mnt"),
     "no network namespaces": lambda machine: _fails("unshare", "--net", "true"),
     "no shared data": lambda machine: not (machine.root.parent / "shared" / "data").is_dir(),
     "no mitsuba": lambda machine: importlib.util.find_spec("mitsuba") is None,

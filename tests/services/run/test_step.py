@@ -65,7 +65,7 @@ def made(cluster, tmp_path_factory) -> tuple[Path, str]:
     ("slots", "run"),
     [
         (2, {"shard_size": 1, "range_size": 4}),
-        (2, {"shard_size": 7, "range_size": 16}),
+        pytest.param(2, {"shard_size": 7, "range_size": 16}, marks=pytest.mark.slow),
         (1, {"shard_size": 7, "range_size": 4}),
     ],
 )
