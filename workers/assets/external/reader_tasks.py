@@ -120,5 +120,4 @@ def check_fit(asset: Asset, path: Path) -> None:
     try:
         convex_hull(asset.shape.vertices)
     except (QhullError, ValueError) as error:
-        why = describe_error(error).split("\\n", 1)[0]
-        raise MeshError("no_hull", f"{path} has too few points apart for a body: {why:.120}") from error
+        raise MeshError("no_hull", f"{path} is no body: it needs four points apart that are not in a line") from error

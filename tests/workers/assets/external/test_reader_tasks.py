@@ -53,7 +53,7 @@ def test_a_good_mesh_passes_and_a_refused_one_says_why(tmp_path):
 def test_a_single_triangle_is_no_body_but_may_be_a_table(tmp_path):
     triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
     reason, detail, _ = json.loads(answer(tmp_path, triangle)[1:])
-    assert reason == "no_hull" and "too few points" in detail
+    assert reason == "no_hull" and "four points apart" in detail
     assert answer(tmp_path, triangle, category="table") == ANSWER
 
 
