@@ -24,7 +24,7 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 EXPECTED_SKIPS: Final = "tests/expected_skips.txt"
 
 CORE_SECONDS: Final = {"default": 900, "ci": 1500, "all": 7200}
-"""What a whole run takes by scope, in seconds of one core: measured on two cores of a Xeon at 2.1 GHz, and doubled. Said
+"""What a whole run takes by scope, in seconds of one core: estimates, from a run on two busy cores. Said
 before the first run on a machine; later ones say how long the last one took."""
 
 LAST_RUN: Final = Path(sys.prefix, "verso-test-seconds.json")
@@ -112,10 +112,10 @@ def check_skips(skips: Sequence[Skip], scope: str) -> tuple[Check, list[str]]:
 
 
 def expected_duration(scope: str, processes: int) -> str:
-    """How long a whole run takes, in words: as the last one here, or by the figure that was measured."""
+    """How long a whole run takes, in words: as the last one here, or by an estimate."""
     last = _last_runs().get(f"{scope} {processes}")
     seconds = last or CORE_SECONDS[scope] / processes
-    source = "as the last time" if last else "as measured elsewhere"
+    source = "as the last time" if last else "an estimate"
     cores = f"{processes} core{'s' * (processes > 1)}"
     return f"about {max(1, round(seconds / 60))} minutes on {cores}, {source}"
 
