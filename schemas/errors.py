@@ -16,6 +16,7 @@
         +-- SettleError     the object did not come to rest on the table
         +-- ViewError       a camera does not see what it must
         +-- LabelError      a check found labels that disagree
+        +-- CaptureError    a capture that cannot be read, or whose poses cannot be estimated
 
 A message says what failed, the number measured, and the setting to change. All arguments go to `Exception.__init__`,
 because an exception that crosses processes is rebuilt from them.
@@ -113,3 +114,9 @@ class LabelError(SceneError):
     """A check found labels that disagree."""
 
     stage = "check"
+
+
+class CaptureError(SceneError):
+    """A capture that cannot be read, or whose poses cannot be estimated."""
+
+    stage = "capture"

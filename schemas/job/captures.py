@@ -1,0 +1,190 @@
+"""The `captures` branch of a job: real or simulated photographs of one object on a marker board, and how they are processed.
+
+A job with this branch makes captures in place of scenes: capture number n is the scene with id first_scene + n.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from schemas.base import (
+    Folder,
+    Frozen,
+    Interval,
+    NonNegative,
+    NonNegativeInt,
+    Positive,
+    PositiveInt,
+    Range,
+    Share,
+    Text,
+)
+from schemas.job.sensor import Distortion, Exposure, RgbNoise
+
+Estimate = Literal["markers", "article", "joint"]
+ESTIMATES: tuple[Estimate, ...] = ("markers", "article", "joint")
+
+
+class Board(Frozen):
+    """A grid of unique square ArUco markers on a flat board (board.json).
+
+    Board frame: origin at the centre of the printed grid, x along the rows to the right, y up the print, z out of the board,
+    metres. Marker `first_id` is at the top left; ids run along the rows.
+    """
+
+    dictionary: Text = "DICT_4X4_50"
+    """A predefined dictionary of OpenCV, or the name of a file beside board.json in OpenCV's dictionary format."""
+    columns: Annotated[int, Field(ge=1, le=100)] = 7
+    rows: Annotated[int, Field(ge=1, le=100)] = 5
+    marker_m: Annotated[float, Field(gt=0, le=10)] = 0.06
+    """Side of a marker, its black border included, metres."""
+    gap_m: Annotated[float, Field(gt=0, le=10)] = 0.02
+    """Between two markers, metres."""
+    width_m: Annotated[float, Field(gt=0, le=100)] = 0.60
+    height_m: Annotated[float, Field(gt=0, le=100)] = 0.40
+    """Size of the whole board, which is centred on the grid."""
+    first_id: NonNegativeInt = 0
+    ruler_m: Positive = 0.20
+    """Length of the printed ruler as it should be."""
+    measured_ruler_m: Positive | None = None
+    """Length of the ruler as somebody measured it on the print; every length of the board is scaled by it."""
+
+    @property
+    def scale(self) -> float:
+        """True size over nominal size of the print; 1 where nobody measured it."""
+        return 1.0 if self.measured_ruler_m is None else self.measured_ruler_m / self.ruler_m
+
+    @model_validator(mode="after")
+    def _fits(self) -> "Board":
+        for name, count, size in (("width_m", self.columns, self.width_m), ("height_m", self.rows, self.height_m)):
+            needed = count * self.marker_m + (count - 1) * self.gap_m
+            if needed > size + 1e-9:
+                raise ValueError(f"{name} is {size:g}, and {count} markers with their gaps need {needed:g}")
+        if not 0.5 <= self.scale <= 2.0:
+            raise ValueError(f"measured_ruler_m over ruler_m is {self.scale:g}: must be between 0.5 and 2")
+        return self
+
+
+class KinectDepthNoise(Frozen):
+    """Noise of the simulated depth camera; its numbers and their sources are in workers/capture/simulate."""
+
+    times: NonNegative = 1.0
+    """Factor on every random error of the preset."""
+    bias_m: float = 0.0
+    """Further systematic error, metres."""
+
+
+class MotionBlur(Frozen):
+    """Movement of the hand-held camera during an exposure."""
+
+    exposure_s: Positive = 0.008
+    speed_m_s: NonNegative = 0.15
+    turn_deg_s: NonNegative = 8.0
+
+
+class HiddenMarkers(Frozen):
+    """Patches of paper that cover markers in part."""
+
+    share: Share = 0.15
+    """Share of the markers that are covered in part."""
+
+
+class RegistrationError(Frozen):
+    """Error of the depth camera's assumed place: what registers depth to colour uses this wrong pose."""
+
+    shift_m: Annotated[list[float], Field(min_length=3, max_length=3)] = Field(
+        default_factory=lambda: [0.010, 0.0, 0.0]
+    )
+    turn_deg: float = 0.0
+
+
+class Simulate(Frozen):
+    """A virtual capture with known truth; an effect that is not asked for is not simulated."""
+
+    views: Annotated[int, Field(ge=1, le=1000)] = 40
+    distance_m: Interval = Range(0.6, 1.0)
+    """Of the camera to the middle of the object."""
+    inclination_rad: Interval = Range(0.5, 1.2)
+    """Angle of the optical axis below the horizontal."""
+    roll_deg: NonNegative = 12.0
+    """Standard deviation of the roll of the hand-held camera."""
+    image_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Size of all images over the Azure Kinect's (1920 x 1080 and 640 x 576); below 1 for quick trials."""
+    tier: Literal["raster", "pathtraced"] = "raster"
+    depth_noise: KinectDepthNoise | None = None
+    rgb_noise: RgbNoise | None = None
+    motion_blur: MotionBlur | None = None
+    exposure: Exposure | None = None
+    distortion: Distortion | None = None
+    hidden_markers: HiddenMarkers | None = None
+    print_scale: Annotated[float, Field(gt=0.5, lt=2)] | None = None
+    """True size of the print over its nominal size."""
+    registration_error: RegistrationError | None = None
+
+
+class Estimation(Frozen):
+    """How the camera poses are estimated."""
+
+    estimate: Estimate = "joint"
+    """Which of the three estimates the cloud and the dataset are made with; all three are reported."""
+    compare: bool = True
+    """Compute the other two as well."""
+    max_iterations: PositiveInt = 100
+    min_markers: PositiveInt = 1
+    """A view with fewer markers is not used."""
+    max_reprojection_px: Positive = 3.0
+    """A view whose median reprojection error is larger is flagged and not used."""
+    corner_px: Positive = 0.2
+    """Standard deviation of a detected corner, which weighs corners against depth."""
+    depth_sigma_m: Positive = 0.003
+    """Standard deviation of depth at 1 m, which grows with the square of the distance; measured anew from the capture."""
+    trust: Literal["print", "depth"] = "print"
+    """What is metric truth where the print and the depth disagree about the scale."""
+
+
+class Fusion(Frozen):
+    """How the views' depth is merged into one cloud and one mesh."""
+
+    voxel_m: Annotated[float, Field(ge=0.0005, le=0.02)] = 0.002
+    max_edge_deg: Annotated[float, Field(gt=0, le=90)] = 75.0
+    """Pixels that see their surface at a larger angle of incidence are left out."""
+    board_clearance_m: NonNegative = 0.004
+    """What is nearer to the board's plane than this belongs to the board."""
+    min_views: PositiveInt = 2
+    """A point of the cloud must be confirmed by as many views."""
+
+
+class Synthesis(Frozen):
+    """How views from other poses are made."""
+
+    views: PositiveInt = 6
+    """How many captured views are merged, those whose optical axes are nearest to the new camera's."""
+    fill_px: NonNegativeInt = 3
+    """Holes up to about this size are filled, and counted as not measured."""
+
+
+class Captures(Frozen):
+    """Captures in place of scenes."""
+
+    source: Literal["simulate", "folders"] = "simulate"
+    folders: Annotated[list[Folder], Field(max_length=100_000)] = Field(default_factory=list)
+    """For source `folders`: one folder a capture, in order; relative to the job file."""
+    category: Text = "object"
+    """For source `folders`: the category of captures whose capture.json names none."""
+    board: Board = Board()
+    simulate: Simulate = Simulate()
+    estimation: Estimation = Estimation()
+    fusion: Fusion = Fusion()
+    synthesis: Synthesis = Synthesis()
+    most_views: Annotated[int, Field(ge=1, le=1000)] = 64
+    """Views of a capture that are stored: fixes the arithmetic of pose ids."""
+
+    @model_validator(mode="after")
+    def _has_folders(self) -> "Captures":
+        if (self.source == "folders") != bool(self.folders):
+            raise ValueError("folders must be named for source: folders, and for it alone")
+        if self.source == "simulate" and self.simulate.views > self.most_views:
+            raise ValueError(
+                f"simulate.views is {self.simulate.views}, and most_views is {self.most_views}: raise most_views"
+            )
+        return self

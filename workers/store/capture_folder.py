@@ -1,0 +1,184 @@
+"""The folder of a capture: the only place where its files are read and written.
+
+    camera.json  board.json  capture.json (name and category; may be missing)
+    rgb_00000.png  depth_00000.png  mask_00000.png  board_00000.txt  correction_00000.txt
+    truth/       what a simulation knows; read by evaluation alone
+
+Depth and masks may be missing, in some views or in all. camera.json has width, height, fx, fy, cx, cy, `pixel_centre` ("0" as in
+OpenCV and the Azure Kinect's calibration, or "0.5" from the image's edge), `distortion` (OpenCV's order, 0 to 8 numbers) and
+`depth_units_per_m`. board.json is the job file's branch `captures.board`.
+"""
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError
+
+from schemas.base import Array, Frozen, Pose, Positive, PositiveInt, Text
+from schemas.capture.view import CaptureCamera, CapturedView
+from schemas.errors import CaptureError
+from schemas.job.captures import Board
+from schemas.scene.camera import Intrinsics
+from workers.store.images import encode_png
+
+CAMERA_FILE, BOARD_FILE, CAPTURE_FILE, TRUTH = "camera.json", "board.json", "capture.json", "truth"
+Model = TypeVar("Model", bound=Frozen)
+_RGB = re.compile(r"rgb_([0-9]{5,9})\.png")
+
+
+class CameraFile(Frozen):
+    """camera.json."""
+
+    width: PositiveInt
+    height: PositiveInt
+    fx: Positive
+    fy: Positive
+    cx: float
+    cy: float
+    pixel_centre: Literal["0", "0.5"]
+    """Coordinate of the first pixel's centre."""
+    distortion: Annotated[list[float], Field(max_length=8)] = Field(default_factory=list)
+    depth_units_per_m: Positive = 1000.0
+
+
+class CaptureFile(Frozen):
+    """capture.json."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+    category: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")] = "object"
+    licence: Text = "unknown"
+
+
+@dataclass(frozen=True)
+class CaptureFolder:
+    """An opened capture: its camera, its board, and the numbers of its views in ascending order."""
+
+    path: Path
+    about: CaptureFile
+    camera: CaptureCamera
+    board: Board
+    numbers: tuple[int, ...]
+
+
+def open_folder(path: Path) -> CaptureFolder:
+    """Reads what describes a capture; images are read one view at a time. Raises CaptureError that names file and remedy."""
+    if not path.is_dir():
+        raise CaptureError("missing", f"{path} is no folder")
+    numbers = sorted(int(match[1]) for file in path.iterdir() if (match := _RGB.fullmatch(file.name)))
+    if not numbers:
+        raise CaptureError(
+            "missing", f"{path} has no rgb_00000.png: images are named rgb_, depth_ and mask_ with a number"
+        )
+    spec = _read_json(path / CAMERA_FILE, CameraFile)
+    about = (
+        _read_json(path / CAPTURE_FILE, CaptureFile) if (path / CAPTURE_FILE).exists() else CaptureFile(name=path.name)
+    )
+    return CaptureFolder(path, about, _camera(spec), _read_json(path / BOARD_FILE, Board), tuple(numbers))
+
+
+def read_view(folder: CaptureFolder, number: int) -> CapturedView:
+    """One view's images. Raises CaptureError where one cannot be read or has the wrong size."""
+    rgb = _read_image(folder, f"rgb_{number:05d}.png", cv2.IMREAD_COLOR_RGB, np.uint8)
+    assert rgb is not None
+    depth = _read_image(folder, f"depth_{number:05d}.png", cv2.IMREAD_UNCHANGED, np.uint16, optional=True)
+    mask = _read_image(folder, f"mask_{number:05d}.png", cv2.IMREAD_GRAYSCALE, np.uint8, optional=True)
+    return CapturedView(number, rgb, depth, None if mask is None else mask > 0)
+
+
+def write_view(path: Path, view: CapturedView) -> None:
+    """Writes one view's images below a folder that exists."""
+    (path / f"rgb_{view.number:05d}.png").write_bytes(encode_png(view.rgb))
+    if view.depth is not None:
+        (path / f"depth_{view.number:05d}.png").write_bytes(encode_png(view.depth))
+    if view.mask is not None:
+        (path / f"mask_{view.number:05d}.png").write_bytes(encode_png(view.mask.astype(np.uint8) * 255))
+
+
+def write_description(path: Path, about: CaptureFile, camera: CaptureCamera, board: Board) -> None:
+    """Writes camera.json, board.json and capture.json; the principal point with pixel centres at 0, as the Kinect has it."""
+    k = camera.intrinsics
+    spec = CameraFile(
+        **k.model_dump(include={"width", "height", "fx", "fy"}),
+        cx=k.cx_opencv,
+        cy=k.cy_opencv,
+        pixel_centre="0",
+        distortion=[float(x) for x in camera.lens] if camera.has_lens else [],
+        depth_units_per_m=camera.depth_units_per_m,
+    )
+    for name, model in ((CAMERA_FILE, spec), (BOARD_FILE, board), (CAPTURE_FILE, about)):
+        (path / name).write_text(model.model_dump_json(indent=1) + "\n", encoding="utf-8")
+
+
+def read_pose(path: Path) -> Pose | None:
+    """[4, 4] float64 of a file of four lines of four numbers, None where there is none. Raises CaptureError."""
+    if not path.exists():
+        return None
+    try:
+        T = np.loadtxt(path, dtype=np.float64, ndmin=2)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise CaptureError("unreadable", f"{path} is no matrix of numbers: {error}") from error
+    if T.shape != (4, 4) or not np.isfinite(T).all() or not _is_rigid(T):
+        raise CaptureError("unreadable", f"{path} must hold a rigid transform: 4 lines of 4 numbers, the last 0 0 0 1")
+    return T
+
+
+def write_pose(path: Path, T: Pose) -> None:
+    """Writes 4 lines of 4 numbers that read back to the same doubles."""
+    path.write_text("\n".join(" ".join(repr(float(x)) for x in row) for row in T) + "\n", encoding="utf-8")
+
+
+def _is_rigid(T: Pose) -> bool:
+    R = T[:3, :3]
+    return bool(
+        np.abs(R @ R.T - np.eye(3)).max() < 1e-4 and np.linalg.det(R) > 0 and np.array_equal(T[3], [0, 0, 0, 1])
+    )
+
+
+def _camera(spec: CameraFile) -> CaptureCamera:
+    shift = 0.5 - float(spec.pixel_centre)
+    lens: Array = np.zeros(8)
+    lens[: len(spec.distortion)] = spec.distortion
+    lens.setflags(write=False)
+    size = spec.model_dump(include={"width", "height", "fx", "fy"})
+    return CaptureCamera(Intrinsics(**size, cx=spec.cx + shift, cy=spec.cy + shift), lens, spec.depth_units_per_m)
+
+
+def _read_json(path: Path, model: type[Model]) -> Model:
+    try:
+        return model.model_validate(json.loads(path.read_bytes()))
+    except FileNotFoundError:
+        raise CaptureError("missing", f"{path.parent} has no {path.name}") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise CaptureError("unreadable", f"{path}: {key or 'the file'}: {first['msg']}") from error
+    except ValueError as error:
+        raise CaptureError("unreadable", f"{path} is no JSON: {error}") from error
+
+
+def _read_image(folder: CaptureFolder, name: str, flags: int, dtype: type, optional: bool = False) -> NDArray | None:
+    path = folder.path / name
+    if not path.exists():
+        if optional:
+            return None
+        raise CaptureError("missing", f"{folder.path} has no {name}")
+    image = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), flags)
+    if image is None:
+        raise CaptureError("unreadable", f"{path} is no image that can be read: take it out, or copy it again")
+    k = folder.camera.intrinsics
+    if (
+        image.dtype != dtype
+        or image.shape[:2] != (k.height, k.width)
+        or image.ndim != (3 if flags == cv2.IMREAD_COLOR_RGB else 2)
+    ):
+        kind = (
+            f"{image.shape[1]} x {image.shape[0]} of {image.dtype}, {1 if image.ndim == 2 else image.shape[2]} channels"
+        )
+        raise CaptureError("size", f"{path} is {kind}, and camera.json says {k.width} x {k.height} ({np.dtype(dtype)})")
+    return image
