@@ -6,6 +6,7 @@ are started without this project's commands (`ray start`); a test compares the t
 """
 
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
@@ -48,3 +49,11 @@ def settings_to_change(environ: Mapping[str, str], flags: frozenset[str]) -> dic
     if environ.get(KEEP) == "1":
         return {}
     return {name: value for name, value in stack_environment(flags).items() if environ.get(name) != value}
+
+
+def cache_folder(name: str) -> Path | None:
+    """The user's folder for what is kept between runs, `~/.cache/verso/<name>`; None for a user without a home."""
+    try:
+        return Path.home() / ".cache" / "verso" / name
+    except RuntimeError:
+        return None

@@ -27,7 +27,7 @@ def main(argv: list[str] | None = None) -> int:
         return run_tests(argv[1:])
     options = build_parser().parse_args(argv)
     if from_shell and options.starts_ray(options):
-        return supervise(partial(_run, options), options.kept, quiet=options.quiet)
+        return supervise(partial(_run, options), options.kept, quiet=options.quiet, answers=options.json)
     try:
         return _run(options)
     except KeyboardInterrupt:

@@ -5,9 +5,9 @@ from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE, stored_roles
 from schemas.job.assets import ProceduralSource
 from services.job.record import JobRecord
-from services.job.seal import is_sealed, seal
 from services.merge.step import MergeResult
 from workers.assets.catalogue import Catalogue
+from workers.store.seal import is_sealed, seal
 from workers.store.store import Store
 
 ARTICLE = (

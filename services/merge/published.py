@@ -22,10 +22,10 @@ class PublishedFiles:
         self._store = store
         self._listed: sqlite3.Connection | None = None
         if store.root is None:
-            self._listed = open_scratch(
-                folder / "listed.sqlite", "CREATE TABLE files (path TEXT PRIMARY KEY, bytes INTEGER)"
-            )
             with explain_full_disk():
+                self._listed = open_scratch(
+                    folder / "listed.sqlite", "CREATE TABLE files (path TEXT PRIMARY KEY, bytes INTEGER)"
+                )
                 self._listed.executemany("INSERT OR REPLACE INTO files VALUES (?, ?) ", store.listing())
 
     def check(self, block: Block) -> None:

@@ -35,17 +35,16 @@ def merge_folder(store: Store) -> Iterator[Path]:
 
 
 def open_scratch(path: Path, tables: str) -> sqlite3.Connection:
-    """A new SQLite file with these tables. No journal and no flush: another merge begins with a new file."""
+    """A new SQLite file with these tables. No journal and no flush: whoever comes later begins with a new file."""
     # No other process opens the file, and file locks may be missing on a network drive.
     uri = f"{path.absolute().as_uri()}?nolock=1"
-    with explain_full_disk():
-        connection = sqlite3.connect(uri, uri=True, isolation_level=None)
-        try:
-            connection.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
-            connection.executescript(f"PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF; {tables}; BEGIN;")
-        except sqlite3.Error:
-            connection.close()
-            raise
+    connection = sqlite3.connect(uri, uri=True, isolation_level=None)
+    try:
+        connection.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
+        connection.executescript(f"PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF; {tables}; BEGIN;")
+    except sqlite3.Error:
+        connection.close()
+        raise
     return connection
 
 

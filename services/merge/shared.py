@@ -26,7 +26,8 @@ class SharedRows:
     """Takes assets and files range by range, in any order, and gives them back sorted."""
 
     def __init__(self, folder: Path) -> None:
-        self._db = open_scratch(folder / "shared.sqlite", _TABLES)
+        with explain_full_disk():
+            self._db = open_scratch(folder / "shared.sqlite", _TABLES)
         self.images = 0
 
     def add_assets(self, rows: pa.Table) -> None:

@@ -7,25 +7,17 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from schemas.errors import MachineError
+from services.merge.scratch import open_scratch
 
-CACHE_KIB = 16 << 10
-"""Memory for SQLite's cache."""
-
-_SETUP = """
-PRAGMA journal_mode = OFF;
-PRAGMA synchronous = OFF;
-CREATE TABLE paths (path BLOB PRIMARY KEY, sha256 TEXT) WITHOUT ROWID;
-BEGIN;
-"""
+_TABLE = "CREATE TABLE paths (path BLOB PRIMARY KEY, sha256 TEXT) WITHOUT ROWID"
 
 
 class PathIndex:
     """Takes paths with their SHA-256 in any order, and answers whether a path is among them."""
 
     def __init__(self, folder: Path) -> None:
-        self._db = sqlite3.connect(folder / "paths.sqlite", isolation_level=None)
-        self._db.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
-        self._db.executescript(_SETUP)
+        with _explained():
+            self._db = open_scratch(folder / "paths.sqlite", _TABLE)
 
     def add(self, path: str, sha256: str = "") -> str | None:
         """Takes a path; the SHA-256 that it was given before, None where it is new."""

@@ -1,10 +1,8 @@
 """Files of a committed range made again from the job, and kept only where their SHA-256 is what the commit says."""
 
 import hashlib
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -25,6 +23,7 @@ from workers.store.commit import read_committed
 from workers.store.local import LocalStore
 from workers.store.manifest import decode_table, encode_table, sorted_rows, table_of_rows
 from workers.store.store import Store
+from workers.store.temporary_folder import temporary_folder
 
 
 class Maker:
@@ -72,7 +71,7 @@ class Maker:
         self, record: CommitRecord, awaited: Mapping[str, str], known: Mapping[str, Mapping[int, Row]]
     ) -> Iterator[tuple[str, bytes]]:
         """The files of the whole range, committed in a temporary folder by the code that commits every range."""
-        with tempfile.TemporaryDirectory(prefix="verso-repair-") as folder:
+        with temporary_folder("repair") as folder:
             scratch = LocalStore(folder)
             scratch.prepare()
             attempt = begin_attempt(scratch, record.span, record.terms)
@@ -81,7 +80,7 @@ class Maker:
                 attempt.add_scene(self._output(mark, known))
             attempt.commit()
             for path in list(awaited):
-                file = Path(folder, path)
+                file = folder / path
                 if file.is_file():
                     yield path, file.read_bytes()
 

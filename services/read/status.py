@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 import pyarrow.compute as pc
 
-from schemas.dataset.layout import COMMITS, STAGING, commit_path, parse_range_name
+from schemas.dataset.layout import COMMITS, STAGING, commit_path
 from schemas.dataset.ledger import Ledger
 from schemas.errors import OutputError
 from services.merge.step import read_success
 from services.run.lock import Holder, read_holder
 from services.run.losses import find_lost
-from workers.store.attempt import attempts_at, blamed_scene, retry_of_attempt
+from workers.store.attempt import blamed_scene, retry_of_attempt, staged_attempts
 from workers.store.ledger import list_commits
 from workers.store.store import Store
 
@@ -96,10 +96,8 @@ def _rate(store: Store, ledger: Ledger) -> float | None:
 
 
 def _running(store: Store) -> list[Running]:
-    starts = [start for folder in store.children(STAGING) if (start := parse_range_name(folder)) is not None]
     return [
         Running(start, attempt, blamed_scene(store, start, attempt))
-        for start in starts
-        for attempt in attempts_at(store, start)
+        for start, attempt in staged_attempts(store)
         if store.size(commit_path(start, retry_of_attempt(attempt) or 0)) is None
     ]

@@ -5,7 +5,6 @@ Ranges are read one by one, and what they share is kept in a temporary folder: m
 
 import contextlib
 import errno
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +41,7 @@ from workers.pipeline.allocator import keep_freed_memory
 from workers.store.commit import commits_digest
 from workers.store.ledger import read_kept_rows
 from workers.store.store import Store
+from workers.store.temporary_folder import temporary_folder
 
 TOP_FILES = (JOB_FILE, README_FILE, SUCCESS_FILE, FINGERPRINT_FILE, LEDGER_FILE, CAM_POSES, CAMERAS, OBJECTS)
 """Files with one place each; whether they are whole is checked by name."""
@@ -204,9 +204,9 @@ def _made(folder: Path) -> Path:
 @contextlib.contextmanager
 def _temporary_folder() -> Iterator[Path]:
     """A folder for what the ranges share. Raises MachineError where it is full."""
-    with tempfile.TemporaryDirectory(prefix="verso-verify-") as folder:
+    with temporary_folder("verify") as folder:
         try:
-            yield Path(folder)
+            yield folder
         except OSError as error:
             if error.errno != errno.ENOSPC:
                 raise

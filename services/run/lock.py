@@ -16,6 +16,7 @@ from pathlib import Path
 
 from schemas.dataset.layout import LOCK_CLAIMS, LOCK_FILE
 from schemas.errors import RunError
+from services.run.processes import read_process
 from workers.store.store import Store
 
 
@@ -258,12 +259,8 @@ def _machine() -> str:
 
 def _born(pid: int) -> str | None:
     """The start of a process of this machine, in ticks since boot; None where there is no such process."""
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return None
-    state, *fields = stat.rpartition(")")[2].split()
-    return None if state in "ZX" else fields[18]
+    process = read_process(pid)
+    return None if process is None or process.ended else process.born
 
 
 def _now_s() -> float:

@@ -48,11 +48,12 @@ _listeners: list[int] = []
 """Pipes to the supervisors of this process; empty where it has none."""
 
 
-def supervise(command: Callable[[], int], kept: str, quiet: bool = True) -> int:
+def supervise(command: Callable[[], int], kept: str, quiet: bool = True, answers: bool = False) -> int:
     """The exit code of `command`, which runs in a child; returns there too, with the same code.
 
     A command that dies is told in one line on standard error, with `kept`: what remains of its work. `quiet` keeps what
-    C++ code writes to standard error out of the terminal. For a process without threads.
+    C++ code writes to standard error out of the terminal. With `answers`, the command owes standard output a JSON object in
+    its last line, and one is printed for a command that dies. For a process without threads.
     """
     words = os.memfd_create("last words") if quiet else None
     watched = {number for number in (*STOPS, signal.SIGTSTP, signal.SIGCONT) if _is_wanted(number)}
@@ -61,7 +62,7 @@ def supervise(command: Callable[[], int], kept: str, quiet: bool = True) -> int:
     mark = uuid.uuid4().hex
     os.environ[MARK] = mark  # noqa: TID251 - what the command starts inherits it, and is known by it
     last = os.pipe()
-    keeper = _Layer(frozenset(watched), kept, words, signal.SIGKILL, innermost=True, last=last)
+    keeper = _Layer(frozenset(watched), kept, words, answers, signal.SIGKILL, innermost=True, last=last)
     front = replace(keeper, dies_with_parent=signal.SIGTERM, innermost=False)
     return front.tend(lambda: keeper.tend(lambda: _drive(command, words, mask)))
 
@@ -88,6 +89,7 @@ class _Layer:
     watched: frozenset[signal.Signals]
     kept: str
     words: int | None
+    answers: bool
     dies_with_parent: signal.Signals
     """What its child gets when this process dies."""
     innermost: bool
@@ -122,6 +124,8 @@ class _Layer:
             line += where if stopped_by is None else ""
             with contextlib.suppress(OSError):  # a terminal that was closed
                 print(f"verso: {line}", file=sys.stderr, flush=True)
+                if self.answers:
+                    print(json.dumps({"ok": False, "error": line, "kind": "Ended"}), flush=True)
         tell(code=code, ended_by=None)
         return code
 

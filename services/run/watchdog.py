@@ -12,10 +12,9 @@ import time
 from pathlib import Path
 from types import TracebackType
 
-from schemas.dataset.layout import STAGING
 from services.run.processes import Process, descendants, read_process, send
 from services.run.stalls import COMMIT_FACTOR, SCENE_FACTOR, AttemptName, Sight, Stall, find_stalls, look
-from workers.store.attempt import attempts_at, blamed_scene
+from workers.store.attempt import blamed_scene, staged_attempts
 from workers.store.store import Store
 
 LOOKS = 12
@@ -77,9 +76,8 @@ class Watchdog:
 
 def scenes_in_progress(store: Store, label: str) -> dict[AttemptName, int | None]:
     """The scene in progress (None between scenes) of every attempt with this label that has not ended."""
-    starts = [int(folder) for folder in store.children(STAGING) if folder.isdigit()]
-    attempts = [AttemptName(start, name) for start in starts for name in attempts_at(store, start) if label in name]
-    return {attempt: blamed_scene(store, attempt.start, attempt.name) for attempt in attempts}
+    own = (AttemptName(start, name) for start, name in staged_attempts(store) if label in name)
+    return {attempt: blamed_scene(store, attempt.start, attempt.name) for attempt in own}
 
 
 def find_own_workers() -> list[Process]:

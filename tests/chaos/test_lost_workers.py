@@ -21,9 +21,10 @@ from services.run.range_planner import committed_ranges, plan_ranges
 from tests.bucket_faults import REQUESTS, requests
 from tests.disk_faults import unflushed
 from tests.made_up_scenes import attempt_at, small_scene, terms
+from tests.published_files import check_published
 from workers.assets.catalogue import Catalogue
 from workers.store.attempt import Attempt, begin_attempt
-from workers.store.commit import check_published, publish, read_record
+from workers.store.commit import publish, read_record
 from workers.store.committed_rows import list_commits
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore

@@ -14,8 +14,8 @@ from schemas.errors import MachineError, OutputError
 from tests.disk_faults import unflushed
 from tests.made_up_runs import FIRST, RANGE, make_dataset, settings_of
 from tests.made_up_scenes import attempt_at, small_scene
+from tests.published_files import check_published
 from tests.s3_server import FAULTS, Bucket, Fault, s3_server
-from workers.store.commit import check_published
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 

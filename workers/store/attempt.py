@@ -25,9 +25,11 @@ from schemas.dataset.commit import (
 from schemas.dataset.layout import (
     FENCED,
     JOB_FILE,
+    STAGING,
     SUCCESS_FILE,
     commit_path,
     is_shape,
+    parse_range_name,
     range_table_path,
     staging_path,
 )
@@ -97,6 +99,13 @@ def attempts_at(store: Store, start: int) -> list[str]:
     names = store.children(staging_path(start, "")[:-1])
     known = (name for name in names if retry_of_attempt(name) is not None and not name.endswith(FENCED))
     return [name for name in known if not store.is_fenced(staging_path(start, name))]
+
+
+def staged_attempts(store: Store) -> Iterator[tuple[int, str]]:
+    """(start of its range, name) of every attempt that has a folder and is not fenced."""
+    for folder in store.children(STAGING):
+        if (start := parse_range_name(folder)) is not None:
+            yield from ((start, name) for name in attempts_at(store, start))
 
 
 def blamed_scene(store: Store, start: int, attempt: str) -> int | None:

@@ -165,18 +165,6 @@ def read_committed(store: Store, record: CommitRecord, path: str) -> bytes:
     raise CorruptError(f"{path} is committed and missing: restore it from a copy")
 
 
-def check_published(store: Store, record: CommitRecord) -> tuple[FileEntry, ...]:
-    """Every file of the record, as `committed_files`.
-
-    Raises CorruptError naming one that is not in its final place with its size. A shape that a mix of stacks shares
-    keeps the size of whichever was first.
-    """
-    files = committed_files(store, record)
-    for entry in files:
-        _check_final(store, entry, record.terms.fingerprint_mode == "strict" or not is_shape(entry.path))
-    return files
-
-
 def compare_attempts(
     mine: CommitRecord, my_files: Iterable[FileEntry], winner: CommitRecord, its_files: Iterable[FileEntry]
 ) -> str | None:
@@ -230,9 +218,9 @@ def _move(store: Store, record: CommitRecord, entry: FileEntry) -> bool:
     return False
 
 
-def _check_final(store: Store, entry: FileEntry, exact: bool = True) -> None:
+def _check_final(store: Store, entry: FileEntry) -> None:
     final = store.size(entry.path)
     if final is None:
         raise CorruptError(f"{entry.path} is named by a commit and is neither staged nor published")
-    if final != entry.bytes and exact:
+    if final != entry.bytes:
         raise CorruptError(f"{entry.path} has {final} bytes, and its commit says {entry.bytes}")

@@ -3,19 +3,19 @@
 The seal is no signature: anyone can seal a record. So decoding refuses every path that is not the range's own.
 """
 
-import hashlib
 import json
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 from pydantic import ValidationError
 
 from schemas.dataset.commit import COMMIT_VERSION, MARK, CommitRecord
 from schemas.errors import CorruptError, OutputError
 from schemas.plain_line import plain_line
+from workers.store.seal import is_sealed, seal
 
-_SEAL = b',"seal":"'
-"""The last key of a record: the SHA-256 of all bytes before it."""
+_SEAL: Final = (',"seal":"', '"}\n')
+"""What stands before and after the SHA-256 of all bytes above it: the last key of a record."""
 
 
 def encode_record(record: CommitRecord) -> bytes:
@@ -35,8 +35,7 @@ def encode_record(record: CommitRecord) -> bytes:
 def seal_record(raw: Mapping[str, object]) -> bytes:
     """The bytes of a record with these keys."""
     body = json.dumps(raw, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    head = body[:-1].encode()
-    return head + _SEAL + hashlib.sha256(head).hexdigest().encode() + b'"}\n'
+    return seal(body[:-1], *_SEAL)
 
 
 def decode_record(data: bytes, name: str) -> CommitRecord:
@@ -59,7 +58,6 @@ def decode_record(data: bytes, name: str) -> CommitRecord:
 
 def _unsealed(data: bytes, name: str) -> dict[str, Any]:
     """The JSON object of a record whose seal is whole and whose version is not newer than this program's."""
-    head, mark, seal = data.rpartition(_SEAL)
     try:
         raw = json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -73,7 +71,7 @@ def _unsealed(data: bytes, name: str) -> dict[str, Any]:
             f"{name} has schema_version {raw['schema_version']}, and this program reads up to {COMMIT_VERSION}: "
             "install a newer verso"
         )
-    if not mark or seal != hashlib.sha256(head).hexdigest().encode() + b'"}\n':
+    if not is_sealed(data, *_SEAL):
         raise CorruptError(f"{name} was altered after it was written: its seal does not match")
     return raw
 

@@ -14,5 +14,5 @@ def test_a_full_table_is_explained(tmp_path):
 
 
 def test_a_folder_that_is_gone_is_explained(tmp_path):
-    with pytest.raises(MachineError, match="unable to open"):
+    with pytest.raises(MachineError, match="unable to open"), explain_full_disk():
         open_scratch(tmp_path / "none" / "a.sqlite", "CREATE TABLE rows (text TEXT)")

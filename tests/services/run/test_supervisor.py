@@ -1,5 +1,6 @@
 """A supervised command, with plain Python in place of Ray: every end is told, and nothing is left behind."""
 
+import json
 import os
 import signal
 import subprocess
@@ -82,6 +83,17 @@ def test_a_signal_ends_the_command_and_all_that_it_started(number, words):
     run.send_signal(number)
     assert end(run) == (1, "", words)
     assert not any(Path(f"/proc/{process.pid}").exists() for process in below)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_program_that_waits_for_json_gets_it_from_a_command_that_dies(number):
+    run = spawn(START.format(body=FOREVER).replace('"all is kept"', '"all is kept", answers=True'))
+    assert run.stdout is not None
+    run.stdout.readline()
+    os.kill(chain_of(run.pid)[2], number)
+    code, told, wrong = end(run)
+    answer = json.loads(told.splitlines()[-1])
+    assert code == 1 and answer["ok"] is False and wrong == f"verso: {answer['error']}\n"
 
 
 def test_a_command_that_ignores_the_interrupt_is_killed_by_a_second_one():

@@ -8,8 +8,8 @@ from schemas.dataset.commit import FileEntry
 from schemas.dataset.layout import RANGES, STAGING, commit_path, range_table_path
 from schemas.errors import CommitConflict, CorruptError
 from tests.made_up_scenes import attempt_at, made_scene, terms, with_shapes
+from tests.published_files import check_published
 from workers.store.commit import (
-    check_published,
     commit_names,
     commits_digest,
     committed_files,
@@ -126,7 +126,7 @@ def test_a_published_file_of_the_wrong_size_is_told_by_name(store, undecided):
     image = committed_files(store, undecided)[-1].path
     store.write_whole(image, b"short")
     with pytest.raises(CorruptError, match=f"{image} has 5 bytes"):
-        check_published(store, undecided)
+        publish(store, undecided)
 
 
 @pytest.mark.parametrize("layout", ["files", "tar"])

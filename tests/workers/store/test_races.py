@@ -2,8 +2,8 @@ import subprocess
 import sys
 
 from tests.made_up_scenes import TERMS
+from tests.published_files import check_published
 from tests.stored_images import iter_records
-from workers.store.commit import check_published
 from workers.store.local import LocalStore
 from workers.store.sweep import sweep
 

@@ -5,9 +5,9 @@ import pytest
 from schemas.dataset.layout import commit_path
 from schemas.errors import CorruptError, OutputError
 from tests.made_up_scenes import attempt_at, made_scene
+from tests.published_files import check_published
 from tests.stored_images import iter_records
 from workers.store.commit import (
-    check_published,
     committed_files,
     compare_attempts,
     publish,

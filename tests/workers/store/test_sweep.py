@@ -3,7 +3,7 @@ import pytest
 from schemas.dataset.layout import STAGING
 from schemas.errors import CorruptError
 from tests.made_up_scenes import attempt_at
-from workers.store.commit import check_published
+from tests.published_files import check_published
 from workers.store.sweep import sweep
 
 pytestmark = pytest.mark.usefixtures("unflushed")

@@ -15,6 +15,7 @@ from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
+from schemas.environment import cache_folder
 from schemas.errors import MeshError
 from schemas.job.assets import Assets, FolderSource, ShapeNetSource
 from workers.assets import mass
@@ -32,14 +33,7 @@ FOLDER = "{folder}"
 """Stands for the source's folder in a stored detail, because the same files may lie elsewhere."""
 
 
-def _usual_folder() -> Path | None:
-    try:
-        return Path.home() / ".cache" / "verso" / "verdicts"
-    except RuntimeError:  # a user without a home
-        return None
-
-
-USUAL_FOLDER = _usual_folder()
+USUAL_FOLDER = cache_folder("verdicts")
 
 
 @cache

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from schemas.base import Array, frozen_array
+from schemas.environment import cache_folder
 
 CAPACITY_BYTES = 64 * 1024 * 1024
 """Memory per process: a thousand mugs."""
@@ -31,14 +32,7 @@ class Parts(NamedTuple):
     method: str
 
 
-def _usual_folder() -> Path | None:
-    try:
-        return Path.home() / ".cache" / "verso" / "parts"
-    except RuntimeError:  # a user without a home
-        return None
-
-
-USUAL_FOLDER = _usual_folder()
+USUAL_FOLDER = cache_folder("parts")
 
 
 def key_of(*inputs: str | bytes) -> str:

@@ -2,8 +2,8 @@
 
 import random
 
-from services.job.seal import is_sealed, seal
 from tests.damage import cut, flip
+from workers.store.seal import is_sealed, seal
 
 TEXT = "key: 5\nname: kubek żółty\n"
 
