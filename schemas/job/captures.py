@@ -3,7 +3,8 @@
 A job with this branch makes captures in place of scenes: capture number n is the scene with id first_scene + n.
 """
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -35,15 +36,19 @@ class Board(Frozen):
     dictionary: Text = "DICT_4X4_50"
     """A predefined dictionary of OpenCV, or the name of a file beside board.json in OpenCV's dictionary format."""
     columns: Annotated[int, Field(ge=1, le=100)] = 7
+    """Markers in a row."""
     rows: Annotated[int, Field(ge=1, le=100)] = 5
+    """Rows of markers."""
     marker_m: Annotated[float, Field(gt=0, le=10)] = 0.06
     """Side of a marker, its black border included, metres."""
     gap_m: Annotated[float, Field(gt=0, le=10)] = 0.02
     """Between two markers, metres."""
     width_m: Annotated[float, Field(gt=0, le=100)] = 0.60
+    """Width of the whole board, which is centred on the grid."""
     height_m: Annotated[float, Field(gt=0, le=100)] = 0.40
-    """Size of the whole board, which is centred on the grid."""
+    """Height of the whole board."""
     first_id: NonNegativeInt = 0
+    """Id of the marker at the top left; ids run along the rows."""
     ruler_m: Positive = 0.20
     """Length of the printed ruler as it should be."""
     measured_ruler_m: Positive | None = None
@@ -78,8 +83,11 @@ class MotionBlur(Frozen):
     """Movement of the hand-held camera during an exposure."""
 
     exposure_s: Positive = 0.008
+    """Time that the shutter is open."""
     speed_m_s: NonNegative = 0.15
+    """Speed of the camera."""
     turn_deg_s: NonNegative = 8.0
+    """Speed at which the camera turns."""
 
 
 class HiddenMarkers(Frozen):
@@ -95,13 +103,16 @@ class RegistrationError(Frozen):
     shift_m: Annotated[list[float], Field(min_length=3, max_length=3)] = Field(
         default_factory=lambda: [0.010, 0.0, 0.0]
     )
+    """Error of the assumed place along the axes of the colour camera."""
     turn_deg: float = 0.0
+    """Error of the assumed orientation, about the vertical axis of the colour camera."""
 
 
 class Simulate(Frozen):
     """A virtual capture with known truth; an effect that is not asked for is not simulated."""
 
     views: Annotated[int, Field(ge=1, le=1000)] = 40
+    """Viewpoints of a capture."""
     distance_m: Interval = Range(0.6, 1.0)
     """Of the camera to the middle of the object."""
     inclination_rad: Interval = Range(0.5, 1.2)
@@ -111,15 +122,23 @@ class Simulate(Frozen):
     image_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
     """Size of all images over the Azure Kinect's (1920 x 1080 and 640 x 576); below 1 for quick trials."""
     tier: Literal["raster", "pathtraced"] = "raster"
+    """How RGB is made."""
     depth_noise: KinectDepthNoise | None = None
+    """Noise of the Azure Kinect's depth; nothing: exact depth."""
     rgb_noise: RgbNoise | None = None
+    """Shot noise and read noise of RGB."""
     motion_blur: MotionBlur | None = None
+    """Movement of the camera while it exposes."""
     exposure: Exposure | None = None
+    """Exposure of every view."""
     distortion: Distortion | None = None
+    """Lens of the colour camera; nothing: a pinhole."""
     hidden_markers: HiddenMarkers | None = None
+    """Patches of paper on the board."""
     print_scale: Annotated[float, Field(gt=0.5, lt=2)] | None = None
     """True size of the print over its nominal size."""
     registration_error: RegistrationError | None = None
+    """Error of the depth camera's assumed pose."""
 
 
 class Estimation(Frozen):
@@ -130,6 +149,7 @@ class Estimation(Frozen):
     compare: bool = True
     """Compute the other two as well."""
     max_iterations: PositiveInt = 100
+    """Most iterations of `article` and of `joint`."""
     min_markers: PositiveInt = 1
     """A view with fewer markers is not used."""
     max_reprojection_px: Positive = 3.0
@@ -146,6 +166,7 @@ class Fusion(Frozen):
     """How the views' depth is merged into one cloud and one mesh."""
 
     voxel_m: Annotated[float, Field(ge=0.0005, le=0.02)] = 0.002
+    """Distance of the points of the cloud."""
     max_edge_deg: Annotated[float, Field(gt=0, le=90)] = 75.0
     """Pixels that see their surface at a larger angle of incidence are left out."""
     board_clearance_m: NonNegative = 0.004
@@ -167,15 +188,21 @@ class Captures(Frozen):
     """Captures in place of scenes."""
 
     source: Literal["simulate", "folders"] = "simulate"
+    """Virtual captures with known truth, or folders of photographs."""
     folders: Annotated[list[Folder], Field(max_length=100_000)] = Field(default_factory=list)
     """For source `folders`: one folder a capture, in order; relative to the job file."""
     category: Text = "object"
     """For source `folders`: the category of captures whose capture.json names none."""
     board: Board = Board()
+    """The marker board of simulated captures; a folder has its own board.json."""
     simulate: Simulate = Simulate()
+    """Virtual captures."""
     estimation: Estimation = Estimation()
+    """How the camera poses are estimated."""
     fusion: Fusion = Fusion()
+    """How the views are merged."""
     synthesis: Synthesis = Synthesis()
+    """How mirror views are made."""
     most_views: Annotated[int, Field(ge=1, le=1000)] = 64
     """Views of a capture that are stored: fixes the arithmetic of pose ids."""
 
@@ -188,3 +215,10 @@ class Captures(Frozen):
                 f"simulate.views is {self.simulate.views}, and most_views is {self.most_views}: raise most_views"
             )
         return self
+
+
+def with_scenes(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of a job's keys, with `scenes` where folders are captured and the job does not give it: their number."""
+    captures = tree.get("captures")
+    folders = captures.get("folders") if isinstance(captures, Mapping) else None
+    return {"scenes": len(folders), **tree} if isinstance(folders, list) and folders else dict(tree)

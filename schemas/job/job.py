@@ -3,13 +3,14 @@
 Every key but `name` has a default, and an unknown key is an error.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer, model_validator
 
 from schemas.base import Frozen, NonNegativeInt, PositiveInt, Seed, Weight
 from schemas.job.assets import Assets
 from schemas.job.cameras import Cameras
+from schemas.job.captures import Captures, with_scenes
 from schemas.job.images import Images
 from schemas.job.physics import Physics
 from schemas.job.preset import PresetName, with_preset
@@ -37,7 +38,7 @@ class Job(Frozen):
     seed: Seed = 0
     """Seed of all that is random in a scene."""
     scenes: PositiveInt = 64
-    """Number of scenes; more than before extends a dataset."""
+    """Number of scenes or captures; more than before extends a dataset. Default with captures.folders: their number."""
     first_scene: NonNegativeInt = 0
     """Id of the first scene."""
     pairs_per_scene: Annotated[int, Field(ge=1, le=1000)] = 1
@@ -62,6 +63,8 @@ class Job(Frozen):
     """Effects of real sensors on exact images; none by default."""
     check: Check = Check()
     """What is checked before a scene is committed."""
+    captures: Captures | None = None
+    """Captures of objects on a marker board in place of scenes; nothing: scenes."""
     output: Output = Output()
     """How files are laid out."""
     run: Run = Run()
@@ -70,7 +73,7 @@ class Job(Frozen):
     @model_validator(mode="before")
     @classmethod
     def _fill(cls, value: object) -> object:
-        return with_preset(value) if isinstance(value, dict) else value
+        return with_scenes(with_preset(value)) if isinstance(value, dict) else value
 
     @field_validator("categories", mode="before")
     @classmethod
@@ -92,6 +95,17 @@ class Job(Frozen):
         return self
 
     @model_validator(mode="after")
+    def _has_folders(self) -> "Job":
+        if self.captures is not None and self.captures.source == "folders":
+            folders = len(self.captures.folders)
+            if self.first_scene or self.scenes > folders:
+                raise ValueError(
+                    f"captures.folders names {folders} folders, and first_scene and scenes ask for captures "
+                    f"{self.first_scene} to {self.stop_scene - 1}: first_scene must be 0 and scenes at most {folders}"
+                )
+        return self
+
+    @model_validator(mode="after")
     def _agrees(self) -> "Job":
         if self.images.projection.enabled and not self.cameras.mirror.enabled:
             raise ValueError(
@@ -104,6 +118,14 @@ class Job(Frozen):
                 "and sensor.exposure"
             )
         return self
+
+    @model_serializer(mode="wrap")
+    def _leave_out_absent_captures(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A job of scenes is written, and digested, as it was before there were captures."""
+        keys: dict[str, Any] = dump(self)
+        if self.captures is None:
+            keys.pop("captures", None)
+        return keys
 
     @property
     def stop_scene(self) -> int:

@@ -2,12 +2,16 @@
 
 import argparse
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
-from services.cli.arguments import Parser, read_address, read_count, read_index, read_path, read_place
+from services.cli.arguments import Parser, read_address, read_index, read_path, read_place
+from services.cli.capture_parser import CAPTURE_COMMANDS
+from services.cli.command import JOB, JSON, OUT, SCENE, SET, Command, number, option
+
+if TYPE_CHECKING:
+    Commands = argparse._SubParsersAction[Parser]
 
 KEPT: Final = "what is committed is kept, the same command goes on from there"
 
@@ -25,19 +29,32 @@ def build_parser() -> argparse.ArgumentParser:
         epilog="`verso COMMAND --help` explains a command and gives an example.",
     )
     parser.add_argument("--version", action="version", version=_version())
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for name, entry in COMMANDS.items():
-        command = commands.add_parser(
+    _add_commands(parser.add_subparsers(title="commands", metavar="COMMAND", required=True), COMMANDS)
+    return parser
+
+
+def _add_commands(parsers: "Commands", commands: Mapping[str, Command], above: str = "") -> None:
+    """Adds a parser for each command and, below it, for each of its own commands; `above` are the words before them."""
+    for name, entry in commands.items():
+        words = f"{above}{name}"
+        command = parsers.add_parser(
             name,
             help=entry.what,
             description=entry.what[0].upper() + entry.what[1:] + ".",
-            epilog=f"example: verso {name} {entry.example}".rstrip(),
+            epilog=f"example: verso {words} {entry.example}".rstrip(),
         )
+        if entry.commands:
+            below = command.add_subparsers(title="commands", metavar="COMMAND", required=True)
+            _add_commands(below, entry.commands, f"{words} ")
+            continue
         for names, settings in (JSON, *entry.options):
             command.add_argument(*names, **settings)
+        if entry.one_of:
+            group = command.add_mutually_exclusive_group(required=True)
+            for names, settings in entry.one_of:
+                group.add_argument(*names, **settings)
         handler = entry.handler or f"services.cli.commands:{name}"
         command.set_defaults(handler=handler, starts_ray=entry.starts_ray, kept=entry.kept, quiet=entry.quiet)
-    return parser
 
 
 def _version() -> str:
@@ -48,38 +65,6 @@ def _version() -> str:
     except PackageNotFoundError:
         return "verso (a checkout that is not installed)"
 
-
-Option = tuple[tuple[str, ...], dict[str, Any]]
-
-
-def option(*names: str, **settings: Any) -> Option:
-    """An argument of `add_argument`."""
-    return names, settings
-
-
-def number(name: str, text: str, default: int | None = None) -> Option:
-    """An option that takes a whole number from 1 up."""
-    return option(name, type=read_count, metavar="N", default=default, help=text)
-
-
-@dataclass(frozen=True)
-class Command:
-    """A command: what it does, arguments of an example, options, and its handler `module:function` (default: commands.py)."""
-
-    what: str
-    example: str
-    options: tuple[Option, ...] = ()
-    handler: str = ""
-    starts_ray: Callable[[argparse.Namespace], bool] = lambda options: False
-    kept: str = ""
-    quiet: bool = False
-
-
-JSON = option("--json", action="store_true", help="print one JSON object as the last line of standard output")
-JOB = option("job", type=read_path, metavar="JOB.yaml")
-OUT = option("out", type=read_place, metavar="OUT")
-SCENE = option("scene", type=read_index, metavar="SCENE")
-SET = option("--set", action="append", default=[], metavar="KEY=VALUE", dest="changes", help="change a key of the job")
 
 COMMANDS: dict[str, Command] = {
     "run": Command(
@@ -151,6 +136,11 @@ COMMANDS: dict[str, Command] = {
         "write the posed geometry of one scene",
         "data/tabletop 17 --glb scene17.glb",
         (OUT, SCENE, option("--glb", type=read_path, required=True, metavar="FILE")),
+    ),
+    "capture": Command(
+        "real photographs of an object on a marker board: print a board, simulate, import, process, make views, score",
+        "process data/mug",
+        commands=CAPTURE_COMMANDS,
     ),
     "test": Command(
         "lint, types, layer rules and tests",

@@ -38,7 +38,8 @@ def list_keys(model: type[BaseModel] = Job, prefix: str = "") -> Iterator[tuple[
 def _branches(annotation: Any) -> Iterator[tuple[str, type[BaseModel]]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         source = annotation.model_fields.get("source")
-        kind = f"[{typing.get_args(source.annotation)[0]}]" if source is not None else ""
+        kinds = typing.get_args(source.annotation) if source is not None else ()
+        kind = f"[{kinds[0]}]" if len(kinds) == 1 else ""
         yield kind, annotation
         return
     for argument in typing.get_args(annotation):
@@ -75,6 +76,8 @@ def _name(annotation: Any) -> str:
     if origin in (typing.Union, types.UnionType):
         names = ["nothing" if argument is type(None) else _name(argument) for argument in arguments]
         return " or ".join(dict.fromkeys(names))
+    if origin is list:
+        return f"list of {_name(typing.get_args(annotation)[0])}"
     if origin is tuple:
         return "list" if Ellipsis in arguments else f"list of {len(arguments)} numbers"
     if origin is dict or (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
@@ -109,7 +112,7 @@ def write_doc() -> str:
     """The whole page."""
     lines = []
     for path, field in list_keys():
-        if not path.endswith(".source"):
+        if not (path.endswith(".source") and len(typing.get_args(field.annotation)) == 1):
             meaning = " ".join((field.description or "").split())
             lines.append(f"| `{path}` | {describe_allowed(field)} | {_default(field)} | {meaning} |\n")
     return HEADER + "".join(lines)

@@ -5,7 +5,7 @@ import pytest
 from services.cli.parser import COMMANDS, build_parser
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "test"])
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("test", "capture")])
 def test_a_commands_example_is_accepted_and_its_handler_exists(name):
     words = COMMANDS[name].example.replace('"', "").split()
     if name == "query":
@@ -23,3 +23,10 @@ def test_a_number_that_cannot_be_is_refused(words, capsys):
         build_parser().parse_args(words)
     assert caught.value.code == 2
     assert "whole number" in capsys.readouterr().err
+
+
+def test_a_command_that_has_commands_asks_for_one(capsys):
+    with pytest.raises(SystemExit) as caught:
+        build_parser().parse_args(["capture"])
+    assert caught.value.code == 2
+    assert "COMMAND" in capsys.readouterr().err
