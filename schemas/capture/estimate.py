@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from schemas.base import Array, Pose, frozen_array
+from schemas.capture.view import Detection
 from schemas.job.captures import Estimate
 
 ViewStatus = Literal["used", "flagged", "refused"]
@@ -68,6 +69,25 @@ class CaptureEstimate:
     def used(self) -> tuple[ViewEstimate, ...]:
         """The views that take part in the result."""
         return tuple(view for view in self.views if view.status == "used")
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """The estimates of one capture side by side, and the markers that they were made from.
+
+    `chosen` names the one that the cloud and the dataset are made with; it is always among `by_name`. `seconds` of processor
+    time of what all estimates share (read, detect, sample depth).
+    """
+
+    chosen: Estimate
+    by_name: Mapping[Estimate, CaptureEstimate]
+    detections: tuple[Detection, ...]
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def estimate(self) -> CaptureEstimate:
+        """The one that was chosen."""
+        return self.by_name[self.chosen]
 
 
 @dataclass(frozen=True, eq=False)

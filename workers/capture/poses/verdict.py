@@ -1,0 +1,88 @@
+"""What becomes of a view's pose: used, flagged or refused, with reasons that name the number measured."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.base import Array, Pose
+from schemas.capture.estimate import DepthCorrection, ViewEstimate, ViewStatus
+from schemas.capture.view import CaptureCamera
+from schemas.job.captures import Estimation
+from workers.capture.poses.observation import Observation, Patches
+from workers.capture.poses.rays import pixels_of_points
+from workers.geometry.frames import transform
+
+MAX_SIGMA_M = 0.005
+MAX_SIGMA_RAD = math.radians(1.0)
+"""A pose that is less certain than this spoils a cloud; its view is flagged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A view's pose in one estimate, before it is judged: T_board_cam or None, covariance [6, 6] or None, known faults."""
+
+    T_board_cam: Pose | None
+    covariance: Array | None = None
+    faults: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    """Said of a view that is used."""
+
+
+def judge(
+    observation: Observation,
+    pose: Judged,
+    camera: CaptureCamera,
+    spec: Estimation,
+    depth: DepthCorrection,
+    scale: float = 1.0,
+) -> ViewEstimate:
+    """The estimate of one view, with its residuals; `scale` is the print's."""
+    number, markers, T = observation.number, observation.markers, pose.T_board_cam
+    if T is None or not np.isfinite(T).all():
+        reasons = pose.faults or ("no pose was found",)
+        return ViewEstimate(number, "refused", None, None, markers, None, None, reasons)
+    reprojection_px = median_reprojection(observation, T, camera, scale)
+    faults = [*pose.faults, *_doubts(pose.covariance)]
+    if reprojection_px is not None and reprojection_px > spec.max_reprojection_px:
+        faults.append(
+            f"median reprojection error {reprojection_px:.2f} px, above max_reprojection_px {spec.max_reprojection_px:g}: "
+            "the markers do not lie as board.json says, or the view is blurred"
+        )
+    status: ViewStatus = "flagged" if faults else "used"
+    depth_mm = median_board_distance(observation.board_patches, T, depth)
+    return ViewEstimate(
+        number, status, T, pose.covariance, markers, reprojection_px, depth_mm, (*faults, *pose.remarks)
+    )
+
+
+def median_reprojection(observation: Observation, T: Pose, camera: CaptureCamera, scale: float) -> float | None:
+    """Median distance, pixels, of all corners found from where the pose projects them; None without corners."""
+    corners = observation.corners
+    if not len(corners.board):
+        return None
+    distance = np.linalg.norm(pixels_of_points(corners.board * scale, T, camera) - corners.pixels, axis=1)
+    return float(np.median(np.where(np.isfinite(distance), distance, 1e6)))
+
+
+def median_board_distance(patches: Patches, T: Pose, depth: DepthCorrection) -> float | None:
+    """Median distance, millimetres, of the board as depth measures it from the board's plane; None without depth there."""
+    if not len(patches):
+        return None
+    points = transform(T, corrected_points(patches, depth))
+    return 1000 * float(np.median(np.abs(points[:, 2])))
+
+
+def corrected_points(patches: Patches, depth: DepthCorrection) -> Array:
+    """[P, 3] metres, camera axes: the patches' middles after the correction of depth."""
+    return transform(depth.T_cam_depth, depth.scale * patches.ray_z + depth.offset_m * patches.ray)
+
+
+def _doubts(covariance: Array | None) -> list[str]:
+    if covariance is None:
+        return []
+    sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance[:3, :3])[-1])))
+    sigma_rad = math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance[3:, 3:])[-1])))
+    if sigma_m <= MAX_SIGMA_M and sigma_rad <= MAX_SIGMA_RAD:
+        return []
+    return [f"the pose is uncertain: {1000 * sigma_m:.1f} mm, {math.degrees(sigma_rad):.2f} degrees (one sigma)"]

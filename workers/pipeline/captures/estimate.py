@@ -1,0 +1,84 @@
+"""The poses of a capture: images are read one view at a time, and what is found in them goes to the three estimates."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from schemas.capture.estimate import CaptureEstimate, Estimates
+from schemas.capture.view import Detection
+from schemas.errors import CaptureError
+from schemas.job.captures import ESTIMATES, Estimate, Estimation
+from workers.capture.board.layout import open_dictionary
+from workers.capture.detect import detect_markers, other_dictionaries
+from workers.capture.poses.from_markers import estimate_markers
+from workers.capture.poses.markers import MarkerPose, fit_markers
+from workers.capture.poses.observation import Observation, corners_of
+from workers.store.capture_folder import CaptureFolder, read_view
+
+
+@dataclass
+class _Clock:
+    """Seconds of processor time by stage."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        begun = time.process_time()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.process_time() - begun
+
+
+def estimate_poses(folder: CaptureFolder, spec: Estimation) -> Estimates:
+    """The estimate that is asked for and, with `compare`, the other two.
+
+    Raises CaptureError where a file cannot be read or the estimate that is asked for has no usable view.
+    """
+    clock = _Clock()
+    detections, observations, poses = _observe(folder, spec, clock)
+    if not any(len(found.ids) for found in detections):
+        raise CaptureError("markers", _no_markers(folder))
+    wanted = ESTIMATES if spec.compare else (spec.estimate,)
+    by_name: dict[Estimate, CaptureEstimate] = {}
+    for name in wanted:
+        with clock.stage(name):
+            by_name[name] = estimate_markers(observations, poses, folder.camera, spec)
+    estimates = Estimates(spec.estimate, by_name, tuple(detections), clock.seconds)
+    if not estimates.estimate.used:
+        raise CaptureError("poses", _no_pose(estimates.estimate))
+    return estimates
+
+
+def _observe(
+    folder: CaptureFolder, spec: Estimation, clock: _Clock
+) -> tuple[list[Detection], list[Observation], list[MarkerPose]]:
+    """What is found in each view, in order of number; no two views' images are held at once."""
+    dictionary = open_dictionary(folder.board, folder.path)
+    detections, observations, poses = [], [], []
+    for number in folder.numbers:
+        with clock.stage("read"):
+            view = read_view(folder, number)
+        with clock.stage("detect"):
+            detection = detect_markers(view.rgb, folder.board, dictionary, number)
+        with clock.stage("fit"):
+            observation = Observation(number, corners_of(detection, folder.board, folder.camera))
+            found = fit_markers(observation, folder.camera, spec)
+        detections.append(detection)
+        observations.append(observation)
+        poses.append(found)
+    return detections, observations, poses
+
+
+def _no_markers(folder: CaptureFolder) -> str:
+    board = folder.board
+    seen = other_dictionaries(read_view(folder, folder.numbers[len(folder.numbers) // 2]).rgb)
+    what = f"{folder.path}: no marker of {board.dictionary} was found in any of {len(folder.numbers)} views"
+    return f"{what}; {seen}: correct board.json" if seen else f"{what}: check that they are sharp, and not over-exposed"
+
+
+def _no_pose(estimate: CaptureEstimate) -> str:
+    first = next((f"view {view.number}: {'; '.join(view.reasons)}" for view in estimate.views if view.reasons), "")
+    return f"none of {len(estimate.views)} views has a usable pose by {estimate.estimate}; {first}"
