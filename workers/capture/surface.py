@@ -1,0 +1,181 @@
+"""What every view says about the points of a merged surface: where it really is, how many see it, and its colour."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array
+from schemas.scene.camera import Camera
+from workers.capture.depth_fit import FittedDepth
+from workers.capture.posed_view import PosedView
+from workers.capture.tsdf import sample_inverse
+from workers.geometry.frames import invert
+from workers.geometry.jit import compiled
+from workers.geometry.srgb import SRGB_STEPS, encode_codes
+
+BEST = 3
+"""Views that a point's colour is the mean of."""
+
+LEAST_LIGHT = 0.02
+"""Darker colours, in linear light, say nothing about a view's exposure."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A view ready to be asked: its pictures, the fit of its depth about the object, and the smallest cosine of incidence."""
+
+    view: PosedView
+    fitted: FittedDepth
+    least_cos: float
+
+
+@dataclass(frozen=True, eq=False)
+class Offsets:
+    """How far the views see the surface beyond each point along its normal: mean [N], metres; `views` [N] that see it."""
+
+    mean_m: Array
+    views: NDArray[np.int32]
+
+
+def measure_offsets(points: Array, normals: Array, sights: Sequence[Sight], within_m: float) -> Offsets:
+    """Mean over the views, weighted by inverse variance, of the distance to the surface that they see there."""
+    total, weight = np.zeros(len(points)), np.zeros(len(points))
+    views = np.zeros(len(points), np.int32)
+    for sight in sights:
+        offset, w = observe(points, normals, sight, within_m)
+        total += offset * w
+        weight += w
+        views += w > 0.0
+    return Offsets(np.where(weight > 0.0, total / np.where(weight > 0.0, weight, 1.0), 0.0), views)
+
+
+def observe(points: Array, normals: Array, sight: Sight, within_m: float) -> tuple[Array, Array]:
+    """(offset along the normal, weight), each [N]: weight 0 where the view does not see a point within `within_m`."""
+    offset, weight = np.zeros(len(points)), np.zeros(len(points))
+    camera, fitted = sight.view.depth_camera, sight.fitted
+    k = camera.intrinsics
+    intrinsics = (k.fx, k.fy, k.cx - fitted.left - 0.5, k.cy - fitted.top - 0.5)
+    T = invert(camera.T_world_cam)
+    _observe(points, normals, T, intrinsics, fitted.inverse, sight.least_cos, within_m, offset, weight)
+    return offset, weight
+
+
+@compiled
+def _observe(
+    points: Array,
+    normals: Array,
+    T: Array,
+    k: tuple[float, float, float, float],
+    inverse: NDArray[np.float32],
+    least_cos: float,
+    within_m: float,
+    offset: Array,
+    weight: Array,
+) -> None:
+    """A difference of z times (normal . ray) is the distance along the normal; weights as in the distance field."""
+    height, width = inverse.shape
+    for i in range(len(points)):
+        p, n = points[i], normals[i]
+        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+        if not z > 0.05:
+            continue
+        ray_x = (T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]) / z
+        ray_y = (T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]) / z
+        x, y = k[0] * ray_x + k[2], k[1] * ray_y + k[3]
+        if not (-0.5 < x < width - 0.5 and -0.5 < y < height - 0.5):
+            continue
+        q = sample_inverse(inverse, x, y)
+        if q == 0.0:
+            continue
+        slope = 0.0  # of the ray against the normal
+        for axis in range(3):
+            ray = T[0, axis] * ray_x + T[1, axis] * ray_y + T[2, axis]
+            slope -= n[axis] * ray
+        if slope < least_cos * math.sqrt(1.0 + ray_x * ray_x + ray_y * ray_y):
+            continue
+        s = (z - 1.0 / q) * slope
+        if abs(s) < within_m:
+            offset[i] = s
+            weight[i] = slope * slope * q * q * q * q
+
+
+def color_points(points: Array, normals: Array, sights: Sequence[Sight], within_m: float) -> NDArray[np.uint8]:
+    """[N, 3] uint8 sRGB: the mean of the views that see a point best, after their exposures were made alike; grey if none."""
+    light = np.zeros((len(sights), len(points), 3), np.float32)
+    score = np.zeros((len(sights), len(points)), np.float32)
+    for number, sight in enumerate(sights):
+        _, weight = observe(points, normals, sight, within_m)
+        seen = np.flatnonzero(weight > 0.0)
+        colors, inside = sample_light(sight.view.rgb, sight.view.camera, points[seen])
+        light[number, seen] = colors
+        score[number, seen] = np.where(inside, weight[seen], 0.0)
+    light *= exposure_gains(light, score)[:, None, None].astype(np.float32)
+    few = min(BEST, len(sights))
+    best = np.argpartition(-score, few - 1, axis=0)[:few]
+    best.sort(axis=0)
+    w = np.take_along_axis(score, best, axis=0)[..., None].astype(np.float64)
+    total = w.sum(axis=0)
+    mean = (np.take_along_axis(light, best[..., None], axis=0) * w).sum(axis=0) / np.where(total > 0.0, total, 1.0)
+    codes = encode_codes(mean)
+    codes[total[:, 0] == 0.0] = 128
+    return codes
+
+
+def exposure_gains(light: NDArray[np.float32], score: NDArray[np.float32]) -> Array:
+    """[V]: factors on the views' light [V, N, 3] that make what they see in common (score [V, N] > 0) equally bright.
+
+    Medians of ratios, so that gloss and misplaced edges do not count; the views' median factor is 1.
+    """
+    bright = light.mean(axis=2, dtype=np.float64)
+    known = (score > 0.0) & (bright > LEAST_LIGHT) & (bright < 0.9)
+    log = np.log(np.where(known, bright, 1.0))
+    gains = np.zeros(len(light))
+    for _ in range(4):
+        count = known.sum(axis=0)
+        mean = np.where(known, log + gains[:, None], 0.0).sum(axis=0) / np.maximum(count, 1)
+        for view in range(len(light)):
+            shared = known[view] & (count > 1)
+            gains[view] = np.median(mean[shared] - log[view, shared]) if shared.sum() >= 50 else 0.0
+        gains -= np.median(gains)
+    return np.asarray(np.exp(np.clip(gains, -1.5, 1.5)))
+
+
+def sample_light(rgb: NDArray[np.uint8], camera: Camera, points: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """(linear light [N, 3], inside the image [N]) of an image at points [N, 3], board frame; bilinear."""
+    k = camera.intrinsics
+    light, inside = np.zeros((len(points), 3)), np.zeros(len(points), np.bool_)
+    T = invert(camera.T_world_cam)
+    _sample_light(rgb, SRGB_STEPS, T, (k.fx, k.fy, k.cx_opencv, k.cy_opencv), points, light, inside)
+    return light, inside
+
+
+@compiled
+def _sample_light(
+    rgb: NDArray[np.uint8],
+    steps: Array,
+    T: Array,
+    k: tuple[float, float, float, float],
+    points: Array,
+    light: Array,
+    inside: NDArray[np.bool_],
+) -> None:
+    height, width = rgb.shape[0], rgb.shape[1]
+    for i in range(len(points)):
+        p = points[i]
+        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+        if not z > 0.05:
+            continue
+        x = k[0] * (T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]) / z + k[2]
+        y = k[1] * (T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]) / z + k[3]
+        if not (0.0 <= x < width - 1 and 0.0 <= y < height - 1):
+            continue
+        column, row = int(np.floor(x)), int(np.floor(y))
+        s, t = x - column, y - row
+        inside[i] = True
+        for c in range(3):
+            upper = steps[rgb[row, column, c]] * (1.0 - s) + steps[rgb[row, column + 1, c]] * s
+            lower = steps[rgb[row + 1, column, c]] * (1.0 - s) + steps[rgb[row + 1, column + 1, c]] * s
+            light[i, c] = upper * (1.0 - t) + lower * t

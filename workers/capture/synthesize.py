@@ -1,0 +1,115 @@
+"""Views from poses that were not captured: the nearest views, merged and drawn from there (Staszak and Belter 2024, step 4)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array
+from schemas.capture.estimate import SynthesizedView
+from schemas.errors import CaptureError
+from schemas.job.captures import Synthesis
+from schemas.scene.camera import Camera
+from workers.capture.fill import fill_holes
+from workers.capture.warp import Layer, Source, warp
+from workers.geometry.jit import compiled
+
+AGREE_M = 0.006
+"""Surfaces nearer to one another than this along a pixel's ray are one, whose depth is the views' mean."""
+
+SHARPNESS = 8
+"""Power of the cosine between two optical axes that weighs a view: one 30 degrees off counts a third."""
+
+
+def rank_views(axes: Array, camera: Camera) -> NDArray[np.int64]:
+    """[V] indices, best first: by the cosine between each view's z-axis [V, 3] and the camera's; the first among equals."""
+    return np.argsort(-(axes @ camera.T_world_cam[:3, 2]), kind="stable")
+
+
+def synthesize_view(sources: Sequence[Source], camera: Camera, spec: Synthesis) -> SynthesizedView:
+    """What `camera` would see, from the best `spec.views` of the sources.
+
+    Raises CaptureError where none of them shows anything to it.
+    """
+    axes = np.array([source.camera.T_world_cam[:3, 2] for source in sources]).reshape(-1, 3)
+    best = rank_views(axes, camera)[: spec.views]
+    layers = []
+    for n in best:
+        cosine = max(float(axes[n] @ camera.T_world_cam[:3, 2]), 0.0)
+        layers.append(warp(sources[n], camera, max(cosine**SHARPNESS, 1e-6)))
+    numbers = tuple(sources[n].number for n in best)
+    if not any(layer.weight.any() for layer in layers):
+        raise CaptureError(
+            "nothing_seen",
+            f"none of the {len(numbers)} nearest views ({_words(numbers)}) shows anything to this camera",
+        )
+    view = merge_layers(layers, camera)
+    filled = fill_holes(*view, spec.fill_px)
+    measured = view[1] > 0.0
+    return SynthesizedView(
+        rgb=filled[0],
+        depth_m=filled[1],
+        mask=filled[2],
+        measured=measured,
+        measured_share=float(measured.sum() / max(int((filled[1] > 0.0).sum()), 1)),
+        sources=numbers,
+    )
+
+
+def _words(numbers: Sequence[int]) -> str:
+    return ", ".join(str(number) for number in numbers)
+
+
+def merge_layers(layers: Sequence[Layer], camera: Camera) -> tuple[NDArray[np.uint8], Array, NDArray[np.bool_]]:
+    """(rgb, depth_m, mask): at each pixel the mean of the layers' nearest surface; empty where one is seen from behind."""
+    shape = (camera.intrinsics.height, camera.intrinsics.width)
+    rgb, depth, mask = np.zeros((*shape, 3), np.uint8), np.zeros(shape), np.zeros(shape, np.bool_)
+    _merge(
+        np.stack([layer.depth_m for layer in layers]),
+        np.stack([layer.weight for layer in layers]),
+        np.stack([layer.rgb for layer in layers]),
+        np.stack([layer.mask for layer in layers]),
+        rgb,
+        depth,
+        mask,
+    )
+    return rgb, depth, mask
+
+
+@compiled
+def _merge(
+    depths: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    rgbs: NDArray[np.uint8],
+    masks: NDArray[np.bool_],
+    rgb: NDArray[np.uint8],
+    depth: Array,
+    mask: NDArray[np.bool_],
+) -> None:
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            nearest = hidden = np.inf
+            for n in range(len(depths)):
+                z = depths[n, row, column]
+                if z > 0.0 and weights[n, row, column] > 0.0:
+                    nearest = min(nearest, z)
+                elif z > 0.0:
+                    hidden = min(hidden, z)
+            if not nearest < np.inf or hidden < nearest - AGREE_M:
+                continue
+            total = z_total = r = g = b = inside = 0.0
+            for n in range(len(depths)):
+                z, w = depths[n, row, column], weights[n, row, column]
+                if z > 0.0 and w > 0.0 and z < nearest + AGREE_M:
+                    total += w
+                    z_total += w * z
+                    r += w * rgbs[n, row, column, 0]
+                    g += w * rgbs[n, row, column, 1]
+                    b += w * rgbs[n, row, column, 2]
+                    if masks[n, row, column]:
+                        inside += w
+            depth[row, column] = z_total / total
+            rgb[row, column, 0] = np.uint8(r / total + 0.5)
+            rgb[row, column, 1] = np.uint8(g / total + 0.5)
+            rgb[row, column, 2] = np.uint8(b / total + 0.5)
+            mask[row, column] = inside > 0.5 * total
