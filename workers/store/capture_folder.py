@@ -82,6 +82,11 @@ def open_folder(path: Path) -> CaptureFolder:
     return CaptureFolder(path, about, _camera(spec), _read_json(path / BOARD_FILE, Board), tuple(numbers))
 
 
+def read_board(path: Path) -> Board:
+    """The board of a board.json, wherever it is. Raises CaptureError that names the file."""
+    return _read_json(path, Board)
+
+
 def read_view(folder: CaptureFolder, number: int) -> CapturedView:
     """One view's images. Raises CaptureError where one cannot be read or has the wrong size."""
     rgb = _read_image(folder, f"rgb_{number:05d}.png", cv2.IMREAD_COLOR_RGB, np.uint8)
