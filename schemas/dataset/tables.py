@@ -1,5 +1,7 @@
 """The Arrow schemas and the keys of the six manifest tables."""
 
+from collections.abc import Collection
+
 import pyarrow as pa
 
 SCHEMA_VERSION = 1
@@ -112,10 +114,76 @@ _COLUMNS: dict[str, list[pa.Field]] = {
     ],
 }
 
-SCHEMAS: dict[str, pa.Schema] = {
-    table: pa.schema(columns, {b"verso_table": table.encode(), b"schema_version": str(SCHEMA_VERSION).encode()})
-    for table, columns in _COLUMNS.items()
+_left_out = pa.struct([*_columns(_i64, "number"), *_columns(_str, "status", "why")])
+_capture_scene = pa.struct(
+    [
+        *_columns(_str, "name", "estimate"),
+        *_columns(_str, "input_sha256", nullable=True),
+        *_columns(_i64, "views", "markers"),
+        *_columns(_f64, "reprojection_before_px", "reprojection_px", "depth_mm", nullable=True),
+        *_columns(_f64, "depth_offset_m", "depth_scale", "print_scale"),
+        *_columns(pa.list_(_str), "identified"),
+        *_columns(_bool, "depth_corrected", "undistorted", "converged"),
+        *_columns(_i64, "iterations", "cloud_points"),
+        *_columns(_f64, "measured_share", nullable=True),
+        *_columns(pa.list_(_left_out), "left_out"),
+        *_columns(pa.list_(_str), "notes"),
+        *_columns(_f64, "pose_mm", "pose_deg", "cloud_median_mm", "cloud_p95_mm", nullable=True),
+        *_columns(_f64, "completeness", "depth_median_mm", nullable=True),
+    ]
+)
+"""Quality of a capture. `views`: those that are used; `reprojection_before_px` is that of estimate `markers`, the others that
+of `estimate`: medians over the used views. `identified`: parameters of the depth correction that the capture determines;
+`depth_corrected`: whether stored depth is corrected by it. `left_out`: views that are not used. From `pose_mm` on: errors
+against truth, null where there is none."""
+_capture_view = pa.struct(
+    [
+        *_columns(_i64, "number", "markers"),
+        *_columns(_f64, "reprojection_before_px", "reprojection_px", "depth_mm", nullable=True),
+        *_columns(_f64, "pose_mm", "pose_deg", "measured_share", "depth_median_mm", nullable=True),
+        *_columns(pa.list_(_i64), "sources", nullable=True),
+    ]
+)
+"""One view of a capture: `number` in the names of its captured images, residuals before and after, errors against truth;
+of a mirror view the share of its filled pixels that are measured, and the numbers of the captured views that it is made of."""
+
+_CAPTURE_COLUMNS: dict[str, pa.Field] = {
+    "scenes": pa.field("capture", _capture_scene),
+    "views": pa.field("capture", _capture_view),
 }
+"""The column that a table has in datasets of captures alone, behind all others."""
+
+_PHYSICS = {*(field.name for field in _rest), "pose", "settle_s"}
+"""Columns of `scenes` that a capture cannot have: null there."""
+
+
+def _capture_fields(table: str, columns: list[pa.Field]) -> list[pa.Field]:
+    if table not in _CAPTURE_COLUMNS:
+        return columns
+    return [
+        *(field.with_nullable(True) if field.name in _PHYSICS else field for field in columns),
+        _CAPTURE_COLUMNS[table],
+    ]
+
+
+def _schema(table: str, columns: list[pa.Field]) -> pa.Schema:
+    return pa.schema(columns, {b"verso_table": table.encode(), b"schema_version": str(SCHEMA_VERSION).encode()})
+
+
+SCHEMAS: dict[str, pa.Schema] = {table: _schema(table, columns) for table, columns in _COLUMNS.items()}
+"""Of datasets of scenes."""
+
+CAPTURE_SCHEMAS: dict[str, pa.Schema] = {
+    table: _schema(table, _capture_fields(table, columns)) for table, columns in _COLUMNS.items()
+}
+"""Of datasets of captures: every column of a dataset of scenes, and those of captures. Reads rows of both."""
+
+
+def schema_of(table: str, columns: Collection[str]) -> pa.Schema:
+    """The schema of rows with these columns: that of captures where they have its column, else that of scenes."""
+    own = _CAPTURE_COLUMNS.get(table)
+    return (CAPTURE_SCHEMAS if own is not None and own.name in columns else SCHEMAS)[table]
+
 
 SHAPE_FILE_COLUMNS = (pa.field("file_bytes", _i64), pa.field("file_sha256", _str))
 """More columns of `assets` in a range's own file: the size and the SHA-256 of the asset's shape, null where none is

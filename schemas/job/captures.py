@@ -3,7 +3,9 @@
 A job with this branch makes captures in place of scenes: capture number n is the scene with id first_scene + n.
 """
 
+import copy
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -20,6 +22,7 @@ from schemas.base import (
     Share,
     Text,
 )
+from schemas.job.keys import set_key
 from schemas.job.sensor import Distortion, Exposure, RgbNoise
 
 Estimate = Literal["markers", "article", "joint"]
@@ -189,9 +192,9 @@ class Captures(Frozen):
 
     source: Literal["simulate", "folders"] = "simulate"
     """Virtual captures with known truth, or folders of photographs."""
-    folders: Annotated[list[Folder], Field(max_length=100_000)] = Field(default_factory=list)
+    folders: Annotated[list[Folder], Field(max_length=10_000)] = Field(default_factory=list)
     """For source `folders`: one folder a capture, in order; relative to the job file."""
-    category: Text = "object"
+    category: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")] = "object"
     """For source `folders`: the category of captures whose capture.json names none."""
     board: Board = Board()
     """The marker board of simulated captures; a folder has its own board.json."""
@@ -217,8 +220,20 @@ class Captures(Frozen):
         return self
 
 
-def with_scenes(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of a job's keys, with `scenes` where folders are captured and the job does not give it: their number."""
+def with_capture_keys(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of a job's keys, with those that follow from `captures` where the job does not give them.
+
+    `scenes` is the number of folders, `pairs_per_scene` is `most_views`, and there are no aligned views: depth of a capture
+    is registered to its colour camera.
+    """
     captures = tree.get("captures")
-    folders = captures.get("folders") if isinstance(captures, Mapping) else None
-    return {"scenes": len(folders), **tree} if isinstance(folders, list) and folders else dict(tree)
+    filled = copy.deepcopy(dict(tree))
+    if not isinstance(captures, Mapping):
+        return filled
+    if isinstance(folders := captures.get("folders"), list) and folders:
+        filled.setdefault("scenes", len(folders))
+    most_views = captures.get("most_views", Captures.model_fields["most_views"].default)
+    for path, value in {"pairs_per_scene": most_views, "cameras.depth.enabled": False}.items():
+        with suppress(ValueError):
+            set_key(filled, path, value, keep=True)
+    return filled

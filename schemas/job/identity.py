@@ -1,6 +1,6 @@
 """The identity of a job: which of its keys decide the dataset, which decide a scene, and their digests.
 
-An asset folder's path is never part of it: the catalogue's digest covers the files.
+The path of a folder of assets or of a capture is never part of it: the catalogue's digest covers the files.
 """
 
 import hashlib
@@ -43,6 +43,9 @@ def dataset_keys(job: Job) -> dict[str, Any]:
     for source in (*keys["assets"]["objects"], *keys["assets"]["tables"]):
         source.pop("folder", None)
     keys["assets"]["limits"] = deciding_limits(keys["assets"]["limits"])
+    if job.captures is not None:
+        for unused in ("folders", "simulate", "board") if job.captures.folders else ("folders", "category"):
+            del keys["captures"][unused]
     return keys
 
 

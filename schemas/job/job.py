@@ -10,7 +10,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, field_validator, mode
 from schemas.base import Frozen, NonNegativeInt, PositiveInt, Seed, Weight
 from schemas.job.assets import Assets
 from schemas.job.cameras import Cameras
-from schemas.job.captures import Captures, with_scenes
+from schemas.job.captures import Captures, with_capture_keys
 from schemas.job.images import Images
 from schemas.job.physics import Physics
 from schemas.job.preset import PresetName, with_preset
@@ -73,7 +73,7 @@ class Job(Frozen):
     @model_validator(mode="before")
     @classmethod
     def _fill(cls, value: object) -> object:
-        return with_scenes(with_preset(value)) if isinstance(value, dict) else value
+        return with_capture_keys(with_preset(value)) if isinstance(value, dict) else value
 
     @field_validator("categories", mode="before")
     @classmethod
@@ -95,14 +95,9 @@ class Job(Frozen):
         return self
 
     @model_validator(mode="after")
-    def _has_folders(self) -> "Job":
-        if self.captures is not None and self.captures.source == "folders":
-            folders = len(self.captures.folders)
-            if self.first_scene or self.scenes > folders:
-                raise ValueError(
-                    f"captures.folders names {folders} folders, and first_scene and scenes ask for captures "
-                    f"{self.first_scene} to {self.stop_scene - 1}: first_scene must be 0 and scenes at most {folders}"
-                )
+    def _suits_captures(self) -> "Job":
+        if self.captures is not None and (unfit := _unfit_for_captures(self, self.captures)):
+            raise ValueError(unfit)
         return self
 
     @model_validator(mode="after")
@@ -131,3 +126,22 @@ class Job(Frozen):
     def stop_scene(self) -> int:
         """One past the last scene id."""
         return self.first_scene + self.scenes
+
+
+def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
+    """The key of a job of captures that a capture cannot have, with the remedy; None where all fit."""
+    folders = len(captures.folders)
+    if folders and (job.first_scene or job.scenes > folders):
+        return (
+            f"captures.folders names {folders} folders, and captures {job.first_scene} to {job.stop_scene - 1} are asked for: "
+            f"first_scene must be 0 and scenes at most {folders}"
+        )
+    if job.pairs_per_scene != captures.most_views:
+        return f"pairs_per_scene is {job.pairs_per_scene}: leave it out, captures.most_views ({captures.most_views}) decides it"
+    if job.cameras.depth.enabled:
+        return "cameras.depth.enabled is true: leave it out, depth of a capture is registered to its colour camera"
+    if job.objects_per_scene != ONE_OBJECT:
+        return "objects_per_scene must be 1: a capture is of one object"
+    if job.sensor != SensorEffects():
+        return "sensor has effects: leave them out, those of a virtual capture are keys of captures.simulate"
+    return None if job.render.rgb else "render.rgb is false: a capture has colour, leave it out"

@@ -37,13 +37,18 @@ def load_job(path: Path, changes: Sequence[str] = ()) -> Job:
 
 def _check_homes(job: Job, name: str) -> None:
     """Raises JobError for a folder that begins with the name of a user whom this machine does not know."""
-    for branch in ("objects", "tables"):
-        for number, source in enumerate(getattr(job.assets, branch)):
-            try:
-                Path(getattr(source, "folder", "")).expanduser()
-            except RuntimeError as error:
-                key = f"assets.{branch}.{number}.folder"
-                raise JobError(f"{name}: {key}: {plain_line(repr(source.folder))}: there is no such user") from error
+    sources = {
+        f"assets.{branch}.{number}.folder": getattr(source, "folder", "")
+        for branch in ("objects", "tables")
+        for number, source in enumerate(getattr(job.assets, branch))
+    }
+    folders = job.captures.folders if job.captures is not None else []
+    sources |= {f"captures.folders.{number}": folder for number, folder in enumerate(folders)}
+    for key, folder in sources.items():
+        try:
+            Path(folder).expanduser()
+        except RuntimeError as error:
+            raise JobError(f"{name}: {key}: {plain_line(repr(folder))}: there is no such user") from error
 
 
 def read_tree(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import dataclasses
 import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -39,23 +40,39 @@ REMEDY = "restore it from a copy"
 
 @dataclass(frozen=True)
 class JobRecord:
-    """A job, the digest of its asset catalogue, and the folder that its relative paths start from."""
+    """A job, the digest of its asset catalogue, and the folder that its relative paths start from.
+
+    `inputs`: digest of the input files of each folder of captures, which `catalogue` covers too; none without such folders.
+    """
 
     job: Job
     digest: str
     catalogue: str
     folder: str
+    inputs: tuple[str, ...] = ()
+
+    def describe_change(self, inputs: tuple[str, ...]) -> str:
+        """The files of the job's sources that are others now, in words; `inputs` are the digests of the folders now."""
+        names = self.job.captures.folders if self.job.captures is not None else []
+        changed = [name for name, before, now in zip(names, self.inputs, inputs, strict=False) if before != now]
+        if changed:
+            return f"the files of the captures in {', '.join(changed[:5])}{' and more' if len(changed) > 5 else ''}"
+        if len(self.inputs) != len(inputs):
+            return f"captures.folders, which were {len(self.inputs)} and are {len(inputs)}"
+        return "the files of the asset folders"
 
 
-def record_job(job: Job, catalogue_digest: str, folder: Path) -> JobRecord:
+def record_job(job: Job, catalogue_digest: str, folder: Path, inputs: tuple[str, ...] = ()) -> JobRecord:
     """The record of a job with the digest of its asset catalogue; `folder` is the job file's."""
-    return JobRecord(job, job_digest(job, catalogue_digest), catalogue_digest, str(folder.resolve()))
+    return JobRecord(job, job_digest(job, catalogue_digest), catalogue_digest, str(folder.resolve()), inputs)
 
 
 def encode_job(record: JobRecord) -> bytes:
     """OUT/job.yaml."""
     job = record.job.model_dump(mode="json")
-    tree = {"digest": record.digest, "catalogue": record.catalogue, "folder": record.folder, "job": job}
+    tree: dict[str, Any] = {"digest": record.digest, "catalogue": record.catalogue, "folder": record.folder}
+    tree |= {"inputs": list(record.inputs)} if record.inputs else {}
+    tree["job"] = job
     return seal(HEADER + yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=110), SEAL)
 
 
@@ -72,9 +89,13 @@ def decode_job(data: bytes, name: str) -> JobRecord:
     try:
         tree = parse_yaml(data.decode())
         job = validate_job(tree["job"], name)
-        record = JobRecord(job, tree["digest"], tree["catalogue"], _folder(tree["folder"]))
+        record = JobRecord(
+            job, tree["digest"], tree["catalogue"], _folder(tree["folder"]), tuple(tree.get("inputs", ()))
+        )
         if wrong := [name for name in ("digest", "catalogue", "folder") if not isinstance(tree[name], str)]:
             raise TypeError(f"{wrong[0]} is no text")
+        if not all(isinstance(digest, str) for digest in record.inputs):
+            raise TypeError("inputs holds what is no text")
     except JobError as error:
         told = str(error).splitlines()[0].removeprefix(f"{name}: ")
         raise CorruptError(f"{name} is not a job that `verso run` wrote: {told}; {REMEDY}") from error
@@ -143,7 +164,7 @@ def adopt(store: Store, new: JobRecord) -> JobRecord:
         return new
     differing = [f"  {key}: {before} there, {after} here" for key, before, after in compare_jobs(old.job, new.job)]
     if old.catalogue != new.catalogue and not differing:
-        differing.append("  the files of the asset folders (their digest changed)")
+        differing.append(f"  {old.describe_change(new.inputs)} (their digest changed)")
     if differing:
         lines = [f"{store.name} belongs to another job; these differ:", *differing]
         raise OutputError("\n".join([*lines, "choose another --out, or change them back"]))

@@ -17,7 +17,7 @@ from schemas.dataset.tables import SCHEMAS, SHAPE_FILE_COLUMNS, TABLES
 from schemas.errors import CorruptError
 from workers.store.commit import committed_files
 from workers.store.committed_rows import Spread, iter_ranges, range_rows
-from workers.store.manifest import conform, decode_rows
+from workers.store.manifest import conform, decode_rows, join_rows
 from workers.store.store import Store
 
 RANGES_PER_BLOCK = 128
@@ -182,7 +182,7 @@ def _concatenated(table: str, parts: Sequence[pa.Table], name: str) -> pa.Table:
     if not parts:
         return SCHEMAS[table].empty_table()
     if any(part.schema != parts[0].schema for part in parts):
-        parts = [conform(table, part, name) for part in parts]
+        return join_rows(table, [conform(table, part, name) for part in parts]).combine_chunks()
     return conform(table, pa.concat_tables(parts), name).combine_chunks()
 
 

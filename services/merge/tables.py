@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from schemas.dataset.layout import merged_table_path
-from schemas.dataset.tables import SCHEMAS, SORT_KEYS
+from schemas.dataset.tables import SCHEMAS, SORT_KEYS, schema_of
 from schemas.errors import CorruptError
 from workers.store.canonical import TableDigest
 from workers.store.manifest import PARQUET_OPTIONS
@@ -100,8 +100,7 @@ class _Parts:
         self._table = table
         self._category = category
         self._folder = folder
-        schema = SCHEMAS[table]
-        self._schema = schema.remove(schema.get_field_index("category"))
+        self._schema: pa.Schema | None = None
         self._waiting: list[pa.Table] = []
         self.waiting_bytes = 0
         self._writer: pq.ParquetWriter | None = None
@@ -110,8 +109,11 @@ class _Parts:
         self._files: dict[str, Path] = {}
 
     def write(self, rows: pa.Table) -> None:
-        """Takes the next rows."""
+        """Takes the next rows; the first ones decide whether the files are of scenes or of captures."""
         self._waiting.append(rows.drop_columns("category"))
+        if self._schema is None:
+            schema = schema_of(self._table, rows.column_names)
+            self._schema = schema.remove(schema.get_field_index("category"))
         self.waiting_bytes += self._waiting[-1].nbytes
         if sum(map(len, self._waiting)) >= ROWS_PER_GROUP:
             self.flush()
@@ -125,6 +127,7 @@ class _Parts:
 
     def flush(self) -> None:
         """Writes the rows that wait."""
+        assert self._schema is not None
         rows = pa.concat_tables([self._schema.empty_table(), *self._waiting])
         self._waiting, self.waiting_bytes = [], 0
         while rows.num_rows or not self._files:

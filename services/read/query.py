@@ -1,5 +1,6 @@
 """`verso query`: SQL over the manifests of a dataset, finished or being made. Reads nothing else and writes nothing."""
 
+import contextlib
 import urllib.parse
 import warnings
 from collections.abc import Iterable, Mapping
@@ -13,12 +14,14 @@ import pyarrow.parquet as pq
 
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import COMMITS, MANIFEST, STAGING, SUCCESS_FILE, range_name, range_table_path
-from schemas.dataset.tables import SCHEMAS, TABLES
+from schemas.dataset.tables import CAPTURE_SCHEMAS, SCHEMAS, TABLES, schema_of
 from schemas.errors import CorruptError, InputError, OutputError
+from services.job.record import read_job
 from services.merge.step import read_success
 from services.read.damage import explain_damage
 from workers.store.commit import commit_names, read_record
 from workers.store.committed_rows import range_rows
+from workers.store.manifest import join_rows
 from workers.store.store import Store
 
 _LOCKED = {
@@ -65,14 +68,27 @@ def _register(connection: duckdb.DuckDBPyConnection, store: Store) -> None:
     """Make a view of each table."""
     done = read_success(store)
     committed = _Committed(store) if done is None else None
+    schemas = _schemas(store)
     for table in TABLES:
-        parts = committed.parts(table) if committed else _merged(store, _merged_files(store, done), table)
+        schema = schemas[table]
+        parts = (
+            committed.parts(table, schema) if committed else _merged(store, _merged_files(store, done), table, schema)
+        )
         for number, part in enumerate(parts):
             connection.register(f"_{table}_{number}", part)
-        columns = ", ".join(f'"{name}"' for name in SCHEMAS[table].names)
+        columns = ", ".join(f'"{name}"' for name in schema.names)
         union = " UNION ALL ".join(f"SELECT {columns} FROM _{table}_{number}" for number in range(len(parts)))
         once = "DISTINCT ON (instance_id)" if table == "assets" else ""
         connection.execute(f"CREATE VIEW {table} AS SELECT {once} {columns} FROM ({union})")
+
+
+def _schemas(store: Store) -> Mapping[str, pa.Schema]:
+    """The schemas of the tables: by job.yaml those of scenes or of captures."""
+    with contextlib.suppress(CorruptError):  # the tables can be asked without it
+        record = read_job(store)
+        if record is not None and record.job.captures is not None:
+            return CAPTURE_SCHEMAS
+    return SCHEMAS
 
 
 def _merged_files(store: Store, success: Mapping[str, Any] | None) -> list[str]:
@@ -86,15 +102,15 @@ def _merged_files(store: Store, success: Mapping[str, Any] | None) -> list[str]:
     raise CorruptError(f"{told}: `verso replay {store.name} --repair` writes it again")
 
 
-def _merged(store: Store, keys: Iterable[str], table: str) -> list[Rows]:
+def _merged(store: Store, keys: Iterable[str], table: str, schema: pa.Schema) -> list[Rows]:
     """The merged table: read lazily from a disk, as a whole from an object store."""
     folder = f"{MANIFEST}/{table}"
     keys = [key for key in keys if key.startswith(f"{folder}/")]
     if store.root is None:
-        return [pa.concat_tables([read_merged(table, key, store.read(key)) for key in keys])]
+        return [join_rows(table, [schema.empty_table(), *(read_merged(table, key, store.read(key)) for key in keys)])]
     partitioning = ds.partitioning(pa.schema([("category", pa.string())]), flavor="hive")
     paths, base = [str(store.root / key) for key in keys], str(store.root / folder)
-    return [ds.dataset(paths, SCHEMAS[table], _FORMAT, partitioning=partitioning, partition_base_dir=base)]
+    return [ds.dataset(paths, schema, _FORMAT, partitioning=partitioning, partition_base_dir=base)]
 
 
 def read_merged(table: str, key: str, data: bytes) -> pa.Table:
@@ -102,7 +118,8 @@ def read_merged(table: str, key: str, data: bytes) -> pa.Table:
     rows = pq.read_table(pa.BufferReader(data), page_checksum_verification=True)
     category = urllib.parse.unquote(key.split("/")[-2].removeprefix("category="))
     column = pa.repeat(pa.scalar(category), rows.num_rows)
-    return rows.append_column("category", column).select(SCHEMAS[table].names).cast(SCHEMAS[table])
+    schema = schema_of(table, rows.column_names)
+    return rows.append_column("category", column).select(schema.names).cast(schema)
 
 
 class _Committed:
@@ -125,11 +142,11 @@ class _Committed:
                 records = [record for retry in retries if (record := read_record(store, start, retry)) is not None]
                 self._other.append(records)
 
-    def parts(self, table: str) -> list[Rows]:
+    def parts(self, table: str, schema: pa.Schema) -> list[Rows]:
         """The rows of one table: those in memory, and those in files."""
         rows = [range_rows(self._store, records, table) for records in self._other]
-        parts: list[Rows] = [pa.concat_tables([SCHEMAS[table].empty_table(), *rows])]
+        parts: list[Rows] = [join_rows(table, [schema.empty_table(), *rows])]
         if self._plain and self._store.root is not None:
             paths = [str(self._store.root / range_table_path(start, table)) for start in self._plain]
-            parts.append(ds.dataset(paths, SCHEMAS[table], _FORMAT))
+            parts.append(ds.dataset(paths, schema, _FORMAT))
         return parts

@@ -21,7 +21,7 @@ from services.read.verify_job import StoredJob, Terms, check_fingerprint, encode
 from services.read.verify_range import read_records
 from services.read.verify_span import commit_groups
 from services.run.lock import hold_lock
-from workers.assets.catalogue import open_catalogue
+from workers.pipeline.captures.listing import open_sources
 from workers.pipeline.fingerprint import take_fingerprint
 from workers.render.raster.gbuffer import shared_renderer
 from workers.store.attempt import reopen
@@ -71,7 +71,7 @@ def _merge_again(store: Store, found: Repair) -> None:
         if "merge" in found.verdict.parts:
             found.done.append(f"_SUCCESS and the merged files: written again from the commits, digest {merged.digest}")
         if "card" in found.verdict.parts:
-            catalogue = open_catalogue(job.assets, Path(record.folder), tuple(job.categories))
+            catalogue = open_sources(job, Path(record.folder))
             write_card(store, record, catalogue, merged)
             found.done.append("DATASET.md: written again")
     except VersoError as error:
@@ -125,7 +125,7 @@ class _Repairing:
         run = kept.run.model_copy(update={"range_size": next(iter(self._terms.range_sizes))})
         whole = kept.model_copy(update={"scenes": asked[1] - asked[0], "run": run})
         if whole.first_scene == asked[0] and whole.scenes > 0:
-            record = record_job(whole, job.record.catalogue, Path(job.record.folder))
+            record = record_job(whole, job.record.catalogue, Path(job.record.folder), job.record.inputs)
             self._put(JOB_FILE, encode_job(record))
 
     def _mend_fingerprint(self) -> None:

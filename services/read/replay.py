@@ -13,7 +13,7 @@ from schemas.job.identity import job_digest
 from schemas.scene.scene import SceneOutput
 from services.job.record import JobRecord, require_job
 from services.read.dataset_reader import StoredRange, file_reader, find_scene
-from workers.assets.catalogue import open_catalogue
+from workers.pipeline.captures.listing import open_sources
 from workers.pipeline.context import WorkerContext, open_worker
 from workers.pipeline.fingerprint import take_fingerprint
 from workers.pipeline.run_shard import run_scene
@@ -64,11 +64,10 @@ def replay_scene(store: Store, scene_id: int) -> Replay:
 
 def open_context(record: JobRecord) -> WorkerContext:
     """The context that makes a stored job's scenes here. Raises MachineError where the assets have changed."""
-    catalogue = open_catalogue(record.job.assets, Path(record.folder), tuple(record.job.categories))
+    catalogue = open_sources(record.job, Path(record.folder))
     if catalogue.digest != record.catalogue:
-        raise MachineError(
-            f"the asset folders of this job (from {record.folder}) do not hold what they held when it was run"
-        )
+        changed = record.describe_change(tuple(listing.sha256 for listing in catalogue.captures))
+        raise MachineError(f"{changed} (from {record.folder}) do not hold what they held when this job was run")
     return open_worker(record.job, catalogue)
 
 

@@ -21,7 +21,8 @@ from services.run.out_folder import explain_lost_folder
 from services.run.progress import ProgressLine, event_log, log_event
 from services.run.range_planner import MAX_SHARD, SpanPlan, choose_shard_size, group_shards, plan_spans
 from services.run.ray_cluster import Slots, open_ray
-from workers.assets.catalogue import Catalogue, open_catalogue
+from workers.assets.catalogue import Catalogue
+from workers.pipeline.captures.listing import open_sources
 from workers.render.step import require_tier
 from workers.store.ledger import LedgerKeeper, list_commits
 from workers.store.local import open_store
@@ -80,7 +81,7 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     refuse_foreign(store)
     store.prepare()
     with explain_lost_folder(store.root), hold_lock(store) as lock, event_log(store.root):
-        record = adopt(store, record_job(request.job, catalogue.digest, request.job_folder))
+        record = adopt(store, _record(request, catalogue))
         sweep(store, fenced=None)
         ledger = list_commits(store)
         for line in find_lost(store, ledger):
@@ -100,9 +101,15 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     return RunResult(merged, time.monotonic() - begun, made_now)
 
 
+def _record(request: RunRequest, catalogue: Catalogue) -> JobRecord:
+    """The record of the job that is asked for, with what its sources hold now."""
+    inputs = tuple(listing.sha256 for listing in catalogue.captures)
+    return record_job(request.job, catalogue.digest, request.job_folder, inputs)
+
+
 def _open_catalogue(request: RunRequest) -> Catalogue:
     """The job's catalogue; shows how many files are listed and checked, which takes long where there are many new ones."""
-    job, lines = request.job, dict[str, ProgressLine]()
+    lines = dict[str, ProgressLine]()
 
     def watch(what: str, done: int, asked: int) -> None:
         if what not in lines:
@@ -111,7 +118,7 @@ def _open_catalogue(request: RunRequest) -> Catalogue:
         lines[what].show(done)
 
     try:
-        return open_catalogue(job.assets, request.job_folder, tuple(job.categories), watch)
+        return open_sources(request.job, request.job_folder, watch)
     finally:
         for line in lines.values():
             line.close()

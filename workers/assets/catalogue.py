@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from schemas.capture.listing import CaptureListing
 from schemas.errors import AssetSourceError
 from schemas.job.assets import (
     Assets,
@@ -55,6 +56,8 @@ class Catalogue:
     tables: tuple[Listing | None, ...]
     digest: str
     skipped: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    captures: tuple[CaptureListing, ...] = ()
+    """Folders of captures, in order; the digest covers their files too."""
 
     def offers(self, category: str) -> list[tuple[int, AnySource, int]]:
         """Number, settings and count of instances of every source that has this category."""

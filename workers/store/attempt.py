@@ -34,13 +34,14 @@ from schemas.dataset.layout import (
     staging_path,
 )
 from schemas.dataset.shard import JobChange
-from schemas.dataset.tables import SCHEMAS, TABLES
+from schemas.dataset.tables import TABLES
 from schemas.errors import OutputError, RunError
 from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
 from workers.store.commit import committed_files, compare_attempts, encode_record, publish, read_record
 from workers.store.manifest import (
     check_files,
     encode_table,
+    join_rows,
     outcome_of,
     scene_digest,
     shape_paths,
@@ -130,7 +131,7 @@ class Attempt:
         self._terms = terms
         self._staging = staging_path(span.start, name)
         self._files: dict[str, FileEntry] = {}
-        self._rows: dict[str, list[pa.Table]] = {table: [SCHEMAS[table].empty_table()] for table in TABLES}
+        self._rows: dict[str, list[pa.Table]] = {table: [] for table in TABLES}
         self._scenes: list[SceneMark] = []
         self._packing = Packing(store, self._staging, span, tar=terms.layout == "tar")
 
@@ -192,7 +193,7 @@ class Attempt:
         """The record of this attempt, after the last of its files is written."""
         tables, entries = {}, []
         for table in TABLES:
-            rows = sorted_rows(table, pa.concat_tables(self._rows[table]).combine_chunks())
+            rows = sorted_rows(table, join_rows(table, self._rows[table]).combine_chunks())
             tables[table] = TableEntry(rows=rows.num_rows)
             if table == "assets":
                 rows = with_shape_files(rows, self._files)

@@ -14,7 +14,7 @@ from schemas.dataset.tables import SORT_KEYS
 from schemas.errors import RunError
 from workers.store.commit import check_retries, list_codes, read_range_file, require_record, split_code
 from workers.store.ledger import list_commits as list_commits
-from workers.store.manifest import decode_table
+from workers.store.manifest import decode_table, join_rows
 from workers.store.store import Store
 
 A = TypeVar("A")
@@ -78,7 +78,7 @@ def range_rows(store: Store, records: Sequence[CommitRecord], table: str) -> pa.
             later = {scene_id for record in records[number + 1 :] for scene_id in record.span.scenes}
             again = pc.is_in(part.column("scene_id"), value_set=pa.array(sorted(later), pa.int64()))
             parts[number] = part.filter(pc.invert(again))
-    return pa.concat_tables(parts).sort_by([(key, "ascending") for key in SORT_KEYS[table]])
+    return join_rows(table, parts).sort_by([(key, "ascending") for key in SORT_KEYS[table]])
 
 
 def read_range_table(store: Store, record: CommitRecord, table: str) -> pa.Table:

@@ -14,7 +14,14 @@ import pyarrow.parquet as pq
 
 from schemas.dataset.commit import FileEntry, Outcome
 from schemas.dataset.layout import asset_path, is_plain_path, is_shape
-from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, SHAPE_FILE_COLUMNS, SORT_KEYS
+from schemas.dataset.tables import (
+    CAPTURE_SCHEMAS,
+    DETERMINISTIC_TABLES,
+    SCHEMAS,
+    SHAPE_FILE_COLUMNS,
+    SORT_KEYS,
+    schema_of,
+)
 from schemas.errors import CorruptError
 from schemas.scene.scene import SceneOutput
 
@@ -31,14 +38,14 @@ _RANGE_OPTIONS: dict[str, Any] = {
 
 
 def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
-    """Rows as an Arrow table with exactly the schema of `table`.
+    """Rows as an Arrow table with exactly the schema of `table`, of scenes or of captures.
 
     Raises ValueError naming the table and the column where a key is unknown or missing, a value has the wrong type, a
     required one is absent or a number is not finite.
     """
-    schema = SCHEMAS[table]
     if not rows:
-        return schema.empty_table()
+        return SCHEMAS[table].empty_table()
+    schema = schema_of(table, rows[0].keys())
     names = set(schema.names)
     for row in rows:
         if row.keys() != names:
@@ -187,9 +194,20 @@ def conform(table: str, rows: pa.Table, name: str) -> pa.Table:
 
     A schema only grows. So rows that lack a column and have an unknown one have a damaged column name.
     """
-    schema = SCHEMAS[table]
+    return _fitted(table, rows, schema_of(table, rows.column_names), name)
+
+
+def join_rows(table: str, parts: Sequence[pa.Table]) -> pa.Table:
+    """Rows one after another, in the schema of captures where one of them is of a capture."""
+    schema = schema_of(table, {name for part in parts for name in part.column_names})
+    fitted = [part if part.schema == schema else _fitted(table, part, schema, table) for part in parts]
+    return pa.concat_tables(fitted) if fitted else schema.empty_table()
+
+
+def _fitted(table: str, rows: pa.Table, schema: pa.Schema, name: str) -> pa.Table:
+    """Rows with exactly this schema. Raises as `conform`."""
     missing = [column for column in schema.names if column not in rows.column_names]
-    known = {*schema.names, *(field.name for field in SHAPE_FILE_COLUMNS)}
+    known = {*CAPTURE_SCHEMAS[table].names, *(field.name for field in SHAPE_FILE_COLUMNS)}
     foreign = [column for column in rows.column_names if column not in known]
     if missing and foreign:
         raise CorruptError(f"{name} lacks the column {missing[0]} of the table {table}, and has {foreign[0]!r}")

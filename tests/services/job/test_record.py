@@ -62,3 +62,21 @@ def test_a_folder_that_is_no_absolute_path_is_refused(store, folder):
     store.write_whole(JOB_FILE, yaml.safe_dump(tree | {"folder": folder}).encode())
     with pytest.raises(CorruptError, match="is not a job that `verso run` wrote"):
         require_job(store)
+
+
+def test_captures_whose_files_changed_are_named_by_their_folders(store):
+    captures = {"source": "folders", "folders": ["shots/mug", "shots/box"]}
+    job = Job.model_validate({"name": "a", "captures": captures})
+    before = record_job(job, "c", Path("jobs"), ("1" * 64, "2" * 64))
+    store.write_whole(JOB_FILE, encode_job(before))
+    assert require_job(store) == before
+    assert adopt(store, before).inputs == before.inputs
+    with pytest.raises(OutputError, match="captures in shots/box ") as caught:
+        adopt(store, record_job(job, "d", Path("jobs"), ("1" * 64, "3" * 64)))
+    assert "shots/mug" not in str(caught.value)
+
+
+def test_a_record_without_captures_is_written_as_before_there_were_any():
+    tree = yaml.safe_load(encode_job(record()))
+    assert list(tree) == ["digest", "catalogue", "folder", "job", "seal"]
+    assert "captures" not in tree["job"]
