@@ -3,23 +3,18 @@
 import numpy as np
 
 from schemas.capture.estimate import CaptureEstimate, DepthCorrection
-from schemas.capture.view import CaptureCamera
-from schemas.job.captures import Estimation
-from workers.capture.poses.markers import MarkerPose, is_ambiguous, measured_corner_px
-from workers.capture.poses.observation import Observation
+from workers.capture.poses.evidence import Evidence
+from workers.capture.poses.markers import MarkerPose, is_ambiguous
 from workers.capture.poses.verdict import Judged, judge
 
 
-def estimate_markers(
-    observations: list[Observation], poses: list[MarkerPose], camera: CaptureCamera, spec: Estimation
-) -> CaptureEstimate:
+def estimate_markers(evidence: Evidence) -> CaptureEstimate:
     """Each view by itself; the sigma of a corner, which tells how certain a pose is, is measured over all of them."""
-    corner_px = measured_corner_px(poses, spec)
     views = [
-        judge(observation, judged(found, corner_px), camera, spec, DepthCorrection())
-        for observation, found in zip(observations, poses, strict=True)
+        judge(observation, judged(found, evidence.corner_px), evidence, DepthCorrection())
+        for observation, found in zip(evidence.observations, evidence.markers, strict=True)
     ]
-    return CaptureEstimate("markers", tuple(views), notes=(f"sigma of a corner: {corner_px:.3f} px",))
+    return CaptureEstimate("markers", tuple(views), notes=(f"sigma of a corner: {evidence.corner_px:.3f} px",))
 
 
 def judged(found: MarkerPose, corner_px: float) -> Judged:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.capture.view import CaptureCamera, Detection
-from schemas.job.captures import Board
+from schemas.job.captures import Board, Estimation
 from workers.capture.board.layout import marker_corners
 from workers.capture.poses.rays import rays_of_pixels
 
@@ -68,6 +68,15 @@ class Observation:
     def markers(self) -> int:
         """How many markers were found."""
         return len(self.corners.board) // 4
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What is known of a capture before its images are read."""
+
+    camera: CaptureCamera
+    board: Board
+    spec: Estimation
 
 
 def corners_of(detection: Detection, board: Board, camera: CaptureCamera) -> Corners:

@@ -8,7 +8,7 @@ import numpy as np
 from schemas.base import Array, Pose
 from schemas.capture.estimate import DepthCorrection, ViewEstimate, ViewStatus
 from schemas.capture.view import CaptureCamera
-from schemas.job.captures import Estimation
+from workers.capture.poses.evidence import Evidence
 from workers.capture.poses.observation import Observation, Patches
 from workers.capture.poses.rays import pixels_of_points
 from workers.geometry.frames import transform
@@ -30,23 +30,19 @@ class Judged:
 
 
 def judge(
-    observation: Observation,
-    pose: Judged,
-    camera: CaptureCamera,
-    spec: Estimation,
-    depth: DepthCorrection,
-    scale: float = 1.0,
+    observation: Observation, pose: Judged, evidence: Evidence, depth: DepthCorrection, print_scale: float = 1.0
 ) -> ViewEstimate:
-    """The estimate of one view, with its residuals; `scale` is the print's."""
+    """The estimate of one view, with its residuals."""
     number, markers, T = observation.number, observation.markers, pose.T_board_cam
     if T is None or not np.isfinite(T).all():
         reasons = pose.faults or ("no pose was found",)
         return ViewEstimate(number, "refused", None, None, markers, None, None, reasons)
-    reprojection_px = median_reprojection(observation, T, camera, scale)
+    reprojection_px = median_reprojection(observation, T, evidence.camera, print_scale)
+    most_px = evidence.spec.max_reprojection_px
     faults = [*pose.faults, *_doubts(pose.covariance)]
-    if reprojection_px is not None and reprojection_px > spec.max_reprojection_px:
+    if reprojection_px is not None and reprojection_px > most_px:
         faults.append(
-            f"median reprojection error {reprojection_px:.2f} px, above max_reprojection_px {spec.max_reprojection_px:g}: "
+            f"median reprojection error {reprojection_px:.2f} px, above max_reprojection_px {most_px:g}: "
             "the markers do not lie as board.json says, or the view is blurred"
         )
     status: ViewStatus = "flagged" if faults else "used"
@@ -56,12 +52,12 @@ def judge(
     )
 
 
-def median_reprojection(observation: Observation, T: Pose, camera: CaptureCamera, scale: float) -> float | None:
+def median_reprojection(observation: Observation, T: Pose, camera: CaptureCamera, print_scale: float) -> float | None:
     """Median distance, pixels, of all corners found from where the pose projects them; None without corners."""
     corners = observation.corners
     if not len(corners.board):
         return None
-    distance = np.linalg.norm(pixels_of_points(corners.board * scale, T, camera) - corners.pixels, axis=1)
+    distance = np.linalg.norm(pixels_of_points(corners.board * print_scale, T, camera) - corners.pixels, axis=1)
     return float(np.median(np.where(np.isfinite(distance), distance, 1e6)))
 
 

@@ -1,7 +1,8 @@
 """The poses of a capture: images are read one view at a time, and what is found in them goes to the three estimates."""
 
+import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -11,9 +12,12 @@ from schemas.errors import CaptureError
 from schemas.job.captures import ESTIMATES, Estimate, Estimation
 from workers.capture.board.layout import open_dictionary
 from workers.capture.detect import detect_markers, other_dictionaries
+from workers.capture.poses.article import estimate_article
+from workers.capture.poses.evidence import Evidence
+from workers.capture.poses.from_joint import estimate_joint
 from workers.capture.poses.from_markers import estimate_markers
-from workers.capture.poses.markers import MarkerPose, fit_markers
-from workers.capture.poses.observation import Observation, corners_of
+from workers.capture.poses.observation import Setup
+from workers.capture.poses.observe import observe_view
 from workers.store.capture_folder import CaptureFolder, read_view
 
 
@@ -32,30 +36,36 @@ class _Clock:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.process_time() - begun
 
 
+MAKE: dict[Estimate, Callable[[Evidence], CaptureEstimate]] = {
+    "markers": estimate_markers,
+    "article": estimate_article,
+    "joint": estimate_joint,
+}
+
+
 def estimate_poses(folder: CaptureFolder, spec: Estimation) -> Estimates:
     """The estimate that is asked for and, with `compare`, the other two.
 
     Raises CaptureError where a file cannot be read or the estimate that is asked for has no usable view.
     """
     clock = _Clock()
-    detections, observations, poses = _observe(folder, spec, clock)
+    detections, evidence = _observe(folder, spec, clock)
     if not any(len(found.ids) for found in detections):
         raise CaptureError("markers", _no_markers(folder))
-    wanted = ESTIMATES if spec.compare else (spec.estimate,)
     by_name: dict[Estimate, CaptureEstimate] = {}
-    for name in wanted:
-        with clock.stage(name):
-            by_name[name] = estimate_markers(observations, poses, folder.camera, spec)
+    for name in ESTIMATES if spec.compare else (spec.estimate,):
+        begun = time.process_time()
+        made = MAKE[name](evidence)
+        by_name[name] = dataclasses.replace(made, seconds={name: time.process_time() - begun})
     estimates = Estimates(spec.estimate, by_name, tuple(detections), clock.seconds)
     if not estimates.estimate.used:
         raise CaptureError("poses", _no_pose(estimates.estimate))
     return estimates
 
 
-def _observe(
-    folder: CaptureFolder, spec: Estimation, clock: _Clock
-) -> tuple[list[Detection], list[Observation], list[MarkerPose]]:
+def _observe(folder: CaptureFolder, spec: Estimation, clock: _Clock) -> tuple[list[Detection], Evidence]:
     """What is found in each view, in order of number; no two views' images are held at once."""
+    setup = Setup(folder.camera, folder.board, spec)
     dictionary = open_dictionary(folder.board, folder.path)
     detections, observations, poses = [], [], []
     for number in folder.numbers:
@@ -63,13 +73,12 @@ def _observe(
             view = read_view(folder, number)
         with clock.stage("detect"):
             detection = detect_markers(view.rgb, folder.board, dictionary, number)
-        with clock.stage("fit"):
-            observation = Observation(number, corners_of(detection, folder.board, folder.camera))
-            found = fit_markers(observation, folder.camera, spec)
+        with clock.stage("sample"):
+            observation, found = observe_view(detection, view.depth, setup)
         detections.append(detection)
         observations.append(observation)
         poses.append(found)
-    return detections, observations, poses
+    return detections, Evidence.of(setup, observations, poses)
 
 
 def _no_markers(folder: CaptureFolder) -> str:

@@ -1,15 +1,19 @@
 """Captures of corners and depth by arithmetic, with truth: OpenCV's projectPoints and planes, without any picture."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 
 from schemas.base import Pose
 from schemas.capture.view import CaptureCamera
-from schemas.job.captures import Board
+from schemas.job.captures import Board, Estimation
 from schemas.scene.camera import Intrinsics
 from tests.workers.capture.photographs import KINECT
 from workers.capture.board.layout import marker_corners
-from workers.capture.poses.observation import Corners, Observation
+from workers.capture.poses.evidence import Evidence
+from workers.capture.poses.markers import fit_markers
+from workers.capture.poses.observation import Corners, Observation, Setup
 from workers.capture.poses.rays import rays_of_pixels
 from workers.geometry.frames import angle_between, invert
 
@@ -53,6 +57,30 @@ def observe(
         points[chosen].reshape(-1, 3), found, rays_of_pixels(found, camera), np.repeat(chosen, 4), np.zeros(len(found))
     )
     return Observation(number, corners)
+
+
+def with_corner_depth(
+    view: Observation,
+    T_board_cam: Pose,
+    rng: np.random.Generator,
+    *,
+    sigma_m=0.002,
+    bias_m=0.0,
+    shift_m=(0, 0, 0),
+    scale=1.0,
+) -> Observation:
+    """The view with the depth that a camera sees at its corners: the board's plane, shifted in camera axes, less a bias."""
+    rays = np.column_stack([view.corners.rays, np.ones(len(view.corners.rays))])
+    normal, height = T_board_cam[2, :3], T_board_cam[2, 3]
+    z = (-height + normal @ np.asarray(shift_m)) / (rays @ normal) / scale - bias_m + rng.normal(0, sigma_m, len(rays))
+    return dataclasses.replace(view, corners=dataclasses.replace(view.corners, depth_m=z))
+
+
+def evidence_of(views: list[Observation], camera=PINHOLE, **spec) -> Evidence:
+    """What the estimates are made from; `spec` are settings of the estimation."""
+    estimation = Estimation(**spec)
+    poses = [fit_markers(view, camera, estimation) for view in views]
+    return Evidence.of(Setup(camera, Board(), estimation), views, poses)
 
 
 def errors(estimated: Pose, true: Pose) -> tuple[float, float]:

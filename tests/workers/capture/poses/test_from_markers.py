@@ -1,17 +1,13 @@
 import numpy as np
 import pytest
 
-from schemas.job.captures import Estimation
 from tests.workers.capture.photographs import hand_held
-from tests.workers.capture.poses.scenes import PINHOLE, errors, observe
+from tests.workers.capture.poses.scenes import errors, evidence_of, observe
 from workers.capture.poses.from_markers import estimate_markers
-from workers.capture.poses.markers import fit_markers
-
-SPEC = Estimation()
 
 
 def estimate(views):
-    return estimate_markers(views, [fit_markers(view, PINHOLE, SPEC) for view in views], PINHOLE, SPEC)
+    return estimate_markers(evidence_of(views))
 
 
 def test_every_view_is_there_with_its_pose_and_residual():

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from schemas.capture.estimate import DepthCorrection
-from schemas.job.captures import Estimation
 from tests.workers.capture.photographs import hand_held
-from tests.workers.capture.poses.scenes import PINHOLE, observe
+from tests.workers.capture.poses.scenes import evidence_of, observe
 from workers.capture.poses.motion import moved
 from workers.capture.poses.observation import Patches
 from workers.capture.poses.verdict import Judged, corrected_points, judge
 from workers.geometry.frames import invert, transform, translation
 
-SPEC, NONE = Estimation(), DepthCorrection()
+NONE = DepthCorrection()
 T = hand_held(np.random.default_rng(0), 1)[0]
 VIEW = observe(T, np.random.default_rng(0))
+EVIDENCE = evidence_of([VIEW])
 
 
 def patches_on_board(lift_m=0.0):
@@ -25,27 +25,27 @@ def patches_on_board(lift_m=0.0):
 
 
 def test_a_good_view_is_used_and_its_depth_is_measured_against_the_board():
-    view = judge(dataclasses.replace(VIEW, board_patches=patches_on_board(0.004)), Judged(T), PINHOLE, SPEC, NONE)
+    view = judge(dataclasses.replace(VIEW, board_patches=patches_on_board(0.004)), Judged(T), EVIDENCE, NONE)
     assert view.status == "used" and view.depth_mm == pytest.approx(4.0)
     assert view.reprojection_px < 0.3
 
 
 def test_a_view_that_does_not_fit_is_flagged_with_the_number():
     off = moved(T, np.array([0, 0, 0, 0, 0.01, 0]))
-    view = judge(VIEW, Judged(off), PINHOLE, SPEC, NONE)
+    view = judge(VIEW, Judged(off), EVIDENCE, NONE)
     assert view.status == "flagged" and "above max_reprojection_px 3" in view.reasons[0]
     assert f"{view.reprojection_px:.2f} px" in view.reasons[0]
 
 
 def test_an_uncertain_pose_is_flagged_with_its_sigma():
     covariance = np.diag([1e-8] * 3 + [0.02**2] * 3)
-    view = judge(VIEW, Judged(T, covariance), PINHOLE, SPEC, NONE)
+    view = judge(VIEW, Judged(T, covariance), EVIDENCE, NONE)
     assert view.reasons == ("the pose is uncertain: 0.1 mm, 1.15 degrees (one sigma)",)
 
 
 @pytest.mark.parametrize("pose", [None, np.full((4, 4), np.nan)])
 def test_no_pose_is_refused_and_never_nan(pose):
-    view = judge(VIEW, Judged(pose), PINHOLE, SPEC, NONE)
+    view = judge(VIEW, Judged(pose), EVIDENCE, NONE)
     assert view.status == "refused" and view.T_board_cam is None and view.reasons
 
 

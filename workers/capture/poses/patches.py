@@ -1,0 +1,114 @@
+"""Small planar pieces of a depth image: on the markers of the board, and around their corners.
+
+A piece of plane has an inverse depth that is affine in the ray (x, y): 1 / z = a x + b y + c, with the plane's normal along
+(a, b, c). So one robust linear fit gives the piece's middle, its normal and its noise.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array
+from schemas.capture.view import CaptureCamera, Detection
+from schemas.job.captures import Board
+from workers.capture.poses.observation import Patches
+from workers.capture.poses.rays import rays_of_pixels
+
+GRID = 12
+"""Samples along each side of a marker or gap."""
+MARGIN = 0.1
+"""Share of a marker's side at each end that is left out: depth is mixed at the edges of what hides a marker."""
+MIN_SAMPLES = 12
+MIN_SHARE = 0.25
+"""A piece needs so many samples with depth, and such a share of them."""
+OUTLIER = 3.5
+"""A sample farther from its piece's plane than this many standard deviations is left out."""
+CORNER_WINDOW_PX = 2
+"""Half the width of the window whose median is the depth of a corner."""
+
+
+def board_patches(depth: NDArray[np.uint16], detection: Detection, board: Board, camera: CaptureCamera) -> Patches:
+    """A patch for each marker found, and for each gap between two: what covers one would have kept it from being found.
+
+    The gaps are white where black ink may swallow the infrared light that depth is measured with.
+    """
+    quads = np.concatenate([detection.corners_px, _gaps(detection, board)])
+    place = np.linspace(MARGIN, 1 - MARGIN, GRID)
+    s, t = (axis.ravel() for axis in np.meshgrid(place, place))
+    weights = np.stack([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t], axis=1)  # of the corners, clockwise
+    pixels = np.floor(np.einsum("gk,mkc->mgc", weights, quads)).astype(np.int64)
+    return sample_patches(depth, pixels, camera)
+
+
+def _gaps(detection: Detection, board: Board) -> Array:
+    """[G, 4, 2] pixels: the areas between markers found side by side or one above the other."""
+    place = {int(marker) - board.first_id: n for n, marker in enumerate(detection.ids)}
+    corners, gaps = detection.corners_px, []
+    for marker, n in place.items():
+        right, below = place.get(marker + 1), place.get(marker + board.columns)
+        if right is not None and (marker + 1) % board.columns:
+            gaps.append([corners[n, 1], corners[right, 0], corners[right, 3], corners[n, 2]])
+        if below is not None:
+            gaps.append([corners[n, 3], corners[n, 2], corners[below, 1], corners[below, 0]])
+    return np.array(gaps, dtype=np.float64).reshape(-1, 4, 2)
+
+
+def sample_patches(depth: NDArray[np.uint16], pixels: NDArray[np.int64], camera: CaptureCamera) -> Patches:
+    """Patches fitted to the depth at pixels [P, S, 2] (column, row); those with too little depth are left out."""
+    height, width = depth.shape
+    inside = ((pixels >= 0) & (pixels < np.array([width, height]))).all(axis=2)
+    column, row = np.where(inside, pixels[..., 0], 0), np.where(inside, pixels[..., 1], 0)
+    z = np.where(inside, depth[row, column], 0) / camera.depth_units_per_m
+    centres: Array = pixels.reshape(-1, 2).astype(np.float64) + 0.5
+    rays = rays_of_pixels(centres, camera).reshape(pixels.shape)
+    return fit_patches(rays, np.where(np.isfinite(rays).all(axis=2), z, 0.0))
+
+
+def fit_patches(rays: Array, z: Array) -> Patches:
+    """Planes through samples at rays [P, S, 2] with depths z [P, S], 0 where there is none."""
+    count = (z > 0).sum(axis=1)
+    enough = (count >= MIN_SAMPLES) & (count >= MIN_SHARE * z.shape[1])
+    rays, z = np.where((z > 0)[..., None], rays, 0.0)[enough], z[enough]
+    basis = np.concatenate([rays, np.ones((*z.shape, 1))], axis=2)
+    inverse = np.where(z > 0, 1.0 / np.where(z > 0, z, 1.0), 0.0)
+    used = z > 0
+    plane, sigma = np.zeros((len(z), 3)), np.full(len(z), np.inf)
+    for _ in range(3):
+        plane = _planes(basis, inverse, used)
+        off = (inverse - np.einsum("psk,pk->ps", basis, plane)) * z**2  # metres along z, to first order
+        sigma = 1.4826 * np.nanmedian(np.where(used, np.abs(off), np.nan), axis=1) if len(z) else np.zeros(0)
+        used = (z > 0) & (np.abs(off) <= OUTLIER * np.maximum(sigma, 1e-4)[:, None])
+    total = np.maximum(used.sum(axis=1), 1)
+    ray = (basis * used[..., None]).sum(axis=1) / total[:, None]
+    ray_z = (basis * (z * used)[..., None]).sum(axis=1) / total[:, None]
+    normal = -plane / np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1e-12)
+    good = (used.sum(axis=1) >= MIN_SAMPLES) & (ray_z[:, 2] > 0)
+    return Patches(ray_z[good], ray[good], normal[good], total[good], sigma[good])
+
+
+def _planes(basis: Array, inverse: Array, used: NDArray[np.bool_]) -> Array:
+    """[P, 3]: least squares of inverse depth [P, S] on the basis [P, S, 3] over the samples used.
+
+    The basis is centred first, because the rays of a small piece are nearly one.
+    """
+    total = np.maximum(used.sum(axis=1), 1)[:, None]
+    middle = (basis[..., :2] * used[..., None]).sum(axis=1) / total
+    mean = (inverse * used).sum(axis=1, keepdims=True) / total
+    dx = (basis[..., :2] - middle[:, None]) * used[..., None]
+    matrix = np.einsum("psi,psj->pij", dx, dx)
+    matrix += 1e-9 * (np.trace(matrix, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(2)
+    slope = np.linalg.solve(matrix, np.einsum("psi,ps->pi", dx, inverse - mean)[..., None])[..., 0]
+    return np.concatenate([slope, mean - (slope * middle).sum(axis=1, keepdims=True)], axis=1)
+
+
+def depth_at(depth: NDArray[np.uint16], pixels: Array, units_per_m: float) -> Array:
+    """[N] metres: median of the depth around pixels [N, 2] (centres at +0.5); 0 where fewer than a third have depth."""
+    reach = np.arange(-CORNER_WINDOW_PX, CORNER_WINDOW_PX + 1)
+    height, width = depth.shape
+    column = np.clip(np.floor(pixels[:, 0]).astype(np.int64)[:, None] + reach, 0, width - 1)
+    row = np.clip(np.floor(pixels[:, 1]).astype(np.int64)[:, None] + reach, 0, height - 1)
+    window = depth[row[:, :, None], column[:, None, :]].reshape(len(pixels), len(reach) ** 2)
+    few = (window > 0).sum(axis=1) * 3 < window.shape[1]
+    ordered = np.sort(np.where(window > 0, window, np.iinfo(np.uint16).max), axis=1)
+    half = np.maximum((window > 0).sum(axis=1) - 1, 0) // 2
+    median = ordered[np.arange(len(pixels)), half]
+    return np.where(few, 0.0, median / units_per_m)
