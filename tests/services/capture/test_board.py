@@ -40,7 +40,7 @@ def test_another_kind_of_file_is_refused(tmp_path, name, tiles):
 
 def test_a_board_that_cannot_be_read_is_named(tmp_path):
     (tmp_path / "board.json").write_text('{"columns": 30}')
-    with pytest.raises(CaptureError, match="board.json"):
+    with pytest.raises(CaptureError, match=r"board\.json"):
         board(options(tmp_path / "b.pdf", board=tmp_path / "board.json"))
 
 

@@ -22,8 +22,8 @@ def check_detection(picture: np.ndarray, board: Board, px_per_m: float, size_m: 
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     corners, ids, _ = cv2.aruco.ArucoDetector(open_dictionary(board), parameters).detectMarkers(picture)
     assert sorted(ids.ravel()) == list(range(board.first_id, board.first_id + board.columns * board.rows))
-    for found, number in zip(corners, ids.ravel().tolist(), strict=True):
-        true = nominal(board)[number - board.first_id, :, :2]
+    for found, number in zip(corners, ids.ravel(), strict=True):
+        true = nominal(board)[int(number) - board.first_id, :, :2]
         pixels = (true * [1, -1] + [0.5 * size_m[0], 0.5 * size_m[1]]) * px_per_m
         assert np.abs(found[0] + 0.5 - pixels).max() < 0.2
 
