@@ -224,7 +224,7 @@ def with_capture_keys(tree: Mapping[str, Any]) -> dict[str, Any]:
     """A copy of a job's keys, with those that follow from `captures` where the job does not give them.
 
     `scenes` is the number of folders, `pairs_per_scene` is `most_views`, and there are no aligned views: depth of a capture
-    is registered to its colour camera.
+    is registered to its colour camera. A capture takes as long as dozens of scenes, so each is committed by itself.
     """
     captures = tree.get("captures")
     filled = copy.deepcopy(dict(tree))
@@ -233,7 +233,13 @@ def with_capture_keys(tree: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(folders := captures.get("folders"), list) and folders:
         filled.setdefault("scenes", len(folders))
     most_views = captures.get("most_views", Captures.model_fields["most_views"].default)
-    for path, value in {"pairs_per_scene": most_views, "cameras.depth.enabled": False}.items():
+    usual = {
+        "pairs_per_scene": most_views,
+        "cameras.depth.enabled": False,
+        "run.range_size": 1,
+        "run.scene_timeout_s": 1800.0,
+    }
+    for path, value in usual.items():
         with suppress(ValueError):
             set_key(filled, path, value, keep=True)
     return filled

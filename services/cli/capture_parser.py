@@ -24,9 +24,10 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
         "write the marker board for printing, at true scale and with a ruler to check the print",
         "board.pdf --tiles a4",
         (
-            option("file", type=read_path, metavar="FILE.pdf", help="a PNG and board.json are written beside it"),
+            option("file", type=read_path, metavar="FILE.pdf", help="or FILE.png, for a printer's shop"),
             option("--tiles", choices=("a4",), help="several sheets to glue together instead of one large one"),
             BOARD,
+            number("--dpi", "resolution of a PNG, dots an inch (default: 300)", 300),
         ),
         "services.capture.board:board",
     ),

@@ -34,7 +34,7 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
             for view in pair.views:
                 own = encode_view(view, pair, context.job.images)
                 files += own
-                views.append(view_row(scene, pair, view, own, context.job))
+                views.append(view_row(scene.plan.scene_id, pair, view, own, context.job))
         every = (scene.plan.table.asset, *(start.asset for start in scene.plan.objects))
         assets = list({asset.instance_id: asset for asset in every}.values())
         for asset in assets:
@@ -45,7 +45,10 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
         "scenes": [scene_row(context, scene)],
         "views": views,
         "objects": [
-            row for pair in scene.pairs for view in pair.views for row in object_rows(scene, view, context.job)
+            row
+            for pair in scene.pairs
+            for view in pair.views
+            for row in object_rows(scene.plan.scene_id, view, context.job)
         ],
         "assets": [asset_row(asset, context.job) for asset in assets],
         "failures": [],
@@ -72,8 +75,8 @@ def scene_row(context: WorkerContext, scene: Scene) -> Row:
     }
 
 
-def view_row(scene: Scene, pair: Pair, view: View, files: Sequence[EncodedFile], job: Job) -> Row:
-    """The row of `views`, key (pose_id, role)."""
+def view_row(scene_id: int, pair: Pair, view: View, files: Sequence[EncodedFile], job: Job) -> Row:
+    """The row of `views`, key (pose_id, role); the category is the first object's."""
     labels = object_labels(view, pair)
     projected = view.role == "projected"
     agreement = pair.agreement if view.role == "mirror" else None
@@ -81,8 +84,8 @@ def view_row(scene: Scene, pair: Pair, view: View, files: Sequence[EncodedFile],
         "pose_id": view.pose_id,
         "parent_id": view.parent_id,
         "role": view.role,
-        "scene_id": scene.plan.scene_id,
-        "category": scene.plan.category,
+        "scene_id": scene_id,
+        "category": labels[0].category,
         **camera_columns(view.camera),
         "inclination_rad": inclination(view.camera.T_world_cam),
         "yaw_rad": yaw(view.camera.T_world_cam),
@@ -100,13 +103,13 @@ def view_row(scene: Scene, pair: Pair, view: View, files: Sequence[EncodedFile],
     }
 
 
-def object_rows(scene: Scene, view: View, job: Job) -> list[Row]:
+def object_rows(scene_id: int, view: View, job: Job) -> list[Row]:
     """The rows of `objects`, key (pose_id, role, region_id); the table has one too."""
     return [
         {
             "pose_id": view.pose_id,
             "role": view.role,
-            "scene_id": scene.plan.scene_id,
+            "scene_id": scene_id,
             **label_columns(label),
             "patch_object_fraction": None
             if label.region_id < REGION_FIRST_OBJECT

@@ -131,18 +131,31 @@ def _attempt_scene(
 
 
 def run_scene(context: WorkerContext, scene_id: int, total: Stopwatch) -> SceneOutput:
-    """One scene: made, or a row that says why not."""
+    """One scene, or one capture: made, or a row that says why not."""
     category = _category(context, scene_id)
     stopwatch = Stopwatch()
     try:
-        output = record_scene(context, make_scene(context, scene_id, stopwatch), stopwatch)
+        output = _make_output(context, scene_id, stopwatch)
+        category = str(output.rows["scenes"][0]["category"])
     except SceneError as error:
         output = failed_scene(scene_id, category, error)
     total.add(stopwatch)
     return replace(output, rows={**output.rows, "timings": [timing_row(scene_id, category, stopwatch)]})
 
 
+def _make_output(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> SceneOutput:
+    if context.job.captures is None:
+        return record_scene(context, make_scene(context, scene_id, stopwatch), stopwatch)
+    from workers.pipeline.captures.make_capture import run_capture  # loads what scenes have no use for
+
+    return run_capture(context, scene_id, stopwatch)
+
+
 def _category(context: WorkerContext, scene_id: int) -> str:
+    """The category of a scene before it is made; a capture in a folder may turn out to have another."""
+    captures = context.job.captures
+    if captures is not None and captures.folders:
+        return captures.category
     return choose_category(context.job, SceneChance(context.job.seed, scene_id))
 
 

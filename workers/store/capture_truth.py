@@ -79,3 +79,9 @@ def read_truth(path: Path) -> CaptureTruth | None:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise CaptureError("unreadable", f"{file} is no truth of a simulated capture: {error!r}") from error
+
+
+def read_receipt(path: Path) -> tuple[tuple[str, ...], tuple[dict[str, str], ...]]:
+    """(names of the effects that ran, [{effect, why}] of those that did not) of a simulated capture's folder."""
+    record = json.loads((path / TRUTH / TRUTH_FILE).read_bytes())
+    return tuple(record["effects"]), tuple(record["skipped"])

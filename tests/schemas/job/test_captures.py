@@ -25,6 +25,11 @@ def test_pose_ids_follow_from_the_most_views_and_there_is_no_aligned_view():
     assert (made.pairs_per_scene, made.cameras.depth.enabled, made.scenes) == (50, False, 64)
 
 
+def test_a_capture_is_committed_by_itself_and_may_take_long_unless_the_job_says_otherwise():
+    assert (job(SIMULATED).run.range_size, job(SIMULATED).run.scene_timeout_s) == (1, 1800.0)
+    assert job(SIMULATED, run={"range_size": 4}).run.range_size == 4
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

@@ -1,0 +1,110 @@
+"""One pair of a capture: a captured view as it is stored, and its view from the other side."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array, Pose
+from schemas.capture.estimate import SynthesizedView
+from schemas.capture.processed import PosedImages
+from schemas.dataset.layout import file_pose_id, input_pose_id
+from schemas.job.captures import Board
+from schemas.job.job import Job
+from schemas.scene.camera import Camera, Role
+from schemas.scene.effects import EffectPlan
+from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
+from schemas.scene.scene import Placed
+from schemas.scene.shape import Asset
+from schemas.scene.view import ObjectLabel, Pair, View
+from workers.cameras.placement import object_distance, place_mirror_camera
+from workers.geometry.pixels import measure_regions
+from workers.geometry.stored_depth import quantise_depth
+from workers.labels.agreement import compare_views
+from workers.labels.board_regions import capture_regions
+from workers.labels.projected_view import derive_projected, projection_shares
+from workers.labels.regions import label_region
+
+CountPixels = Callable[[Placed, Camera], int]
+Synthesize = Callable[[Camera], SynthesizedView]
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedObject:
+    """The object of a capture on its board, in the board frame, which is the world of a capture.
+
+    `effects` of the dataset's images that the job asks for.
+    """
+
+    scene_id: int
+    asset: Asset
+    T_world_obj: Pose
+    board: Board
+    board_asset: Asset
+    effects: EffectPlan
+
+    @property
+    def things(self) -> tuple[Placed, Placed]:
+        """Board and object where they are."""
+        eye = np.eye(4)
+        return (
+            Placed(REGION_TABLE, self.board_asset.shape, eye),
+            Placed(REGION_FIRST_OBJECT, self.asset.shape, self.T_world_obj),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedPair:
+    """A pair as scenes have it; the number of its captured view, and its mirror view as it was made."""
+
+    number: int
+    pair: Pair
+    mirror: SynthesizedView | None
+
+
+def make_capture_pair(
+    job: Job, thing: CapturedObject, images: PosedImages, at: int, synthesize: Synthesize, count: CountPixels
+) -> CapturedPair:
+    """The views of captured view `at` (its place among the used ones) that the job asks for.
+
+    The mirror camera follows from the stored input depth as in scenes. Raises ViewError where the view has no depth of
+    the object, CaptureError where no captured view shows anything to the mirror camera.
+    """
+    parent_id = input_pose_id(thing.scene_id, at, job.pairs_per_scene)
+
+    def view(role: Role, camera: Camera, rgb: NDArray[np.uint8], depth_m: Array, region: NDArray[np.uint8]) -> View:
+        labels = _labels(thing, camera, region, count)
+        depth = quantise_depth(depth_m, job.images)
+        return View(role, file_pose_id(role, parent_id), parent_id, camera, rgb, depth, region, labels)
+
+    region = capture_regions(images.camera, thing.board, images.mask)
+    first = view("input", images.camera, images.rgb, images.depth_m, region)
+    pair = Pair(object_distance(first.depth, region, job.images, job.cameras.mirror), first, None)
+    if not thing.effects.runs("mirror"):
+        return CapturedPair(images.number, pair, None)
+    camera = place_mirror_camera(images.camera, pair.d_z_m, job.cameras.mirror)
+    made = synthesize(camera)
+    known = made.depth_m > 0.0
+    region = np.where(known, capture_regions(camera, thing.board, made.mask), np.uint8(0))
+    mirror = view("mirror", camera, made.rgb, made.depth_m, region)
+    agreement = compare_views(first, mirror, job.images, job.check.mirror_agreement_mm)
+    pair = replace(pair, mirror=mirror, agreement=agreement)
+    if thing.effects.runs("projection"):
+        rgb, depth = derive_projected(first, camera, job.images, None, thing.effects)
+        filled, hidden = projection_shares(depth, mirror.depth, job.images)
+        projected = View("projected", first.pose_id, first.pose_id, camera, rgb, depth, None, ())
+        pair = replace(pair, projected=projected, filled_share=filled, hidden_share=hidden)
+    return CapturedPair(images.number, pair, made)
+
+
+def _labels(
+    thing: CapturedObject, camera: Camera, region: NDArray[np.uint8], count: CountPixels
+) -> tuple[ObjectLabel, ...]:
+    """Labels of board and object in a mask."""
+    extents = measure_regions(region)
+    names = [(asset.category, asset.instance_id) for asset in (thing.board_asset, thing.asset)]
+    return tuple(
+        label_region(placed, name, camera, extents[placed.region_id], count)
+        for placed, name in zip(thing.things, names, strict=True)
+    )

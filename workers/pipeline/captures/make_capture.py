@@ -1,0 +1,134 @@
+"""One capture from its id to what is written: the list of steps."""
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from schemas.capture.processed import ProcessedCapture
+from schemas.errors import CaptureError, ViewError
+from schemas.job.captures import Captures
+from schemas.job.job import Job
+from schemas.scene.effects import EffectPlan
+from schemas.scene.scene import SceneOutput
+from workers.assets.captured import CaptureNames, board_asset, reconstructed_asset
+from workers.assets.step import choose_object, load_asset
+from workers.pipeline.captures.capture_pair import CapturedObject, CapturedPair, make_capture_pair
+from workers.pipeline.captures.process_capture import process_capture
+from workers.pipeline.captures.rows import LeftOut, Origin, record_capture
+from workers.pipeline.captures.simulate import simulate_capture
+from workers.pipeline.context import WorkerContext
+from workers.pipeline.stopwatch import Stopwatch
+from workers.plan.randomness import SceneChance, Stream
+from workers.plan.step import choose_category
+from workers.store.capture_folder import open_folder
+from workers.store.capture_inputs import digest_inputs
+from workers.store.capture_truth import read_receipt, read_truth
+
+SOURCE, SIMULATED = "capture", "simulated_capture"
+"""`scenes.source` and `assets.source` of captures; those of scenes are the source of the shape."""
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A folder to process, the name of its object where the job knows it, and where it came from."""
+
+    path: Path
+    name: str | None
+    origin: Origin
+
+
+def run_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> SceneOutput:
+    """Simulate or open, estimate, merge, draw the mirror views, score, record. Raises SceneError where it cannot be used."""
+    job, captures = context.job, require_captures(context.job)
+    with open_capture(context, scene_id, watch) as opened:
+        folder = open_folder(opened.path)
+        done = process_capture(folder, captures, watch)
+        known = folder.about.model_fields_set
+        category = folder.about.category if "category" in known else captures.category
+        with watch.stage("labels"):
+            name = opened.name or done.name
+            source = SOURCE if read_truth(opened.path) is None else SIMULATED
+            names = CaptureNames(f"{name}-{scene_id:05d}", category, done.licence, source)
+            asset, T_world_obj = reconstructed_asset(done.surface, names, job.assets)
+            effects = image_effects(job)
+            thing = CapturedObject(
+                scene_id, asset, T_world_obj, done.board, board_asset(done.board, job.assets), effects
+            )
+        return record_capture(context, thing, done, opened.origin, make_pairs(context, thing, done, watch), watch)
+
+
+@contextmanager
+def open_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Iterator[Opened]:
+    """The folder of a capture: one of the job's, or a simulated one that is gone afterwards."""
+    captures = require_captures(context.job)
+    if captures.source == "folders":
+        listing = context.catalogue.captures[scene_id]
+        with watch.stage("read"):
+            if digest_inputs(listing.folder) != listing.sha256:
+                raise CaptureError("changed", f"{listing.folder} does not hold what it held when the run began")
+        yield Opened(listing.folder, None, Origin(False, listing.sha256))
+        return
+    with tempfile.TemporaryDirectory(prefix="verso-capture-") as scratch:
+        path = Path(scratch) / "capture"
+        with watch.stage("simulate"):
+            chance = SceneChance(context.job.seed, scene_id)
+            ref = choose_object(context.catalogue, choose_category(context.job, chance), chance.stream(Stream.OBJECT))
+            simulate_capture(captures.simulate, captures.board, load_asset(context.catalogue, ref), chance, path)
+            ran, skipped = read_receipt(path)
+        yield Opened(path, ref.instance_id, Origin(True, None, ran, skipped))
+
+
+def make_pairs(
+    context: WorkerContext, thing: CapturedObject, done: ProcessedCapture, watch: Stopwatch
+) -> Iterator[CapturedPair | LeftOut]:
+    """The pairs of the used views in order, and those views that have none. Raises CaptureError where none has one."""
+    used = [view.number for view in done.estimates.estimate.used]
+    chosen = choose_views(used, context.job.pairs_per_scene)
+    made = 0
+    for at, number in enumerate(chosen):
+        try:
+            with watch.stage("views"):
+                images = done.images(number)
+                one: CapturedPair | LeftOut = make_capture_pair(
+                    context.job, thing, images, at, done.synthesize, context.renderer.count_pixels
+                )
+                made += 1
+        except (ViewError, CaptureError) as error:
+            one = LeftOut(number, "no_pair", error.detail)
+        yield one
+    for number in sorted(set(used) - set(chosen)):
+        yield LeftOut(number, "spare", f"captures.most_views is {context.job.pairs_per_scene}")
+    if not made:
+        raise CaptureError(
+            "no_pair", f"none of {len(chosen)} used views sees the object and has a view from the other side"
+        )
+
+
+def choose_views(numbers: list[int], most: int) -> list[int]:
+    """At most so many of the views, evenly over their order."""
+    if len(numbers) <= most:
+        return numbers
+    places = np.round(np.linspace(0, len(numbers) - 1, most)).astype(int)
+    return [numbers[place] for place in places]
+
+
+def image_effects(job: Job) -> EffectPlan:
+    """The effects on the images of a dataset that a job of captures has: switches of its keys."""
+    projection = job.images.projection
+    switches = {
+        "mirror": job.cameras.mirror.enabled,
+        "projection": projection.enabled,
+        "splat": projection.enabled and projection.splat > 1,
+        "hidden_point_removal": projection.enabled and projection.hidden_point_removal,
+    }
+    return EffectPlan(tuple(name for name, runs in switches.items() if runs), {})
+
+
+def require_captures(job: Job) -> Captures:
+    """The branch `captures` of a job that has one."""
+    assert job.captures is not None
+    return job.captures
