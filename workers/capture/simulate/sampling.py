@@ -26,6 +26,10 @@ class Sample:
     moment: float
 
 
+CENTRE = Sample(0.0, 0.0, 0.0)
+"""The sample of a picture that is antialiased already."""
+
+
 def make_samples() -> tuple[Sample, ...]:
     """Nine samples with nine columns, nine rows and nine moments: an edge along a row or a column moves in steps of 1/9 px.
 
@@ -44,6 +48,11 @@ def shift_camera(k: Intrinsics, sample: Sample) -> Intrinsics:
     return k.model_copy(update={"cx": k.cx - sample.right_px, "cy": k.cy - sample.down_px})
 
 
+def light_table(samples: int) -> NDArray[np.float32]:
+    """[256] float32: what each code adds to the mean of so many samples, in linear light."""
+    return (SRGB_STEPS / samples).astype(np.float32)
+
+
 @compiled
 def add_light(total: NDArray[np.float32], rgb: NDArray[np.uint8], light_of: NDArray[np.float32]) -> None:
     """Adds the linear light of rgb [H, W, 3] to total [H, W, 3], in place; light_of [256]: of each code."""
@@ -52,7 +61,3 @@ def add_light(total: NDArray[np.float32], rgb: NDArray[np.uint8], light_of: NDAr
         for column in range(width):
             for channel in range(3):
                 total[row, column, channel] += light_of[rgb[row, column, channel]]
-
-
-LIGHT_OF = SRGB_STEPS.astype(np.float32) / np.float32(SAMPLES)
-"""[256] float32: what one of the samples adds for each code."""
