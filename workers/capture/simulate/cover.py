@@ -27,8 +27,8 @@ def cover_markers(hidden: HiddenMarkers, board: Board, rng: np.random.Generator)
         return None
     slips = np.stack([_slip(corners[m], rng) for m in chosen])
     vertices = np.dstack([slips, np.full((*slips.shape[:2], 1), HEIGHT_M)]).reshape(-1, 3)
-    first = 4 * np.arange(len(chosen))[:, None]
-    faces = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])
+    first = 4 * np.arange(len(chosen))[:, None, None]
+    faces = (first + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
     return Shape(
         (Part("slips", frozen_array(vertices), frozen_array(faces, np.int32), Material(YELLOW, roughness=1.0)),)
     )

@@ -51,9 +51,9 @@ def nearest_pixels(image: NDArray[np.generic], u: Array, v: Array) -> NDArray:
 
 @compiled
 def add_bent_light(
-    total: NDArray[np.float32],
+    total: Array,
     rgb: NDArray[np.uint8],
-    light_of: NDArray[np.float32],
+    light_of: Array,
     lookup: tuple[Array, Array],
     offsets: tuple[float, float, float, float],
 ) -> None:
@@ -75,7 +75,7 @@ def add_bent_light(
             y = v[row, column] - drawn_down - 0.5
             y += along * (v[row, after] - v[row, before]) + across * (v[below, column] - v[above, column])
             i, j = int(y), int(x)
-            a, b = np.float32(x - j), np.float32(y - i)
+            a, b = x - j, y - i
             for channel in range(3):
                 p, q = light_of[rgb[i, j, channel]], light_of[rgb[i, j + 1, channel]]
                 r, s = light_of[rgb[i + 1, j, channel]], light_of[rgb[i + 1, j + 1, channel]]

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.base import Array
 from schemas.scene.camera import Intrinsics
 from workers.geometry.jit import compiled
 from workers.geometry.srgb import SRGB_STEPS
@@ -48,13 +49,13 @@ def shift_camera(k: Intrinsics, sample: Sample) -> Intrinsics:
     return k.model_copy(update={"cx": k.cx - sample.right_px, "cy": k.cy - sample.down_px})
 
 
-def light_table(samples: int) -> NDArray[np.float32]:
-    """[256] float32: what each code adds to the mean of so many samples, in linear light."""
-    return (SRGB_STEPS / samples).astype(np.float32)
+def light_table(samples: int) -> Array:
+    """[256]: what each code adds to the mean of so many samples, in linear light."""
+    return SRGB_STEPS / samples
 
 
 @compiled
-def add_light(total: NDArray[np.float32], rgb: NDArray[np.uint8], light_of: NDArray[np.float32]) -> None:
+def add_light(total: Array, rgb: NDArray[np.uint8], light_of: Array) -> None:
     """Adds the linear light of rgb [H, W, 3] to total [H, W, 3], in place; light_of [256]: of each code."""
     height, width = total.shape[:2]
     for row in range(height):

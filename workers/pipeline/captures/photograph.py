@@ -19,7 +19,7 @@ from workers.assets.appearance.draw import draw_appearance
 from workers.capture.simulate.board_body import THICKNESS_M, board_body
 from workers.capture.simulate.cover import cover_markers
 from workers.capture.simulate.lens import add_bent_light, nearest_pixels, opencv_lens, pinhole_lookup
-from workers.capture.simulate.motion import AT_REST, draw_motion, pose_at
+from workers.capture.simulate.motion import AT_REST, Motion, draw_motion, pose_at
 from workers.capture.simulate.noise import STEP_M, kinect_noise
 from workers.capture.simulate.place import true_board
 from workers.capture.simulate.rig import Rig, assumed_device, make_rig
@@ -43,9 +43,6 @@ TRACED_SAMPLES_MOVING = 4
 
 FINER = 3.0
 """The floor's pattern is so many times as fine as in a scene: a table top is looked at from nearby."""
-
-Light = NDArray[np.float32]
-"""[H, W, 3] linear light."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,27 +97,20 @@ def photograph(studio: Studio, number: int, T_board_cam: Pose) -> tuple[Captured
     """One view as it is stored, and the object's true pixels [H, W] bool."""
     T_world_cam = studio.T_world_board @ T_board_cam
     light, mask = take_light(studio, number, T_world_cam)
-    rgb = encode_codes(np.asarray(sense_light(studio, number, light), np.float64))
+    rgb = encode_codes(sense_light(studio, number, light))
     depth_m = measure_depth(studio, number, T_world_cam)
     depth = np.rint(np.clip(depth_m * DEPTH_UNITS_PER_M, 0.0, 65_535.0)).astype(np.uint16)
     return CapturedView(number, rgb, depth, None), mask
 
 
-def take_light(studio: Studio, number: int, T_world_cam: Pose) -> tuple[Light, NDArray[np.bool_]]:
-    """(the light of one exposure, the object's pixels [H, W] bool at pixel centres at the middle of the exposure)."""
-    k, motion, moving = studio.rig.color, AT_REST, studio.effects.runs("motion_blur")
-    if moving and studio.simulate.motion_blur is not None:
-        motion = draw_motion(studio.simulate.motion_blur, studio.chance.stream(Stream.MOTION, number))
-    traced = studio.simulate.tier == "pathtraced"
-    samples = (CENTRE,) if traced and not moving else make_samples()
-    render = Render(tier=studio.simulate.tier)
-    if traced and moving:
-        render = render.model_copy(update={"path_samples": TRACED_SAMPLES_MOVING})
-    total, light_of = np.zeros((k.height, k.width, 3), np.float32), light_table(len(samples))
-    mask = np.zeros((k.height, k.width), np.bool_)
-    rng = studio.chance.stream(Stream.PATHS, number)
+def take_light(studio: Studio, number: int, T_world_cam: Pose) -> tuple[Array, NDArray[np.bool_]]:
+    """(linear light [H, W, 3] of one exposure, the object's pixels [H, W] bool at pixel centres at its middle)."""
+    k, motion = studio.rig.color, motion_of(studio, number)
+    samples, render = plan_pictures(studio)
+    total, mask = np.zeros((k.height, k.width, 3)), np.zeros((k.height, k.width), np.bool_)
+    light_of, rng = light_table(len(samples)), studio.chance.stream(Stream.PATHS, number)
     for sample in samples:
-        drawn_at = _point_drawn(sample, studio.lookup is not None, traced)
+        drawn_at = point_drawn(sample, studio)
         camera = Camera(shift_camera(studio.drawn_color, drawn_at), pose_at(T_world_cam, motion, sample.moment))
         drawn = draw_view(shared_renderer(), studio.things, studio.appearance, camera, render, rng, studio.effects)
         assert drawn.rgb is not None
@@ -136,19 +126,37 @@ def take_light(studio: Studio, number: int, T_world_cam: Pose) -> tuple[Light, N
     return total, mask
 
 
-def _point_drawn(sample: Sample, bent: bool, traced: bool) -> Sample:
+def motion_of(studio: Studio, number: int) -> Motion:
+    """The camera's motion in one exposure."""
+    if not studio.effects.runs("motion_blur") or studio.simulate.motion_blur is None:
+        return AT_REST
+    return draw_motion(studio.simulate.motion_blur, studio.chance.stream(Stream.MOTION, number))
+
+
+def plan_pictures(studio: Studio) -> tuple[tuple[Sample, ...], Render]:
+    """The samples of a photograph, and how each picture is drawn."""
+    render = Render(tier=studio.simulate.tier)
+    if render.tier != "pathtraced":
+        return make_samples(), render
+    if not studio.effects.runs("motion_blur"):
+        return (CENTRE,), render
+    return make_samples(), render.model_copy(update={"path_samples": TRACED_SAMPLES_MOVING})
+
+
+def point_drawn(sample: Sample, studio: Studio) -> Sample:
     """The point of a pixel that a picture has at its pixel centres.
 
     Through a lens it is the opposite one, so that the nine pictures are read at nine places between their pixels, and all of
     the image is equally sharp. A traced picture is antialiased already, with its mean at the centre.
     """
-    if traced:
+    if studio.simulate.tier == "pathtraced":
         return replace(CENTRE, moment=sample.moment)
+    bent = studio.lookup is not None
     return replace(sample, right_px=-sample.right_px, down_px=-sample.down_px) if bent else sample
 
 
-def sense_light(studio: Studio, number: int, light: Light) -> NDArray[np.floating]:
-    """What the colour sensor makes of the light: exposure, then noise."""
+def sense_light(studio: Studio, number: int, light: Array) -> Array:
+    """[H, W, 3]: what the colour sensor makes of linear light: exposure, then noise."""
     simulate, effects, sensed = studio.simulate, studio.effects, light
     if effects.runs("exposure") and simulate.exposure is not None:
         sensed = expose(sensed, simulate.exposure, studio.chance.stream(Stream.SENSOR_EXPOSURE, number))
