@@ -49,7 +49,8 @@ FINER = 3.0
 class Studio:
     """What is photographed and by what; the board lies on the floor of the world, z up.
 
-    T_world_board [4, 4]: the board frame lies on top of the board. `drawn_color` is the pinhole camera that the colour image
+    `simulate` has the effects that run, and `effects` is the plan of drawing. T_world_board [4, 4]: the board frame lies on top
+    of the board. `drawn_color` is the pinhole camera that the colour image
     is drawn with: `rig.color`, or a wider one that `lookup` bends into it.
     """
 
@@ -74,11 +75,11 @@ def build_studio(simulate: Simulate, board: Board, thing: Placed, effects: Effec
         Placed(REGION_TABLE, board_body(printed), T_world_board),
         replace(thing, T_world_shape=frozen_array(T_world_board @ thing.T_world_shape)),
     ]
-    if effects.runs("hidden_markers") and simulate.hidden_markers is not None:
+    if simulate.hidden_markers is not None:
         slips = cover_markers(simulate.hidden_markers, printed, chance.stream(Stream.HIDDEN_MARKERS))
         things[2:2] = [] if slips is None else [Placed(REGION_TABLE, slips, T_world_board)]
     drawn, lookup = rig.color, None
-    if effects.runs("distortion") and simulate.distortion is not None:
+    if simulate.distortion is not None:
         drawn, *places = pinhole_lookup(simulate.distortion, rig.color)
         lookup = places[0], places[1]
     return Studio(simulate, effects, tuple(things), appearance, rig, T_world_board, chance, drawn, lookup)
@@ -128,7 +129,7 @@ def take_light(studio: Studio, number: int, T_world_cam: Pose) -> tuple[Array, N
 
 def motion_of(studio: Studio, number: int) -> Motion:
     """The camera's motion in one exposure."""
-    if not studio.effects.runs("motion_blur") or studio.simulate.motion_blur is None:
+    if studio.simulate.motion_blur is None:
         return AT_REST
     return draw_motion(studio.simulate.motion_blur, studio.chance.stream(Stream.MOTION, number))
 
@@ -138,7 +139,7 @@ def plan_pictures(studio: Studio) -> tuple[tuple[Sample, ...], Render]:
     render = Render(tier=studio.simulate.tier)
     if render.tier != "pathtraced":
         return make_samples(), render
-    if not studio.effects.runs("motion_blur"):
+    if studio.simulate.motion_blur is None:
         return (CENTRE,), render
     return make_samples(), render.model_copy(update={"path_samples": TRACED_SAMPLES_MOVING})
 
@@ -157,10 +158,10 @@ def point_drawn(sample: Sample, studio: Studio) -> Sample:
 
 def sense_light(studio: Studio, number: int, light: Array) -> Array:
     """[H, W, 3]: what the colour sensor makes of linear light: exposure, then noise."""
-    simulate, effects, sensed = studio.simulate, studio.effects, light
-    if effects.runs("exposure") and simulate.exposure is not None:
+    simulate, sensed = studio.simulate, light
+    if simulate.exposure is not None:
         sensed = expose(sensed, simulate.exposure, studio.chance.stream(Stream.SENSOR_EXPOSURE, number))
-    if effects.runs("rgb_noise") and simulate.rgb_noise is not None:
+    if simulate.rgb_noise is not None:
         sensed = add_noise(sensed, simulate.rgb_noise, studio.chance.stream(Stream.SENSOR_RGB, number))
     return sensed
 
@@ -171,10 +172,9 @@ def measure_depth(studio: Studio, number: int, T_world_cam: Pose) -> Array:
     camera = Camera(device.intrinsics, T_world_cam @ device.T_color_depth)
     drawn = shared_renderer().draw(studio.things, studio.appearance, camera, effects=DEPTH_ONLY)
     depth_m: Array = drawn.depth_m.astype(np.float64)
-    if studio.effects.runs("depth_noise") and simulate.depth_noise is not None:
+    if simulate.depth_noise is not None:
         rng = studio.chance.stream(Stream.SENSOR_DEPTH, number)
         depth_m = sense_depth(depth_m, drawn.region, camera, kinect_noise(simulate.depth_noise), rng)
         depth_m = STEP_M * np.rint(depth_m / STEP_M)
-    error = simulate.registration_error if studio.effects.runs("registration_error") else None
-    lens = opencv_lens(simulate.distortion) if studio.effects.runs("distortion") else None
-    return register_depth(depth_m, assumed_device(device, error), studio.rig.color, lens)
+    assumed = assumed_device(device, simulate.registration_error)
+    return register_depth(depth_m, assumed, studio.rig.color, opencv_lens(simulate.distortion))

@@ -6,19 +6,29 @@ from schemas.base import frozen_array
 from schemas.capture.view import CaptureCamera, CaptureTruth
 from schemas.errors import CaptureError
 from schemas.job.captures import Board, Simulate
+from schemas.job.job import Job
 from schemas.scene.effects import EffectPlan
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Asset
+from workers.assets.catalogue import Catalogue
 from workers.assets.glb import asset_glb
-from workers.capture.simulate.effects import plan_effects
+from workers.assets.step import load_asset
+from workers.capture.simulate.effects import plan_effects, planned_settings
 from workers.capture.simulate.lens import opencv_lens
 from workers.capture.simulate.path import plan_path
 from workers.capture.simulate.place import place_object
 from workers.pipeline.captures.photograph import DEPTH_UNITS_PER_M, Studio, build_studio, photograph
 from workers.plan.randomness import SceneChance, Stream
+from workers.plan.step import choose_assets
 from workers.store.capture_folder import CaptureFile, write_description, write_view
 from workers.store.capture_truth import TrueObject, write_true_mask, write_truth
+
+
+def load_object(job: Job, catalogue: Catalogue, chance: SceneChance) -> Asset:
+    """The object of a capture, chosen as the first object of a scene is. Raises MeshError where its mesh is refused."""
+    (ref, *_), _ = choose_assets(job, catalogue, chance)
+    return load_asset(catalogue, ref)
 
 
 def simulate_capture(
@@ -39,6 +49,7 @@ def simulate_capture(
     if any(path.iterdir()):
         raise CaptureError("exists", f"{path} holds files already: name a new or an empty folder")
     plan = plan_effects(simulate) if effects is None else effects
+    simulate = planned_settings(simulate, plan)
     thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
     studio = build_studio(simulate, board, thing, plan, chance)
     poses = plan_path(simulate, thing.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
