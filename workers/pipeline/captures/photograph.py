@@ -22,7 +22,7 @@ from workers.capture.simulate.lens import add_bent_light, nearest_pixels, opencv
 from workers.capture.simulate.motion import AT_REST, Motion, draw_motion, pose_at
 from workers.capture.simulate.noise import STEP_M, kinect_noise
 from workers.capture.simulate.place import true_board
-from workers.capture.simulate.rig import Rig, assumed_device, make_rig
+from workers.capture.simulate.rig import Rig, assumed_device, make_rig, scale_intrinsics
 from workers.capture.simulate.sampling import CENTRE, Sample, add_light, light_table, make_samples, shift_camera
 from workers.geometry.frames import translation
 from workers.geometry.registration import register_depth
@@ -35,8 +35,11 @@ from workers.sensor.rgb import add_noise, expose
 
 DEPTH_UNITS_PER_M = 1000.0
 
-DEPTH_ONLY = EffectPlan(("floor", "table"), {})
-"""What is drawn for the depth camera."""
+LABELS = EffectPlan(("floor", "table"), {})
+"""What is drawn of depth and regions, without colour."""
+
+LABELS_FINER = 3
+"""Regions that a lens bends are drawn so many times as fine."""
 
 TRACED_SAMPLES_MOVING = 4
 """Paths through each pixel of the nine pictures of a moving camera, which together have 36."""
@@ -97,34 +100,39 @@ def _finer(floor: Shape) -> Shape:
 def photograph(studio: Studio, number: int, T_board_cam: Pose) -> tuple[CapturedView, NDArray[np.bool_]]:
     """One view as it is stored, and the object's true pixels [H, W] bool."""
     T_world_cam = studio.T_world_board @ T_board_cam
-    light, mask = take_light(studio, number, T_world_cam)
-    rgb = encode_codes(sense_light(studio, number, light))
+    rgb = encode_codes(sense_light(studio, number, take_light(studio, number, T_world_cam)))
     depth_m = measure_depth(studio, number, T_world_cam)
     depth = np.rint(np.clip(depth_m * DEPTH_UNITS_PER_M, 0.0, 65_535.0)).astype(np.uint16)
-    return CapturedView(number, rgb, depth, None), mask
+    return CapturedView(number, rgb, depth, None), mark_object(studio, T_world_cam)
 
 
-def take_light(studio: Studio, number: int, T_world_cam: Pose) -> tuple[Array, NDArray[np.bool_]]:
-    """(linear light [H, W, 3] of one exposure, the object's pixels [H, W] bool at pixel centres at its middle)."""
+def take_light(studio: Studio, number: int, T_world_cam: Pose) -> Array:
+    """[H, W, 3]: linear light of one exposure, whose middle is at the pose T_world_cam."""
     k, motion = studio.rig.color, motion_of(studio, number)
     samples, render = plan_pictures(studio)
-    total, mask = np.zeros((k.height, k.width, 3)), np.zeros((k.height, k.width), np.bool_)
-    light_of, rng = light_table(len(samples)), studio.chance.stream(Stream.PATHS, number)
+    total, light_of = np.zeros((k.height, k.width, 3)), light_table(len(samples))
+    rng = studio.chance.stream(Stream.PATHS, number)
     for sample in samples:
         drawn_at = point_drawn(sample, studio)
         camera = Camera(shift_camera(studio.drawn_color, drawn_at), pose_at(T_world_cam, motion, sample.moment))
         drawn = draw_view(shared_renderer(), studio.things, studio.appearance, camera, render, rng, studio.effects)
         assert drawn.rgb is not None
-        region = drawn.region
         if studio.lookup is None:
             add_light(total, drawn.rgb, light_of)
         else:
             offsets = (sample.right_px, sample.down_px, drawn_at.right_px, drawn_at.down_px)
             add_bent_light(total, drawn.rgb, light_of, studio.lookup, offsets)
-            region = nearest_pixels(region, *studio.lookup)
-        if sample.moment == 0.0:
-            mask = region == REGION_FIRST_OBJECT
-    return total, mask
+    return total
+
+
+def mark_object(studio: Studio, T_world_cam: Pose) -> NDArray[np.bool_]:
+    """[H, W] bool: pixels of the stored image whose centres see the object; through a lens to a sixth of a pixel."""
+    k, finer = studio.drawn_color, 1 if studio.lookup is None else LABELS_FINER
+    camera = Camera(scale_intrinsics(k, finer), T_world_cam)
+    region = shared_renderer().draw(studio.things, studio.appearance, camera, effects=LABELS).region
+    if studio.lookup is not None:
+        region = nearest_pixels(region, *(finer * place for place in studio.lookup))
+    return np.asarray(region == REGION_FIRST_OBJECT)
 
 
 def motion_of(studio: Studio, number: int) -> Motion:
@@ -170,7 +178,7 @@ def measure_depth(studio: Studio, number: int, T_world_cam: Pose) -> Array:
     """[H, W] float64, metres: measured from the depth camera's place, and registered to the colour camera as stored."""
     simulate, device = studio.simulate, studio.rig.depth
     camera = Camera(device.intrinsics, T_world_cam @ device.T_color_depth)
-    drawn = shared_renderer().draw(studio.things, studio.appearance, camera, effects=DEPTH_ONLY)
+    drawn = shared_renderer().draw(studio.things, studio.appearance, camera, effects=LABELS)
     depth_m: Array = drawn.depth_m.astype(np.float64)
     if simulate.depth_noise is not None:
         rng = studio.chance.stream(Stream.SENSOR_DEPTH, number)
