@@ -22,6 +22,8 @@ class Stream(IntEnum):
     SENSOR_EXPOSURE = 10
     PATHS = 11
     COUNT = 12
+    HIDDEN_MARKERS = 13
+    MOTION = 14
 
 
 @dataclass(frozen=True)

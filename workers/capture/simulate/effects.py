@@ -32,3 +32,8 @@ def plan_effects(simulate: Simulate) -> EffectPlan:
     skipped = {name: f"tier is {simulate.tier}" for name in (*RASTER, *TRACED) if name not in of_tier}
     skipped |= {name: f"captures.simulate.{name} is off" for name in ASKED if name not in ran}
     return EffectPlan(tuple(ran), skipped)
+
+
+def planned_settings(simulate: Simulate, plan: EffectPlan) -> Simulate:
+    """The settings of those effects that the plan runs: every other one is off."""
+    return simulate.model_copy(update=dict.fromkeys(name for name in ASKED if not plan.runs(name)))

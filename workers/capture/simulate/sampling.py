@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.base import Array
 from schemas.scene.camera import Intrinsics
 from workers.geometry.jit import compiled
 from workers.geometry.srgb import SRGB_STEPS
@@ -26,6 +27,10 @@ class Sample:
     moment: float
 
 
+CENTRE = Sample(0.0, 0.0, 0.0)
+"""The sample of a picture that is antialiased already."""
+
+
 def make_samples() -> tuple[Sample, ...]:
     """Nine samples with nine columns, nine rows and nine moments: an edge along a row or a column moves in steps of 1/9 px.
 
@@ -44,15 +49,16 @@ def shift_camera(k: Intrinsics, sample: Sample) -> Intrinsics:
     return k.model_copy(update={"cx": k.cx - sample.right_px, "cy": k.cy - sample.down_px})
 
 
+def light_table(samples: int) -> Array:
+    """[256]: what each code adds to the mean of so many samples, in linear light."""
+    return SRGB_STEPS / samples
+
+
 @compiled
-def add_light(total: NDArray[np.float32], rgb: NDArray[np.uint8], light_of: NDArray[np.float32]) -> None:
+def add_light(total: Array, rgb: NDArray[np.uint8], light_of: Array) -> None:
     """Adds the linear light of rgb [H, W, 3] to total [H, W, 3], in place; light_of [256]: of each code."""
     height, width = total.shape[:2]
     for row in range(height):
         for column in range(width):
             for channel in range(3):
                 total[row, column, channel] += light_of[rgb[row, column, channel]]
-
-
-LIGHT_OF = SRGB_STEPS.astype(np.float32) / np.float32(SAMPLES)
-"""[256] float32: what one of the samples adds for each code."""

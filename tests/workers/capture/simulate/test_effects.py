@@ -3,7 +3,7 @@
 import pytest
 
 from schemas.job.captures import Simulate
-from workers.capture.simulate.effects import ASKED, plan_effects
+from workers.capture.simulate.effects import ASKED, plan_effects, planned_settings
 
 EMPTY = {"print_scale": 1.02}
 """Settings that are numbers; the others are branches with defaults."""
@@ -32,3 +32,11 @@ def test_each_tier_has_its_own_light():
     assert not plan_effects(Simulate()).runs("glass")
     assert plan_effects(Simulate(tier="pathtraced")).runs("glass")
     assert not plan_effects(Simulate(tier="pathtraced")).runs("shadows")
+
+
+def test_an_effect_that_is_withdrawn_is_off_in_the_settings():
+    simulate = Simulate(**{name: EMPTY.get(name, {}) for name in ASKED})
+    for name in ASKED:
+        planned = planned_settings(simulate, plan_effects(simulate).without(name))
+        assert [effect for effect in ASKED if getattr(planned, effect) is None] == [name]
+    assert planned_settings(simulate, plan_effects(simulate)) == simulate

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from schemas.scene.camera import Intrinsics
-from workers.capture.simulate.sampling import LIGHT_OF, SAMPLES, add_light, make_samples, shift_camera
+from workers.capture.simulate.sampling import SAMPLES, add_light, light_table, make_samples, shift_camera
 from workers.geometry.srgb import decode_srgb
 
 
@@ -34,7 +34,7 @@ def test_a_shifted_camera_sees_its_sample_at_the_pixels_centre():
 
 
 def test_light_is_averaged_before_it_is_encoded():
-    total = np.zeros((1, 1, 3), np.float32)
+    total = np.zeros((1, 1, 3))
     for n in range(SAMPLES):
-        add_light(total, np.full((1, 1, 3), 255 if n < 3 else 40, np.uint8), LIGHT_OF)
-    assert total == pytest.approx((3.0 + 6.0 * decode_srgb(np.array(40 / 255.0))) / 9.0, rel=1e-6)
+        add_light(total, np.full((1, 1, 3), 255 if n < 3 else 40, np.uint8), light_table(SAMPLES))
+    assert total == pytest.approx((3.0 + 6.0 * decode_srgb(np.array(40 / 255.0))) / 9.0, rel=1e-12)

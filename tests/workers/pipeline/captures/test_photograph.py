@@ -1,0 +1,160 @@
+"""Photographs: pixel conventions against OpenCV, and every effect against what it should do."""
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from tests.workers.pipeline.captures.edge_corners import corner_errors, grey, project_opencv
+from tests.workers.pipeline.captures.made_captures import made
+from workers.capture.simulate.noise import AXIAL_M, AXIAL_PER_M, OFFSET_M, OFFSET_SHARE
+from workers.geometry.frames import invert, transform
+from workers.geometry.srgb import decode_codes
+from workers.store.capture_folder import read_view
+
+NEAR = {"views": 1, "image_scale": 0.5, "distance_m": [0.4, 0.45]}
+SMALL = {"views": 2, "image_scale": 0.25}
+LENS = {"k1": 0.08, "k2": -0.05, "p1": 0.0005, "p2": -0.0004, "k3": 0.02}
+
+
+def corners_of(capture, board=None):
+    """(mean error [2], mean outward error) px of the corners of all views, and how many there are."""
+    found = [
+        corner_errors(
+            read_view(capture.folder, n).rgb,
+            capture.folder.camera,
+            capture.truth.T_board_cam[n],
+            board or capture.folder.board,
+        )
+        for n in capture.folder.numbers
+    ]
+    errors, outwards = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+    return errors, (errors * outwards).sum(axis=1)
+
+
+@pytest.mark.parametrize("settings", [{}, {"distortion": LENS}, {"motion_blur": {}}, {"rgb_noise": {}}])
+def test_corners_lie_where_opencv_projects_them(settings):
+    """A pixel convention off by half a pixel would show as 0.5; a blur to one side or uneven samples as some hundredths."""
+    errors, outwards = corners_of(made(**NEAR, **settings))
+    assert len(errors) >= 60
+    assert np.abs(errors.mean(axis=0)).max() < 0.03
+    assert abs(np.median(outwards)) < 0.03
+    assert np.median(np.abs(errors)) < 0.05
+
+
+def test_a_print_that_is_too_large_is_seen_so():
+    capture = made(**NEAR, print_scale=1.02)
+    board = capture.folder.board
+    assert board.measured_ruler_m is None  # nobody told
+    errors, _ = corners_of(capture, board.model_copy(update={"measured_ruler_m": 1.02 * board.ruler_m}))
+    assert np.abs(errors.mean(axis=0)).max() < 0.03
+    assert np.median(np.abs(errors)) < 0.05
+
+
+def test_motion_blurs_edges():
+    sharp, blurred = (made(**NEAR, **more) for more in ({}, {"motion_blur": {"exposure_s": 0.1}}))
+    slopes = [
+        np.abs(np.diff(grey(read_view(one.folder, 0).rgb), axis=1)).max(axis=1).mean() for one in (sharp, blurred)
+    ]
+    assert slopes[1] < 0.8 * slopes[0]
+
+
+def test_a_lens_leaves_no_black_corner():
+    view = read_view(made(**NEAR, distortion={"k1": -0.12, "k2": 0.05}).folder, 0)
+    assert all(view.rgb[row, column].max() > 0 for row in (0, -1) for column in (0, -1))
+
+
+def test_exposure_multiplies_linear_light():
+    plain, dark = (made(**SMALL, **more) for more in ({}, {"exposure": {"stops": [-1.0, -1.0]}}))
+    before, after = (decode_codes(read_view(one.folder, 0).rgb) for one in (plain, dark))
+    bright = before > 0.2
+    assert np.median(after[bright] / before[bright]) == pytest.approx(0.5, rel=0.01)
+
+
+def test_colour_noise_has_the_variance_of_its_electrons():
+    plain, noisy = (made(**SMALL, **more) for more in ({}, {"rgb_noise": {"full_well_e": 1000.0, "read_noise_e": 5.0}}))
+    light, seen = (decode_codes(read_view(one.folder, 1).rgb) for one in (plain, noisy))
+    for low, high in ((0.1, 0.15), (0.2, 0.3)):
+        chosen = (light > low) & (light < high)
+        expected = light[chosen].mean() / 1000.0 + (5.0 / 1000.0) ** 2
+        assert np.var((seen - light)[chosen]) == pytest.approx(expected, rel=0.1)
+
+
+def test_hidden_markers_are_found_no_more():
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
+    found = []
+    for more in ({}, {"hidden_markers": {"share": 0.6}}):
+        image = cv2.cvtColor(read_view(made(**NEAR, **more).folder, 0).rgb, cv2.COLOR_RGB2GRAY)
+        found.append(len(detector.detectMarkers(image)[1]))
+    assert found[0] >= 15
+    assert found[1] < 0.75 * found[0]
+
+
+# ---------------------------------------------------------------------------------------------- depth
+
+
+def board_depth(capture, number, shift=(0.0, 0.0, 0.0)):
+    """(stored depth, depth of the print's plane moved by `shift` in camera axes), metres, at pixels well within the print."""
+    k, T = capture.folder.camera.intrinsics, invert(capture.truth.T_board_cam[number])
+    depth = read_view(capture.folder, number).depth / 1000.0
+    v, u = np.mgrid[0 : k.height, 0 : k.width] + 0.5
+    rays = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones_like(u)], axis=-1)
+    normal = T[:3, 2]
+    plane = normal @ (T[:3, 3] + shift) / (rays @ normal)
+    corners = transform(
+        T, np.array([[x, y, 0.0] for x, y in ((-0.27, -0.17), (0.27, -0.17), (0.27, 0.17), (-0.27, 0.17))])
+    )
+    outline = np.stack(
+        [k.fx * corners[:, 0] / corners[:, 2] + k.cx, k.fy * corners[:, 1] / corners[:, 2] + k.cy], axis=1
+    )
+    inside = cv2.fillConvexPoly(np.zeros(depth.shape, np.uint8), np.rint(outline).astype(np.int32), 1) > 0
+    mask = cv2.imread(str(capture.folder.path / "truth" / f"mask_{number:05d}.png"), cv2.IMREAD_UNCHANGED) > 0
+    around = cv2.dilate(mask.astype(np.uint8), np.ones((41, 41), np.uint8)) > 0
+    chosen = inside & ~around & (depth > 0.0)
+    assert chosen.sum() > 500
+    return depth[chosen], plane[chosen]
+
+
+def test_exact_depth_of_the_board_is_that_of_its_plane():
+    for number in (0, 1):
+        found, expected = board_depth(made(**SMALL), number)
+        assert np.abs(found - expected).max() < 0.001  # half a millimetre of rounding, and float32
+
+
+def test_depth_noise_has_the_bias_of_its_preset():
+    for more in ({}, {"bias_m": 0.01}):
+        found, expected = board_depth(made(**SMALL, depth_noise=more), 0)
+        bias = OFFSET_M + OFFSET_SHARE * expected.mean() + more.get("bias_m", 0.0)
+        assert np.mean(found - expected) == pytest.approx(bias, abs=5e-4)
+
+
+def test_twice_the_noise_scatters_twice_as_much():
+    sigma = []
+    for times in (1.0, 2.0):
+        found, expected = board_depth(made(**SMALL, depth_noise={"times": times}), 0)
+        sigma.append(np.std(found - expected))
+    assert sigma[1] / sigma[0] == pytest.approx(2.0, rel=0.15)
+    stated = AXIAL_M + AXIAL_PER_M * np.mean(expected) ** 2
+    assert 0.5 * stated < sigma[0] < 2.0 * stated  # registration averages neighbours, and the board is seen at an angle
+
+
+def test_a_wrong_registration_moves_the_measured_surface():
+    """Every measured point is taken to lie `shift` further, so the plane that is stored is the true one moved by it."""
+    shift = [0.010, 0.004, -0.006]
+    found, expected = board_depth(made(**SMALL, registration_error={"shift_m": shift}), 0, np.array(shift))
+    true = board_depth(made(**SMALL, registration_error={"shift_m": shift}), 0)[1]
+    assert np.abs(found - expected).max() < 0.001
+    assert np.abs(found - true).max() > 0.003
+
+
+def test_a_mask_is_the_objects_picture():
+    """Every vertex of the can that OpenCV puts well inside the mask's outline is in the mask, and none is far from it."""
+    capture = made(**SMALL)
+    mask = cv2.imread(str(capture.folder.path / "truth" / "mask_00001.png"), cv2.IMREAD_UNCHANGED)
+    vertices = trimesh.load(capture.folder.path / "truth" / "mesh.glb", force="mesh").vertices
+    placed = transform(capture.truth.T_board_obj, np.asarray(vertices, np.float64))
+    pixels = project_opencv(capture.folder.camera, capture.truth.T_board_cam[1], placed)
+    hull = cv2.convexHull(pixels.astype(np.float32))
+    drawn = cv2.fillConvexPoly(np.zeros_like(mask), np.rint(hull[:, 0]).astype(np.int32), 255)
+    assert (mask != drawn).mean() < 0.002  # a can is nearly convex
+    assert 0.005 < (mask > 0).mean() < 0.3
