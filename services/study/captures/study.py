@@ -1,0 +1,86 @@
+"""The study of a job of simulated captures: what views, estimates, iterations and voxels cost, and what they give."""
+
+import itertools
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from schemas.errors import InputError
+from services.bench.machine import pinned
+from services.run.progress import ProgressLine
+from services.study.captures.measure import measure_capture, simulate_whole
+from services.study.journal import Journal
+from services.study.measure.statistics import image_figures
+from services.study.measure.timing import cost_of, job_cost
+from services.study.model import Plan, Row
+from workers.pipeline.context import WorkerContext
+
+LEAST_CAPTURES = 2
+"""Fewer tell nothing of how errors spread."""
+
+
+def check_captures(plan: Plan) -> None:
+    """Raises InputError where a job's captures cannot be studied."""
+    captures = plan.job.captures
+    if captures is None or captures.source != "simulate":
+        raise InputError(
+            "captures.source is folders: a study needs truth, which simulated captures alone have; use captures.source: simulate"
+        )
+    if plan.sizes.scenes < LEAST_CAPTURES:
+        raise InputError(f"{plan.sizes.scenes} capture cannot tell how errors spread: ask for {LEAST_CAPTURES} or more")
+
+
+def run_capture_study(plan: Plan, journal: Journal, context: WorkerContext, progress: ProgressLine) -> tuple[Row, ...]:
+    """Measure what is not in the journal yet, and make the table; its first row is the job itself.
+
+    A capture is simulated once, and processed with every setting in an order of its own, lap by lap, on one core.
+    """
+    first, sizes = plan.job.first_scene, plan.sizes
+    units = {
+        f"captures/{scene}/{lap}": (scene, lap)
+        for scene, lap in itertools.product(range(first, first + sizes.scenes), range(sizes.laps))
+    }
+    progress.expect(len(units))
+    with pinned():
+        for scene in range(first, first + sizes.scenes):
+            missing = [name for name, (of, _) in units.items() if of == scene and name not in journal]
+            if not missing:
+                continue
+            with tempfile.TemporaryDirectory(prefix="verso-study-") as scratch:
+                path = Path(scratch, "capture")
+                simulate_whole(context, scene, path)
+                for name in missing:
+                    journal.add(name, measure_capture(context, plan.settings, path, units[name]))
+                    progress.show(sum(unit in journal for unit in units))
+    laps: list[dict[int, dict[str, Any]]] = [{} for _ in range(sizes.laps)]
+    for name, (scene, lap) in units.items():
+        laps[lap][scene] = journal[name]
+    return rows_of(plan, laps)
+
+
+def rows_of(plan: Plan, laps: Sequence[Mapping[int, Mapping[str, Any]]]) -> tuple[Row, ...]:
+    """The table, from the answers by lap and capture; settings that no capture could be processed with are left out."""
+    own = plan.settings[0].name
+    own_ms, own_kb = job_cost(laps, own)
+    rows = []
+    for setting in plan.settings:
+        cost = cost_of(setting.name, own, laps)
+        if cost is None:
+            continue
+        answers = list(laps[0].values())
+        failed = [str(one["failed"][setting.name]) for one in answers if setting.name in one["failed"]]
+        rows.append(
+            Row(
+                setting=setting,
+                ms=own_ms * cost.ratio.median,
+                ratio=cost.ratio.median,
+                ratio_least=cost.ratio.least,
+                ratio_most=cost.ratio.most,
+                kilobytes=own_kb if cost.kilobytes is None else cost.kilobytes,
+                errors=image_figures([one["errors"][setting.name] for one in answers if setting.name in one["errors"]]),
+                failed_share=len(failed) / len(answers),
+                notes=tuple(dict.fromkeys(failed)),
+            )
+        )
+    return tuple(rows)
