@@ -12,7 +12,7 @@ from services.merge.dataset_card import write_card
 from services.merge.step import merge
 from services.read.verify import verify
 from services.run.range_planner import plan_spans
-from workers.assets.catalogue import open_catalogue
+from workers.pipeline.captures.listing import open_sources
 from workers.pipeline.context import open_worker
 from workers.pipeline.fingerprint import take_fingerprint
 from workers.pipeline.run_shard import run_scene
@@ -45,15 +45,15 @@ def make_dataset(out: Path, **changes: Any) -> tuple[LocalStore, str]:
     return run_here(validate_job(overlaid(SMALL, changes), "test"), out)
 
 
-def run_here(job: Job, out: Path) -> tuple[LocalStore, str]:
-    """(the finished dataset of a job, as one run would leave it; its digest)."""
-    catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
+def run_here(job: Job, out: Path, folder: Path = Path()) -> tuple[LocalStore, str]:
+    """(the finished dataset of a job file in `folder`, as one run would leave it; its digest)."""
+    catalogue = open_sources(job, folder)
     context = open_worker(job, catalogue)
     store = LocalStore(out)
     store.prepare()
-    record = record_job(job, catalogue.digest, Path())
+    record = record_job(job, catalogue.digest, folder, tuple(one.sha256 for one in catalogue.captures))
     store.write_whole(JOB_FILE, encode_job(record))
-    fingerprint = take_fingerprint(context.renderer, job.render.tier)
+    fingerprint = take_fingerprint(context.renderer, job.drawn.tier)
     store.put_if_absent(FINGERPRINT_FILE, fingerprint.model_dump_json(indent=1).encode())
     terms = ShardOrder.of(str(out), job, record.digest).terms.model_copy(update={"fingerprint": fingerprint.digest})
     for span in plan_spans(job, list_commits(store), False):

@@ -123,6 +123,16 @@ class Job(Frozen):
         return keys
 
     @property
+    def drawn(self) -> Render:
+        """How images are drawn: `render`, with the tier of virtual captures where the job makes those."""
+        virtual = self.captures is not None and not self.captures.folders
+        return (
+            self.render.model_copy(update={"tier": self.captures.simulate.tier})
+            if virtual and self.captures
+            else self.render
+        )
+
+    @property
     def stop_scene(self) -> int:
         """One past the last scene id."""
         return self.first_scene + self.scenes

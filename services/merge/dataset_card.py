@@ -4,6 +4,7 @@ from schemas.base import Counts
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE, stored_roles
 from schemas.job.assets import ProceduralSource
+from schemas.job.captures import Captures
 from services.job.record import JobRecord
 from services.merge.step import MergeResult
 from workers.assets.catalogue import Catalogue
@@ -13,6 +14,11 @@ from workers.store.store import Store
 ARTICLE = (
     "R. Staszak and D. Belter, *3D object reconstruction: A comprehensive view-dependent dataset*, Data in Brief 55 "
     "(2024) 110569, https://doi.org/10.1016/j.dib.2024.110569, CC BY"
+)
+
+SHAPES_OF_CAPTURES = (
+    "- reconstructed from the captures: the merged mesh with the licence in capture.json; what no view saw is missing\n"
+    "- boards: a rectangle, CC0-1.0"
 )
 
 SEAL = ("<!-- SHA-256 of the text above: ", " -->\n")
@@ -35,7 +41,11 @@ def describe_dataset(record: JobRecord, catalogue: Catalogue, merged: MergeResul
     job = record.job
     libraries = "\n".join(f"| {name} | {version} |" for name, version in sorted(fingerprint.libraries.items()))
     sources = "\n".join(f"- {line}" for line in describe_sources(catalogue))
+    captured = job.captures is not None
     counts = ", ".join(f"{merged.scenes[outcome]} {outcome}" for outcome in ("made", "intrinsic", "environmental"))
+    regions = (
+        "neither board nor object, 2 board, 3 object" if captured else "nothing, 1 floor, 2 table, 3 and up objects"
+    )
     return f"""# {job.name}
 
 View-dependent RGB-D pairs for reconstructing objects from a single view: what a camera sees, and what the camera on the
@@ -44,7 +54,7 @@ other side sees. Made by Verso; the layout and the geometry follow {ARTICLE}.
 | | |
 |---|---|
 | scenes | {job.first_scene} to {job.stop_scene - 1}: {counts} |
-| pairs in each scene | {job.pairs_per_scene} |
+| pairs in each scene | {"at most " * captured}{job.pairs_per_scene} |
 | objects in each scene | {_count(job.objects_per_scene)} |
 | views of each pair | {", ".join(stored_roles(job))}{"" if job.render.rgb else "; without RGB"} |
 | seed | {job.seed} |
@@ -58,9 +68,9 @@ other side sees. Made by Verso; the layout and the geometry follow {ARTICLE}.
 |---|---|
 {libraries}
 
-## Shapes
+{_describe_captures(job.captures, catalogue) if job.captures is not None else ""}## Shapes
 
-{sources}
+{SHAPES_OF_CAPTURES if captured else sources}
 
 Every shape, with its licence and its split by instance, is a row of the `assets` table.
 
@@ -69,8 +79,29 @@ Every shape, with its licence and its split by instance, is a row of the `assets
 `pyarrow.dataset.dataset("manifest/views", partitioning="hive")` has a row for each camera and the names and checksums of
 its images, `manifest/objects` one for each thing that it may see; `bodies` in `manifest/scenes` says where each object lies.
 Depth is 16-bit PNG, z along the optical axis, {job.images.depth_units_per_m:g} units a metre, 0 where there is none.
-Masks are 8-bit PNG: 0 nothing, 1 floor, 2 table, 3 and up objects. Poses are camera to world, optical frame (x right,
+Masks are 8-bit PNG: 0 {regions}. Poses are camera to world, optical frame (x right,
 y down, z forward), metres.
+"""
+
+
+def _describe_captures(captures: Captures, catalogue: Catalogue) -> str:
+    """The section on where photographs come from and what was done to them."""
+    board = captures.board
+    origin = f"{len(catalogue.captures)} folders of photographs with registered depth, each with the board in its board.json."
+    if not captures.folders:
+        shapes = "\n".join(f"- {line}" for line in describe_sources(catalogue))
+        markers = f"{board.columns} x {board.rows} markers"
+        origin = f"virtual, of {captures.simulate.views} views, {markers}, and shapes from\n\n{shapes}"
+    return f"""## Captures
+
+Each scene is a capture of one object on a board of markers; its world is the board's frame. The captures are {origin}
+
+Poses are those of the estimate `{captures.estimation.estimate}`. Input images are the photographs without their lens, and
+their depth as it was measured; where the estimate determined an offset, a scale or a registration of the depth camera, depth
+is corrected by it. Mirror images are made of the {captures.synthesis.views} nearest photographs, projected images of the input's.
+The column `capture` of `manifest/scenes` and `manifest/views` has residuals, what was corrected, the share that was measured,
+and, for virtual captures, errors against truth.
+
 """
 
 

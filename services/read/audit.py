@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, is_shape
-from schemas.errors import SceneError
+from schemas.errors import InputError, SceneError
 from schemas.scene.scene import SceneOutput
 from services.job.record import require_job
 from services.read.audit_motion import Motion, measure_motion
@@ -57,8 +57,13 @@ class Audit:
 
 
 def audit(store: Store, count: int, progress: Callable[[Audit], None]) -> Audit:
-    """Audit `count` scenes. Raises OutputError where the folder is no dataset."""
+    """Audit `count` scenes. Raises OutputError where the folder is no dataset, InputError where it is one of captures."""
     record = require_job(store)
+    if record.job.captures is not None:
+        raise InputError(
+            "--audit forces effects that the plan of a scene left out, and a capture has no such plan: "
+            f"`verso replay {store.name} CAPTURE` makes one again and compares every byte"
+        )
     context = open_context(record)
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
     tallies = {effect.name: Tally(effect.kind) for effect in EFFECTS if effect.kind != "asked"}

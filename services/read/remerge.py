@@ -3,13 +3,12 @@
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-
 from schemas.dataset.layout import pose_of_image
 from schemas.dataset.tables import TABLES
 from services.merge.merging import Merging
 from services.merge.reading import RANGES_PER_BLOCK, ROWS_PER_BLOCK, Block
 from services.read.verify_range import ReadRange
+from workers.store.manifest import join_rows
 
 
 class Remerge:
@@ -43,7 +42,7 @@ class Remerge:
             return
         files = [(one.records[0], entry) for one in waiting for entry in one.files if pose_of_image(entry.path) is None]
         rows = {
-            table: pa.concat_tables([one.rows[table] for one in waiting if one.rows]).combine_chunks()
+            table: join_rows(table, [one.rows[table] for one in waiting if one.rows]).combine_chunks()
             for table in TABLES
         }
         self._merging.add(Block([one.records for one in waiting], files, rows))

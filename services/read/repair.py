@@ -189,7 +189,7 @@ class _Repairing:
     def _mine(self) -> Fingerprint:
         """This stack's."""
         job = read_stored_job(self._store, Verdict()).record
-        return take_fingerprint(shared_renderer(), job.job.render.tier if job else "raster")
+        return take_fingerprint(shared_renderer(), job.job.drawn.tier if job else "raster")
 
     def _drop(self, start: int, why: str) -> None:
         """Removes the records of a range whose scenes this stack makes the same again; its images stay until then."""

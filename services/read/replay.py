@@ -54,7 +54,7 @@ def replay_scene(store: Store, scene_id: int) -> Replay:
         )
     context = open_context(record)
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
-    same_stack = take_fingerprint(context.renderer, context.job.render.tier) == theirs
+    same_stack = take_fingerprint(context.renderer, context.job.drawn.tier) == theirs
     output = run_scene(context, scene_id, Stopwatch())
     differences = compare_files(store, stored, output, same_stack)
     if same_stack:

@@ -8,13 +8,15 @@ from PIL import Image
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from schemas.dataset.codec import read_world_poses
+from schemas.dataset.codec import Row, read_world_poses
 from schemas.errors import InputError, OutputError
 from schemas.scene.region import REGION_FLOOR, REGION_TABLE
 from schemas.scene.shape import Part
 from services.job.record import require_job
+from services.read.capture_export import captured_geometry
 from services.read.dataset_reader import find_scene
 from services.read.replay import open_context
+from workers.pipeline.context import WorkerContext
 from workers.plan.randomness import SceneChance
 from workers.plan.step import plan_scene
 from workers.store.store import Store
@@ -31,7 +33,23 @@ def export_scene(store: Store, scene_id: int, target: Path) -> int:
     if row is None:
         reason = next((f["reason"] for f in stored.rows["failures"] if f["scene_id"] == scene_id), "unknown")
         raise InputError(f"scene {scene_id} was not made ({reason}): it has no geometry")
-    context = open_context(record)
+    if record.job.captures is not None:
+        scene = trimesh.Scene()
+        for name, mesh, T_world_mesh in captured_geometry(store, stored, row):
+            scene.add_geometry(mesh, geom_name=name, node_name=name, transform=T_world_mesh)
+    else:
+        scene = _planned_geometry(open_context(record), scene_id, row)
+    data: bytes = scene.export(file_type="glb")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(data)
+    except OSError as error:
+        raise OutputError(f"{target} cannot be written: {error.strerror or error}; choose another --glb") from error
+    return len(data)
+
+
+def _planned_geometry(context: WorkerContext, scene_id: int, row: Row) -> trimesh.Scene:
+    """Floor, table and objects of a scene, from the job's sources."""
     plan = plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
     T_world = {REGION_FLOOR: np.eye(4), **read_world_poses(row)}
     table = plan.table.asset
@@ -47,13 +65,7 @@ def export_scene(store: Store, scene_id: int, target: Path) -> int:
             label, look = f"{name}/{number}-{part.name}", _visual(part)
             mesh = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=look, process=False)
             scene.add_geometry(mesh, geom_name=label, node_name=label, transform=T_world[region_id])
-    data: bytes = scene.export(file_type="glb")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(data)
-    except OSError as error:
-        raise OutputError(f"{target} cannot be written: {error.strerror or error}; choose another --glb") from error
-    return len(data)
+    return scene
 
 
 def _visual(part: Part) -> TextureVisuals | ColorVisuals:

@@ -57,14 +57,23 @@ class RunResult:
 def describe_plan(request: RunRequest) -> list[str]:
     """Lines that tell what a run would do, without doing any of it."""
     job = request.job
-    require_tier(job.render)
+    require_tier(job.drawn)
     catalogue = _open_catalogue(request)
     return [
-        f"job {job.name}: scenes {job.first_scene} to {job.stop_scene - 1}, {job.pairs_per_scene} pair(s) each, seed {job.seed}",
+        f"job {job.name}: {describe_scenes(job)}, seed {job.seed}",
         f"categories: {', '.join(f'{name} {weight:g}' for name, weight in sorted(job.categories.items()))}",
         *describe_sources(catalogue),
         f"out: {request.out}, ranges of {job.run.range_size}, shards of {job.run.shard_size or f'up to {MAX_SHARD}'} scenes",
     ]
+
+
+def describe_scenes(job: Job) -> str:
+    """What a job makes, in a few words."""
+    ids = f"{job.first_scene} to {job.stop_scene - 1}"
+    if job.captures is None:
+        return f"scenes {ids}, {job.pairs_per_scene} pair(s) each"
+    virtual = f"virtual, of {job.captures.simulate.views} views"
+    return f"captures {ids}, {'in folders' if job.captures.folders else virtual}, at most {job.captures.most_views} pairs each"
 
 
 def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slots] | None = None) -> RunResult:
@@ -73,7 +82,7 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     `cluster` is entered if there is something to make; by default it is the one that the request asks for.
     """
     begun = time.monotonic()
-    require_tier(request.job.render)
+    require_tier(request.job.drawn)
     catalogue = _open_catalogue(request)
     store = open_store(request.out)
     for line in describe_left_out(catalogue):

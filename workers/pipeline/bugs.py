@@ -36,8 +36,11 @@ def describe(error: BaseException) -> str:
 
 
 def name_scene(context: WorkerContext, scene_id: int) -> str:
-    """The scene with its category and the instances in it, as far as they can be drawn."""
+    """The scene with its category and the instances in it, as far as they can be drawn, or the capture and its folder."""
     drawn = ""
+    if context.job.captures is not None:
+        folders = context.job.captures.folders
+        return f"capture {scene_id}{f' ({folders[scene_id]})' if scene_id < len(folders) else ''}"
     with contextlib.suppress(Exception):  # what failed may be the draw itself
         objects, table = choose_assets(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
         each = ", ".join(f"{ref.category} {ref.instance_id}" for ref in objects)

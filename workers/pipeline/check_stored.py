@@ -58,7 +58,7 @@ def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], sc
         if role != "projected":
             faults += _check_labels(view, scene)
             faults += _check_patch_shares(job, view, scene, objects)
-            faults += _check_images(view)
+            faults += _check_images(view, scene)
         faults += _check_patches(view, stored["mirror" if role == "projected" else role], job, read, views[role])
     faults += _check_cameras(job, stored, views)
     if "mirror" in stored:
@@ -116,8 +116,8 @@ def _check_labels(view: View, scene: Row) -> list[str]:
 
 
 def _check_patch_shares(job: Job, view: View, scene: Row, objects: list[Row]) -> list[str]:
-    """Compare the share of its patch that each object fills; a dataset without bodies has no such column."""
-    if scene["bodies"] is None:
+    """Compare the share of its patch that each object fills; a dataset of scenes without bodies has no such column."""
+    if scene["bodies"] is None and not _is_captured(scene):
         return []
     own = [row for row in objects if (row["pose_id"], row["role"]) == (view.pose_id, view.role)]
     shares, faults = {row["region_id"]: row["patch_object_fraction"] for row in own}, []
@@ -129,15 +129,26 @@ def _check_patch_shares(job: Job, view: View, scene: Row, objects: list[Row]) ->
     return faults
 
 
-def _check_images(view: View) -> list[str]:
-    """Compare the mask with the depth, and its regions with those of `objects`."""
+def _is_captured(scene: Row) -> bool:
+    """Whether a row of `scenes` is of a capture."""
+    return scene.get("capture") is not None
+
+
+def _check_images(view: View, scene: Row) -> list[str]:
+    """Compare the mask with the depth, and its regions with those of `objects`.
+
+    Nothing, in a photograph, is what is neither board nor object, and may have depth; a view that was made of photographs
+    shows nothing without depth.
+    """
     assert view.region is not None
     where, faults = f"pose {view.pose_id} ({view.role})", []
     known = {0, 1} | {label.region_id for label in view.labels}
     if foreign := set(np.unique(view.region).tolist()) - known:
         faults.append(f"{where}: the mask has regions {sorted(foreign)} that objects lacks")
-    if (view.depth[view.region == 0] != 0).any():
+    if not _is_captured(scene) and (view.depth[view.region == 0] != 0).any():
         faults.append(f"{where}: depth where the mask says that nothing was hit")
+    if _is_captured(scene) and view.role == "mirror" and (view.region[view.depth == 0] != 0).any():
+        faults.append(f"{where}: the mask has regions where there is no depth")
     return faults
 
 

@@ -49,10 +49,10 @@ class BlamedScene(SceneError):
 def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
     """Make and commit every range of the order. A scene that cannot be made is a row; errors of the stack propagate."""
     begun, cpu = time.perf_counter(), time.process_time()
-    require_tier(order.job.render)
+    require_tier(order.job.drawn)
     context = open_worker(order.job, catalogue)
     require_device(context.renderer.name, order.job.run.device)
-    fingerprint = _fingerprint(order.job.render.tier)
+    fingerprint = _fingerprint(order.job.drawn.tier)
     store = open_store(order.out)
     _join_stack(store, fingerprint, order)
     order = order.model_copy(update={"terms": order.terms.model_copy(update={"fingerprint": fingerprint.digest})})

@@ -58,6 +58,17 @@ class StoredPair:
     images: dict[tuple[str, str], NDArray] = field(default_factory=dict)
     """Decoded images by role and kind of pixel."""
 
+    @property
+    def is_captured(self) -> bool:
+        """Whether the input view is a photograph: it stands where it was taken, by a camera of its own."""
+        return self.job.get("captures") is not None
+
+    @property
+    def sensor(self) -> Mapping[str, Any]:
+        """The pinhole camera of every view: the job's, of captures the photograph's."""
+        sensor = self.job["cameras"]["sensor"]
+        return {name: self.views["input"][name] for name in sensor} if self.is_captured else sensor
+
     def kinds(self, role: str) -> list[str]:
         """Kinds of pixel that the job stores of a view."""
         return [kind for kind in IMAGES[role] if kind != "rgb" or self.job["render"]["rgb"]]
@@ -80,7 +91,7 @@ def check_images(pair: StoredPair, view: Row) -> Iterator[str]:
 
 def check_camera(pair: StoredPair, view: Row) -> Iterator[str]:
     """Ids, intrinsics in both conventions, a rigid pose, and its angles."""
-    pairs, sensor, parent = pair.job["pairs_per_scene"], pair.job["cameras"]["sensor"], view["parent_id"]
+    pairs, sensor, parent = pair.job["pairs_per_scene"], pair.sensor, view["parent_id"]
     first = 2 * pairs * pair.scene["scene_id"]
     if parent not in range(first, first + 2 * pairs, 2) or view["pose_id"] != parent + (view["role"] == "mirror"):
         yield f"ids {view['pose_id']} and {parent} do not follow from scene {pair.scene['scene_id']}"
@@ -88,58 +99,17 @@ def check_camera(pair: StoredPair, view: Row) -> Iterator[str]:
     derived = {"cx_opencv": sensor["cx"] - 0.5, "cy_opencv": sensor["cy"] - 0.5, "depth_units_per_m": units}
     for name, value in {**sensor, **derived}.items():
         if view[name] != value:
-            yield f"{name} is {view[name]}, the job gives {value}"
-    T = _matrix(view, "T_world_cam")
+            yield f"{name} is {view[name]}, the {'input view' if pair.is_captured else 'job'} gives {value}"
+    T = matrix(view, "T_world_cam")
     R, axis = T[:3, :3], T[:3, 2]
-    if _distance(R.T @ R, np.eye(3)) > ROUNDING or np.linalg.det(R) < 0 or list(T[3]) != [0, 0, 0, 1]:
+    if distance(R.T @ R, np.eye(3)) > ROUNDING or np.linalg.det(R) < 0 or list(T[3]) != [0, 0, 0, 1]:
         yield "T_world_cam is no rigid transform"
     if abs(math.sin(view["inclination_rad"]) + axis[2]) > ROUNDING:
         yield f"inclination_rad {view['inclination_rad']} is not the angle of the optical axis below the horizontal"
     level = math.hypot(axis[0], axis[1])
     direction = level * np.array([math.cos(view["yaw_rad"]), math.sin(view["yaw_rad"])])
-    if level > ROUNDING and _distance(direction, -axis[:2]) > ROUNDING:
+    if level > ROUNDING and distance(direction, -axis[:2]) > ROUNDING:
         yield f"yaw_rad {view['yaw_rad']} is not the direction from the table to the camera"
-
-
-def check_poses(pair: StoredPair) -> Iterator[str]:
-    """The input camera on its orbit, d_z, and from these the aligned and the mirror camera."""
-    cameras, T_in = pair.job["cameras"], _matrix(pair.views["input"], "T_world_cam")
-    orbit, axis = cameras["orbit"], T_in[:3, 2]
-    target = T_in[:3, 3] + orbit["radius_m"] * axis
-    low, high = np.sin(orbit["inclination_rad"])
-    if _distance(target[:2], np.zeros(2)) > ROUNDING or abs(T_in[2, 0]) > ROUNDING:
-        yield "the input camera does not look at the table's centre from cameras.orbit.radius_m without roll"
-    if not low - ROUNDING <= -axis[2] <= high + ROUNDING:
-        yield "the input camera's inclination is outside cameras.orbit.inclination_rad"
-    d_z = _derive_d_z(pair)
-    for role, view in pair.views.items():
-        if not abs(view["d_z_m"] - d_z) <= ROUNDING:
-            yield f"d_z_m of {role} is {view['d_z_m']}, the object's input depth gives {d_z}"
-    expected = {"aligned": T_in @ _transform(np.eye(3), cameras["depth"]["offset_m"])}
-    expected["mirror"] = expected["projected"] = _derive_mirror(T_in, d_z, cameras["mirror"]["T_z_m"])
-    for role, T in expected.items():
-        if role in pair.views and not (off := _distance(_matrix(pair.views[role], "T_world_cam"), T)) <= ROUNDING:
-            yield f"T_world_cam of {role} is off by {off:.3g} from its definition"
-
-
-def _derive_d_z(pair: StoredPair) -> float:
-    """Metres: a percentile (interpolated linearly), the median or the least of the object's stored input depth."""
-    mirror, depth = pair.job["cameras"]["mirror"], pair.images["input", "depth"]
-    z = np.sort(depth[(pair.images["input", "region"] >= FIRST_OBJECT) & (depth > 0)])
-    if not len(z):
-        return math.nan
-    percentile = {"nearest": 0.0, "median": 50.0, "percentile": mirror["percentile"]}[mirror["pivot_depth"]]
-    units = np.interp(percentile / 100.0 * (len(z) - 1), np.arange(len(z)), z)
-    return float(units / pair.job["images"]["depth_units_per_m"])
-
-
-def _derive_mirror(T_in: Array, d_z: float, T_z: float) -> Array:
-    """T_in Trans_z(d_z) Rot_x(phi) Rot_y(pi) Rot_x(-phi) Trans_z(-T_z), phi the angle of the axis below the horizontal."""
-    phi = math.atan2(-T_in[2, 2], math.hypot(T_in[0, 2], T_in[1, 2]))
-    c, s = math.cos(phi), math.sin(phi)
-    rotation_x = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-    turn = rotation_x @ np.diag([-1.0, 1.0, -1.0]) @ rotation_x.T
-    return T_in @ _transform(turn, (0.0, 0.0, d_z)) @ _transform(np.eye(3), (0.0, 0.0, -T_z))
 
 
 def check_depth(pair: StoredPair, view: Row) -> Iterator[str]:
@@ -149,11 +119,11 @@ def check_depth(pair: StoredPair, view: Row) -> Iterator[str]:
     some = depth[depth > 0]
     if len(some) and not (low * units - 0.5 <= some.min() and some.max() <= high * units + 0.5):
         yield f"depth from {some.min() / units} to {some.max() / units} m is outside images.depth_range_m"
-    if (depth[region == 0] > 0).any():
+    if (depth[region == 0] > 0).any() and not pair.is_captured:
         yield "depth where the mask says that nothing was hit"
-    points, _ = _unproject(view, np.where(region == FLOOR, depth, 0))
+    points, _ = unproject(view, np.where(region == FLOOR, depth, 0))
     if points.shape[1] and not pair.job["sensor"]["depth_noise"]:
-        up = _matrix(view, "T_world_cam")[2]
+        up = matrix(view, "T_world_cam")[2]
         rounding = 0.5 / units * np.abs(up[:3] @ (points[:3] / points[2]))
         height_m = np.abs(up @ points)
         if (height_m - rounding > FLOOR_SHARE * points[2]).any():
@@ -164,8 +134,8 @@ def check_labels(pair: StoredPair, view: Row) -> Iterator[str]:
     """Regions, pixel counts, boxes, object poses and image coordinates."""
     region, scene = pair.images[view["role"], "region"], pair.scene
     bodies = scene["bodies"] or [{"region_id": FIRST_OBJECT, "T_world_obj": scene["T_world_obj"]}]
-    poses = {body["region_id"]: _matrix(body, "T_world_obj") for body in bodies}
-    poses[TABLE] = _matrix(scene, "T_world_table")
+    poses = {body["region_id"]: matrix(body, "T_world_obj") for body in bodies}
+    poses[TABLE] = matrix(scene, "T_world_table")
     labels = {row["region_id"]: row for row in pair.objects if row["role"] == view["role"]}
     if labels.keys() != poses.keys() or not set(np.unique(region).tolist()) <= {0, FLOOR, *poses}:
         yield f"regions are {sorted(labels)} in objects, {sorted(poses)} in scenes, {np.unique(region)} in the mask"
@@ -173,14 +143,14 @@ def check_labels(pair: StoredPair, view: Row) -> Iterator[str]:
     if view["object_pixels"] != np.count_nonzero(region >= FIRST_OBJECT):
         yield f"object_pixels {view['object_pixels']} is not the number of pixels of objects"
     for number, label in labels.items():
-        T = np.linalg.inv(_matrix(view, "T_world_cam")) @ poses[number]
+        T = np.linalg.inv(matrix(view, "T_world_cam")) @ poses[number]
         x, y, width, height = cv2.boundingRect((region == number).astype(np.uint8))
         for name, value in {"pixels": np.count_nonzero(region == number), "bbox_xywh": [x, y, width, height]}.items():
             if label[name] != value:
                 yield f"region {number}: {name} is {label[name]}, the mask gives {value}"
         if not _shows_origin(view, label, T):
             yield f"region {number}: ({label['u']}, {label['v']}) is not the pixel of the object's origin"
-        if not _distance(_matrix(label, "T_cam_obj"), T) <= ROUNDING:
+        if not distance(matrix(label, "T_cam_obj"), T) <= ROUNDING:
             yield f"region {number}: T_cam_obj is not inverse(T_world_cam) T_world_obj"
 
 
@@ -221,8 +191,8 @@ def check_patches(pair: StoredPair, view: Row) -> Iterator[str]:
 def check_projection(pair: StoredPair) -> Iterator[str]:
     """The stored input cloud in the mirror camera: pixel is floor(u, v), the nearest z wins, ties go to the lowest index."""
     source, target = pair.views["input"], pair.views["projected"]
-    points, index = _unproject(source, pair.images["input", "depth"])
-    points = np.linalg.inv(_matrix(target, "T_world_cam")) @ _matrix(source, "T_world_cam") @ points
+    points, index = unproject(source, pair.images["input", "depth"])
+    points = np.linalg.inv(matrix(target, "T_world_cam")) @ matrix(source, "T_world_cam") @ points
     (x, y, z, _), index = points[:, points[2] > 0], index[points[2] > 0]
     u, v = np.floor(target["fx"] * x / z + target["cx"]), np.floor(target["fy"] * y / z + target["cy"])
     inside = (u >= 0) & (u < target["width"]) & (v >= 0) & (v < target["height"])
@@ -262,20 +232,17 @@ def _decode(data: bytes) -> NDArray:
     return np.zeros(0) if image is None else image[..., ::-1] if image.ndim == 3 else image
 
 
-def _matrix(row: Row, name: str) -> Array:
+def matrix(row: Row, name: str) -> Array:
+    """[4, 4] of a column."""
     return np.array(row[name], np.float64).reshape(4, 4)
 
 
-def _transform(R: Array, t: Sequence[float]) -> Array:
-    return np.vstack([np.column_stack([R, t]), [0.0, 0.0, 0.0, 1.0]])
-
-
-def _distance(a: Array, b: Array) -> float:
+def distance(a: Array, b: Array) -> float:
     """Largest difference of two arrays' elements."""
     return float(np.abs(a - b).max())
 
 
-def _unproject(view: Row, depth: NDArray) -> tuple[Array, NDArray[np.int64]]:
+def unproject(view: Row, depth: NDArray) -> tuple[Array, NDArray[np.int64]]:
     """([4, N] homogeneous points in the camera's frame of the pixels that have depth, their flat indices [N])."""
     rows, columns = np.nonzero(depth)
     z = depth[rows, columns] / view["depth_units_per_m"]

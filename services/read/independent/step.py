@@ -8,7 +8,7 @@ import urllib.parse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from services.read.independent import derive
+from services.read.independent import derive, poses
 from services.read.independent.derive import Row, StoredPair
 
 _ELEMENTS = [f"T{i}{j}" for i in range(4) for j in range(4)]
@@ -22,6 +22,10 @@ def list_underived(job: Mapping[str, Any]) -> list[str]:
     """Stored values that have no second derivation for this job, a sentence each."""
     told = ["visible_fraction, mirror_agreement and projected_hidden_share are not derived"]
     sensor, projection = job["sensor"], job["images"]["projection"]
+    if job.get("captures") is not None:
+        told.append(
+            "poses of input cameras, and depth and colour of mirror views, follow from photographs: not derived"
+        )
     if projection["enabled"] and not _has_plain_points(job):
         told.append("projected images are not derived: images.projection.splat or hidden_point_removal is on")
     elif projection["enabled"] and sensor["distortion"]:
@@ -54,7 +58,8 @@ def check_pair(pair: StoredPair) -> list[str]:
         elif _has_plain_points(pair.job):
             own += derive.check_projection(pair)
         faults += [f"pose {view['pose_id']} ({role}): {fault}" for fault in own]
-    return faults + [f"pair {pair.views['input']['pose_id']}: {fault}" for fault in derive.check_poses(pair)]
+    own = [*poses.check_poses(pair), *(poses.check_board if pair.is_captured else poses.check_orbit)(pair)]
+    return faults + [f"pair {pair.views['input']['pose_id']}: {fault}" for fault in own]
 
 
 def check_merged(read: Callable[[str], bytes], views: Sequence[Row], objects: Sequence[Row]) -> Iterator[str]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Array, Pose
+from schemas.base import Pose
 from schemas.capture.estimate import SynthesizedView
 from schemas.capture.processed import PosedImages
 from schemas.dataset.layout import file_pose_id, input_pose_id
@@ -14,7 +14,7 @@ from schemas.job.captures import Board
 from schemas.job.job import Job
 from schemas.scene.camera import Camera, Role
 from schemas.scene.effects import EffectPlan
-from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
+from schemas.scene.region import REGION_FIRST_OBJECT, REGION_NOTHING, REGION_TABLE
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Asset
 from schemas.scene.view import ObjectLabel, Pair, View
@@ -73,21 +73,21 @@ def make_capture_pair(
     """
     parent_id = input_pose_id(thing.scene_id, at, job.pairs_per_scene)
 
-    def view(role: Role, camera: Camera, rgb: NDArray[np.uint8], depth_m: Array, region: NDArray[np.uint8]) -> View:
+    def view(role: Role, camera: Camera, made: PosedImages | SynthesizedView) -> View:
+        region, depth = capture_regions(camera, thing.board, made.mask), quantise_depth(made.depth_m, job.images)
+        if role == "mirror":
+            region[depth == 0] = REGION_NOTHING
         labels = _labels(thing, camera, region, count)
-        depth = quantise_depth(depth_m, job.images)
-        return View(role, file_pose_id(role, parent_id), parent_id, camera, rgb, depth, region, labels)
+        return View(role, file_pose_id(role, parent_id), parent_id, camera, made.rgb, depth, region, labels)
 
-    region = capture_regions(images.camera, thing.board, images.mask)
-    first = view("input", images.camera, images.rgb, images.depth_m, region)
-    pair = Pair(object_distance(first.depth, region, job.images, job.cameras.mirror), first, None)
+    first = view("input", images.camera, images)
+    assert first.region is not None
+    pair = Pair(object_distance(first.depth, first.region, job.images, job.cameras.mirror), first, None)
     if not thing.effects.runs("mirror"):
         return CapturedPair(images.number, pair, None)
     camera = place_mirror_camera(images.camera, pair.d_z_m, job.cameras.mirror)
     made = synthesize(camera)
-    known = made.depth_m > 0.0
-    region = np.where(known, capture_regions(camera, thing.board, made.mask), np.uint8(0))
-    mirror = view("mirror", camera, made.rgb, made.depth_m, region)
+    mirror = view("mirror", camera, made)
     agreement = compare_views(first, mirror, job.images, job.check.mirror_agreement_mm)
     pair = replace(pair, mirror=mirror, agreement=agreement)
     if thing.effects.runs("projection"):

@@ -3,7 +3,7 @@
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,9 +50,9 @@ def run_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Scen
         known = folder.about.model_fields_set
         category = folder.about.category if "category" in known else captures.category
         with watch.stage("labels"):
-            name = opened.name or done.name
+            done = replace(done, name=opened.name or done.name)
             source = SOURCE if read_truth(opened.path) is None else SIMULATED
-            names = CaptureNames(f"{name}-{scene_id:05d}", category, done.licence, source)
+            names = CaptureNames(f"{done.name}-{scene_id:05d}", category, done.licence, source)
             asset, T_world_obj = reconstructed_asset(done.surface, names, job.assets)
             effects = image_effects(job)
             thing = CapturedObject(
