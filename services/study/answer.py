@@ -6,7 +6,19 @@ from services.study.choose import AS_CHEAP, TargetError, Targets, candidates, ch
 from services.study.model import Row, Study
 from services.study.words import amount, duration, listed, milliseconds, short, size, times
 
-DEFAULT_TARGETS: Targets = {"penetration_mm": 0.1, "gap_mm": 0.1, "pose_mm": 0.1, "depth_mm": 0.1, "mask_share": 0.001}
+DEFAULT_TARGETS: Targets = {
+    "penetration_mm": 0.1,
+    "gap_mm": 0.1,
+    "pose_mm": 0.1,
+    "depth_mm": 0.1,
+    "mask_share": 0.001,
+    "camera_mm": 0.5,
+    "camera_deg": 0.05,
+    "cloud_mm": 1.0,
+    "cloud_p95_mm": 3.0,
+    "missing_share": 0.05,
+    "view_depth_mm": 1.5,
+}
 """The targets without a wish of the user: the accuracy that a dataset's labels promise."""
 
 

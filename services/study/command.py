@@ -18,6 +18,7 @@ from services.job.read import load_job, read_tree
 from services.run.cores import usable_cores
 from services.run.progress import ProgressLine
 from services.study.answer import answer, recommend
+from services.study.captures.study import check_captures, run_capture_study
 from services.study.choose import parse_targets
 from services.study.journal import Journal
 from services.study.knobs import apply, choose_knobs, job_tree_with, knobs_of, preset_settings, settings_of
@@ -50,7 +51,10 @@ def main(options: argparse.Namespace) -> int:
     require_device(context.renderer.name, plan.job.run.device)
     header = header_of(plan, context.settings_digest, code_digest())
     with Journal(options.out, header) as journal, closing(ProgressLine(0, "tradeoff", unit="measurement")) as progress:
-        rows = run_study(plan, journal, context, options.workers or usable_cores(), progress)
+        if plan.job.captures is not None:
+            rows = run_capture_study(plan, journal, context, progress)
+        else:
+            rows = run_study(plan, journal, context, options.workers or usable_cores(), progress)
     study = study_of(plan, rows, context.renderer.name, shlex.join(["verso", *sys.argv[1:]]), left_out)
     write_tables(study, options.out)
     write_page(study, write_plots(study, options.out), options.out / "index.html", targets)
@@ -73,6 +77,8 @@ def main(options: argparse.Namespace) -> int:
 def make_plan(asked: Job, options: argparse.Namespace, targets: Mapping[str, float] | None) -> tuple[Plan, list[str]]:
     """The plan for these options, and what is left out, and why. Raises InputError."""
     scenes = min(options.scenes, asked.scenes)
+    if asked.captures is not None:
+        return make_capture_plan(asked, options, targets, scenes), []
     if scenes < LEAST_SCENES:
         raise InputError(
             f"{scenes} scene{'s' * (scenes > 1)} cannot tell how errors spread: ask for {LEAST_SCENES} or more with --scenes, "
@@ -87,6 +93,20 @@ def make_plan(asked: Job, options: argparse.Namespace, targets: Mapping[str, flo
     limited = {name: min(getattr(usual, name), scenes) for name in ("posed", "released", "timed")}
     sizes = replace(usual, scenes=scenes, settled=options.physics_scenes, laps=options.laps, **limited)
     return Plan(job, options.job.parent, knobs, settings, preset_settings(job), targets, sizes), list(left_out)
+
+
+def make_capture_plan(
+    asked: Job, options: argparse.Namespace, targets: Mapping[str, float] | None, captures: int
+) -> Plan:
+    """The plan for a job of captures; presets have no keys of captures. Raises InputError."""
+    job = apply(asked, {"captures.estimation.compare": False})
+    knobs = choose_knobs(knobs_of(job), options.knobs.split(",") if options.knobs else None)
+    settings, _ = settings_of(job, knobs)
+    plan = Plan(
+        job, options.job.parent, knobs, settings, (), targets, Sizes(scenes=captures, settled=0, laps=options.laps)
+    )
+    check_captures(plan)
+    return plan
 
 
 def write_job(source: Path, changes: list[str], row: Row, path: Path, target: str) -> None:

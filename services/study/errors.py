@@ -8,6 +8,7 @@ _RAYS = "a ray caster in float64 at the same pixel centres"
 _FRONT = "65,536 rays about the objects, and their vertices"
 _PATCH = "rays at random in the objects' patch"
 _FINEST = "the finest steps, 1 s"
+_TRUTH = "the truth of the simulation"
 _REFERENCE = "finer steps than any that is measured"
 
 
@@ -59,6 +60,15 @@ ERRORS = {kind.name: kind for kind in (
               "object pixels of the mirror view seen by both that stay empty", _RAYS, "mirror"),
     ErrorKind("hidden_share", "", "projected pixels that show through",
               "projected pixels that show what the mirror camera cannot see", _RAYS, "mirror"),
+    ErrorKind("camera_mm", "mm", "camera position", "camera position off, median of a capture's views", _TRUTH, "capture"),
+    ErrorKind("camera_deg", "deg", "camera rotation", "camera rotation off, median of its views", _TRUTH, "capture"),
+    ErrorKind("cloud_mm", "mm", "merged cloud", "points of the merged cloud off, median", _TRUTH, "capture"),
+    ErrorKind("cloud_p95_mm", "mm", "merged cloud, 95 %",
+              "points of the merged cloud off, 95 % of them", _TRUTH, "capture"),
+    ErrorKind("missing_share", "", "surface that is missing",
+              "visible surface without a point within 3 mm", _TRUTH, "capture"),
+    ErrorKind("view_depth_mm", "mm", "depth of synthesised views",
+              "depth of synthesised views off, median", _TRUTH, "capture"),
     ErrorKind("flip", "", "colour, FLIP", "colour: FLIP, 0 the same to 1", "a converged path-traced image", "colour"),
     ErrorKind("edge_flip", "", "edges, FLIP",
               "smoothness of edges: FLIP, 0 the same to 1", "64 samples a pixel, same light", "colour"),

@@ -14,6 +14,7 @@ from schemas.job.job import Job
 from schemas.job.keys import set_key
 from schemas.job.preset import PRESETS
 from services.job.read import describe_fault, did_you_mean
+from services.study.captures.knobs import capture_knobs
 from services.study.model import Changes, Group, Knob, Setting, Value
 
 SPIN_PER_SPEED = 0.01
@@ -25,6 +26,8 @@ WIDTHS = (160, 320, 640, 1280)
 
 def knobs_of(job: Job) -> tuple[Knob, ...]:
     """Every knob, with the values that mean something for this job."""
+    if job.captures is not None:
+        return capture_knobs(job.captures)
     physics = {
         "step": _values("physics.step_hz", (60, 120, 240, 480, 960, 1920)),
         "step_travel": _values("physics.max_step_travel_mm", (1.0, 0.3, 0.1, 0.05, 0.035)),
@@ -167,5 +170,5 @@ def job_tree_with(changes: Changes, tree: Mapping[str, Any] | None = None) -> di
 def groups_of(setting: Setting, knobs: Mapping[str, Knob]) -> frozenset[Group]:
     """Which parts of a scene a setting changes; every part for the job itself and for presets, which are no knob's."""
     if not setting.parts or any(name not in knobs for name, _ in setting.parts):
-        return frozenset(("physics", "labels", "mirror", "colour"))
+        return frozenset(("physics", "labels", "mirror", "colour", "capture"))
     return frozenset(knobs[name].group for name, _ in setting.parts)

@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 from schemas.job.job import Job
 
-Group = Literal["physics", "labels", "mirror", "colour"]
+Group = Literal["physics", "labels", "mirror", "colour", "capture"]
 """The part of a scene that a knob or an error belongs to: how objects come to rest; depth and masks; the mirror pose and the
-projection into its view; RGB."""
+projection into its view; RGB; or a capture as a whole."""
 
 Changes = Mapping[str, Any]
 """Values by dotted key of the job, such as {"physics.step_hz": 240}."""
@@ -107,6 +107,13 @@ class Study:
     preset: str = "balanced"
     job_scenes: int = 0
     notes: tuple[str, ...] = ()
+
+    @property
+    def sample(self) -> str:
+        """What was measured with each setting, in words: a study of captures drops nothing."""
+        if not self.physics_scenes:
+            return f"{self.scenes} captures processed"
+        return f"{self.scenes} scenes made and {self.physics_scenes} dropped"
 
 
 @dataclass(frozen=True)

@@ -162,7 +162,7 @@ def study_of(plan: Plan, rows: Sequence[Row], renderer: str, command: str, left_
         physics_scenes=plan.sizes.settled,
         job_scenes=plan.job.scenes,
         rows=tuple(rows),
-        slopes=slopes(),
+        slopes={} if plan.job.captures is not None else slopes(),
         preset=plan.job.preset,
         notes=tuple(left_out),
     )

@@ -59,7 +59,7 @@ def run_capture_study(plan: Plan, journal: Journal, context: WorkerContext, prog
     return rows_of(plan, laps)
 
 
-def rows_of(plan: Plan, laps: Sequence[Mapping[int, Mapping[str, Any]]]) -> tuple[Row, ...]:
+def rows_of(plan: Plan, laps: Sequence[Mapping[int, dict[str, Any]]]) -> tuple[Row, ...]:
     """The table, from the answers by lap and capture; settings that no capture could be processed with are left out."""
     own = plan.settings[0].name
     own_ms, own_kb = job_cost(laps, own)

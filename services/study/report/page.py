@@ -15,7 +15,13 @@ from services.study.words import duration, milliseconds, number, short, shown, s
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
-GROUPS = {"physics": "How objects rest", "labels": "Depth and masks", "mirror": "The other side", "colour": "Colour"}
+GROUPS = {
+    "physics": "How objects rest",
+    "labels": "Depth and masks",
+    "mirror": "The other side",
+    "colour": "Colour",
+    "capture": "Captures",
+}
 
 
 def write_page(study: Study, plots: Sequence[Path], file: Path, targets: Targets | None = None) -> None:
@@ -86,7 +92,7 @@ def _machine(study: Study) -> str:
     own = own_row(study.rows)
     rows = [
         ("command", study.command),
-        ("scenes", f"{study.scenes} made and {study.physics_scenes} dropped with each of {len(study.rows)} settings"),
+        ("scenes", f"{study.sample} with each of {len(study.rows)} settings"),
         ("preset of the job", study.preset),
         ("a scene as the job is", f"{milliseconds(own.ms)} of processor, {size(own.kilobytes)}"),
     ]

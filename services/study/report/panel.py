@@ -34,6 +34,10 @@ _MAIN = (
     ("in depth", "Depth and masks", ("between_mm", "depth_mm", "outline_share", "mask_share", "table_depth_mm")),
     ("in the mirror", "The other side", ("mirror_mm", "agreement_mm", "unfilled_share", "hidden_share")),
     ("in colour", "Colour", ("flip", "edge_flip")),
+    ("in the poses", "Camera poses", ("camera_mm", "camera_deg")),
+    ("in the cloud", "Merged cloud", ("cloud_mm", "cloud_p95_mm")),
+    ("in completeness", "What is missing", ("missing_share",)),
+    ("in new views", "Synthesised views", ("view_depth_mm",)),
 )
 """Each part of a scene: its name in the title, its heading, and its errors. The panel shows the first that settings move."""
 

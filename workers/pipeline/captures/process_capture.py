@@ -57,9 +57,7 @@ def pose_views(folder: CaptureFolder, estimate: CaptureEstimate) -> dict[int, Po
     posed = {}
     for view in estimate.used:
         assert view.T_board_cam is not None
-        posed[view.number] = pose_view(
-            read_view(folder, view.number), folder.camera, view.T_board_cam, estimate.depth
-        )
+        posed[view.number] = pose_view(read_view(folder, view.number), folder.camera, view.T_board_cam, estimate.depth)
     return posed
 
 
