@@ -73,8 +73,8 @@ def draw_tradeoff(study: Study) -> Picture:
     lines = -(-len(panels) // columns)
     picture, looks = new_picture(WIDTH, HEAD + lines * PANEL + FOOT, HEAD, FOOT), looks_of(study.rows, panels)
     write_head(picture, headline(study, panels), 0.15, fontsize=15, fontweight="bold", color=INK)
-    measured = f"{cut(study.job, 40)}: {study.sample} with each of {len(study.rows)} settings; one core of "
-        f"{cut(str(study.machine.get('cpu', 'an unknown processor')), 60)}"
+    core = cut(str(study.machine.get("cpu", "an unknown processor")), 60)
+    measured = f"{cut(study.job, 40)}: {study.sample} with each of {len(study.rows)} settings; one core of {core}"
     write_head(picture, measured, 0.5, fontsize=10, color=PALE)
     _draw_foot(picture)
 
