@@ -7,6 +7,7 @@ import trimesh
 
 from tests.workers.pipeline.captures.edge_corners import corner_errors, grey, project_opencv
 from tests.workers.pipeline.captures.made_captures import made
+from workers.capture.board.layout import marker_corners
 from workers.capture.simulate.noise import AXIAL_M, AXIAL_PER_M, OFFSET_M, OFFSET_SHARE
 from workers.geometry.frames import invert, transform
 from workers.geometry.srgb import decode_codes
@@ -30,6 +31,19 @@ def corners_of(capture, board=None):
     ]
     errors, outwards = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     return errors, (errors * outwards).sum(axis=1)
+
+
+def detected_errors(capture, number):
+    """[N, 2] px: corners that OpenCV's detector finds, against OpenCV's projection of the true ones."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    image = cv2.cvtColor(read_view(capture.folder, number).rgb, cv2.COLOR_RGB2GRAY)
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
+    true = marker_corners(capture.folder.board)[ids.ravel()].reshape(-1, 3)
+    projected = project_opencv(capture.folder.camera, capture.truth.T_board_cam[number], true)
+    errors = np.concatenate(corners).reshape(-1, 2) - projected
+    return errors[np.abs(errors).max(axis=1) < 2.0]
 
 
 @pytest.mark.parametrize("settings", [{}, {"distortion": LENS}, {"motion_blur": {}}, {"rgb_noise": {}}])
@@ -158,3 +172,30 @@ def test_a_mask_is_the_objects_picture():
     drawn = cv2.fillConvexPoly(np.zeros_like(mask), np.rint(hull[:, 0]).astype(np.int32), 255)
     assert (mask != drawn).mean() < 0.002  # a can is nearly convex
     assert 0.005 < (mask > 0).mean() < 0.3
+
+
+# ---------------------------------------------------------------------------------------------- the other renderer
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("settings", [{}, {"distortion": LENS}])
+def test_a_traced_capture_has_its_corners_where_opencv_projects_them(settings):
+    """Mitsuba shares nothing with the rasteriser: neither its camera nor its samples."""
+    pytest.importorskip("mitsuba", reason="Mitsuba is not installed: ./verso extra pathtraced")
+    errors, outwards = corners_of(made(**NEAR, tier="pathtraced", **settings))
+    assert len(errors) >= 60
+    assert np.abs(errors.mean(axis=0)).max() < 0.03
+    assert abs(np.median(outwards)) < 0.03
+    assert np.median(np.abs(errors)) < 0.06
+
+
+@pytest.mark.parametrize("tier", ["raster", pytest.param("pathtraced", marks=pytest.mark.slow)])
+def test_opencvs_detector_finds_the_corners_of_both_tiers(tier):
+    """Its corners lie a little inside the true ones (edge_corners.py), so their mean over all markers is what must be 0."""
+    if tier == "pathtraced":
+        pytest.importorskip("mitsuba", reason="Mitsuba is not installed: ./verso extra pathtraced")
+    capture = made(**NEAR, tier=tier)
+    errors = detected_errors(capture, 0)
+    assert len(errors) >= 60
+    assert np.abs(errors.mean(axis=0)).max() < 0.05
+    assert np.median(np.abs(errors)) < 0.3
