@@ -12,7 +12,7 @@ WIDTH, HEIGHT = 320, 180
 def scene(seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     coarse = cv2.resize(rng.integers(0, 256, (5, 30)).astype(np.uint8), (2400, 400), interpolation=cv2.INTER_CUBIC)
-    return cv2.addWeighted(coarse, 0.8, rng.integers(0, 256, coarse.shape).astype(np.uint8), 0.2, 0)
+    return (0.8 * coarse + 0.2 * rng.integers(0, 256, coarse.shape)).astype(np.uint8)
 
 
 def filmed(seed: int, places: np.ndarray, blurred: np.ndarray) -> list[FrameMeasure]:
