@@ -19,12 +19,14 @@ def filmed(seed: int, places: np.ndarray, blurred: np.ndarray) -> list[FrameMeas
     """Frames at horizontal places, pixels of the scene."""
     whole = scene(seed)
     rng = np.random.default_rng(seed + 100)
+    noise = rng.normal(0, 2, (2 * HEIGHT, WIDTH))
     made = []
     for place, is_blurred in zip(places, blurred, strict=True):
         frame = whole[100 : 100 + HEIGHT, int(place) : int(place) + WIDTH]
         if is_blurred:
             frame = cv2.blur(frame, (9, 1))
-        noisy = np.clip(frame + rng.normal(0, 2, frame.shape), 0, 255).astype(np.uint8)
+        start = rng.integers(HEIGHT)  # sensor noise, other in each frame
+        noisy = np.clip(frame + noise[start : start + HEIGHT], 0, 255).astype(np.uint8)
         made.append(measure_frame(noisy))
     return made
 
