@@ -12,19 +12,21 @@ WIDTH, HEIGHT = 320, 180
 def scene(seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     coarse = cv2.resize(rng.integers(0, 256, (5, 30)).astype(np.uint8), (2400, 400), interpolation=cv2.INTER_CUBIC)
-    return cv2.addWeighted(coarse, 0.8, rng.integers(0, 256, coarse.shape).astype(np.uint8), 0.2, 0)
+    return (0.8 * coarse + 0.2 * rng.integers(0, 256, coarse.shape)).astype(np.uint8)
 
 
 def filmed(seed: int, places: np.ndarray, blurred: np.ndarray) -> list[FrameMeasure]:
     """Frames at horizontal places, pixels of the scene."""
     whole = scene(seed)
     rng = np.random.default_rng(seed + 100)
+    noise = rng.normal(0, 2, (2 * HEIGHT, WIDTH))
     made = []
     for place, is_blurred in zip(places, blurred, strict=True):
         frame = whole[100 : 100 + HEIGHT, int(place) : int(place) + WIDTH]
         if is_blurred:
             frame = cv2.blur(frame, (9, 1))
-        noisy = np.clip(frame + rng.normal(0, 2, frame.shape), 0, 255).astype(np.uint8)
+        start = rng.integers(HEIGHT)  # sensor noise, other in each frame
+        noisy = np.clip(frame + noise[start : start + HEIGHT], 0, 255).astype(np.uint8)
         made.append(measure_frame(noisy))
     return made
 

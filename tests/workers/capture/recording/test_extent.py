@@ -1,5 +1,7 @@
 """What a file says about its own length, against files that were written whole."""
 
+from typing import Any
+
 import pytest
 
 from tests.workers.capture.recording.matroska import Track, element, write_recording
@@ -8,7 +10,7 @@ from workers.capture.recording.extent import Extent, read_extent
 FRAMES = [(i * 33_333, bytes(100)) for i in range(10)]
 
 
-def written(**settings: object) -> bytes:
+def written(**settings: Any) -> bytes:
     return write_recording([Track("COLOR", 1280, 720, b"MJPG", FRAMES)], b"{}", {}, **settings)
 
 

@@ -43,6 +43,19 @@ def test_jpeg_frames_may_be_padded_and_other_bytes_are_none():
     assert decode_color(data, "MJPG", (48, 64)) is None, "another size than the track's"
 
 
+def test_motion_jpeg_without_huffman_tables_is_read():
+    """Cameras leave the standard tables out (segments DHT, 0xFFC4), as AVI's MJPG allows."""
+    data = color_bytes(SMOOTH, "MJPG")
+    at, bare = 2, data[:2]
+    while data[at + 1] != 0xDA:
+        length = 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        bare += b"" if data[at + 1] == 0xC4 else data[at : at + length]
+        at += length
+    bare += data[at:]
+    assert len(bare) < len(data)
+    assert np.array_equal(decode_color(bare, "MJPG", SIZE), decode_color(data, "MJPG", SIZE))
+
+
 def test_depth_is_big_endian():
     data = bytes([0x01, 0x02, 0xFF, 0x00, 0x00, 0x07])
     assert decode_depth(data, (3, 1)).tolist() == [[0x0102, 0xFF00, 7]]
