@@ -31,7 +31,7 @@ from workers.pipeline.captures.import_recording import Imported, import_recordin
 from workers.store.capture_folder import CaptureFile, open_folder, read_view
 
 COUNT = 6
-DEPTH_MM = 1.6
+DEPTH_MM = 1.3
 """Millimetres of the recording and of the folder, each rounded, on a steep table."""
 
 Make = Callable[[], bytes]
