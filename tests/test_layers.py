@@ -9,10 +9,21 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = (
-    *("schemas", *(f"schemas/{name}" for name in ("dataset", "job", "scene"))),
-    *("services", *(f"services/{name}" for name in ("bench", "cli", "job", "merge", "read", "run", "study"))),
+    *("schemas", *(f"schemas/{name}" for name in ("capture", "dataset", "job", "scene"))),
+    *(
+        "services",
+        *(f"services/{name}" for name in ("bench", "capture", "cli", "job", "merge", "read", "run", "study")),
+    ),
     "services/read/independent",
-    *("workers", "workers/assets", "workers/cameras", "workers/geometry", "workers/labels", "workers/physics"),
+    *(
+        "workers",
+        "workers/assets",
+        "workers/cameras",
+        "workers/capture",
+        "workers/geometry",
+        "workers/labels",
+        "workers/physics",
+    ),
     *("workers/pipeline", "workers/plan", "workers/render", "workers/render/raster", "workers/sensor", "workers/store"),
 )
 FILES = (
@@ -59,6 +70,9 @@ def lint(project: Path, imports: dict[str, str]) -> subprocess.CompletedProcess[
         ("workers/store/images.py", "OpenGL.GL", "OpenGL stays in its room"),
         ("services/read/report.py", "pyrender", "OpenGL stays in its room"),
         ("workers/render/step.py", "mitsuba", "Mitsuba stays in one file"),
+        ("workers/capture/fuse.py", "skimage.measure", "each known to one file"),
+        ("services/capture/board.py", "reportlab.pdfgen", "each known to one file"),
+        ("schemas/capture/thing.py", "schemas.dataset.thing", "schemas: what is stored"),
     ],
 )
 def test_a_forbidden_import_is_found(tmp_path, file, module, rule):

@@ -75,7 +75,7 @@ def test_the_depth_camera_stands_where_the_correction_puts_it():
 
 
 def test_a_view_without_depth_is_refused():
-    with pytest.raises(CaptureError, match="depth_00007.png is missing"):
+    with pytest.raises(CaptureError, match=r"depth_00007\.png is missing"):
         pose_view(
             CapturedView(7, blobs([(5, 6)]), None, None), CaptureCamera(K, np.zeros(8)), np.eye(4), DepthCorrection()
         )
