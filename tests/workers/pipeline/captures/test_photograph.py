@@ -46,7 +46,9 @@ def detected_errors(rgb, camera, T_board_cam):
     return errors[np.abs(errors).max(axis=1) < 2.0]
 
 
-@pytest.mark.parametrize("settings", [{}, {"distortion": LENS}, {"motion_blur": {}}, {"rgb_noise": {}}])
+@pytest.mark.parametrize(
+    "settings", [{}, {"seed": 12}, {"seed": 13}, {"distortion": LENS}, {"motion_blur": {}}, {"rgb_noise": {}}]
+)
 def test_corners_lie_where_opencv_projects_them(settings):
     """A pixel convention off by half a pixel would show as 0.5; a blur to one side or uneven samples as some hundredths."""
     errors, outwards = corners_of(made(**NEAR, **settings))
