@@ -37,7 +37,7 @@ def refine_corners(gray: NDArray[np.uint8], corners_px: Array, bits: int) -> Arr
     refined = np.array(corners_px, dtype=np.float64)
     if not len(refined):
         return refined
-    light = cv2.LUT(gray, LINEAR)
+    light = LINEAR[gray]
     sides = np.linalg.norm(np.roll(refined, -1, axis=1) - refined, axis=2).min(axis=1)
     half_px = np.clip(0.7 * sides / bits, MIN_HALF_PX, MAX_HALF_PX)
     for turn in range(ROUNDS):
