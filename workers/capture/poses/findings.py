@@ -48,7 +48,7 @@ def noise_notes(joint: Joint, views: Views) -> list[str]:
             growth = patches.ray_z[:, 2] ** 2 if what == "the board" else np.hypot(*_squares(term))
             notes.append(
                 f"depth of {what}: sigma of a patch {1000 * float(np.median(term.sigma_m / growth)):.2f} mm at 1 m, "
-                f"variance inflated {term.inflation:.1f} times because patches of a view err alike"
+                f"variance inflated {float(np.median(term.inflation)):.1f} times because patches of a view err alike"
             )
     if joint.board is None and joint.surface is None:
         notes.append("no depth on the board or the object: the joint estimate has corners alone")

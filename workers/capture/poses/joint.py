@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.job.captures import Estimation
 from workers.capture.poses.matches import Matches, match_patches
-from workers.capture.poses.noise import inflation, patch_sigma
+from workers.capture.poses.noise import inflation, patch_sigma, row_inflation
 from workers.capture.poses.observation import Observation, Patches
 from workers.capture.poses.rows import POSE, SHARED
 from workers.capture.poses.shared import Shared, prior_sigma
@@ -68,7 +68,7 @@ def solve_jointly(views: Views, spec: Estimation) -> Joint:
     corners, held = views.corner_term(), np.ones(len(views.poses), bool)
     shared, board = Shared(), None
     if len(on_board):
-        board = BoardTerm(board_view, on_board, spec.depth_sigma_m * on_board.ray_z[:, 2] ** 2, 1.0)
+        board = BoardTerm(board_view, on_board, spec.depth_sigma_m * on_board.ray_z[:, 2] ** 2, np.ones(len(on_board)))
         start = Problem([corners, board] if spec.trust == "depth" else [board], prior, held)
         if spec.trust == "depth":  # a print of another size moves the cameras: they must be free
             start = dataclasses.replace(start, fixed=views.fixed)
@@ -77,7 +77,7 @@ def solve_jointly(views: Views, spec: Estimation) -> Joint:
         board = _measured_board(board, views, first)
     terms: list[Term] = [corners, *([board] if board else [])]
     solution = minimise(Problem(terms, prior, views.fixed), views.poses, shared, spec.max_iterations)
-    surface, iterations = None, solution.iterations
+    surface, iterations, alike = None, solution.iterations, 1.0
     for _ in range(ROUNDS if len(on_object) else 0):
         if iterations >= spec.max_iterations:
             break
@@ -86,8 +86,8 @@ def solve_jointly(views: Views, spec: Estimation) -> Joint:
         if measured is None:
             break
         # Poses that have followed the object's depth no longer show how far it had pulled them: the first rounds tell.
-        most = max(measured.inflation, surface.inflation if surface else 1.0)
-        surface = dataclasses.replace(measured, inflation=most)
+        alike = max(alike, measured[1])
+        surface = _weighed(measured[0], alike)
         problem = Problem([*terms, surface], prior, views.fixed)
         before = solution
         solution = minimise(problem, before.poses, before.shared, spec.max_iterations - iterations)
@@ -117,7 +117,7 @@ def _measured_board(term: BoardTerm, views: Views, found: Solution) -> BoardTerm
     by_plane = np.where(np.isfinite(by_plane), by_plane, 0.0)
     covariance = _plane_covariance(views, found.poses)
     factor = inflation(rows.residual[chosen], by_plane[chosen], term.view[chosen], covariance)
-    return dataclasses.replace(term, sigma_m=sigma_m, inflation=factor)
+    return dataclasses.replace(term, sigma_m=sigma_m, inflation=row_inflation(factor, sigma_m, term.view))
 
 
 def _plane_covariance(views: Views, poses: Array) -> Array:
@@ -130,13 +130,13 @@ def _plane_covariance(views: Views, poses: Array) -> Array:
 
 def _measured_object(
     patches: Patches, view: NDArray[np.int64], matches: Matches, views: Views, found: Solution
-) -> ObjectTerm | None:
-    """The term of the pairs, weighed by their own residuals; None where there are none."""
+) -> tuple[ObjectTerm, float] | None:
+    """(the term of the pairs with their sigma by their own residuals, inflation); None where there are none."""
     if not len(matches.pairs):
         return None
     a, b = matches.pairs.T
     growth = np.hypot(patches.ray_z[a, 2] ** 2, patches.ray_z[b, 2] ** 2)
-    term = ObjectTerm(view, patches, matches.pairs, matches.normal, growth, 1.0)
+    term = ObjectTerm(view, patches, matches.pairs, matches.normal, growth, np.ones(len(growth)))
     residual = term.rows(found.poses, found.shared).residual
     chosen = views.sure()[view[a]] & views.sure()[view[b]]
     chosen = chosen if chosen.any() else np.ones_like(chosen)
@@ -148,4 +148,9 @@ def _measured_object(
     covariance = found.covariance()[:-SHARED, :-SHARED].reshape(len(views.poses), POSE, -1, POSE)
     own = covariance[range(len(views.poses)), :, range(len(views.poses))]
     factor = inflation(np.tile(rows.residual[chosen], 2), by, both, own)
-    return dataclasses.replace(term, sigma_m=sigma_m, inflation=factor)
+    return dataclasses.replace(term, sigma_m=sigma_m), factor
+
+
+def _weighed(term: ObjectTerm, factor: float) -> ObjectTerm:
+    a, b = term.view[term.pairs].T
+    return dataclasses.replace(term, inflation=row_inflation(factor, term.sigma_m, a, b))

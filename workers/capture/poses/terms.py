@@ -50,12 +50,12 @@ class CornerTerm:
 
 @dataclass(frozen=True, eq=False)
 class BoardTerm:
-    """Depth of the board: patches of all views lie on its plane. view [P]; sigma_m [P]; inflation of their variance."""
+    """Depth of the board: patches of all views lie on its plane. view, sigma_m, inflation of their variance: each [P]."""
 
     view: NDArray[np.int64]
     patches: Patches
     sigma_m: Array
-    inflation: float
+    inflation: Array
 
     def rows(self, poses: Array, shared: Shared) -> Rows:
         """One row a patch: its height over the board."""
@@ -65,9 +65,8 @@ class BoardTerm:
         by_point = up / sigma_m[:, None]
         by_shared = np.einsum("pi,pij->pj", by_point, shared.derivative(self.patches))
         by_shared[:, DEPTH_SCALE] -= residual / shared.scale
-        weight, cost = robust(residual**2)
-        by_pose = by_motion(by_point, p)
-        return _of_one_view(residual, self.view, by_pose, by_shared, weight / self.inflation, cost / self.inflation)
+        weight, cost = robust(residual**2, 1.0 / self.inflation)
+        return _of_one_view(residual, self.view, by_motion(by_point, p), by_shared, weight, cost)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +78,7 @@ class ObjectTerm:
     pairs: NDArray[np.int64]
     normal: Array
     sigma_m: Array
-    inflation: float
+    inflation: Array
 
     def rows(self, poses: Array, shared: Shared) -> Rows:
         """One row a pair: the distance between the two along their common normal."""
@@ -93,11 +92,9 @@ class ObjectTerm:
         along_a, along_b = (np.einsum("nji,nj->ni", R[index], unit) for index in (a, b))
         by_shared = np.einsum("ni,nij->nj", along_a, by[a]) - np.einsum("ni,nij->nj", along_b, by[b])
         by_shared[:, DEPTH_SCALE] -= residual / shared.scale
-        weight, cost = robust(residual**2)
-        return Rows(
-            residual, self.view[a], by_motion(along_a, p[a]), self.view[b], -by_motion(along_b, p[b]), by_shared,
-            weight / self.inflation, cost / self.inflation,
-        )  # fmt: skip
+        weight, cost = robust(residual**2, 1.0 / self.inflation)
+        by_a, by_b = by_motion(along_a, p[a]), -by_motion(along_b, p[b])
+        return Rows(residual, self.view[a], by_a, self.view[b], by_b, by_shared, weight, cost)
 
 
 def by_motion(along: Array, points: Array) -> Array:
@@ -105,9 +102,9 @@ def by_motion(along: Array, points: Array) -> Array:
     return np.concatenate([along, np.cross(points, along)], axis=1)
 
 
-def robust(squares: Array) -> tuple[Array, float]:
-    """(weights, cost) of Cauchy's loss for squared residuals in sigma."""
-    return 1.0 / (1.0 + squares / ROBUST**2), float((ROBUST**2 * np.log1p(squares / ROBUST**2)).sum())
+def robust(squares: Array, times: Array | float = 1.0) -> tuple[Array, float]:
+    """(weights, cost) of Cauchy's loss for squared residuals in sigma, each `times` a constant weight."""
+    return times / (1.0 + squares / ROBUST**2), float((times * ROBUST**2 * np.log1p(squares / ROBUST**2)).sum())
 
 
 def _of_one_view(
