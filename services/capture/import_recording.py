@@ -2,27 +2,34 @@
 
 import argparse
 import json
-import re
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import ValidationError
 
 from schemas.errors import InputError, OutputError
 from schemas.job.captures import Board
 
+if TYPE_CHECKING:
+    from workers.store.capture_folder import CaptureFile
+
 
 def import_recording(options: argparse.Namespace) -> int:
-    """Reads options.recording, `out`, `views`, `board` (a path or None), `category` and `json`. Returns 0."""
+    """Reads options.recording, `out`, `frames`, `board` (a path or None), `name`, `category` and `json`. Returns 0.
+
+    Raises InputError and OutputError for what cannot be, CaptureError for a recording that cannot be used.
+    """
     from workers.capture.recording.pairs import describe_losses
     from workers.pipeline.captures import import_recording as work
-    from workers.store.capture_folder import CaptureFile, read_board
+    from workers.store.capture_folder import read_board
 
     recording, out = Path(options.recording), Path(options.out)
+    about = _describe(options.name, options.category, out)
     board = read_board(Path(options.board)) if options.board else Board()
     if not recording.is_file():
         raise InputError(f"{recording}: no such file")
-    name = re.sub(r"[^A-Za-z0-9._-]+", "_", recording.stem).lstrip("._-")[:64] or "recording"
-    about = CaptureFile(name=name, category=options.category)
-    made = work.import_recording(recording, _make_empty(out), about, board, options.views)
+    made = work.import_recording(recording, _make_empty(out), about, board, options.frames)
     notes = describe_losses(made.losses)
     print(
         f"{out}: {len(made.views)} views of {made.frames} frames, depth registered by the recording's own calibration"
@@ -34,6 +41,18 @@ def import_recording(options: argparse.Namespace) -> int:
         told = {"ok": True, "out": str(out), "frames": made.frames, "notes": notes, "default_board": not options.board}
         print(json.dumps({**told, "losses": asdict(made.losses), "views": [asdict(view) for view in made.views]}))
     return 0
+
+
+def _describe(name: str | None, category: str, out: Path) -> "CaptureFile":
+    from workers.store.capture_folder import CaptureFile, derive_name
+
+    try:
+        return CaptureFile(name=name or derive_name(out.resolve().name), category=category)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(
+            f"--{first['loc'][0]} {first['input']!r}: letters, digits, - and _ only, at most 64"
+        ) from error
 
 
 def _make_empty(out: Path) -> Path:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.base import Array
 from schemas.scene.camera import Intrinsics
 from workers.geometry.jit import compiled
 
@@ -19,12 +20,16 @@ REACH = 2
 STRIDE_FOCAL_PX = 456.0
 """Focal length at which neighbouring samples are one pixel apart: two pixels at the Azure Kinect's 912, about a depth pixel."""
 
-GATE = 0.012
-"""A sample that is farther from the middle one than this share of its depth belongs to another surface: ten times the noise
-of a depth pixel, and a slope of 70 degrees across the neighbourhood."""
+WIDE = 0.035
+"""A sample that is farther from the middle one than this share of its depth belongs to another surface: a slope of 80 degrees
+across the neighbourhood."""
 
-LEAST_SHARE = 0.6
-"""A pixel with fewer samples of its own surface lies on an edge, where depth mixes two surfaces: it is left out."""
+GATE = 0.008
+"""A sample that is farther from the first fit than this share of its depth, over the cosine of incidence, belongs to another
+surface: 6 mm at 0.8 m, three times the noise of a depth pixel that has twice the noise of an Azure Kinect."""
+
+LEAST_SHARE = 0.44
+"""A pixel with fewer samples on its own surface, 11 of 25, is a speck or between two surfaces: it is left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +69,12 @@ def _fit(
     inverse: NDArray[np.float32],
     facing: NDArray[np.float32],
 ) -> None:
-    """Least squares of 1/z = a + b du + c dv by Cramer's rule about the mean of the samples."""
+    """Two fits of 1/z = a + b du + c dv: to the samples at about the pixel's depth, then to those near the first plane."""
     height, width = depth_m.shape
-    least = int(np.ceil(LEAST_SHARE * (2 * REACH + 1) ** 2))
+    side = 2 * REACH + 1
+    least = int(np.ceil(LEAST_SHARE * side * side))
+    q, at_x, at_y = np.empty(side * side), np.empty(side * side), np.empty(side * side)
+    plane = np.empty(3)
     for at_row in range(inverse.shape[0]):
         row = at_row + corner[0]
         ray_y = (row + 0.5 - k[3]) / k[1]
@@ -75,43 +83,65 @@ def _fit(
             z0 = depth_m[row, column]
             if not z0 > 0.0:
                 continue
-            low, high = z0 * (1.0 - GATE), z0 * (1.0 + GATE)
             n = 0
-            sx = sy = sxx = sxy = syy = sq = sxq = syq = 0.0
             for i in range(-REACH, REACH + 1):
                 y = row + i * stride
-                if y < 0 or y >= height:
-                    continue
                 for j in range(-REACH, REACH + 1):
                     x = column + j * stride
-                    if x < 0 or x >= width:
-                        continue
-                    z = depth_m[y, x]
-                    if low < z < high:
-                        q = 1.0 / z
-                        n += 1
-                        sx += j
-                        sy += i
-                        sxx += j * j
-                        sxy += i * j
-                        syy += i * i
-                        sq += q
-                        sxq += j * q
-                        syq += i * q
-            if n < least:
+                    if 0 <= y < height and 0 <= x < width:
+                        z = depth_m[y, x]
+                        if z0 * (1.0 - WIDE) < z < z0 * (1.0 + WIDE):
+                            q[n], at_x[n], at_y[n] = 1.0 / z, j, i
+                            n += 1
+            if n < least or not _solve(q, at_x, at_y, n, plane):
                 continue
-            mx, my, mq = sx / n, sy / n, sq / n
-            cxx, cyy, cxy = sxx - sx * mx, syy - sy * my, sxy - sx * my
-            cxq, cyq = sxq - sx * mq, syq - sy * mq
-            area = cxx * cyy - cxy * cxy
-            if not area > 0.0:
-                continue
-            b, c = (cxq * cyy - cyq * cxy) / area, (cyq * cxx - cxq * cxy) / area
-            q = mq - b * mx - c * my
             ray_x = (column + 0.5 - k[2]) / k[0]
-            A, B = b / stride * k[0], c / stride * k[1]
-            C = q - A * ray_x - B * ray_y
-            slope = q / np.sqrt(A * A + B * B + C * C)
-            if q > 0.0 and slope >= least_cos * np.sqrt(1.0 + ray_x * ray_x + ray_y * ray_y):
-                inverse[at_row, at_column] = q
+            ray = np.sqrt(1.0 + ray_x * ray_x + ray_y * ray_y)
+            slope = _facing(plane, stride, k, ray_x, ray_y)
+            # dz = z^2 dq, so a share of the depth is the same share of its inverse.
+            gate = min(GATE * ray / slope, WIDE) * plane[0]
+            kept = 0
+            for i in range(n):
+                if abs(q[i] - plane[0] - plane[1] * at_x[i] - plane[2] * at_y[i]) < gate:
+                    q[kept], at_x[kept], at_y[kept] = q[i], at_x[i], at_y[i]
+                    kept += 1
+            if kept < least or not _solve(q, at_x, at_y, kept, plane):
+                continue
+            slope = _facing(plane, stride, k, ray_x, ray_y)
+            if slope >= least_cos * ray and abs(1.0 / z0 - plane[0]) < gate:
+                inverse[at_row, at_column] = plane[0]
                 facing[at_row, at_column] = slope
+
+
+@compiled
+def _solve(q: Array, x: Array, y: Array, n: int, plane: Array) -> bool:
+    """Least squares of q = plane . (1, x, y) by Cramer's rule about the means; False where the samples lie in a line."""
+    mx = my = mq = 0.0
+    for i in range(n):
+        mx += x[i]
+        my += y[i]
+        mq += q[i]
+    mx, my, mq = mx / n, my / n, mq / n
+    cxx = cyy = cxy = cxq = cyq = 0.0
+    for i in range(n):
+        dx, dy, dq = x[i] - mx, y[i] - my, q[i] - mq
+        cxx += dx * dx
+        cyy += dy * dy
+        cxy += dx * dy
+        cxq += dx * dq
+        cyq += dy * dq
+    area = cxx * cyy - cxy * cxy
+    if not area > 1e-9:
+        return False
+    plane[1] = (cxq * cyy - cyq * cxy) / area
+    plane[2] = (cyq * cxx - cxq * cxy) / area
+    plane[0] = mq - plane[1] * mx - plane[2] * my
+    return bool(plane[0] > 0.0)
+
+
+@compiled
+def _facing(plane: Array, stride: int, k: tuple[float, float, float, float], ray_x: float, ray_y: float) -> float:
+    """Cosine of incidence times the ray's length: the plane is A x + B y + C z = 1 in camera coordinates."""
+    A, B = plane[1] / stride * k[0], plane[2] / stride * k[1]
+    C = plane[0] - A * ray_x - B * ray_y
+    return float(plane[0] / np.sqrt(A * A + B * B + C * C))

@@ -17,7 +17,7 @@ from workers.capture.mesh import cut_below, extract_surface, keep_vertices, larg
 from workers.capture.object_region import ObjectRegion
 from workers.capture.posed_view import PosedView
 from workers.capture.surface import Sight, color_points, measure_offsets
-from workers.capture.tsdf import FRONT_VOXELS, empty_volume, integrate
+from workers.capture.tsdf import FRONT_VOXELS, empty_volume, integrate, views_near
 from workers.geometry.camera import project_bounds
 from workers.geometry.frames import invert, transform
 
@@ -74,7 +74,8 @@ def fuse_views(
     for sight in sights:
         integrate(volume, sight.fitted, sight.view.depth_camera)
     within_m = FRONT_VOXELS * spec.voxel_m
-    mesh = _confirm(extract_surface(volume), sights, within_m, spec.min_views)
+    mesh = extract_surface(volume)
+    mesh, _ = keep_vertices(mesh, views_near(volume, mesh.vertices) >= spec.min_views)
     mesh = _settle(mesh, sights, within_m)
     mesh = _clean(cut_below(mesh, region.plane, region.clearance_m), region)
     if not len(mesh.faces):
@@ -84,7 +85,7 @@ def fuse_views(
             "object has no depth (shiny, black or transparent)",
         )
     normals = vertex_normals(mesh)
-    count = measure_offsets(mesh.vertices, normals, sights, within_m).views
+    count = views_near(volume, mesh.vertices)
     colors = color_points(mesh.vertices, normals, sights, within_m)
     sure = count >= spec.min_views
     return Reconstruction(
@@ -97,14 +98,6 @@ def fuse_views(
         vertex_colors=colors,
         seconds=dict(seconds or {}),
     )
-
-
-def _confirm(mesh: Mesh, sights: Sequence[Sight], within_m: float, min_views: int) -> Mesh:
-    """What enough views see."""
-    if not len(mesh.faces):
-        return mesh
-    seen = measure_offsets(mesh.vertices, vertex_normals(mesh), sights, within_m).views
-    return keep_vertices(mesh, seen >= min_views)[0]
 
 
 def _settle(mesh: Mesh, sights: Sequence[Sight], within_m: float) -> Mesh:

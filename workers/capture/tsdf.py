@@ -24,21 +24,32 @@ BACK_VOXELS = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Voxel centres at origin + voxel_m * (i, j, k), board frame; distance_m and weight [X, Y, Z] float32.
+    """Voxel centres at origin + voxel_m * (i, j, k), board frame; distance_m and weight [X, Y, Z] float32, near [X, Y, Z] uint16.
 
-    distance_m is positive outside; weight is 0 where no view has seen the voxel.
+    distance_m is positive outside; weight is 0 where no view has seen the voxel; near: views that have a surface this side of
+    either end of the truncation.
     """
 
     origin: Array
     voxel_m: float
     distance_m: NDArray[np.float32]
     weight: NDArray[np.float32]
+    near: NDArray[np.uint16]
 
 
 def empty_volume(low: Array, high: Array, voxel_m: float) -> Volume:
     """A volume without views that reaches from corner to corner, board frame, metres."""
     shape = np.maximum(np.ceil((high - low) / voxel_m).astype(np.int64) + 1, 2)
-    return Volume(np.array(low), voxel_m, np.zeros(shape, np.float32), np.zeros(shape, np.float32))
+    distance_m, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    return Volume(np.array(low), voxel_m, distance_m, weight, np.zeros(shape, np.uint16))
+
+
+def views_near(volume: Volume, points: Array) -> NDArray[np.int32]:
+    """[N] views that have a surface near points [N, 3] on the edges between voxels: the more of an edge's two ends."""
+    at = (points - volume.origin) / volume.voxel_m
+    last = np.array(volume.near.shape) - 1
+    ends = [np.clip(turn(at).astype(np.int64), 0, last) for turn in (np.floor, np.ceil)]
+    return np.maximum(*(volume.near[end[:, 0], end[:, 1], end[:, 2]] for end in ends)).astype(np.int32)
 
 
 def integrate(volume: Volume, fitted: FittedDepth, camera: Camera) -> None:
@@ -47,6 +58,7 @@ def integrate(volume: Volume, fitted: FittedDepth, camera: Camera) -> None:
     _integrate(
         volume.distance_m,
         volume.weight,
+        volume.near,
         volume.origin,
         volume.voxel_m,
         invert(camera.T_world_cam),
@@ -83,6 +95,7 @@ def sample_inverse(inverse: NDArray[np.float32], x: float, y: float) -> float:
 def _integrate(
     distance_m: NDArray[np.float32],
     weight: NDArray[np.float32],
+    near: NDArray[np.uint16],
     origin: Array,
     voxel_m: float,
     T: Array,
@@ -119,5 +132,7 @@ def _integrate(
                 total = weight[i, j, n] + w
                 if s > front:
                     s = front
+                else:
+                    near[i, j, n] += 1
                 distance_m[i, j, n] = (distance_m[i, j, n] * weight[i, j, n] + s * w) / total
                 weight[i, j, n] = total

@@ -24,6 +24,7 @@ class Stream(IntEnum):
     COUNT = 12
     HIDDEN_MARKERS = 13
     MOTION = 14
+    HELD_OUT = 15
 
 
 @dataclass(frozen=True)

@@ -70,16 +70,24 @@ def open_folder(path: Path) -> CaptureFolder:
     """Reads what describes a capture; images are read one view at a time. Raises CaptureError that names file and remedy."""
     if not path.is_dir():
         raise CaptureError("missing", f"{path} is no folder")
-    numbers = sorted(int(match[1]) for file in path.iterdir() if (match := _RGB.fullmatch(file.name)))
+    found = (match[1] for file in path.iterdir() if (match := _RGB.fullmatch(file.name)))
+    numbers = sorted(int(digits) for digits in found if digits == f"{int(digits):05d}")
     if not numbers:
         raise CaptureError(
             "missing", f"{path} has no rgb_00000.png: images are named rgb_, depth_ and mask_ with a number"
         )
     spec = _read_json(path / CAMERA_FILE, CameraFile)
     about = (
-        _read_json(path / CAPTURE_FILE, CaptureFile) if (path / CAPTURE_FILE).exists() else CaptureFile(name=path.name)
+        _read_json(path / CAPTURE_FILE, CaptureFile)
+        if (path / CAPTURE_FILE).exists()
+        else CaptureFile(name=derive_name(path.resolve().name))
     )
     return CaptureFolder(path, about, _camera(spec), _read_json(path / BOARD_FILE, Board), tuple(numbers))
+
+
+def derive_name(words: str) -> str:
+    """A name for capture.json from any words: what a name cannot have becomes `_`."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", words).lstrip("._-")[:64] or "capture"
 
 
 def read_board(path: Path) -> Board:
@@ -135,7 +143,12 @@ def read_pose(path: Path) -> Pose | None:
 
 def write_pose(path: Path, T: Pose) -> None:
     """Writes 4 lines of 4 numbers that read back to the same doubles."""
-    path.write_text("\n".join(" ".join(repr(float(x)) for x in row) for row in T) + "\n", encoding="utf-8")
+    path.write_text(pose_text(T), encoding="utf-8")
+
+
+def pose_text(T: Pose) -> str:
+    """4 lines of 4 numbers that read back to the same doubles."""
+    return "\n".join(" ".join(repr(float(x)) for x in row) for row in T) + "\n"
 
 
 def _is_rigid(T: Pose) -> bool:

@@ -21,7 +21,7 @@ from schemas.job.sensor import Distortion
 from workers.store.capture_folder import TRUTH
 from workers.store.images import encode_png
 
-TRUTH_FILE, MESH_FILE = "truth.json", "mesh.glb"
+TRUTH_FILE, MESH_FILE, HELD_OUT = "truth.json", "mesh.glb", "held_out"
 
 
 @dataclass(frozen=True, eq=False)

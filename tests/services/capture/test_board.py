@@ -3,6 +3,7 @@
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,7 +11,7 @@ from schemas.errors import CaptureError, InputError, OutputError
 from services.capture.board import board
 
 
-def options(path: Path, **changes: object) -> argparse.Namespace:
+def options(path: Path, **changes: Any) -> argparse.Namespace:
     return argparse.Namespace(**{"file": path, "board": None, "tiles": None, "dpi": 100.0, "json": False} | changes)
 
 

@@ -8,6 +8,7 @@ from schemas.job.captures import Board
 from schemas.scene.camera import Intrinsics
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import invert, rotation_about
+from workers.geometry.srgb import encode_srgb
 
 KINECT = Intrinsics(width=1920, height=1080, fx=912.37, fy=912.25, cx=961.94, cy=548.79)
 HALF = Intrinsics(width=960, height=540, fx=456.185, fy=456.125, cx=480.97, cy=274.395)
@@ -48,9 +49,17 @@ def homography(T_board_cam: Pose, k: Intrinsics) -> Array:
 
 
 def photograph(
-    board: Board, T_board_cam: Pose, k: Intrinsics, rng: np.random.Generator, *, blur_px=0.6, noise=2.5, picture=None
+    board: Board,
+    T_board_cam: Pose,
+    k: Intrinsics,
+    rng: np.random.Generator,
+    *,
+    blur_px=0.6,
+    noise=2.5,
+    exposure=1.0,
+    picture=None,
 ) -> np.ndarray:
-    """[H, W, 3] uint8: the board on grey ground, four samples a pixel each way, lens blur and noise of the sensor."""
+    """[H, W, 3] uint8: the board on grey ground, four samples a pixel each way, lens blur in linear light, sRGB, noise."""
     picture, times = printed(board) if picture is None else picture, 4
     to_board = np.array([[1 / PX_PER_M, 0, -board.width_m / 2], [0, -1 / PX_PER_M, board.height_m / 2], [0, 0, 1]])
     from_edge = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV warps between pixel centres at integers
@@ -59,8 +68,9 @@ def photograph(
     large = cv2.warpPerspective(
         picture, H, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110
     )
-    gray = 30 + 0.75 * cv2.resize(large, (k.width, k.height), interpolation=cv2.INTER_AREA).astype(np.float32)
-    gray = cv2.GaussianBlur(gray, (0, 0), blur_px) + rng.normal(0, noise, gray.shape)
+    light = 0.03 + 0.57 * cv2.resize(large, (k.width, k.height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+    light = exposure * cv2.GaussianBlur(light, (0, 0), blur_px)
+    gray = 255 * encode_srgb(light) + rng.normal(0, noise, light.shape)
     return np.repeat(np.clip(np.rint(gray), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
 

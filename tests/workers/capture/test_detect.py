@@ -25,7 +25,7 @@ def test_corners_lie_where_a_homography_puts_them():
         assert len(found.ids) >= 33 and found.dropped == ()
         errors.append(errors_px(found, T, KINECT))
     errors = np.concatenate(errors)
-    assert np.sqrt((errors**2).mean()) < 0.06  # pixels an axis; OpenCV's cornerSubPix leaves 0.17 here
+    assert np.sqrt((errors**2).mean()) < 0.07  # pixels an axis; OpenCV's cornerSubPix leaves 0.44 here
     assert np.abs(errors.mean(axis=0)).max() < 0.01  # half a pixel of convention would show
 
 

@@ -2,6 +2,7 @@ import cv2
 import numpy as np
 
 from workers.capture.edges import refine_corners
+from workers.geometry.srgb import encode_srgb
 
 
 def square(corners, blur_px, exposure):
@@ -11,7 +12,8 @@ def square(corners, blur_px, exposure):
     for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         inside &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= 0
     white = 255.0 * (1 - inside.reshape(120, 8, 120, 8).mean((1, 3)))
-    return np.clip(20 + cv2.GaussianBlur(white, (0, 0), blur_px) * exposure, 0, 255).astype(np.uint8)
+    light = 0.02 + cv2.GaussianBlur(white / 255, (0, 0), blur_px) * exposure
+    return np.rint(255 * encode_srgb(light)).astype(np.uint8)
 
 
 def test_corners_of_a_drawn_square_are_found_to_a_few_hundredths_of_a_pixel():

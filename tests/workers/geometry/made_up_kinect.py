@@ -15,9 +15,8 @@ COLOR = Intrinsics(width=1920, height=1080, fx=912.37, fy=912.25, cx=961.94, cy=
 COLOR_LENS = frozen_array([0.52, -2.65, 0.0007, -0.0003, 1.55, 0.40, -2.47, 1.47])
 DEPTH = Intrinsics(width=640, height=576, fx=504.4, fy=504.5, cx=321.3, cy=337.9)
 DEPTH_LENS = frozen_array([2.91, 1.82, 0.00006, -0.00003, 0.093, 3.25, 2.79, 0.49])
-T_COLOR_DEPTH = frozen_array(
-    pose(rotation_about(np.array([0.9961, 0.0619, -0.0619]), np.radians(-6.2)), np.array([-0.0320, -0.0021, 0.0039]))
-)
+AXIS = np.array([0.9961, 0.0619, -0.0619]) / np.linalg.norm([0.9961, 0.0619, -0.0619])
+T_COLOR_DEPTH = frozen_array(pose(rotation_about(AXIS, np.radians(-6.2)), np.array([-0.0320, -0.0021, 0.0039])))
 CAMERA = DepthCamera(DEPTH, DEPTH_LENS, T_COLOR_DEPTH)
 
 

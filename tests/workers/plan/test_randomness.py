@@ -26,5 +26,5 @@ def test_stream_numbers_are_never_reused():
     assert {one.name: int(one) for one in Stream} == {
         "CATEGORY": 0, "OBJECT": 1, "TABLE": 2, "START": 3, "REDRAW": 4, "CAMERA": 5, "APPEARANCE": 6,
         "RAYCAST_CHECK": 7, "SENSOR_DEPTH": 8, "SENSOR_RGB": 9, "SENSOR_EXPOSURE": 10, "PATHS": 11, "COUNT": 12,
-        "HIDDEN_MARKERS": 13, "MOTION": 14,
+        "HIDDEN_MARKERS": 13, "MOTION": 14, "HELD_OUT": 15,
     }  # fmt: skip

@@ -145,7 +145,7 @@ def _measured_object(
     # Each pair tells of both of its views.
     both = np.concatenate([rows.first[chosen], rows.second[chosen]])
     by = np.concatenate([rows.by_first[chosen], rows.by_second[chosen]])
-    covariance = 2.0 * found.covariance()[:-SHARED, :-SHARED].reshape(len(views.poses), POSE, -1, POSE)
+    covariance = found.covariance()[:-SHARED, :-SHARED].reshape(len(views.poses), POSE, -1, POSE)
     own = covariance[range(len(views.poses)), :, range(len(views.poses))]
     factor = inflation(np.tile(rows.residual[chosen], 2), by, both, own)
     return dataclasses.replace(term, sigma_m=sigma_m, inflation=factor)

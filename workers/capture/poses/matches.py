@@ -44,6 +44,8 @@ def match_patches(patches: Patches, view: NDArray[np.int64], poses: Array, share
     found = np.isfinite(distance)
     neighbour = np.where(found, neighbour, 0)
     alike = np.einsum("pi,pki->pk", normals, normals[neighbour]) > MIN_COSINE
+    normals = _smoothed(normals, neighbour, found & alike)
+    alike = np.einsum("pi,pki->pk", normals, normals[neighbour]) > MIN_COSINE
     good = found & alike & (view[neighbour] != view[:, None])
     good &= np.cumsum(good, axis=1) <= PARTNERS
     first, column = np.nonzero(good)
@@ -51,3 +53,10 @@ def match_patches(patches: Patches, view: NDArray[np.int64], poses: Array, share
     pairs = np.unique(pairs, axis=0)
     normal = normals[pairs[:, 0]] + normals[pairs[:, 1]]
     return Matches(pairs, normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+def _smoothed(normals: Array, neighbour: NDArray[np.intp], chosen: NDArray[np.bool_]) -> Array:
+    """[P, 3]: the mean of the normals around each patch: the surface bends less over a patch than its noise."""
+    total = (normals[neighbour] * chosen[..., None]).sum(axis=1)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(length > 0.5, total / np.maximum(length, 1e-9), normals)

@@ -10,7 +10,7 @@ from workers.capture.poses.shared import Shared
 
 REACH_M = 0.05
 """Movements up to this are seen."""
-PER_VIEW = 50
+PER_VIEW = 25
 """Patches of a view that are looked at."""
 QUANTILE = 0.85
 """A slide along a face leaves that face where it was: the surfaces that disagree most tell."""

@@ -27,7 +27,8 @@ def inflation(residual: Array, by_view: Array, view: NDArray[np.int64], pose_cov
 
     residual [N] in sigma, by_view [N, k] derivatives by what a view's patches tell (k numbers), view [N] index;
     pose_covariance [V, k, k]: what is not known of each view beforehand, which makes residuals too. The misfit of a view,
-    g^T H^-1 g, is k on average where the patches are independent; the median over the views resists a bad one.
+    g^T H^-1 g, is k on average where the patches are independent; the median over the views resists a bad one. It is
+    squared: what errs alike within a view does so between views too, of which the misfit of single views shows nothing.
     """
     ratios = []
     for number in np.unique(view):
@@ -44,7 +45,7 @@ def inflation(residual: Array, by_view: Array, view: NDArray[np.int64], pose_cov
         ratios.append((misfit - known) / (rank * _median_of_chi_square(rank)))
     if len(ratios) < FEW_VIEWS:
         return INFLATION_OF_FEW
-    return max(1.0, float(np.median(ratios)))
+    return max(1.0, float(np.median(ratios))) ** 2
 
 
 def _median_of_chi_square(degrees: int) -> float:

@@ -13,8 +13,8 @@ from workers.geometry.frames import transform
 
 SIDE_RAD = 0.012
 """Width of a patch, seen from the camera: 10 mm at 0.8 m."""
-STEP_PX = 2
-"""Every second pixel is read: registered depth is coarser than colour."""
+ACROSS = 5
+"""Samples across a patch: registered depth is coarser than colour, and need not be read at every pixel."""
 CLEARANCE_M = 0.01
 TALLEST_M = 0.5
 """A patch lies so far above the board, as depth has the board."""
@@ -29,7 +29,7 @@ MOST = 200
 def object_patches(depth: NDArray[np.uint16], T_board_cam: Pose, on_board: Patches, setup: Setup) -> Patches:
     """The object's patches in one view, at most MOST; heights are over the board's plane as this view's depth has it."""
     board, camera = setup.board, setup.camera
-    side = max(3 * STEP_PX, round(SIDE_RAD * camera.intrinsics.fx / STEP_PX) * STEP_PX)
+    side = max(ACROSS, round(SIDE_RAD * camera.intrinsics.fx))
     blocks = _blocks_over_board(T_board_cam, board, camera, side)
     if not len(blocks):
         return sample_patches(depth, np.zeros((0, 1, 2), np.int64), camera)
@@ -41,7 +41,7 @@ def object_patches(depth: NDArray[np.uint16], T_board_cam: Pose, on_board: Patch
     points = np.column_stack([rays, np.ones(len(rays))]) * z[:, None]
     with np.errstate(invalid="ignore"):
         blocks = blocks[(z > 0) & (points @ normal - distance > CLEARANCE_M)]
-    reach = np.arange(0, side, STEP_PX)
+    reach = np.arange(0, side, side // ACROSS)
     offsets = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
     found = sample_patches(depth, blocks[:, None] + offsets, camera)
     keep = np.flatnonzero(_is_surface(found, normal, distance, setup.spec) & _over_board(found, T_board_cam, board))

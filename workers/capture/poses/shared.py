@@ -24,18 +24,21 @@ NAMES = (
     "print_scale",
 )
 """The shared parameters in the order in which they stand in every array of nine."""
+DEPTH_SCALE = NAMES.index("scale")
 PRINT_SCALE = NAMES.index("print_scale")
 
 OFFSET_M = 0.011
 SCALE = 0.001
 """The Azure Kinect's systematic error is below 11 mm + 0.1 % of the distance (Microsoft, Azure Kinect DK hardware
 specifications); taken as one sigma, because it is a bound for good conditions."""
-SCALE_BY_PRINT = 0.02
+SCALE_BY_PRINT = 0.5
+"""Nothing is known of the print's size where depth is metric truth."""
 """Sigma of the scale of depth where the print is metric truth: the scale then takes up the error of the print as well."""
 SHIFT_M = 0.010
 TURN_RAD = math.radians(0.5)
 """Registration: users report up to 1 to 2 cm between markers and depth."""
-PRINT = 0.02
+PRINT = 0.5
+"""Nothing is known of the print's size where depth is metric truth."""
 IDENTIFIED = 0.5
 """A parameter is identified by a capture that leaves it less than this share of its prior sigma."""
 

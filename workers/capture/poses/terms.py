@@ -1,6 +1,7 @@
 """The terms of the joint estimate as rows of residuals over sigma: corners, the board's depth, the object's depth.
 
-Each term is fixed data; its rows depend on the poses [V, 4, 4] (T_board_cam) and on the shared parameters.
+Each term is fixed data; its rows depend on the poses [V, 4, 4] (T_board_cam) and on the shared parameters. The sigma of
+depth grows with its scale: otherwise a smaller scale, which makes noise smaller, would always fit better.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from workers.capture.poses.motion import cross_matrix
 from workers.capture.poses.observation import Patches
 from workers.capture.poses.reprojection import derivative_of_projection
 from workers.capture.poses.rows import POSE, SHARED, Rows
-from workers.capture.poses.shared import PRINT_SCALE, Shared
+from workers.capture.poses.shared import DEPTH_SCALE, PRINT_SCALE, Shared
 
 ROBUST = 3.0
 """Cauchy's loss: a residual of three sigma has half the weight of a small one."""
@@ -58,11 +59,12 @@ class BoardTerm:
 
     def rows(self, poses: Array, shared: Shared) -> Rows:
         """One row a patch: its height over the board."""
-        p = shared.corrected(self.patches)
+        p, sigma_m = shared.corrected(self.patches), self.sigma_m * shared.scale
         up = poses[self.view, 2, :3]
-        residual = ((p * up).sum(axis=1) + poses[self.view, 2, 3]) / self.sigma_m
-        by_point = up / self.sigma_m[:, None]
+        residual = ((p * up).sum(axis=1) + poses[self.view, 2, 3]) / sigma_m
+        by_point = up / sigma_m[:, None]
         by_shared = np.einsum("pi,pij->pj", by_point, shared.derivative(self.patches))
+        by_shared[:, DEPTH_SCALE] -= residual / shared.scale
         weight, cost = robust(residual**2)
         by_pose = by_motion(by_point, p)
         return _of_one_view(residual, self.view, by_pose, by_shared, weight / self.inflation, cost / self.inflation)
@@ -85,10 +87,12 @@ class ObjectTerm:
         R = poses[self.view, :3, :3]
         placed = np.einsum("pij,pj->pi", R, p) + poses[self.view, :3, 3]
         a, b = self.pairs.T
-        residual = ((placed[a] - placed[b]) * self.normal).sum(axis=1) / self.sigma_m
-        unit = self.normal / self.sigma_m[:, None]
+        sigma_m = self.sigma_m * shared.scale
+        residual = ((placed[a] - placed[b]) * self.normal).sum(axis=1) / sigma_m
+        unit = self.normal / sigma_m[:, None]
         along_a, along_b = (np.einsum("nji,nj->ni", R[index], unit) for index in (a, b))
         by_shared = np.einsum("ni,nij->nj", along_a, by[a]) - np.einsum("ni,nij->nj", along_b, by[b])
+        by_shared[:, DEPTH_SCALE] -= residual / shared.scale
         weight, cost = robust(residual**2)
         return Rows(
             residual, self.view[a], by_motion(along_a, p[a]), self.view[b], -by_motion(along_b, p[b]), by_shared,

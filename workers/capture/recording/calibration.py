@@ -143,10 +143,10 @@ def _lens(camera: _Camera) -> np.ndarray:
 def _color_intrinsics(camera: _Camera, size: tuple[int, int]) -> Intrinsics:
     """Calibrations of early devices are of the 16:9 part of the sensor, later ones of the whole 4:3 sensor."""
     width, height = size
-    ratio = camera.SensorWidth / camera.SensorHeight
-    if ratio not in (4 / 3, 16 / 9):
-        raise _wrong(f"the colour sensor is {camera.SensorWidth} x {camera.SensorHeight}, neither 4:3 nor 16:9")
-    calibrated = round(width / ratio)
+    across, down = camera.SensorWidth, camera.SensorHeight
+    if across * 3 != down * 4 and across * 9 != down * 16:
+        raise _wrong(f"the colour sensor is {across} x {down}, neither 4:3 nor 16:9")
+    calibrated = width * down // across
     return _intrinsics(camera, (width, calibrated), (0, (calibrated - height) // 2), size)
 
 

@@ -59,12 +59,7 @@ def import_recording(path: Path, out: Path, about: CaptureFile, board: Board, vi
     folder that was left half-made is not taken for a capture. Raises CaptureError for a recording that cannot be used.
     """
     recording = open_recording(path)
-    device = read_calibration(recording.calibration, recording.color_size, recording.depth_mode)
-    size = (device.depth.intrinsics.width, device.depth.intrinsics.height)
-    if recording.depth_size != size:
-        raise CaptureError(
-            "mode", f"{path}: depth is {recording.depth_size}, and the mode {recording.depth_mode} has {size}"
-        )
+    device = _read_device(recording)
     found = _measure(recording)
     pairs = pair_frames(found.color_us, found.depth_us, recording.period_us, recording.depth_delay_us)
     if not pairs:
@@ -86,6 +81,21 @@ def import_recording(path: Path, out: Path, about: CaptureFile, board: Board, vi
     _write_source(recording, made, losses, out)
     write_description(out, about, device.color, board)
     return Imported(made, len(pairs), losses)
+
+
+def _read_device(recording: Recording) -> DeviceCalibration:
+    """The recording's cameras. Raises CaptureError that names the file."""
+    path = recording.path
+    try:
+        device = read_calibration(recording.calibration, recording.color_size, recording.depth_mode)
+    except CaptureError as error:
+        raise CaptureError(error.reason, f"{path}: {error.detail}") from error
+    size = (device.depth.intrinsics.width, device.depth.intrinsics.height)
+    if recording.depth_size != size:
+        raise CaptureError(
+            "mode", f"{path}: depth is {recording.depth_size}, and the mode {recording.depth_mode} has {size}"
+        )
+    return device
 
 
 def _measure(recording: Recording) -> _Frames:

@@ -127,12 +127,15 @@ def take_light(studio: Studio, number: int, T_world_cam: Pose) -> Array:
 
 def mark_object(studio: Studio, T_world_cam: Pose) -> NDArray[np.bool_]:
     """[H, W] bool: pixels of the stored image whose centres see the object; through a lens to a sixth of a pixel."""
-    k, finer = studio.drawn_color, 1 if studio.lookup is None else LABELS_FINER
-    camera = Camera(scale_intrinsics(k, finer), T_world_cam)
-    region = shared_renderer().draw(studio.things, studio.appearance, camera, effects=LABELS).region
-    if studio.lookup is not None:
-        region = nearest_pixels(region, *(finer * place for place in studio.lookup))
-    return np.asarray(region == REGION_FIRST_OBJECT)
+    finer = 1 if studio.lookup is None else LABELS_FINER
+    _, mask = draw_labels(studio, Camera(scale_intrinsics(studio.drawn_color, finer), T_world_cam))
+    return mask if studio.lookup is None else nearest_pixels(mask, *(finer * place for place in studio.lookup))
+
+
+def draw_labels(studio: Studio, camera: Camera) -> tuple[Array, NDArray[np.bool_]]:
+    """(depth [H, W] float64, metres, 0 where nothing is; the object's pixels [H, W] bool), both of pixel centres."""
+    drawn = shared_renderer().draw(studio.things, studio.appearance, camera, effects=LABELS)
+    return drawn.depth_m.astype(np.float64), drawn.region == REGION_FIRST_OBJECT
 
 
 def motion_of(studio: Studio, number: int) -> Motion:

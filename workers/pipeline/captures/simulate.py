@@ -18,11 +18,12 @@ from workers.capture.simulate.effects import plan_effects, planned_settings
 from workers.capture.simulate.lens import opencv_lens
 from workers.capture.simulate.path import plan_path
 from workers.capture.simulate.place import place_object
+from workers.pipeline.captures.held_out import write_held_out
 from workers.pipeline.captures.photograph import DEPTH_UNITS_PER_M, Studio, build_studio, photograph
 from workers.plan.randomness import SceneChance, Stream
 from workers.plan.step import choose_assets
-from workers.store.capture_folder import CaptureFile, write_description, write_view
-from workers.store.capture_truth import TrueObject, write_true_mask, write_truth
+from workers.store.capture_folder import TRUTH, CaptureFile, write_description, write_view
+from workers.store.capture_truth import HELD_OUT, TrueObject, write_true_mask, write_truth
 
 
 def load_object(job: Job, catalogue: Catalogue, chance: SceneChance) -> Asset:
@@ -52,7 +53,8 @@ def simulate_capture(
     simulate = planned_settings(simulate, plan)
     thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
     studio = build_studio(simulate, board, thing, plan, chance)
-    poses = plan_path(simulate, thing.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
+    target = thing.T_world_shape[:3, 3]
+    poses = plan_path(simulate, target, chance.stream(Stream.CAMERA))
     for number, T_board_cam in enumerate(poses):
         view, mask = photograph(studio, number, T_board_cam)
         write_view(path, view)
@@ -65,6 +67,7 @@ def simulate_capture(
         depth_bias_m=0.0 if simulate.depth_noise is None else simulate.depth_noise.bias_m,
         lens=simulate.distortion,
     )
+    write_held_out(studio, board, target, path / TRUTH / HELD_OUT)
     write_truth(path, truth, TrueObject(asset.category, asset.instance_id, asset_glb(asset)), plan.ran, plan.skipped)
     _describe(studio, board, asset, path)
     return truth

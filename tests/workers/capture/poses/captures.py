@@ -1,7 +1,7 @@
 """Whole captures by arithmetic, with truth: corners by OpenCV's projectPoints, depth of a board with a box by planes."""
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -27,7 +27,7 @@ class Virtual:
 
     views: int = 40
     seed: int = 0
-    wrong: DepthErrors = DepthErrors(sigma_m=0.003)
+    wrong: DepthErrors = field(default_factory=lambda: DepthErrors(sigma_m=0.003))
     print_scale: float = 1.0
     corner_px: float = CORNER_PX
     box: bool = True

@@ -6,6 +6,7 @@ Modes 1280 x 720 and NFOV_2X2BINNED, which are the smallest. Rays and projection
 import dataclasses
 import functools
 import json
+from typing import Any
 
 import cv2
 import numpy as np
@@ -158,7 +159,7 @@ TAGS = {
 }
 
 
-def recording(count: int = 4, fourcc: str = "MJPG", **settings: object) -> bytes:
+def recording(count: int = 4, fourcc: str = "MJPG", **settings: Any) -> bytes:
     """The bytes of a whole recording."""
     return write_recording(tracks(count, fourcc), json.dumps(calibration()).encode(), TAGS, **settings)
 
@@ -167,5 +168,5 @@ def without(made: list[Track], name: str) -> list[Track]:
     return [track for track in made if track.name != name]
 
 
-def renamed(made: list[Track], name: str, **changes: object) -> list[Track]:
+def renamed(made: list[Track], name: str, **changes: Any) -> list[Track]:
     return [dataclasses.replace(track, **changes) if track.name == name else track for track in made]

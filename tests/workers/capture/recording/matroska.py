@@ -43,6 +43,10 @@ class Track:
     bits: int = 16
 
 
+IMU_TRACK = 9
+"""Number of the track of inertial samples, which every recording of a device has unless it was switched off."""
+
+
 def tag(name: str, value: str, track_uid: int = 0, attachment_uid: int = 0) -> bytes:
     targets = b""
     if track_uid:
@@ -82,6 +86,9 @@ def write_recording(
         all_tags += tag(f"K4A_{track.name}_TRACK", str(uid), uid)
         all_tags += b"".join(tag(name, value, uid) for name, value in track.tags.items())
         blocks += [(stamp, n, data) for stamp, data in track.frames]
+    imu = element(0xD7, IMU_TRACK) + element(0x73C5, 7_000_000_999) + element(0x83, 0x11) + element(0x536E, "IMU")
+    entries += element(0xAE, imu + element(0x86, "S_K4A/IMU"))
+    all_tags += tag("K4A_IMU_TRACK", "7000000999", 7_000_000_999) + tag("K4A_IMU_MODE", "ON", 7_000_000_999)
     all_tags += b"".join(tag(name, value) for name, value in tags.items())
     body = element(0x1549A966, info) + element(0x1654AE6B, entries)
     if calibration is not None:
@@ -102,5 +109,8 @@ def clusters(blocks: list[tuple[int, int, bytes]], length_us: int) -> list[bytes
             element(0xA3, bytes([0x80 | track]) + struct.pack(">hB", stamp - start, 0x80) + data)
             for stamp, track, data in inside
         ]
-        made.append(element(0x1F43B675, element(0xE7, start) + b"".join(simple)))
+        samples = element(0xA1, bytes([0x80 | IMU_TRACK]) + bytes(3) + bytes(48))
+        group = element(0xA0, samples + element(0x9B, 20_000))
+        checksum = element(0xBF, bytes(4))  # readers do not check it; the device's is right
+        made.append(element(0x1F43B675, checksum + element(0xE7, start) + b"".join(simple) + group))
     return made

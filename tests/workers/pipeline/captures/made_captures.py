@@ -5,13 +5,19 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from schemas.capture.view import CaptureTruth
+from schemas.capture.view import CaptureCamera, CaptureTruth
 from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Board, Simulate
+from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.scene import Placed
 from workers.assets.builtin.make import make_asset
 from workers.capture.simulate.effects import plan_effects
+from workers.capture.simulate.lens import opencv_lens
+from workers.capture.simulate.path import plan_path
+from workers.capture.simulate.place import place_object
+from workers.pipeline.captures.photograph import build_studio, photograph
 from workers.pipeline.captures.simulate import simulate_capture
-from workers.plan.randomness import SceneChance
+from workers.plan.randomness import SceneChance, Stream
 from workers.store.capture_folder import CaptureFolder, open_folder
 
 KEPT = tempfile.TemporaryDirectory(prefix="verso-captures-")
@@ -41,3 +47,13 @@ def _made(settings, seed, without):
     plan = plan_effects(simulate).without(*without)
     truth = simulate_capture(simulate, Board(), asset_of(), SceneChance(seed, 0), path, plan)
     return Made(open_folder(path), truth)
+
+
+def take_one(seed=11, **settings):
+    """(view, camera, T_board_cam): the first photograph of a can, without a folder."""
+    simulate, chance, asset = Simulate(**settings), SceneChance(seed, 0), asset_of()
+    thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
+    studio = build_studio(simulate, Board(), thing, plan_effects(simulate), chance)
+    (T_board_cam, *_) = plan_path(simulate, thing.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
+    view, _ = photograph(studio, 0, T_board_cam)
+    return view, CaptureCamera(studio.rig.color, opencv_lens(simulate.distortion)), T_board_cam

@@ -29,7 +29,7 @@ from workers.store.capture_folder import CaptureFile, CaptureFolder, open_folder
 
 ABOUT = CaptureFile(name="made-up", category="ball")
 COUNT = 4
-QUANTA_MM = 1.6
+QUANTA_MM = 1.3
 """Half a millimetre of the recording, half a unit of the folder, and the former once more where a surface is steep."""
 
 

@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from schemas.job.captures import Board
 from tests.workers.pipeline.captures.edge_corners import corner_errors, grey, project_opencv
-from tests.workers.pipeline.captures.made_captures import made
+from tests.workers.pipeline.captures.made_captures import made, take_one
+from workers.capture.board.layout import marker_corners
 from workers.capture.simulate.noise import AXIAL_M, AXIAL_PER_M, OFFSET_M, OFFSET_SHARE
 from workers.geometry.frames import invert, transform
 from workers.geometry.srgb import decode_codes
@@ -30,6 +32,18 @@ def corners_of(capture, board=None):
     ]
     errors, outwards = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     return errors, (errors * outwards).sum(axis=1)
+
+
+def detected_errors(rgb, camera, T_board_cam):
+    """[N, 2] px: corners that OpenCV's detector finds, against OpenCV's projection of the true ones."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    detector = cv2.aruco.ArucoDetector(dictionary, parameters)
+    corners, ids, _ = detector.detectMarkers(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
+    true = marker_corners(Board())[ids.ravel()].reshape(-1, 3)
+    errors = np.concatenate(corners).reshape(-1, 2) - project_opencv(camera, T_board_cam, true)
+    return errors[np.abs(errors).max(axis=1) < 2.0]
 
 
 @pytest.mark.parametrize("settings", [{}, {"distortion": LENS}, {"motion_blur": {}}, {"rgb_noise": {}}])
@@ -147,6 +161,26 @@ def test_a_wrong_registration_moves_the_measured_surface():
     assert np.abs(found - true).max() > 0.003
 
 
+def test_depth_is_registered_to_the_image_that_the_lens_draws():
+    """At a stored pixel, depth is that of the ray which OpenCV undistorts it to."""
+    capture = made(**SMALL, distortion={"k1": 0.3, "p1": 0.002})
+    k, T = capture.folder.camera.intrinsics, invert(capture.truth.T_board_cam[0])
+    depth = read_view(capture.folder, 0).depth / 1000.0
+    points = np.array([[x, y, 0.0] for x in np.linspace(-0.28, 0.28, 15) for y in (-0.18, -0.14, 0.14, 0.18)])
+    pixels = np.rint(project_opencv(capture.folder.camera, capture.truth.T_board_cam[0], points))
+    seen = ((pixels >= 0) & (pixels < [k.width, k.height])).all(axis=1)
+    stored = depth[pixels[seen, 1].astype(int), pixels[seen, 0].astype(int)]
+    matrix = np.array([[k.fx, 0.0, k.cx_opencv], [0.0, k.fy, k.cy_opencv], [0.0, 0.0, 1.0]])
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+    rays = cv2.undistortPoints(pixels[seen][:, None], matrix, capture.folder.camera.lens, criteria=stop)[:, 0]
+    normal = T[:3, 2]
+    expected = normal @ T[:3, 3] / (np.column_stack([rays, np.ones(len(rays))]) @ normal)
+    measured = stored > 0.0
+    assert measured.sum() >= 15
+    assert np.median(np.abs(stored - expected)[measured]) < 5e-4
+    assert (np.abs(stored - expected)[measured] < 0.001).mean() > 0.8  # the can hides some of the points
+
+
 def test_a_mask_is_the_objects_picture():
     """Every vertex of the can that OpenCV puts well inside the mask's outline is in the mask, and none is far from it."""
     capture = made(**SMALL)
@@ -158,3 +192,31 @@ def test_a_mask_is_the_objects_picture():
     drawn = cv2.fillConvexPoly(np.zeros_like(mask), np.rint(hull[:, 0]).astype(np.int32), 255)
     assert (mask != drawn).mean() < 0.002  # a can is nearly convex
     assert 0.005 < (mask > 0).mean() < 0.3
+
+
+# ---------------------------------------------------------------------------------------------- the other renderer
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("settings", [{}, {"distortion": LENS}])
+def test_a_traced_photograph_has_its_corners_where_opencv_projects_them(settings):
+    """Mitsuba shares nothing with the rasteriser: neither its camera nor its samples."""
+    pytest.importorskip("mitsuba", reason="Mitsuba is not installed: ./verso extra pathtraced")
+    view, camera, T_board_cam = take_one(tier="pathtraced", **NEAR, **settings)
+    errors, outwards = corner_errors(view.rgb, camera, T_board_cam, Board())
+    assert len(errors) >= 60
+    assert np.abs(errors.mean(axis=0)).max() < 0.03
+    assert abs(np.median((errors * outwards).sum(axis=1))) < 0.03
+    assert np.median(np.abs(errors)) < 0.06
+    found = detected_errors(view.rgb, camera, T_board_cam)
+    assert len(found) >= 60
+    assert np.abs(found.mean(axis=0)).max() < 0.05
+
+
+def test_opencvs_detector_finds_the_corners():
+    """Its corners lie a little inside the true ones (edge_corners.py), so their mean over all markers is what must be 0."""
+    capture = made(**NEAR)
+    errors = detected_errors(read_view(capture.folder, 0).rgb, capture.folder.camera, capture.truth.T_board_cam[0])
+    assert len(errors) >= 60
+    assert np.abs(errors.mean(axis=0)).max() < 0.05
+    assert np.median(np.abs(errors)) < 0.3

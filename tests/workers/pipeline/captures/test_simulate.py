@@ -32,8 +32,8 @@ ON = {
 }
 
 CHANGES = {
-    "hidden_markers": {"rgb", "depth"},
-    "print_scale": {"rgb", "depth"},
+    "hidden_markers": {"rgb", "depth", "truth/held_out/rgb", "truth/held_out/depth"},
+    "print_scale": {"rgb", "depth", "truth/held_out/rgb", "truth/held_out/depth"},
     "motion_blur": {"rgb"},
     "distortion": {"rgb", "depth", "truth/mask", "camera.json"},
     "exposure": {"rgb"},

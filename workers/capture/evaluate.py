@@ -1,0 +1,170 @@
+"""Errors of a processed capture against truth: poses, merged surface, synthesised views."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array, Pose
+from schemas.capture.estimate import Reconstruction, SynthesizedView
+from schemas.errors import CaptureError
+from schemas.scene.camera import Camera
+from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.scene import Placed
+from schemas.scene.shape import Mesh, Part, Shape
+from workers.geometry.camera import project
+from workers.geometry.frames import angle_between, invert, transform
+from workers.geometry.projection import in_frame
+from workers.geometry.raycast import cast_view, first_hit
+from workers.geometry.surface_distance import distance_to_mesh
+
+SAMPLES = 40_000
+"""Points of the true surface: their share within a distance is known to a quarter of a percent."""
+
+SEED = 20_240_801
+"""Of the surface samples, so that the same capture has the same figures."""
+
+CLEAR_M = 1e-5
+"""A sample is lifted off its face by so much before it is looked at, above float32's steps in the ray caster."""
+
+COMPLETE_M = 0.003
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Distance and angle between estimated and true camera poses: median and worst."""
+
+    median_mm: float
+    worst_mm: float
+    median_deg: float
+    worst_deg: float
+    views: int
+
+
+@dataclass(frozen=True)
+class SurfaceErrors:
+    """Merged cloud against the true surface.
+
+    cloud_*: from each point of the cloud to the surface; surface_*: from each visible sample of the true surface to the merged
+    mesh, millimetres; completeness: share of the visible samples with a point of the cloud within 3 mm; visible_share: share of
+    the surface that is visible to a camera at all.
+    """
+
+    cloud_median_mm: float
+    cloud_p95_mm: float
+    surface_median_mm: float
+    surface_p95_mm: float
+    completeness: float
+    visible_share: float
+    points: int
+
+
+@dataclass(frozen=True)
+class ViewErrors:
+    """A synthesised view against the true one, on pixels of the object that both have.
+
+    color_error: mean absolute difference of 8-bit codes, None where the true colours are unknown; covered: share of the true
+    object's pixels that the view has; beyond: share of the view's object pixels that are none.
+    """
+
+    depth_median_mm: float
+    depth_p95_mm: float
+    color_error: float | None
+    covered: float
+    beyond: float
+    measured_share: float
+
+
+def compare_poses(estimated: Sequence[Pose], true: Sequence[Pose]) -> PoseErrors:
+    """Errors of T_board_cam. Raises CaptureError for no poses."""
+    if not len(estimated):
+        raise CaptureError("no_pose", "no view has a pose that could be compared with the truth")
+    mm = [1e3 * float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a, b in zip(estimated, true, strict=True)]
+    deg = [float(np.degrees(angle_between(a[:3, :3], b[:3, :3]))) for a, b in zip(estimated, true, strict=True)]
+    return PoseErrors(float(np.median(mm)), max(mm), float(np.median(deg)), max(deg), len(mm))
+
+
+def sample_surface(mesh: Mesh, count: int = SAMPLES) -> tuple[Array, Array]:
+    """(points, unit normals), each [N, 3]: evenly over the area, the same for the same mesh."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    across = np.cross(b - a, c - a)
+    area = np.linalg.norm(across, axis=1)
+    total = np.cumsum(area)
+    rng = np.random.default_rng(SEED)
+    # One sample in each of N equal shares of the area.
+    at = (np.arange(count) + rng.uniform(size=count)) / count * total[-1]
+    face = np.minimum(np.searchsorted(total, at, side="right"), len(area) - 1)
+    s, t = rng.uniform(size=(2, count))
+    s, t = np.where(s + t > 1.0, 1.0 - s, s), np.where(s + t > 1.0, 1.0 - t, t)
+    points = a[face] + s[:, None] * (b - a)[face] + t[:, None] * (c - a)[face]
+    return points, across[face] / np.maximum(area[face], 1e-300)[:, None]
+
+
+def compare_surface(
+    found: Reconstruction, true: Mesh, samples: Array, visible: NDArray[np.bool_], cloud_of_samples_m: Array
+) -> SurfaceErrors:
+    """The errors of a merged surface; samples [N, 3] of the true one, which of them are visible, and how far the cloud is."""
+    off, _ = distance_to_mesh(found.points, true)
+    back, _ = distance_to_mesh(samples[visible], Mesh(found.vertices, found.faces))
+    return SurfaceErrors(
+        cloud_median_mm=1e3 * float(np.median(off)),
+        cloud_p95_mm=1e3 * float(np.quantile(off, 0.95)),
+        surface_median_mm=1e3 * float(np.median(back)),
+        surface_p95_mm=1e3 * float(np.quantile(back, 0.95)),
+        completeness=float((cloud_of_samples_m[visible] <= COMPLETE_M).mean()),
+        visible_share=float(visible.mean()),
+        points=len(found.points),
+    )
+
+
+def visible_samples(mesh: Mesh, points: Array, normals: Array, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
+    """[N] bool: samples of the mesh that at least one camera sees, at whatever angle, by rays to its centre."""
+    thing = [_placed(mesh)]
+    visible = np.zeros(len(points), np.bool_)
+    for camera in cameras:
+        asked = np.flatnonzero(~visible & in_view(points, normals, camera))
+        origins = points[asked] + CLEAR_M * normals[asked]
+        hits = first_hit(thing, origins, camera.position - origins)
+        visible[asked[hits.distance > 1.0]] = True
+    return visible
+
+
+def true_view(mesh: Mesh, camera: Camera) -> Array:
+    """[H, W] float64: exact depth of the mesh alone, by the ray caster, 0 where it is not seen."""
+    return cast_view([_placed(mesh)], camera)[0]
+
+
+def _placed(mesh: Mesh) -> Placed:
+    return Placed(REGION_FIRST_OBJECT, Shape((Part("truth", mesh.vertices, mesh.faces),)), np.eye(4))
+
+
+def in_view(points: Array, normals: Array, camera: Camera) -> NDArray[np.bool_]:
+    """[N] bool: points [N, 3] in front of a camera, within its image, whose normals face it."""
+    seen = transform(invert(camera.T_world_cam), points)
+    front = seen[:, 2] > 0.05
+    u, v = project(np.where(front[:, None], seen, [0.0, 0.0, 1.0]), camera.intrinsics)
+    facing = ((camera.position - points) * normals).sum(axis=1) > 0.0
+    return front & facing & in_frame(u, v, camera.intrinsics)
+
+
+def compare_view(
+    view: SynthesizedView,
+    depth_m: Array,
+    mask: NDArray[np.bool_],
+    rgb: NDArray[np.uint8] | None = None,
+) -> ViewErrors:
+    """The errors of a synthesised view. Raises CaptureError where it has no pixel of the object in common with the truth."""
+    both = view.mask & mask & (view.depth_m > 0.0) & (depth_m > 0.0)
+    if not both.any():
+        raise CaptureError("nothing_seen", "a synthesised view shows nothing of the object where it is")
+    off_mm = 1e3 * np.abs(view.depth_m - depth_m)[both]
+    color = None if rgb is None else float(np.abs(view.rgb[both].astype(np.float64) - rgb[both]).mean())
+    return ViewErrors(
+        depth_median_mm=float(np.median(off_mm)),
+        depth_p95_mm=float(np.quantile(off_mm, 0.95)),
+        color_error=color,
+        covered=float(both.sum() / mask.sum()),
+        beyond=float((view.mask & ~mask).sum() / max(int(view.mask.sum()), 1)),
+        measured_share=view.measured_share,
+    )
