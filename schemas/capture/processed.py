@@ -25,7 +25,10 @@ class PosedImages:
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Errors of one view against truth: of its pose, and the median of its mirror view's depth; None where not measured."""
+    """Errors of one view against truth: of its pose, and the median of the depth that the other views together give for it.
+
+    None where not measured.
+    """
 
     pose_mm: float | None = None
     pose_deg: float | None = None

@@ -144,8 +144,9 @@ _capture_view = pa.struct(
         *_columns(pa.list_(_i64), "sources", nullable=True),
     ]
 )
-"""One view of a capture: `number` in the names of its captured images, residuals before and after, errors against truth;
-of a mirror view the share of its filled pixels that are measured, and the numbers of the captured views that it is made of."""
+"""One view of a capture: `number` in the names of its captured images, residuals before and after, errors against truth.
+`depth_median_mm`, of input views: the error of the depth that the other views together give for it. `measured_share` and
+`sources`, of mirror views: the share of what it shows that is measured and not filled, and the views that it is made of."""
 
 _CAPTURE_COLUMNS: dict[str, pa.Field] = {
     "scenes": pa.field("capture", _capture_scene),

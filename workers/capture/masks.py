@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from schemas.scene.camera import Camera
 from schemas.scene.shape import Mesh
-from workers.capture.object_region import ObjectRegion
+from workers.capture.object_region import Ground
 from workers.capture.raster import draw_depth
 
 RIM_M = 0.0005
@@ -17,14 +17,14 @@ def silhouette(mesh: Mesh, camera: Camera) -> NDArray[np.bool_]:
     return draw_depth(mesh, camera) > 0.0
 
 
-def down_to_board(mesh: Mesh, region: ObjectRegion) -> Mesh:
+def down_to_board(mesh: Mesh, ground: Ground) -> Mesh:
     """The mesh with walls from its cut edge down to the board: the object goes on below the clearance."""
     edges = _open_edges(mesh)
-    height = region.height_m(mesh.vertices)
-    edges = edges[(height[edges] < region.clearance_m + RIM_M).all(axis=1)]
+    height = ground.height_m(mesh.vertices)
+    edges = edges[(height[edges] < ground.clearance_m + RIM_M).all(axis=1)]
     if not len(edges):
         return mesh
-    a, b, c = region.plane
+    a, b, c = ground.plane
     rim, local = np.unique(edges, return_inverse=True)
     foot = mesh.vertices[rim].copy()
     foot[:, 2] = a * foot[:, 0] + b * foot[:, 1] + c

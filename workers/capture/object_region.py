@@ -39,27 +39,32 @@ BRIDGE_CELLS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectRegion:
+class Ground:
+    """The board's surface z = a x + b y + c as depth measures it, `plane` (a, b, c); what is nearer than clearance_m is it."""
+
+    plane: tuple[float, float, float]
+    clearance_m: float
+
+    def height_m(self, points: Array) -> Array:
+        """[N] height of points [N, 3] above the surface."""
+        a, b, c = self.plane
+        return points[:, 2] - (a * points[:, 0] + b * points[:, 1] + c)
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectRegion(Ground):
     """The object's surroundings, board frame, metres.
 
-    low, high [3]: a box around it; `plane` (a, b, c): the board's surface z = a x + b y + c as depth measures it, with
-    `spread_m`, the standard deviation of its cells; `clearance_m`: what is nearer to that plane is the board. `footprint`
-    [cells in x, cells in y] bool, cell (0, 0) beginning at `corner` [2]. `notes` for the user.
+    low, high [3]: a box around it; spread_m: standard deviation of the board's cells about its plane. `footprint` [cells in x,
+    cells in y] bool, cell (0, 0) beginning at `corner` [2]. `notes` for the user.
     """
 
     low: Array
     high: Array
-    plane: tuple[float, float, float]
     spread_m: float
-    clearance_m: float
     footprint: NDArray[np.bool_]
     corner: Array
     notes: tuple[str, ...] = ()
-
-    def height_m(self, points: Array) -> Array:
-        """[N] height of points [N, 3] above the board's measured surface."""
-        a, b, c = self.plane
-        return points[:, 2] - (a * points[:, 0] + b * points[:, 1] + c)
 
     def holds(self, points: Array) -> NDArray[np.bool_]:
         """[N] bool: points [N, 3] above the footprint and above the clearance."""
@@ -217,4 +222,4 @@ def _region(
     low = np.array([corner[0] + i.min() * CELL_M, corner[1] + j.min() * CELL_M, plane[2] - 0.008])
     high = np.array([corner[0] + (i.max() + 1) * CELL_M, corner[1] + (j.max() + 1) * CELL_M, plane[2] + top + 0.01])
     spread, clearance = spread_and_clearance
-    return ObjectRegion(low, high, plane, spread, clearance, grown, corner, notes)
+    return ObjectRegion(plane, clearance, low, high, spread, grown, corner, notes)

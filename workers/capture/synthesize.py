@@ -1,6 +1,6 @@
 """Views from poses that were not captured: the nearest views, merged and drawn from there (Staszak and Belter 2024, step 4)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,33 +26,40 @@ def rank_views(axes: Array, camera: Camera) -> NDArray[np.int64]:
     return np.argsort(-(axes @ camera.T_world_cam[:3, 2]), kind="stable")
 
 
+def choose_sources(axes: Mapping[int, Array], camera: Camera, spec: Synthesis) -> list[int]:
+    """Numbers of the views that a picture is made of, best first, of the z-axes [3] of all views by number."""
+    numbers = sorted(axes)
+    order = rank_views(np.array([axes[number] for number in numbers]).reshape(-1, 3), camera)
+    return [numbers[n] for n in order[: spec.views]]
+
+
 def synthesize_view(sources: Sequence[Source], camera: Camera, spec: Synthesis) -> SynthesizedView:
     """What `camera` would see, from the best `spec.views` of the sources.
 
     Raises CaptureError where none of them shows anything to it.
     """
-    axes = np.array([source.camera.T_world_cam[:3, 2] for source in sources]).reshape(-1, 3)
-    best = rank_views(axes, camera)[: spec.views]
+    by_number = {source.number: source for source in sources}
+    numbers = choose_sources({n: source.camera.T_world_cam[:3, 2] for n, source in by_number.items()}, camera, spec)
     layers = []
-    for n in best:
-        cosine = max(float(axes[n] @ camera.T_world_cam[:3, 2]), 0.0)
-        layers.append(warp(sources[n], camera, max(cosine**SHARPNESS, 1e-6)))
-    numbers = tuple(sources[n].number for n in best)
+    for number in numbers:
+        source = by_number[number]
+        cosine = max(float(source.camera.T_world_cam[:3, 2] @ camera.T_world_cam[:3, 2]), 0.0)
+        layers.append(warp(source, camera, max(cosine**SHARPNESS, 1e-6)))
     if not any(layer.weight.any() for layer in layers):
         raise CaptureError(
             "nothing_seen",
             f"none of the {len(numbers)} nearest views ({_words(numbers)}) shows anything to this camera",
         )
-    view = merge_layers(layers, camera)
-    filled = fill_holes(*view, spec.fill_px)
-    measured = view[1] > 0.0
+    rgb, depth_m, mask = merge_layers(layers, camera)
+    filled = fill_holes(rgb, depth_m, mask, spec.fill_px)
+    measured = depth_m > 0.0
     return SynthesizedView(
         rgb=filled[0],
         depth_m=filled[1],
         mask=filled[2],
         measured=measured,
         measured_share=float(measured.sum() / max(int((filled[1] > 0.0).sum()), 1)),
-        sources=numbers,
+        sources=tuple(numbers),
     )
 
 

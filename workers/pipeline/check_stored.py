@@ -61,7 +61,7 @@ def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], sc
             faults += _check_images(view, scene)
         faults += _check_patches(view, stored["mirror" if role == "projected" else role], job, read, views[role])
     faults += _check_cameras(job, stored, views)
-    if "mirror" in stored:
+    if "mirror" in stored and not _is_captured(scene):
         faults += _check_agreement(job, stored, views)
     if "projected" in stored:
         faults += _check_projection(job, stored, views, EffectPlan(tuple(scene["effects"]), {}))

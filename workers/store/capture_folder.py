@@ -143,7 +143,12 @@ def read_pose(path: Path) -> Pose | None:
 
 def write_pose(path: Path, T: Pose) -> None:
     """Writes 4 lines of 4 numbers that read back to the same doubles."""
-    path.write_text("\n".join(" ".join(repr(float(x)) for x in row) for row in T) + "\n", encoding="utf-8")
+    path.write_text(pose_text(T), encoding="utf-8")
+
+
+def pose_text(T: Pose) -> str:
+    """4 lines of 4 numbers that read back to the same doubles."""
+    return "\n".join(" ".join(repr(float(x)) for x in row) for row in T) + "\n"
 
 
 def _is_rigid(T: Pose) -> bool:

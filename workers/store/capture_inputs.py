@@ -7,16 +7,18 @@ from pathlib import Path
 
 from schemas.errors import CaptureError
 from workers.store.capture_folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, TRUTH
+from workers.store.capture_results import own_files
 
-_IMAGE = re.compile(r"(?:rgb|depth|mask)_[0-9]{5,9}\.png|correction_[0-9]{5,9}\.txt")
+_IMAGE = re.compile(r"(?:rgb|depth|mask)_[0-9]{5,9}\.png|(?:board|correction)_[0-9]{5,9}\.txt")
 
 
 def list_inputs(path: Path) -> list[Path]:
     """Every file that decides the result, sorted by name: descriptions, images, corrections, truth, a dictionary of markers.
 
-    Results that were written beside them are none of them.
+    Results that processing wrote beside them are none of them. Raises CaptureError where process.json cannot be read.
     """
-    top = [file for file in path.iterdir() if file.is_file() and _is_input(file.name)]
+    ours = own_files(path)
+    top = [file for file in path.iterdir() if file.is_file() and _is_input(file.name) and file.name not in ours]
     truth = [file for file in (path / TRUTH).rglob("*") if file.is_file()] if (path / TRUTH).is_dir() else []
     return sorted([*top, *truth, *_dictionary(path)])
 

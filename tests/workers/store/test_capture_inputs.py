@@ -2,6 +2,7 @@ import pytest
 
 from schemas.errors import CaptureError
 from workers.store.capture_inputs import digest_inputs, list_inputs
+from workers.store.capture_results import write_results
 
 
 @pytest.fixture
@@ -42,10 +43,19 @@ def test_a_file_more_or_less_or_under_another_name_is_another_capture(folder):
 
 def test_neither_the_folders_path_nor_what_was_written_beside_it_changes_the_digest(folder):
     before = digest_inputs(folder)
-    for name in ("cloud.ply", "mesh.glb", "notes.txt", "board_00000.txt", "estimates.parquet"):
-        (folder / name).write_text("result")
+    written = {"cloud.ply": b"c", "mesh.ply": b"m", "board_00000.txt": b"1 0", "mask_00000.png": b"p"}
+    assert write_results(folder, written, {}) == []
+    (folder / "notes.txt").write_text("mine")
+    assert digest_inputs(folder) == before
     moved = folder.rename(folder.with_name("elsewhere"))
     assert digest_inputs(moved) == before
+
+
+def test_what_the_user_changed_among_the_results_is_an_input(folder):
+    write_results(folder, {"correction_00000.txt": b"1 0"}, {})
+    before = digest_inputs(folder)
+    (folder / "correction_00000.txt").write_text("1 1")
+    assert digest_inputs(folder) != before
 
 
 def test_names_are_listed_in_one_order(folder):

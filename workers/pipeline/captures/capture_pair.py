@@ -21,7 +21,6 @@ from schemas.scene.view import ObjectLabel, Pair, View
 from workers.cameras.placement import object_distance, place_mirror_camera
 from workers.geometry.pixels import measure_regions
 from workers.geometry.stored_depth import quantise_depth
-from workers.labels.agreement import compare_views
 from workers.labels.board_regions import capture_regions
 from workers.labels.projected_view import derive_projected, projection_shares
 from workers.labels.regions import label_region
@@ -88,8 +87,8 @@ def make_capture_pair(
     camera = place_mirror_camera(images.camera, pair.d_z_m, job.cameras.mirror)
     made = synthesize(camera)
     mirror = view("mirror", camera, made)
-    agreement = compare_views(first, mirror, job.images, job.check.mirror_agreement_mm)
-    pair = replace(pair, mirror=mirror, agreement=agreement)
+    # No agreement: which pixels are co-visible follows from normals, which the noise of measured depth turns about.
+    pair = replace(pair, mirror=mirror)
     if thing.effects.runs("projection"):
         rgb, depth = derive_projected(first, camera, job.images, None, thing.effects)
         filled, hidden = projection_shares(depth, mirror.depth, job.images)

@@ -9,6 +9,7 @@ from schemas.capture.estimate import CaptureEstimate, ViewEstimate
 from schemas.capture.processed import ProcessedCapture, ViewScore
 from schemas.dataset.codec import Row, matrix_column
 from schemas.dataset.layout import asset_path
+from schemas.scene.camera import Role
 from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
 from workers.assets.catalogue import split_of
 from workers.assets.glb import asset_glb
@@ -75,7 +76,7 @@ def record_capture(
                 own = encode_view(view, one.pair, job.images)
                 files += own
                 row = view_row(scene_id, one.pair, view, own, job)
-                views.append(row | {"capture": view_columns(done, one, view.role == "mirror")})
+                views.append(row | {"capture": view_columns(done, one, view.role)})
                 objects += object_rows(scene_id, view, job)
     with watch.stage("encode"):
         path = asset_path(thing.asset.category, thing.asset.instance_id)
@@ -158,13 +159,13 @@ def quality_columns(
     }
 
 
-def view_columns(done: ProcessedCapture, one: CapturedPair, mirror: bool) -> Row:
-    """The column `capture` of `views`; residuals are those of the captured view, what was synthesised the mirror view's."""
+def view_columns(done: ProcessedCapture, one: CapturedPair, role: Role) -> Row:
+    """The column `capture` of `views`: residuals and errors of the captured view, and of what the mirror view is made."""
     estimate: CaptureEstimate = done.estimates.estimate
     own = next(view for view in estimate.views if view.number == one.number)
     before = _markers(done).get(one.number)
     score = done.score.views.get(one.number, ViewScore()) if done.score is not None else ViewScore()
-    made = one.mirror if mirror else None
+    made = one.mirror if role == "mirror" else None
     return {
         "number": one.number,
         "markers": own.markers,
@@ -174,7 +175,7 @@ def view_columns(done: ProcessedCapture, one: CapturedPair, mirror: bool) -> Row
         "pose_mm": score.pose_mm,
         "pose_deg": score.pose_deg,
         "measured_share": made.measured_share if made is not None else None,
-        "depth_median_mm": score.depth_median_mm if mirror else None,
+        "depth_median_mm": score.depth_median_mm if role == "input" else None,
         "sources": list(made.sources) if made is not None else None,
     }
 

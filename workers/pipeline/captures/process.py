@@ -1,0 +1,122 @@
+"""A capture's folder from photographs to poses, masks, cloud and mesh, written beside them: the list of steps."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from schemas.capture.estimate import CaptureEstimate, Estimates
+from schemas.job.captures import Captures
+from schemas.scene.camera import Camera
+from schemas.scene.shape import Mesh
+from workers.capture.masks import silhouette
+from workers.capture.posed_view import distort_mask
+from workers.pipeline.captures.corrections import correct_manually, corrections_of, given_files
+from workers.pipeline.captures.estimate import estimate_poses
+from workers.pipeline.captures.pose_table import pose_table
+from workers.pipeline.captures.reconstruct import Merged, reconstruct
+from workers.pipeline.stopwatch import Stopwatch
+from workers.store.capture_folder import CaptureFolder, open_folder, pose_text
+from workers.store.capture_results import (
+    CLOUD_FILE,
+    MESH_FILE,
+    POSES_FILE,
+    cloud_ply,
+    mesh_ply,
+    write_results,
+)
+from workers.store.images import encode_png
+
+
+@dataclass(frozen=True, eq=False)
+class ProcessedFolder:
+    """What processing found and wrote; `users`: files that the user gave and that stayed."""
+
+    folder: CaptureFolder
+    estimates: Estimates
+    merged: Merged
+    notes: tuple[str, ...]
+    seconds: Mapping[str, float]
+    users: tuple[str, ...]
+
+
+def process_folder(path: Path, captures: Captures) -> ProcessedFolder:
+    """Estimates poses, merges the views and writes the results into the folder.
+
+    Started again on the same folder it writes the same bytes, but for the seconds in process.json. Raises CaptureError where
+    the capture cannot be used; nothing is written then.
+    """
+    watch = Stopwatch()
+    folder = open_folder(path)
+    with watch.stage("estimate"):
+        estimates = correct_manually(given_files(folder), estimate_poses(folder, captures.estimation))
+    merged = reconstruct(folder, estimates.estimate, captures.fusion, watch)
+    with watch.stage("masks"):
+        files = {**_pose_files(folder, estimates), **_mask_files(folder, estimates.estimate, merged.body)}
+    surface = merged.surface
+    with watch.stage("encode"):
+        files[CLOUD_FILE] = cloud_ply(surface.points, surface.normals, surface.colors, surface.views)
+        files[MESH_FILE] = mesh_ply(surface.vertices, surface.faces, surface.vertex_colors)
+        files[POSES_FILE] = pose_table(estimates, folder.camera)
+    notes = tuple(dict.fromkeys((*estimates.estimate.notes, *merged.notes)))
+    seconds = {name: round(s, 3) for name, s in _all_seconds(estimates, watch).items()}
+    users = write_results(path, files, _record(captures, estimates, merged, notes) | {"seconds": seconds})
+    return ProcessedFolder(folder, estimates, merged, notes, seconds, tuple(users))
+
+
+def _pose_files(folder: CaptureFolder, estimates: Estimates) -> dict[str, bytes]:
+    """board_ and correction_ files of every view with a pose."""
+    files = {}
+    for number, (board, correction) in corrections_of(given_files(folder), estimates).items():
+        files[f"board_{number:05d}.txt"] = pose_text(board).encode()
+        files[f"correction_{number:05d}.txt"] = pose_text(correction).encode()
+    return files
+
+
+def _mask_files(folder: CaptureFolder, estimate: CaptureEstimate, body: Mesh) -> dict[str, bytes]:
+    """mask_ files of every view with a pose and without a mask of the user's, as the lens draws them."""
+    given, files = given_files(folder), {}
+    for view in estimate.views:
+        if view.T_board_cam is not None and not given.has_mask(view.number):
+            mask = silhouette(body, Camera(folder.camera.intrinsics, view.T_board_cam))
+            files[f"mask_{view.number:05d}.png"] = encode_png(distort_mask(mask, folder.camera).astype(np.uint8) * 255)
+    return files
+
+
+def _all_seconds(estimates: Estimates, watch: Stopwatch) -> dict[str, float]:
+    """Seconds by stage, those of the estimates in place of their sum."""
+    own: dict[str, float] = {f"poses_{name}": s for name, s in estimates.seconds.items()}
+    for name, estimate in estimates.by_name.items():
+        own[f"poses_{name}"] = sum(estimate.seconds.values())
+    rest = {name: s for name, s in watch.seconds.items() if name != "estimate"}
+    return {**own, **rest, "total": sum(watch.seconds.values())}
+
+
+def _record(captures: Captures, estimates: Estimates, merged: Merged, notes: tuple[str, ...]) -> dict[str, Any]:
+    """process.json without the seconds and the files."""
+    chosen, region = estimates.estimate, merged.region
+    depth = chosen.depth
+    return {
+        "settings": captures.model_dump(mode="json", include={"estimation", "fusion", "synthesis"}),
+        "estimate": chosen.estimate,
+        "views": [
+            {"number": view.number, "status": view.status, "reasons": list(view.reasons)} for view in chosen.views
+        ],
+        "depth": {
+            "offset_m": depth.offset_m,
+            "scale": depth.scale,
+            "T_cam_depth": depth.T_cam_depth.tolist(),
+            "identified": list(depth.identified),
+        },
+        "print_scale": chosen.print_scale,
+        "board_as_measured": {
+            "plane": list(region.plane),
+            "spread_m": region.spread_m,
+            "clearance_m": region.clearance_m,
+        },
+        "cloud_points": len(merged.surface.points),
+        "mesh_faces": len(merged.surface.faces),
+        "notes": list(notes),
+    }
