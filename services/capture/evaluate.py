@@ -3,9 +3,13 @@
 import argparse
 import dataclasses
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from schemas.errors import CaptureError
+
+if TYPE_CHECKING:
+    from workers.capture.evaluate import SurfaceErrors
+    from workers.pipeline.captures.stored_result import StoredResult
 
 
 def evaluate(options: argparse.Namespace) -> int:
@@ -13,46 +17,69 @@ def evaluate(options: argparse.Namespace) -> int:
 
     Raises CaptureError where the folder was not processed, or there is neither truth nor a mesh.
     """
-    from workers.pipeline.captures.score import read_mesh_file, read_whole_truth, score_capture
-    from workers.pipeline.captures.score_mesh import score_against_mesh
     from workers.pipeline.captures.stored_result import read_result
 
     result = read_result(options.folder)
-    answer: dict[str, Any] = {"ok": True, "folder": str(options.folder), "estimate": result.estimate.estimate}
-    if options.mesh is not None:
-        surface, alignment = score_against_mesh(result, read_mesh_file(options.mesh))
-        how = f"{options.mesh} aligned to the merged mesh by ICP, which leaves {alignment.rms_mm:.2f} mm rms"
-        print(f"{how}: poses cannot be scored, and errors that a rigid motion explains are not seen")
-        answer |= {"aligned_by": "icp", "icp_rms_mm": alignment.rms_mm, **dict.fromkeys(("pose_mm", "pose_deg"))}
-        answer |= {"depth_median_mm": None, "T_board_obj": alignment.T_board_obj.tolist()}
-    else:
-        truth = read_whole_truth(result.folder)
-        if truth is None:
-            raise CaptureError(
-                "no_truth",
-                f"{options.folder} has no truth/, which simulated captures have: give the object's mesh with --mesh",
-            )
-        score = score_capture(result.estimate, result.surface, result.views, truth)
-        surface, one = score.surface, score.summary
-        print(
-            f"poses    median {one.pose_mm:.3f} mm, {one.pose_deg:.4f} degrees; worst {score.worst_mm:.3f} mm, {score.worst_deg:.4f} degrees"
-        )
-        for number, errors in score.held_out.items():
-            print(
-                f"view {number} made of the others: depth {errors.depth_median_mm:.2f} mm (95 %: {errors.depth_p95_mm:.2f}), "
-                f"colour {errors.color_error:.1f} of 255, covers {errors.covered:.1%}, {errors.measured_share:.1%} measured"
-            )
-        answer |= {"aligned_by": None, "pose_mm": one.pose_mm, "pose_deg": one.pose_deg}
-        answer |= {"pose_worst_mm": score.worst_mm, "pose_worst_deg": score.worst_deg}
-        answer |= {"depth_median_mm": one.depth_median_mm}
-        answer["held_out"] = {str(number): dataclasses.asdict(errors) for number, errors in score.held_out.items()}
-    print(
-        f"cloud    {surface.points} points, median {surface.cloud_median_mm:.3f} mm, 95 %: {surface.cloud_p95_mm:.3f} mm off the surface"
-    )
-    print(
-        f"surface  median {surface.surface_median_mm:.3f} mm, 95 %: {surface.surface_p95_mm:.3f} mm off the mesh; {surface.completeness:.1%} of what was visible has a point within 3 mm ({surface.visible_share:.1%} of the whole surface was)"
-    )
-    answer |= dataclasses.asdict(surface)
+    surface, answer = _against_truth(result) if options.mesh is None else _against_mesh(result, options)
+    _print_surface(surface)
     if options.json:
-        print(json.dumps(answer))
+        known = {"ok": True, "folder": str(options.folder), "estimate": result.estimate.estimate}
+        print(json.dumps({**known, **answer, **dataclasses.asdict(surface)}))
     return 0
+
+
+def _against_truth(result: "StoredResult") -> tuple["SurfaceErrors", dict[str, Any]]:
+    from workers.pipeline.captures.score import read_whole_truth, score_capture
+
+    truth = read_whole_truth(result.folder)
+    if truth is None:
+        raise CaptureError(
+            "no_truth",
+            f"{result.folder.path} has no truth/, which simulated captures have: give the object's mesh with --mesh",
+        )
+    score = score_capture(result.estimate, result.surface, result.views, truth)
+    one = score.summary
+    print(f"poses    median {one.pose_mm:.3f} mm, {one.pose_deg:.4f} degrees")
+    print(f"         worst {score.worst_mm:.3f} mm, {score.worst_deg:.4f} degrees")
+    for number, errors in score.held_out.items():
+        print(
+            f"view {number} made of the others: depth {errors.depth_median_mm:.2f} mm (95 %: {errors.depth_p95_mm:.2f}), "
+            f"colour {errors.color_error:.1f} of 255, covers {errors.covered:.1%}, {errors.measured_share:.1%} measured"
+        )
+    answer = {
+        "aligned_by": None,
+        "pose_mm": one.pose_mm,
+        "pose_deg": one.pose_deg,
+        "pose_worst_mm": score.worst_mm,
+        "pose_worst_deg": score.worst_deg,
+        "depth_median_mm": one.depth_median_mm,
+        "held_out": {str(number): dataclasses.asdict(errors) for number, errors in score.held_out.items()},
+    }
+    return score.surface, answer
+
+
+def _against_mesh(result: "StoredResult", options: argparse.Namespace) -> tuple["SurfaceErrors", dict[str, Any]]:
+    from workers.pipeline.captures.score import read_mesh_file
+    from workers.pipeline.captures.score_mesh import score_against_mesh
+
+    surface, alignment = score_against_mesh(result, read_mesh_file(options.mesh))
+    print(f"{options.mesh} was aligned to the cloud by ICP, which leaves {alignment.rms_mm:.2f} mm rms:")
+    print("poses are not scored, and errors that a rigid motion explains are not seen")
+    answer = {
+        **dict.fromkeys(("pose_mm", "pose_deg", "depth_median_mm")),
+        "aligned_by": "icp",
+        "icp_rms_mm": alignment.rms_mm,
+        "T_board_obj": alignment.T_board_obj.tolist(),
+    }
+    return surface, answer
+
+
+def _print_surface(errors: "SurfaceErrors") -> None:
+    print(
+        f"cloud    {errors.points} points; median {errors.cloud_median_mm:.3f} mm, 95 %: {errors.cloud_p95_mm:.3f} mm off "
+        "the surface"
+    )
+    print(f"surface  median {errors.surface_median_mm:.3f} mm, 95 %: {errors.surface_p95_mm:.3f} mm off the mesh")
+    print(
+        f"         {errors.completeness:.1%} of what was visible has a point within 3 mm; visible was {errors.visible_share:.1%}"
+    )

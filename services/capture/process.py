@@ -15,8 +15,9 @@ def process(options: argparse.Namespace) -> int:
     from workers.pipeline.captures.process import process_folder
 
     done = process_folder(options.folder, captures)
-    for name, estimate in done.estimates.by_name.items():
-        print(f"{name:8} {_describe(estimate)}{' (chosen)' * (name == done.estimates.chosen)}")
+    for estimate in done.estimates.by_name.values():
+        chosen = " (chosen)" * (estimate.estimate == done.estimates.chosen)
+        print(f"{estimate.estimate:8} {_describe(estimate)}{chosen}")
     for view in done.estimates.estimate.views:
         if view.status != "used":
             print(f"view {view.number} {view.status}: {'; '.join(view.reasons)}")
@@ -26,7 +27,7 @@ def process(options: argparse.Namespace) -> int:
         print(f"kept: {name}, which processing did not write")
     surface, slowest = done.merged.surface, sorted(done.seconds.items(), key=lambda item: -item[1])
     print(
-        f"{options.folder}: {len(surface.points)} points, {len(surface.faces)} faces in {done.seconds['total']:.1f} s"
+        f"{options.folder}: {len(surface.points)} points, {len(surface.faces)} faces in {done.seconds['total']:.1f} s of processor time"
     )
     print("  " + ", ".join(f"{name} {s:.1f} s" for name, s in slowest if name != "total"))
     if options.json:

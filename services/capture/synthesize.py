@@ -10,7 +10,7 @@ from schemas.errors import CaptureError, InputError
 def synthesize(options: argparse.Namespace) -> int:
     """Writes views of options.folder to options.out: from the pose in the file `pose`, or with `mirror` one for each view.
 
-    Returns 0. Raises InputError where the pose file is missing, CaptureError where the folder was not processed or nothing is seen.
+    Returns 0. Raises InputError where the pose file is missing, CaptureError where nothing was processed or nothing is seen.
     """
     from workers.pipeline.captures.stored_result import read_result
     from workers.pipeline.captures.synthesized_files import write_mirrors, write_synthesized

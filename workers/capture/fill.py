@@ -14,22 +14,32 @@ STEP_M = 0.01
 def fill_holes(
     rgb: NDArray[np.uint8], depth_m: Array, mask: NDArray[np.bool_], size_px: int
 ) -> tuple[NDArray[np.uint8], Array, NDArray[np.bool_]]:
-    """(rgb, depth_m, mask) where holes up to about 2 * size_px wide are filled from their rims inwards; outer edges stay."""
+    """(rgb, depth_m, mask) where small holes are filled from their rims inwards, and outer edges stay as they are.
+
+    Small are gaps of up to about 2 * size_px across, and holes that are enclosed and have at most (4 * size_px)^2 pixels.
+    """
     if size_px == 0:
         return rgb, depth_m, mask
-    known = (depth_m > 0.0).astype(np.uint8)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size_px + 1, 2 * size_px + 1))
-    # Beyond the image's edge nothing is known: without the border, closing would fill along it.
-    framed = np.pad(known, 2 * size_px)
-    closed = cv2.morphologyEx(framed, cv2.MORPH_CLOSE, disc)[2 * size_px : -2 * size_px, 2 * size_px : -2 * size_px]
-    holes = np.argwhere((closed > 0) & (known == 0))
+    holes = np.argwhere(_small_holes(depth_m > 0.0, size_px))
     rgb, depth_m, mask = rgb.copy(), depth_m.copy(), mask.copy()
-    for _ in range(2 * size_px):
-        if not len(holes):
-            break
+    while len(holes):
         left = _fill_rim(rgb, depth_m, mask, holes)
+        if left.all():
+            break
         holes = holes[left]
     return rgb, depth_m, mask
+
+
+def _small_holes(known: NDArray[np.bool_], size_px: int) -> NDArray[np.bool_]:
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size_px + 1, 2 * size_px + 1))
+    # Beyond the image's edge nothing is known: without the border, closing would fill along it.
+    border = 2 * size_px
+    framed = np.pad(known.view(np.uint8), border)
+    gaps = cv2.morphologyEx(framed, cv2.MORPH_CLOSE, disc) > framed
+    _, label, stats, _ = cv2.connectedComponentsWithStats(1 - framed, connectivity=4)
+    small = stats[:, cv2.CC_STAT_AREA] <= (4 * size_px) ** 2
+    small[0] = False
+    return np.asarray((gaps | small[label])[border:-border, border:-border])
 
 
 @compiled

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from schemas.base import Array
 from schemas.scene.camera import Camera
@@ -15,9 +16,6 @@ from workers.capture.tsdf import sample_inverse
 from workers.geometry.frames import invert
 from workers.geometry.jit import compiled
 from workers.geometry.srgb import SRGB_STEPS, encode_codes
-
-BEST = 3
-"""Views that a point's colour is the mean of."""
 
 LEAST_LIGHT = 0.02
 """Darker colours, in linear light, say nothing about a view's exposure."""
@@ -103,7 +101,10 @@ def _observe(
 
 
 def color_points(points: Array, normals: Array, sights: Sequence[Sight], within_m: float) -> NDArray[np.uint8]:
-    """[N, 3] uint8 sRGB: the mean of the views that see a point best, after their exposures were made alike; grey if none."""
+    """[N, 3] uint8 sRGB: the mean of the views, mostly of those that see a point best, after their exposures were made alike.
+
+    A point that no view sees has the colour of the nearest one that is seen.
+    """
     light = np.zeros((len(sights), len(points), 3), np.float32)
     score = np.zeros((len(sights), len(points)), np.float32)
     for number, sight in enumerate(sights):
@@ -113,14 +114,15 @@ def color_points(points: Array, normals: Array, sights: Sequence[Sight], within_
         light[number, seen] = colors
         score[number, seen] = np.where(inside, weight[seen], 0.0)
     light *= exposure_gains(light, score)[:, None, None].astype(np.float32)
-    few = min(BEST, len(sights))
-    best = np.argpartition(-score, few - 1, axis=0)[:few]
-    best.sort(axis=0)
-    w = np.take_along_axis(score, best, axis=0)[..., None].astype(np.float64)
-    total = w.sum(axis=0)
-    mean = (np.take_along_axis(light, best[..., None], axis=0) * w).sum(axis=0) / np.where(total > 0.0, total, 1.0)
+    # Squares, so that the best views decide, without a seam where their order changes.
+    weight = score.astype(np.float64) ** 2
+    total = weight.sum(axis=0)
+    mean = np.einsum("vn,vnc->nc", weight, light) / np.where(total > 0.0, total, 1.0)[:, None]
     codes = encode_codes(mean)
-    codes[total[:, 0] == 0.0] = 128
+    unseen = total == 0.0
+    if unseen.any() and not unseen.all():
+        _, nearest = cKDTree(points[~unseen]).query(points[unseen])
+        codes[unseen] = codes[~unseen][nearest]
     return codes
 
 

@@ -27,6 +27,14 @@ def test_a_gap_between_two_surfaces_is_shared_and_its_middle_belongs_to_the_fart
         assert np.allclose(got[5:-5], expected[5:-5])
 
 
+def test_an_enclosed_hole_is_filled_whole_or_not_at_all():
+    rgb, depth, mask = scene()
+    depth[10:21, 10:21], depth[35:50, 10:25] = 0.0, 0.0
+    filled = fill_holes(rgb, depth, mask, 3)[1]
+    assert np.allclose(filled[10:21, 10:21], 0.8)
+    assert not filled[39:46, 14:21].any()
+
+
 def test_large_holes_and_outer_edges_stay():
     rgb, depth, mask = scene()
     depth[:, 60:], depth[10:30, 10:30] = 0.0, 0.0

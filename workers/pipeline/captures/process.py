@@ -16,8 +16,8 @@ from workers.capture.posed_view import distort_mask
 from workers.pipeline.captures.corrections import correct_manually, corrections_of, given_files
 from workers.pipeline.captures.estimate import estimate_poses
 from workers.pipeline.captures.pose_table import pose_table
+from workers.pipeline.captures.processor_clock import ProcessorClock
 from workers.pipeline.captures.reconstruct import Merged, reconstruct
-from workers.pipeline.stopwatch import Stopwatch
 from workers.store.capture_folder import CaptureFolder, open_folder, pose_text
 from workers.store.capture_results import (
     CLOUD_FILE,
@@ -48,7 +48,7 @@ def process_folder(path: Path, captures: Captures) -> ProcessedFolder:
     Started again on the same folder it writes the same bytes, but for the seconds in process.json. Raises CaptureError where
     the capture cannot be used; nothing is written then.
     """
-    watch = Stopwatch()
+    watch = ProcessorClock()
     folder = open_folder(path)
     with watch.stage("estimate"):
         estimates = correct_manually(given_files(folder), estimate_poses(folder, captures.estimation))
@@ -85,8 +85,8 @@ def _mask_files(folder: CaptureFolder, estimate: CaptureEstimate, body: Mesh) ->
     return files
 
 
-def _all_seconds(estimates: Estimates, watch: Stopwatch) -> dict[str, float]:
-    """Seconds by stage, those of the estimates in place of their sum."""
+def _all_seconds(estimates: Estimates, watch: ProcessorClock) -> dict[str, float]:
+    """Seconds of processor time by stage, those of the estimates in place of their sum."""
     own: dict[str, float] = {f"poses_{name}": s for name, s in estimates.seconds.items()}
     for name, estimate in estimates.by_name.items():
         own[f"poses_{name}"] = sum(estimate.seconds.values())
