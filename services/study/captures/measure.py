@@ -1,23 +1,20 @@
 """One capture processed with every setting: processor time, bytes, and errors against its truth."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from workers.pipeline.captures.score import score_capture
 
 from schemas.capture.processed import CaptureScore, ProcessedCapture
 from schemas.errors import CaptureError
-from schemas.job.captures import Captures
 from services.study.measure.settling import context_for
 from services.study.model import Setting
-from workers.pipeline.captures.make_capture import choose_views, require_captures, simulate_one
+from workers.pipeline.captures.make_capture import choose_views, require_captures
 from workers.pipeline.captures.process_capture import process_capture
+from workers.pipeline.captures.processor_clock import ProcessorClock
 from workers.pipeline.context import WorkerContext
-from workers.pipeline.stopwatch import Stopwatch
 from workers.store.capture_folder import CaptureFolder, open_folder
 
 BYTES_OF_POINT = 3 * 4 + 3 * 4 + 3
@@ -35,11 +32,6 @@ ERRORS_OF_SCORE = {
 """Names of the study's errors, and of the score's figures."""
 
 
-def simulate_whole(context: WorkerContext, scene_id: int, path: Path) -> None:
-    """Simulate a capture of the job with all its views."""
-    simulate_one(context, scene_id, path)
-
-
 def measure_capture(
     context: WorkerContext, settings: Sequence[Setting], path: Path, unit: tuple[int, int]
 ) -> dict[str, Any]:
@@ -51,15 +43,17 @@ def measure_capture(
     answer: dict[str, Any] = {"whole": {}, "settling": {}, "bytes": {}, "errors": {}, "failed": {}}
     whole = open_folder(path)
     first = settings[0]
-    _process(whole, require_captures(context_for(context, first).job))  # compiles, and fills the disk's cache
+    process_capture(
+        whole, require_captures(context_for(context, first).job), ProcessorClock()
+    )  # compiles, and fills the disk's cache
     for setting in [settings[n] for n in np.random.default_rng(unit).permutation(len(settings))]:
         captures = require_captures(context_for(context, setting).job)
         folder = fewer_views(whole, captures.simulate.views)
-        began = time.process_time()
+        watch = ProcessorClock()
         try:
-            done = _process(folder, captures)
-            answer["whole"][setting.name] = time.process_time() - began
-            answer["errors"][setting.name] = errors_of(score_capture(path, done, captures))
+            done = process_capture(folder, captures, watch)
+            answer["whole"][setting.name] = sum(s for stage, s in watch.seconds.items() if stage != "score")
+            answer["errors"][setting.name] = errors_of(done.score or CaptureScore())
             answer["bytes"][setting.name] = _bytes(done)
         except CaptureError as error:
             answer["failed"][setting.name] = str(error)
@@ -77,10 +71,6 @@ def errors_of(score: CaptureScore) -> dict[str, float]:
     found = {name: getattr(score, figure) for name, figure in ERRORS_OF_SCORE.items()}
     found["missing_share"] = None if score.completeness is None else 1.0 - score.completeness
     return {name: float(value) for name, value in found.items() if value is not None}
-
-
-def _process(folder: CaptureFolder, captures: Captures) -> ProcessedCapture:
-    return process_capture(folder, captures, Stopwatch())
 
 
 def _bytes(done: ProcessedCapture) -> int:

@@ -1,20 +1,20 @@
 """The study of a job of simulated captures: what views, estimates, iterations and voxels cost, and what they give."""
 
 import itertools
-import tempfile
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from schemas.errors import InputError
 from services.bench.machine import pinned
 from services.run.progress import ProgressLine
-from services.study.captures.measure import measure_capture, simulate_whole
+from services.study.captures.measure import measure_capture
 from services.study.journal import Journal
 from services.study.measure.statistics import image_figures
 from services.study.measure.timing import cost_of, job_cost
 from services.study.model import Plan, Row
+from workers.pipeline.captures.make_capture import simulate_one
 from workers.pipeline.context import WorkerContext
+from workers.store.temporary_folder import temporary_folder
 
 LEAST_CAPTURES = 2
 """Fewer tell nothing of how errors spread."""
@@ -47,9 +47,9 @@ def run_capture_study(plan: Plan, journal: Journal, context: WorkerContext, prog
             missing = [name for name, (of, _) in units.items() if of == scene and name not in journal]
             if not missing:
                 continue
-            with tempfile.TemporaryDirectory(prefix="verso-study-") as scratch:
-                path = Path(scratch, "capture")
-                simulate_whole(context, scene, path)
+            with temporary_folder("study") as scratch:
+                path = scratch / "capture"
+                simulate_one(context, scene, path)
                 for name in missing:
                     journal.add(name, measure_capture(context, plan.settings, path, units[name]))
                     progress.show(sum(unit in journal for unit in units))

@@ -1,6 +1,5 @@
 """One capture from its id to what is written: the list of steps."""
 
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -27,6 +26,7 @@ from workers.plan.step import choose_category
 from workers.store.capture_folder import open_folder
 from workers.store.capture_inputs import digest_inputs
 from workers.store.capture_truth import read_receipt, read_truth
+from workers.store.temporary_folder import temporary_folder
 
 SOURCE, SIMULATED = "capture", "simulated_capture"
 """`scenes.source` and `assets.source` of captures; those of scenes are the source of the shape."""
@@ -72,14 +72,20 @@ def open_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Ite
                 raise CaptureError("changed", f"{listing.folder} does not hold what it held when the run began")
         yield Opened(listing.folder, None, Origin(False, listing.sha256))
         return
-    with tempfile.TemporaryDirectory(prefix="verso-capture-") as scratch:
-        path = Path(scratch) / "capture"
+    with temporary_folder("capture") as scratch:
+        path = scratch / "capture"
         with watch.stage("simulate"):
-            chance = SceneChance(context.job.seed, scene_id)
-            ref = choose_object(context.catalogue, choose_category(context.job, chance), chance.stream(Stream.OBJECT))
-            simulate_capture(captures.simulate, captures.board, load_asset(context.catalogue, ref), chance, path)
+            instance_id = simulate_one(context, scene_id, path)
             ran, skipped = read_receipt(path)
-        yield Opened(path, ref.instance_id, Origin(True, None, ran, skipped))
+        yield Opened(path, instance_id, Origin(True, None, ran, skipped))
+
+
+def simulate_one(context: WorkerContext, scene_id: int, path: Path) -> str:
+    """Simulates a capture of the job into an empty folder; the instance id of its object."""
+    captures, chance = require_captures(context.job), SceneChance(context.job.seed, scene_id)
+    ref = choose_object(context.catalogue, choose_category(context.job, chance), chance.stream(Stream.OBJECT))
+    simulate_capture(captures.simulate, captures.board, load_asset(context.catalogue, ref), chance, path)
+    return ref.instance_id
 
 
 def make_pairs(

@@ -5,7 +5,7 @@ from services.study.knobs import apply, knobs_of, settings_of
 
 
 def test_every_value_makes_a_job_that_differs_from_the_jobs_own():
-    job = Job(name="t", scenes=2, captures=Captures(simulate=Simulate(views=24)))
+    job = Job.model_validate({"name": "t", "scenes": 2, "captures": {"simulate": {"views": 24}}})
     settings, left_out = settings_of(job, knobs_of(job))
     assert left_out == ()
     own = apply(job, settings[0].changes)

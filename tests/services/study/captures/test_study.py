@@ -3,7 +3,6 @@ from pathlib import Path
 import pytest
 
 from schemas.errors import InputError
-from schemas.job.captures import Captures, Simulate
 from schemas.job.job import Job
 from services.study.captures.study import check_captures, rows_of
 from services.study.model import Plan, Setting, Sizes
@@ -11,8 +10,8 @@ from services.study.model import Plan, Setting, Sizes
 OWN, COARSE, HOPELESS = Setting(), Setting((("voxel", "0.006"),)), Setting((("views", "4"),))
 
 
-def plan(captures: Captures, count: int = 2) -> Plan:
-    job = Job(name="t", scenes=count, captures=captures)
+def plan(captures: dict, count: int = 2) -> Plan:
+    job = Job.model_validate({"name": "t", "scenes": count, "captures": captures})
     return Plan(job, Path(), (), (OWN, COARSE, HOPELESS), (), None, Sizes(scenes=count, settled=0, laps=2))
 
 
@@ -29,7 +28,7 @@ def answer(own_s: float, coarse_s: float) -> dict:
 
 def test_a_row_has_the_ratio_of_times_over_captures_and_the_worst_errors():
     laps = [{0: answer(4.0, 1.0), 1: answer(8.0, 2.0)}, {0: answer(4.0, 1.0), 1: answer(8.0, 2.0)}]
-    own, coarse = rows_of(plan(Captures()), laps)
+    own, coarse = rows_of(plan({}), laps)
     assert (own.ratio, own.ms, own.kilobytes) == (1.0, 6000.0, 2.0)
     assert (coarse.ratio, coarse.ms, coarse.kilobytes) == (0.25, 1500.0, 0.5)
     assert coarse.errors["cloud_mm"].value == 0.8
@@ -39,12 +38,12 @@ def test_a_setting_that_some_captures_cannot_be_made_with_says_why():
     first = answer(4.0, 1.0) | {"failed": {COARSE.name: "fuse: nothing is seen"}}
     del first["whole"][COARSE.name], first["errors"][COARSE.name], first["bytes"][COARSE.name]
     laps = [{0: first, 1: answer(8.0, 2.0)}] * 2
-    coarse = rows_of(plan(Captures()), laps)[1]
+    coarse = rows_of(plan({}), laps)[1]
     assert coarse.failed_share == 0.5 and coarse.notes == ("fuse: nothing is seen",)
 
 
 def test_captures_without_truth_and_a_single_capture_are_refused():
     with pytest.raises(InputError, match=r"captures\.source"):
-        check_captures(plan(Captures(source="folders", folders=["a", "b"])))
+        check_captures(plan({"source": "folders", "folders": ["a", "b"]}))
     with pytest.raises(InputError, match="1 capture cannot tell"):
-        check_captures(plan(Captures(simulate=Simulate(views=8)), count=1))
+        check_captures(plan({"simulate": {"views": 8}}, count=1))
