@@ -51,7 +51,12 @@ def _made(settings, seed, without):
 
 def take_one(seed=11, **settings):
     """(view, camera, T_board_cam): the first photograph of a can, without a folder."""
-    simulate, chance, asset = Simulate(**settings), SceneChance(seed, 0), asset_of()
+    return _taken(Simulate(**settings).model_dump_json(), seed)
+
+
+@functools.cache
+def _taken(settings, seed):
+    simulate, chance, asset = Simulate.model_validate_json(settings), SceneChance(seed, 0), asset_of()
     thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
     studio = build_studio(simulate, Board(), thing, plan_effects(simulate), chance)
     (T_board_cam, *_) = plan_path(simulate, thing.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))

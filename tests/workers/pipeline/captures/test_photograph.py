@@ -19,18 +19,10 @@ SMALL = {"views": 2, "image_scale": 0.25}
 LENS = {"k1": 0.08, "k2": -0.05, "p1": 0.0005, "p2": -0.0004, "k3": 0.02}
 
 
-def corners_of(capture, board=None):
-    """(mean error [2], mean outward error) px of the corners of all views, and how many there are."""
-    found = [
-        corner_errors(
-            read_view(capture.folder, n).rgb,
-            capture.folder.camera,
-            capture.truth.T_board_cam[n],
-            board or capture.folder.board,
-        )
-        for n in capture.folder.numbers
-    ]
-    errors, outwards = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+def corners_of(board=None, **settings):
+    """(errors [N, 2] px of the corners of one photograph, their outward parts [N])."""
+    view, camera, T_board_cam = take_one(**NEAR, **settings)
+    errors, outwards = corner_errors(view.rgb, camera, T_board_cam, board or Board())
     return errors, (errors * outwards).sum(axis=1)
 
 
@@ -51,7 +43,7 @@ def detected_errors(rgb, camera, T_board_cam):
 )
 def test_corners_lie_where_opencv_projects_them(settings):
     """A pixel convention off by half a pixel would show as 0.5; a blur to one side or uneven samples as some hundredths."""
-    errors, outwards = corners_of(made(**NEAR, **settings))
+    errors, outwards = corners_of(**settings)
     assert len(errors) >= 60
     assert np.abs(errors.mean(axis=0)).max() < 0.03
     assert abs(np.median(outwards)) < 0.03
@@ -59,24 +51,20 @@ def test_corners_lie_where_opencv_projects_them(settings):
 
 
 def test_a_print_that_is_too_large_is_seen_so():
-    capture = made(**NEAR, print_scale=1.02)
-    board = capture.folder.board
-    assert board.measured_ruler_m is None  # nobody told
-    errors, _ = corners_of(capture, board.model_copy(update={"measured_ruler_m": 1.02 * board.ruler_m}))
+    """The board that the settings name is as large as it should be; only a ruler would tell the print's size."""
+    errors, _ = corners_of(Board(measured_ruler_m=1.02 * Board().ruler_m), print_scale=1.02)
     assert np.abs(errors.mean(axis=0)).max() < 0.03
     assert np.median(np.abs(errors)) < 0.05
 
 
 def test_motion_blurs_edges():
-    sharp, blurred = (made(**NEAR, **more) for more in ({}, {"motion_blur": {"exposure_s": 0.1}}))
-    slopes = [
-        np.abs(np.diff(grey(read_view(one.folder, 0).rgb), axis=1)).max(axis=1).mean() for one in (sharp, blurred)
-    ]
+    sharp, blurred = (take_one(**NEAR, **more)[0] for more in ({}, {"motion_blur": {"exposure_s": 0.1}}))
+    slopes = [np.abs(np.diff(grey(one.rgb), axis=1)).max(axis=1).mean() for one in (sharp, blurred)]
     assert slopes[1] < 0.8 * slopes[0]
 
 
 def test_a_lens_leaves_no_black_corner():
-    view = read_view(made(**NEAR, distortion={"k1": -0.12, "k2": 0.05}).folder, 0)
+    view, _, _ = take_one(**NEAR, distortion={"k1": -0.12, "k2": 0.05})
     assert all(view.rgb[row, column].max() > 0 for row in (0, -1) for column in (0, -1))
 
 
@@ -100,7 +88,7 @@ def test_hidden_markers_are_found_no_more():
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
     found = []
     for more in ({}, {"hidden_markers": {"share": 0.6}}):
-        image = cv2.cvtColor(read_view(made(**NEAR, **more).folder, 0).rgb, cv2.COLOR_RGB2GRAY)
+        image = cv2.cvtColor(take_one(**NEAR, **more)[0].rgb, cv2.COLOR_RGB2GRAY)
         found.append(len(detector.detectMarkers(image)[1]))
     assert found[0] >= 15
     assert found[1] < 0.75 * found[0]
@@ -217,8 +205,8 @@ def test_a_traced_photograph_has_its_corners_where_opencv_projects_them(settings
 
 def test_opencvs_detector_finds_the_corners():
     """Its corners lie a little inside the true ones (edge_corners.py), so their mean over all markers is what must be 0."""
-    capture = made(**NEAR)
-    errors = detected_errors(read_view(capture.folder, 0).rgb, capture.folder.camera, capture.truth.T_board_cam[0])
+    view, camera, T_board_cam = take_one(**NEAR)
+    errors = detected_errors(view.rgb, camera, T_board_cam)
     assert len(errors) >= 60
     assert np.abs(errors.mean(axis=0)).max() < 0.05
     assert np.median(np.abs(errors)) < 0.3
