@@ -4,6 +4,7 @@ import io
 from collections.abc import Iterator
 
 import trimesh
+from trimesh.visual import ColorVisuals
 
 from schemas.base import Pose
 from schemas.dataset.codec import Row, read_world_poses
@@ -11,6 +12,7 @@ from schemas.dataset.layout import asset_path
 from schemas.errors import CorruptError
 from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
 from services.read.dataset_reader import StoredRange
+from workers.assets.external.materials import read_visual
 from workers.store.store import Store
 
 
@@ -24,9 +26,11 @@ def captured_geometry(store: Store, stored: StoredRange, row: Row) -> Iterator[t
     path = asset_path(row["category"], row["instance_id"])
     try:
         scene = trimesh.load_scene(io.BytesIO(store.read(path)), file_type="glb", process=False)
-    except (OSError, ValueError) as error:
+    except Exception as error:  # trimesh raises errors of many kinds for a damaged file
         raise CorruptError(
             f"{path} cannot be read: {error}; `verso replay {store.name} --repair` makes it again"
         ) from error
     for mesh in scene.geometry.values():
+        visual, _ = read_visual(mesh, linear=True)
+        mesh.visual = ColorVisuals(mesh, vertex_colors=visual.colors)
         yield f"{row['category']} {row['instance_id']}", mesh, T_world[REGION_FIRST_OBJECT]

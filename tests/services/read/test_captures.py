@@ -118,6 +118,7 @@ def test_geometry_of_a_capture_is_its_board_and_its_mesh_where_they_are(virtual,
     placed = trimesh.transform_points(thing[1].vertices, thing[2])
     assert placed[:, 2].min() == pytest.approx(0.0, abs=1e-6)
     assert abs(placed[:, :2].mean()) < 0.05
+    assert thing[1].visual.vertex_colors[0].tolist() == [120, 120, 120, 255]
 
 
 def test_folders_are_captures_and_one_that_cannot_be_used_is_a_row_of_failures(tmp_path, monkeypatch):

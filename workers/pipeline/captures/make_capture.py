@@ -47,18 +47,20 @@ def run_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Scen
     with open_capture(context, scene_id, watch) as opened:
         folder = open_folder(opened.path)
         done = process_capture(folder, captures, watch)
-        known = folder.about.model_fields_set
-        category = folder.about.category if "category" in known else captures.category
+        done = replace(done, name=opened.name or done.name)
+        category = done.category if "category" in folder.about.model_fields_set else captures.category
         with watch.stage("labels"):
-            done = replace(done, name=opened.name or done.name)
             source = SOURCE if read_truth(opened.path) is None else SIMULATED
-            names = CaptureNames(f"{done.name}-{scene_id:05d}", category, done.licence, source)
-            asset, T_world_obj = reconstructed_asset(done.surface, names, job.assets)
-            effects = image_effects(job)
-            thing = CapturedObject(
-                scene_id, asset, T_world_obj, done.board, board_asset(done.board, job.assets), effects
-            )
+            thing = place_capture(job, scene_id, done, category, source)
         return record_capture(context, thing, done, opened.origin, make_pairs(context, thing, done, watch), watch)
+
+
+def place_capture(job: Job, scene_id: int, done: ProcessedCapture, category: str, source: str) -> CapturedObject:
+    """The reconstructed object and the board as assets, where they are. Each capture of an object is an instance."""
+    names = CaptureNames(f"{done.name}-{scene_id:05d}", category, done.licence, source)
+    asset, T_world_obj = reconstructed_asset(done.surface, names, job.assets)
+    board = board_asset(done.board, job.assets)
+    return CapturedObject(scene_id, asset, T_world_obj, done.board, board, image_effects(job))
 
 
 @contextmanager
