@@ -26,6 +26,9 @@ from schemas.job.keys import set_key
 from schemas.job.sensor import Distortion, Exposure, RgbNoise
 
 Estimate = Literal["markers", "article", "joint"]
+BoardFrame = Literal["centre", "opencv", "opencv_old"]
+"""Where a board pose has its origin: ours at the grid's centre, y up the print, z out; OpenCV's since 4.6 at the top left,
+y down, z into the board; OpenCV's before at the bottom left, y up, z out."""
 ESTIMATES: tuple[Estimate, ...] = ("markers", "article", "joint")
 
 

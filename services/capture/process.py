@@ -26,18 +26,17 @@ def process(options: argparse.Namespace) -> int:
     for name in done.users:
         print(f"kept: {name}, which processing did not write")
     surface, slowest = done.merged.surface, sorted(done.seconds.items(), key=lambda item: -item[1])
-    print(
-        f"{options.folder}: {len(surface.points)} points, {len(surface.faces)} faces in {done.seconds['total']:.1f} s of processor time"
-    )
+    counts = f"{len(surface.points)} points, {len(surface.faces)} faces"
+    print(f"{options.folder}: {counts}, {done.seconds['total']:.1f} s of processor time")
     print("  " + ", ".join(f"{name} {s:.1f} s" for name, s in slowest if name != "total"))
     if options.json:
-        chosen = done.estimates.estimate
+        final = done.estimates.estimate
         answer = {
             "ok": True,
             "folder": str(options.folder),
-            "estimate": chosen.estimate,
-            "views": len(chosen.views),
-            "used": len(chosen.used),
+            "estimate": final.estimate,
+            "views": len(final.views),
+            "used": len(final.used),
             "points": len(surface.points),
             "faces": len(surface.faces),
             "notes": list(done.notes),

@@ -10,13 +10,10 @@ from schemas.base import Array, Pose
 from schemas.capture.estimate import Reconstruction, SynthesizedView
 from schemas.errors import CaptureError
 from schemas.scene.camera import Camera
-from schemas.scene.region import REGION_FIRST_OBJECT
-from schemas.scene.scene import Placed
-from schemas.scene.shape import Mesh, Part, Shape
-from workers.geometry.camera import project
-from workers.geometry.frames import angle_between, invert, transform
-from workers.geometry.projection import in_frame
-from workers.geometry.raycast import cast_view, first_hit
+from schemas.scene.shape import Mesh
+from workers.capture.visibility import placed
+from workers.geometry.frames import angle_between
+from workers.geometry.raycast import cast_view
 from workers.geometry.surface_distance import distance_to_mesh
 
 SAMPLES = 40_000
@@ -24,9 +21,6 @@ SAMPLES = 40_000
 
 SEED = 20_240_801
 """Of the surface samples, so that the same capture has the same figures."""
-
-CLEAR_M = 1e-5
-"""A sample is lifted off its face by so much before it is looked at, above float32's steps in the ray caster."""
 
 COMPLETE_M = 0.003
 
@@ -118,34 +112,9 @@ def compare_surface(
     )
 
 
-def visible_samples(mesh: Mesh, points: Array, normals: Array, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
-    """[N] bool: samples of the mesh that at least one camera sees, at whatever angle, by rays to its centre."""
-    thing = [_placed(mesh)]
-    visible = np.zeros(len(points), np.bool_)
-    for camera in cameras:
-        asked = np.flatnonzero(~visible & in_view(points, normals, camera))
-        origins = points[asked] + CLEAR_M * normals[asked]
-        hits = first_hit(thing, origins, camera.position - origins)
-        visible[asked[hits.distance > 1.0]] = True
-    return visible
-
-
 def true_view(mesh: Mesh, camera: Camera) -> Array:
     """[H, W] float64: exact depth of the mesh alone, by the ray caster, 0 where it is not seen."""
-    return cast_view([_placed(mesh)], camera)[0]
-
-
-def _placed(mesh: Mesh) -> Placed:
-    return Placed(REGION_FIRST_OBJECT, Shape((Part("truth", mesh.vertices, mesh.faces),)), np.eye(4))
-
-
-def in_view(points: Array, normals: Array, camera: Camera) -> NDArray[np.bool_]:
-    """[N] bool: points [N, 3] in front of a camera, within its image, whose normals face it."""
-    seen = transform(invert(camera.T_world_cam), points)
-    front = seen[:, 2] > 0.05
-    u, v = project(np.where(front[:, None], seen, [0.0, 0.0, 1.0]), camera.intrinsics)
-    facing = ((camera.position - points) * normals).sum(axis=1) > 0.0
-    return front & facing & in_frame(u, v, camera.intrinsics)
+    return cast_view([placed(mesh)], camera)[0]
 
 
 def compare_view(

@@ -18,6 +18,7 @@ from workers.capture.object_region import ObjectRegion
 from workers.capture.posed_view import PosedView
 from workers.capture.surface import Sight, color_points, measure_offsets
 from workers.capture.tsdf import FRONT_VOXELS, empty_volume, integrate, views_near
+from workers.capture.visibility import visible_points
 from workers.geometry.camera import project_bounds
 from workers.geometry.frames import invert, transform
 
@@ -26,6 +27,9 @@ MARGIN_PX = 12
 
 LEAST_PART = 0.02
 """Share of the largest part's area below which a loose part is noise."""
+
+LIFT_VOXELS = 0.25
+"""Points are looked at from so far above the surface: its roughness hides less."""
 
 STEPS = 2
 """Times that points are moved along their normals to where the views see the surface."""
@@ -76,6 +80,7 @@ def fuse_views(
     within_m = FRONT_VOXELS * spec.voxel_m
     mesh = extract_surface(volume)
     mesh, _ = keep_vertices(mesh, views_near(volume, mesh.vertices) >= spec.min_views)
+    mesh = _outside(mesh, sights, spec)
     mesh = _settle(mesh, sights, within_m)
     mesh = _clean(cut_below(mesh, region.plane, region.clearance_m), region)
     if not len(mesh.faces):
@@ -98,6 +103,23 @@ def fuse_views(
         vertex_colors=colors,
         seconds=dict(seconds or {}),
     )
+
+
+def _outside(mesh: Mesh, sights: Sequence[Sight], spec: Fusion) -> Mesh:
+    """What a camera can see past what the views measured face to face.
+
+    A pixel that mixes two surfaces looks into the object, and there the field has a second surface behind the first.
+    """
+    if not len(mesh.faces):
+        return mesh
+    normals = vertex_normals(mesh)
+    faced = measure_offsets(mesh.vertices, normals, sights, FRONT_VOXELS * spec.voxel_m).views >= spec.min_views
+    hiding, _ = keep_vertices(mesh, faced)
+    if not len(hiding.faces):
+        return mesh
+    cameras = [sight.view.depth_camera for sight in sights]
+    seen = visible_points(hiding, mesh.vertices, normals, cameras, LIFT_VOXELS * spec.voxel_m)
+    return keep_vertices(mesh, seen)[0]
 
 
 def _settle(mesh: Mesh, sights: Sequence[Sight], within_m: float) -> Mesh:

@@ -26,8 +26,8 @@ BACK_VOXELS = 2.0
 class Volume:
     """Voxel centres at origin + voxel_m * (i, j, k), board frame; distance_m and weight [X, Y, Z] float32, near [X, Y, Z] uint16.
 
-    distance_m is positive outside; weight is 0 where no view has seen the voxel; near: views that have a surface this side of
-    either end of the truncation.
+    distance_m is positive outside; weight is 0 where no view has seen the voxel. near counts the views that have their surface
+    within the truncation.
     """
 
     origin: Array

@@ -23,13 +23,13 @@ from pydantic import Field, ValidationError
 from schemas.base import Array, Frozen, Pose, Positive, PositiveInt, Text
 from schemas.capture.view import CaptureCamera, CapturedView
 from schemas.errors import CaptureError
-from schemas.job.captures import Board
+from schemas.job.captures import Board, BoardFrame
 from schemas.scene.camera import Intrinsics
 from workers.store.images import encode_png
 
 CAMERA_FILE, BOARD_FILE, CAPTURE_FILE, TRUTH = "camera.json", "board.json", "capture.json", "truth"
 Model = TypeVar("Model", bound=Frozen)
-_RGB = re.compile(r"rgb_([0-9]{5,9})\.png")
+_FILE_OF_VIEW = re.compile(r"(rgb|depth|mask|board|correction)_([0-9]{1,9})\.(png|txt)")
 
 
 class CameraFile(Frozen):
@@ -53,6 +53,8 @@ class CaptureFile(Frozen):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
     category: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")] = "object"
     licence: Text = "unknown"
+    frame: BoardFrame = "centre"
+    """Frame of the files board_ and correction_ that others made."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +72,7 @@ def open_folder(path: Path) -> CaptureFolder:
     """Reads what describes a capture; images are read one view at a time. Raises CaptureError that names file and remedy."""
     if not path.is_dir():
         raise CaptureError("missing", f"{path} is no folder")
-    found = (match[1] for file in path.iterdir() if (match := _RGB.fullmatch(file.name)))
-    numbers = sorted(int(digits) for digits in found if digits == f"{int(digits):05d}")
-    if not numbers:
-        raise CaptureError(
-            "missing", f"{path} has no rgb_00000.png: images are named rgb_, depth_ and mask_ with a number"
-        )
+    numbers = _view_numbers(path)
     spec = _read_json(path / CAMERA_FILE, CameraFile)
     about = (
         _read_json(path / CAPTURE_FILE, CaptureFile)
@@ -88,6 +85,27 @@ def open_folder(path: Path) -> CaptureFolder:
 def derive_name(words: str) -> str:
     """A name for capture.json from any words: what a name cannot have becomes `_`."""
     return re.sub(r"[^A-Za-z0-9._-]+", "_", words).lstrip("._-")[:64] or "capture"
+
+
+def _view_numbers(path: Path) -> list[int]:
+    """Numbers of the views, ascending. Raises CaptureError for a file of a view whose rgb_ is missing, and for odd names."""
+    found: dict[str, set[int]] = {}
+    for file in sorted(path.iterdir()):
+        if match := _FILE_OF_VIEW.fullmatch(file.name):
+            kind, digits, ending = match.groups()
+            if digits != f"{int(digits):05d}":
+                raise CaptureError("name", f"{file} must be named {kind}_{int(digits):05d}.{ending}")
+            found.setdefault(kind, set()).add(int(digits))
+    rgb = found.pop("rgb", set())
+    if not rgb:
+        raise CaptureError(
+            "missing", f"{path} has no rgb_00000.png: images are named rgb_, depth_ and mask_ with a number"
+        )
+    for kind, numbers in found.items():
+        if alone := sorted(numbers - rgb):
+            name, counts = f"{kind}_{alone[0]:05d}", f"{len(rgb)} rgb_ and {len(numbers)} {kind}_"
+            raise CaptureError("counts", f"{path}: {name} has no rgb_{alone[0]:05d}.png ({counts}): copy it again")
+    return sorted(rgb)
 
 
 def read_board(path: Path) -> Board:
@@ -169,15 +187,21 @@ def _camera(spec: CameraFile) -> CaptureCamera:
 
 def _read_json(path: Path, model: type[Model]) -> Model:
     try:
-        return model.model_validate(json.loads(path.read_bytes()))
+        return model.model_validate(json.loads(path.read_bytes(), parse_constant=_refuse_constant))
     except FileNotFoundError:
         raise CaptureError("missing", f"{path.parent} has no {path.name}") from None
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         raise CaptureError("unreadable", f"{path}: {key or 'the file'}: {first['msg']}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CaptureError("unreadable", f"{path} is no JSON: {error}") from error
+    except OSError as error:
+        raise CaptureError("unreadable", f"{path} cannot be read: {error.strerror or error}") from error
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is no number of JSON")
 
 
 def _read_image(folder: CaptureFolder, name: str, flags: int, dtype: type, optional: bool = False) -> NDArray | None:

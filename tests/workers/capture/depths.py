@@ -1,5 +1,6 @@
 """Depth of a board with a box or a ball on it by arithmetic, as a depth camera with systematic and random errors has it."""
 
+import functools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,14 +27,20 @@ class DepthErrors:
     """Height of a wave of the error along z, 0.25 m long, and of another across the image."""
 
 
+@functools.cache
+def rays_of(k: Intrinsics) -> Array:
+    """[H W, 3]: through the pixels' centres, z = 1."""
+    v, u = np.mgrid[: k.height, : k.width]
+    return np.stack([(u + 0.5 - k.cx) / k.fx, (v + 0.5 - k.cy) / k.fy, np.ones(u.shape)], axis=-1).reshape(-1, 3)
+
+
 def surface_depth(T_board_cam: Pose, k: Intrinsics, *, box=True, shift_m=None, scale=1.0, size_m=(0.6, 0.4)) -> Array:
     """[H, W] metres: z of board, floor and box seen by a camera that stands at the pose, by intersection with planes.
 
     `shift_m` moves the surface in camera axes: what a wrong registration does to it.
     """
     T = T_board_cam if shift_m is None else T_board_cam @ invert(translation(*shift_m))
-    v, u = np.mgrid[: k.height, : k.width]
-    rays = np.stack([(u + 0.5 - k.cx) / k.fx, (v + 0.5 - k.cy) / k.fy, np.ones(u.shape)], axis=-1).reshape(-1, 3)
+    rays = rays_of(k)
     origin, direction = T[:3, 3], rays @ T[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = np.full(len(rays), np.inf)
@@ -46,7 +53,7 @@ def surface_depth(T_board_cam: Pose, k: Intrinsics, *, box=True, shift_m=None, s
             low, high = (BOX[0] - origin) / direction, (BOX[1] - origin) / direction
             enter, leave = np.minimum(low, high).max(axis=1), np.maximum(low, high).min(axis=1)
             depth = np.where((enter < leave) & (enter > 0) & (enter < depth), enter, depth)
-    return np.where(np.isfinite(depth), depth, 0.0).reshape(u.shape)
+    return np.where(np.isfinite(depth), depth, 0.0).reshape(k.height, k.width)
 
 
 def measured_depth(
@@ -55,7 +62,7 @@ def measured_depth(
     """[H, W] uint16 millimetres. Noise is equal over pieces of `grain_px` pixels, as a coarser depth camera's is."""
     z = surface_depth(T_board_cam, k, box=box, shift_m=wrong.shift_m, scale=scale)
     grains = rng.standard_normal((k.height // grain_px + 1, k.width // grain_px + 1))
-    noise = np.kron(grains, np.ones((grain_px, grain_px)))[: k.height, : k.width]
+    noise = grains.repeat(grain_px, axis=0).repeat(grain_px, axis=1)[: k.height, : k.width]
     across = np.sin(np.arange(k.width) * 2 * np.pi / (0.3 * k.width))
     wave = wrong.wave_m * (np.sin(2 * np.pi * z / 0.25) + across)
     read = (z - wrong.bias_m) / wrong.scale + wave + wrong.sigma_m * z**2 * noise

@@ -12,6 +12,7 @@ from workers.geometry.srgb import encode_srgb
 
 KINECT = Intrinsics(width=1920, height=1080, fx=912.37, fy=912.25, cx=961.94, cy=548.79)
 HALF = Intrinsics(width=960, height=540, fx=456.185, fy=456.125, cx=480.97, cy=274.395)
+QUARTER = Intrinsics(width=480, height=270, fx=228.0925, fy=228.0625, cx=240.485, cy=137.1975)
 PX_PER_M = 4000
 
 

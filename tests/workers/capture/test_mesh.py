@@ -15,13 +15,9 @@ def sphere(seen=lambda p: np.ones(p.shape[:3], bool)):
     axis = np.arange(-15, 16) * 0.002
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
     distance = np.linalg.norm(grid - [0.0003, 0.0, -0.0005], axis=-1) - RADIUS
-    return Volume(
-        np.full(3, axis[0]),
-        0.002,
-        distance.astype(np.float32),
-        seen(grid).astype(np.float32),
-        np.ones(grid.shape[:3], np.uint16),
-    )
+    near = np.ones(grid.shape[:3], np.uint16)
+    weight = seen(grid).astype(np.float32)
+    return Volume(np.full(3, axis[0]), 0.002, distance.astype(np.float32), weight, near)
 
 
 def test_the_surface_lies_at_distance_zero_and_is_wound_outwards():

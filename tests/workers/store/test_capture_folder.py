@@ -1,12 +1,9 @@
-"""Folders as the article lays them out, written here by other means, and what a folder says of files that it cannot use."""
-
 import json
 
 import cv2
 import numpy as np
 import pytest
 
-from schemas.base import frozen_array
 from schemas.capture.view import CaptureCamera, CapturedView
 from schemas.errors import CaptureError
 from schemas.job.captures import Board
@@ -24,143 +21,184 @@ from workers.store.capture_folder import (
     write_view,
 )
 
-KINECT = {"width": 48, "height": 27, "fx": 22.81, "fy": 22.8, "cx": 23.5, "cy": 13.2, "pixel_centre": "0"}
-RNG = np.random.default_rng(4)
-RGB = RNG.integers(0, 256, (27, 48, 3)).astype(np.uint8)
-DEPTH = RNG.integers(0, 3000, (27, 48)).astype(np.uint16)
-MASK = RNG.random((27, 48)) > 0.5
+K = Intrinsics(width=40, height=30, fx=35.5, fy=35.25, cx=20.25, cy=15.75)
+CAMERA = CaptureCamera(K, np.array([0.1, -0.05, 1e-3, 0, 0, 0, 0, 0]))
+RNG = np.random.default_rng(0)
+VIEW = CapturedView(
+    0,
+    RNG.integers(0, 256, (30, 40, 3), np.uint8),
+    RNG.integers(0, 65536, (30, 40)).astype(np.uint16),
+    RNG.random((30, 40)) < 0.5,
+)
 
 
 @pytest.fixture
-def article(tmp_path):
-    """The article's layout by OpenCV and text, without this project's writer; view 3 has an image alone."""
-    path = tmp_path / "box 1"
-    path.mkdir()
-    for number in (0, 3, 12):
-        assert cv2.imwrite(str(path / f"rgb_{number:05d}.png"), RGB[:, :, ::-1])
-    for number in (0, 12):
-        assert cv2.imwrite(str(path / f"depth_{number:05d}.png"), DEPTH)
-        assert cv2.imwrite(str(path / f"mask_{number:05d}.png"), MASK.astype(np.uint8) * 255)
-        for name in ("board", "correction"):
-            (path / f"{name}_{number:05d}.txt").write_text("0 -1 0 0.1\n1 0 0 -2e-1\n0 0 1 0.75\n0 0 0 1\n")
-    (path / "camera.json").write_text(json.dumps(KINECT))
-    (path / "board.json").write_text("{}")
-    return path
+def folder(tmp_path):
+    write_description(tmp_path, CaptureFile(name="cup", category="mug"), CAMERA, Board(columns=3))
+    write_view(tmp_path, VIEW)
+    write_view(tmp_path, CapturedView(3, VIEW.rgb, None, None))
+    return tmp_path
 
 
-def test_the_article_s_folder_is_read(article):
-    folder = open_folder(article)
-    assert folder.numbers == (0, 3, 12)
-    assert (folder.about.name, folder.about.category) == ("box_1", "object")
-    assert folder.board == Board()
-    k = folder.camera.intrinsics
-    assert (k.cx, k.cy) == pytest.approx((24.0, 13.7)) and (k.cx_opencv, k.cy_opencv) == pytest.approx((23.5, 13.2))
-    assert folder.camera.depth_units_per_m == 1000.0 and not folder.camera.has_lens
-    view = read_view(folder, 12)
-    assert np.array_equal(view.rgb, RGB) and np.array_equal(view.depth, DEPTH) and np.array_equal(view.mask, MASK)
-    bare = read_view(folder, 3)
-    assert np.array_equal(bare.rgb, RGB) and bare.depth is None and bare.mask is None
-    for name in ("board", "correction"):
-        T = read_pose(article / f"{name}_00012.txt")
-        assert T.tolist() == [[0, -1, 0, 0.1], [1, 0, 0, -0.2], [0, 0, 1, 0.75], [0, 0, 0, 1]]
-        assert read_pose(article / f"{name}_00003.txt") is None
+def change(folder, name, **keys):
+    """A JSON file with keys changed, or taken out where None."""
+    spec = json.loads((folder / name).read_text()) | keys
+    (folder / name).write_text(json.dumps({key: value for key, value in spec.items() if value is not None}))
 
 
-def test_pixel_centres_at_a_half_are_read_as_they_are(article):
-    (article / "camera.json").write_text(
-        json.dumps(KINECT | {"pixel_centre": "0.5", "distortion": [0.1, 0, 0, 0, 0.2]})
-    )
-    camera = open_folder(article).camera
-    assert camera.intrinsics.cx == 23.5 and camera.lens.tolist() == [0.1, 0, 0, 0, 0.2, 0, 0, 0]
+def refused(folder, reason, words, number=None):
+    with pytest.raises(CaptureError, match=words) as error:
+        opened = open_folder(folder)
+        if number is not None:
+            read_view(opened, number)
+    assert error.value.reason == reason
 
 
-def test_what_is_written_is_read_back(tmp_path):
-    k = Intrinsics(width=48, height=27, fx=22.81, fy=22.8, cx=24.0, cy=13.7)
-    camera = CaptureCamera(k, frozen_array([0.1, -0.2, 0.001, 0.002, 0.3, 0.4, 0.5, 0.6]))
-    board, about = Board(columns=4, measured_ruler_m=0.199), CaptureFile(name="can", category="can", licence="CC0")
-    write_description(tmp_path, about, camera, board)
-    write_view(tmp_path, CapturedView(100_000, RGB, DEPTH, MASK))
-    folder = open_folder(tmp_path)
-    assert (folder.about, folder.board, folder.numbers) == (about, board, (100_000,))
-    assert folder.camera.lens.tolist() == camera.lens.tolist()
-    assert folder.camera.intrinsics.cx == pytest.approx(24.0, abs=1e-12)
-    assert np.array_equal(read_view(folder, 100_000).depth, DEPTH)
-    assert read_board(tmp_path / "board.json") == board
+def test_what_was_written_is_read(folder):
+    opened = open_folder(folder)
+    assert opened.numbers == (0, 3) and opened.about.category == "mug" and opened.board.columns == 3
+    assert opened.camera.intrinsics == K and np.array_equal(opened.camera.lens, CAMERA.lens) and opened.camera.has_lens
+    view = read_view(opened, 0)
+    assert all(np.array_equal(getattr(view, name), getattr(VIEW, name)) for name in ("rgb", "depth", "mask"))
+    assert read_view(opened, 3).depth is None and read_view(opened, 3).mask is None
+    assert read_board(folder / "board.json") == opened.board
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_a_pose_reads_back_to_the_same_doubles(tmp_path, seed):
-    rng = np.random.default_rng(seed)
-    axis = rng.normal(size=3)
-    T = pose(rotation_about(axis / np.linalg.norm(axis), 2.0), rng.normal(size=3))
-    write_pose(tmp_path / "t.txt", T)
-    assert np.array_equal(read_pose(tmp_path / "t.txt"), T)
-
-
-NO_POSES = [
-    "",
-    "1 0 0 0",
-    "a b c d\n" * 4,
-    "1 0 0 nan\n0 1 0 0\n0 0 1 0\n0 0 0 1",
-    "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1",
-    "1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1",
-]
-
-
-@pytest.mark.parametrize("words", NO_POSES)
-@pytest.mark.filterwarnings("ignore:loadtxt")
-def test_a_pose_that_is_none_is_named(tmp_path, words):
-    (tmp_path / "t.txt").write_text(words)
-    with pytest.raises(CaptureError, match=r"t\.txt"):
-        read_pose(tmp_path / "t.txt")
-
-
-def broken(path, name: str, content: bytes | None) -> None:
-    if content is None:
-        (path / name).unlink()
-    else:
-        (path / name).write_bytes(content)
-
-
-def read_all(path) -> None:
-    folder = open_folder(path)
-    for number in folder.numbers:
-        read_view(folder, number)
-
-
-PNG_8_BIT = cv2.imencode(".png", MASK.astype(np.uint8))[1].tobytes()
-BROKEN = [
-    ("camera.json", None, "has no camera.json"),
-    ("camera.json", b"{", "no JSON"),
-    ("camera.json", json.dumps(KINECT | {"fx": 0}).encode(), "fx"),
-    ("camera.json", json.dumps(KINECT | {"pixel_centre": "1"}).encode(), "pixel_centre"),
-    ("board.json", b'{"columns": 30}', "width_m"),
-    ("capture.json", b'{"name": "a b"}', "name"),
-    ("rgb_00003.png", b"", "no image that can be read"),
-    ("depth_00000.png", PNG_8_BIT, "uint8"),
-    ("mask_00012.png", cv2.imencode(".png", np.zeros((5, 5), np.uint8))[1].tobytes(), "5 x 5"),
-]
-
-
-@pytest.mark.parametrize(("name", "content", "told"), BROKEN, ids=[f"{name}: {told}" for name, _, told in BROKEN])
-def test_a_file_that_cannot_be_used_is_named(article, name, content, told):
-    broken(article, name, content)
-    with pytest.raises(CaptureError, match=told) as caught:
-        read_all(article)
-    assert name in caught.value.detail
-
-
-def test_a_folder_without_images_says_how_they_are_named(tmp_path):
-    (tmp_path / "rgb_1.png").touch()
-    (tmp_path / "rgb_000001.png").touch()
-    with pytest.raises(CaptureError, match=r"rgb_00000\.png"):
-        open_folder(tmp_path)
-    with pytest.raises(CaptureError, match="no folder"):
-        open_folder(tmp_path / "none")
+@pytest.mark.parametrize(("pixel_centre", "cx"), [("0", 20.5), ("0.5", 20.0)])
+def test_the_principal_point_is_where_its_pixel_convention_says(folder, pixel_centre, cx):
+    change(folder, "camera.json", cx=20.0, pixel_centre=pixel_centre)
+    assert open_folder(folder).camera.intrinsics.cx == cx
 
 
 @pytest.mark.parametrize(
-    ("words", "name"), [("mug", "mug"), ("my mug (2)", "my_mug_2_"), ("._x", "x"), ("", "capture"), ("ü", "capture")]
+    ("name", "keys", "words"),
+    [
+        ("camera.json", {"fx": None}, "camera.json: fx: Field required"),
+        ("camera.json", {"fx": -1}, "camera.json: fx: Input should be greater than 0"),
+        ("camera.json", {"fx": float("nan")}, "camera.json is no JSON: NaN"),
+        ("camera.json", {"cx": float("inf")}, "camera.json is no JSON: Infinity"),
+        ("camera.json", {"pixel_centre": "1"}, "pixel_centre"),
+        ("camera.json", {"distortion": [0.0] * 9}, "distortion"),
+        ("camera.json", {"zoom": 2}, "zoom: Extra inputs"),
+        ("board.json", {"marker_m": 0.5}, "columns|width_m is"),
+        ("board.json", {"columns": "many"}, "columns"),
+        ("board.json", {"measured_ruler_m": 2.0}, "measured_ruler_m over ruler_m is 10"),
+        ("capture.json", {"name": "../etc"}, "name"),
+        ("capture.json", {"frame": "left"}, "frame"),
+    ],
 )
-def test_any_words_give_a_name(words, name):
-    assert derive_name(words) == name == CaptureFile(name=name).name
+def test_a_wrong_description_names_file_and_key(folder, name, keys, words):
+    change(folder, name, **keys)
+    refused(folder, "unreadable", words)
+
+
+@pytest.mark.parametrize("text", [b"", b"{", b"[1]", b"\xff\xfe", b"[" * 100_000, b"null"])
+@pytest.mark.parametrize("name", ["camera.json", "board.json", "capture.json"])
+def test_no_text_that_is_no_description_is_more_than_refused(folder, name, text):
+    (folder / name).write_bytes(text)
+    refused(folder, "unreadable", name)
+
+
+@pytest.mark.parametrize("name", ["camera.json", "board.json"])
+def test_a_missing_description_is_named(folder, name):
+    (folder / name).unlink()
+    refused(folder, "missing", f"has no {name}")
+
+
+def test_a_folder_instead_of_a_file_is_named(folder):
+    (folder / "camera.json").unlink()
+    (folder / "camera.json").mkdir()
+    refused(folder, "unreadable", "camera.json cannot be read")
+
+
+def test_a_folder_without_photographs_or_none_at_all_is_missing(tmp_path):
+    refused(tmp_path, "missing", "has no rgb_00000.png")
+    refused(tmp_path / "nothing", "missing", "is no folder")
+
+
+@pytest.mark.parametrize("kind", ["depth", "mask"])
+def test_different_counts_are_refused_with_the_view_that_lacks_its_photograph(folder, kind):
+    (folder / f"{kind}_00007.png").write_bytes((folder / f"{kind}_00000.png").read_bytes())
+    refused(folder, "counts", f"{kind}_00007 has no rgb_00007.png")
+
+
+def test_a_pose_of_no_view_is_refused(folder):
+    write_pose(folder / "correction_00009.txt", np.eye(4))
+    refused(folder, "counts", "correction_00009 has no rgb_00009.png")
+
+
+@pytest.mark.parametrize("name", ["rgb_0000.png", "rgb_000003.png"])
+def test_a_number_of_other_width_is_refused_by_name(folder, name):
+    (folder / name).write_bytes((folder / "rgb_00000.png").read_bytes())
+    refused(folder, "name", f"{name} must be named rgb_0000")
+
+
+@pytest.mark.parametrize("name", ["rgb_00000.png", "depth_00000.png", "mask_00000.png"])
+@pytest.mark.parametrize("keep", [0.0, 0.01, 0.5, 0.98])
+def test_a_truncated_image_is_refused(folder, name, keep):
+    data = (folder / name).read_bytes()
+    (folder / name).write_bytes(data[: int(keep * len(data))])
+    refused(folder, "unreadable", f"{name} is no image that can be read", number=0)
+
+
+@pytest.mark.parametrize("name", ["rgb_00000.png", "depth_00000.png"])
+def test_an_image_with_a_wrong_byte_is_refused(folder, name):
+    data = bytearray((folder / name).read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    (folder / name).write_bytes(bytes(data))
+    refused(folder, "unreadable", name, number=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "image", "words"),
+    [
+        ("rgb_00000.png", np.zeros((31, 40, 3), np.uint8), "40 x 31 of uint8"),
+        ("depth_00000.png", np.zeros((30, 41), np.uint16), "41 x 30 of uint16"),
+        ("depth_00000.png", np.zeros((30, 40), np.uint8), "uint8, 1 channels, and .* uint16"),
+        ("depth_00000.png", np.zeros((30, 40, 3), np.uint16), "3 channels"),
+        ("mask_00000.png", np.zeros((15, 20), np.uint8), "20 x 15"),
+    ],
+)
+def test_an_image_of_another_size_or_type_is_refused_with_both(folder, name, image, words):
+    cv2.imwrite(str(folder / name), image)
+    refused(folder, "size", words, number=0)
+
+
+def test_a_grey_photograph_is_read_as_grey_colour(folder):
+    cv2.imwrite(str(folder / "rgb_00000.png"), np.full((30, 40), 77, np.uint8))
+    assert (read_view(open_folder(folder), 0).rgb == 77).all()
+
+
+def test_a_view_that_is_gone_is_missing(folder):
+    opened = open_folder(folder)
+    (folder / "rgb_00003.png").unlink()
+    with pytest.raises(CaptureError, match="has no rgb_00003.png"):
+        read_view(opened, 3)
+
+
+def test_poses_are_read_back_to_the_bit(tmp_path):
+    T = pose(rotation_about(np.array([0.0, 0.6, 0.8]), 1.1), np.array([0.1, -1 / 3, 1e-17]))
+    write_pose(tmp_path / "board_00000.txt", T)
+    assert np.array_equal(read_pose(tmp_path / "board_00000.txt"), T)
+    assert len((tmp_path / "board_00000.txt").read_text().splitlines()) == 4
+    assert read_pose(tmp_path / "board_00001.txt") is None
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "1 2 3", "a b c d\n" * 4, "nan 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1", "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1"]
+    + [
+        "-1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1",
+        "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 2",
+        "1 0 0 inf\n0 1 0 0\n0 0 1 0\n0 0 0 1",
+    ],
+)
+def test_what_is_no_rigid_transform_is_refused(tmp_path, text):
+    (tmp_path / "correction_00000.txt").write_text(text)
+    with pytest.raises(CaptureError, match="correction_00000.txt"):
+        read_pose(tmp_path / "correction_00000.txt")
+
+
+def test_names_are_made_of_any_words():
+    assert derive_name("my cup (2)") == "my_cup_2_" and derive_name("///") == "capture"
+    assert len(derive_name("x" * 200)) == 64

@@ -35,7 +35,9 @@ def estimate_article(evidence: Evidence) -> CaptureEstimate:
     most, converged = 0, True
     for observation, found in zip(evidence.observations, evidence.markers, strict=True):
         pose = Judged(None, faults=(found.reason,))
-        if found.fit is not None:
+        if observation.manual_T_board_cam is not None:
+            pose = Judged(observation.manual_T_board_cam, remarks=(observation.given_by,))
+        elif found.fit is not None:
             fitted = fit_article(observation.corners, found.fit.T_board_cam, evidence.spec.max_iterations)
             lifted = int((observation.corners.depth_m > 0).sum())
             pose = Judged(None, faults=(f"{lifted} corners have depth, and {MIN_CORNERS} are needed",))

@@ -3,13 +3,14 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.job.captures import Board, Estimation
 from workers.capture.poses.joint import Joint, Views
 from workers.capture.poses.rows import SHARED
 from workers.capture.poses.shared import NAMES, PRINT_SCALE
-from workers.capture.poses.terms import ObjectTerm
+from workers.capture.poses.terms import BoardTerm, ObjectTerm
 
 SCALES_DIFFER = 0.01
 """Print and depth disagree: smaller differences may be errors of depth that change with distance, within specification."""
@@ -42,20 +43,22 @@ def scale_note(joint: Joint, board: Board, spec: Estimation) -> str:
 def noise_notes(joint: Joint, views: Views) -> list[str]:
     """The sigmas that the terms were weighed with."""
     notes = [f"sigma of a corner: {views.corner_px:.3f} px"]
-    for term, what in ((joint.board, "the board"), (joint.surface, "the object")):
-        if term is not None:
-            patches = term.patches
-            growth = patches.ray_z[:, 2] ** 2 if what == "the board" else np.hypot(*_squares(term))
-            notes.append(
-                f"depth of {what}: sigma of a patch {1000 * float(np.median(term.sigma_m / growth)):.2f} mm at 1 m, "
-                f"variance inflated {float(np.median(term.inflation)):.1f} times because patches of a view err alike"
-            )
+    if joint.board is not None:
+        growth = joint.board.patches.ray_z[:, 2] ** 2
+        notes.append(f"depth of the board: {_weights(joint.board, joint.board.view, growth)}")
+    if joint.surface is not None:
+        first, second = joint.surface.pairs.T
+        z = joint.surface.patches.ray_z[:, 2]
+        notes.append(
+            f"depth of the object: {_weights(joint.surface, joint.surface.view[first], np.hypot(z[first] ** 2, z[second] ** 2))}"
+        )
     if joint.board is None and joint.surface is None:
         notes.append("no depth on the board or the object: the joint estimate has corners alone")
     return notes
 
 
-def _squares(term: object) -> tuple[Array, Array]:
-    assert isinstance(term, ObjectTerm)
-    z = term.patches.ray_z[:, 2]
-    return z[term.pairs[:, 0]] ** 2, z[term.pairs[:, 1]] ** 2
+def _weights(term: BoardTerm | ObjectTerm, view: NDArray[np.int64], growth: Array) -> str:
+    """The sigma of a patch, and of all that the patches of one view tell together."""
+    together = np.bincount(view, 1.0 / (term.sigma_m**2 * term.inflation))
+    patch, whole = np.median(term.sigma_m / growth), np.median(1.0 / np.sqrt(together[together > 0]))
+    return f"sigma of a patch {1000 * patch:.2f} mm at 1 m, of all patches of a view together {1000 * whole:.2f} mm"

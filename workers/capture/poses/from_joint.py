@@ -120,7 +120,7 @@ def _result(starts: list[Start], problem: Views, joint: Joint, evidence: Evidenc
             solution.poses[place],
             joint.covariance[block, block],
             ("ambiguous: a pose of another tilt fits markers and depth as well",) if start.ambiguous else (),
-            ("pose by a manual correction",) if start.fixed else (),
+            (evidence.observations[start.index].given_by,) if start.fixed else (),
         )
         view = judge(evidence.observations[start.index], pose, evidence, correction, shared.print_scale)
         views[start.index] = _flag_depth(view)

@@ -62,7 +62,8 @@ class Observation:
     object_patches: Patches = field(default_factory=no_patches)
     has_depth: bool = False
     manual_T_board_cam: Pose | None = None
-    notes: tuple[str, ...] = ()
+    given_by: str = ""
+    """Where the pose that was given is from, in words."""
 
     @property
     def markers(self) -> int:

@@ -10,15 +10,18 @@ from schemas.capture.estimate import CaptureEstimate, Estimates
 from schemas.capture.view import Detection
 from schemas.errors import CaptureError
 from schemas.job.captures import ESTIMATES, Estimate, Estimation
+from workers.capture.board.frames import correction_in_board, in_board
 from workers.capture.board.layout import open_dictionary
 from workers.capture.detect import detect_markers, other_dictionaries
 from workers.capture.poses.article import estimate_article
 from workers.capture.poses.evidence import Evidence
 from workers.capture.poses.from_joint import estimate_joint
 from workers.capture.poses.from_markers import estimate_markers
-from workers.capture.poses.observation import Setup
+from workers.capture.poses.markers import MarkerPose
+from workers.capture.poses.observation import Observation, Setup
 from workers.capture.poses.observe import observe_view
 from workers.store.capture_folder import CaptureFolder, read_view
+from workers.store.pose_files import read_given_pose
 
 
 @dataclass
@@ -50,7 +53,7 @@ def estimate_poses(folder: CaptureFolder, spec: Estimation) -> Estimates:
     """
     clock = _Clock()
     detections, evidence = _observe(folder, spec, clock)
-    if not any(len(found.ids) for found in detections):
+    if not any(len(found.ids) for found in detections) and not _any_given(evidence):
         raise CaptureError("markers", _no_markers(folder))
     by_name: dict[Estimate, CaptureEstimate] = {}
     for name in ESTIMATES if spec.compare else (spec.estimate,):
@@ -75,10 +78,30 @@ def _observe(folder: CaptureFolder, spec: Estimation, clock: _Clock) -> tuple[li
             detection = detect_markers(view.rgb, folder.board, dictionary, number)
         with clock.stage("sample"):
             observation, found = observe_view(detection, view.depth, setup)
+        observation = _with_given_pose(observation, found, folder)
         detections.append(detection)
         observations.append(observation)
         poses.append(found)
     return detections, Evidence.of(setup, observations, poses)
+
+
+def _with_given_pose(seen: Observation, found: MarkerPose, folder: CaptureFolder) -> Observation:
+    """The view with the pose that others gave it: correction · board, or the board pose of a view without markers."""
+    given = read_given_pose(folder.path, seen.number)
+    board, frame = folder.board, folder.about.frame
+    T = None if given.board is None else in_board(given.board, board, frame)
+    name = f"board_{seen.number:05d}.txt"
+    if given.correction is not None:
+        name = f"correction_{seen.number:05d}.txt"
+        T = found.fit.T_board_cam if T is None and found.fit is not None else T
+        if T is None:
+            raise CaptureError(
+                "correction", f"{folder.path / name} corrects nothing: the view has no markers and no board_"
+            )
+        T = correction_in_board(given.correction, board, frame) @ T
+    elif found.fit is not None or T is None:
+        return seen
+    return dataclasses.replace(seen, manual_T_board_cam=T, given_by=f"the pose of {name} is kept as it was given")
 
 
 def _no_markers(folder: CaptureFolder) -> str:
@@ -86,6 +109,10 @@ def _no_markers(folder: CaptureFolder) -> str:
     seen = other_dictionaries(read_view(folder, folder.numbers[len(folder.numbers) // 2]).rgb)
     what = f"{folder.path}: no marker of {board.dictionary} was found in any of {len(folder.numbers)} views"
     return f"{what}; {seen}: correct board.json" if seen else f"{what}: check that they are sharp, and not over-exposed"
+
+
+def _any_given(evidence: Evidence) -> bool:
+    return any(seen.manual_T_board_cam is not None for seen in evidence.observations)
 
 
 def _no_pose(estimate: CaptureEstimate) -> str:

@@ -23,8 +23,8 @@ from workers.capture.evaluate import (
     compare_view,
     sample_surface,
     true_view,
-    visible_samples,
 )
+from workers.capture.visibility import visible_points
 from workers.geometry.frames import transform
 from workers.pipeline.captures.views import CaptureViews
 from workers.store.capture_folder import TRUTH, CaptureFolder
@@ -108,7 +108,7 @@ def score_capture(
 def score_surface(surface: Reconstruction, true: Mesh, cameras: Sequence[Camera]) -> SurfaceErrors:
     """Cloud and mesh against the true surface, of which the cameras see a part."""
     samples, normals = sample_surface(true)
-    visible = visible_samples(true, samples, normals, cameras)
+    visible = visible_points(true, samples, normals, cameras)
     distance, _ = cKDTree(surface.points).query(samples)
     return compare_surface(surface, true, samples, visible, np.asarray(distance, np.float64))
 

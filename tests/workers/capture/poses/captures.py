@@ -10,15 +10,16 @@ from schemas.capture.estimate import CaptureEstimate
 from schemas.capture.view import CaptureCamera, Detection
 from schemas.job.captures import Board, Estimation
 from tests.workers.capture.depths import DepthErrors, measured_depth
-from tests.workers.capture.photographs import HALF, hand_held
+from tests.workers.capture.photographs import HALF, KINECT, QUARTER, hand_held
 from tests.workers.capture.poses.scenes import errors, observe
 from workers.capture.poses.evidence import Evidence
-from workers.capture.poses.observation import Setup
+from workers.capture.poses.observation import Setup, no_patches
 from workers.capture.poses.observe import observe_view
 
-CAMERA = CaptureCamera(HALF, np.zeros(8))
-"""Half the Kinect's size, with half its error of a corner: the same accuracy in a quarter of the time."""
-CORNER_PX = 0.1
+CAMERA = CaptureCamera(QUARTER, np.zeros(8))
+"""A quarter of the Kinect's size, with a quarter of its error of a corner: the same accuracy in little time."""
+FINER = CaptureCamera(HALF, np.zeros(8))
+CORNER_PX = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,29 +30,36 @@ class Virtual:
     seed: int = 0
     wrong: DepthErrors = field(default_factory=lambda: DepthErrors(sigma_m=0.003))
     print_scale: float = 1.0
-    corner_px: float = CORNER_PX
+    corner_px: float = 0.2
+    """At the Kinect's full size."""
     box: bool = True
     few: tuple[int, ...] = ()
     few_ids: tuple[int, ...] = ()
+    camera: CaptureCamera = CAMERA
 
 
 def make(virtual: Virtual, **spec) -> tuple[list[Pose], Evidence]:
     """(true T_board_cam, what the estimates are made from)."""
     rng = np.random.default_rng(virtual.seed)
     truth = hand_held(rng, virtual.views)
-    setup = Setup(CAMERA, Board(), Estimation(corner_px=CORNER_PX, **spec))
+    setup = Setup(virtual.camera, Board(), Estimation(corner_px=_corner_px(virtual), **spec))
     seen = [one_view(number, T, virtual, setup, rng) for number, T in enumerate(truth)]
     return truth, Evidence.of(setup, [o for o, _ in seen], [m for _, m in seen])
 
 
 def one_view(number, T, virtual, setup, rng):
     """(observation, pose from markers) of one view; markers behind the box are not seen."""
-    visible = observe(T, rng, number=number, camera=CAMERA, scale=virtual.print_scale, corner_px=virtual.corner_px)
-    depth = measured_depth(T, HALF, virtual.wrong, rng, box=virtual.box, scale=virtual.print_scale)
+    k, scale = setup.camera.intrinsics, virtual.print_scale
+    visible = observe(T, rng, number=number, camera=setup.camera, scale=scale, corner_px=_corner_px(virtual))
+    depth = measured_depth(T, k, virtual.wrong, rng, box=virtual.box, scale=scale, grain_px=1)
     ids = np.unique(visible.corners.markers)
     chosen = np.isin(ids, virtual.few_ids) if number in virtual.few else ~covered(ids) | (not virtual.box)
     pixels = visible.corners.pixels.reshape(-1, 4, 2)[chosen]
     return observe_view(Detection(number, ids[chosen], pixels), depth, setup)
+
+
+def _corner_px(virtual: Virtual) -> float:
+    return virtual.corner_px * virtual.camera.intrinsics.fx / KINECT.fx
 
 
 def covered(ids):
@@ -69,3 +77,18 @@ def median_errors(estimate: CaptureEstimate, truth: list[Pose]) -> tuple[float, 
 def replaced(virtual: Virtual, **changes) -> Virtual:
     """The capture with other settings."""
     return dataclasses.replace(virtual, **changes)
+
+
+def without_depth(evidence: Evidence) -> Evidence:
+    """The same views, of a camera without depth."""
+    bare = [
+        dataclasses.replace(
+            seen,
+            corners=dataclasses.replace(seen.corners, depth_m=np.zeros(len(seen.corners.board))),
+            board_patches=no_patches(),
+            object_patches=no_patches(),
+            has_depth=False,
+        )
+        for seen in evidence.observations
+    ]
+    return dataclasses.replace(evidence, observations=tuple(bare))
