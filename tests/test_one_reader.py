@@ -38,8 +38,8 @@ def load_examples(*folders: Path) -> Iterator[Example]:
         for pair in pairs.values():
             first, mirror = pair["input"], pair["mirror"]
             images = {
-                (role, Path(file["path"]).name.rstrip("0123456789.png")): cv2.imread(
-                    str(folder / file["path"]), cv2.IMREAD_UNCHANGED
+                (role, Path(file["path"]).name.rstrip("0123456789.png")): np.asarray(
+                    cv2.imread(str(folder / file["path"]), cv2.IMREAD_UNCHANGED)
                 )
                 for role, row in (("input", first), ("mirror", mirror))
                 for file in row["files"]

@@ -89,7 +89,7 @@ def _describe_captures(captures: Captures, catalogue: Catalogue) -> str:
     board = captures.board
     origin = f"{len(catalogue.captures)} folders of photographs with registered depth, each with the board in its board.json."
     if not captures.folders:
-        shapes = "\n".join(f"- {line}" for line in describe_sources(catalogue))
+        shapes = "\n".join(f"- {line}" for line in describe_sources(catalogue) if not line.startswith("tables"))
         markers = f"{board.columns} x {board.rows} markers"
         origin = f"virtual, of {captures.simulate.views} views, {markers}, and shapes from\n\n{shapes}"
     return f"""## Captures
@@ -98,7 +98,7 @@ Each scene is a capture of one object on a board of markers; its world is the bo
 
 Poses are those of the estimate `{captures.estimation.estimate}`. Input images are the photographs without their lens, and
 their depth as it was measured; where the estimate determined an offset, a scale or a registration of the depth camera, depth
-is corrected by it. Mirror images are made of the {captures.synthesis.views} nearest photographs, projected images of the input's.
+is corrected by it, and drawn anew from the fitted surface where the depth camera's place is. Mirror images are made of the {captures.synthesis.views} nearest photographs, projected images of the input's.
 The column `capture` of `manifest/scenes` and `manifest/views` has residuals, what was corrected, the share that was measured,
 and, for virtual captures, errors against truth.
 

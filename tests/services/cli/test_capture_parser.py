@@ -1,3 +1,4 @@
+import importlib
 import shlex
 import subprocess
 import sys
@@ -14,6 +15,7 @@ def test_an_example_of_a_capture_command_is_accepted_and_names_its_handler(name)
     module, _, function = options.handler.partition(":")
     assert module == f"services.capture.{function}"
     assert function.startswith(name)
+    assert callable(getattr(importlib.import_module(module), function))
     assert not options.starts_ray(options)
 
 

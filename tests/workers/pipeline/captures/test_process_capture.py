@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from schemas.capture.estimate import DepthCorrection
+from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Board, Captures, Estimation, KinectDepthNoise, Simulate
-from tests.captures import captures_job
 from workers.assets.builtin.make import make_asset
 from workers.geometry.frames import translation
 from workers.pipeline.captures.process_capture import is_corrected, process_capture
@@ -26,8 +26,7 @@ CAPTURES = Captures(
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("capture") / "box"
-    source = captures_job().assets.objects[0]
-    asset = make_asset("box", source.model_copy(update={"size": "metric"}), 1, 1000.0)
+    asset = make_asset("box", ProceduralSource(source="procedural", size="metric"), 1, 1000.0)
     simulate_capture(CAPTURES.simulate, Board(), asset, SceneChance(3, 0), path)
     return path
 
