@@ -68,7 +68,8 @@ def run(case: CaptureCase, path: Path) -> tuple[float | None, str, str]:
     reasons = "; ".join([*views[0].reasons, *estimates.estimate.notes])
     if not used:
         return None, FLAG, reasons
-    return max(errors(view.T_board_cam, case.poses[view.number])[0] for view in used), HOLD, reasons
+    posed = [(view.T_board_cam, case.poses[view.number]) for view in used if view.T_board_cam is not None]
+    return max(errors(T, true)[0] for T, true in posed), HOLD, reasons
 
 
 def assert_finite(estimate: CaptureEstimate) -> None:
@@ -180,7 +181,12 @@ def take(name: str) -> Spoil:
 
 def cut(name: str) -> Spoil:
     """A file is half as long."""
-    return lambda path: (path / name).write_bytes((path / name).read_bytes()[: (path / name).stat().st_size // 2])
+
+    def spoil(path: Path) -> None:
+        data = (path / name).read_bytes()
+        (path / name).write_bytes(data[: len(data) // 2])
+
+    return spoil
 
 
 def one_more(path: Path) -> None:
