@@ -42,7 +42,7 @@ def estimate_article(evidence: Evidence) -> CaptureEstimate:
             lifted = int((observation.corners.depth_m > 0).sum())
             pose = Judged(None, faults=(f"{lifted} corners have depth, and {MIN_CORNERS} are needed",))
             if fitted is not None:
-                pose = Judged(fitted.T_board_cam, fitted.covariance)
+                pose = Judged(fitted.T_board_cam, fitted.covariance, by_corners=False)
                 most, converged = max(most, fitted.iterations), converged and fitted.converged
         views.append(judge(observation, pose, evidence, DepthCorrection()))
     return CaptureEstimate("article", tuple(views), iterations=most, converged=converged)

@@ -28,6 +28,8 @@ class Judged:
     faults: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     """Said of a view that is used."""
+    by_corners: bool = True
+    """Whether the covariance is by the sigma of a corner, and must grow where the view's corners fit worse than that."""
 
 
 def judge(
@@ -40,7 +42,9 @@ def judge(
         return ViewEstimate(number, "refused", None, None, markers, None, None, reasons)
     reprojection_px = median_reprojection(observation, T, evidence.camera, print_scale)
     most_px = evidence.spec.max_reprojection_px
-    covariance = _widened(pose.covariance, reprojection_px, len(observation.corners.board), evidence.corner_px)
+    covariance = pose.covariance
+    if pose.by_corners:
+        covariance = _widened(covariance, reprojection_px, len(observation.corners.board), evidence.corner_px)
     faults = [*pose.faults, *_doubts(covariance)]
     if reprojection_px is not None and reprojection_px > most_px:
         faults.append(

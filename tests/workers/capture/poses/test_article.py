@@ -72,6 +72,14 @@ def test_the_warning_holds_10_mm_of_bias_come_out_as_11_mm():
     assert 0.1 < degrees < 0.6
 
 
+def test_a_bias_of_depth_does_not_leave_the_article_without_views():
+    """Its corners do not fit their images, which is what the article accepts."""
+    rng = np.random.default_rng(7)
+    truth = hand_held(rng, 4)
+    views = [with_corner_depth(observe(T, rng, corner_px=0.05), T, rng, bias_m=0.01) for T in truth]
+    assert all(view.status == "used" for view in estimate_article(evidence_of(views)).views)
+
+
 def test_wild_depth_at_a_few_corners_does_not_carry_the_pose_away():
     rng = np.random.default_rng(5)
     T = hand_held(rng, 1)[0]
