@@ -22,10 +22,10 @@ _kept = tempfile.TemporaryDirectory(prefix="verso-small-capture-")
 
 @functools.cache
 def made() -> Path:
-    """A box with the preset's depth noise, at half the resolution. Copy it before it is changed."""
+    """A box with the preset's depth noise, at about a third of the resolution. Copy it before it is changed."""
     path = Path(_kept.name) / "made"
     asset = make_asset("box", ProceduralSource(source="procedural"), 1, 600.0)
-    settings = Simulate(views=VIEWS, image_scale=0.5, depth_noise=KinectDepthNoise())
+    settings = Simulate(views=VIEWS, image_scale=0.35, depth_noise=KinectDepthNoise())
     simulate_capture(settings, Board(), asset, SceneChance(11, 1), path)
     return path
 

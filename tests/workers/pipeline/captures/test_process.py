@@ -77,7 +77,7 @@ def test_a_manual_correction_and_a_given_mask_are_respected_and_stay(tmp_path):
 def test_a_capture_that_is_refused_keeps_its_folder_as_it_was(tmp_path):
     path = copy_of(made(), tmp_path)
     for n in range(VIEWS):
-        cv2.imwrite(str(path / f"depth_{n:05d}.png"), np.zeros((540, 960), np.uint16))
+        cv2.imwrite(str(path / f"depth_{n:05d}.png"), np.zeros((378, 672), np.uint16))
     before = sorted(file.name for file in path.iterdir())
     with pytest.raises(CaptureError) as refusal:
         process_folder(path, CAPTURES)

@@ -25,12 +25,12 @@ def test_a_view_is_written_with_its_pose_and_shares(result, tmp_path):
     depth = cv2.imread(str(tmp_path / "views" / "depth_00000.png"), cv2.IMREAD_UNCHANGED)
     mask = cv2.imread(str(tmp_path / "views" / "mask_00000.png"), 0) > 0
     measured = cv2.imread(str(tmp_path / "views" / "measured_00000.png"), 0) > 0
-    assert rgb.shape == (540, 960, 3) and depth.dtype == np.uint16
+    assert rgb.shape == (378, 672, 3) and depth.dtype == np.uint16
     assert np.array_equal(read_pose(tmp_path / "views" / "board_00000.txt"), T)
     assert (mask & (depth > 0)).sum() > 1000 and not (measured & (depth == 0)).any()
     assert told["measured_share"] == pytest.approx(measured.sum() / (depth > 0).sum())
     record = json.loads((tmp_path / "views" / "views.json").read_bytes())
-    assert record["views"] == [told] and record["camera"]["width"] == 960 and told["sources"][0] == 2
+    assert record["views"] == [told] and record["camera"]["width"] == 672 and told["sources"][0] == 2
 
 
 def test_every_view_has_a_mirror_view_with_its_number(result, tmp_path):
