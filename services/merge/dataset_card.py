@@ -98,7 +98,8 @@ Each scene is a capture of one object on a board of markers; its world is the bo
 
 Poses are those of the estimate `{captures.estimation.estimate}`. Input images are the photographs without their lens, and
 their depth as it was measured; where the estimate determined an offset, a scale or a registration of the depth camera, depth
-is corrected by it, and drawn anew from the fitted surface where the depth camera's place is. Mirror images are made of the {captures.synthesis.views} nearest photographs, projected images of the input's.
+is corrected by it, and drawn anew from the fitted surface where the depth camera's place is. Mirror images are made of the
+{captures.synthesis.views} nearest photographs, projected images of the input's.
 The column `capture` of `manifest/scenes` and `manifest/views` has residuals, what was corrected, the share that was measured,
 and, for virtual captures, errors against truth.
 
