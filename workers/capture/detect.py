@@ -40,19 +40,22 @@ def other_dictionaries(rgb: NDArray[np.uint8]) -> str:
     best, most = "", SEVERAL - 1
     for picture, how in ((gray, ""), (np.ascontiguousarray(gray[:, ::-1]), ", mirrored")):
         for name in PREDEFINED:
-            if name.endswith(("_50", "_100", "_250")):
-                continue  # the first markers of the dictionary of 1000
+            if name.endswith(("_50", "_100", "_250")) or name != name.upper():
+                continue  # the first markers of the dictionary of 1000, or a second name
             dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
             _, ids, _ = _detector(dictionary, CLEAR_PERIMETER).detectMarkers(picture)
             if ids is not None and len(ids) > most:
-                best, most = f"the image holds {len(ids)} markers of {_smallest(name, int(ids.max()))}{how}", len(ids)
+                best, most = (
+                    f"the image holds {len(ids)} markers of {_smallest(name, int(np.median(ids)))}{how}",
+                    len(ids),
+                )
     return best
 
 
-def _smallest(name: str, highest_id: int) -> str:
-    """The smallest dictionary of the family that has the id."""
+def _smallest(name: str, usual_id: int) -> str:
+    """The smallest dictionary of the family that has the id; a few ids may be misread."""
     family, _, size = name.rpartition("_")
-    return f"{family}_{next(n for n in (50, 100, 250, 1000) if n > highest_id)}" if size == "1000" else name
+    return f"{family}_{next(n for n in (50, 100, 250, 1000) if n > usual_id)}" if size == "1000" else name
 
 
 def _detector(dictionary: "cv2.aruco.Dictionary", min_perimeter: float = MIN_PERIMETER) -> "cv2.aruco.ArucoDetector":

@@ -39,7 +39,7 @@ def refine_corners(gray: NDArray[np.uint8], corners_px: Array, bits: int) -> Arr
         return refined
     light = LINEAR[gray]
     sides = np.linalg.norm(np.roll(refined, -1, axis=1) - refined, axis=2).min(axis=1)
-    half_px = np.clip(0.7 * sides / bits, MIN_HALF_PX, MAX_HALF_PX)
+    half_px = np.clip(0.5 * sides / bits, MIN_HALF_PX, MAX_HALF_PX)
     for turn in range(ROUNDS):
         lines = _edge_lines(light, refined, half_px, only_rising=turn == 0)
         met = _intersections(lines)

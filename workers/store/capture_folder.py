@@ -151,8 +151,10 @@ def read_pose(path: Path) -> Pose | None:
     if not path.exists():
         return None
     try:
-        T = np.loadtxt(path, dtype=np.float64, ndmin=2)
-    except (ValueError, UnicodeDecodeError) as error:
+        T = np.array(
+            [line.split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()], np.float64
+        )
+    except ValueError as error:
         raise CaptureError("unreadable", f"{path} is no matrix of numbers: {error}") from error
     if T.shape != (4, 4) or not np.isfinite(T).all() or not _is_rigid(T):
         raise CaptureError("unreadable", f"{path} must hold a rigid transform: 4 lines of 4 numbers, the last 0 0 0 1")

@@ -8,7 +8,7 @@ from schemas.scene.camera import Camera
 from tests.workers.capture.analytic_capture import Thing, cast, kinect
 from workers.capture.depth_fit import fit_depth
 from workers.capture.posed_view import PosedView
-from workers.capture.warp import prepare_source, warp
+from workers.capture.warp import move_depth, prepare_source, warp
 from workers.geometry.camera import look_at
 from workers.geometry.frames import translation
 
@@ -66,6 +66,19 @@ def test_colours_follow_a_depth_camera_that_stands_elsewhere():
     expected = cast(THING, depth_camera)[2]
     seen = source.fitted.inverse > 0
     assert np.median(np.abs(source.rgb.astype(int) - expected)[seen]) <= 2
+
+
+def test_depth_of_a_camera_that_moved_is_that_of_its_new_place():
+    near, far = (
+        camera_at(0.5, 0.1, 0.45),
+        Camera(K, frozen_array(camera_at(0.5, 0.1, 0.45).T_world_cam @ translation(0.01, 0, 0))),
+    )
+    moved = move_depth(cast(THING, near)[0].astype(np.float32), near, far)
+    truth = cast(THING, far)[0]
+    both = (moved > 0) & (truth > 0)
+    assert both.sum() > 0.9 * (truth > 0).sum() and np.quantile(np.abs(moved - truth)[both], 0.9) < 1e-4
+    same = move_depth(cast(THING, near)[0].astype(np.float32), near, near)
+    assert np.abs(same - cast(THING, near)[0])[same > 0].max() < 1e-5
 
 
 def test_the_factor_scales_weights():

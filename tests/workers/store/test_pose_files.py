@@ -36,7 +36,7 @@ def test_a_file_that_was_there_before_is_given(tmp_path):
 @pytest.mark.parametrize("text", ["[", "[1]", '{"a": 1}'])
 def test_a_spoilt_table_of_our_files_is_named(tmp_path, text):
     (tmp_path / OWN_FILE).write_text(text)
-    with pytest.raises(CaptureError, match="poses.json"):
+    with pytest.raises(CaptureError, match=r"poses\.json"):
         read_given_pose(tmp_path, 0)
 
 

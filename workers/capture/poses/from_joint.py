@@ -25,6 +25,8 @@ OFF_BOARD_MM = 10.0
 """A view whose depth lies farther off the board than this, after the correction, is flagged."""
 MIN_PATCHES = 4
 """So many patches of the board tell its tilt."""
+CERTAIN = 5.0
+"""The object is said to have moved where it did so by this many times the sigma of a camera's place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +50,17 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
     joint = solve_jointly(problem, evidence.spec)
     patches, view = gather([o.object_patches for o in problem.observations])
     moved = moved_after(patches, view, joint.solution.poses, joint.solution.shared)
-    if moved is None:
+    if moved is None or moved[1] < CERTAIN * _sigma_m(joint, len(starts)):
         return _result(starts, problem, joint, evidence)
     still = tuple(dataclasses.replace(o, object_patches=no_patches()) for o in problem.observations)
     problem = dataclasses.replace(problem, observations=still)
     return _mark_moved(_result(starts, problem, solve_jointly(problem, evidence.spec), evidence), starts, *moved)
+
+
+def _sigma_m(joint: Joint, views: int) -> float:
+    """Median over the views of the sigma of a camera's place, metres, in the direction that is known worst."""
+    blocks = [joint.covariance[POSE * n : POSE * n + 3, POSE * n : POSE * n + 3] for n in range(views)]
+    return float(np.sqrt(np.median([max(0.0, np.linalg.eigvalsh(block)[-1]) for block in blocks])))
 
 
 def _problem(starts: list[Start], evidence: Evidence) -> Views:

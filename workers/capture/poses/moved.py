@@ -88,9 +88,8 @@ def _pairs(points: Array, normals: Array, view: NDArray[np.int64], views: int) -
 
 
 def _shift(normal: Array, distance_m: Array) -> tuple[Array, float]:
-    """(the shift [3] that explains the distances along the normals best, robustly; sum of squares that it explains)."""
+    """(the shift [3] that explains the distances along the normals best; by how much it lowers their robust cost)."""
     shift = np.zeros(3)
-    explained = 0.0
     for _ in range(5):
         weight = 1.0 / (1.0 + ((distance_m - normal @ shift) / ROBUST_M) ** 2)
         matrix = (normal * weight[:, None]).T @ normal
@@ -98,5 +97,8 @@ def _shift(normal: Array, distance_m: Array) -> tuple[Array, float]:
         known = strength > FLAT * weight.sum()
         along = directions[:, known].T @ ((normal * weight[:, None]).T @ distance_m)
         shift = directions[:, known] @ (along / strength[known])
-        explained = float((along**2 / strength[known]).sum())
-    return shift, explained
+    return shift, _cost(distance_m) - _cost(distance_m - normal @ shift)
+
+
+def _cost(distance_m: Array) -> float:
+    return float(np.log1p((distance_m / ROBUST_M) ** 2).sum())

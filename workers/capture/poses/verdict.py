@@ -16,6 +16,7 @@ from workers.geometry.frames import transform
 MAX_SIGMA_M = 0.005
 MAX_SIGMA_RAD = math.radians(1.0)
 """A pose that is less certain than this spoils a cloud; its view is flagged."""
+MIN_CORNERS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +40,8 @@ def judge(
         return ViewEstimate(number, "refused", None, None, markers, None, None, reasons)
     reprojection_px = median_reprojection(observation, T, evidence.camera, print_scale)
     most_px = evidence.spec.max_reprojection_px
-    faults = [*pose.faults, *_doubts(pose.covariance)]
+    covariance = _widened(pose.covariance, reprojection_px, len(observation.corners.board), evidence.corner_px)
+    faults = [*pose.faults, *_doubts(covariance)]
     if reprojection_px is not None and reprojection_px > most_px:
         faults.append(
             f"median reprojection error {reprojection_px:.2f} px, above max_reprojection_px {most_px:g}: "
@@ -47,9 +49,7 @@ def judge(
         )
     status: ViewStatus = "flagged" if faults else "used"
     depth_mm = median_board_distance(observation.board_patches, T, depth)
-    return ViewEstimate(
-        number, status, T, pose.covariance, markers, reprojection_px, depth_mm, (*faults, *pose.remarks)
-    )
+    return ViewEstimate(number, status, T, covariance, markers, reprojection_px, depth_mm, (*faults, *pose.remarks))
 
 
 def median_reprojection(observation: Observation, T: Pose, camera: CaptureCamera, print_scale: float) -> float | None:
@@ -72,6 +72,17 @@ def median_board_distance(patches: Patches, T: Pose, depth: DepthCorrection) -> 
 def corrected_points(patches: Patches, depth: DepthCorrection) -> Array:
     """[P, 3] metres, camera axes: the patches' middles after the correction of depth."""
     return transform(depth.T_cam_depth, depth.scale * patches.ray_z + depth.offset_m * patches.ray)
+
+
+def _widened(covariance: Array | None, reprojection_px: float | None, corners: int, corner_px: float) -> Array | None:
+    """The covariance of a view whose corners fit worse than those of the capture do, by how much worse.
+
+    The median of a Rayleigh law is 1.177 sigma; of 2 K coordinates 6 are used up by the pose.
+    """
+    if covariance is None or reprojection_px is None or corners < MIN_CORNERS:
+        return covariance
+    worse = (reprojection_px / (1.1774 * corner_px)) ** 2 * (2 * corners) / (2 * corners - 6)
+    return covariance * max(1.0, worse)
 
 
 def _doubts(covariance: Array | None) -> list[str]:

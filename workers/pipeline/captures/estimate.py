@@ -39,6 +39,8 @@ class _Clock:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.process_time() - begun
 
 
+FEW_MARKERS = 4
+"""Where no view has as many, other markers than the board's may have been found by chance."""
 MAKE: dict[Estimate, Callable[[Evidence], CaptureEstimate]] = {
     "markers": estimate_markers,
     "article": estimate_article,
@@ -62,7 +64,7 @@ def estimate_poses(folder: CaptureFolder, spec: Estimation) -> Estimates:
         by_name[name] = dataclasses.replace(made, seconds={name: time.process_time() - begun})
     estimates = Estimates(spec.estimate, by_name, tuple(detections), clock.seconds)
     if not estimates.estimate.used:
-        raise CaptureError("poses", _no_pose(estimates.estimate))
+        raise CaptureError("poses", _no_pose(estimates.estimate, folder))
     return estimates
 
 
@@ -106,15 +108,22 @@ def _with_given_pose(seen: Observation, found: MarkerPose, folder: CaptureFolder
 
 def _no_markers(folder: CaptureFolder) -> str:
     board = folder.board
-    seen = other_dictionaries(read_view(folder, folder.numbers[len(folder.numbers) // 2]).rgb)
+    seen = _other_markers(folder)
     what = f"{folder.path}: no marker of {board.dictionary} was found in any of {len(folder.numbers)} views"
     return f"{what}; {seen}: correct board.json" if seen else f"{what}: check that they are sharp, and not over-exposed"
+
+
+def _other_markers(folder: CaptureFolder) -> str:
+    return other_dictionaries(read_view(folder, folder.numbers[len(folder.numbers) // 2]).rgb)
 
 
 def _any_given(evidence: Evidence) -> bool:
     return any(seen.manual_T_board_cam is not None for seen in evidence.observations)
 
 
-def _no_pose(estimate: CaptureEstimate) -> str:
+def _no_pose(estimate: CaptureEstimate, folder: CaptureFolder) -> str:
     first = next((f"view {view.number}: {'; '.join(view.reasons)}" for view in estimate.views if view.reasons), "")
-    return f"none of {len(estimate.views)} views has a usable pose by {estimate.estimate}; {first}"
+    what = f"none of {len(estimate.views)} views has a usable pose by {estimate.estimate}; {first}"
+    few = max(view.markers for view in estimate.views) < FEW_MARKERS
+    seen = _other_markers(folder) if few else ""
+    return f"{what}; {seen}" if seen else what

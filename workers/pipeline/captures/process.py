@@ -62,8 +62,10 @@ def process_folder(path: Path, captures: Captures) -> ProcessedFolder:
         files[POSES_FILE] = pose_table(estimates, folder.camera)
     notes = tuple(dict.fromkeys((*estimates.estimate.notes, *merged.notes)))
     seconds = {name: round(s, 3) for name, s in _all_seconds(estimates, watch).items()}
-    users = write_results(path, files, _record(captures, estimates, merged, notes) | {"seconds": seconds})
-    return ProcessedFolder(folder, estimates, merged, notes, seconds, tuple(users))
+    given = given_files(folder)
+    masks = [f"mask_{number:05d}.png" for number in folder.numbers if given.has_mask(number)]
+    stayed = write_results(path, files, _record(captures, estimates, merged, notes) | {"seconds": seconds})
+    return ProcessedFolder(folder, estimates, merged, notes, seconds, tuple(sorted([*stayed, *masks])))
 
 
 def _pose_files(folder: CaptureFolder, estimates: Estimates) -> dict[str, bytes]:

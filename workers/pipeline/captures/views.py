@@ -18,7 +18,7 @@ from workers.capture.depth_fit import fit_depth
 from workers.capture.masks import silhouette
 from workers.capture.posed_view import PosedView
 from workers.capture.synthesize import choose_sources, synthesize_view
-from workers.capture.warp import Source, prepare_source, warp
+from workers.capture.warp import Source, move_depth, prepare_source
 from workers.pipeline.captures.corrections import given_files
 from workers.pipeline.captures.reconstruct import read_posed
 from workers.store.capture_folder import CaptureFolder
@@ -84,18 +84,14 @@ class CaptureViews:
     def _depth(self, view: PosedView) -> Array:
         if np.array_equal(view.camera.T_world_cam, view.depth_camera.T_world_cam):
             return view.depth_m.astype(np.float64)
-        shown = warp(self._prepared(view, silhouette(self.body, view.depth_camera)), view.camera)
-        return np.where(shown.weight > 0.0, shown.depth_m, 0.0).astype(np.float64)
+        return move_depth(view.depth_m, view.depth_camera, view.camera).astype(np.float64)
 
     def _source(self, number: int) -> Source:
         if number not in self._sources:
             view = self.posed(number)
-            self._sources[number] = self._prepared(view, silhouette(self.body, view.depth_camera))
+            fitted = fit_depth(view.depth_m, view.depth_camera.intrinsics, self.captures.fusion.max_edge_deg)
+            self._sources[number] = prepare_source(view, fitted, silhouette(self.body, view.depth_camera))
             while len(self._sources) > max(KEPT, 2 * self.captures.synthesis.views):
                 self._sources.popitem(last=False)
         self._sources.move_to_end(number)
         return self._sources[number]
-
-    def _prepared(self, view: PosedView, mask: NDArray[np.bool_]) -> Source:
-        fitted = fit_depth(view.depth_m, view.depth_camera.intrinsics, self.captures.fusion.max_edge_deg)
-        return prepare_source(view, fitted, mask)

@@ -25,7 +25,7 @@ def test_a_still_object_did_not_move():
 @pytest.mark.parametrize("shift_m", [(0.03, 0.01, 0), (-0.02, 0.02, 0)])
 def test_a_move_is_found_with_its_view_and_size(first, shift_m):
     last, apart_m = moved_after(PATCHES, VIEW, poses(shift_m, first), Shared())
-    assert abs(last - (first - 1)) <= 2  # a view between may not see the faces that moved
+    assert abs(last - (first - 1)) <= 5  # views between that see other faces cannot tell on which side they are
     assert 0.6 * np.linalg.norm(shift_m) < apart_m < 1.2 * np.linalg.norm(shift_m)
 
 

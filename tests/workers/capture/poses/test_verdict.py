@@ -38,9 +38,17 @@ def test_a_view_that_does_not_fit_is_flagged_with_the_number():
 
 
 def test_an_uncertain_pose_is_flagged_with_its_sigma():
-    covariance = np.diag([1e-8] * 3 + [0.02**2] * 3)
+    covariance = np.diag([1e-8] * 3 + [0.03**2] * 3)
     view = judge(VIEW, Judged(T, covariance), EVIDENCE, NONE)
-    assert view.reasons == ("the pose is uncertain: 0.1 mm, 1.15 degrees (one sigma)",)
+    assert len(view.reasons) == 1 and "the pose is uncertain: 0.1 mm, 1.7" in view.reasons[0]
+
+
+def test_a_view_that_fits_worse_than_others_is_less_certain():
+    rng = np.random.default_rng(3)
+    poor = observe(T, rng, corner_px=0.6)
+    covariance = np.diag([1e-8] * 6)
+    told = judge(poor, Judged(T, covariance), EVIDENCE, NONE).covariance
+    assert told[0, 0] / 1e-8 == pytest.approx((0.6 / EVIDENCE.corner_px) ** 2, rel=0.3)
 
 
 @pytest.mark.parametrize("pose", [None, np.full((4, 4), np.nan)])
