@@ -83,6 +83,23 @@ def test_a_capture_is_made_again_to_the_byte(virtual):
         assert result.compared > 20
 
 
+def test_a_run_that_was_cut_off_between_captures_goes_on_to_the_same_digest(virtual, tmp_path, monkeypatch):
+    usual = make_capture.process_capture
+
+    def cut_off(folder, captures, watch):
+        if folder.about.name == "mug-1":
+            raise KeyboardInterrupt
+        return usual(folder, captures, watch)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(make_capture, "process_capture", cut_off)
+        with pytest.raises(KeyboardInterrupt):
+            run_here(captures_job(), tmp_path)
+    assert len(list(tmp_path.glob("manifest/_commits/*.json"))) == 1
+    _, digest = run_here(captures_job(), tmp_path)
+    assert digest == json.loads((virtual / "_SUCCESS").read_text())["digest"]
+
+
 def test_an_audit_says_why_there_is_none(virtual):
     with pytest.raises(InputError, match="verso replay"):
         audit(LocalStore(virtual), 1, lambda _: None)
