@@ -17,6 +17,9 @@ from workers.geometry.frames import invert
 from workers.geometry.jit import compiled
 from workers.geometry.srgb import SRGB_STEPS, encode_codes
 
+UNSEEN = 128
+"""The code of each channel where no view sees anything."""
+
 LEAST_LIGHT = 0.02
 """Darker colours, in linear light, say nothing about a view's exposure."""
 
@@ -103,7 +106,7 @@ def _observe(
 def color_points(points: Array, normals: Array, sights: Sequence[Sight], within_m: float) -> NDArray[np.uint8]:
     """[N, 3] uint8 sRGB: the mean of the views, mostly of those that see a point best, after their exposures were made alike.
 
-    A point that no view sees has the colour of the nearest one that is seen.
+    A point that no view sees has the colour of the nearest one that is seen, grey where there is none.
     """
     light = np.zeros((len(sights), len(points), 3), np.float32)
     score = np.zeros((len(sights), len(points)), np.float32)
@@ -120,7 +123,9 @@ def color_points(points: Array, normals: Array, sights: Sequence[Sight], within_
     mean = np.einsum("vn,vnc->nc", weight, light) / np.where(total > 0.0, total, 1.0)[:, None]
     codes = encode_codes(mean)
     unseen = total == 0.0
-    if unseen.any() and not unseen.all():
+    if unseen.all():
+        codes[:] = UNSEEN
+    elif unseen.any():
         _, nearest = cKDTree(points[~unseen]).query(points[unseen])
         codes[unseen] = codes[~unseen][nearest]
     return codes

@@ -38,7 +38,8 @@ def test_of_each_knob_the_defaults_have_a_value_that_is_not_measured_twice():
 
 
 def test_every_part_of_a_scene_that_has_errors_has_a_knob_and_no_other_has():
-    assert {knob.group for knob in KNOBS} == {kind.group for kind in ERRORS.values()}
+    captured = knobs_of(Job.model_validate({"name": "t", "captures": {}}))
+    assert {knob.group for knob in (*KNOBS, *captured)} == {kind.group for kind in ERRORS.values()}
 
 
 def test_another_image_size_is_the_same_picture():
@@ -87,7 +88,7 @@ def test_what_is_no_knobs_changes_every_part_of_a_scene():
     known = {knob.name: knob for knob in KNOBS}
     assert groups_of(Setting((("step", "60"),)), known) == {"physics"}
     assert groups_of(Setting((("step", "60"), ("colour", "flat"))), known) == {"physics", "colour"}
-    everything = {"physics", "labels", "mirror", "colour"}
+    everything = {"physics", "labels", "mirror", "colour", "capture"}
     assert groups_of(Setting(), known) == groups_of(Setting((("preset", "fast"),)), known) == everything
 
 

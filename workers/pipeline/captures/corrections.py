@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from schemas.base import Pose, frozen_array
 from schemas.capture.estimate import CaptureEstimate, Estimates, ViewEstimate
 from schemas.errors import CaptureError
+from workers.capture.board.frames import correction_in_board, in_board
 from workers.geometry.frames import invert
 from workers.store.capture_folder import CaptureFolder, read_pose
 from workers.store.capture_results import own_files
@@ -20,9 +21,15 @@ class Given:
     ours: frozenset[str]
 
     def pose(self, prefix: str, number: int) -> Pose | None:
-        """[4, 4] of the user's file `prefix`_00000.txt, None where there is none or it is ours. Raises CaptureError."""
+        """[4, 4] of the user's file `prefix`_00000.txt in our board frame, None where there is none or it is ours.
+
+        Raises CaptureError for a file that is no rigid transform.
+        """
         name = f"{prefix}_{number:05d}.txt"
-        return None if name in self.ours else read_pose(self.folder.path / name)
+        if name in self.ours or (T := read_pose(self.folder.path / name)) is None:
+            return None
+        convert = in_board if prefix == "board" else correction_in_board
+        return convert(T, self.folder.board, self.folder.about.frame)
 
     def has_mask(self, number: int) -> bool:
         """Whether the user gave a mask of this view."""

@@ -11,8 +11,8 @@ from tests.workers.pipeline.captures.folders import write_capture
 from workers.capture.board.frames import frame_in_board
 from workers.geometry.frames import invert, pose, rotation_about
 from workers.pipeline.captures.estimate import estimate_poses
-from workers.store.capture_folder import open_folder, write_pose
-from workers.store.pose_files import write_pose_files
+from workers.store.capture_folder import open_folder, pose_text, write_pose
+from workers.store.capture_results import write_results
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,8 @@ def test_given_board_poses_are_read_in_the_frame_that_the_flag_names(copy, captu
 
 def test_our_own_corrections_of_an_earlier_run_change_nothing(copy):
     before = estimate_poses(open_folder(copy), Estimation())
-    write_pose_files(copy, {0: np.eye(4)}, {0: CORRECTION, 2: CORRECTION})
+    own = {"board_00000.txt": np.eye(4), "correction_00000.txt": CORRECTION, "correction_00002.txt": CORRECTION}
+    write_results(copy, {name: pose_text(T).encode() for name, T in own.items()}, {})
     after = estimate_poses(open_folder(copy), Estimation())
     for a, b in zip(before.estimate.views, after.estimate.views, strict=True):
         assert np.array_equal(a.T_board_cam, b.T_board_cam)
