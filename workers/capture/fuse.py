@@ -28,6 +28,9 @@ MARGIN_PX = 12
 LEAST_PART = 0.02
 """Share of the largest part's area below which a loose part is noise."""
 
+FACING_AWAY = -1.0
+"""Whichever way a rough point's normal turns, it is seen where nothing hides it."""
+
 LIFT_VOXELS = 0.25
 """Points are looked at from so far above the surface: its roughness hides less."""
 
@@ -118,7 +121,7 @@ def _outside(mesh: Mesh, sights: Sequence[Sight], spec: Fusion) -> Mesh:
     if not len(hiding.faces):
         return mesh
     cameras = [sight.view.depth_camera for sight in sights]
-    seen = visible_points(hiding, mesh.vertices, normals, cameras, LIFT_VOXELS * spec.voxel_m)
+    seen = visible_points(hiding, mesh.vertices, normals, cameras, LIFT_VOXELS * spec.voxel_m, FACING_AWAY)
     return keep_vertices(mesh, seen)[0]
 
 

@@ -19,10 +19,22 @@ CLEAR_M = 1e-5
 """A point is lifted off its face by so much before it is looked at, above float32's steps in the ray caster."""
 
 
+UNSEEN = -2.0
+"""Stands for the cosine of a point that is not in the image."""
+
+
 def visible_points(
-    mesh: Mesh, points: Array, normals: Array, cameras: Sequence[Camera], clear_m: float = CLEAR_M
+    mesh: Mesh,
+    points: Array,
+    normals: Array,
+    cameras: Sequence[Camera],
+    clear_m: float = CLEAR_M,
+    least_cos: float = 0.0,
 ) -> NDArray[np.bool_]:
-    """[N] bool: points [N, 3] of the mesh, with unit normals, that at least one camera sees from their outside, at any angle."""
+    """[N] bool: points [N, 3] that a camera sees past the mesh, lifted along their unit normals by `clear_m`.
+
+    A camera counts where the cosine between the normal and the way to it is above `least_cos`: 0 for any angle from outside.
+    """
     visible = np.zeros(len(points), np.bool_)
     if not len(points) or not len(cameras):
         return visible
@@ -36,7 +48,7 @@ def visible_points(
         if len(point):
             place = np.tile(np.arange(first, min(stop, len(cameras))), int((~visible).sum()))
             camera_of = order[place, point]
-            asked = cosine[camera_of, point] > 0.0
+            asked = cosine[camera_of, point] > least_cos
             point, camera_of = point[asked], camera_of[asked]
             origins = points[point] + clear_m * normals[point]
             hits = first_hit([placed(mesh)], origins, positions[camera_of] - origins)
@@ -46,13 +58,13 @@ def visible_points(
 
 
 def facing_cosine(points: Array, normals: Array, camera: Camera) -> Array:
-    """[N] cosine between the normal of points [N, 3] and the way to a camera, 0 where they are not in its image."""
+    """[N] cosine between the normal of points [N, 3] and the way to a camera, `UNSEEN` where they are not in its image."""
     seen = transform(invert(camera.T_world_cam), points)
     front = seen[:, 2] > 0.05
     u, v = project(np.where(front[:, None], seen, [0.0, 0.0, 1.0]), camera.intrinsics)
     towards = camera.position - points
     cosine = (towards * normals).sum(axis=1) / np.linalg.norm(towards, axis=1)
-    return np.where(front & in_frame(u, v, camera.intrinsics), cosine, 0.0)
+    return np.where(front & in_frame(u, v, camera.intrinsics), cosine, UNSEEN)
 
 
 def placed(mesh: Mesh) -> Placed:

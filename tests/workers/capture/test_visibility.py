@@ -6,7 +6,7 @@ import trimesh
 from schemas.base import frozen_array
 from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.shape import Mesh
-from workers.capture.visibility import facing_cosine, visible_points
+from workers.capture.visibility import UNSEEN, facing_cosine, visible_points
 from workers.geometry.camera import look_at
 
 K = Intrinsics(width=200, height=150, fx=200.0, fy=200.0, cx=100.0, cy=75.0)
@@ -40,13 +40,13 @@ def test_what_another_part_hides_is_not_seen_unless_another_camera_sees_it():
     assert visible_points(mesh, back, normals, many)[back[:, 0] > 0.05].mean() > 0.9
 
 
-def test_the_cosine_is_that_of_incidence_and_0_outside_the_image():
+def test_the_cosine_is_that_of_incidence_and_unseen_outside_the_image():
     points, normals = (
         np.array([[0.0, 0, 0], [0.0, 0, 0], [5.0, 0, 0]]),
         np.array([[0, 0, 1.0], [1.0, 0, 0], [0, 0, 1.0]]),
     )
     cosine = facing_cosine(points, normals, camera_at(0.6, 0.0, 0.8))
-    assert np.allclose(cosine, [0.8, 0.6, 0.0])
+    assert np.allclose(cosine, [0.8, 0.6, UNSEEN])
 
 
 def test_no_points_and_no_cameras_see_nothing():
