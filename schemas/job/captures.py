@@ -176,7 +176,7 @@ class Fusion(Frozen):
     max_edge_deg: Annotated[float, Field(gt=0, le=90)] = 75.0
     """Pixels that see their surface at a larger angle of incidence are left out."""
     board_clearance_m: NonNegative = 0.003
-    """What is nearer to the board's plane than this, once all views are merged, belongs to the board; more where depth is uneven."""
+    """What is nearer to the board's plane than this, once all views are merged, is the board's; more where depth is uneven."""
     min_views: PositiveInt = 2
     """A point of the cloud must be confirmed by as many views."""
 

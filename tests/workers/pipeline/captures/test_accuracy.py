@@ -78,6 +78,8 @@ def pose_errors(path: Path, estimates: Estimates) -> dict:
     found = {}
     for name, one in estimates.by_name.items():
         used = [(view.T_board_cam, truth.T_board_cam[view.number]) for view in one.used if view.T_board_cam is not None]
+        if not used:  # all of its views are flagged, as the article's are where the print is of another size
+            continue
         errors = compare_poses([a for a, _ in used], [frozen_array(b) for _, b in used])
         found[name] = errors.median_mm, errors.median_deg
     return found
