@@ -1,4 +1,3 @@
-import cv2
 import numpy as np
 import pytest
 
@@ -34,4 +33,3 @@ def test_a_point_behind_the_camera_has_no_pixel():
     behind = T[:3, 3] - T[:3, 2]
     assert np.isnan(pixels_of_points(behind[None], T, PINHOLE)).all()
     assert rays_of_pixels(np.zeros((0, 2)), LENS).shape == (0, 2)
-    assert cv2.__version__
