@@ -58,6 +58,8 @@ def why_skip(markers: set[str], scope: str) -> str:
         return "slow: runs with --all"
     if markers & {"docker", "root"} and scope == "default":
         return "needs root or Docker: runs with --ci"
+    if "minute" in markers and scope == "default":
+        return "takes about a minute: runs with --ci"
     if "docker" in markers and not docker_answers():
         return "no Docker engine answers"
     if "root" in markers and os.geteuid() != 0:

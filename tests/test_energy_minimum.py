@@ -11,6 +11,8 @@ from tests.physics.settling import settle_single
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.frames import pose, rotation_about
 
+pytestmark = pytest.mark.minute
+
 
 def ellipsoid(x, y, z):
     return np.asarray(trimesh.creation.icosphere(5, 1.0).vertices) * [x, y, z]

@@ -23,6 +23,8 @@ from workers.physics.placement import Ground, gap_m, placed_mesh
 from workers.physics.separation import clearances
 from workers.plan.effects import PHYSICS_EFFECTS, Facts, plan_effects
 
+pytestmark = pytest.mark.minute
+
 GAP_MM = 0.1
 """The most that may be between a resting object and what it rests on, or that they may overlap."""
 

@@ -21,6 +21,8 @@ from workers.geometry.raycast import cast_view
 from workers.physics.step import settle_scene
 from workers.plan.effects import EFFECTS, Facts, names_of_kind, plan_effects
 
+pytestmark = pytest.mark.minute
+
 SCENES = 200
 
 KNOWN_MISSES = {(247, "rolling_friction")}

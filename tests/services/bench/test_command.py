@@ -3,8 +3,12 @@
 import json
 import os
 
+import pytest
+
 from services.cli.main import main
 from tests.services.bench.small_job import SMALL
+
+pytestmark = pytest.mark.minute
 
 
 def test_bench_prints_one_object_last_and_leaves_nothing(tmp_path, capsys):

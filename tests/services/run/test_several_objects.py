@@ -25,6 +25,8 @@ from workers.store.images import decode_png
 from workers.store.local import LocalStore
 from workers.store.tars import read_tar
 
+pytestmark = pytest.mark.minute
+
 THREE: dict[str, Any] = {
     "objects_per_scene": 3,
     "scenes": 3,

@@ -14,6 +14,8 @@ from services.study.journal import JOURNAL_FILE
 from tests.services.cli.test_main import TABLETOP, told
 from tests.stored_studies import read_study
 
+pytestmark = pytest.mark.minute
+
 SMALL = [
     *("--scenes", "4", "--physics-scenes", "2", "--laps", "1", "--workers", "1", "--knobs", "step,units,splat"),
     *("--set", "cameras.sensor={width: 160, height: 120, fx: 131.25, fy: 131.25, cx: 80, cy: 60}"),

@@ -26,6 +26,8 @@ from workers.store.commit import committed_files, read_record
 from workers.store.images import decode_png
 from workers.store.local import LocalStore
 
+pytestmark = pytest.mark.minute
+
 IN_THE_MIDDLE = {"offset_m": [0.0, 0.0], "pose": "placed"}
 EVERY_EFFECT = {"depth_noise": {}, "distortion": {"k1": -0.1}, "rgb_noise": {}, "exposure": {}}
 HARD_TO_DERIVE = {"projection": {"splat": 15, "hidden_point_removal": True}}

@@ -13,6 +13,8 @@ from workers.pipeline.captures.make_capture import simulate_one
 from workers.pipeline.context import open_worker
 from workers.store.capture_folder import open_folder
 
+pytestmark = pytest.mark.minute
+
 JOB = {
     "name": "t",
     "scenes": 2,
