@@ -8,7 +8,7 @@ from schemas.scene.camera import Camera
 from tests.workers.capture.analytic_capture import Thing, cast, kinect
 from workers.capture.depth_fit import fit_depth
 from workers.capture.posed_view import PosedView
-from workers.capture.surface import Sight, color_points, exposure_gains, measure_offsets, observe, sample_light
+from workers.capture.surface import UNSEEN, Sight, color_points, exposure_gains, measure_offsets, observe, sample_light
 from workers.geometry.camera import look_at
 from workers.geometry.srgb import decode_codes
 
@@ -88,4 +88,4 @@ def test_a_point_that_no_view_sees_has_its_neighbours_colour():
     some = np.concatenate([points(), points(0.1)[:1]])
     colors = color_points(some, np.tile([0.0, 0.0, 1.0], (len(some), 1)), [sight((0.02, 0, 0.6))], 0.006)
     assert np.array_equal(colors[-1], colors[0])
-    assert not color_points(points(0.1), UP, [sight((0.02, 0, 0.6))], 0.006).any()
+    assert (color_points(points(0.1), UP, [sight((0.02, 0, 0.6))], 0.006) == UNSEEN).all()
