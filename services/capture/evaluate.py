@@ -29,7 +29,7 @@ def evaluate(options: argparse.Namespace) -> int:
 
 
 def _against_truth(result: "StoredResult") -> tuple["SurfaceErrors", dict[str, Any]]:
-    from workers.pipeline.captures.score import read_whole_truth, score_capture
+    from workers.pipeline.captures.score import read_whole_truth, score_capture, score_measured
 
     truth = read_whole_truth(result.folder)
     if truth is None:
@@ -46,7 +46,13 @@ def _against_truth(result: "StoredResult") -> tuple["SurfaceErrors", dict[str, A
             f"view {number} made of the others: depth {errors.depth_median_mm:.2f} mm (95 %: {errors.depth_p95_mm:.2f}), "
             f"colour {errors.color_error:.1f} of 255, covers {errors.covered:.1%}, {errors.measured_share:.1%} measured"
         )
+    depth = score_measured(result.surface, result.views, truth)
+    print(
+        f"depth    of {depth.measured_of_visible:.1%} of what was visible in any view; {depth.completeness_of_measured:.1%} of "
+        "that has a point within 3 mm"
+    )
     answer = {
+        **dataclasses.asdict(depth),
         "aligned_by": None,
         "pose_mm": one.pose_mm,
         "pose_deg": one.pose_deg,

@@ -11,8 +11,10 @@ from schemas.capture.estimate import Reconstruction, SynthesizedView
 from schemas.errors import CaptureError
 from schemas.scene.camera import Camera
 from schemas.scene.shape import Mesh
-from workers.capture.visibility import placed
-from workers.geometry.frames import angle_between
+from workers.capture.posed_view import PosedView
+from workers.capture.visibility import facing_cosine, placed
+from workers.geometry.camera import project
+from workers.geometry.frames import angle_between, invert, transform
 from workers.geometry.raycast import cast_view
 from workers.geometry.surface_distance import distance_to_mesh
 
@@ -23,6 +25,9 @@ SEED = 20_240_801
 """Of the surface samples, so that the same capture has the same figures."""
 
 COMPLETE_M = 0.003
+
+MEASURED_M = 0.004
+"""Depth of the surface itself and not of another: three times the noise of a pixel that has twice an Azure Kinect's."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,17 @@ class SurfaceErrors:
     completeness: float
     visible_share: float
     points: int
+
+
+@dataclass(frozen=True)
+class MeasuredSurface:
+    """What depth there was to merge: share of the visible samples that at least one view has depth of, and their completeness.
+
+    A surface that is seen at a grazing angle alone, or between two edges, is visible and has no depth.
+    """
+
+    measured_of_visible: float
+    completeness_of_measured: float
 
 
 @dataclass(frozen=True)
@@ -110,6 +126,22 @@ def compare_surface(
         visible_share=float(visible.mean()),
         points=len(found.points),
     )
+
+
+def measured_points(points: Array, normals: Array, view: PosedView) -> NDArray[np.bool_]:
+    """[N] bool: points [N, 3] of the true surface, unit normals outwards, of which a view has depth.
+
+    The pixel that a point projects to has depth within `MEASURED_M` of the surface, along its normal.
+    """
+    camera = view.depth_camera
+    k, cosine = camera.intrinsics, facing_cosine(points, normals, camera)
+    measured = np.zeros(len(points), np.bool_)
+    facing = np.flatnonzero(cosine > 0.0)
+    seen = transform(invert(camera.T_world_cam), points[facing])
+    u, v = project(seen, k)
+    z = view.depth_m[np.floor(v).astype(np.int64), np.floor(u).astype(np.int64)]
+    measured[facing] = (z > 0.0) & (np.abs(z - seen[:, 2]) * cosine[facing] < MEASURED_M)
+    return measured
 
 
 def true_view(mesh: Mesh, camera: Camera) -> Array:

@@ -67,7 +67,8 @@ def _fill_rim(
                     found[n, 1] += mask[y, x]
                     for c in range(3):
                         found[n, 2 + c] += rgb[y, x, c]
-        found[n] /= count
+        for i in range(5):
+            found[n, i] /= count
         left[n] = False
     for n in range(len(holes)):
         if not left[n]:

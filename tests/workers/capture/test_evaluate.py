@@ -10,7 +10,15 @@ from schemas.errors import CaptureError
 from schemas.scene.camera import Camera
 from schemas.scene.shape import Mesh
 from tests.workers.capture.analytic_capture import kinect
-from workers.capture.evaluate import compare_poses, compare_surface, compare_view, sample_surface, true_view
+from workers.capture.evaluate import (
+    compare_poses,
+    compare_surface,
+    compare_view,
+    measured_points,
+    sample_surface,
+    true_view,
+)
+from workers.capture.posed_view import PosedView
 from workers.geometry.camera import look_at
 from workers.geometry.frames import pose, rotation_about, translation
 
@@ -69,3 +77,16 @@ def test_view_errors_count_what_is_off_missing_and_too_much():
     assert errors.beyond == pytest.approx(300 / (300 + shown.sum()))
     with pytest.raises(CaptureError, match="nothing of the object"):
         compare_view(SynthesizedView(rgb, depth, extra, shown, 0.9, ()), depth, mask)
+
+
+def test_points_are_measured_where_a_pixel_has_their_depth():
+    camera = Camera(kinect(0.25), frozen_array(look_at(np.array([0.4, 0.1, 0.4]), np.zeros(3))))
+    depth = true_view(MESH, camera).astype(np.float32)
+    points, normals = sample_surface(MESH, 4000)
+    view = PosedView(0, camera, camera, np.zeros((*depth.shape, 3), np.uint8), depth)
+    towards = ((camera.position - points) * normals).sum(axis=1) > 0.02
+    measured = measured_points(points, normals, view)
+    assert measured[towards].mean() > 0.97 and not measured[~towards].any()
+    for spoilt in (np.zeros_like(depth), np.where(depth > 0, depth + np.float32(0.1), 0)):
+        gone = PosedView(0, camera, camera, view.rgb, spoilt.astype(np.float32))
+        assert measured_points(points, normals, gone).mean() < 0.01

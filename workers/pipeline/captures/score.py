@@ -16,11 +16,14 @@ from schemas.errors import CaptureError, ViewError
 from schemas.scene.camera import Camera
 from schemas.scene.shape import Mesh
 from workers.capture.evaluate import (
+    COMPLETE_M,
+    MeasuredSurface,
     SurfaceErrors,
     ViewErrors,
     compare_poses,
     compare_surface,
     compare_view,
+    measured_points,
     sample_surface,
     true_view,
 )
@@ -111,6 +114,23 @@ def score_surface(surface: Reconstruction, true: Mesh, cameras: Sequence[Camera]
     visible = visible_points(true, samples, normals, cameras)
     distance, _ = cKDTree(surface.points).query(samples)
     return compare_surface(surface, true, samples, visible, np.asarray(distance, np.float64))
+
+
+def score_measured(surface: Reconstruction, views: CaptureViews, truth: Truth) -> MeasuredSurface:
+    """How much of what was visible had depth in any used view, and how much of that has a point within 3 mm."""
+    samples, normals = sample_surface(truth.surface)
+    numbers = sorted(set(views.cameras) & set(truth.T_board_cam))
+    k = views.folder.camera.intrinsics
+    visible = visible_points(truth.surface, samples, normals, [Camera(k, truth.T_board_cam[n]) for n in numbers])
+    measured = np.zeros(len(samples), np.bool_)
+    for number in numbers:
+        measured |= measured_points(samples, normals, views.posed(number))
+    distance, _ = cKDTree(surface.points).query(samples)
+    both = visible & measured
+    return MeasuredSurface(
+        float(both.sum() / max(int(visible.sum()), 1)),
+        float((distance[both] <= COMPLETE_M).mean()) if both.any() else 0.0,
+    )
 
 
 def score_held_out(views: CaptureViews, truth: Truth, known: Sequence[int], most: int) -> dict[int, ViewErrors]:

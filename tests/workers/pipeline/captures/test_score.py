@@ -11,7 +11,13 @@ from schemas.errors import CaptureError
 from schemas.scene.shape import Mesh
 from tests.workers.pipeline.captures.small_capture import made, processed
 from workers.geometry.frames import translation
-from workers.pipeline.captures.score import read_mesh_file, read_whole_truth, score_capture, score_surface
+from workers.pipeline.captures.score import (
+    read_mesh_file,
+    read_whole_truth,
+    score_capture,
+    score_measured,
+    score_surface,
+)
 from workers.pipeline.captures.stored_result import read_result
 from workers.store.capture_folder import open_folder
 
@@ -53,6 +59,17 @@ def test_a_cloud_that_is_off_and_one_that_lacks_a_half_are_told():
     keep = result.surface.points[:, 0] > np.median(result.surface.points[:, 0])
     half = dataclasses.replace(result.surface, points=result.surface.points[keep])
     assert 0.25 < score_surface(half, truth.surface, cameras).completeness < 0.75 < good.completeness
+
+
+def test_what_had_depth_is_told_from_what_was_visible():
+    result = read_result(processed()[0])
+    truth = read_whole_truth(result.folder)
+    depth = score_measured(result.surface, result.views, truth)
+    assert 0.9 < depth.measured_of_visible <= 1.0 and depth.completeness_of_measured > 0.95
+    keep = result.surface.points[:, 0] > np.median(result.surface.points[:, 0])
+    half = dataclasses.replace(result.surface, points=result.surface.points[keep])
+    spoilt = score_measured(half, result.views, truth)
+    assert spoilt.measured_of_visible == depth.measured_of_visible and 0.3 < spoilt.completeness_of_measured < 0.7
 
 
 def test_the_true_surface_is_that_of_the_simulated_asset():
