@@ -21,7 +21,7 @@ from services.run.step import RunRequest, run_job
 from tests.killed_runs import disturbed_scene
 from workers.store.local import LocalStore
 
-pytestmark = pytest.mark.ray
+pytestmark = [pytest.mark.ray, pytest.mark.minute]
 
 SMALL: dict[str, Any] = {
     "name": "small",

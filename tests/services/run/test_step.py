@@ -252,6 +252,7 @@ def test_a_scene_that_kills_its_worker_becomes_a_row_and_the_rest_is_made(made, 
     assert faults_of(out) == ""
 
 
+@pytest.mark.minute
 def test_an_interrupted_run_says_so_leaves_no_process_and_goes_on_where_it_stopped(cluster, tmp_path):
     """Ctrl-C in a terminal. Of 40 scenes most are still to be made then."""
     changes = {"scenes": 40, "run": {"range_size": 4}}
