@@ -1,10 +1,7 @@
 """The poses of a capture: images are read one view at a time, and what is found in them goes to the three estimates."""
 
 import dataclasses
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable
 
 from schemas.capture.estimate import CaptureEstimate, Estimates
 from schemas.capture.view import Detection
@@ -20,24 +17,9 @@ from workers.capture.poses.from_markers import estimate_markers
 from workers.capture.poses.markers import MarkerPose
 from workers.capture.poses.observation import Observation, Setup
 from workers.capture.poses.observe import observe_view
+from workers.pipeline.captures.processor_clock import ProcessorClock
 from workers.store.capture_folder import CaptureFolder, read_view
 from workers.store.pose_files import read_given_pose
-
-
-@dataclass
-class _Clock:
-    """Seconds of processor time by stage."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        begun = time.process_time()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.process_time() - begun
-
 
 FEW_MARKERS = 4
 """Where no view has as many, other markers than the board's may have been found by chance."""
@@ -53,22 +35,23 @@ def estimate_poses(folder: CaptureFolder, spec: Estimation) -> Estimates:
 
     Raises CaptureError where a file cannot be read or the estimate that is asked for has no usable view.
     """
-    clock = _Clock()
+    clock = ProcessorClock()
     detections, evidence = _observe(folder, spec, clock)
     if not any(len(found.ids) for found in detections) and not _any_given(evidence):
         raise CaptureError("markers", _no_markers(folder))
     by_name: dict[Estimate, CaptureEstimate] = {}
     for name in ESTIMATES if spec.compare else (spec.estimate,):
-        begun = time.process_time()
-        made = MAKE[name](evidence)
-        by_name[name] = dataclasses.replace(made, seconds={name: time.process_time() - begun})
+        own = ProcessorClock()
+        with own.stage(name):
+            made = MAKE[name](evidence)
+        by_name[name] = dataclasses.replace(made, seconds=own.seconds)
     estimates = Estimates(spec.estimate, by_name, tuple(detections), clock.seconds)
     if not estimates.estimate.used:
         raise CaptureError("poses", _no_pose(estimates.estimate, folder))
     return estimates
 
 
-def _observe(folder: CaptureFolder, spec: Estimation, clock: _Clock) -> tuple[list[Detection], Evidence]:
+def _observe(folder: CaptureFolder, spec: Estimation, clock: ProcessorClock) -> tuple[list[Detection], Evidence]:
     """What is found in each view, in order of number; no two views' images are held at once."""
     setup = Setup(folder.camera, folder.board, spec)
     dictionary = open_dictionary(folder.board, folder.path)
