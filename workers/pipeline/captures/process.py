@@ -51,7 +51,8 @@ def process_folder(path: Path, captures: Captures) -> ProcessedFolder:
     watch = ProcessorClock()
     folder = open_folder(path)
     with watch.stage("estimate"):
-        estimates = correct_manually(given_files(folder), estimate_poses(folder, captures.estimation))
+        given = given_files(folder)
+        estimates = correct_manually(given, estimate_poses(given, captures.estimation))
     merged = reconstruct(folder, estimates.estimate, captures.fusion, watch)
     with watch.stage("masks"):
         files = {**_pose_files(folder, estimates), **_mask_files(folder, estimates.estimate, merged.body)}

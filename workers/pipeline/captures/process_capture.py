@@ -19,7 +19,8 @@ from workers.store.capture_folder import CaptureFolder
 def process_capture(folder: CaptureFolder, captures: Captures, watch: Stopwatch) -> ProcessedCapture:
     """Estimate, merge, score where there is truth. Raises CaptureError where the capture cannot be used."""
     with watch.stage("estimate"):
-        estimates = correct_manually(given_files(folder), estimate_poses(folder, captures.estimation))
+        given = given_files(folder)
+        estimates = correct_manually(given, estimate_poses(given, captures.estimation))
     merged = reconstruct(folder, estimates.estimate, captures.fusion, watch)
     estimates = with_notes(estimates, merged.notes)
     views = CaptureViews(folder, estimates.estimate, captures, merged.body)
