@@ -11,7 +11,8 @@ from schemas.capture.processed import CaptureScore, ProcessedCapture
 from schemas.errors import CaptureError
 from services.study.measure.settling import context_for
 from services.study.model import Setting
-from workers.pipeline.captures.make_capture import choose_views, require_captures
+from workers.geometry.spread import spread_evenly
+from workers.pipeline.captures.make_capture import require_captures
 from workers.pipeline.captures.process_capture import process_capture
 from workers.pipeline.captures.processor_clock import ProcessorClock
 from workers.pipeline.context import WorkerContext
@@ -63,7 +64,7 @@ def measure_capture(
 
 def fewer_views(folder: CaptureFolder, views: int) -> CaptureFolder:
     """The same capture with some of its views only, evenly over the path."""
-    return replace(folder, numbers=tuple(choose_views(list(folder.numbers), views)))
+    return replace(folder, numbers=tuple(folder.numbers[place] for place in spread_evenly(len(folder.numbers), views)))
 
 
 def errors_of(score: CaptureScore) -> dict[str, float]:

@@ -5,8 +5,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from schemas.capture.processed import ProcessedCapture
 from schemas.errors import CaptureError, ViewError
 from schemas.job.captures import Captures
@@ -15,6 +13,7 @@ from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import SceneOutput
 from workers.assets.captured import CaptureNames, board_asset, reconstructed_asset
 from workers.assets.step import choose_object, load_asset
+from workers.geometry.spread import spread_evenly
 from workers.pipeline.captures.capture_pair import CapturedObject, CapturedPair, make_capture_pair
 from workers.pipeline.captures.process_capture import process_capture
 from workers.pipeline.captures.rows import LeftOut, Origin, record_capture
@@ -95,7 +94,7 @@ def make_pairs(
 ) -> Iterator[CapturedPair | LeftOut]:
     """The pairs of the used views in order, and those views that have none. Raises CaptureError where none has one."""
     used = [view.number for view in done.estimates.estimate.used]
-    chosen = choose_views(used, context.job.pairs_per_scene)
+    chosen = [used[place] for place in spread_evenly(len(used), context.job.pairs_per_scene)]
     made = 0
     for at, number in enumerate(chosen):
         try:
@@ -114,14 +113,6 @@ def make_pairs(
         raise CaptureError(
             "no_pair", f"none of {len(chosen)} used views sees the object and has a view from the other side"
         )
-
-
-def choose_views(numbers: list[int], most: int) -> list[int]:
-    """At most so many of the views, evenly over their order."""
-    if len(numbers) <= most:
-        return numbers
-    places = np.round(np.linspace(0, len(numbers) - 1, most)).astype(int)
-    return [numbers[place] for place in places]
 
 
 def image_effects(job: Job) -> EffectPlan:
