@@ -9,6 +9,7 @@ from schemas.capture.estimate import CaptureEstimate, ViewEstimate
 from schemas.capture.processed import ProcessedCapture, ViewScore
 from schemas.dataset.codec import Row, matrix_column
 from schemas.dataset.layout import asset_path
+from schemas.dataset.tables import NOT_OF_CAPTURES
 from schemas.scene.camera import Role
 from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
 from workers.assets.catalogue import split_of
@@ -19,12 +20,6 @@ from workers.pipeline.image_files import encode_view
 from workers.pipeline.rows import asset_row, object_rows, view_row
 from workers.pipeline.stopwatch import Stopwatch
 from workers.store.images import encode_png
-
-ABSENT = (
-    *("pose", "penetration_mm", "hover_gap_mm", "support_margin_mm", "residual_speed_mm_s", "recheck_move_mm"),
-    *("recheck_turn_deg", "equilibrium_residual", "settle_s", "bodies"),
-)
-"""Columns of `scenes` that a capture cannot have: nothing was simulated to rest."""
 
 SCORES = ("pose_mm", "pose_deg", "cloud_median_mm", "cloud_p95_mm", "completeness", "depth_median_mm")
 
@@ -101,7 +96,7 @@ def scene_row(
     left_out: Sequence[LeftOut],
 ) -> Row:
     """The row of `scenes`: the board is the table, and the board frame the world."""
-    absent: Row = dict.fromkeys(ABSENT)
+    absent: Row = dict.fromkeys(NOT_OF_CAPTURES)
     return {
         **absent,
         "scene_id": thing.scene_id,
