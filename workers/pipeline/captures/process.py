@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from schemas.capture.estimate import CaptureEstimate, Estimates
 from schemas.job.captures import Captures
 from schemas.scene.camera import Camera
@@ -27,7 +25,7 @@ from workers.store.capture_results import (
     mesh_ply,
     write_results,
 )
-from workers.store.images import encode_png
+from workers.store.images import encode_mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +83,7 @@ def _mask_files(given: Given, estimate: CaptureEstimate, body: Mesh) -> dict[str
     for view in estimate.views:
         if view.T_board_cam is not None and not given.has_mask(view.number):
             mask = silhouette(body, Camera(camera.intrinsics, view.T_board_cam))
-            files[f"mask_{view.number:05d}.png"] = encode_png(distort_mask(mask, camera).astype(np.uint8) * 255)
+            files[f"mask_{view.number:05d}.png"] = encode_mask(distort_mask(mask, camera))
     return files
 
 
