@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.capture.estimate import CaptureEstimate, ViewEstimate
+from schemas.capture.estimate import CaptureEstimate
 from schemas.capture.processed import ProcessedCapture, ViewScore
 from schemas.dataset.codec import Row, matrix_column
 from schemas.dataset.layout import asset_path
@@ -134,7 +134,7 @@ def quality_columns(
         "views": len(used) - len(left_out),
         "markers": sum(view.markers for view in used),
         "reprojection_before_px": _median(
-            [view.reprojection_px for view in _markers(done).values() if view.number in numbers]
+            [view.reprojection_px for number, view in done.estimates.by_markers.items() if number in numbers]
         ),
         "reprojection_px": _median([view.reprojection_px for view in used]),
         "depth_mm": _median([view.depth_mm for view in used]),
@@ -158,7 +158,7 @@ def view_columns(done: ProcessedCapture, one: CapturedPair, role: Role) -> Row:
     """The column `capture` of `views`: residuals and errors of the captured view, and of what the mirror view is made."""
     estimate: CaptureEstimate = done.estimates.estimate
     own = next(view for view in estimate.views if view.number == one.number)
-    before = _markers(done).get(one.number)
+    before = done.estimates.by_markers.get(one.number)
     score = done.score.views.get(one.number, ViewScore()) if done.score is not None else ViewScore()
     made = one.mirror if role == "mirror" else None
     return {
@@ -173,12 +173,6 @@ def view_columns(done: ProcessedCapture, one: CapturedPair, role: Role) -> Row:
         "depth_median_mm": score.depth_median_mm if role == "input" else None,
         "sources": list(made.sources) if made is not None else None,
     }
-
-
-def _markers(done: ProcessedCapture) -> dict[int, ViewEstimate]:
-    """The views of the estimate from markers alone, by number; none where it was not computed."""
-    markers = done.estimates.by_name.get("markers")
-    return {view.number: view for view in markers.views} if markers is not None else {}
 
 
 def _median(values: Sequence[float | None]) -> float | None:
