@@ -8,7 +8,7 @@ from typing import Any
 from schemas.errors import InputError
 from services.bench.machine import pinned
 from services.run.progress import ProgressLine
-from services.study.captures.measure import measure_capture
+from services.study.captures.measure import measure_capture, warm_up
 from services.study.journal import Journal
 from services.study.measure.statistics import image_figures
 from services.study.measure.timing import timed_rows
@@ -42,16 +42,19 @@ def run_capture_study(plan: Plan, journal: Journal, context: WorkerContext, prog
         f"captures/{scene}/{lap}": (scene, lap)
         for scene, lap in itertools.product(range(first, first + sizes.scenes), range(sizes.laps))
     }
+    missing: dict[int, list[str]] = {}
+    for name, (scene, _) in units.items():
+        if name not in journal:
+            missing.setdefault(scene, []).append(name)
     progress.expect(len(units))
     with pinned():
-        for scene in range(first, first + sizes.scenes):
-            missing = [name for name, (of, _) in units.items() if of == scene and name not in journal]
-            if not missing:
-                continue
+        for number, (scene, names) in enumerate(missing.items()):
             with temporary_folder("study") as scratch:
                 path = scratch / "capture"
                 simulate_one(context, scene, path)
-                for name in missing:
+                if number == 0:
+                    warm_up(context, plan.settings[0], path)
+                for name in names:
                     journal.add(name, measure_capture(context, plan.settings, path, units[name]))
                     progress.show(sum(unit in journal for unit in units))
     laps: list[dict[int, dict[str, Any]]] = [{} for _ in range(sizes.laps)]
