@@ -47,7 +47,7 @@ def measure_scaling(
     each = Span(start=job.first_scene, stop=job.first_scene + max(1, scenes // workers))
     drive = _RayDrive(job, open_catalogue(job.assets, job_folder, tuple(job.categories)), folder, workers)
     with private_ray(workers), plain_processes(job, job_folder, folder, workers) as processes:
-        drive.run("warm", workers, 4 * workers * job.run.range_size, job.run.range_size)
+        drive.run("warm", workers, 4 * workers * job.range_size, job.range_size)
         for number in range(rounds):
             for count in counts:
                 ray[count].append(drive.run(f"{number}-{count}", count, scenes, shard))
@@ -128,7 +128,7 @@ class _RayDrive:
 
     def run(self, name: str, slots: int, count: int, shard_size: int) -> tuple[Lap, float]:
         """A lap of that many scenes, and the share of the slots' time without a shard."""
-        out, size, first = self.folder / name, self.job.run.range_size, self.job.first_scene
+        out, size, first = self.folder / name, self.job.range_size, self.job.first_scene
         store = LocalStore(out)
         store.prepare()
         spans = [Span(start=s, stop=min(s + size, first + count)) for s in range(first, first + count, size)]

@@ -63,7 +63,7 @@ def describe_plan(request: RunRequest) -> list[str]:
         f"job {job.name}: {describe_scenes(job)}, seed {job.seed}",
         f"categories: {', '.join(f'{name} {weight:g}' for name, weight in sorted(job.categories.items()))}",
         *describe_sources(catalogue),
-        f"out: {request.out}, ranges of {job.run.range_size}, shards of {job.run.shard_size or f'up to {MAX_SHARD}'} scenes",
+        f"out: {request.out}, ranges of {job.range_size}, shards of {job.run.shard_size or f'up to {MAX_SHARD}'} scenes",
     ]
 
 
@@ -170,7 +170,7 @@ def _make(
     tally = Tally(asked=plan.scenes)
     log_event("started", job=job.name, scenes=tally.asked, slots=slots.running)
     limits = Limits(slots.in_flight, job.run.max_attempts, int(job.run.max_failure_share * job.scenes))
-    shards = group_shards(plan, job.run.shard_size or choose_shard_size(tally.asked, slots.running))
+    shards = group_shards(plan, job.run.shard_size or choose_shard_size(tally.asked, slots.running, job.range_size))
     with contextlib.closing(ProgressLine(tally.asked, job.name)) as line:
 
         def follow(now: Tally) -> None:
