@@ -21,9 +21,10 @@ from schemas.errors import RunError
 from schemas.job.job import Job
 from services.bench.ratios import Lap, Spread, by_clock, by_processor, idle_share, slope_ratio
 from services.bench.stages import run_process
-from services.run.coordinator import Coordinator, Limits, Tally
+from services.run.coordinator import Coordinator, Limits
 from services.run.range_planner import MAX_SHARD, group_shards
 from services.run.ray_cluster import PREFETCH, private_ray
+from services.run.tally import Tally
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.store.local import LocalStore
 

@@ -4,7 +4,7 @@ from collections import Counter
 
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.shard import ShardReport, SpanReport
-from services.run.coordinator import Tally
+from services.run.tally import Tally
 
 STACK = Fingerprint(canary="c", code="d", libraries={}, simd="", renderer="")
 
@@ -33,3 +33,14 @@ def test_a_conflict_is_kept_word_for_word():
     tally = Tally(asked=4)
     tally.add(report(span(0, 4, {}, conflict="two attempts made other bytes")))
     assert tally.conflicts == ["two attempts made other bytes"]
+
+
+def test_what_is_served_is_what_was_counted_and_stays_when_the_run_goes_on():
+    tally = Tally(asked=12)
+    tally.add(report(span(0, 3, {"intrinsic: left_table": 1})).model_copy(update={"seconds": {"settle": 1.5}}))
+    before = tally.counts(2)
+    tally.add(report(span(4, 3, {"intrinsic: left_table": 1})).model_copy(update={"seconds": {"settle": 2.5}}))
+    after = tally.counts(2)
+    assert (before.made, before.failed, before.seconds) == (3, {"intrinsic: left_table": 1}, {"settle": 1.5})
+    assert (after.made, after.failed, after.seconds) == (6, {"intrinsic: left_table": 2}, {"settle": 4.0})
+    assert (after.asked, after.slots) == (12, 2)
