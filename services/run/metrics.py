@@ -18,7 +18,7 @@ class Counts:
     """The state of a run at one moment.
 
     `failed` by `kind: reason`; `lost`: workers by the cause of their death; `seconds`: of the workers by stage;
-    `in_flight`: ranges given to Ray; `slots`: shards that may run at once; `phase`: one of `PHASES`.
+    `in_flight`: ranges given to Ray; `slots`: shards that may run at once; `since`: when the making began, seconds since 1970; `phase`: one of `PHASES`.
     """
 
     asked: int = 0
@@ -29,6 +29,7 @@ class Counts:
     commits: int = 0
     in_flight: int = 0
     slots: int = 0
+    since: float = 0.0
     phase: str = "planning"
 
 
@@ -54,6 +55,7 @@ class Meter(Collector):
             "verso_scenes_asked": ("Scenes that this run was to make.", now.asked),
             "verso_ranges_in_flight": ("Ranges given to Ray and not reported.", now.in_flight),
             "verso_slots": ("Shards that may run at once.", now.slots),
+            "verso_making_since_timestamp_seconds": ("When the making began.", now.since),
         }
         counters = {
             "verso_scenes_made": ("Scenes made and committed in this run.", now.made),

@@ -1,5 +1,6 @@
 """What a run has come to so far."""
 
+import time
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 
@@ -24,6 +25,8 @@ class Tally:
     """Of the workers, by stage."""
     ranges: int = 0
     """Those committed."""
+    since: float = field(default_factory=time.time)
+    """When the run began to make scenes, seconds since 1970."""
     in_flight: int = 0
     """Ranges given to Ray and not reported."""
     shard_wall_s: float = 0.0
@@ -64,5 +67,6 @@ class Tally:
             commits=self.ranges,
             in_flight=self.in_flight,
             slots=slots,
+            since=self.since,
             phase="making",
         )

@@ -56,6 +56,7 @@ def test_what_is_counted_is_served(place):
                 commits=4,
                 in_flight=7,
                 slots=2,
+                since=1.8e9,
                 phase="making",
             )
         )
@@ -67,6 +68,7 @@ def test_what_is_counted_is_served(place):
     assert found["verso_stage_seconds_total", "settle"] == 1.5
     assert found["verso_stage_seconds_total", 'a "stage"\n'] == 2.0
     assert (found["verso_commits_total",], found["verso_ranges_in_flight",], found["verso_slots",]) == (4, 7, 2)
+    assert found["verso_making_since_timestamp_seconds",] == 1.8e9
     assert (found["verso_phase", "making"], found["verso_phase", "planning"]) == (1.0, 0.0)
 
 
