@@ -18,7 +18,8 @@ class Counts:
     """The state of a run at one moment.
 
     `failed` by `kind: reason`; `lost`: workers by the cause of their death; `seconds`: of the workers by stage;
-    `in_flight`: ranges given to Ray; `slots`: shards that may run at once; `since`: when the making began, seconds since 1970; `phase`: one of `PHASES`.
+    `in_flight`: ranges given to Ray; `slots`: shards that may run at once; `since`: when the making began, seconds since
+    1970; `phase`: one of `PHASES`.
     """
 
     asked: int = 0
