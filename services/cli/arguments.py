@@ -58,3 +58,14 @@ def read_address(text: str) -> str:
         told = "write it as HOST:PORT, as `ray start` prints it (port 6379 by default)"
         raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
     return text
+
+
+def read_listener(text: str) -> str:
+    """An address of this machine and a port to listen on, HOST:PORT. Raises argparse.ArgumentTypeError."""
+    told = "write it as HOST:PORT, such as 127.0.0.1:9464 (0.0.0.0 listens on every address)"
+    if text == "auto" or text.startswith("ray://"):
+        raise argparse.ArgumentTypeError(f"{text}: {told}")
+    try:
+        return read_address(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}") from None

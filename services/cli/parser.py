@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from services.cli.arguments import Parser, read_address, read_index, read_path, read_place
+from services.cli.arguments import Parser, read_address, read_index, read_listener, read_path, read_place
 from services.cli.capture_parser import CAPTURE_COMMANDS
 from services.cli.command import JOB, JSON, OUT, SCENE, SET, Command, number, option
 
@@ -84,6 +84,12 @@ COMMANDS: dict[str, Command] = {
                 help="a Ray cluster that runs already (default: a private Ray here)",
             ),
             SET,
+            option(
+                "--metrics",
+                type=read_listener,
+                metavar="HOST:PORT",
+                help="serve what the run counts to Prometheus there (default: not at all)",
+            ),
             option("--dry-run", action="store_true", help="check everything and say what would be done"),
             option(
                 "--retry-failed", action="store_true", help="try scenes again that failed for environmental reasons"

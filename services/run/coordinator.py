@@ -5,19 +5,20 @@ import signal
 import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import ray
 from ray.exceptions import OutOfMemoryError, RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from schemas.dataset.commit import CommitSummary, Span
+from schemas.dataset.commit import Span
 from schemas.dataset.layout import commit_path, staging_path
 from schemas.dataset.shard import Blame, Reason, ShardOrder, ShardReport
 from schemas.errors import CommitConflict, RunError, VersoError
 from services.run.processes import Process, send
 from services.run.progress import log_event, say
 from services.run.stalls import Stall
+from services.run.tally import Tally
 from services.run.watchdog import Watchdog, end_worker_here, find_own_workers
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.run_shard import TIMED_OUT, run_shard
@@ -35,41 +36,6 @@ EXPLANATIONS: dict[Reason, str] = {
     "killed": "the worker was killed or crashed in this scene each time: see OUT/_logs, then run with --retry-failed",
 }
 """The stored detail of an environmental failure."""
-
-
-@dataclass
-class Tally:
-    """The results of a run so far; changed by the coordinator alone."""
-
-    asked: int
-    made: int = 0
-    failed: Counter[str] = field(default_factory=Counter)
-    conflicts: list[str] = field(default_factory=list)
-    commits: list[CommitSummary] = field(default_factory=list)
-    """Those of this run that nobody has taken yet."""
-    shard_wall_s: float = 0.0
-    shard_cpu_s: float = 0.0
-
-    @property
-    def done(self) -> int:
-        """Scenes made or failed."""
-        return self.made + self.failed.total()
-
-    def add(self, report: ShardReport) -> None:
-        """Counts one shard's report."""
-        self.shard_wall_s += report.wall_s
-        self.shard_cpu_s += report.cpu_s
-        for span in report.spans:
-            if span.conflict:
-                self.conflicts.append(span.conflict)
-            self.made += span.made
-            self.failed.update(span.failed)
-            self.commits += [span.commit] if span.commit else []
-
-    def take_commits(self) -> list[CommitSummary]:
-        """The commits since the last call."""
-        commits, self.commits = self.commits, []
-        return commits
 
 
 @dataclass(frozen=True)
@@ -119,6 +85,7 @@ class Coordinator:
                         self._collect(ref, self._running.pop(ref))
                     for stall in watchdog.take_stalls():
                         self._end_stalled(stall)
+                    self._tally.in_flight = sum(len(spans) for spans in self._running.values())
                     progress(self._tally)
         except BaseException:
             self._cancel()
@@ -219,6 +186,7 @@ class Coordinator:
             self._tally.made += summary.made
             self._tally.failed.update(kind for _, kind, _ in summary.failed)
             self._tally.commits.append(summary)
+            self._tally.ranges += 1
             left.pop(0)
         if left:
             self._count_death(left[0], error, stalled)
@@ -232,6 +200,7 @@ class Coordinator:
         )
         message = " ".join(str(error).split())[:300]
         log_event("worker lost", logging.WARNING, range=span.start, scene=scene, reason=reason, error=message)
+        self._tally.lost[reason] += 1
         key = ("range", span.start) if scene is None else ("scene", scene)
         self._deaths[key] += 1
         deaths = self._deaths[key]

@@ -16,8 +16,9 @@ from schemas.errors import RunError
 from services.job.read import validate_job
 from services.merge.step import merge
 from services.run import coordinator as module
-from services.run.coordinator import Coordinator, Limits, Tally
+from services.run.coordinator import Coordinator, Limits
 from services.run.range_planner import committed_ranges, plan_ranges
+from services.run.tally import Tally
 from tests.bucket_faults import REQUESTS, requests
 from tests.disk_faults import unflushed
 from tests.made_up_scenes import attempt_at, small_scene, terms

@@ -4,7 +4,7 @@ from collections import Counter
 
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.shard import ShardReport, SpanReport
-from services.run.coordinator import Tally
+from services.run.tally import Tally
 
 STACK = Fingerprint(canary="c", code="d", libraries={}, simd="", renderer="")
 
