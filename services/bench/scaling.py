@@ -21,9 +21,11 @@ from schemas.errors import RunError
 from schemas.job.job import Job
 from services.bench.ratios import Lap, Spread, by_clock, by_processor, idle_share, slope_ratio
 from services.bench.stages import run_process
-from services.run.coordinator import Coordinator, Limits
+from services.run.coordinator import Coordinator, Limits, Pattern
+from services.run.joining import terms_of_driver
 from services.run.range_planner import MAX_SHARD, group_shards
-from services.run.ray_cluster import PREFETCH, private_ray
+from services.run.ray_cluster import private_ray
+from services.run.slots import PREFETCH, Slots
 from services.run.tally import Tally
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.store.local import LocalStore
@@ -135,11 +137,11 @@ class _RayDrive:
         spans = [Span(start=s, stop=min(s + size, first + count)) for s in range(first, first + count, size)]
         tally = Tally(asked=count)
         # The other slot could start a waiting shard, so one worker gets one shard at a time.
-        limits = Limits(PREFETCH * slots if slots == self.workers else slots, 1, count)
+        in_flight = PREFETCH * slots if slots == self.workers else slots
+        limits = Limits(Slots(slots, in_flight), 1, count)
+        pattern = Pattern(ShardOrder.of(str(out), self.job, "bench"), self.catalogue, terms_of_driver())
         begun = time.perf_counter()
-        Coordinator(store, ShardOrder.of(str(out), self.job, "bench"), self.catalogue, limits, tally).run(
-            group_shards(spans, shard_size)
-        )
+        Coordinator(store, pattern, limits, tally).run(group_shards(spans, shard_size))
         seconds = time.perf_counter() - begun
         idle = idle_share(tally.shard_wall_s, slots, seconds)
         return Lap(tally.made, seconds, tally.shard_cpu_s, {}), idle

@@ -52,8 +52,12 @@ def read_place(text: str) -> str:
 
 def read_address(text: str) -> str:
     """Where a Ray listens. Raises argparse.ArgumentTypeError."""
+    if text.startswith("ray://"):
+        told = "Verso runs beside a node of the cluster and not through Ray's client: write HOST:PORT (port 6379 by default) on"
+        told += " a machine of the cluster, or `ray submit CLUSTER.yaml deploy/submit.py JOB` from elsewhere"
+        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
     host = r"[\w-]{1,63}(?:\.[\w-]{1,63})*|\[[0-9a-fA-F:.]{2,45}\]"
-    found = re.fullmatch(rf"(?:ray://)?(?:{host}):(\d{{1,5}})", text, re.ASCII)
+    found = re.fullmatch(rf"(?:{host}):(\d{{1,5}})", text, re.ASCII)
     if text != "auto" and not (found and 0 < int(found[1]) < 65536):
         told = "write it as HOST:PORT, as `ray start` prints it (port 6379 by default)"
         raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")

@@ -3,7 +3,7 @@
 import contextlib
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
@@ -14,14 +14,16 @@ from schemas.job.job import Job
 from services.job.record import JobRecord, adopt, encode_job, record_job, refuse_foreign
 from services.merge.dataset_card import describe_left_out, describe_sources, write_card
 from services.merge.step import MergeResult, merge
-from services.run.coordinator import Coordinator, Limits
+from services.run.coordinator import Coordinator, Limits, Pattern
+from services.run.joining import join_cluster, terms_of_driver, with_own_stack
 from services.run.lock import hold_lock
 from services.run.losses import find_lost
 from services.run.metrics import Meter, serve
 from services.run.out_folder import explain_lost_folder
 from services.run.progress import ProgressLine, event_log, log_event
 from services.run.range_planner import MAX_SHARD, SpanPlan, choose_shard_size, group_shards, plan_spans
-from services.run.ray_cluster import Slots, open_ray
+from services.run.ray_cluster import open_ray
+from services.run.slots import Slots
 from services.run.tally import Tally
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.captures.listing import open_sources
@@ -108,9 +110,13 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
         made_now = 0
         with contextlib.closing(LedgerKeeper(store, ledger)) as keeper:
             if plan.scenes:
-                order = order_pattern(store, request.out, record, ledger)
+                pattern = Pattern(order_pattern(store, request.out, record, ledger), catalogue, terms_of_driver())
+                if request.address is not None:
+                    pattern = replace(pattern, order=with_own_stack(store, pattern.order))
                 with cluster or open_ray(request.address, record.job.run.workers) as slots:
-                    made_now = _make(store, order, catalogue, plan, slots, keeper, meter)
+                    if request.address is not None:
+                        pattern = join_cluster(store, lock, pattern)
+                    made_now = _make(store, pattern, plan, slots, keeper, meter)
         meter.enter("merging")
         if store.size(JOB_FILE) is None or store.read(JOB_FILE) != encode_job(record):
             store.write_whole(JOB_FILE, encode_job(record))
@@ -173,27 +179,19 @@ def _committed_stack(store: Store, job: Job, ledger: Ledger) -> str:
     return stacks[0] if stacks else ""
 
 
-def _make(
-    store: Store,
-    order: ShardOrder,
-    catalogue: Catalogue,
-    plan: SpanPlan,
-    slots: Slots,
-    keeper: LedgerKeeper,
-    meter: Meter,
-) -> int:
+def _make(store: Store, pattern: Pattern, plan: SpanPlan, slots: Slots, keeper: LedgerKeeper, meter: Meter) -> int:
     """Makes the ranges, and shows how many scenes are done. The number of scenes made."""
-    job = order.job
+    job = pattern.order.job
     tally = Tally(asked=plan.scenes)
     log_event("started", job=job.name, scenes=tally.asked, slots=slots.running)
-    limits = Limits(slots.in_flight, job.run.max_attempts, int(job.run.max_failure_share * job.scenes))
+    limits = Limits(slots, job.run.max_attempts, int(job.run.max_failure_share * job.scenes))
     shards = group_shards(plan, job.run.shard_size or choose_shard_size(tally.asked, slots.running, job.range_size))
     with contextlib.closing(ProgressLine(tally.asked, job.name)) as line:
 
         def follow(now: Tally) -> None:
             line.show(now.done, now.failed.total())
             keeper.add(now.take_commits())
-            meter.show(now.counts(slots.running))
+            meter.show(now.counts(slots.now().running))
 
-        Coordinator(store, order, catalogue, limits, tally).run(shards, follow)
+        Coordinator(store, pattern, limits, tally).run(shards, follow)
     return tally.made
