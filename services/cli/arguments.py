@@ -34,6 +34,11 @@ def read_count(text: str) -> int:
     return int(text)
 
 
+def read_counts(text: str) -> list[int]:
+    """Whole numbers from 1 up, with commas between. Raises argparse.ArgumentTypeError."""
+    return [read_count(one) for one in text.split(",")]
+
+
 def read_path(text: str) -> Path:
     """A file or folder. Raises argparse.ArgumentTypeError where none can have that name."""
     return Path(read_place(text))

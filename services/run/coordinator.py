@@ -64,20 +64,28 @@ class Pattern:
     env_vars: Mapping[str, str] = field(default_factory=dict)
 
 
-_run_shard = ray.remote(num_cpus=1, max_retries=0)(enter_shard)
 _end_worker = ray.remote(num_cpus=0, max_retries=0)(end_worker_here)
 
 
 class Coordinator:
     """The state of a run: the shards that run, those to run again, and how often workers died."""
 
-    def __init__(self, store: Store, pattern: Pattern, limits: Limits, tally: Tally) -> None:
+    def __init__(
+        self,
+        store: Store,
+        pattern: Pattern,
+        limits: Limits,
+        tally: Tally,
+        enter: Callable[[WorkerTerms, bytes, bytes], ShardReport] = enter_shard,
+    ) -> None:
+        """`enter` makes a shard in a worker; simulations give another."""
         self._store = store
         self._order = pattern.order.model_copy(update={"label": uuid.uuid4().hex[:8]})
         self._terms = pattern.terms
         self._catalogue = ray.put(pickle.dumps(pattern.catalogue))
         env_vars = dict(pattern.env_vars)
-        self._task = _run_shard.options(runtime_env={"env_vars": env_vars}) if env_vars else _run_shard
+        task = ray.remote(num_cpus=1, max_retries=0)(enter)
+        self._task = task.options(runtime_env={"env_vars": env_vars}) if env_vars else task
         self._limits = limits
         self._tally = tally
         self._again: deque[tuple[Span, ...]] = deque()

@@ -60,7 +60,7 @@ def handed_out(monkeypatch, tmp_path):
             return name
 
     monkeypatch.setattr(module.ray, "put", lambda value: "catalogue")
-    monkeypatch.setattr(module, "_run_shard", Task)
+    monkeypatch.setattr(module.ray, "remote", lambda **options: lambda enter: Task)
     order = ShardOrder.of(str(tmp_path), validate_job({"name": "drained", "scenes": 8}, "test"), "j" * 64)
     pattern = Pattern(order, cast(Catalogue, None), WorkerTerms((), "", ""))
     slots = [1]
