@@ -134,7 +134,8 @@ class _RayDrive:
         spans = [Span(start=s, stop=min(s + size, first + count)) for s in range(first, first + count, size)]
         tally = Tally(asked=count)
         # The other slot could start a waiting shard, so one worker gets one shard at a time.
-        limits = Limits(PREFETCH * slots if slots == self.workers else slots, 1, count)
+        in_flight = PREFETCH * slots if slots == self.workers else slots
+        limits = Limits(lambda: in_flight, 1, count)
         begun = time.perf_counter()
         Coordinator(store, ShardOrder.of(str(out), self.job, "bench"), self.catalogue, limits, tally).run(
             group_shards(spans, shard_size)

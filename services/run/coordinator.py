@@ -74,9 +74,9 @@ class Tally:
 
 @dataclass(frozen=True)
 class Limits:
-    """At most `in_flight` shards given to Ray at once, `attempts` at a range, and `failures` failed scenes."""
+    """At most `in_flight()` shards given to Ray at once, `attempts` at a range, and `failures` failed scenes."""
 
-    in_flight: int
+    in_flight: Callable[[], int]
     attempts: int
     failures: int
 
@@ -126,7 +126,7 @@ class Coordinator:
 
     def _fill_slots(self, shards: Iterator[tuple[Span, ...]]) -> bool:
         """Gives shards to Ray while there is room; False where nothing is left to wait for."""
-        while len(self._running) < self._limits.in_flight:
+        while len(self._running) < self._limits.in_flight():
             spans = self._again.popleft() if self._again else next(shards, None)
             if spans is None:
                 break

@@ -1,10 +1,11 @@
 """The Ray that runs the work: a private one on this machine, or a running cluster."""
 
 import contextlib
+import math
 import os
 import shutil
 import socket
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,13 @@ class Slots:
 
     running: int
     in_flight: int
+    jobs: Callable[[], int] = lambda: 1
+    """How many jobs share them now; asked again and again."""
+
+    def room(self) -> int:
+        """Shards of this job that may be given to Ray now: with other jobs an even share, and none that waits in Ray."""
+        jobs = self.jobs()
+        return self.in_flight if jobs <= 1 else math.ceil(self.running / jobs)
 
 
 def open_ray(address: str | None, workers: int | None) -> contextlib.AbstractContextManager[Slots]:

@@ -1,8 +1,10 @@
 """`verso run`: makes a job's dataset, or the part of it that is missing."""
 
 import contextlib
+import dataclasses
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,6 +45,8 @@ class RunRequest:
     out: str
     address: str | None = None
     retry_failed: bool = False
+    sharing: Callable[[], int] = lambda: 1
+    """How many jobs share the cluster now."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +105,8 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
             if plan.scenes:
                 order = order_pattern(store, request.out, record, ledger)
                 with cluster or open_ray(request.address, record.job.run.workers) as slots:
-                    made_now = _make(store, order, catalogue, plan, slots, keeper)
+                    shared = dataclasses.replace(slots, jobs=request.sharing)
+                    made_now = _make(store, order, catalogue, plan, shared, keeper)
         if store.size(JOB_FILE) is None or store.read(JOB_FILE) != encode_job(record):
             store.write_whole(JOB_FILE, encode_job(record))
         merged = merge(store, record.job.first_scene, record.job.stop_scene, lock.require_held)
@@ -169,7 +174,7 @@ def _make(
     job = order.job
     tally = Tally(asked=plan.scenes)
     log_event("started", job=job.name, scenes=tally.asked, slots=slots.running)
-    limits = Limits(slots.in_flight, job.run.max_attempts, int(job.run.max_failure_share * job.scenes))
+    limits = Limits(slots.room, job.run.max_attempts, int(job.run.max_failure_share * job.scenes))
     shards = group_shards(plan, job.run.shard_size or choose_shard_size(tally.asked, slots.running))
     with contextlib.closing(ProgressLine(tally.asked, job.name)) as line:
 

@@ -68,7 +68,7 @@ def coordinator_of(monkeypatch):
     def make(store) -> Coordinator:
         order = ShardOrder.of(store.name, validate_job({"name": "chaos", "scenes": 2}, "test"), "j" * 64)
         catalogue = cast(Catalogue, None)
-        coordinator = Coordinator(store, order, catalogue, Limits(1, 3, 0), Tally(asked=2))
+        coordinator = Coordinator(store, order, catalogue, Limits(lambda: 1, 3, 0), Tally(asked=2))
         coordinator._order = order.model_copy(update={"label": LABEL})
         return coordinator
 
