@@ -12,7 +12,7 @@ PACKAGES = (
     *("schemas", *(f"schemas/{name}" for name in ("capture", "dataset", "job", "scene"))),
     *(
         "services",
-        *(f"services/{name}" for name in ("bench", "capture", "cli", "job", "merge", "read", "run", "study")),
+        *(f"services/{name}" for name in ("bench", "capture", "cli", "job", "merge", "queue", "read", "run", "study")),
     ),
     "services/read/independent",
     *(
@@ -27,7 +27,7 @@ PACKAGES = (
     *("workers/pipeline", "workers/plan", "workers/render", "workers/render/raster", "workers/sensor", "workers/store"),
 )
 FILES = (
-    *("schemas/base.py", "schemas/environment.py", "schemas/errors.py"),
+    *("schemas/base.py", "schemas/environment.py", "schemas/errors.py", "schemas/queue.py"),
     *("services/read/dataset_reader.py", "services/read/verify.py"),
 )
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 from services.cli.arguments import Parser, read_address, read_counts, read_index, read_listener, read_path, read_place
 from services.cli.capture_parser import CAPTURE_COMMANDS
 from services.cli.command import JOB, JSON, OUT, SCENE, SET, Command, number, option
+from services.cli.queue_parser import QUEUE_COMMANDS
 
 if TYPE_CHECKING:
     Commands = argparse._SubParsersAction[Parser]
@@ -148,6 +149,7 @@ COMMANDS: dict[str, Command] = {
         "process data/mug",
         commands=CAPTURE_COMMANDS,
     ),
+    **QUEUE_COMMANDS,
     "test": Command(
         "lint, types, layer rules and tests",
         "tests/hard_cases --figures f.json",

@@ -3,6 +3,7 @@
 import contextlib
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from services.run.out_folder import explain_lost_folder
 from services.run.progress import ProgressLine, event_log, log_event
 from services.run.range_planner import MAX_SHARD, SpanPlan, choose_shard_size, group_shards, plan_spans
 from services.run.ray_cluster import open_ray
-from services.run.slots import Slots
+from services.run.slots import SharedSlots, Slots
 from services.run.tally import Tally
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.captures.listing import open_sources
@@ -40,6 +41,7 @@ class RunRequest:
 
     Relative asset folders are resolved from `job_folder`; `out` is a URL or an absolute path, because workers have
     other working folders. `metrics`: HOST:PORT where Prometheus may read what the run counts.
+    `sharing` tells how many jobs share the cluster now.
     """
 
     job: Job
@@ -48,6 +50,7 @@ class RunRequest:
     address: str | None = None
     retry_failed: bool = False
     metrics: str | None = None
+    sharing: Callable[[], int] | None = None
 
 
 @dataclass(frozen=True)
@@ -116,7 +119,8 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
                 with cluster or open_ray(request.address, record.job.run.workers) as slots:
                     if request.address is not None:
                         pattern = join_cluster(store, lock, pattern)
-                    made_now = _make(store, pattern, plan, slots, keeper, meter)
+                    own = SharedSlots.of(slots, request.sharing) if request.sharing else slots
+                    made_now = _make(store, pattern, plan, own, keeper, meter)
         meter.enter("merging")
         if store.size(JOB_FILE) is None or store.read(JOB_FILE) != encode_job(record):
             store.write_whole(JOB_FILE, encode_job(record))

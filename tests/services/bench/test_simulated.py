@@ -17,7 +17,7 @@ def test_a_sleeping_worker_reports_what_it_was_given():
     from types import SimpleNamespace
 
     order = pickle.dumps(SimpleNamespace(spans=spans(0, 2, 8)))
-    made = sleeping(0.0)(None, order, b"")  # type: ignore[arg-type]
+    made = sleeping(0.0)(None, order, b"")
     assert [(span.start, span.stop, span.made) for span in made.spans] == [(0, 2, 2), (2, 4, 2), (8, 10, 2)]
 
 
