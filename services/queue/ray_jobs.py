@@ -89,11 +89,14 @@ class RayDrivers(Drivers):
                 f"--address {self._address}: the cluster asks for a token: set RAY_AUTH_MODE=token and its RAY_AUTH_TOKEN "
                 "here too"
             ) from error
-        except (OSError, RuntimeError, ValueError) as error:  # what `requests` raises are OSErrors
-            told = plain_line(" ".join(str(error).split()), 300)
+        except OSError as error:  # what `requests` raises are OSErrors, too
             raise MachineError(
-                f"--address {self._address}: Ray's job API does not answer as it should: {told}"
+                f"--address {self._address}: Ray's job API does not answer there ({type(error).__name__}): it is the address of "
+                "the dashboard, as `ray start --head` prints it"
             ) from error
+        except (RuntimeError, ValueError) as error:
+            told = plain_line(" ".join(str(error).split()), 300)
+            raise MachineError(f"--address {self._address}: Ray's job API refuses: {told}") from error
 
 
 def _first_line(text: str | None) -> str:
