@@ -37,6 +37,11 @@ def read_count(text: str) -> int:
     return int(text)
 
 
+def read_counts(text: str) -> list[int]:
+    """Whole numbers from 1 up, with commas between. Raises argparse.ArgumentTypeError."""
+    return [read_count(one) for one in text.split(",")]
+
+
 def read_path(text: str) -> Path:
     """A file or folder. Raises argparse.ArgumentTypeError where none can have that name."""
     return Path(read_place(text))
@@ -55,12 +60,27 @@ def read_place(text: str) -> str:
 
 def read_address(text: str) -> str:
     """Where a Ray listens. Raises argparse.ArgumentTypeError."""
+    if text.startswith("ray://"):
+        told = "Verso runs beside a node of the cluster and not through Ray's client: write HOST:PORT (port 6379 by default) on"
+        told += " a machine of the cluster, or `ray submit CLUSTER.yaml deploy/submit.py JOB` from elsewhere"
+        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
     host = r"[\w-]{1,63}(?:\.[\w-]{1,63})*|\[[0-9a-fA-F:.]{2,45}\]"
-    found = re.fullmatch(rf"(?:ray://)?(?:{host}):(\d{{1,5}})", text, re.ASCII)
+    found = re.fullmatch(rf"(?:{host}):(\d{{1,5}})", text, re.ASCII)
     if text != "auto" and not (found and 0 < int(found[1]) < 65536):
         told = "write it as HOST:PORT, as `ray start` prints it (port 6379 by default)"
         raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
     return text
+
+
+def read_listener(text: str) -> str:
+    """An address of this machine and a port to listen on, HOST:PORT. Raises argparse.ArgumentTypeError."""
+    told = "write it as HOST:PORT, such as 127.0.0.1:9464 (0.0.0.0 listens on every address)"
+    if text == "auto" or text.startswith("ray://"):
+        raise argparse.ArgumentTypeError(f"{text}: {told}")
+    try:
+        return read_address(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}") from None
 
 
 def read_http(text: str) -> str:

@@ -28,7 +28,7 @@ def run(options: argparse.Namespace) -> int:
 
     out = options.out or f"data/{job.name}"
     absolute = out if "://" in out else str(Path(out).resolve())
-    request = RunRequest(job, options.job.parent, absolute, options.address, options.retry_failed)
+    request = RunRequest(job, options.job.parent, absolute, options.address, options.retry_failed, options.metrics)
     if options.dry_run:
         print("\n".join(describe_plan(request)))
         return 0

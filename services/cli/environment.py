@@ -2,19 +2,9 @@
 
 import os
 import sys
-from pathlib import Path
 
 from schemas.environment import settings_to_change
-
-
-def processor_flags(cpuinfo: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
-    """Feature flags of this machine's first core, from Linux; empty where it does not list them."""
-    try:
-        with cpuinfo.open() as lines:
-            first = next((line for line in lines if line.startswith("flags")), "")
-    except OSError:
-        return frozenset()
-    return frozenset(first.partition(":")[2].split())
+from services.run.sight import processor_flags
 
 
 def enter_stack_environment() -> None:

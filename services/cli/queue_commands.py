@@ -132,7 +132,7 @@ def drive(options: argparse.Namespace) -> int:
             file = Path(folder) / "job.yaml"
             file.write_text(asked.text, encoding="utf-8")
             job = load_job(file, asked.changes)
-        request = RunRequest(job, Path(asked.folder), asked.out, "auto", asked.retry_failed, Sharing(queue))
+        request = RunRequest(job, Path(asked.folder), asked.out, "auto", asked.retry_failed, sharing=Sharing(queue))
         result = run_job(request)
         complete, answer = tell_result(asked.out, job, result)
         note = "" if complete else "scenes failed: `verso logs` says why"

@@ -68,6 +68,11 @@ class Lock:
         self._one_at_a_time = threading.Lock()
 
     @property
+    def token(self) -> str:
+        """What the lock file holds as long as this process has the lock."""
+        return self._mine.token
+
+    @property
     def held(self) -> bool:
         """Whether this process still has the lock. Asks the store, and shows life there. Raises MachineError."""
         with self._one_at_a_time:

@@ -3,7 +3,7 @@
 import math
 
 from services.queue.share import EVERY_S, Sharing
-from services.run.ray_cluster import Slots
+from services.run.slots import SharedSlots, Slots
 from tests.fake_drivers import queue_of
 
 
@@ -25,7 +25,7 @@ def test_it_is_read_every_few_seconds_and_survives_a_store_that_fails(tmp_path):
 def test_even_shares_use_every_core_and_none_is_without():
     for cores in range(1, 20):
         for jobs in range(1, 6):
-            slots = Slots(cores, 2 * cores, lambda jobs=jobs: jobs)
-            assert slots.room() == (2 * cores if jobs == 1 else math.ceil(cores / jobs))
-            assert slots.room() >= 1
-            assert jobs * slots.room() >= cores
+            slots = SharedSlots.of(Slots(cores, 2 * cores), lambda jobs=jobs: jobs).now()
+            assert slots.in_flight == (2 * cores if jobs == 1 else math.ceil(cores / jobs))
+            assert slots.in_flight >= 1
+            assert jobs * slots.in_flight >= cores

@@ -17,7 +17,8 @@ from services.read.dataset_reader import iter_stored
 from services.read.query import query
 from services.read.replay import replay_scene
 from services.read.verify import verify
-from services.run.ray_cluster import Slots, private_ray
+from services.run.ray_cluster import private_ray
+from services.run.slots import Slots
 from services.run.step import RunRequest, run_job
 from tests.killed_runs import deadly_scene, disturb_at_first_commit, interrupt
 from workers.store.images import decode_png
