@@ -74,6 +74,8 @@ def logs(options: argparse.Namespace) -> int:
     queue, drivers = _open(options), _drivers(options)
     view = queue.read(options.id)
     if options.follow:
+        if not view.ended:
+            _say(_describe_supervisor(queue))
         for part in follow_logs(queue, drivers, options.id, _say):
             print(part, end="", flush=True)
         view = queue.read(options.id)
@@ -84,8 +86,9 @@ def logs(options: argparse.Namespace) -> int:
         print(f"{header(attempt)}{text}", end="" if text.endswith("\n") else "\n")
     if not texts:
         _say(f"job {view.request.id} is {view.state}: nothing is known of what it wrote")
-    _answer(options, {"ok": True, "id": options.id, "state": view.state, "logs": texts})
-    return 0
+    known = bool(texts) or view.attempt == 0
+    _answer(options, {"ok": known, "id": options.id, "state": view.state, "logs": texts})
+    return 0 if known else 1
 
 
 def cancel(options: argparse.Namespace) -> int:

@@ -150,6 +150,8 @@ def test_logs_of_a_job_whose_cluster_is_gone(queue, capsys):
     assert "nothing is known of what it wrote" in told(capsys, "logs", job, "--queue", queue)[2]
     for kind in ("started", "began"):
         made.append(job, kind, 1)
+    code, _, err = told(capsys, "logs", job, "--queue", queue, "--address", "http://127.0.0.1:1")
+    assert code == 1 and "no copy of its log is in the queue yet" in err
     made.append(job, "ended", 1, code=0)
     made.put_log(job, 1, "8 scenes made\n")
     assert told(capsys, "logs", job, "--queue", queue)[1] == "--- attempt 1 ---\n8 scenes made\n"

@@ -109,11 +109,14 @@ def test_three_jobs_of_which_one_is_cancelled_one_killed_and_one_waits(tmp_path)
         told = verso(head, "cancel", cancelled, "--queue", queue)
         assert (told.returncode, told.stdout) == (0, f"{cancelled}: cancelling\n")
 
-        with supervisor(head, queue, log):
+        with supervisor(head, queue, log) as second:
             again = verso(head, "supervise", "--queue", queue, "--address", head.http)
             assert again.returncode == 1 and "another supervisor works here" in again.stderr
             wait_for("the end", lambda: all(read(job).ended for job in (killed, cancelled, waiting)), log)
             wait_for("the last log", lambda: open_queue(queue).has_log(killed, 2), log)
+            second.terminate()
+            assert second.wait(30) == 0
+            assert read_holder(open_queue(queue).store) is None
         found = rows()
         kept = found[cancelled].pop("scenes_done")
         assert 0 < kept < 64
