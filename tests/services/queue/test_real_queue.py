@@ -21,7 +21,9 @@ from tests.killed_runs import processes_with
 from tests.ray_head import ROOT, RayHead, ray_head
 
 TABLETOP = ROOT / "deploy" / "jobs" / "tabletop.yaml"
-EACH_ONE = ["--set", "run.range_size=1", "--set", "run.shard_size=1"]
+SCENES = 16
+SLOWLY = [*("--set", "run.range_size=1"), *("--set", "run.shard_size=1"), *("--set", "run.workers=1")]
+"""Commits come one by one, so that there is time to kill between them."""
 HOSTILE = "o $(touch x) `touch x`; touch x 'y' \"z\""
 PATIENCE_S = 90.0
 
@@ -72,13 +74,13 @@ def kill_driver(head: RayHead, job: str) -> None:
 @pytest.mark.minute
 @pytest.mark.timeout(250)
 def test_three_jobs_of_which_one_is_cancelled_one_killed_and_one_waits(tmp_path):
-    _, digest = run_here(load_job(TABLETOP, ["scenes=8"]), tmp_path / "alone")
+    _, digest = run_here(load_job(TABLETOP, [f"scenes={SCENES}"]), tmp_path / "alone")
     queue, log = str(tmp_path / "queue"), tmp_path / "supervisor.log"
 
     with ray_head(2) as head:
 
         def submit(out: str, priority: int, scenes: int) -> str:
-            words = ["--out", str(tmp_path / out), "--priority", str(priority), "--scenes", str(scenes), *EACH_ONE]
+            words = ["--out", str(tmp_path / out), "--priority", str(priority), "--scenes", str(scenes), *SLOWLY]
             done = verso(head, "submit", str(TABLETOP), *words, VERSO_QUEUE=queue)
             assert "no supervisor is running" in done.stderr
             return done.stdout.strip()
@@ -87,11 +89,11 @@ def test_three_jobs_of_which_one_is_cancelled_one_killed_and_one_waits(tmp_path)
             told = verso(head, "jobs", "--queue", queue, "--json").stdout
             return {row["id"]: row for row in json.loads(told.splitlines()[-1])["jobs"]}
 
-        waiting, cancelled, killed = submit(HOSTILE, 0, 8), submit("cancelled", 3, 64), submit("killed", 5, 8)
+        waiting, cancelled, killed = submit(HOSTILE, 0, SCENES), submit("cancelled", 3, 64), submit("killed", 5, SCENES)
         assert {job: (row["state"], row["scenes_asked"]) for job, row in rows().items()} == {
-            killed: ("queued", 8),
+            killed: ("queued", SCENES),
             cancelled: ("queued", 64),
-            waiting: ("queued", 8),
+            waiting: ("queued", SCENES),
         }
         read = open_queue(queue).read
 
@@ -126,7 +128,7 @@ def test_three_jobs_of_which_one_is_cancelled_one_killed_and_one_waits(tmp_path)
             waiting: ("done", 1),
         }
         assert (found[killed]["digest"], found[waiting]["digest"]) == (digest, digest)
-        assert (found[killed]["scenes_done"], found[waiting]["scenes_done"]) == (8, 8)
+        assert (found[killed]["scenes_done"], found[waiting]["scenes_done"]) == (SCENES, SCENES)
         assert not [one for one in processes_with(head.mark) if " drive " in one.name]
     logs = verso(head, "logs", killed, "--queue", queue, "--address", head.http)  # the cluster is gone
     assert logs.stdout.index("--- attempt 1 ---") < logs.stdout.index("--- attempt 2 ---")
