@@ -46,6 +46,12 @@ class JobRequest(Frozen):
     submitted: float
     """Seconds since 1970 by the submitter's clock; orders jobs of one priority, and nothing else depends on it."""
 
+    @model_validator(mode="after")
+    def _findable(self) -> Any:
+        if not self.folder.startswith("/") or not (self.out.startswith("/") or "://" in self.out):
+            raise ValueError("`folder` is an absolute path, `out` one or a URL")
+        return self
+
 
 EventKind = Literal["started", "began", "busy", "ended", "died", "cancel", "stopped"]
 """What can happen to a job.

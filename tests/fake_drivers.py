@@ -6,7 +6,7 @@ from pathlib import Path
 
 from schemas.errors import MachineError
 from schemas.queue import JobRequest, submission_id
-from services.queue.decide import DriverState
+from services.queue.decide import Driver
 from services.queue.ray_jobs import Drivers
 from services.queue.store import Queue, make_queue
 
@@ -15,21 +15,21 @@ class FakeDrivers(Drivers):
     """Knows what was handed over; a test says what becomes of it."""
 
     def __init__(self) -> None:
-        self.known: dict[str, DriverState] = {}
+        self.known: dict[str, Driver] = {}
         self.entrypoints: dict[str, list[str]] = {}
         self.stopped: list[str] = []
         self.logs: dict[str, str] = {}
         self.handed_over: list[str] = []
         self.answers = True
 
-    def states(self) -> dict[str, DriverState]:
+    def states(self) -> dict[str, Driver]:
         self._answer()
         return dict(self.known)
 
     def hand_over(self, submission: str, entrypoint: str, metadata: Mapping[str, str]) -> None:
         self._answer()
         if submission not in self.known:
-            self.known[submission] = "running"
+            self.known[submission] = Driver("running")
             self.handed_over.append(submission)
             self.entrypoints[submission] = shlex.split(entrypoint)
 
@@ -43,7 +43,7 @@ class FakeDrivers(Drivers):
 
     def end(self, job: str, attempt: int) -> None:
         """The driver is over, whatever it told."""
-        self.known[submission_id(job, attempt)] = "over"
+        self.known[submission_id(job, attempt)] = Driver("over")
 
     def _answer(self) -> None:
         if not self.answers:

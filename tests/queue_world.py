@@ -3,13 +3,13 @@
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from schemas.errors import VersoError
 from schemas.queue import submission_id
+from services.queue.decide import Driver
 from services.queue.drive import Ending, drive
-from services.queue.store import Queue, make_queue
+from services.queue.store import Queue
 from services.queue.supervise import Rules, Supervisor
 from tests.fake_drivers import FakeDrivers, request_of
 
@@ -28,7 +28,7 @@ class Killed(BaseException):
 class World(FakeDrivers):
     """Ray with drivers that work. `effect` is called before and after whatever a supervisor does to the world."""
 
-    folder: Path
+    queue: Queue
     ticks: int = 0
     effect: Callable[[], None] = lambda: None
     working: dict[str, int] = field(default_factory=dict)
@@ -39,7 +39,6 @@ class World(FakeDrivers):
 
     def __post_init__(self) -> None:
         super().__init__()
-        self.queue = make_queue(str(self.folder))
 
     def submit(self, job: str, **changes: Any) -> None:
         assert self.queue.put_request(request_of(job, **changes))
@@ -65,15 +64,15 @@ class World(FakeDrivers):
     def stop(self, submission: str) -> None:
         self.effect()
         super().stop(submission)
-        if self.known.get(submission) == "running":
-            self.known[submission] = "over"
+        if self.known.get(submission) == Driver("running"):
+            self.known[submission] = Driver("over")
             self.working.pop(submission, None)
         self.effect()
 
     def tick(self) -> None:
         """Lets the drivers work for a while."""
         self.ticks += 1
-        for submission in [one for one, state in self.known.items() if state == "running"]:
+        for submission in [one for one, state in self.known.items() if state == Driver("running")]:
             self._work(submission)
         folders = Counter(self.queue.read(one[6:15]).request.out for one in self.working)
         assert set(folders.values()) <= {1}, "two drivers in one folder"
@@ -88,14 +87,14 @@ class World(FakeDrivers):
             if not (DIES in name and attempt == 1):
                 self.queue.append(job, "ended", attempt, code=0)
             del self.working[submission]
-            self.known[submission] = "over"
+            self.known[submission] = Driver("over")
 
     def _begin(self, submission: str, job: str, attempt: int) -> None:
         """As `drive` does; a driver that is refused ends at once."""
         try:
             drive(self.queue, job, attempt, self._stay)
         except VersoError:
-            self.known[submission] = "over"
+            self.known[submission] = Driver("over")
         except Killed:
             self.began[submission] += 1
             self.working[submission] = self.ticks + WORK_TICKS
@@ -114,4 +113,4 @@ class World(FakeDrivers):
 
     def is_running(self, job: str) -> bool:
         view = self.queue.read(job)
-        return self.known.get(submission_id(job, view.attempt)) == "running" and view.began
+        return self.known.get(submission_id(job, view.attempt)) == Driver("running") and view.began

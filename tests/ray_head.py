@@ -52,9 +52,9 @@ def ray_head(cores: int) -> Iterator[RayHead]:
     command = [str(Path(sys.executable).with_name("ray")), "start", "--head", "--block", "--node-ip-address=127.0.0.1"]
     command += ["--dashboard-host=127.0.0.1", "--include-dashboard=true", f"--num-cpus={cores}"]
     command += [f"--temp-dir={folder}/r", "--object-store-memory=134217728", *(f"--{k}={v}" for k, v in ports.items())]
+    with (folder / "head.log").open("wb") as log:
+        started = subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=log, start_new_session=True)
     try:
-        with (folder / "head.log").open("wb") as log:
-            subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=log, start_new_session=True)
         head = RayHead(f"http://127.0.0.1:{http}", environment, mark)
         _wait_until_it_answers(head, folder / "head.log")
         yield head
@@ -64,6 +64,7 @@ def ray_head(cores: int) -> Iterator[RayHead]:
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(process.pid, signal.SIGKILL)
             time.sleep(0.2)
+        started.wait()
         shutil.rmtree(folder, ignore_errors=True)
 
 

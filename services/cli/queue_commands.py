@@ -10,10 +10,11 @@ import urllib.parse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.errors import InputError, JobError
+from schemas.errors import InputError, JobError, RunError
 from schemas.plain_line import plain_line
 from schemas.queue import JobRequest
 from services.cli.commands import tell_result
+from services.cli.environment import default_queue
 from services.job.read import load_job, read_text
 from services.queue.store import Queue, make_queue, new_id, open_queue
 
@@ -73,6 +74,8 @@ def logs(options: argparse.Namespace) -> int:
     queue, drivers = _open(options), _drivers(options)
     view = queue.read(options.id)
     if options.follow:
+        if not view.ended:
+            _say(_describe_supervisor(queue))
         for part in follow_logs(queue, drivers, options.id, _say):
             print(part, end="", flush=True)
         view = queue.read(options.id)
@@ -83,8 +86,9 @@ def logs(options: argparse.Namespace) -> int:
         print(f"{header(attempt)}{text}", end="" if text.endswith("\n") else "\n")
     if not texts:
         _say(f"job {view.request.id} is {view.state}: nothing is known of what it wrote")
-    _answer(options, {"ok": True, "id": options.id, "state": view.state, "logs": texts})
-    return 0
+    known = bool(texts) or view.attempt == 0
+    _answer(options, {"ok": known, "id": options.id, "state": view.state, "logs": texts})
+    return 0 if known else 1
 
 
 def cancel(options: argparse.Namespace) -> int:
@@ -93,8 +97,8 @@ def cancel(options: argparse.Namespace) -> int:
     view = queue.append(options.id, "cancel")
     if view is None:
         view = queue.read(options.id)
-        if view.state != "cancelling":
-            raise InputError(f"job {options.id} is {view.state}: there is nothing to cancel")
+        if view.state not in ("cancelling", "cancelled"):
+            raise RunError(f"job {options.id} is {view.state}: there is nothing to cancel")
     if view.state == "cancelling":
         _say(f"job {options.id} runs: its supervisor stops it; what is committed in {view.request.out} is kept")
         _say(_describe_supervisor(queue))
@@ -143,9 +147,10 @@ def drive(options: argparse.Namespace) -> int:
 
 def _named_queue(options: argparse.Namespace) -> str:
     """The queue that was asked for. Raises InputError where none is."""
-    if not options.queue:
+    queue = options.queue or default_queue()
+    if queue is None:
         raise InputError("which queue? name it by --queue URL or in the environment variable VERSO_QUEUE")
-    return str(options.queue)
+    return str(queue)
 
 
 def _open(options: argparse.Namespace) -> Queue:

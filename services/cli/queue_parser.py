@@ -4,7 +4,6 @@ from typing import Final
 
 from services.cli.arguments import read_count, read_http, read_job_id, read_path, read_place, read_priority
 from services.cli.command import JOB, SET, Command, number, option
-from services.cli.environment import default_queue
 
 DASHBOARD: Final = "http://127.0.0.1:8265"
 """Where Ray's job API answers by default."""
@@ -13,7 +12,6 @@ QUEUE: Final = option(
     "--queue",
     type=read_place,
     metavar="URL",
-    default=default_queue(),
     help="the queue: a folder that all hosts see, or a bucket (default: $VERSO_QUEUE)",
 )
 ADDRESS: Final = option(

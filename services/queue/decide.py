@@ -2,13 +2,18 @@
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 from schemas.queue import submission_id
 from services.queue.fold import JobView
 
-DriverState = Literal["running", "over"]
-"""What Ray's job API says of a driver that it knows: it waits or runs, or it has ended in any way."""
+
+class Driver(NamedTuple):
+    """A driver as Ray's job API knows it: it waits or runs, or it has ended in any way; and Ray's words for that."""
+
+    state: Literal["running", "over"]
+    said: str = ""
+
 
 PAUSES_S: Final = (10.0, 60.0, 300.0)
 """Before a job is taken up again after its first, second and third death."""
@@ -30,20 +35,21 @@ class Action:
     note: str = ""
 
 
-def tend_drivers(views: Sequence[JobView], drivers: Mapping[str, DriverState]) -> list[Action]:
+def tend_drivers(views: Sequence[JobView], drivers: Mapping[str, Driver]) -> list[Action]:
     """What to do about jobs that have a driver, or should have one; `drivers` by submission id, as Ray knows them."""
     return [action for view in views if view.held and (action := _tend(view, drivers)) is not None]
 
 
-def _tend(view: JobView, drivers: Mapping[str, DriverState]) -> Action | None:
+def _tend(view: JobView, drivers: Mapping[str, Driver]) -> Action | None:
     job, attempt = view.request.id, view.attempt
     found = drivers.get(submission_id(job, attempt))
     if view.state == "cancelling":
-        return Action("stop" if found == "running" else "note stop", job, attempt)
-    if found == "running":
+        return Action("stop" if found is not None and found.state == "running" else "note stop", job, attempt)
+    if found is not None and found.state == "running":
         return None
-    if found == "over":
-        return Action("note death", job, attempt, "its driver ended without a word")
+    if found is not None:
+        said = f" ({found.said})" if found.said else ""
+        return Action("note death", job, attempt, f"its driver ended without telling how{said}")
     if view.began:
         return Action("note death", job, attempt, "Ray does not know its driver any more")
     return Action("hand over", job, attempt)  # the supervisor was killed in between, or Ray forgot it

@@ -6,6 +6,7 @@ import time
 import uuid
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any, Final, TypeVar
 
 from pydantic import ValidationError
@@ -26,7 +27,7 @@ from schemas.queue import (
     log_path,
     request_path,
 )
-from services.queue.fold import JobView, applies, fold
+from services.queue.fold import JobView, applies, apply, fold
 from workers.store.local import open_store
 from workers.store.store import Store, retry_if_swept
 
@@ -94,12 +95,15 @@ class Queue:
         So nothing is decided twice, however many supervisors, drivers and users there are.
         """
         event = JobEvent(kind=kind, attempt=attempt, at=time.time(), nonce=uuid.uuid4().hex, **fields)
+        pause_s = 0.01
         while True:
             view = self.read(job)
             if not applies(view, event):
                 return None
             if self.store.put_if_absent(event_path(job, view.events), _encode(event)):
-                return fold(view.request, self._events(job)[: view.events + 1])
+                return replace(apply(view, event), events=view.events + 1)
+            time.sleep(pause_s)  # over NFS, the listing may be old for some seconds
+            pause_s = min(1.0, 2 * pause_s)
 
     def put_log(self, job: str, attempt: int, text: str) -> None:
         """Keeps the end of a driver's log, once."""

@@ -9,7 +9,7 @@ from typing import Final
 
 from schemas.errors import CorruptError, InUseError, MachineError, RunError
 from schemas.queue import submission_id
-from services.queue.decide import Action, DriverState, choose_starts, pause_of, tend_drivers
+from services.queue.decide import Action, Driver, choose_starts, pause_of, tend_drivers
 from services.queue.fold import JobView
 from services.queue.ray_jobs import Drivers
 from services.queue.store import Queue
@@ -38,6 +38,8 @@ class _Memory:
     kept: set[str] = field(default_factory=set)
     """Drivers whose logs are in the queue, or could not be had."""
     share: int | None = None
+    outage: str | None = None
+    """Why the last look failed."""
     told: set[str] = field(default_factory=set)
     """What was said and need not be said again."""
 
@@ -59,13 +61,30 @@ class Supervisor:
         self._clock = clock
         self._memory = _Memory()
 
+    def look_if(self, lock: Lock) -> None:
+        """One round, while nobody else holds the queue. Raises RunError where another took over."""
+        self._bear(lock.require_held, self._look)
+
     def look(self) -> None:
         """One round. Where storage or Ray does not answer, that is told, and waited for."""
+        self._bear(self._look)
+
+    def _bear(self, *steps: Callable[[], None]) -> None:
         try:
-            views, faults = self._queue.read_all(job for job in self._queue.ids() if job not in self._memory.settled)
-            known = self._drivers.states()
+            for step in steps:
+                step()
         except (MachineError, OSError) as error:
-            return self._say_once(str(error))
+            if self._memory.outage is None:
+                self._say(f"{error}; it is asked again and again")
+            self._memory.outage = str(error)
+        else:
+            if self._memory.outage is not None:
+                self._say("all answer again")
+            self._memory.outage = None
+
+    def _look(self) -> None:
+        views, faults = self._queue.read_all(job for job in self._queue.ids() if job not in self._memory.settled)
+        known = self._drivers.states()
         for job, fault in faults.items():
             self._say_once(f"job {job} is left alone: {fault}")
         self._do_all(tend_drivers(views, known))
@@ -110,15 +129,15 @@ class Supervisor:
         entrypoint = build_entrypoint(self._rules.command, self._queue.name, job, attempt)
         self._drivers.hand_over(submission_id(job, attempt), entrypoint, metadata)
 
-    def _keep_logs(self, views: Sequence[JobView], known: Mapping[str, DriverState]) -> None:
+    def _keep_logs(self, views: Sequence[JobView], known: Mapping[str, Driver]) -> None:
         """Copies the logs of drivers that are over into the queue, while Ray still has them."""
         for view in views:
             job = view.request.id
             for attempt in range(1, view.attempt + 1):
                 submission = submission_id(job, attempt)
-                if known.get(submission) == "over" and submission not in self._memory.kept:
+                if _is(known.get(submission), "over") and submission not in self._memory.kept:
                     self._keep_log(job, attempt)
-            if view.ended and known.get(submission_id(job, view.attempt)) != "running":
+            if view.ended and not _is(known.get(submission_id(job, view.attempt)), "running"):
                 self._memory.settled.add(job)
 
     def _keep_log(self, job: str, attempt: int) -> None:
@@ -151,6 +170,10 @@ class Supervisor:
             self._say(line)
 
 
+def _is(driver: Driver | None, state: str) -> bool:
+    return driver is not None and driver.state == state
+
+
 def build_entrypoint(command: Sequence[str], queue: str, job: str, attempt: int) -> str:
     """What Ray gives to a shell: each word quoted, and none of them from a job."""
     return shlex.join([*command, "drive", job, str(attempt), "--queue", queue])
@@ -162,8 +185,7 @@ def supervise(queue: Queue, drivers: Drivers, rules: Rules, say: Callable[[str],
     with hold_queue(queue) as lock:
         supervisor = Supervisor(queue, drivers, rules, say, time.monotonic)
         while True:
-            lock.require_held()
-            supervisor.look()
+            supervisor.look_if(lock)
             time.sleep(EVERY_S)
 
 

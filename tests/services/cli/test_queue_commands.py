@@ -127,8 +127,8 @@ def test_jobs_for_people_and_for_programs(queue, capsys):
 
 
 def test_cancel_ends_a_waiting_job_at_once_and_a_running_one_by_its_supervisor(queue, capsys):
-    first, second = ids(2)
-    made = queue_of(Path(queue), request_of(first), request_of(second))
+    first, second, third = ids(3)
+    made = queue_of(Path(queue), request_of(first), request_of(second), request_of(third))
     made.append(second, "started", 1)
     code, out, _ = told(capsys, "cancel", first, "--queue", queue)
     assert (code, out) == (0, f"{first}: cancelled\n")
@@ -136,8 +136,12 @@ def test_cancel_ends_a_waiting_job_at_once_and_a_running_one_by_its_supervisor(q
         code, out, err = told(capsys, "cancel", second, "--queue", queue)
         assert (code, out) == (0, f"{second}: cancelling\n")
         assert "what is committed in /out/" in err
-    code, out, err = told(capsys, "cancel", first, "--queue", queue)
-    assert (code, err) == (2, f"verso: job {first} is cancelled: there is nothing to cancel\n")
+    assert told(capsys, "cancel", first, "--queue", queue)[:2] == (0, f"{first}: cancelled\n")
+    made.append(third, "started", 1)
+    made.append(third, "began", 1)
+    made.append(third, "ended", 1, code=1)
+    code, out, err = told(capsys, "cancel", third, "--queue", queue)
+    assert (code, out, err) == (1, "", f"verso: job {third} is failed: there is nothing to cancel\n")
 
 
 def test_logs_of_a_job_whose_cluster_is_gone(queue, capsys):
@@ -146,6 +150,8 @@ def test_logs_of_a_job_whose_cluster_is_gone(queue, capsys):
     assert "nothing is known of what it wrote" in told(capsys, "logs", job, "--queue", queue)[2]
     for kind in ("started", "began"):
         made.append(job, kind, 1)
+    code, _, err = told(capsys, "logs", job, "--queue", queue, "--address", "http://127.0.0.1:1")
+    assert code == 1 and "no copy of its log is in the queue yet" in err
     made.append(job, "ended", 1, code=0)
     made.put_log(job, 1, "8 scenes made\n")
     assert told(capsys, "logs", job, "--queue", queue)[1] == "--- attempt 1 ---\n8 scenes made\n"
@@ -158,3 +164,11 @@ def test_a_supervisor_without_a_cluster_is_told_in_one_line(queue, capsys):
     code, _, err = told(capsys, "supervise", "--queue", queue, "--address", "http://127.0.0.1:1")
     assert code == 1
     assert err.startswith("verso: --address http://127.0.0.1:1: ") and err.count("\n") == 1
+
+
+def test_the_queue_may_be_named_by_the_environment(queue, capsys, monkeypatch, tmp_path):
+    queue_of(Path(queue))
+    queue_of(tmp_path / "other", request_of("j00000001"))
+    monkeypatch.setenv("VERSO_QUEUE", queue)
+    assert told(capsys, "jobs")[:2] == (0, f"{queue} has no jobs\n")
+    assert "j00000001" in told(capsys, "jobs", "--queue", str(tmp_path / "other"))[1]

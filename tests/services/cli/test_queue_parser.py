@@ -28,20 +28,3 @@ def test_a_word_that_cannot_be_is_refused(words, capsys):
 
 def test_a_priority_may_be_below_zero():
     assert build_parser().parse_args(["submit", "j.yaml", "--priority", "-5"]).priority == -5
-
-
-def test_the_queue_may_be_named_by_the_environment(monkeypatch):
-    import importlib
-
-    from services.cli import parser, queue_parser
-
-    monkeypatch.setenv("VERSO_QUEUE", "/shared/queue")
-    importlib.reload(queue_parser)
-    importlib.reload(parser)
-    try:
-        assert parser.build_parser().parse_args(["jobs"]).queue == "/shared/queue"
-        assert parser.build_parser().parse_args(["jobs", "--queue", "/other"]).queue == "/other"
-    finally:
-        monkeypatch.delenv("VERSO_QUEUE")
-        importlib.reload(queue_parser)
-        importlib.reload(parser)

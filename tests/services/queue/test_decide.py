@@ -1,24 +1,25 @@
 """Whose turn it is, and what becomes of drivers."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from schemas.queue import submission_id
-from services.queue.decide import PAUSES_S, Action, choose_starts, pause_of, tend_drivers, waiting_for_folder
-from services.queue.fold import JobView
+from services.queue.decide import PAUSES_S, Action, Driver, choose_starts, pause_of, tend_drivers, waiting_for_folder
+from services.queue.fold import JobState, JobView
 from tests.fake_drivers import request_of
 
 A, B, C = "j0000000a", "j0000000b", "j0000000c"
 
 
 def view(
-    job: str, state: str = "queued", attempt: int = 0, began: bool = False, deaths: int = 0, **request: object
+    job: str, state: JobState = "queued", attempt: int = 0, began: bool = False, deaths: int = 0, **request: object
 ) -> JobView:
     return replace(JobView(request_of(job, **request)), state=state, attempt=attempt, began=began, deaths=deaths)
 
 
-def started(*views: JobView, at_once: int = 2, **kwargs: object) -> list[str]:
+def started(*views: JobView, at_once: int = 2, **kwargs: Any) -> list[str]:
     return [action.job for action in choose_starts(views, at_once, **kwargs)]
 
 
@@ -69,13 +70,16 @@ def test_pauses_grow():
     ],
 )
 def test_what_is_done_about_a_driver(state, began, driver, deed):
-    drivers = {submission_id(A, 2): driver} if driver else {}
-    done = tend_drivers([view(A, state, 2, began)], {submission_id(A, 1): "over", **drivers})
+    drivers = {submission_id(A, 2): Driver(driver)} if driver else {}
+    done = tend_drivers([view(A, state, 2, began)], {submission_id(A, 1): Driver("over"), **drivers})
     assert [(one.deed, one.job, one.attempt) for one in done] == ([(deed, A, 2)] if deed else [])
 
 
 def test_jobs_without_a_driver_are_left_alone():
-    assert tend_drivers([view(A), view(B, "done", 1), view(C, "waiting", 1)], {submission_id(B, 1): "running"}) == []
+    assert (
+        tend_drivers([view(A), view(B, "done", 1), view(C, "waiting", 1)], {submission_id(B, 1): Driver("running")})
+        == []
+    )
 
 
 def test_a_start_is_the_next_attempt():

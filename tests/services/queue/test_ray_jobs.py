@@ -18,5 +18,7 @@ def test_an_address_where_nothing_answers_is_told_in_one_line():
             lambda: drivers.stop("verso-j00000001-1"),
             lambda: drivers.log("verso-j00000001-1"),
         ):
-            with pytest.raises(MachineError, match=rf"^--address {address}: [^\n]*$"):
+            with pytest.raises(
+                MachineError, match=rf"^--address {address}: Ray's job API does not answer there[^\n]*$"
+            ):
                 ask()

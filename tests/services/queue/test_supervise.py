@@ -8,10 +8,14 @@ import pytest
 
 from schemas.errors import RunError
 from schemas.queue import submission_id
+from services.queue.decide import Driver
+from services.queue.store import Queue, make_queue
 from services.queue.supervise import build_entrypoint, hold_queue
 from tests.disk_faults import unflushed
 from tests.fake_drivers import ids
 from tests.queue_world import AT_ONCE, DIES, Killed, World
+from tests.s3_server import Bucket, s3_server
+from workers.store.objects import ObjectStore
 
 __all__ = ["unflushed"]
 pytestmark = pytest.mark.usefixtures("unflushed")
@@ -20,9 +24,9 @@ PLAIN, DYING, CANCELLED, SECOND, LAST = ids(5)
 MOST_TICKS = 60
 
 
-def world_of(folder) -> World:
+def world_of(folder, queue: Queue | None = None) -> World:
     """Five jobs: one plain, one whose first driver dies, one to be cancelled while it runs, two of one folder."""
-    world = World(folder / "q")
+    world = World(queue or make_queue(str(folder / "q")))
     world.submit(PLAIN, priority=2)
     world.submit(DYING, priority=2, name=f"{DIES}-once", submitted=2.0)
     world.submit(CANCELLED, priority=1)
@@ -67,16 +71,16 @@ def test_five_jobs_come_to_their_ends(tmp_path):
     assert world.handed_over == [
         submission_id(*one) for one in [(PLAIN, 1), (DYING, 1), (CANCELLED, 1), (DYING, 2), (SECOND, 1), (LAST, 1)]
     ] or world.handed_over.index(submission_id(SECOND, 1)) < world.handed_over.index(submission_id(LAST, 1))
-    assert f"job {DYING}, attempt 1: its driver ended without a word; it is taken up again in 10 s" in said
+    assert f"job {DYING}, attempt 1: its driver ended without telling how; it is taken up again in 10 s" in said
     assert f"job {CANCELLED}: cancelled; what it committed is kept" in said
     assert world.queue.share() == 1
 
 
 def count_effects(folder) -> int:
-    world, count = world_of(folder), itertools.count()
-    world.effect = lambda: next(count)
+    world, effects = world_of(folder), []
+    world.effect = lambda: effects.append(world.ticks)
     play(world, world.supervisor().look)
-    return next(count)
+    return len(effects)
 
 
 def test_a_supervisor_killed_at_any_step_loses_nothing_and_starts_nothing_twice(tmp_path):
@@ -160,26 +164,28 @@ def test_while_ray_does_not_answer_nothing_is_decided_and_that_is_told_once(tmp_
     for _ in range(5):
         supervisor.look()
     assert world.states_of_jobs() == before
-    assert said == [*told, "Ray's job API does not answer"]
+    assert said == [*told, "Ray's job API does not answer; it is asked again and again"]
     world.answers = True
+    supervisor.look()
+    assert said[len(told) + 1] == "all answer again"
     play(world, supervisor.look)
 
 
 def test_a_job_whose_drivers_always_die_is_lost_after_three_more_tries(tmp_path):
-    world = World(tmp_path / "q")
+    world = World(make_queue(str(tmp_path / "q")))
     world.submit(PLAIN)
     supervisor = world.supervisor()
     for _ in range(40):
         supervisor.look()
         world.ticks += 1
         for submission in world.known:
-            world.known[submission] = "over"
+            world.known[submission] = Driver("over")
     assert world.queue.read(PLAIN).state == "lost"
     assert len(world.handed_over) == 4
 
 
 def test_a_pause_is_kept(tmp_path):
-    world = World(tmp_path / "q")
+    world = World(make_queue(str(tmp_path / "q")))
     world.submit(PLAIN)
     clock = [0.0]
     supervisor = world.supervisor()
@@ -237,9 +243,20 @@ def test_the_entrypoint_gives_the_shell_nothing_to_do(place, tmp_path):
 
 def test_a_second_supervisor_is_refused_by_name(tmp_path):
     world = world_of(tmp_path)
-    with (
-        hold_queue(world.queue),
-        pytest.raises(RunError, match=r"^another supervisor works here: .* by process \d+ on"),
-        hold_queue(world.queue),
-    ):
+    refused = pytest.raises(RunError, match=r"^another supervisor works here: .* by process \d+ on")
+    with hold_queue(world.queue), refused, hold_queue(world.queue):
         pass
+
+
+def test_five_jobs_come_to_their_ends_in_a_bucket_that_fails_one_request_in_ten(tmp_path):
+    bucket = Bucket()
+    bucket.share, bucket.faults = 0.1, ("500", "503", "503 when done", "reset", "reset when done")
+    with s3_server(bucket) as client:
+        store = ObjectStore(client, "s3://mine")
+        world = world_of(tmp_path, Queue(store))
+        play(world, world.supervisor().look)
+        check_ends(world)
+    assert bucket.requests["fault"] > 20
+    events = [key for key in bucket.objects if "/events/" in key]
+    assert len(events) > 15
+    assert {bucket.puts[key] for key in events} == {1}
