@@ -16,7 +16,7 @@ NOT_COPIED = shutil.ignore_patterns(".git", ".venv*", "data", ".*_cache", "__pyc
 
 IMAGE = "verso-under-test"
 
-SCENES = 24
+SCENES = 16
 """Enough for two of each category: the shapes of boxes and cans are what other instruction sets change first."""
 
 JOB = "deploy/jobs/tabletop.yaml"
