@@ -84,8 +84,10 @@ def test_the_hook_before_sigterm_ends_the_node(pods):
     wait_for(lambda: _state(WORKER)["Status"] == "exited", 30, "the worker's end")
     assert time.monotonic() - begun < 25
     assert _state(WORKER)["OOMKilled"] is False
-    nodes = must(docker("exec", HEAD, "ray", "status", "-v"))
-    assert nodes.count("Node: ") == 1  # the head's; the worker has left, and was not lost
+    asks = ("ray", "list", "nodes", "--format", "json", "--detail", "--filter", "is_head_node=False")
+    (node,) = json.loads(must(docker("exec", HEAD, *asks)))
+    assert node["state"] == "DEAD"
+    assert "Terminated due to preemption" in node["state_message"]  # it said good-bye, and was not lost
 
 
 def _start(name: str, volume: Path, token: str, *bash: str) -> None:
