@@ -44,8 +44,13 @@ class Stage:
         }
 
     def start(self, *args: str, **environ: str) -> subprocess.Popen[str]:
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        return subprocess.Popen([ENTRYPOINT, *args], env={**self.environ, **environ}, text=True, **pipes)
+        return subprocess.Popen(
+            [str(ENTRYPOINT), *args],
+            env={**self.environ, **environ},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
 
     def __call__(self, *args: str, **environ: str) -> tuple[int, str, str]:
         with self.start(*args, **environ) as process:
