@@ -21,9 +21,12 @@ from schemas.errors import RunError
 from schemas.job.job import Job
 from services.bench.ratios import Lap, Spread, by_clock, by_processor, idle_share, slope_ratio
 from services.bench.stages import run_process
-from services.run.coordinator import Coordinator, Limits, Tally
+from services.run.coordinator import Coordinator, Limits, Pattern
+from services.run.joining import terms_of_driver
 from services.run.range_planner import MAX_SHARD, group_shards
-from services.run.ray_cluster import PREFETCH, private_ray
+from services.run.ray_cluster import private_ray
+from services.run.slots import PREFETCH, Slots
+from services.run.tally import Tally
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.store.local import LocalStore
 
@@ -47,7 +50,7 @@ def measure_scaling(
     each = Span(start=job.first_scene, stop=job.first_scene + max(1, scenes // workers))
     drive = _RayDrive(job, open_catalogue(job.assets, job_folder, tuple(job.categories)), folder, workers)
     with private_ray(workers), plain_processes(job, job_folder, folder, workers) as processes:
-        drive.run("warm", workers, 4 * workers * job.run.range_size, job.run.range_size)
+        drive.run("warm", workers, 4 * workers * job.range_size, job.range_size)
         for number in range(rounds):
             for count in counts:
                 ray[count].append(drive.run(f"{number}-{count}", count, scenes, shard))
@@ -128,17 +131,17 @@ class _RayDrive:
 
     def run(self, name: str, slots: int, count: int, shard_size: int) -> tuple[Lap, float]:
         """A lap of that many scenes, and the share of the slots' time without a shard."""
-        out, size, first = self.folder / name, self.job.run.range_size, self.job.first_scene
+        out, size, first = self.folder / name, self.job.range_size, self.job.first_scene
         store = LocalStore(out)
         store.prepare()
         spans = [Span(start=s, stop=min(s + size, first + count)) for s in range(first, first + count, size)]
         tally = Tally(asked=count)
         # The other slot could start a waiting shard, so one worker gets one shard at a time.
-        limits = Limits(PREFETCH * slots if slots == self.workers else slots, 1, count)
+        in_flight = PREFETCH * slots if slots == self.workers else slots
+        limits = Limits(Slots(slots, in_flight), 1, count)
+        pattern = Pattern(ShardOrder.of(str(out), self.job, "bench"), self.catalogue, terms_of_driver())
         begun = time.perf_counter()
-        Coordinator(store, ShardOrder.of(str(out), self.job, "bench"), self.catalogue, limits, tally).run(
-            group_shards(spans, shard_size)
-        )
+        Coordinator(store, pattern, limits, tally).run(group_shards(spans, shard_size))
         seconds = time.perf_counter() - begun
         idle = idle_share(tally.shard_wall_s, slots, seconds)
         return Lap(tally.made, seconds, tally.shard_cpu_s, {}), idle

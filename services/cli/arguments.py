@@ -8,6 +8,9 @@ from typing import Final, NoReturn
 
 from schemas.plain_line import plain_line
 
+JOB_ID: Final = r"j[0-9a-f]{8}"
+"""An id of schemas/queue.py, which loads too much for a parser; a test compares the two."""
+
 MOST_PATH_CHARACTERS: Final = 4000
 """Longest name of a file or folder that Linux takes, but for some bytes."""
 
@@ -34,6 +37,11 @@ def read_count(text: str) -> int:
     return int(text)
 
 
+def read_counts(text: str) -> list[int]:
+    """Whole numbers from 1 up, with commas between. Raises argparse.ArgumentTypeError."""
+    return [read_count(one) for one in text.split(",")]
+
+
 def read_path(text: str) -> Path:
     """A file or folder. Raises argparse.ArgumentTypeError where none can have that name."""
     return Path(read_place(text))
@@ -52,9 +60,47 @@ def read_place(text: str) -> str:
 
 def read_address(text: str) -> str:
     """Where a Ray listens. Raises argparse.ArgumentTypeError."""
+    if text.startswith("ray://"):
+        told = "Verso runs beside a node of the cluster and not through Ray's client: write HOST:PORT (port 6379 by default) on"
+        told += " a machine of the cluster, or `ray submit CLUSTER.yaml deploy/submit.py JOB` from elsewhere"
+        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
     host = r"[\w-]{1,63}(?:\.[\w-]{1,63})*|\[[0-9a-fA-F:.]{2,45}\]"
-    found = re.fullmatch(rf"(?:ray://)?(?:{host}):(\d{{1,5}})", text, re.ASCII)
+    found = re.fullmatch(rf"(?:{host}):(\d{{1,5}})", text, re.ASCII)
     if text != "auto" and not (found and 0 < int(found[1]) < 65536):
         told = "write it as HOST:PORT, as `ray start` prints it (port 6379 by default)"
         raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
     return text
+
+
+def read_listener(text: str) -> str:
+    """An address of this machine and a port to listen on, HOST:PORT. Raises argparse.ArgumentTypeError."""
+    told = "write it as HOST:PORT, such as 127.0.0.1:9464 (0.0.0.0 listens on every address)"
+    if text == "auto" or text.startswith("ray://"):
+        raise argparse.ArgumentTypeError(f"{text}: {told}")
+    try:
+        return read_address(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}") from None
+
+
+def read_http(text: str) -> str:
+    """The address of an HTTP server. Raises argparse.ArgumentTypeError."""
+    if not re.fullmatch(r"https?://[^\s/?#@]+(?:/[^\s?#]*)?", text, re.ASCII):
+        told = "write it as http://HOST:PORT, as `ray start` prints it for the dashboard (port 8265 by default)"
+        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
+    return text.rstrip("/")
+
+
+def read_job_id(text: str) -> str:
+    """The id of a job in a queue. Raises argparse.ArgumentTypeError."""
+    if not re.fullmatch(JOB_ID, text, re.ASCII):
+        told = "an id is a j and eight digits or letters a to f, as `verso submit` prints it and `verso jobs` lists it"
+        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
+    return text
+
+
+def read_priority(text: str) -> int:
+    """A whole number from -1000 to 1000. Raises argparse.ArgumentTypeError."""
+    if not re.fullmatch(r"[+-]?[0-9]{1,4}", text, re.ASCII) or abs(int(text)) > 1000:
+        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)} is not a whole number from -1000 to 1000")
+    return int(text)

@@ -1,20 +1,10 @@
-"""Edge: restarts a command in the environment variables that its bytes depend on (schemas/environment.py)."""
+"""Edge: restarts a command in the environment variables that its bytes depend on (schemas/environment.py), and reads settings."""
 
 import os
 import sys
-from pathlib import Path
 
 from schemas.environment import settings_to_change
-
-
-def processor_flags(cpuinfo: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
-    """Feature flags of this machine's first core, from Linux; empty where it does not list them."""
-    try:
-        with cpuinfo.open() as lines:
-            first = next((line for line in lines if line.startswith("flags")), "")
-    except OSError:
-        return frozenset()
-    return frozenset(first.partition(":")[2].split())
+from services.run.sight import processor_flags
 
 
 def enter_stack_environment() -> None:
@@ -25,3 +15,8 @@ def enter_stack_environment() -> None:
     changes = settings_to_change(os.environ, processor_flags())
     if changes:
         os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], {**os.environ, **changes})
+
+
+def default_queue() -> str | None:
+    """The queue that commands use where they name none: $VERSO_QUEUE."""
+    return os.environ.get("VERSO_QUEUE") or None

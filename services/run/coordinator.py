@@ -1,26 +1,31 @@
 """The coordinator: gives shards to Ray, a limited number at a time, reads every report and counts the attempts."""
 
 import logging
+import pickle
 import signal
 import uuid
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import ray
 from ray.exceptions import OutOfMemoryError, RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from schemas.dataset.commit import CommitSummary, Span
+from schemas.dataset.commit import Span
 from schemas.dataset.layout import commit_path, staging_path
 from schemas.dataset.shard import Blame, Reason, ShardOrder, ShardReport
 from schemas.errors import CommitConflict, RunError, VersoError
 from services.run.processes import Process, send
 from services.run.progress import log_event, say
+from services.run.slots import Slots
 from services.run.stalls import Stall
+from services.run.tally import Tally
 from services.run.watchdog import Watchdog, end_worker_here, find_own_workers
+from services.run.worker_entry import enter_shard
+from services.run.worker_terms import WorkerTerms
 from workers.assets.catalogue import Catalogue
-from workers.pipeline.run_shard import TIMED_OUT, run_shard
+from workers.pipeline.run_shard import TIMED_OUT
 from workers.store.attempt import attempts_at, blamed_scene, host_part, retry_of_attempt
 from workers.store.ledger import read_summary
 from workers.store.store import Store
@@ -37,64 +42,50 @@ EXPLANATIONS: dict[Reason, str] = {
 """The stored detail of an environmental failure."""
 
 
-@dataclass
-class Tally:
-    """The results of a run so far; changed by the coordinator alone."""
-
-    asked: int
-    made: int = 0
-    failed: Counter[str] = field(default_factory=Counter)
-    conflicts: list[str] = field(default_factory=list)
-    commits: list[CommitSummary] = field(default_factory=list)
-    """Those of this run that nobody has taken yet."""
-    shard_wall_s: float = 0.0
-    shard_cpu_s: float = 0.0
-
-    @property
-    def done(self) -> int:
-        """Scenes made or failed."""
-        return self.made + self.failed.total()
-
-    def add(self, report: ShardReport) -> None:
-        """Counts one shard's report."""
-        self.shard_wall_s += report.wall_s
-        self.shard_cpu_s += report.cpu_s
-        for span in report.spans:
-            if span.conflict:
-                self.conflicts.append(span.conflict)
-            self.made += span.made
-            self.failed.update(span.failed)
-            self.commits += [span.commit] if span.commit else []
-
-    def take_commits(self) -> list[CommitSummary]:
-        """The commits since the last call."""
-        commits, self.commits = self.commits, []
-        return commits
-
-
 @dataclass(frozen=True)
 class Limits:
-    """At most `in_flight` shards given to Ray at once, `attempts` at a range, and `failures` failed scenes."""
+    """The shards given to Ray at once, at most `attempts` at a range, and at most `failures` failed scenes."""
 
-    in_flight: int
+    slots: Slots
     attempts: int
     failures: int
 
 
-_run_shard = ray.remote(num_cpus=1, max_retries=0)(run_shard)
+@dataclass(frozen=True)
+class Pattern:
+    """What every shard is given: an order without ranges, the assets, and what its worker must have.
+
+    `env_vars` are set for the workers of a cluster; those of a private Ray inherit them.
+    """
+
+    order: ShardOrder
+    catalogue: Catalogue
+    terms: WorkerTerms
+    env_vars: Mapping[str, str] = field(default_factory=dict)
+
+
 _end_worker = ray.remote(num_cpus=0, max_retries=0)(end_worker_here)
 
 
 class Coordinator:
-    """The state of a run: the shards that run, those to run again, and how often workers died.
+    """The state of a run: the shards that run, those to run again, and how often workers died."""
 
-    `order` is the pattern of every shard's order, `catalogue` that of its assets.
-    """
-
-    def __init__(self, store: Store, order: ShardOrder, catalogue: Catalogue, limits: Limits, tally: Tally) -> None:
+    def __init__(
+        self,
+        store: Store,
+        pattern: Pattern,
+        limits: Limits,
+        tally: Tally,
+        enter: Callable[[WorkerTerms, bytes, bytes], ShardReport] = enter_shard,
+    ) -> None:
+        """`enter` makes a shard in a worker; simulations give another."""
         self._store = store
-        self._order = order.model_copy(update={"label": uuid.uuid4().hex[:8]})
-        self._catalogue = ray.put(catalogue)
+        self._order = pattern.order.model_copy(update={"label": uuid.uuid4().hex[:8]})
+        self._terms = pattern.terms
+        self._catalogue = ray.put(pickle.dumps(pattern.catalogue))
+        env_vars = dict(pattern.env_vars)
+        task = ray.remote(num_cpus=1, max_retries=0)(enter)
+        self._task = task.options(runtime_env={"env_vars": env_vars}) if env_vars else task
         self._limits = limits
         self._tally = tally
         self._again: deque[tuple[Span, ...]] = deque()
@@ -119,6 +110,7 @@ class Coordinator:
                         self._collect(ref, self._running.pop(ref))
                     for stall in watchdog.take_stalls():
                         self._end_stalled(stall)
+                    self._tally.in_flight = sum(len(spans) for spans in self._running.values())
                     progress(self._tally)
         except BaseException:
             self._cancel()
@@ -126,13 +118,14 @@ class Coordinator:
 
     def _fill_slots(self, shards: Iterator[tuple[Span, ...]]) -> bool:
         """Gives shards to Ray while there is room; False where nothing is left to wait for."""
-        while len(self._running) < self._limits.in_flight:
+        room = self._limits.slots.now().in_flight
+        while len(self._running) < room:
             spans = self._again.popleft() if self._again else next(shards, None)
             if spans is None:
                 break
             blamed = tuple(self._blamed[scene] for span in spans for scene in span.scene_ids if scene in self._blamed)
             order = self._order.model_copy(update={"spans": spans, "blamed": blamed})
-            self._running[_run_shard.remote(order, self._catalogue)] = spans
+            self._running[self._task.remote(self._terms, pickle.dumps(order), self._catalogue)] = spans
         return bool(self._running)
 
     def _cancel(self) -> None:
@@ -164,6 +157,9 @@ class Coordinator:
             for bug in span.bugs:
                 log_event("bug", logging.ERROR, range=span.start, error=bug)
                 say(bug)
+        if left := spans[len(report.spans) :]:
+            log_event("worker drained", range=left[0].start, host=report.host)
+            self._again.append(left)
         if self._tally.conflicts:
             raise CommitConflict(self._tally.conflicts[0])
         if self._tally.failed.total() > self._limits.failures:
@@ -219,6 +215,7 @@ class Coordinator:
             self._tally.made += summary.made
             self._tally.failed.update(kind for _, kind, _ in summary.failed)
             self._tally.commits.append(summary)
+            self._tally.ranges += 1
             left.pop(0)
         if left:
             self._count_death(left[0], error, stalled)
@@ -232,6 +229,7 @@ class Coordinator:
         )
         message = " ".join(str(error).split())[:300]
         log_event("worker lost", logging.WARNING, range=span.start, scene=scene, reason=reason, error=message)
+        self._tally.lost[reason] += 1
         key = ("range", span.start) if scene is None else ("scene", scene)
         self._deaths[key] += 1
         deaths = self._deaths[key]

@@ -5,7 +5,6 @@ import os
 import shutil
 import socket
 from collections.abc import Iterator, Mapping, MutableMapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from schemas.errors import MachineError
 from services.run.cores import usable_cores
 from services.run.ray_environment import NOT_INHERITED, private_environment
 from services.run.ray_folder import private_folder
+from services.run.slots import PREFETCH, ClusterSlots, Slots
 from services.run.supervisor import core_stderr, tell
 
 OBJECT_STORE_BYTES = 128 * 2**20
@@ -26,17 +26,6 @@ OBJECT_STORE_BYTES = 128 * 2**20
 
 CONNECT_S = 10.0
 """Time for a cluster's head to accept a connection."""
-
-PREFETCH = 2
-"""Shards given to Ray for each slot: one that runs and one that waits, so that no slot is idle between two."""
-
-
-@dataclass(frozen=True)
-class Slots:
-    """The number of shards that run at once, and that may be given to Ray at once."""
-
-    running: int
-    in_flight: int
 
 
 def open_ray(address: str | None, workers: int | None) -> contextlib.AbstractContextManager[Slots]:
@@ -52,7 +41,7 @@ def private_ray(workers: int) -> Iterator[Slots]:
     a folder that no other user can enter, and answer those that show its token, which no file and no log holds. Raises
     MachineError where Ray does not start.
     """
-    with private_folder() as folder, _kept_private():
+    with private_folder() as folder, kept_private():
         tell(folder=str(folder.parent))  # the supervisor removes it where this process cannot
         settings = {
             "num_cpus": workers,
@@ -65,7 +54,7 @@ def private_ray(workers: int) -> Iterator[Slots]:
         }
         with contextlib.ExitStack() as stack:
             try:
-                stack.enter_context(_connection("local", **settings))
+                stack.enter_context(connection("local", **settings))
             except Exception as error:  # Ray raises plain ones, after half a minute where the machine is overloaded
                 said = next(iter(str(error).splitlines()), type(error).__name__)
                 raise MachineError(
@@ -75,7 +64,7 @@ def private_ray(workers: int) -> Iterator[Slots]:
 
 
 @contextlib.contextmanager
-def _kept_private() -> Iterator[None]:
+def kept_private() -> Iterator[None]:
     """Makes Ray's next start in this process a private one; afterwards the user's own settings count again.
 
     `ray.init` has no setting that keeps these from starting:
@@ -140,7 +129,7 @@ def _object_store_folder(temporary: str) -> str:
 
 @contextlib.contextmanager
 def cluster_ray(address: str, workers: int | None) -> Iterator[Slots]:
-    """A running cluster: as many slots as it has cores, or `workers` where that is less.
+    """A running cluster: as many slots as it has cores at the moment, or `workers` where that is less.
 
     The user's own settings of authentication (RAY_AUTH_MODE, RAY_AUTH_TOKEN) count. Raises MachineError where no Ray
     answers at the address, or where it wants another token.
@@ -148,21 +137,23 @@ def cluster_ray(address: str, workers: int | None) -> Iterator[Slots]:
     _check_reachable(address)
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(_connection(address))
+            stack.enter_context(connection(address))
         except (ConnectionError, RuntimeError, ValueError, RayError) as error:
             raise MachineError(
                 f"--address {address}: {' '.join(str(error).split())}; a cluster that asks for a token needs "
                 "RAY_AUTH_MODE=token and its RAY_AUTH_TOKEN here too"
             ) from error
-        cores = int(ray.cluster_resources().get("CPU", 0))
-        if cores < 1:
+        if _count_cores() < 1:
             raise MachineError(f"--address {address}: the cluster has no CPU to run on")
-        # Any free core would start a waiting shard, so none may wait where there are fewer workers than cores.
-        yield Slots(workers, workers) if workers and workers < cores else Slots(cores, PREFETCH * cores)
+        yield ClusterSlots.of(_count_cores, workers)
+
+
+def _count_cores() -> int:
+    return int(ray.cluster_resources().get("CPU", 0))
 
 
 @contextlib.contextmanager
-def _connection(address: str, **settings: Any) -> Iterator[None]:
+def connection(address: str, **settings: Any) -> Iterator[None]:
     """A connection to a Ray, shut down when the block ends.
 
     Ray's messages about dead workers go where its C++ core writes (to the user, or to a supervisor, which keeps them for
@@ -184,8 +175,8 @@ def _check_reachable(address: str) -> None:
     """Raises MachineError unless something accepts a connection; Ray itself would wait for a minute."""
     if address == "auto":
         return
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not host or not port.isdigit():
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdigit() or "://" in host:
         raise MachineError(
             f"--address {address}: write it as HOST:PORT, as `ray start` prints it (port 6379 by default)"
         )

@@ -28,8 +28,8 @@ from services.study.report.page import write_page
 from services.study.report.tables import write_tables
 from services.study.study import header_of, run_study, study_of
 from workers.assets.catalogue import open_catalogue
+from workers.pipeline.code import code_digest
 from workers.pipeline.context import open_worker
-from workers.pipeline.fingerprint import code_digest
 from workers.render.raster.context import require_device
 from workers.render.step import require_tier
 

@@ -9,7 +9,7 @@ import pytest
 
 from tests.killed_runs import EndedRun, chain_of, disturb_at_first_commit, kill_processes
 
-pytestmark = pytest.mark.ray
+pytestmark = [pytest.mark.ray, pytest.mark.minute]
 
 JOB = {
     "name": "small",

@@ -16,8 +16,11 @@ from schemas.errors import RunError
 from services.job.read import validate_job
 from services.merge.step import merge
 from services.run import coordinator as module
-from services.run.coordinator import Coordinator, Limits, Tally
+from services.run.coordinator import Coordinator, Limits, Pattern
 from services.run.range_planner import committed_ranges, plan_ranges
+from services.run.slots import Slots
+from services.run.tally import Tally
+from services.run.worker_terms import WorkerTerms
 from tests.bucket_faults import REQUESTS, requests
 from tests.disk_faults import unflushed
 from tests.made_up_scenes import attempt_at, small_scene, terms
@@ -67,8 +70,8 @@ def coordinator_of(monkeypatch):
 
     def make(store) -> Coordinator:
         order = ShardOrder.of(store.name, validate_job({"name": "chaos", "scenes": 2}, "test"), "j" * 64)
-        catalogue = cast(Catalogue, None)
-        coordinator = Coordinator(store, order, catalogue, Limits(1, 3, 0), Tally(asked=2))
+        pattern = Pattern(order, cast(Catalogue, None), WorkerTerms((), "", ""))
+        coordinator = Coordinator(store, pattern, Limits(Slots(1, 1), 3, 0), Tally(asked=2))
         coordinator._order = order.model_copy(update={"label": LABEL})
         return coordinator
 

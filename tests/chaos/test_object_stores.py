@@ -112,7 +112,7 @@ def test_a_slow_store_gets_the_dataset_of_a_disk(delay_s, tmp_path, record_figur
     record_figure(f"seconds at {delay_s} s a request", "passed", seconds, requests * delay_s)
 
 
-@pytest.mark.parametrize("conditional", ["ignored", "refused"])
+@pytest.mark.parametrize("conditional", ["ignored", pytest.param("refused", marks=pytest.mark.minute)])
 def test_a_store_without_conditional_puts_is_refused_before_anything_is_made(conditional):
     bucket = Bucket(conditional)
     with (
@@ -146,6 +146,7 @@ def test_a_store_whose_quota_is_used_up_at_any_put_loses_nothing(tmp_path):
     assert told == 6
 
 
+@pytest.mark.minute
 def test_files_that_are_put_in_parts_arrive_whole_through_faults(tmp_path):
     bucket = Bucket()
     bucket.share, bucket.chance = 0.2, random.Random(3)

@@ -16,12 +16,13 @@ from schemas.errors import MachineError
 from services.job.read import validate_job
 from services.read.query import query
 from services.run import coordinator
-from services.run.ray_cluster import Slots, private_ray
+from services.run.ray_cluster import private_ray
+from services.run.slots import Slots
 from services.run.step import RunRequest, run_job
 from tests.killed_runs import disturbed_scene
 from workers.store.local import LocalStore
 
-pytestmark = pytest.mark.ray
+pytestmark = [pytest.mark.ray, pytest.mark.minute]
 
 SMALL: dict[str, Any] = {
     "name": "small",

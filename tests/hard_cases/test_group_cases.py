@@ -85,14 +85,14 @@ def let_go_again(case: GroupCase, rest: Sequence[Settled]) -> tuple[float, float
 
 
 def rows(moves: bool) -> list[Any]:
-    """The cases, those that are expected to fail marked so; what takes long to let go again is left to `--all`."""
+    """The cases, those that are expected to fail marked so; what takes long to let go again is left to `--ci` or `--all`."""
     found = []
     for case in GROUPS:
         why = case.moves if moves else case.miss
         marks = [pytest.mark.xfail(reason=why, raises=AssertionError)] if why else []
-        found.append(
-            pytest.param(case, id=case.name, marks=[*marks, *([pytest.mark.slow] if moves and case.slow else [])])
-        )
+        if moves:
+            marks += [pytest.mark.slow] * case.slow + [pytest.mark.minute] * case.minute
+        found.append(pytest.param(case, id=case.name, marks=marks))
     return found
 
 

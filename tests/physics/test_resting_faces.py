@@ -155,6 +155,7 @@ def test_the_box_has_the_solid_angles_of_its_rectangles():
         assert share == pytest.approx(exact, rel=1e-9)
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize(("drops", "fine_hz"), SAMPLES)
 @pytest.mark.parametrize("name", ["box", "hull"])
 def test_tumbling_drops_end_as_the_quasi_static_prediction_says_within_its_bias(name, drops, fine_hz, record_figure):
@@ -168,6 +169,7 @@ def test_tumbling_drops_end_as_the_quasi_static_prediction_says_within_its_bias(
     assert off < BIAS + noise
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize(("drops", "fine_hz"), SAMPLES)
 @pytest.mark.parametrize("name", ["box", "hull"])
 def test_tumbling_drops_end_as_they_do_with_the_finest_steps(name, drops, fine_hz, record_figure):

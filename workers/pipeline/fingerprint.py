@@ -1,7 +1,6 @@
 """The fingerprint of a stack: the digest of one small scene, versions of libraries, and the code."""
 
 import hashlib
-from functools import cache
 from importlib.metadata import version
 from operator import attrgetter
 from pathlib import Path
@@ -13,6 +12,7 @@ from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.job.render import Tier
 from workers.assets.catalogue import open_catalogue
+from workers.pipeline.code import code_digest
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import make_scene
 from workers.pipeline.rows import record_scene
@@ -44,9 +44,6 @@ LIBRARIES = (
 TIER_LIBRARIES: dict[Tier, tuple[str, ...]] = {"pathtraced": ("mitsuba", "drjit")}
 """Libraries that the bytes of one tier depend on; the canary scene is not drawn in it."""
 
-SOURCE_PACKAGES = ("schemas", "workers")
-"""Packages of the project that the bytes depend on: not the services that drive it."""
-
 
 def take_fingerprint(renderer: Renderer, tier: Tier) -> Fingerprint:
     """The fingerprint of this process's stack, as far as a tier's bytes depend on it.
@@ -73,17 +70,6 @@ def canary_digest(renderer: Renderer) -> str:
         digest.update(file.path.encode())
         digest.update(bytes.fromhex(file.sha256))
     digest.update(repr(sorted(output.rows.items())).encode())
-    return digest.hexdigest()
-
-
-@cache
-def code_digest() -> str:
-    """SHA-256, hex, of the source files that the bytes depend on, by path."""
-    root = Path(__file__).resolve().parents[2]
-    digest = hashlib.sha256()
-    for path in sorted(path for package in SOURCE_PACKAGES for path in (root / package).rglob("*.py")):
-        digest.update(path.relative_to(root).as_posix().encode() + b"\0")
-        digest.update(hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()
 
 

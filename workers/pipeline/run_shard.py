@@ -6,10 +6,11 @@ import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
+from itertools import takewhile
 from typing import IO
 
 from schemas.dataset.commit import Span, summarize
@@ -46,8 +47,11 @@ class BlamedScene(SceneError):
     kind = "environmental"
 
 
-def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
-    """Make and commit every range of the order. A scene that cannot be made is a row; errors of the stack propagate."""
+def run_shard(order: ShardOrder, catalogue: Catalogue, is_over: Callable[[], bool] = lambda: False) -> ShardReport:
+    """Make and commit every range of the order; once `is_over`, no further one is begun, and the report has fewer.
+
+    A scene that cannot be made is a row; errors of the stack propagate.
+    """
     begun, cpu = time.perf_counter(), time.process_time()
     require_tier(order.job.drawn)
     context = open_worker(order.job, catalogue)
@@ -57,7 +61,8 @@ def run_shard(order: ShardOrder, catalogue: Catalogue) -> ShardReport:
     _join_stack(store, fingerprint, order)
     order = order.model_copy(update={"terms": order.terms.model_copy(update={"fingerprint": fingerprint.digest})})
     total = Stopwatch()
-    reports = tuple(run_span(context, store, order, span, total) for span in order.spans)
+    begun_spans = takewhile(lambda span: not is_over(), order.spans)
+    reports = tuple(run_span(context, store, order, span, total) for span in begun_spans)
     return ShardReport(
         spans=reports,
         seconds=total.seconds,

@@ -18,6 +18,7 @@ def test_the_gain_of_several_is_in_pairs_and_its_price_in_processor_time():
     assert (gain["one_scenes_per_s"], gain["all_scenes_per_s"]) == pytest.approx((0.75, (10 / 6 + 1.0) / 2))
 
 
+@pytest.mark.minute
 def test_plain_processes_make_the_same_scenes_at_the_same_time(tmp_path):
     span = Span(start=0, stop=3)
     with plain_processes(validate_job(SMALL, "test"), tmp_path, tmp_path, 2) as processes:

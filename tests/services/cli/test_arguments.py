@@ -22,6 +22,8 @@ from services.cli.parser import build_parser
         (["run", "j", "--address", "localhost:²"], "HOST:PORT"),
         (["run", "j", "--address", "a\0b:6379"], "HOST:PORT"),
         (["run", "j", "--address", "nonsense"], "HOST:PORT"),
+        (["run", "j", "--metrics", "9464"], "HOST:PORT"),
+        (["run", "j", "--metrics", "auto"], "HOST:PORT"),
         (["\x1b[31m" * 10_000], "\\x1b[31m"),
     ],
 )
@@ -34,8 +36,14 @@ def test_a_hostile_argument_is_told_in_a_short_line(words, told, capsys):
     assert line.isprintable() and len(line) < 500, line
 
 
-@pytest.mark.parametrize(
-    "address", ["auto", "127.0.0.1:6379", "head.cluster.local:6379", "ray://head:10001", "[::1]:6379", "a_b-c:1"]
-)
+@pytest.mark.parametrize("address", ["auto", "127.0.0.1:6379", "head.cluster.local:6379", "[::1]:6379", "a_b-c:1"])
 def test_an_address_as_ray_prints_it_is_taken(address):
     assert build_parser().parse_args(["run", "j", "--address", address]).address == address
+
+
+def test_an_address_of_rays_client_is_refused_with_the_ways_that_work(capsys):
+    with pytest.raises(SystemExit) as caught:
+        build_parser().parse_args(["run", "j", "--address", "ray://head:10001"])
+    assert caught.value.code == 2
+    told = capsys.readouterr().err
+    assert "'ray://head:10001'" in told and "HOST:PORT" in told and "deploy/submit.py" in told

@@ -133,6 +133,7 @@ def test_a_machine_without_gl_is_told_what_to_install():
 
 
 @pytest.mark.ray
+@pytest.mark.minute
 def test_the_first_command_of_the_readme_makes_a_dataset_and_the_others_read_it(tmp_path):
     """From the shell, as a user would, with a small job."""
     out = tmp_path / "out"

@@ -167,6 +167,7 @@ def test_outside_a_checkout_it_says_where_the_tests_are(tmp_path, monkeypatch, c
     assert "checkout" in capfd.readouterr().err
 
 
+@pytest.mark.minute
 def test_figures_of_all_processes_come_in_one_list_and_a_failed_case_says_so(project, monkeypatch):
     write_suite(project, measured=9)
     monkeypatch.setattr(selftest, "usable_cores", lambda: 2)

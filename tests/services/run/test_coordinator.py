@@ -1,10 +1,22 @@
-"""Counting of reports; deaths, retries and interruptions on a real Ray are in test_step.py."""
+"""Counting of reports and handing out of shards; deaths, retries and interruptions on a real Ray are in test_step.py."""
 
+import pickle
 from collections import Counter
+from typing import cast
 
+import pytest
+
+from schemas.dataset.commit import Span
 from schemas.dataset.fingerprint import Fingerprint
-from schemas.dataset.shard import ShardReport, SpanReport
-from services.run.coordinator import Tally
+from schemas.dataset.shard import ShardOrder, ShardReport, SpanReport
+from services.job.read import validate_job
+from services.run import coordinator as module
+from services.run.coordinator import Coordinator, Limits, Pattern
+from services.run.slots import ClusterSlots, Slots
+from services.run.tally import Tally
+from services.run.worker_terms import WorkerTerms
+from workers.assets.catalogue import Catalogue
+from workers.store.local import LocalStore
 
 STACK = Fingerprint(canary="c", code="d", libraries={}, simd="", renderer="")
 
@@ -33,3 +45,51 @@ def test_a_conflict_is_kept_word_for_word():
     tally = Tally(asked=4)
     tally.add(report(span(0, 4, {}, conflict="two attempts made other bytes")))
     assert tally.conflicts == ["two attempts made other bytes"]
+
+
+@pytest.fixture
+def handed_out(monkeypatch, tmp_path):
+    """A coordinator without Ray, and the shards that it has handed out, by the names of their references."""
+    shards: dict[str, tuple[Span, ...]] = {}
+
+    class Task:
+        @staticmethod
+        def remote(terms: WorkerTerms, order: bytes, catalogue: str) -> str:
+            name = f"shard {len(shards)}"
+            shards[name] = pickle.loads(order).spans
+            return name
+
+    monkeypatch.setattr(module.ray, "put", lambda value: "catalogue")
+    monkeypatch.setattr(module.ray, "remote", lambda **options: lambda enter: Task)
+    order = ShardOrder.of(str(tmp_path), validate_job({"name": "drained", "scenes": 8}, "test"), "j" * 64)
+    pattern = Pattern(order, cast(Catalogue, None), WorkerTerms((), "", ""))
+    slots = [1]
+    looking = ClusterSlots(1, 1, lambda: Slots(slots[0], slots[0]))
+    return Coordinator(LocalStore(tmp_path), pattern, Limits(looking, 1, 0), Tally(asked=8)), shards, slots
+
+
+def spans(*starts: int) -> tuple[Span, ...]:
+    return tuple(Span(start=start, stop=start + 2) for start in starts)
+
+
+def test_what_a_node_that_is_to_end_gives_back_is_handed_out_again_without_counting_a_death(handed_out, monkeypatch):
+    coordinator, shards, _ = handed_out
+    waiting = iter([spans(0, 2, 4), spans(6)])
+    for done in (1, 0, 0, 0, 2):  # more empty answers than attempts
+        assert coordinator._fill_slots(waiting)
+        (name,) = coordinator._running
+        given = coordinator._running.pop(name)
+        answer = report(*(span(one.start, 2, {}) for one in given[:done]))
+        monkeypatch.setattr(module.ray, "get", lambda ref, answer=answer: answer)
+        coordinator._collect(name, given)
+    assert list(shards.values()) == [spans(0, 2, 4), *[spans(2, 4)] * 4]
+    assert (coordinator._tally.made, coordinator._deaths) == (6, Counter())
+    assert coordinator._fill_slots(waiting) and list(shards.values())[-1] == spans(6)
+
+
+def test_shards_are_handed_out_as_the_cluster_grows_and_held_back_as_it_shrinks(handed_out):
+    coordinator, shards, slots = handed_out
+    waiting = (spans(start) for start in range(0, 100, 2))
+    for slots[0], expected in ((2, 2), (5, 5), (1, 5), (6, 6)):
+        assert coordinator._fill_slots(waiting)
+        assert len(shards) == expected

@@ -18,7 +18,8 @@ from services.read.query import query
 from services.read.replay import replay_scene
 from services.read.scene_export import export_scene
 from services.read.verify import verify
-from services.run.ray_cluster import Slots, private_ray
+from services.run.ray_cluster import private_ray
+from services.run.slots import Slots
 from services.run.step import RunRequest, run_job
 from tests.datasets import SMALL, faults_of, images_of, make_dataset, overlaid
 from workers.store.images import decode_png

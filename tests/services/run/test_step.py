@@ -17,7 +17,8 @@ from services.read.dataset_reader import iter_stored
 from services.read.query import query
 from services.read.replay import replay_scene
 from services.read.verify import verify
-from services.run.ray_cluster import Slots, private_ray
+from services.run.ray_cluster import private_ray
+from services.run.slots import Slots
 from services.run.step import RunRequest, run_job
 from tests.killed_runs import deadly_scene, disturb_at_first_commit, interrupt
 from workers.store.images import decode_png
@@ -252,6 +253,7 @@ def test_a_scene_that_kills_its_worker_becomes_a_row_and_the_rest_is_made(made, 
     assert faults_of(out) == ""
 
 
+@pytest.mark.minute
 def test_an_interrupted_run_says_so_leaves_no_process_and_goes_on_where_it_stopped(cluster, tmp_path):
     """Ctrl-C in a terminal. Of 40 scenes most are still to be made then."""
     changes = {"scenes": 40, "run": {"range_size": 4}}

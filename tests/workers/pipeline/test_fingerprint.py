@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from workers.pipeline.fingerprint import TIER_LIBRARIES, code_digest, numpy_simd, take_fingerprint
+from workers.pipeline.code import code_digest
+from workers.pipeline.fingerprint import TIER_LIBRARIES, numpy_simd, take_fingerprint
 from workers.render.raster.gbuffer import shared_renderer
 
 

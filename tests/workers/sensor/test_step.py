@@ -14,7 +14,8 @@ from schemas.scene.view import View
 from services.job.read import validate_job
 from services.read.query import query
 from services.read.verify import verify
-from services.run.ray_cluster import Slots, private_ray
+from services.run.ray_cluster import private_ray
+from services.run.slots import Slots
 from services.run.step import RunRequest, run_job
 from tests.services.run.test_step import SMALL
 from workers.geometry.srgb import decode_codes

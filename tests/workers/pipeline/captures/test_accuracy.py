@@ -85,8 +85,8 @@ def pose_errors(path: Path, estimates: Estimates) -> dict:
     return found
 
 
-def assess(path: Path, record, what: str) -> dict:
-    """Process and score a capture, record its figures, and hold them to their bounds."""
+def assess(path: Path, record, what: str) -> tuple[dict, list]:
+    """Process and score a capture and record its figures: pose errors by estimate, and (name, figure, bound) of the missed."""
     clock = ProcessorClock()
     done = process_capture(open_folder(path), Captures(), clock)
     poses, score = pose_errors(path, done.estimates), done.score
@@ -108,25 +108,26 @@ def assess(path: Path, record, what: str) -> dict:
         missed += [] if fine else [(name, figure, bound)]
     rounded = {name: None if figure is None else round(figure, 4) for name, (figure, _) in figures.items()}
     print(what, rounded, clock.seconds, flush=True)
-    assert not missed, (what, missed)
-    return poses
+    return poses, missed
 
 
 @pytest.mark.parametrize(("category", "number"), OBJECTS)
 def test_a_capture_is_as_exact_as_promised(category, number, tmp_path, record_figure):
     asset, path = object_of(category, number), tmp_path / "capture"
     simulate_capture(NOISE, Board(), asset, chance_of(number), path)
-    assess(path, record_figure, f"{category} {number}, the noise")
-    for what, changes in OTHER_DEPTH.items():
+    _, missed = assess(path, record_figure, f"{category} {number}, the noise")
+    for what, changes in OTHER_DEPTH.items():  # all of them are measured, also where one misses
         other = with_other_depth(path, NOISE.model_copy(update=changes), asset, number)
-        poses = assess(other, record_figure, f"{category} {number}, {what}") if what == "twice the noise" else None
-        if poses is None:
-            done = process_capture(open_folder(other), Captures(), ProcessorClock())
-            poses = pose_errors(other, done.estimates)
-            better = poses["article"][0] / poses["joint"][0]
-            record_figure(f"{category} {number}, {what}: article over joint", "passed", better, 3.0)
-            print(category, number, what, poses, flush=True)
-            assert better >= 3.0
+        if what == "twice the noise":
+            missed += assess(other, record_figure, f"{category} {number}, {what}")[1]
+            continue
+        done = process_capture(open_folder(other), Captures(), ProcessorClock())
+        poses = pose_errors(other, done.estimates)
+        better = poses["article"][0] / poses["joint"][0]
+        record_figure(f"{category} {number}, {what}: article over joint", "passed", better, 3.0)
+        print(category, number, what, poses, flush=True)
+        missed += [] if better >= 3.0 else [(what, better, 3.0)]
+    assert not missed, missed
 
 
 @pytest.mark.parametrize(("category", "number"), [("jar", 31), ("box", 32)])

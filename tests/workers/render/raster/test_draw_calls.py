@@ -38,7 +38,14 @@ def test_the_names_are_those_of_effects():
     assert set(DRAWN) == names_of_kind("no_op") - {"exact_agreement"}
 
 
-@pytest.mark.parametrize("look", [FLAT, RASTER, FOUR], ids=["flat", "raster", "four samples"])
+@pytest.mark.parametrize(
+    "look",
+    [
+        pytest.param(FLAT, id="flat"),
+        pytest.param(RASTER, id="raster"),
+        pytest.param(FOUR, id="four samples", marks=pytest.mark.minute),
+    ],
+)
 @pytest.mark.parametrize("name", DRAWN)
 def test_forcing_a_pass_changes_no_byte(renderer, name, look):
     for things, views in scenes(14):
