@@ -62,6 +62,7 @@ def test_the_plain_command_makes_the_dataset_and_ends(compose, expected_digest):
     assert f"{SCENES}" in must(compose("run", "--rm", "--no-deps", "job", "status", "data/tabletop"))
 
 
+@pytest.mark.slow
 def test_the_plain_command_returns_the_exit_code_of_the_job(compose):
     job = compose.checkout / JOB
     right = job.read_text()
