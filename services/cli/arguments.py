@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final, NoReturn
 
 from schemas.plain_line import plain_line
+from services.job.packed import MOST_CHARACTERS, is_packed
 
 MOST_PATH_CHARACTERS: Final = 4000
 """Longest name of a file or folder that Linux takes, but for some bytes."""
@@ -37,6 +38,13 @@ def read_count(text: str) -> int:
 def read_path(text: str) -> Path:
     """A file or folder. Raises argparse.ArgumentTypeError where none can have that name."""
     return Path(read_place(text))
+
+
+def read_job(text: str) -> Path:
+    """A job file, or a packed one (`job:...`), which may be longer. Raises argparse.ArgumentTypeError."""
+    if is_packed(text) and len(text) <= MOST_CHARACTERS and text.isascii() and text.isprintable():
+        return Path(text)
+    return read_path(text)
 
 
 def read_place(text: str) -> str:
