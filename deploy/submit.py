@@ -120,7 +120,7 @@ def client() -> Any:
         raise Refused(
             f"{sys.executable} has no Ray ({error}): see the setup_commands of deploy/cluster.yaml"
         ) from error
-    logging.getLogger("ray").setLevel(logging.WARNING)
+    logging.getLogger("ray.dashboard.modules.job.sdk").setLevel(logging.WARNING)  # else it tells of its sockets
     with told(DASHBOARD):
         return JobSubmissionClient(DASHBOARD)
 

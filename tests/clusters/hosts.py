@@ -94,7 +94,11 @@ class Cluster:
         return time.monotonic() - begun
 
 
-def filled_in(folder: Path) -> Cluster:
+QUICK = "export RAY_health_check_period_ms=1000 RAY_health_check_timeout_ms=1000 RAY_health_check_failure_threshold=5\n"
+"""The head counts a host that was cut off as lost after about 10 s; by default it does so after about a minute."""
+
+
+def filled_in(folder: Path, quick: bool) -> Cluster:
     """deploy/cluster.yaml with the hosts' addresses, without what installs: the hosts see this machine's Python and code."""
     tree = yaml.safe_load((ROOT / "deploy" / "cluster.yaml").read_text())
     tree["provider"] |= {"head_ip": "10.77.0.1", "worker_ips": ["10.77.0.2", "10.77.0.3"]}
@@ -103,7 +107,7 @@ def filled_in(folder: Path) -> Cluster:
     (folder / ".verso-token").write_text(secrets.token_hex(32))
     env = (ROOT / "deploy" / "cluster.env").read_text()
     env = env.replace("/mnt/verso", str(folder / "storage")).replace("$HOME/verso/venv/bin", str(BIN))
-    (folder / "env").write_text(f"{env}export PYTHONPATH={ROOT}\n")
+    (folder / "env").write_text(f"{env}export PYTHONPATH={ROOT}\n{QUICK if quick else ''}")
     mounts = tree["file_mounts"]
     del mounts["~/verso/dist"]
     mounts |= {"~/verso/env": str(folder / "env"), "~/verso/token": str(folder / ".verso-token")}
