@@ -48,7 +48,7 @@ class Cluster:
         """What VERSO_STORAGE names."""
         return self.folder / "storage"
 
-    def ray(self, *words: str, timeout: float = 280) -> "subprocess.CompletedProcess[str]":
+    def ray(self, *words: str, timeout: float = 800) -> "subprocess.CompletedProcess[str]":
         """A command of Ray's launcher, from the root of the checkout as the file says."""
         return subprocess.run(self._command(*words), capture_output=True, text=True, check=False, timeout=timeout)
 

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -127,40 +126,63 @@ def test_a_host_that_would_make_other_bytes_or_keep_them_is_refused_before_the_f
         assert not list(cluster.storage.glob("refused/manifest/_commits/*"))
 
 
-def test_a_worker_host_killed_and_one_cut_off_under_way_change_no_byte(cluster, packed, local):
-    out, begun = cluster.storage / "disturbed", time.monotonic()
-    process = cluster.start("submit", str(ROOT / "deploy" / "submit.py"), packed, "--out", "disturbed")
+def lose_two_hosts(cluster: Cluster, job: str, out: Path, *words: str) -> str:
+    """What `ray submit` says of a job during which host 2 is killed and host 3 is cut off."""
+    begun = time.monotonic()
+    process = cluster.start("submit", str(ROOT / "deploy" / "submit.py"), job, "--out", out.name, *words)
     try:
         await_commits(out, 3, process)
         hosts("kill", "2", check=False)
         hosts("cut", "3")
-        said = process.communicate(timeout=280)[0]
+        said = process.communicate(timeout=800)[0]
     finally:
         process.kill()
         hosts("join", "3")
         hosts("boot", "2")
     assert process.returncode == 0, said
-    assert digest_in(said) == local
-    print(
-        f"\ntwo of three hosts lost: {time.monotonic() - begun:.0f} s, {made_in_vain(out)} scenes of 48 begun in vain"
-    )
-    assert made_in_vain(out) <= 2 * 2 * 2, "at most the ranges that the two hosts had"
+    print(f"\ntwo of three hosts lost: {time.monotonic() - begun:.0f} s, {made_in_vain(out)} scenes made in vain")
+    return said
 
 
-def test_a_killed_head_that_is_brought_back_and_asked_again_makes_the_same_dataset(cluster, packed, local):
-    out = cluster.storage / "headless"
-    process = cluster.start("submit", str(ROOT / "deploy" / "submit.py"), packed, "--out", "headless")
+def lose_the_head(cluster: Cluster, job: str, out: Path, *words: str) -> str:
+    """What `ray submit` says of a job after its head was killed and brought back."""
+    process = cluster.start("submit", str(ROOT / "deploy" / "submit.py"), job, "--out", out.name, *words)
     await_commits(out, 3, process)
     hosts("kill", "1", check=False)
     process.communicate(timeout=60)
     kept = len(list(out.glob("manifest/_commits/*.json")))
     hosts("boot", "1")
-    up = cluster.up(nodes=2)
-    begun = time.monotonic()
-    done = cluster.submit(packed, "--out", "headless")
+    up, begun = cluster.up(nodes=2), time.monotonic()
+    done = cluster.submit(job, "--out", out.name, *words)
     assert done.returncode == 0, done.stdout[-3000:]
-    assert digest_in(done.stdout) == local
-    committed = [event for event in events(out) if event["event"] == "range committed"]
-    print(f"\nhead killed after {kept} of 24 ranges: up {up:.0f} s, the rest {time.monotonic() - begun:.0f} s")
-    assert kept >= 3 and len(committed) <= 24 + 6, "what was committed is not made again"
-    shutil.rmtree(out)
+    print(f"\nhead killed with {kept} ranges: up again {up:.0f} s, the rest {time.monotonic() - begun:.0f} s")
+    assert kept >= 3
+    return done.stdout
+
+
+def test_a_worker_host_killed_and_one_cut_off_under_way_change_no_byte(cluster, packed, local):
+    out = cluster.storage / "disturbed"
+    assert digest_in(lose_two_hosts(cluster, packed, out)) == local
+    assert made_in_vain(out) <= 2 * 2 * 2, "at most the ranges that the two hosts had"
+
+
+def test_a_killed_head_that_is_brought_back_and_asked_again_makes_the_same_dataset(cluster, packed, local):
+    assert digest_in(lose_the_head(cluster, packed, cluster.storage / "headless")) == local
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_two_hundred_scenes_of_the_first_job_are_the_same_dataset_whatever_is_lost(cluster, tmp_path):
+    """Full-size scenes, and Ray's own patience with hosts that do not answer."""
+    patient = filled_in(tmp_path, quick=False)
+    words = ("--scenes", "200", "--set", "run.range_size=8")
+    begun = time.monotonic()
+    local = run_here(ROOT / "deploy" / "jobs" / "tabletop.yaml", tmp_path / "local", *words)
+    print(f"\nhere: {time.monotonic() - begun:.0f} s; ray up: {patient.up():.0f} s")
+    begun = time.monotonic()
+    quiet = patient.submit("tabletop.yaml", "--out", "quiet", *words)
+    print(f"\nundisturbed: {time.monotonic() - begun:.0f} s")
+    assert digest_in(quiet.stdout) == local
+    assert digest_in(lose_two_hosts(patient, "tabletop.yaml", patient.storage / "disturbed", *words)) == local
+    patient.up()
+    assert digest_in(lose_the_head(patient, "tabletop.yaml", patient.storage / "headless", *words)) == local
