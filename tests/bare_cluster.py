@@ -27,7 +27,7 @@ class BareCluster:
     def verso(self, *words: str, **more: str) -> "subprocess.CompletedProcess[str]":
         """A command of this project in that shell."""
         command = [sys.executable, "-P", "-m", "services.cli.main", *words]
-        environ = {**self.shell, "PYTHONPATH": str(ROOT), **more}
+        environ = {**self.shell, **more}
         return subprocess.run(command, cwd="/", env=environ, capture_output=True, text=True, check=False, timeout=280)
 
 
@@ -42,7 +42,7 @@ def bare_cluster(cores: int = 2, dashboard: bool = False) -> Iterator[BareCluste
     """One node with that many cores, which asks for a token; all of its processes end with the block."""
     with tempfile.TemporaryDirectory(prefix="bare-", dir="/tmp") as folder:
         shell = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "HOME": os.environ["HOME"]}
-        shell |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+        shell |= {"PYTHONPATH": str(ROOT), "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
         port, jobs = free_port(), free_port()
         start = [
             RAY,
@@ -55,6 +55,7 @@ def bare_cluster(cores: int = 2, dashboard: bool = False) -> Iterator[BareCluste
         ]
         start += [f"--temp-dir={folder}/r", f"--include-dashboard={str(dashboard).lower()}"]
         start += ["--dashboard-host=127.0.0.1", f"--dashboard-port={jobs}"]
+        start += [f"--dashboard-agent-listen-port={free_port()}"]
         with _node(start, Path(folder, "head.log"), shell):
             yield BareCluster(f"127.0.0.1:{port}", f"http://127.0.0.1:{jobs}", shell)
 
@@ -64,6 +65,7 @@ def another_node(cluster: BareCluster, folder: Path, *before: str) -> Iterator[N
     """A second node with one core joins; `before` are the words of a command that enters it, such as a namespace."""
     address = f"--address={cluster.address}"
     start = [*before, RAY, "start", "--block", address, "--node-ip-address=127.0.0.1", "--num-cpus=1"]
+    start += [f"--dashboard-agent-listen-port={free_port()}"]
     with _node(start, folder / "node.log", cluster.shell):
         yield
 

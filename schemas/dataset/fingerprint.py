@@ -24,6 +24,18 @@ class Fingerprint(Frozen):
         """SHA-256, hex, of all fields."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
+    def remedies(self, other: "Fingerprint") -> str:
+        """What makes the two the same, by what differs: a clause without a full stop."""
+        if self.code != other.code or self.libraries != other.libraries:
+            return "install the same wheel and requirements.lock, or the same image, on both"
+        if self.renderer != other.renderer:
+            return "install the same Mesa (libgl1-mesa-dri), or the same GPU and driver, on both"
+        if self.simd != other.simd:
+            return (
+                "use processors of one kind, and set NPY_DISABLE_CPU_FEATURES alike (deploy/Dockerfile has the value)"
+            )
+        return "their processors or C libraries differ: use machines of one kind, or the same image"
+
     def differences(self, other: "Fingerprint") -> list[str]:
         """One line for each difference, `name: mine, theirs`."""
         mine, theirs = self.model_dump(), other.model_dump()

@@ -21,8 +21,9 @@ from schemas.errors import RunError
 from schemas.job.job import Job
 from services.bench.ratios import Lap, Spread, by_clock, by_processor, idle_share, slope_ratio
 from services.bench.stages import run_process
-from services.run.coordinator import Coordinator, Limits, Pattern
+from services.run.coordinator import Coordinator, Limits
 from services.run.joining import terms_of_driver
+from services.run.pattern import Pattern
 from services.run.range_planner import MAX_SHARD, group_shards
 from services.run.ray_cluster import private_ray
 from services.run.slots import PREFETCH, Slots

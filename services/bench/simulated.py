@@ -16,8 +16,9 @@ from schemas.dataset.commit import CommitSummary, Span
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.shard import ShardOrder, ShardReport, SpanReport
 from schemas.job.job import Job
-from services.run.coordinator import Coordinator, Limits, Pattern
+from services.run.coordinator import Coordinator, Limits
 from services.run.joining import terms_of_driver
+from services.run.pattern import Pattern
 from services.run.progress import event_log
 from services.run.range_planner import group_shards
 from services.run.ray_cluster import OBJECT_STORE_BYTES, connection, kept_private
@@ -90,11 +91,16 @@ class _Drive:
         store = LocalStore(self._folder / name)
         store.prepare()
         spans = (Span(start=start, stop=start + RANGE) for start in range(0, scenes, RANGE))
-        pattern = Pattern(ShardOrder.of(str(store.root), self._job, "bench"), self._catalogue, terms_of_driver())
+        pattern = Pattern(
+            ShardOrder.of(str(store.root), self._job, "bench"),
+            self._catalogue,
+            terms_of_driver(),
+            enter=sleeping(shard_s),
+        )
         limits, tally = Limits(Slots(self._slots, PREFETCH * self._slots), 1, scenes), Tally(asked=scenes)
         with contextlib.closing(LedgerKeeper(store, list_commits(store))) as keeper, event_log(store.root):
             begun, cpu = time.perf_counter(), time.process_time()
-            Coordinator(store, pattern, limits, tally, sleeping(shard_s)).run(
+            Coordinator(store, pattern, limits, tally).run(
                 group_shards(spans, SHARD), lambda now: keeper.add(now.take_commits())
             )
             wall_s, cpu_s = time.perf_counter() - begun, time.process_time() - cpu

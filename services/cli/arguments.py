@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final, NoReturn
 
 from schemas.plain_line import plain_line
+from services.job.packed import MOST_CHARACTERS, is_packed
 
 JOB_ID: Final = r"j[0-9a-f]{8}"
 """An id of schemas/queue.py, which loads too much for a parser; a test compares the two."""
@@ -45,6 +46,13 @@ def read_counts(text: str) -> list[int]:
 def read_path(text: str) -> Path:
     """A file or folder. Raises argparse.ArgumentTypeError where none can have that name."""
     return Path(read_place(text))
+
+
+def read_job(text: str) -> Path:
+    """A job file, or a packed one (`job:...`), which may be longer. Raises argparse.ArgumentTypeError."""
+    if is_packed(text) and len(text) <= MOST_CHARACTERS and text.isascii() and text.isprintable():
+        return Path(text)
+    return read_path(text)
 
 
 def read_place(text: str) -> str:

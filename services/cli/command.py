@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from services.cli.arguments import read_count, read_index, read_path, read_place
+from services.cli.arguments import read_count, read_index, read_job, read_place
 
 Option = tuple[tuple[str, ...], dict[str, Any]]
 
@@ -39,7 +39,7 @@ class Command:
 
 
 JSON = option("--json", action="store_true", help="print one JSON object as the last line of standard output")
-JOB = option("job", type=read_path, metavar="JOB.yaml")
+JOB = option("job", type=read_job, metavar="JOB.yaml")
 OUT = option("out", type=read_place, metavar="OUT")
 SCENE = option("scene", type=read_index, metavar="SCENE")
 SET = option("--set", action="append", default=[], metavar="KEY=VALUE", dest="changes", help="change a key of the job")

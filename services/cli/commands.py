@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from schemas.errors import InputError, RunError, VersoError
-from services.job.read import load_job
+from services.job.read import load_job, pack_job
 
 if TYPE_CHECKING:
     from schemas.job.job import Job
@@ -67,6 +67,14 @@ def _changes(options: argparse.Namespace) -> list[str]:
 def _answer(options: argparse.Namespace, answer: dict) -> None:
     if options.json:
         print(json.dumps(answer))
+
+
+def pack(options: argparse.Namespace) -> int:
+    """`verso pack`."""
+    packed = pack_job(options.job)
+    print(packed)
+    _answer(options, {"ok": True, "job": packed})
+    return 0
 
 
 def status(options: argparse.Namespace) -> int:

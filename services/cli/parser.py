@@ -100,6 +100,11 @@ COMMANDS: dict[str, Command] = {
         kept=KEPT,
         quiet=True,
     ),
+    "pack": Command(
+        "print a job file as one word that no shell changes, to give it to a cluster in place of the file",
+        "deploy/jobs/tabletop.yaml",
+        (option("job", type=read_path, metavar="JOB.yaml"),),
+    ),
     "status": Command("scenes done, failed and missing; rate; what is running", "data/tabletop", (OUT,)),
     "verify": Command(
         "read every file back and derive the labels again",

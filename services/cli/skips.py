@@ -49,6 +49,7 @@ CONDITIONS: Final[dict[str, Callable[[Machine], bool]]] = {
     "no ext4": lambda machine: _no_loop("mkfs.ext4"),
     "no tmpfs": lambda machine: _fails("unshare", "--mount", "mount", "-t", "tmpfs", "none", "/mnt"),
     "no network namespaces": lambda machine: _fails("unshare", "--net", "true"),
+    "no hosts tool": lambda machine: not (machine.root.parent / "shared" / "tools" / "hosts").exists(),
     "no shared data": lambda machine: not (machine.root.parent / "shared" / "data").is_dir(),
     "no mitsuba": lambda machine: importlib.util.find_spec("mitsuba") is None,
     "no mujoco": lambda machine: importlib.util.find_spec("mujoco") is None,

@@ -12,6 +12,7 @@ from schemas.job.job import Job
 from schemas.job.keys import set_key
 from schemas.plain_line import plain_line
 from services.job.bounded_yaml import MOST_LEVELS, parse_yaml
+from services.job.packed import is_packed, pack, unpack
 from services.job.reference import allowed_keys
 
 MOST_BYTES = 250_000
@@ -28,23 +29,57 @@ MOST_FAULTS = 20
 
 
 def load_job(path: Path, changes: Sequence[str] = ()) -> Job:
-    """Read a job file and apply `path.to.key=value` changes. Raises JobError."""
-    name = plain_line(str(path), 300)
+    """Read a job file, or a packed one, and apply `path.to.key=value` changes. Raises JobError."""
+    name = name_of(path)
     job = validate_job(read_tree(path, changes), name)
     _check_homes(job, name)
+    if is_packed(str(path)):
+        _check_absolute(job, name)
     return job
 
 
-def _check_homes(job: Job, name: str) -> None:
-    """Raises JobError for a folder that begins with the name of a user whom this machine does not know."""
+def pack_job(path: Path) -> str:
+    """A job file as one word, for the command line of another machine. Raises JobError as `load_job`."""
+    if is_packed(str(path)):
+        raise JobError(f"{name_of(path)}: is packed already")
+    _check_absolute(load_job(path), name_of(path))
+    try:
+        return pack(path.read_bytes())
+    except JobError as error:
+        raise JobError(f"{name_of(path)}: {error}") from error
+
+
+def name_of(path: Path) -> str:
+    """What a message calls a job file."""
+    return "the packed job" if is_packed(str(path)) else plain_line(str(path), 300)
+
+
+def _folders(job: Job) -> dict[str, str]:
+    """Every folder that the job names, by its key."""
     sources = {
         f"assets.{branch}.{number}.folder": getattr(source, "folder", "")
         for branch in ("objects", "tables")
         for number, source in enumerate(getattr(job.assets, branch))
     }
     folders = job.captures.folders if job.captures is not None else []
-    sources |= {f"captures.folders.{number}": folder for number, folder in enumerate(folders)}
-    for key, folder in sources.items():
+    return sources | {f"captures.folders.{number}": folder for number, folder in enumerate(folders)}
+
+
+def _check_absolute(job: Job, name: str) -> None:
+    """Raises JobError for a folder that is meant from the job file's own, which a packed job has not."""
+    from workers.assets.external.folder import PYBULLET_DATA
+
+    for key, folder in _folders(job).items():
+        if folder not in ("", PYBULLET_DATA) and not folder.startswith(("/", "~")):
+            raise JobError(
+                f"{name}: {key}: {plain_line(repr(folder))}: a packed job has no folder of its own: write the whole path, the "
+                "same on every node"
+            )
+
+
+def _check_homes(job: Job, name: str) -> None:
+    """Raises JobError for a folder that begins with the name of a user whom this machine does not know."""
+    for key, folder in _folders(job).items():
         try:
             Path(folder).expanduser()
         except RuntimeError as error:
@@ -53,7 +88,7 @@ def _check_homes(job: Job, name: str) -> None:
 
 def read_tree(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
     """The keys of a job file with `path.to.key=value` changes, without defaults. Raises JobError."""
-    name = plain_line(str(path), 300)
+    name = name_of(path)
     try:
         tree = parse_yaml(read_text(path), MOST_KEYS)
     except FileNotFoundError as error:
@@ -74,8 +109,11 @@ def read_tree(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
 
 def read_text(path: Path) -> str:
     """The text of a file, of which no more is read than a job file may have. Raises OSError, ValueError, JobError."""
-    with path.open("rb") as file:
-        data = file.read(MOST_BYTES + 1)
+    if is_packed(str(path)):
+        data = unpack(str(path), MOST_BYTES)
+    else:
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
     if len(data) > MOST_BYTES:
         raise JobError(f"has over {MOST_BYTES} bytes, and no job needs as many")
     return data.decode("utf-8-sig")

@@ -4,27 +4,28 @@ import logging
 import pickle
 import signal
 import uuid
-from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import ray
-from ray.exceptions import OutOfMemoryError, RayError, RayTaskError
+from ray.exceptions import NodeDiedError, OutOfMemoryError, RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from schemas.dataset.commit import Span
 from schemas.dataset.layout import commit_path, staging_path
-from schemas.dataset.shard import Blame, Reason, ShardOrder, ShardReport
+from schemas.dataset.shard import Reason, ShardReport
 from schemas.errors import CommitConflict, RunError, VersoError
+from services.run.deaths import Death, Deaths
+from services.run.lost_nodes import LostNodes, hosts_of
+from services.run.pattern import EnterShard, Pattern
 from services.run.processes import Process, send
 from services.run.progress import log_event, say
 from services.run.slots import Slots
 from services.run.stalls import Stall
 from services.run.tally import Tally
 from services.run.watchdog import Watchdog, end_worker_here, find_own_workers
-from services.run.worker_entry import enter_shard
-from services.run.worker_terms import WorkerTerms
-from workers.assets.catalogue import Catalogue
 from workers.pipeline.run_shard import TIMED_OUT
 from workers.store.attempt import attempts_at, blamed_scene, host_part, retry_of_attempt
 from workers.store.ledger import read_summary
@@ -33,13 +34,6 @@ from workers.store.sweep import sweep_attempt
 
 POLL_S = 0.5
 """Time of one wait for reports: Ctrl-C is seen at least this often."""
-
-EXPLANATIONS: dict[Reason, str] = {
-    "time": "the scene took longer than run.scene_timeout_s each time: raise it, then run with --retry-failed",
-    "memory": "the worker ran out of memory each time: use fewer workers, then run with --retry-failed",
-    "killed": "the worker was killed or crashed in this scene each time: see OUT/_logs, then run with --retry-failed",
-}
-"""The stored detail of an environmental failure."""
 
 
 @dataclass(frozen=True)
@@ -51,50 +45,33 @@ class Limits:
     failures: int
 
 
-@dataclass(frozen=True)
-class Pattern:
-    """What every shard is given: an order without ranges, the assets, and what its worker must have.
-
-    `env_vars` are set for the workers of a cluster; those of a private Ray inherit them.
-    """
-
-    order: ShardOrder
-    catalogue: Catalogue
-    terms: WorkerTerms
-    env_vars: Mapping[str, str] = field(default_factory=dict)
-
-
 _end_worker = ray.remote(num_cpus=0, max_retries=0)(end_worker_here)
+
+
+def _shard_task(enter: EnterShard, env_vars: dict[str, str]) -> Any:
+    """The task that makes a shard, as Ray's remote function; a new one asks for workers of its own."""
+    task = ray.remote(num_cpus=1, max_retries=0)(enter)
+    return task.options(runtime_env={"env_vars": env_vars}) if env_vars else task
 
 
 class Coordinator:
     """The state of a run: the shards that run, those to run again, and how often workers died."""
 
-    def __init__(
-        self,
-        store: Store,
-        pattern: Pattern,
-        limits: Limits,
-        tally: Tally,
-        enter: Callable[[WorkerTerms, bytes, bytes], ShardReport] = enter_shard,
-    ) -> None:
-        """`enter` makes a shard in a worker; simulations give another."""
+    def __init__(self, store: Store, pattern: Pattern, limits: Limits, tally: Tally) -> None:
         self._store = store
         self._order = pattern.order.model_copy(update={"label": uuid.uuid4().hex[:8]})
         self._terms = pattern.terms
         self._catalogue = ray.put(pickle.dumps(pattern.catalogue))
-        env_vars = dict(pattern.env_vars)
-        task = ray.remote(num_cpus=1, max_retries=0)(enter)
-        self._task = task.options(runtime_env={"env_vars": env_vars}) if env_vars else task
+        self._enter, self._env_vars = pattern.enter, dict(pattern.env_vars)
+        self._task = _shard_task(self._enter, self._env_vars)
         self._limits = limits
         self._tally = tally
         self._again: deque[tuple[Span, ...]] = deque()
         self._running: dict[ray.ObjectRef, tuple[Span, ...]] = {}
         self._stalled: set[ray.ObjectRef] = set()
         """Shards whose workers the watchdog ended."""
-        self._deaths: Counter[tuple[str, int]] = Counter()
-        """By ("scene", id), or ("range", start) where no scene was begun."""
-        self._blamed: dict[int, Blame] = {}
+        self._deaths = Deaths(limits.attempts)
+        self._lost_nodes = LostNodes(_alive_hosts)
 
     def run(self, shards: Iterator[tuple[Span, ...]], progress: Callable[[Tally], None] = lambda tally: None) -> None:
         """Makes every range of every shard.
@@ -111,6 +88,8 @@ class Coordinator:
                     for stall in watchdog.take_stalls():
                         self._end_stalled(stall)
                     self._tally.in_flight = sum(len(spans) for spans in self._running.values())
+                    if self._env_vars and (lost := self._lost_nodes.take()):
+                        self._give_up_on(lost)
                     progress(self._tally)
         except BaseException:
             self._cancel()
@@ -123,8 +102,7 @@ class Coordinator:
             spans = self._again.popleft() if self._again else next(shards, None)
             if spans is None:
                 break
-            blamed = tuple(self._blamed[scene] for span in spans for scene in span.scene_ids if scene in self._blamed)
-            order = self._order.model_copy(update={"spans": spans, "blamed": blamed})
+            order = self._order.model_copy(update={"spans": spans, "blamed": self._deaths.blamed_in(spans)})
             self._running[self._task.remote(self._terms, pickle.dumps(order), self._catalogue)] = spans
         return bool(self._running)
 
@@ -168,6 +146,23 @@ class Coordinator:
                 f"{self._tally.failed.total()} of {self._tally.asked} scenes have failed ({reasons}), which is more than "
                 'run.max_failure_share allows: see `verso query OUT "select * from failures"`'
             )
+
+    def _give_up_on(self, hosts: set[str]) -> None:
+        """Gives out again what workers on lost hosts had, and what no worker has begun: Ray may have sent it there."""
+        log_event("nodes lost", logging.WARNING, hosts=sorted(hosts))
+        say(f"lost {', '.join(sorted(hosts))}: what was in progress there is made again elsewhere")
+        # A task shares its requests for workers, and some of these wait for lost hosts.
+        self._task = _shard_task(self._enter, self._env_vars)
+        for ref, spans in list(self._running.items()):
+            had = hosts_of(self._store, self._order.label, spans)
+            if had and not had <= hosts:
+                continue
+            del self._running[ref]
+            ray.cancel(ref, force=True)
+            if had:
+                self._handle_death(spans, NodeDiedError(f"{', '.join(sorted(had))} is not in the cluster any more"))
+            else:
+                self._again.append(spans)
 
     def _end_stalled(self, stall: Stall) -> None:
         """Says that a worker shows no progress, and ends it: what follows is the same as after any other death."""
@@ -230,17 +225,7 @@ class Coordinator:
         message = " ".join(str(error).split())[:300]
         log_event("worker lost", logging.WARNING, range=span.start, scene=scene, reason=reason, error=message)
         self._tally.lost[reason] += 1
-        key = ("range", span.start) if scene is None else ("scene", scene)
-        self._deaths[key] += 1
-        deaths = self._deaths[key]
-        if deaths < self._limits.attempts:
-            return
-        if scene is None:
-            raise RunError(
-                f"the worker for the scenes from {span.start} died {deaths} times before it began one or while it committed "
-                f"({reason}: {message}): see `verso doctor`"
-            )
-        self._blamed[scene] = Blame(scene_id=scene, reason=reason, detail=EXPLANATIONS[reason], attempts=deaths)
+        self._deaths.count(Death(span.start, scene, reason, message, isinstance(error, NodeDiedError)))
 
     def _find_evidence(self, span: Span) -> tuple[int | None, bool]:
         """The scene in progress when a worker of this run was lost, and whether its time was up; gives its attempt up.
@@ -261,6 +246,11 @@ class Coordinator:
 
 def _keys(spans: tuple[Span, ...]) -> list[tuple[int, int]]:
     return [(span.start, span.retry) for span in spans]
+
+
+def _alive_hosts() -> set[str]:
+    """The hosts of the cluster's nodes, as attempts are named."""
+    return {host_part(node["NodeManagerHostname"]) for node in ray.nodes() if node["Alive"]}
 
 
 def _nodes_called(host: str) -> list[str]:

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 from schemas.dataset.layout import FINGERPRINT_FILE, LOCK_FILE
 from schemas.dataset.shard import ShardOrder
-from services.run.coordinator import Pattern
 from services.run.lock import Lock
 from services.run.node_probe import check_nodes
+from services.run.pattern import Pattern
 from services.run.worker_terms import WorkerTerms, worker_environment
 from workers.pipeline.code import code_digest
 from workers.store.store import Store

@@ -15,12 +15,13 @@ from schemas.job.job import Job
 from services.job.record import JobRecord, adopt, encode_job, record_job, refuse_foreign
 from services.merge.dataset_card import describe_left_out, describe_sources, write_card
 from services.merge.step import MergeResult, merge
-from services.run.coordinator import Coordinator, Limits, Pattern
+from services.run.coordinator import Coordinator, Limits
 from services.run.joining import join_cluster, terms_of_driver, with_own_stack
 from services.run.lock import hold_lock
 from services.run.losses import find_lost
 from services.run.metrics import Meter, serve
 from services.run.out_folder import explain_lost_folder
+from services.run.pattern import Pattern
 from services.run.progress import ProgressLine, event_log, log_event
 from services.run.range_planner import MAX_SHARD, SpanPlan, choose_shard_size, group_shards, plan_spans
 from services.run.ray_cluster import open_ray

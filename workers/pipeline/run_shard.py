@@ -172,30 +172,29 @@ def _fingerprint(tier: Tier) -> Fingerprint:
 def _join_stack(store: Store, mine: Fingerprint, order: ShardOrder) -> None:
     """The first worker of a dataset writes its fingerprint down; every other must have the same, if the job is strict.
 
-    `order.terms.fingerprint` is the digest that the commits have, if there are any: it holds without the file too.
+    `order.terms.fingerprint` is the digest that the commits have, or on a cluster the driver: it holds without the file too.
     """
-    committed = order.terms.fingerprint
-    if committed not in ("", mine.digest):
-        raise FingerprintError(
-            f"the stack on {socket.gethostname()} has fingerprint {mine.digest[:12]}, the dataset's commits have "
-            f"{committed[:12]}{_differences(store, mine)}. Use the same stack (the image is one), or set run.fingerprint: record"
-        )
+    wanted = order.terms.fingerprint
+    if wanted not in ("", mine.digest):
+        theirs = _written_down(store)
+        raise _foreign(mine, theirs if theirs and theirs.digest == wanted else None, wanted)
     if store.size(FINGERPRINT_FILE) is None:
         store.put_if_absent(FINGERPRINT_FILE, mine.model_dump_json(indent=1).encode())
-    elif committed and mine != _written_down(store):
+    elif wanted and mine != _written_down(store):
         store.write_whole(FINGERPRINT_FILE, mine.model_dump_json(indent=1).encode())  # it was damaged, or another's
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
     if order.terms.fingerprint_mode == "strict" and mine != theirs:
-        raise FingerprintError(
-            f"the stack on {socket.gethostname()} has fingerprint {mine.digest[:12]}, the dataset's is {theirs.digest[:12]}: "
-            f"{'; '.join(mine.differences(theirs))}. Use the same stack (the image is one), or set run.fingerprint: record"
-        )
+        raise _foreign(mine, theirs, theirs.digest)
 
 
-def _differences(store: Store, mine: Fingerprint) -> str:
-    """What differs from the stack that is written down, if it is."""
-    theirs = _written_down(store)
-    return f": {'; '.join(mine.differences(theirs))}" if theirs and theirs != mine else ""
+def _foreign(mine: Fingerprint, theirs: Fingerprint | None, digest: str) -> FingerprintError:
+    """The error for a stack that is not the dataset's, which has this `digest`; `theirs` is None where it is not known."""
+    told = f": {'; '.join(mine.differences(theirs))}" if theirs else ""
+    remedy = mine.remedies(theirs) if theirs else "use the same stack (the image is one)"
+    return FingerprintError(
+        f"the stack on {socket.gethostname()} has fingerprint {mine.digest[:12]}, the dataset's is {digest[:12]}{told}. To "
+        f"go on, {remedy}; or set run.fingerprint: record"
+    )
 
 
 def _written_down(store: Store) -> Fingerprint | None:

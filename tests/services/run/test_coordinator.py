@@ -11,7 +11,8 @@ from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.shard import ShardOrder, ShardReport, SpanReport
 from services.job.read import validate_job
 from services.run import coordinator as module
-from services.run.coordinator import Coordinator, Limits, Pattern
+from services.run.coordinator import Coordinator, Limits
+from services.run.pattern import Pattern
 from services.run.slots import ClusterSlots, Slots
 from services.run.tally import Tally
 from services.run.worker_terms import WorkerTerms
@@ -60,7 +61,7 @@ def handed_out(monkeypatch, tmp_path):
             return name
 
     monkeypatch.setattr(module.ray, "put", lambda value: "catalogue")
-    monkeypatch.setattr(module.ray, "remote", lambda **options: lambda enter: Task)
+    monkeypatch.setattr(module, "_shard_task", lambda enter, env_vars: Task)
     order = ShardOrder.of(str(tmp_path), validate_job({"name": "drained", "scenes": 8}, "test"), "j" * 64)
     pattern = Pattern(order, cast(Catalogue, None), WorkerTerms((), "", ""))
     slots = [1]
@@ -83,7 +84,7 @@ def test_what_a_node_that_is_to_end_gives_back_is_handed_out_again_without_count
         monkeypatch.setattr(module.ray, "get", lambda ref, answer=answer: answer)
         coordinator._collect(name, given)
     assert list(shards.values()) == [spans(0, 2, 4), *[spans(2, 4)] * 4]
-    assert (coordinator._tally.made, coordinator._deaths) == (6, Counter())
+    assert (coordinator._tally.made, coordinator._deaths._counts) == (6, Counter())
     assert coordinator._fill_slots(waiting) and list(shards.values())[-1] == spans(6)
 
 
@@ -93,3 +94,22 @@ def test_shards_are_handed_out_as_the_cluster_grows_and_held_back_as_it_shrinks(
     for slots[0], expected in ((2, 2), (5, 5), (1, 5), (6, 6)):
         assert coordinator._fill_slots(waiting)
         assert len(shards) == expected
+
+
+def test_what_a_lost_host_had_is_handed_out_again_and_what_others_work_on_is_not(handed_out, monkeypatch):
+    """Also what no worker has begun: Ray does not say whether it was sent there."""
+    coordinator, shards, slots = handed_out
+    slots[0] = 4
+    assert coordinator._fill_slots(iter([spans(0, 2), spans(4), spans(6, 8), spans(10)]))
+    had = {0: {"h2"}, 4: {"h1"}, 6: set(), 10: {"h2", "h1"}}
+    monkeypatch.setattr(module, "hosts_of", lambda store, label, those: had[those[0].start])
+    cancelled: list[str] = []
+    monkeypatch.setattr(module.ray, "cancel", lambda ref, force: cancelled.append(ref))
+    coordinator._give_up_on({"h2"})
+    assert cancelled == ["shard 0", "shard 2"]
+    assert set(coordinator._running) == {"shard 1", "shard 3"}
+    assert coordinator._fill_slots(iter([]))
+    assert sorted(map(str, list(shards.values())[4:])) == sorted(map(str, [spans(0), spans(2)]))
+    slots[0] = 9
+    coordinator._fill_slots(iter([]))
+    assert list(shards.values())[6:] == [spans(6, 8)]

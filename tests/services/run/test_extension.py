@@ -114,7 +114,7 @@ def test_another_stack_is_refused_by_what_the_commits_say(finished, monkeypatch,
     if not gone:
         finished.write_whole(FINGERPRINT_FILE, module._fingerprint("raster").model_dump_json().encode())
     before = kept(finished)
-    with pytest.raises(FingerprintError, match=f"the dataset's commits have {mine.digest[:12]}"):
+    with pytest.raises(FingerprintError, match=f"the dataset's is {mine.digest[:12]}"):
         run_shard(*order_of(finished))
     assert kept(finished) == before
     run_shard(*order_of(finished, fingerprint="record"))

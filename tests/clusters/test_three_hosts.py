@@ -1,0 +1,188 @@
+"""A cluster of three hosts that `ray up` starts: the dataset is the local one, whatever host is killed or cut off."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.clusters.hosts import HOSTS, ROOT, Cluster, filled_in, hosts, three_hosts
+
+VERSO = (sys.executable, "-P", "-m", "services.cli.main")
+SMALL = {
+    "cameras": {"sensor": {"width": 160, "height": 120, "fx": 131.25, "fy": 131.25, "cx": 80.0, "cy": 60.0}},
+    "images": {"patch": {"width": 32, "height": 24}},
+    "check": {"raycast_share": 0.1, "mirror_agreement_mm": 5.0},
+}
+
+pytestmark = [
+    pytest.mark.root,
+    pytest.mark.timeout(900),
+    pytest.mark.skipif(not HOSTS.exists(), reason="no ../shared/tools/hosts beside the checkout"),
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("cluster")
+
+
+@pytest.fixture(scope="module")
+def cluster(folder) -> Iterator[Cluster]:
+    with three_hosts():
+        started = filled_in(folder, quick=True)
+        print(f"\nray up: {started.up():.0f} s")
+        yield started
+
+
+@pytest.fixture(scope="module")
+def job(folder) -> Path:
+    """48 scenes with small pictures, in ranges of two."""
+    file = folder / "small.yaml"
+    file.write_text(json.dumps({"name": "small", "seed": 2024, "scenes": 48, "run": {"range_size": 2}, **SMALL}))
+    return file
+
+
+def digest_in(said: str) -> str:
+    return (re.findall(r"dataset digest (\w{64})", said) or [said])[0]
+
+
+def run_here(job: Path, out: Path, *words: str) -> str:
+    """The digest of a run on this machine alone."""
+    run = [*VERSO, "run", str(job), "--out", str(out), *words]
+    done = subprocess.run(
+        run, cwd="/", env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=True
+    )
+    return digest_in(done.stdout)
+
+
+@pytest.fixture(scope="module")
+def local(job) -> str:
+    return run_here(job, job.parent / "local")
+
+
+@pytest.fixture(scope="module")
+def packed(job) -> str:
+    done = subprocess.run(
+        [*VERSO, "pack", str(job)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    return done.stdout.strip()
+
+
+def await_commits(out: Path, count: int, process: "subprocess.Popen[str]") -> None:
+    deadline = time.monotonic() + 180
+    while len(list(out.glob("manifest/_commits/*.json"))) < count:
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < deadline, f"{out} has not {count} commits"
+        time.sleep(0.1)
+
+
+def events(out: Path) -> list[dict]:
+    return [json.loads(line) for line in (out / "_logs" / "verso.jsonl").read_text().splitlines()]
+
+
+def made_in_vain(out: Path) -> int:
+    """Scenes that were begun by workers that were lost before they committed."""
+    lost = [event for event in events(out) if event["event"] == "worker lost"]
+    return sum(event["scene"] - event["range"] + 1 for event in lost if event["scene"] is not None)
+
+
+def on_the_cluster(cluster: Cluster, job: Path, out: str) -> "subprocess.CompletedProcess[str]":
+    """`verso run --address` on the head, by hand."""
+    token = (cluster.folder / ".verso-token").read_text().strip()
+    environ = ["env", f"PYTHONPATH={ROOT}", "RAY_AUTH_MODE=token", f"RAY_AUTH_TOKEN={token}"]
+    run = [str(HOSTS), "run", "1", *environ, *VERSO, "run", str(job), "--out", str(cluster.storage / out)]
+    return subprocess.run(
+        [*run, "--address", "10.77.0.1:6379"], capture_output=True, text=True, check=False, timeout=120
+    )
+
+
+def test_a_host_that_would_make_other_bytes_or_keep_them_is_refused_before_the_first_scene(cluster, job, tmp_path):
+    cases = {
+        "no AVX2": "sed s/avx2//g /proc/cpuinfo > {0}; mount --bind {0} /proc/cpuinfo",
+        "install the same wheel or image": "sed '$a # changed' {1} > {0}; mount --bind {0} {1}",
+        "does not share the output folder": "mount -t tmpfs none {2}",
+    }
+    code = ROOT / "schemas" / "plain_line.py"
+    places = {"no AVX2": "/proc/cpuinfo", "install the same wheel or image": code}
+    for number, (told, change) in enumerate(cases.items()):
+        hosts("run", "3", "sh", "-c", change.format(tmp_path / str(number), code, cluster.storage))
+        try:
+            done = on_the_cluster(cluster, job, "refused")
+        finally:
+            hosts("run", "3", "umount", str(places.get(told, cluster.storage)))
+        assert done.returncode == (2 if "share" in told else 1), done.stderr
+        (line,) = (line for line in done.stderr.splitlines() if line.startswith("verso: "))
+        assert told in line and "h3" in line, line
+        assert not list(cluster.storage.glob("refused/manifest/_commits/*"))
+
+
+def lose_two_hosts(cluster: Cluster, job: str, out: Path, *words: str) -> str:
+    """What `ray submit` says of a job during which host 2 is killed and host 3 is cut off."""
+    begun = time.monotonic()
+    process = cluster.start("submit", str(ROOT / "deploy" / "submit.py"), job, "--out", out.name, *words)
+    try:
+        await_commits(out, 3, process)
+        hosts("kill", "2", check=False)
+        hosts("cut", "3")
+        said = process.communicate(timeout=800)[0]
+    finally:
+        process.kill()
+        hosts("join", "3")
+        hosts("boot", "2")
+    assert process.returncode == 0, said
+    print(f"\ntwo of three hosts lost: {time.monotonic() - begun:.0f} s, {made_in_vain(out)} scenes made in vain")
+    return said
+
+
+def lose_the_head(cluster: Cluster, job: str, out: Path, *words: str) -> str:
+    """What `ray submit` says of a job after its head was killed and brought back."""
+    process = cluster.start("submit", str(ROOT / "deploy" / "submit.py"), job, "--out", out.name, *words)
+    await_commits(out, 3, process)
+    hosts("kill", "1", check=False)
+    process.communicate(timeout=60)
+    kept = len(list(out.glob("manifest/_commits/*.json")))
+    hosts("boot", "1")
+    up, begun = cluster.up(nodes=2), time.monotonic()
+    done = cluster.submit(job, "--out", out.name, *words)
+    assert done.returncode == 0, done.stdout[-3000:]
+    print(f"\nhead killed with {kept} ranges: up again {up:.0f} s, the rest {time.monotonic() - begun:.0f} s")
+    assert kept >= 3
+    return done.stdout
+
+
+def test_a_worker_host_killed_and_one_cut_off_under_way_change_no_byte(cluster, packed, local):
+    out = cluster.storage / "disturbed"
+    assert digest_in(lose_two_hosts(cluster, packed, out)) == local
+    assert made_in_vain(out) <= 2 * 2 * 2, "at most the ranges that the two hosts had"
+
+
+def test_a_killed_head_that_is_brought_back_and_asked_again_makes_the_same_dataset(cluster, packed, local):
+    assert digest_in(lose_the_head(cluster, packed, cluster.storage / "headless")) == local
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_two_hundred_scenes_of_the_first_job_are_the_same_dataset_whatever_is_lost(cluster, tmp_path):
+    """Full-size scenes, and Ray's own patience with hosts that do not answer."""
+    patient = filled_in(tmp_path, quick=False)
+    words = ("--scenes", "200", "--set", "run.range_size=8")
+    begun = time.monotonic()
+    local = run_here(ROOT / "deploy" / "jobs" / "tabletop.yaml", tmp_path / "local", *words)
+    print(f"\nhere: {time.monotonic() - begun:.0f} s; ray up: {patient.up():.0f} s")
+    begun = time.monotonic()
+    quiet = patient.submit("tabletop.yaml", "--out", "quiet", *words)
+    print(f"\nundisturbed: {time.monotonic() - begun:.0f} s")
+    assert digest_in(quiet.stdout) == local
+    assert digest_in(lose_two_hosts(patient, "tabletop.yaml", patient.storage / "disturbed", *words)) == local
+    patient.up()
+    assert digest_in(lose_the_head(patient, "tabletop.yaml", patient.storage / "headless", *words)) == local

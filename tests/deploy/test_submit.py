@@ -1,0 +1,139 @@
+"""deploy/submit.py on the head of a real cluster that was started in a bare shell."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.bare_cluster import ROOT, BareCluster, bare_cluster
+
+SUBMIT = str(ROOT / "deploy" / "submit.py")
+JOB = "name: shapes\nseed: 2024\nscenes: 4\ncategories: [box, can]\nrun: {range_size: 2}\n"
+ODD = "a b;touch x $(touch y) `touch z` 'q' \"r\" && |"
+
+
+@dataclass(frozen=True)
+class Head:
+    """A home on the head, as deploy/cluster.yaml leaves it: jobs, storage and a token."""
+
+    home: Path
+    cluster: BareCluster
+
+    def start(self, *words: str, **more: str) -> "subprocess.Popen[str]":
+        shell = {**self.cluster.shell, "PYTHONPATH": str(ROOT), "HOME": str(self.home)}
+        shell |= {"RAY_API_SERVER_ADDRESS": self.cluster.dashboard, "VERSO_STORAGE": str(self.home / "storage"), **more}
+        pipe = subprocess.PIPE
+        run = [sys.executable, SUBMIT, *words]
+        return subprocess.Popen(run, cwd=self.home, env=shell, stdout=pipe, stderr=pipe, text=True)
+
+    def submit(self, *words: str, **more: str) -> tuple[int, str, str]:
+        process = self.start(*words, **more)
+        out, err = process.communicate(timeout=200)
+        return process.returncode, out, err
+
+
+@pytest.fixture(scope="module")
+def head(tmp_path_factory) -> Iterator[Head]:
+    home = tmp_path_factory.mktemp("head")
+    (home / "verso" / "jobs").mkdir(parents=True)
+    (home / "verso" / "jobs" / "shapes.yaml").write_text(JOB)
+    (home / "storage").mkdir()
+    with bare_cluster(dashboard=True) as cluster:
+        yield Head(home, cluster)
+
+
+pytestmark = [pytest.mark.ray, pytest.mark.minute]
+
+
+def touched(*folders: Path) -> list[str]:
+    """Files that a shell would have made of ODD."""
+    return [str(path) for folder in folders for path in folder.rglob("*") if path.name in ("x", "y", "z")]
+
+
+def test_a_job_is_made_on_the_cluster_and_its_exit_code_comes_back(head):
+    code, out, err = head.submit("shapes.yaml", "--out", "made", "--scenes", "4")
+    assert code == 0, out + err
+    assert "dataset digest" in out and "submit: job verso-shapes-" in err
+    assert (head.home / "storage" / "made" / "_SUCCESS").exists()
+    assert (head.home / "storage" / "made" / "manifest" / "_fingerprint.json").exists()
+    code, out, err = head.submit("shapes.yaml", "--out", "made", "--scenes", "2")
+    assert code == 2 and "fewer scenes than committed" in out + err, "the job's own exit code and words"
+
+
+def test_words_with_shell_characters_are_text(head):
+    """In the name of the job, the output folder and a setting: nothing of it is run, and the dataset says it as written."""
+    pack = [sys.executable, "-P", "-m", "services.cli.main", "pack"]
+    job = head.home / "odd.yaml"
+    job.write_text(JOB + f"# {ODD}\n")
+    environ = {**os.environ, "PYTHONPATH": str(ROOT)}
+    packed = subprocess.run([*pack, str(job)], env=environ, capture_output=True, text=True, check=True).stdout.strip()
+    code, out, err = head.submit(packed, "--out", ODD, "--scenes", "2", "--set", "categories=[box]")
+    assert code == 0, out + err
+    assert (head.home / "storage" / ODD / "_SUCCESS").exists()
+    code, out, err = head.submit(packed, "--out", "other", "--set", f"name={ODD}")
+    assert code == 2 and "name" in out + err and "submit: job" not in err, "refused before it is queued"
+    code, _, err = head.submit(packed, "--out", "two\nlines")
+    assert code == 2 and "'two\\nlines' has characters that are no part of a name" in err
+    assert touched(head.home, Path("/tmp/ray")) == []
+
+
+def test_a_job_outlives_the_one_who_follows_it_and_can_be_followed_and_stopped(head):
+    process = head.start("shapes.yaml", "--out", "left", "--scenes", "60")
+    deadline = time.monotonic() + 90
+    left = head.home / "storage" / "left" / "manifest" / "_commits"
+    while not any(left.glob("*.json")) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    process.send_signal(signal.SIGHUP)
+    said = process.communicate(timeout=20)[1]
+    assert process.returncode == 128 + signal.SIGHUP, said
+    job = re.findall("submit: job (verso-.*)", said)[0]
+    assert f"--follow {job}" in said and f"--stop {job}" in said
+    then = len(list(left.glob("*.json")))
+    while len(list(left.glob("*.json"))) <= then:
+        assert time.monotonic() < deadline, "the job goes on"
+        time.sleep(0.2)
+    code, _, err = head.submit("--stop", job)
+    assert code == 0 and "is being stopped" in err
+    code, _, err = head.submit("--follow", job)
+    assert code == 1 and "what is committed is kept" in err
+
+
+def test_without_the_token_nobody_submits(head):
+    code, _, err = head.submit("shapes.yaml", "--out", "none", RAY_AUTH_TOKEN="f" * 64)
+    assert code == 2 and "oken" in err and "Traceback" not in err
+    code, _, err = head.submit("shapes.yaml", "--out", "none", RAY_AUTH_TOKEN="")
+    assert code == 2 and "no token: set RAY_AUTH_TOKEN" in err
+    body = b'{"entrypoint": "touch /tmp/x"}'
+    for headers in ({}, {"Authorization": "Bearer " + "f" * 64}):
+        asked = urllib.request.Request(f"{head.cluster.dashboard}/api/jobs/", body, headers)
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            urllib.request.urlopen(asked, timeout=20)
+        assert refused.value.code in (401, 403)
+    assert not (head.home / "storage" / "none").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ((), "what it takes"),
+        (("--out", "x"), "the job comes first"),
+        (("nothing.yaml", "--out", "x"), "no job 'nothing.yaml': "),
+        (("shapes.yaml",), "--out is missing"),
+        (("shapes.yaml", "--out", "x", "--address", "auto"), "--address is this cluster's"),
+        (("--follow", "nobody"), "nobody"),
+        (("--follow",), "the id of one job"),
+        (("shapes.yaml", "--out", "x", "surplus"), "unrecognized arguments: surplus"),
+    ],
+)
+def test_wrong_words_are_refused_in_a_line(head, words, told):
+    code, _, err = head.submit(*words)
+    assert code == 2 and told in err and "Traceback" not in err
