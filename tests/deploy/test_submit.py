@@ -123,6 +123,7 @@ def test_without_the_token_nobody_submits(head):
         with pytest.raises(urllib.error.HTTPError) as refused:
             urllib.request.urlopen(asked, timeout=20)
         assert refused.value.code in (401, 403)
+        refused.value.close()
     assert not (head.home / "storage" / "none").exists()
 
 

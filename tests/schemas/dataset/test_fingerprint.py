@@ -4,7 +4,9 @@ import pytest
 
 from schemas.dataset.fingerprint import Fingerprint
 
-MINE = Fingerprint(canary="c", code="d", libraries={"numpy": "2.4.6"}, simd="X86_V2 X86_V3", renderer="llvmpipe, 256 bits")
+MINE = Fingerprint(
+    canary="c", code="d", libraries={"numpy": "2.4.6"}, simd="X86_V2 X86_V3", renderer="llvmpipe, 256 bits"
+)
 
 
 @pytest.mark.parametrize(
@@ -14,6 +16,7 @@ MINE = Fingerprint(canary="c", code="d", libraries={"numpy": "2.4.6"}, simd="X86
         ({"libraries": {"numpy": "2.4.5"}}, "numpy: 2.4.6, 2.4.5", "requirements.lock"),
         ({"renderer": "llvmpipe, 512 bits"}, "renderer: llvmpipe, 256 bits, llvmpipe, 512 bits", "libgl1-mesa-dri"),
         ({"simd": "X86_V2"}, "simd: X86_V2 X86_V3, X86_V2", "NPY_DISABLE_CPU_FEATURES"),
+        ({"maths": "m"}, "maths: , m", "GLIBC_TUNABLES"),
         ({"canary": "x"}, "canary: c, x", "machines of one kind"),
     ],
 )

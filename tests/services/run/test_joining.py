@@ -13,6 +13,7 @@ from schemas.dataset.layout import FINGERPRINT_FILE
 from schemas.dataset.shard import ShardOrder
 from services.job.read import validate_job
 from services.run.joining import terms_of_driver, with_own_stack
+from services.run.sight import processor_flags
 from tests.bare_cluster import BareCluster, bare_cluster
 from workers.pipeline.code import code_digest
 from workers.pipeline.fingerprint import take_fingerprint
@@ -57,6 +58,19 @@ def test_a_driver_that_sees_no_avx512_makes_the_same_bytes(cluster, job, private
     out = job.parent / "hidden"
     words = ("run", str(job), "--out", str(out), "--address", cluster.address)
     assert digest_of(cluster.verso(*words, GLIBC_TUNABLES=HIDDEN)) == private
+
+
+@pytest.mark.ray
+@pytest.mark.minute
+def test_a_driver_whose_c_library_rounds_otherwise_is_told_both_stacks(cluster, job):
+    if "fma" not in processor_flags():
+        pytest.skip("this processor has no fused multiplication")
+    words = ("run", str(job), "--out", str(job.parent / "other"), "--address", cluster.address)
+    done = cluster.verso(*words, GLIBC_TUNABLES="glibc.cpu.hwcaps=-FMA,-AVX2")
+    assert done.returncode == 1
+    (told,) = (line for line in done.stderr.splitlines() if line.startswith("verso: "))
+    assert "maths: " in told and "the dataset's is " in told and "unset GLIBC_TUNABLES" in told
+    assert not list((job.parent / "other").glob("manifest/_commits/*"))
 
 
 @pytest.mark.ray
