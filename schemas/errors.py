@@ -6,6 +6,7 @@
     |   +-- AssetSourceError  a folder of assets that cannot be used at all
     |   +-- OutputError     the output folder belongs to another job, or cannot be written
     +-- RunError            it ran, but something is missing or wrong                         exit 1
+    |   +-- InUseError      another run works in the output folder
     |   +-- MachineError    this machine lacks something (GL, disk, a Ray that answers)
     |   +-- CommitConflict  two attempts at one range made different bytes
     |   +-- CorruptError    a stored file does not match its checksum or cannot be read
@@ -53,6 +54,18 @@ class OutputError(InputError):
 
 class RunError(VersoError):
     """The work ran, and something is missing or wrong."""
+
+
+class InUseError(RunError):
+    """Another process works in the folder: `place` and `by` say which."""
+
+    def __init__(self, message: str, place: str = "", by: str = "") -> None:
+        super().__init__(message, place, by)
+        self.place = place
+        self.by = by
+
+    def __str__(self) -> str:
+        return str(self.args[0])
 
 
 class MachineError(RunError):

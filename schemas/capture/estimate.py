@@ -89,6 +89,12 @@ class Estimates:
         """The one that was chosen."""
         return self.by_name[self.chosen]
 
+    @property
+    def by_markers(self) -> dict[int, ViewEstimate]:
+        """The views of the estimate from markers alone, by number; none where it was not made."""
+        markers = self.by_name.get("markers")
+        return {view.number: view for view in markers.views} if markers is not None else {}
+
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:

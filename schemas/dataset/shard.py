@@ -50,7 +50,7 @@ class ShardOrder(Frozen):
             fingerprint_mode=job.run.fingerprint,
             layout=job.output.layout,
             first_scene=job.first_scene,
-            range_size=job.run.range_size,
+            range_size=job.range_size,
             pairs_per_scene=job.pairs_per_scene,
         )
         return cls(out=out, job=job, terms=terms, spans=())

@@ -154,15 +154,15 @@ _CAPTURE_COLUMNS: dict[str, pa.Field] = {
 }
 """The column that a table has in datasets of captures alone, behind all others."""
 
-_PHYSICS = {*(field.name for field in _rest), "pose", "settle_s"}
-"""Columns of `scenes` that a capture cannot have: null there."""
+NOT_OF_CAPTURES = ("pose", *(field.name for field in _rest), "settle_s", "bodies")
+"""Columns of `scenes` that a capture cannot have, since nothing was simulated to rest: null there."""
 
 
 def _capture_fields(table: str, columns: list[pa.Field]) -> list[pa.Field]:
     if table not in _CAPTURE_COLUMNS:
         return columns
     return [
-        *(field.with_nullable(True) if field.name in _PHYSICS else field for field in columns),
+        *(field.with_nullable(True) if field.name in NOT_OF_CAPTURES else field for field in columns),
         _CAPTURE_COLUMNS[table],
     ]
 

@@ -14,6 +14,7 @@ from schemas.job.captures import Captures, with_capture_keys
 from schemas.job.images import Images
 from schemas.job.physics import Physics
 from schemas.job.preset import PresetName, with_preset
+from schemas.job.range_size import choose_range_size
 from schemas.job.render import Render
 from schemas.job.run import Check, Output, Run
 from schemas.job.sensor import SensorEffects
@@ -131,6 +132,13 @@ class Job(Frozen):
             if virtual and self.captures
             else self.render
         )
+
+    @property
+    def range_size(self) -> int:
+        """Scenes in a range: `run.range_size`, or what follows from the job."""
+        most = self.objects_per_scene.high
+        given = self.run.range_size
+        return given or choose_range_size(self.scenes, most, self.pairs_per_scene, self.start, self.render)
 
     @property
     def stop_scene(self) -> int:

@@ -34,8 +34,8 @@ class Run(Frozen):
     """None: the cores that this container may use, or the cluster's."""
     shard_size: PositiveInt | None = None
     """Scenes in a Ray task; rounded up to whole ranges. None: 64, and fewer where that would leave workers idle."""
-    range_size: RangeSize = 16
-    """Scenes in a commit; recorded at the first run."""
+    range_size: RangeSize | None = None
+    """Scenes in a commit; recorded at the first run. None: at most 16, and fewer where scenes are few or slow."""
     max_failure_share: Share = 0.01
     """Above this share of failed scenes the run exits 1, and stops early once that is certain."""
     max_attempts: PositiveInt = 3

@@ -34,6 +34,11 @@ def main(options: argparse.Namespace) -> int:
         return _print(options, job, effects.measure_effects(job, job_folder, options.effects), effects.describe)
     refuse_unmatched(job)
     with bench_folder(options.folder) as folder:
+        if options.nodes is not None:
+            from services.bench import simulated  # loads Ray
+
+            laps = simulated.measure_simulated(job, folder, options.nodes, simulated.SHARD_S)
+            return _print(options, job, {"simulated": laps}, simulated.describe)
         if options.pathtraced is not None:
             timed = traced.measure_traced(job, job_folder, folder, options.scenes, options.pathtraced)
             return _print(options, job, timed, traced.describe)

@@ -72,8 +72,8 @@ def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
         others = start_others(sides_of(job), given, folder, running)
         laps: dict[str, list[Lap]] = {name: [] for name in ("ours", "floor", *(side.name for side in others.sides))}
         written = 0
-        for start in range(0, scenes, job.run.range_size):
-            span = bench.next_span(min(job.run.range_size, scenes - start))
+        for start in range(0, scenes, job.range_size):
+            span = bench.next_span(min(job.range_size, scenes - start))
             laps["ours"].append(bench.run(span))
             # The input of the next side is made between the clocks.
             files = bench.files(span)

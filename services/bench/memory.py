@@ -35,7 +35,7 @@ def sample_memory(job: Job, job_folder: Path, folder: Path, scenes: int) -> tupl
     bench = open_workbench(job, job_folder, folder)
     stop, samples = job.first_scene + scenes, []
     while bench.next_scene < stop:
-        span = bench.next_span(min(job.run.range_size, stop - bench.next_scene))
+        span = bench.next_span(min(job.range_size, stop - bench.next_scene))
         lap = bench.run(span)
         samples.append(Sample(len(span.scene_ids), resident_mb("VmRSS"), by_processor(lap)))
     return samples, resident_mb("VmHWM")

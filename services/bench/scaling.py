@@ -21,12 +21,13 @@ from schemas.errors import RunError
 from schemas.job.job import Job
 from services.bench.ratios import Lap, Spread, by_clock, by_processor, idle_share, slope_ratio
 from services.bench.stages import run_process
-from services.run.coordinator import Coordinator, Limits, Tally
+from services.run.coordinator import Coordinator, Limits
 from services.run.joining import terms_of_driver
 from services.run.pattern import Pattern
 from services.run.range_planner import MAX_SHARD, group_shards
 from services.run.ray_cluster import private_ray
 from services.run.slots import PREFETCH, Slots
+from services.run.tally import Tally
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.store.local import LocalStore
 
@@ -50,7 +51,7 @@ def measure_scaling(
     each = Span(start=job.first_scene, stop=job.first_scene + max(1, scenes // workers))
     drive = _RayDrive(job, open_catalogue(job.assets, job_folder, tuple(job.categories)), folder, workers)
     with private_ray(workers), plain_processes(job, job_folder, folder, workers) as processes:
-        drive.run("warm", workers, 4 * workers * job.run.range_size, job.run.range_size)
+        drive.run("warm", workers, 4 * workers * job.range_size, job.range_size)
         for number in range(rounds):
             for count in counts:
                 ray[count].append(drive.run(f"{number}-{count}", count, scenes, shard))
@@ -131,7 +132,7 @@ class _RayDrive:
 
     def run(self, name: str, slots: int, count: int, shard_size: int) -> tuple[Lap, float]:
         """A lap of that many scenes, and the share of the slots' time without a shard."""
-        out, size, first = self.folder / name, self.job.run.range_size, self.job.first_scene
+        out, size, first = self.folder / name, self.job.range_size, self.job.first_scene
         store = LocalStore(out)
         store.prepare()
         spans = [Span(start=s, stop=min(s + size, first + count)) for s in range(first, first + count, size)]

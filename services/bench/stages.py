@@ -80,6 +80,6 @@ def run_process(job: Job, job_folder: Path, folder: Path, span: Span) -> Lap:
     """A plain process's part: make and commit a span into a new folder, range by range."""
     bench, made = open_workbench(job, job_folder, folder), 0
     wall, cpu = time.perf_counter(), time.process_time()
-    for start in range(span.start, span.stop, job.run.range_size):
-        made += bench.run(Span(start=start, stop=min(start + job.run.range_size, span.stop))).scenes
+    for start in range(span.start, span.stop, job.range_size):
+        made += bench.run(Span(start=start, stop=min(start + job.range_size, span.stop))).scenes
     return Lap(made, time.perf_counter() - wall, time.process_time() - cpu, {})

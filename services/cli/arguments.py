@@ -9,6 +9,9 @@ from typing import Final, NoReturn
 from schemas.plain_line import plain_line
 from services.job.packed import MOST_CHARACTERS, is_packed
 
+JOB_ID: Final = r"j[0-9a-f]{8}"
+"""An id of schemas/queue.py, which loads too much for a parser; a test compares the two."""
+
 MOST_PATH_CHARACTERS: Final = 4000
 """Longest name of a file or folder that Linux takes, but for some bytes."""
 
@@ -33,6 +36,11 @@ def read_count(text: str) -> int:
     if not read_index(text):
         raise argparse.ArgumentTypeError(f"{text} is not a whole number from 1 up")
     return int(text)
+
+
+def read_counts(text: str) -> list[int]:
+    """Whole numbers from 1 up, with commas between. Raises argparse.ArgumentTypeError."""
+    return [read_count(one) for one in text.split(",")]
 
 
 def read_path(text: str) -> Path:
@@ -70,3 +78,37 @@ def read_address(text: str) -> str:
         told = "write it as HOST:PORT, as `ray start` prints it (port 6379 by default)"
         raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
     return text
+
+
+def read_listener(text: str) -> str:
+    """An address of this machine and a port to listen on, HOST:PORT. Raises argparse.ArgumentTypeError."""
+    told = "write it as HOST:PORT, such as 127.0.0.1:9464 (0.0.0.0 listens on every address)"
+    if text == "auto" or text.startswith("ray://"):
+        raise argparse.ArgumentTypeError(f"{text}: {told}")
+    try:
+        return read_address(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}") from None
+
+
+def read_http(text: str) -> str:
+    """The address of an HTTP server. Raises argparse.ArgumentTypeError."""
+    if not re.fullmatch(r"https?://[^\s/?#@]+(?:/[^\s?#]*)?", text, re.ASCII):
+        told = "write it as http://HOST:PORT, as `ray start` prints it for the dashboard (port 8265 by default)"
+        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
+    return text.rstrip("/")
+
+
+def read_job_id(text: str) -> str:
+    """The id of a job in a queue. Raises argparse.ArgumentTypeError."""
+    if not re.fullmatch(JOB_ID, text, re.ASCII):
+        told = "an id is a j and eight digits or letters a to f, as `verso submit` prints it and `verso jobs` lists it"
+        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
+    return text
+
+
+def read_priority(text: str) -> int:
+    """A whole number from -1000 to 1000. Raises argparse.ArgumentTypeError."""
+    if not re.fullmatch(r"[+-]?[0-9]{1,4}", text, re.ASCII) or abs(int(text)) > 1000:
+        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)} is not a whole number from -1000 to 1000")
+    return int(text)

@@ -14,6 +14,8 @@ from schemas.errors import InputError, RunError, VersoError
 from services.job.read import load_job, pack_job
 
 if TYPE_CHECKING:
+    from schemas.job.job import Job
+    from services.run.step import RunResult
     from workers.store.store import Store
 
 Found = TypeVar("Found")
@@ -26,11 +28,18 @@ def run(options: argparse.Namespace) -> int:
 
     out = options.out or f"data/{job.name}"
     absolute = out if "://" in out else str(Path(out).resolve())
-    request = RunRequest(job, options.job.parent, absolute, options.address, options.retry_failed)
+    request = RunRequest(job, options.job.parent, absolute, options.address, options.retry_failed, options.metrics)
     if options.dry_run:
         print("\n".join(describe_plan(request)))
         return 0
     result = run_job(request)
+    complete, answer = tell_result(out, job, result)
+    _answer(options, {"ok": complete, **answer})
+    return 0 if complete else 1
+
+
+def tell_result(out: str, job: "Job", result: "RunResult") -> tuple[bool, dict[str, Any]]:
+    """Prints what a run made; whether it is complete, and the answer for programs."""
     merged = result.merged
     made, failed = merged.scenes["made"], merged.scenes["intrinsic"] + merged.scenes["environmental"]
     share = failed / job.scenes
@@ -45,9 +54,7 @@ def run(options: argparse.Namespace) -> int:
         told = f"{share:.1%} of the scenes failed, run.max_failure_share is {job.run.max_failure_share:.1%}"
         asks = f'verso query {out} "select reason, count(*) from failures group by reason"'
         print(f"verso: {told}: `{asks}` says why", file=sys.stderr)
-    answer = {"out": out, "digest": merged.digest, "scenes": merged.scenes, "seconds": result.seconds}
-    _answer(options, {"ok": complete, **answer})
-    return 0 if complete else 1
+    return complete, {"out": out, "digest": merged.digest, "scenes": merged.scenes, "seconds": result.seconds}
 
 
 def _changes(options: argparse.Namespace) -> list[str]:

@@ -1,4 +1,4 @@
-"""Edge: restarts a command in the environment variables that its bytes depend on (schemas/environment.py)."""
+"""Edge: restarts a command in the environment variables that its bytes depend on (schemas/environment.py), and reads settings."""
 
 import os
 import sys
@@ -15,3 +15,8 @@ def enter_stack_environment() -> None:
     changes = settings_to_change(os.environ, processor_flags())
     if changes:
         os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], {**os.environ, **changes})
+
+
+def default_queue() -> str | None:
+    """The queue that commands use where they name none: $VERSO_QUEUE."""
+    return os.environ.get("VERSO_QUEUE") or None

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from services.cli.arguments import Parser, read_address, read_index, read_path, read_place
+from services.cli.arguments import Parser, read_address, read_counts, read_index, read_listener, read_path, read_place
 from services.cli.capture_parser import CAPTURE_COMMANDS
 from services.cli.command import JOB, JSON, OUT, SCENE, SET, Command, number, option
+from services.cli.queue_parser import QUEUE_COMMANDS
 
 if TYPE_CHECKING:
     Commands = argparse._SubParsersAction[Parser]
@@ -84,6 +85,12 @@ COMMANDS: dict[str, Command] = {
                 help="a Ray cluster that runs already (default: a private Ray here)",
             ),
             SET,
+            option(
+                "--metrics",
+                type=read_listener,
+                metavar="HOST:PORT",
+                help="serve what the run counts to Prometheus there (default: not at all)",
+            ),
             option("--dry-run", action="store_true", help="check everything and say what would be done"),
             option(
                 "--retry-failed", action="store_true", help="try scenes again that failed for environmental reasons"
@@ -147,6 +154,7 @@ COMMANDS: dict[str, Command] = {
         "process data/mug",
         commands=CAPTURE_COMMANDS,
     ),
+    **QUEUE_COMMANDS,
     "test": Command(
         "lint, types, layer rules and tests",
         "tests/hard_cases --figures f.json",
@@ -177,13 +185,19 @@ COMMANDS: dict[str, Command] = {
                 metavar="PYTHON",
                 help="time the path-traced tier instead, beside Blender's Cycles where PYTHON (default: this one) has bpy",
             ),
+            option(
+                "--nodes",
+                type=read_counts,
+                metavar="N,N,...",
+                help="measure the coordinator instead, on so many simulated nodes whose scenes only take their time",
+            ),
             number(
                 "--effects",
                 "time settling instead: N scenes by their plan of effects, and with every effect of physics forced",
             ),
         ),
         "services.bench.command:main",
-        starts_ray=lambda options: options.workers is not None,
+        starts_ray=lambda options: options.workers is not None or options.nodes is not None,
         kept="no figures are kept",
     ),
     "tradeoff": Command(

@@ -90,7 +90,7 @@ def read_tree(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
     """The keys of a job file with `path.to.key=value` changes, without defaults. Raises JobError."""
     name = name_of(path)
     try:
-        tree = parse_yaml(_read_text(path), MOST_KEYS)
+        tree = parse_yaml(read_text(path), MOST_KEYS)
     except FileNotFoundError as error:
         raise JobError(f"{name}: no such file; the examples are in deploy/jobs/") from error
     except (OSError, ValueError) as error:
@@ -107,7 +107,7 @@ def read_tree(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
     return tree
 
 
-def _read_text(path: Path) -> str:
+def read_text(path: Path) -> str:
     """The text of a file, of which no more is read than a job file may have. Raises OSError, ValueError, JobError."""
     if is_packed(str(path)):
         data = unpack(str(path), MOST_BYTES)

@@ -63,7 +63,11 @@ class JobRecord:
 
 
 def record_job(job: Job, catalogue_digest: str, folder: Path, inputs: tuple[str, ...] = ()) -> JobRecord:
-    """The record of a job with the digest of its asset catalogue; `folder` is the job file's."""
+    """The record of a job with the digest of its asset catalogue; `folder` is the job file's.
+
+    The size of ranges is written down also where it follows from the job: a dataset that is extended keeps it.
+    """
+    job = job.model_copy(update={"run": job.run.model_copy(update={"range_size": job.range_size})})
     return JobRecord(job, job_digest(job, catalogue_digest), catalogue_digest, str(folder.resolve()), inputs)
 
 
@@ -168,5 +172,5 @@ def adopt(store: Store, new: JobRecord) -> JobRecord:
     if differing:
         lines = [f"{store.name} belongs to another job; these differ:", *differing]
         raise OutputError("\n".join([*lines, "choose another --out, or change them back"]))
-    run = new.job.run.model_copy(update={"range_size": old.job.run.range_size})
+    run = new.job.run.model_copy(update={"range_size": old.job.range_size})
     return dataclasses.replace(new, job=new.job.model_copy(update={"run": run}))

@@ -85,7 +85,7 @@ def _spans(job: StoredJob, success: Success, verdict: Verdict) -> Spans:
     asked = (job.record.job.first_scene, job.record.job.stop_scene) if job.record else None
     if success.asked and not job.whole:
         asked = success.asked
-    range_size = job.record.job.run.range_size if job.record else 16
+    range_size = job.record.job.range_size if job.record else 16
     return Spans(asked, range_size, success.data is not None, verdict)
 
 

@@ -84,7 +84,7 @@ def check_terms(job: StoredJob, terms: Terms, verdict: Verdict) -> None:
         for digest, key in terms.jobs.items():
             if digest != job.digest:
                 verdict.tell(f"{key}: is a commit of another job ({digest[:12]}) than {JOB_FILE}", COPY)
-    size = job.record.job.run.range_size
+    size = job.record.job.range_size
     if size not in terms.range_sizes and terms.range_sizes:
         told = f"{JOB_FILE}: run.range_size is {size}, that of the commits {next(iter(terms.range_sizes))}"
         verdict.tell(told, f"{COPY}, or change it back", "job")

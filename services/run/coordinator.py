@@ -4,16 +4,17 @@ import logging
 import pickle
 import signal
 import uuid
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import ray
 from ray.exceptions import NodeDiedError, OutOfMemoryError, RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from schemas.dataset.commit import CommitSummary, Span
+from schemas.dataset.commit import Span
 from schemas.dataset.layout import commit_path, staging_path
 from schemas.dataset.shard import Reason, ShardReport
 from schemas.errors import CommitConflict, RunError, VersoError
@@ -24,8 +25,10 @@ from services.run.processes import Process, send
 from services.run.progress import log_event, say
 from services.run.slots import Slots
 from services.run.stalls import Stall
+from services.run.tally import Tally
 from services.run.watchdog import Watchdog, end_worker_here, find_own_workers
 from services.run.worker_entry import enter_shard
+from services.run.worker_terms import WorkerTerms
 from workers.pipeline.run_shard import TIMED_OUT
 from workers.store.attempt import attempts_at, blamed_scene, host_part, retry_of_attempt
 from workers.store.ledger import read_summary
@@ -34,41 +37,6 @@ from workers.store.sweep import sweep_attempt
 
 POLL_S = 0.5
 """Time of one wait for reports: Ctrl-C is seen at least this often."""
-
-
-@dataclass
-class Tally:
-    """The results of a run so far; changed by the coordinator alone."""
-
-    asked: int
-    made: int = 0
-    failed: Counter[str] = field(default_factory=Counter)
-    conflicts: list[str] = field(default_factory=list)
-    commits: list[CommitSummary] = field(default_factory=list)
-    """Those of this run that nobody has taken yet."""
-    shard_wall_s: float = 0.0
-    shard_cpu_s: float = 0.0
-
-    @property
-    def done(self) -> int:
-        """Scenes made or failed."""
-        return self.made + self.failed.total()
-
-    def add(self, report: ShardReport) -> None:
-        """Counts one shard's report."""
-        self.shard_wall_s += report.wall_s
-        self.shard_cpu_s += report.cpu_s
-        for span in report.spans:
-            if span.conflict:
-                self.conflicts.append(span.conflict)
-            self.made += span.made
-            self.failed.update(span.failed)
-            self.commits += [span.commit] if span.commit else []
-
-    def take_commits(self) -> list[CommitSummary]:
-        """The commits since the last call."""
-        commits, self.commits = self.commits, []
-        return commits
 
 
 @dataclass(frozen=True)
@@ -83,22 +51,35 @@ class Limits:
 _end_worker = ray.remote(num_cpus=0, max_retries=0)(end_worker_here)
 
 
-def _shard_task(env_vars: dict[str, str]) -> Any:
-    """The task that makes a shard, as Ray's remote function; a new one asks for workers of its own."""
-    task = ray.remote(num_cpus=1, max_retries=0)(enter_shard)
+Enter = Callable[[WorkerTerms, bytes, bytes], ShardReport]
+"""Makes a shard in a worker."""
+
+
+def _shard_task(enter: Enter, env_vars: dict[str, str]) -> Any:
+    """Ray's remote function that makes a shard; a new one asks for workers of its own."""
+    task = ray.remote(num_cpus=1, max_retries=0)(enter)
     return task.options(runtime_env={"env_vars": env_vars}) if env_vars else task
 
 
 class Coordinator:
     """The state of a run: the shards that run, those to run again, and how often workers died."""
 
-    def __init__(self, store: Store, pattern: Pattern, limits: Limits, tally: Tally) -> None:
+    def __init__(
+        self,
+        store: Store,
+        pattern: Pattern,
+        limits: Limits,
+        tally: Tally,
+        enter: Enter = enter_shard,
+    ) -> None:
+        """`enter` makes a shard in a worker; simulations give another."""
         self._store = store
         self._order = pattern.order.model_copy(update={"label": uuid.uuid4().hex[:8]})
         self._terms = pattern.terms
         self._catalogue = ray.put(pickle.dumps(pattern.catalogue))
         self._env_vars = dict(pattern.env_vars)
-        self._task = _shard_task(self._env_vars)
+        self._new_task = partial(_shard_task, enter, self._env_vars)
+        self._task = self._new_task()
         self._limits = limits
         self._tally = tally
         self._again: deque[tuple[Span, ...]] = deque()
@@ -124,6 +105,7 @@ class Coordinator:
                         self._end_stalled(stall)
                     if self._env_vars and (lost := self._lost_nodes.take()):
                         self._give_up_on(lost)
+                    self._tally.in_flight = sum(len(spans) for spans in self._running.values())
                     progress(self._tally)
         except BaseException:
             self._cancel()
@@ -185,9 +167,7 @@ class Coordinator:
         """Gives out again what workers on lost hosts had, and what no worker has begun: Ray may have sent it there."""
         log_event("nodes lost", logging.WARNING, hosts=sorted(hosts))
         say(f"lost {', '.join(sorted(hosts))}: what was in progress there is made again elsewhere")
-        self._task = _shard_task(
-            self._env_vars
-        )  # requests for workers are shared by one task, and some wait for lost hosts
+        self._task = self._new_task()  # requests for workers are shared by one task, and some wait for lost hosts
         for ref, spans in list(self._running.items()):
             had = hosts_of(self._store, self._order.label, spans)
             if had and not had <= hosts:
@@ -245,6 +225,7 @@ class Coordinator:
             self._tally.made += summary.made
             self._tally.failed.update(kind for _, kind, _ in summary.failed)
             self._tally.commits.append(summary)
+            self._tally.ranges += 1
             left.pop(0)
         if left:
             self._count_death(left[0], error, stalled)
@@ -258,6 +239,7 @@ class Coordinator:
         )
         message = " ".join(str(error).split())[:300]
         log_event("worker lost", logging.WARNING, range=span.start, scene=scene, reason=reason, error=message)
+        self._tally.lost[reason] += 1
         self._deaths.count(Death(span.start, scene, reason, message, isinstance(error, NodeDiedError)))
 
     def _find_evidence(self, span: Span) -> tuple[int | None, bool]:

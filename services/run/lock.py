@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from schemas.dataset.layout import LOCK_CLAIMS, LOCK_FILE
-from schemas.errors import RunError
+from schemas.errors import InUseError, RunError
 from services.run.processes import read_process
 from workers.store.store import Store
 
@@ -137,7 +137,7 @@ def hold_lock(store: Store, beat: Beat = DEFAULT_BEAT) -> Iterator[Lock]:
     """Holds the lock of an output folder while the context lasts.
 
     A dead holder on this machine is replaced at once, one elsewhere after `patience` periods without a heartbeat.
-    Raises RunError naming a holder that lives.
+    Raises InUseError naming a holder that lives.
     """
     mine = Holder(uuid.uuid4().hex, socket.gethostname(), os.getpid(), _machine(), _born(os.getpid()) or "")
     shown_at = _now_s()
@@ -168,13 +168,18 @@ def read_holder(store: Store) -> Holder | None:
 
 def shows_life(store: Store, holder: Holder, beat: Beat = DEFAULT_BEAT) -> bool:
     """Whether a holder lives: by its process on this machine, elsewhere by a heartbeat that changes within the patience."""
-    if holder.machine and holder.machine == _machine():
+    if is_here(holder):
         return _born(holder.pid) == holder.born
     for _ in range(beat.patience):
         time.sleep(beat.period_s)
         if read_holder(store) != holder:
             return True
     return False
+
+
+def is_here(holder: Holder) -> bool:
+    """Whether the holder's process is of this machine, so that `shows_life` answers at once."""
+    return bool(holder.machine) and holder.machine == _machine()
 
 
 def _holder_at(store: Store, key: str) -> Holder | None:
@@ -197,7 +202,7 @@ def _show_life(lock: Lock, period_s: float, ended: threading.Event) -> None:
 
 
 def _find_gone(store: Store, beat: Beat) -> Holder | None:
-    """The holder if it is dead or shows no life, None if the lock is free. Raises RunError where it lives."""
+    """The holder if it is dead or shows no life, None if the lock is free. Raises InUseError where it lives."""
     first = read_holder(store)
     if first is None:
         return None
@@ -206,9 +211,11 @@ def _find_gone(store: Store, beat: Beat) -> Holder | None:
     now = read_holder(store)
     if now is None:
         return None
-    raise RunError(
-        f"{store.name} is in use by process {now.pid} on {now.host}: wait until it ends or stop it, "
-        "then start again; `verso status` shows how far it is"
+    by = f"process {now.pid} on {now.host}"
+    raise InUseError(
+        f"{store.name} is in use by {by}: wait until it ends or stop it, then start again; `verso status` shows how far it is",
+        store.name,
+        by,
     )
 
 

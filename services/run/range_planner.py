@@ -18,6 +18,9 @@ from schemas.job.job import Job
 MAX_SHARD = 64
 """Scenes in a shard of a large job: seconds of work for each millisecond that Ray takes to hand it out."""
 
+MOST_RANGES = 4
+"""Ranges in a shard whose size the job does not give."""
+
 
 @dataclass(frozen=True)
 class SpanPlan:
@@ -34,7 +37,7 @@ class SpanPlan:
 
 def plan_spans(job: Job, ledger: Ledger, retry_failed: bool) -> SpanPlan:
     """The missing ranges, and with `retry_failed` the scenes to try again. Raises as `plan_ranges`."""
-    ranges = plan_ranges(job.first_scene, job.stop_scene, job.run.range_size, committed_ranges(ledger))
+    ranges = plan_ranges(job.first_scene, job.stop_scene, job.range_size, committed_ranges(ledger))
     retries = plan_retries(ledger) if retry_failed else []
     return SpanPlan(job.scenes - ledger.committed + sum(span.count for span in retries), ranges, retries)
 
@@ -101,9 +104,12 @@ def plan_retries(ledger: Ledger) -> list[Span]:
     return spans
 
 
-def choose_shard_size(scenes: int, slots: int) -> int:
-    """Scenes in a shard: enough that Ray costs little, few enough that every slot has at least two shards."""
-    return min(MAX_SHARD, math.ceil(scenes / (2 * slots)))
+def choose_shard_size(scenes: int, slots: int, range_size: int) -> int:
+    """Scenes in a shard: enough that Ray costs little, few enough that every slot has at least two shards.
+
+    At most four ranges, so that slow scenes, which have short ranges, have short shards too.
+    """
+    return min(MAX_SHARD, MOST_RANGES * range_size, math.ceil(scenes / (2 * slots)))
 
 
 def group_shards(spans: Iterable[Span], shard_size: int) -> Iterator[tuple[Span, ...]]:

@@ -41,7 +41,7 @@ def private_ray(workers: int) -> Iterator[Slots]:
     a folder that no other user can enter, and answer those that show its token, which no file and no log holds. Raises
     MachineError where Ray does not start.
     """
-    with private_folder() as folder, _kept_private():
+    with private_folder() as folder, kept_private():
         tell(folder=str(folder.parent))  # the supervisor removes it where this process cannot
         settings = {
             "num_cpus": workers,
@@ -54,7 +54,7 @@ def private_ray(workers: int) -> Iterator[Slots]:
         }
         with contextlib.ExitStack() as stack:
             try:
-                stack.enter_context(_connection("local", **settings))
+                stack.enter_context(connection("local", **settings))
             except Exception as error:  # Ray raises plain ones, after half a minute where the machine is overloaded
                 said = next(iter(str(error).splitlines()), type(error).__name__)
                 raise MachineError(
@@ -64,7 +64,7 @@ def private_ray(workers: int) -> Iterator[Slots]:
 
 
 @contextlib.contextmanager
-def _kept_private() -> Iterator[None]:
+def kept_private() -> Iterator[None]:
     """Makes Ray's next start in this process a private one; afterwards the user's own settings count again.
 
     `ray.init` has no setting that keeps these from starting:
@@ -137,7 +137,7 @@ def cluster_ray(address: str, workers: int | None) -> Iterator[Slots]:
     _check_reachable(address)
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(_connection(address))
+            stack.enter_context(connection(address))
         except (ConnectionError, RuntimeError, ValueError, RayError) as error:
             raise MachineError(
                 f"--address {address}: {' '.join(str(error).split())}; a cluster that asks for a token needs "
@@ -153,7 +153,7 @@ def _count_cores() -> int:
 
 
 @contextlib.contextmanager
-def _connection(address: str, **settings: Any) -> Iterator[None]:
+def connection(address: str, **settings: Any) -> Iterator[None]:
     """A connection to a Ray, shut down when the block ends.
 
     Ray's messages about dead workers go where its C++ core writes (to the user, or to a supervisor, which keeps them for

@@ -1,5 +1,6 @@
 """The number of shards that run at once. On a cluster it changes as nodes come and go. Pure."""
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -57,3 +58,24 @@ class ClusterSlots(Slots):
     def now(self) -> Slots:
         """The slots that the cluster has now: at least one, also while it has no node."""
         return self.look()
+
+
+@dataclass(frozen=True)
+class SharedSlots(Slots):
+    """Slots that several jobs share evenly, as many as `jobs` tells at the moment."""
+
+    whole: Slots
+    jobs: Callable[[], int]
+
+    @classmethod
+    def of(cls, whole: Slots, jobs: Callable[[], int]) -> "SharedSlots":
+        """A share of all slots of a cluster."""
+        return cls(whole.running, whole.in_flight, whole, jobs)
+
+    def now(self) -> Slots:
+        """With other jobs an even share, rounded up, of which none waits in Ray: it would take another job's turn."""
+        whole, jobs = self.whole.now(), self.jobs()
+        if jobs <= 1:
+            return whole
+        share = math.ceil(whole.running / jobs)
+        return Slots(share, share)

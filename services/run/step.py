@@ -3,6 +3,7 @@
 import contextlib
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,16 +15,18 @@ from schemas.job.job import Job
 from services.job.record import JobRecord, adopt, encode_job, record_job, refuse_foreign
 from services.merge.dataset_card import describe_left_out, describe_sources, write_card
 from services.merge.step import MergeResult, merge
-from services.run.coordinator import Coordinator, Limits, Tally
+from services.run.coordinator import Coordinator, Limits
 from services.run.joining import join_cluster, terms_of_driver, with_own_stack
 from services.run.lock import hold_lock
 from services.run.losses import find_lost
+from services.run.metrics import Meter, serve
 from services.run.out_folder import explain_lost_folder
 from services.run.pattern import Pattern
 from services.run.progress import ProgressLine, event_log, log_event
 from services.run.range_planner import MAX_SHARD, SpanPlan, choose_shard_size, group_shards, plan_spans
 from services.run.ray_cluster import open_ray
-from services.run.slots import Slots
+from services.run.slots import SharedSlots, Slots
+from services.run.tally import Tally
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.captures.listing import open_sources
 from workers.render.step import require_tier
@@ -38,7 +41,8 @@ class RunRequest:
     """The job to run, and where.
 
     Relative asset folders are resolved from `job_folder`; `out` is a URL or an absolute path, because workers have
-    other working folders.
+    other working folders. `metrics`: HOST:PORT where Prometheus may read what the run counts.
+    `sharing` tells how many jobs share the cluster now.
     """
 
     job: Job
@@ -46,6 +50,8 @@ class RunRequest:
     out: str
     address: str | None = None
     retry_failed: bool = False
+    metrics: str | None = None
+    sharing: Callable[[], int] | None = None
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,7 @@ def describe_plan(request: RunRequest) -> list[str]:
         f"job {job.name}: {describe_scenes(job)}, seed {job.seed}",
         f"categories: {', '.join(f'{name} {weight:g}' for name, weight in sorted(job.categories.items()))}",
         *describe_sources(catalogue),
-        f"out: {request.out}, ranges of {job.run.range_size}, shards of {job.run.shard_size or f'up to {MAX_SHARD}'} scenes",
+        f"out: {request.out}, ranges of {job.range_size}, shards of {job.run.shard_size or f'up to {MAX_SHARD}'} scenes",
     ]
 
 
@@ -92,7 +98,13 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
         print(f"verso: {line}", file=sys.stderr)
     refuse_foreign(store)
     store.prepare()
-    with explain_lost_folder(store.root), hold_lock(store) as lock, event_log(store.root):
+    meter = Meter(request.job.name)
+    with (
+        explain_lost_folder(store.root),
+        hold_lock(store) as lock,
+        event_log(store.root),
+        serve(meter, request.metrics),
+    ):
         record = adopt(store, _record(request, catalogue))
         sweep(store, fenced=None)
         ledger = list_commits(store)
@@ -108,12 +120,15 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
                 with cluster or open_ray(request.address, record.job.run.workers) as slots:
                     if request.address is not None:
                         pattern = join_cluster(store, lock, pattern)
-                    made_now = _make(store, pattern, plan, slots, keeper)
+                    own = SharedSlots.of(slots, request.sharing) if request.sharing else slots
+                    made_now = _make(store, pattern, plan, own, keeper, meter)
+        meter.enter("merging")
         if store.size(JOB_FILE) is None or store.read(JOB_FILE) != encode_job(record):
             store.write_whole(JOB_FILE, encode_job(record))
         merged = merge(store, record.job.first_scene, record.job.stop_scene, lock.require_held)
         write_card(store, record, catalogue, merged)
         log_event("finished", job=record.job.name, digest=merged.digest)
+        meter.enter("done")
     return RunResult(merged, time.monotonic() - begun, made_now)
 
 
@@ -169,18 +184,19 @@ def _committed_stack(store: Store, job: Job, ledger: Ledger) -> str:
     return stacks[0] if stacks else ""
 
 
-def _make(store: Store, pattern: Pattern, plan: SpanPlan, slots: Slots, keeper: LedgerKeeper) -> int:
+def _make(store: Store, pattern: Pattern, plan: SpanPlan, slots: Slots, keeper: LedgerKeeper, meter: Meter) -> int:
     """Makes the ranges, and shows how many scenes are done. The number of scenes made."""
     job = pattern.order.job
     tally = Tally(asked=plan.scenes)
     log_event("started", job=job.name, scenes=tally.asked, slots=slots.running)
     limits = Limits(slots, job.run.max_attempts, int(job.run.max_failure_share * job.scenes))
-    shards = group_shards(plan, job.run.shard_size or choose_shard_size(tally.asked, slots.running))
+    shards = group_shards(plan, job.run.shard_size or choose_shard_size(tally.asked, slots.running, job.range_size))
     with contextlib.closing(ProgressLine(tally.asked, job.name)) as line:
 
         def follow(now: Tally) -> None:
             line.show(now.done, now.failed.total())
             keeper.add(now.take_commits())
+            meter.show(now.counts(slots.now().running))
 
         Coordinator(store, pattern, limits, tally).run(shards, follow)
     return tally.made

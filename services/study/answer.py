@@ -2,7 +2,17 @@
 
 from collections.abc import Sequence
 
-from services.study.choose import AS_CHEAP, TargetError, Targets, candidates, cheapest, choose, error_of, own_row
+from services.study.choose import (
+    AS_CHEAP,
+    TargetError,
+    Targets,
+    candidates,
+    cheapest,
+    choose,
+    describe_default_miss,
+    error_of,
+    own_row,
+)
 from services.study.model import Row, Study
 from services.study.words import amount, duration, listed, milliseconds, short, size, times
 
@@ -61,7 +71,10 @@ def recommend(study: Study, targets: Targets | None = None) -> Row:
         return choose(study.rows, targets)
     asked, bounds = default_targets(study.rows)
     seeing = [row for row in study.rows if not set(dict(row.setting.parts)) & blind_knobs(study.rows)]
-    return choose(seeing, asked, bounds)
+    try:
+        return choose(seeing, asked, bounds)
+    except TargetError:
+        raise TargetError(describe_default_miss(seeing, asked)) from None
 
 
 def default_targets(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]:

@@ -163,8 +163,25 @@ def close_calls(
 
 def describe_miss(rows: Sequence[Row], targets: Targets) -> str:
     """The nearest setting, by how much it misses the targets, and which targets it would meet."""
+    missed, loosened = _describe_nearest(rows, targets)
+    asked = ", ".join(f"{name}={target:g}" for name, target in targets.items())
+    remedy = f". Loosen to at least {_as_option(loosened)}" if loosened else ""
+    return f"no setting meets {asked}. {missed}{remedy}"
+
+
+def describe_default_miss(rows: Sequence[Row], targets: Targets) -> str:
+    """As `describe_miss`, for targets that nobody asked for: with the option that sets others."""
+    missed, loosened = _describe_nearest(rows, targets)
+    asked = {name: f"{target:g}" for name, target in targets.items()}
+    return (
+        f"no setting meets the default targets. {missed}. Set others with --target {_as_option({**asked, **loosened})}"
+    )
+
+
+def _describe_nearest(rows: Sequence[Row], targets: Targets) -> tuple[str, dict[str, str]]:
+    """(a sentence on the nearest setting and what it misses; by error the targets that it would meet, of those missed)."""
     nearest = nearest_row(rows, targets)
-    told, loosened = [], []
+    told, loosened = [], {}
     for name, target in targets.items():
         found = error_of(nearest, name, rows)
         if found is None:
@@ -174,13 +191,17 @@ def describe_miss(rows: Sequence[Row], targets: Targets) -> str:
             ratio = f" ({times(found.value / target)})" if target > 0 else ""
             told.append(f"{name}, {amount(name, found.value)} is {over}{ratio}")
             above = Context(prec=2, rounding=ROUND_CEILING).create_decimal(repr(found.value))  # so that it is met
-            loosened.append(f"{name}={above:f}")
-    asked = ", ".join(f"{name}={target:g}" for name, target in targets.items())
-    remedy = f". Loosen to at least {','.join(loosened)}" if loosened else ""
+            loosened[name] = f"{above:f}"
+    missed = listed(told) or "none of them, and is worse than the job in another error"
     return (
-        f"no setting meets {asked}. The nearest is {nearest.setting.name}, at {times(nearest.ratio)} the job's time: it "
-        f"misses {listed(told)}{remedy}"
+        f"The nearest is {nearest.setting.name}, at {times(nearest.ratio)} the job's time: it misses {missed}",
+        loosened,
     )
+
+
+def _as_option(targets: Mapping[str, str]) -> str:
+    """As `--target` takes them: "depth_mm=0.1,pose_mm=0.2"."""
+    return ",".join(f"{name}={most}" for name, most in targets.items())
 
 
 def nearest_row(rows: Sequence[Row], targets: Targets) -> Row:

@@ -1,14 +1,14 @@
 """A round of the study: settings that are measured side by side, the units of work, and the resulting table."""
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from services.study.errors import ERRORS
 from services.study.journal import Journal
 from services.study.knobs import groups_of
 from services.study.measure.statistics import image_figures, settling_figures
-from services.study.measure.timing import Cost, cost_of, job_cost
+from services.study.measure.timing import timed_rows
 from services.study.model import Figure, Group, Plan, Row, Setting
 
 
@@ -75,26 +75,18 @@ class Round:
 
     def rows(self, journal: Journal) -> tuple[Row, ...]:
         """The round's table, from the answers in the journal; settings without a time are left out."""
-        own = self.settings[0].name
         laps: list[dict[int, dict[str, Any]]] = [{} for _ in range(self.plan.sizes.laps)]
         for unit in self.timings():
             laps[unit.lap][unit.scene_id] = journal[unit.name]
-        own_ms, own_kb = job_cost(laps, own)
-        costs = [(setting, cost_of(setting.name, own, laps)) for setting in self.settings]
-        return tuple(self._row(journal, one, cost, own_ms, own_kb) for one, cost in costs if cost is not None)
+        return tuple(self._with_errors(journal, row, scenes) for row, scenes in timed_rows(self.settings, laps))
 
-    def _row(self, journal: Journal, setting: Setting, cost: Cost, own_ms: float, own_kb: float) -> Row:
-        errors = self._errors(journal, setting.name)
-        return Row(
-            setting=setting,
-            ms=own_ms * cost.ratio.median,
-            ratio=cost.ratio.median,
-            ratio_least=cost.ratio.least,
-            ratio_most=cost.ratio.most,
-            kilobytes=own_kb if cost.kilobytes is None else cost.kilobytes,
+    def _with_errors(self, journal: Journal, row: Row, scenes: int) -> Row:
+        errors = self._errors(journal, row.setting.name)
+        return replace(
+            row,
             errors=errors,
             failed_share=errors["failed_share"].value if "failed_share" in errors else 0.0,
-            notes=() if cost.scenes >= self.plan.sizes.timed else (f"timed in {cost.scenes} scenes",),
+            notes=() if scenes >= self.plan.sizes.timed else (f"timed in {scenes} scenes",),
         )
 
     def _errors(self, journal: Journal, name: str) -> dict[str, Figure]:

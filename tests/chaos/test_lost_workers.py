@@ -16,10 +16,11 @@ from schemas.errors import RunError
 from services.job.read import validate_job
 from services.merge.step import merge
 from services.run import coordinator as module
-from services.run.coordinator import Coordinator, Limits, Tally
+from services.run.coordinator import Coordinator, Limits
 from services.run.pattern import Pattern
 from services.run.range_planner import committed_ranges, plan_ranges
 from services.run.slots import Slots
+from services.run.tally import Tally
 from services.run.worker_terms import WorkerTerms
 from tests.bucket_faults import REQUESTS, requests
 from tests.disk_faults import unflushed

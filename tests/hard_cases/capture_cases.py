@@ -25,6 +25,7 @@ from tests.workers.capture.poses.scenes import errors
 from tests.workers.pipeline.captures.folders import draw_view
 from workers.capture.board.layout import marker_corners
 from workers.geometry.camera import look_at, orbit_pose
+from workers.pipeline.captures.corrections import given_files
 from workers.pipeline.captures.estimate import estimate_poses
 from workers.store.capture_folder import CaptureFile, open_folder, write_description, write_view
 
@@ -60,7 +61,7 @@ def run(case: CaptureCase, path: Path) -> tuple[float | None, str, str]:
         write_view(path, view if case.change is None else case.change(view, T))
     if case.spoil is not None:
         case.spoil(path)
-    estimates = estimate_poses(open_folder(path), Estimation())
+    estimates = estimate_poses(given_files(open_folder(path)), Estimation())
     for estimate in estimates.by_name.values():
         assert_finite(estimate)
     views = estimates.estimate.views

@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Array, Pose, frozen_array
+from schemas.base import Pose, frozen_array
 from schemas.capture.estimate import DepthCorrection
 from schemas.capture.view import CaptureCamera, CapturedView
 from schemas.errors import CaptureError
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.camera import Camera
+from workers.capture.poses.rays import opencv_matrix
 from workers.geometry.jit import compiled
 
 Depth = NDArray[np.float32]
@@ -58,11 +59,6 @@ def correct_depth(stored: NDArray[np.uint16], metres: float, scale: float, offse
             if stored[row, column] > 0:
                 depth[row, column] = max(stored[row, column] * metres * scale + offset_m, 0.0)
     return depth
-
-
-def opencv_matrix(k: Intrinsics) -> Array:
-    """[3, 3] float64: the camera matrix where pixel centres lie on integers."""
-    return np.array([[k.fx, 0.0, k.cx_opencv], [0.0, k.fy, k.cy_opencv], [0.0, 0.0, 1.0]])
 
 
 def lens_map(camera: CaptureCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -25,7 +25,7 @@ from schemas.capture.view import CaptureCamera, CapturedView
 from schemas.errors import CaptureError
 from schemas.job.captures import Board, BoardFrame
 from schemas.scene.camera import Intrinsics
-from workers.store.images import encode_png
+from workers.store.images import encode_mask, encode_png
 
 CAMERA_FILE, BOARD_FILE, CAPTURE_FILE, TRUTH = "camera.json", "board.json", "capture.json", "truth"
 Model = TypeVar("Model", bound=Frozen)
@@ -128,7 +128,7 @@ def write_view(path: Path, view: CapturedView) -> None:
     if view.depth is not None:
         (path / f"depth_{view.number:05d}.png").write_bytes(encode_png(view.depth))
     if view.mask is not None:
-        (path / f"mask_{view.number:05d}.png").write_bytes(encode_png(view.mask.astype(np.uint8) * 255))
+        (path / f"mask_{view.number:05d}.png").write_bytes(encode_mask(view.mask))
 
 
 def write_description(path: Path, about: CaptureFile, camera: CaptureCamera, board: Board) -> None:

@@ -94,7 +94,8 @@ def mesh_ply(vertices: Array, faces: NDArray[np.int32], colors: NDArray[np.uint8
 def read_cloud(path: Path) -> tuple[Array, Array, NDArray[np.uint8], NDArray[np.int32]]:
     """(points, normals, colours, views) of cloud.ply. Raises CaptureError where it is not there or another's."""
     body = _body(path / CLOUD_FILE)
-    rows = _rows(path / CLOUD_FILE, body, _CLOUD, *_counts(path / CLOUD_FILE, body))
+    start, points, _ = _counts(path / CLOUD_FILE, body)
+    rows = _rows(path / CLOUD_FILE, body, _CLOUD, start, points)
     return _take(rows, "x", "y", "z"), _take(rows, "nx", "ny", "nz"), _colors(rows), rows["views"].astype(np.int32)
 
 
@@ -103,8 +104,8 @@ def read_mesh(path: Path) -> tuple[Array, NDArray[np.int32], NDArray[np.uint8]]:
     file = path / MESH_FILE
     body = _body(file)
     start, vertices, faces = _counts(file, body)
-    rows = _rows(file, body, _VERTEX, start, vertices, faces)
-    triangles = _rows(file, body, _FACE, start + vertices * _VERTEX.itemsize, faces, 0)
+    rows = _rows(file, body, _VERTEX, start, vertices)
+    triangles = _rows(file, body, _FACE, start + vertices * _VERTEX.itemsize, faces)
     return _take(rows, "x", "y", "z"), _take(triangles, "a", "b", "c").astype(np.int32), _colors(rows)
 
 
@@ -147,7 +148,7 @@ def _counts(file: Path, body: bytes) -> tuple[int, int, int]:
     return end + len(b"end_header\n"), counts["vertex"], counts.get("face", 0)
 
 
-def _rows(file: Path, body: bytes, kind: np.dtype, start: int, count: int, _: int) -> NDArray:
+def _rows(file: Path, body: bytes, kind: np.dtype, start: int, count: int) -> NDArray:
     if len(body) < start + count * kind.itemsize:
         raise CaptureError("unreadable", f"{file} ends early: delete it, and process the capture again")
     return np.frombuffer(body, kind, count, start)

@@ -19,7 +19,7 @@ from schemas.capture.view import CaptureTruth
 from schemas.errors import CaptureError
 from schemas.job.sensor import Distortion
 from workers.store.capture_folder import TRUTH
-from workers.store.images import encode_png
+from workers.store.images import encode_mask
 
 TRUTH_FILE, MESH_FILE, HELD_OUT = "truth.json", "mesh.glb", "held_out"
 
@@ -58,7 +58,7 @@ def write_true_mask(path: Path, number: int, mask: NDArray[np.bool_]) -> None:
     """Writes the object's true pixels [H, W] of one view."""
     folder = path / TRUTH
     folder.mkdir(exist_ok=True)
-    (folder / f"mask_{number:05d}.png").write_bytes(encode_png(mask.astype(np.uint8) * 255))
+    (folder / f"mask_{number:05d}.png").write_bytes(encode_mask(mask))
 
 
 def read_truth(path: Path) -> CaptureTruth | None:

@@ -11,7 +11,8 @@ from schemas.capture.processed import CaptureScore, ProcessedCapture
 from schemas.errors import CaptureError
 from services.study.measure.settling import context_for
 from services.study.model import Setting
-from workers.pipeline.captures.make_capture import choose_views, require_captures
+from workers.geometry.spread import spread_evenly
+from workers.pipeline.captures.make_capture import require_captures
 from workers.pipeline.captures.process_capture import process_capture
 from workers.pipeline.captures.processor_clock import ProcessorClock
 from workers.pipeline.context import WorkerContext
@@ -32,6 +33,11 @@ ERRORS_OF_SCORE = {
 """Names of the study's errors, and of the score's figures."""
 
 
+def warm_up(context: WorkerContext, setting: Setting, path: Path) -> None:
+    """Process a capture untimed: the first processing in a process compiles its loops. Raises CaptureError."""
+    process_capture(open_folder(path), require_captures(context_for(context, setting).job), ProcessorClock())
+
+
 def measure_capture(
     context: WorkerContext, settings: Sequence[Setting], path: Path, unit: tuple[int, int]
 ) -> dict[str, Any]:
@@ -42,10 +48,6 @@ def measure_capture(
     """
     answer: dict[str, Any] = {"whole": {}, "settling": {}, "bytes": {}, "errors": {}, "failed": {}}
     whole = open_folder(path)
-    first = settings[0]
-    process_capture(
-        whole, require_captures(context_for(context, first).job), ProcessorClock()
-    )  # compiles, and fills the disk's cache
     for setting in [settings[n] for n in np.random.default_rng(unit).permutation(len(settings))]:
         captures = require_captures(context_for(context, setting).job)
         folder = fewer_views(whole, captures.simulate.views)
@@ -57,13 +59,13 @@ def measure_capture(
             answer["bytes"][setting.name] = _bytes(done)
         except CaptureError as error:
             answer["failed"][setting.name] = str(error)
-    answer["cold"] = answer["whole"].get(first.name, 0.0)
+    answer["cold"] = answer["whole"].get(settings[0].name, 0.0)
     return answer
 
 
 def fewer_views(folder: CaptureFolder, views: int) -> CaptureFolder:
     """The same capture with some of its views only, evenly over the path."""
-    return replace(folder, numbers=tuple(choose_views(list(folder.numbers), views)))
+    return replace(folder, numbers=tuple(folder.numbers[place] for place in spread_evenly(len(folder.numbers), views)))
 
 
 def errors_of(score: CaptureScore) -> dict[str, float]:

@@ -2,15 +2,16 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from schemas.errors import InputError
 from services.bench.machine import pinned
 from services.run.progress import ProgressLine
-from services.study.captures.measure import measure_capture
+from services.study.captures.measure import measure_capture, warm_up
 from services.study.journal import Journal
 from services.study.measure.statistics import image_figures
-from services.study.measure.timing import cost_of, job_cost
+from services.study.measure.timing import timed_rows
 from services.study.model import Plan, Row
 from workers.pipeline.captures.make_capture import simulate_one
 from workers.pipeline.context import WorkerContext
@@ -41,16 +42,19 @@ def run_capture_study(plan: Plan, journal: Journal, context: WorkerContext, prog
         f"captures/{scene}/{lap}": (scene, lap)
         for scene, lap in itertools.product(range(first, first + sizes.scenes), range(sizes.laps))
     }
+    missing: dict[int, list[str]] = {}
+    for name, (scene, _) in units.items():
+        if name not in journal:
+            missing.setdefault(scene, []).append(name)
     progress.expect(len(units))
     with pinned():
-        for scene in range(first, first + sizes.scenes):
-            missing = [name for name, (of, _) in units.items() if of == scene and name not in journal]
-            if not missing:
-                continue
+        for number, (scene, names) in enumerate(missing.items()):
             with temporary_folder("study") as scratch:
                 path = scratch / "capture"
                 simulate_one(context, scene, path)
-                for name in missing:
+                if number == 0:
+                    warm_up(context, plan.settings[0], path)
+                for name in names:
                     journal.add(name, measure_capture(context, plan.settings, path, units[name]))
                     progress.show(sum(unit in journal for unit in units))
     laps: list[dict[int, dict[str, Any]]] = [{} for _ in range(sizes.laps)]
@@ -61,24 +65,14 @@ def run_capture_study(plan: Plan, journal: Journal, context: WorkerContext, prog
 
 def rows_of(plan: Plan, laps: Sequence[Mapping[int, dict[str, Any]]]) -> tuple[Row, ...]:
     """The table, from the answers by lap and capture; settings that no capture could be processed with are left out."""
-    own = plan.settings[0].name
-    own_ms, own_kb = job_cost(laps, own)
-    rows = []
-    for setting in plan.settings:
-        cost = cost_of(setting.name, own, laps)
-        if cost is None:
-            continue
-        answers = list(laps[0].values())
-        failed = [str(one["failed"][setting.name]) for one in answers if setting.name in one["failed"]]
+    answers, rows = list(laps[0].values()), []
+    for row, _ in timed_rows(plan.settings, laps):
+        name = row.setting.name
+        failed = [str(one["failed"][name]) for one in answers if name in one["failed"]]
         rows.append(
-            Row(
-                setting=setting,
-                ms=own_ms * cost.ratio.median,
-                ratio=cost.ratio.median,
-                ratio_least=cost.ratio.least,
-                ratio_most=cost.ratio.most,
-                kilobytes=own_kb if cost.kilobytes is None else cost.kilobytes,
-                errors=image_figures([one["errors"][setting.name] for one in answers if setting.name in one["errors"]]),
+            replace(
+                row,
+                errors=image_figures([one["errors"][name] for one in answers if name in one["errors"]]),
                 failed_share=len(failed) / len(answers),
                 notes=tuple(dict.fromkeys(failed)),
             )

@@ -1,7 +1,7 @@
 """Processor time of a scene with each setting, in turn within a round, on one core."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from statistics import fmean, median
@@ -12,7 +12,7 @@ import numpy as np
 from schemas.errors import SceneError
 from services.bench.ratios import Spread
 from services.study.measure.settling import context_for
-from services.study.model import Setting
+from services.study.model import Row, Setting
 from workers.physics.step import settle_scene
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.run_shard import run_scene
@@ -90,6 +90,27 @@ def _own_s(lap: Mapping[int, Answer], first: Mapping[int, Answer], scene: int, o
     """Seconds of the job's own scene in this round, plus the cost of new shapes, which is measured once."""
     new = max(0.0, first[scene]["cold"] - first[scene]["whole"].get(own, first[scene]["cold"]))
     return float(lap[scene]["whole"][own]) + new
+
+
+def timed_rows(settings: Sequence[Setting], laps: Sequence[Mapping[int, Answer]]) -> Iterator[tuple[Row, int]]:
+    """(row without errors, scenes timed) of each setting that has a time; the first setting is the job itself."""
+    own = settings[0].name
+    own_ms, own_kb = job_cost(laps, own)
+    for setting in settings:
+        cost = cost_of(setting.name, own, laps)
+        if cost is None:
+            continue
+        row = Row(
+            setting=setting,
+            ms=own_ms * cost.ratio.median,
+            ratio=cost.ratio.median,
+            ratio_least=cost.ratio.least,
+            ratio_most=cost.ratio.most,
+            kilobytes=own_kb if cost.kilobytes is None else cost.kilobytes,
+            errors={},
+            failed_share=0.0,
+        )
+        yield row, cost.scenes
 
 
 def cost_of(name: str, own: str, laps: Sequence[Mapping[int, Answer]]) -> Cost | None:

@@ -22,6 +22,8 @@ from services.cli.parser import build_parser
         (["run", "j", "--address", "localhost:²"], "HOST:PORT"),
         (["run", "j", "--address", "a\0b:6379"], "HOST:PORT"),
         (["run", "j", "--address", "nonsense"], "HOST:PORT"),
+        (["run", "j", "--metrics", "9464"], "HOST:PORT"),
+        (["run", "j", "--metrics", "auto"], "HOST:PORT"),
         (["\x1b[31m" * 10_000], "\\x1b[31m"),
     ],
 )

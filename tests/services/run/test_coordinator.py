@@ -11,9 +11,10 @@ from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.shard import ShardOrder, ShardReport, SpanReport
 from services.job.read import validate_job
 from services.run import coordinator as module
-from services.run.coordinator import Coordinator, Limits, Tally
+from services.run.coordinator import Coordinator, Limits
 from services.run.pattern import Pattern
 from services.run.slots import ClusterSlots, Slots
+from services.run.tally import Tally
 from services.run.worker_terms import WorkerTerms
 from workers.assets.catalogue import Catalogue
 from workers.store.local import LocalStore
@@ -60,7 +61,7 @@ def handed_out(monkeypatch, tmp_path):
             return name
 
     monkeypatch.setattr(module.ray, "put", lambda value: "catalogue")
-    monkeypatch.setattr(module, "_shard_task", lambda env_vars: Task)
+    monkeypatch.setattr(module.ray, "remote", lambda **options: lambda enter: Task)
     order = ShardOrder.of(str(tmp_path), validate_job({"name": "drained", "scenes": 8}, "test"), "j" * 64)
     pattern = Pattern(order, cast(Catalogue, None), WorkerTerms((), "", ""))
     slots = [1]

@@ -120,7 +120,7 @@ def test_a_plan_of_a_thousand_million_scenes_is_made_on_demand():
     job = Job.model_validate({"name": "large", "scenes": 10**9})
     plan = plan_spans(job, Ledger(join_rows([rows_of([summary(16 * 40_000_000 - 16, stop=16 * 40_000_000)])])), False)
     assert plan.scenes == 10**9 - 16
-    shards = group_shards(plan, choose_shard_size(plan.scenes, 2))
+    shards = group_shards(plan, choose_shard_size(plan.scenes, 2, 16))
     assert [span.start for span in next(shards)] == [0, 16, 32, 48]
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -161,6 +161,7 @@ def test_a_shard_is_whole_ranges_in_order(size, grouped):
 
 
 def test_every_slot_has_two_shards_and_none_is_too_large():
-    assert choose_shard_size(24, 2) == 6
-    assert choose_shard_size(1, 2) == 1
-    assert choose_shard_size(10**6, 2) == 64
+    assert choose_shard_size(24, 2, 16) == 6
+    assert choose_shard_size(1, 2, 16) == 1
+    assert choose_shard_size(10**6, 2, 16) == 64
+    assert choose_shard_size(10**6, 2, 1) == 4

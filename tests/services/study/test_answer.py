@@ -4,7 +4,7 @@ import pytest
 
 from schemas.errors import InputError
 from services.study.answer import answer, blind_knobs, next_better, recommend
-from services.study.choose import TargetError
+from services.study.choose import TargetError, parse_targets
 from tests.made_up_studies import large_study, row, study
 
 OWN = row(penetration_mm=0.01, gap_mm=0.0, mask_share=0.0002, depth_mm=0.1, flip=0.1)
@@ -55,6 +55,36 @@ def test_targets_that_nobody_meets_are_told_with_the_nearest():
     assert told.endswith("Loosen to at least depth_mm=0.1.")
     with pytest.raises(TargetError):
         recommend(study(OWN), {"depth_mm": 0.05})
+
+
+@pytest.mark.parametrize(
+    ("own", "missed", "option"),
+    [
+        (
+            {"camera_mm": 0.2, "view_depth_mm": 1.58},
+            "view_depth_mm, 1.58 mm is 0.08 mm more than 1.5 mm",
+            "camera_mm=0.5,",
+        ),
+        ({"depth_mm": 0.5, "mask_share": 0.0}, "depth_mm, 0.5 mm is 0.4 mm more than 0.1 mm", "depth_mm=0.5,"),
+    ],
+)
+def test_default_targets_that_nobody_meets_are_told_in_a_line_with_the_option_that_sets_others(own, missed, option):
+    made = study(row(**own))
+    with pytest.raises(TargetError) as caught:
+        recommend(made)
+    told = str(caught.value)
+    assert told.startswith("no setting meets the default targets. The nearest is the job,") and "\n" not in told
+    assert f"it misses {missed}" in told and f"Set others with --target {option}" in told
+    assert caught.value.exit_code == 1 and answer(made).endswith(f"is met by nothing that was measured: {told}.")
+    assert recommend(made, parse_targets(told.rpartition("--target ")[2])) is made.rows[0]
+
+
+def test_a_setting_that_meets_the_defaults_and_makes_something_else_worse_is_told():
+    made = study(row(depth_mm=0.5, flip=0.1), row("tier=flat", 0.5, depth_mm=0.05, flip=0.9))
+    with pytest.raises(
+        TargetError, match=r"The nearest is tier=flat.* it misses none of them, and is worse than the job"
+    ):
+        recommend(made)
 
 
 def test_an_unknown_target_is_no_sentence():

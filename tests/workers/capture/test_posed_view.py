@@ -8,7 +8,8 @@ from schemas.capture.estimate import DepthCorrection
 from schemas.capture.view import CaptureCamera, CapturedView
 from schemas.errors import CaptureError
 from schemas.scene.camera import Intrinsics
-from workers.capture.posed_view import correct_depth, distort_mask, opencv_matrix, pose_view
+from workers.capture.posed_view import correct_depth, distort_mask, pose_view
+from workers.capture.poses.rays import opencv_matrix
 
 K = Intrinsics(width=240, height=180, fx=200.0, fy=205.0, cx=121.3, cy=88.7)
 LENS = np.array([0.12, -0.2, 0.002, -0.003, 0.05, 0.0, 0.0, 0.0])

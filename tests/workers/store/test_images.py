@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from schemas.errors import CorruptError
-from workers.store.images import decode_png, encode_png
+from workers.store.images import decode_png, encode_mask, encode_png
 
 SIDES = st.integers(1, 9)
 
@@ -26,6 +26,13 @@ def test_every_level_gives_back_the_pixels_and_their_type(pixels, level):
     decoded = decode_png(encode_png(pixels, level))
     assert decoded.dtype == pixels.dtype
     np.testing.assert_array_equal(decoded, pixels)
+
+
+@given(hnp.arrays(np.bool_, st.tuples(SIDES, SIDES)))
+def test_a_mask_is_white_where_it_is_true_and_black_elsewhere(mask):
+    decoded = decode_png(encode_mask(mask))
+    assert decoded.dtype == np.uint8
+    np.testing.assert_array_equal(decoded, np.where(mask, 255, 0))
 
 
 @given(image_arrays())

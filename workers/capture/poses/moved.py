@@ -10,6 +10,7 @@ from schemas.base import Array
 from workers.capture.poses.matches import MIN_COSINE, placed
 from workers.capture.poses.observation import Patches
 from workers.capture.poses.shared import Shared
+from workers.geometry.spread import spread_evenly
 
 REACH_M = 0.05
 """Movements up to this are seen."""
@@ -44,8 +45,8 @@ def moved_after(patches: Patches, view: NDArray[np.int64], poses: Array, shared:
 
     Of all cuts of the sequence, the one across which a common shift of the object explains most.
     """
-    index = np.arange(len(patches))
-    chosen = np.concatenate([_evenly(index[view == number]) for number in range(len(poses))])
+    of_view = [np.flatnonzero(view == number) for number in range(len(poses))]
+    chosen = np.concatenate([own[spread_evenly(len(own), PER_VIEW)] for own in of_view])
     points, normals = (values[chosen] for values in placed(patches, view, poses, shared))
     pairs = _pairs(points, normals, view[chosen], len(poses))
     best: tuple[int, float] | None = None
@@ -58,12 +59,6 @@ def moved_after(patches: Patches, view: NDArray[np.int64], poses: Array, shared:
         if explained > most:
             best, most = (cut, float(np.linalg.norm(shift))), explained
     return best if best is not None and best[1] > MOVED_M else None
-
-
-def _evenly(index: NDArray[np.intp]) -> NDArray[np.intp]:
-    if len(index) <= PER_VIEW:
-        return index
-    return index[np.linspace(0, len(index) - 1, PER_VIEW).round().astype(np.int64)]
 
 
 def _pairs(points: Array, normals: Array, view: NDArray[np.int64], views: int) -> _Pairs:

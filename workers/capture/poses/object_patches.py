@@ -10,6 +10,7 @@ from workers.capture.poses.observation import Patches, Setup
 from workers.capture.poses.patches import sample_patches
 from workers.capture.poses.rays import pixels_of_points, rays_of_pixels
 from workers.geometry.frames import transform
+from workers.geometry.spread import spread_evenly
 
 SIDE_RAD = 0.012
 """Width of a patch, seen from the camera: 10 mm at 0.8 m."""
@@ -45,8 +46,7 @@ def object_patches(depth: NDArray[np.uint16], T_board_cam: Pose, on_board: Patch
     offsets = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
     found = sample_patches(depth, blocks[:, None] + offsets, camera)
     keep = np.flatnonzero(_is_surface(found, normal, distance, setup.spec) & _over_board(found, T_board_cam, board))
-    if len(keep) > MOST:
-        keep = keep[np.linspace(0, len(keep) - 1, MOST).round().astype(np.int64)]
+    keep = keep[spread_evenly(len(keep), MOST)]
     return Patches(found.ray_z[keep], found.ray[keep], found.normal[keep], found.pixels[keep], found.sigma_m[keep])
 
 

@@ -5,6 +5,7 @@ import numpy as np
 
 from schemas.base import Array, Pose
 from schemas.capture.view import CaptureCamera
+from schemas.scene.camera import Intrinsics
 from workers.geometry.frames import invert
 
 ROUND_TRIP_PX = 0.05
@@ -12,9 +13,8 @@ ROUND_TRIP_PX = 0.05
 ITERATIONS = 60
 
 
-def camera_matrix(camera: CaptureCamera) -> Array:
-    """[3, 3] float64 as OpenCV has it: the first pixel's centre at 0."""
-    k = camera.intrinsics
+def opencv_matrix(k: Intrinsics) -> Array:
+    """[3, 3] float64: the camera matrix as OpenCV has it, the first pixel's centre at 0."""
     return np.array([[k.fx, 0.0, k.cx_opencv], [0.0, k.fy, k.cy_opencv], [0.0, 0.0, 1.0]])
 
 
@@ -25,7 +25,7 @@ def rays_of_pixels(pixels: Array, camera: CaptureCamera) -> Array:
     if not camera.has_lens or not len(rays):
         return rays
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, 1e-10)
-    found = cv2.undistortPoints((pixels - 0.5).reshape(-1, 1, 2), camera_matrix(camera), camera.lens, criteria=stop)
+    found = cv2.undistortPoints((pixels - 0.5).reshape(-1, 1, 2), opencv_matrix(k), camera.lens, criteria=stop)
     rays = found.reshape(-1, 2).astype(np.float64)
     back = _distorted(np.column_stack([rays, np.ones(len(rays))]), camera)
     with np.errstate(invalid="ignore"):
@@ -46,7 +46,7 @@ def pixels_of_points(points_board: Array, T_board_cam: Pose, camera: CaptureCame
 def _distorted(points_cam: Array, camera: CaptureCamera) -> Array:
     if not len(points_cam):
         return np.zeros((0, 2))
-    zero = np.zeros(3)
-    found, _ = cv2.projectPoints(points_cam.reshape(-1, 1, 3), zero, zero, camera_matrix(camera), camera.lens)
+    zero, matrix = np.zeros(3), opencv_matrix(camera.intrinsics)
+    found, _ = cv2.projectPoints(points_cam.reshape(-1, 1, 3), zero, zero, matrix, camera.lens)
     pixels: Array = found.reshape(-1, 2).astype(np.float64) + 0.5
     return pixels

@@ -44,10 +44,8 @@ def given_files(folder: CaptureFolder) -> Given:
 
 def board_poses(given: Given, estimates: Estimates) -> dict[int, Pose]:
     """T_board_cam of `board_` files by view: the user's, else that of the markers, else of the chosen estimate."""
-    poses: dict[int, Pose] = {}
-    markers = estimates.by_name.get("markers")
-    for estimate in (estimates.estimate, *(() if markers is None else (markers,))):
-        poses |= {view.number: view.T_board_cam for view in estimate.views if view.T_board_cam is not None}
+    views = (*estimates.estimate.views, *estimates.by_markers.values())
+    poses: dict[int, Pose] = {view.number: view.T_board_cam for view in views if view.T_board_cam is not None}
     for number in given.folder.numbers:
         if (T := given.pose("board", number)) is not None:
             poses[number] = T

@@ -1,16 +1,12 @@
 """The poses of a capture: images are read one view at a time, and what is found in them goes to the three estimates."""
 
 import dataclasses
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable
 
 from schemas.capture.estimate import CaptureEstimate, Estimates
 from schemas.capture.view import Detection
 from schemas.errors import CaptureError
 from schemas.job.captures import ESTIMATES, Estimate, Estimation
-from workers.capture.board.frames import correction_in_board, in_board
 from workers.capture.board.layout import open_dictionary
 from workers.capture.detect import detect_markers, other_dictionaries
 from workers.capture.poses.article import estimate_article
@@ -20,24 +16,9 @@ from workers.capture.poses.from_markers import estimate_markers
 from workers.capture.poses.markers import MarkerPose
 from workers.capture.poses.observation import Observation, Setup
 from workers.capture.poses.observe import observe_view
+from workers.pipeline.captures.corrections import Given
+from workers.pipeline.captures.processor_clock import ProcessorClock
 from workers.store.capture_folder import CaptureFolder, read_view
-from workers.store.pose_files import read_given_pose
-
-
-@dataclass
-class _Clock:
-    """Seconds of processor time by stage."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        begun = time.process_time()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.process_time() - begun
-
 
 FEW_MARKERS = 4
 """Where no view has as many, other markers than the board's may have been found by chance."""
@@ -48,28 +29,30 @@ MAKE: dict[Estimate, Callable[[Evidence], CaptureEstimate]] = {
 }
 
 
-def estimate_poses(folder: CaptureFolder, spec: Estimation) -> Estimates:
-    """The estimate that is asked for and, with `compare`, the other two.
+def estimate_poses(given: Given, spec: Estimation) -> Estimates:
+    """The estimate that is asked for and, with `compare`, the other two, of a folder and what the user gave in it.
 
     Raises CaptureError where a file cannot be read or the estimate that is asked for has no usable view.
     """
-    clock = _Clock()
-    detections, evidence = _observe(folder, spec, clock)
+    folder, clock = given.folder, ProcessorClock()
+    detections, evidence = _observe(given, spec, clock)
     if not any(len(found.ids) for found in detections) and not _any_given(evidence):
         raise CaptureError("markers", _no_markers(folder))
     by_name: dict[Estimate, CaptureEstimate] = {}
     for name in ESTIMATES if spec.compare else (spec.estimate,):
-        begun = time.process_time()
-        made = MAKE[name](evidence)
-        by_name[name] = dataclasses.replace(made, seconds={name: time.process_time() - begun})
+        own = ProcessorClock()
+        with own.stage(name):
+            made = MAKE[name](evidence)
+        by_name[name] = dataclasses.replace(made, seconds=own.seconds)
     estimates = Estimates(spec.estimate, by_name, tuple(detections), clock.seconds)
     if not estimates.estimate.used:
         raise CaptureError("poses", _no_pose(estimates.estimate, folder))
     return estimates
 
 
-def _observe(folder: CaptureFolder, spec: Estimation, clock: _Clock) -> tuple[list[Detection], Evidence]:
+def _observe(given: Given, spec: Estimation, clock: ProcessorClock) -> tuple[list[Detection], Evidence]:
     """What is found in each view, in order of number; no two views' images are held at once."""
+    folder = given.folder
     setup = Setup(folder.camera, folder.board, spec)
     dictionary = open_dictionary(folder.board, folder.path)
     detections, observations, poses = [], [], []
@@ -80,27 +63,25 @@ def _observe(folder: CaptureFolder, spec: Estimation, clock: _Clock) -> tuple[li
             detection = detect_markers(view.rgb, folder.board, dictionary, number)
         with clock.stage("sample"):
             observation, found = observe_view(detection, view.depth, setup)
-        observation = _with_given_pose(observation, found, folder)
+        observation = _with_given_pose(observation, found, given)
         detections.append(detection)
         observations.append(observation)
         poses.append(found)
     return detections, Evidence.of(setup, observations, poses)
 
 
-def _with_given_pose(seen: Observation, found: MarkerPose, folder: CaptureFolder) -> Observation:
+def _with_given_pose(seen: Observation, found: MarkerPose, given: Given) -> Observation:
     """The view with the pose that others gave it: correction · board, or the board pose of a view without markers."""
-    given = read_given_pose(folder.path, seen.number)
-    board, frame = folder.board, folder.about.frame
-    T = None if given.board is None else in_board(given.board, board, frame)
+    T, correction = (given.pose(prefix, seen.number) for prefix in ("board", "correction"))
     name = f"board_{seen.number:05d}.txt"
-    if given.correction is not None:
+    if correction is not None:
         name = f"correction_{seen.number:05d}.txt"
         T = found.fit.T_board_cam if T is None and found.fit is not None else T
         if T is None:
             raise CaptureError(
-                "correction", f"{folder.path / name} corrects nothing: the view has no markers and no board_"
+                "correction", f"{given.folder.path / name} corrects nothing: the view has no markers and no board_"
             )
-        T = correction_in_board(given.correction, board, frame) @ T
+        T = correction @ T
     elif found.fit is not None or T is None:
         return seen
     return dataclasses.replace(seen, manual_T_board_cam=T, given_by=f"the pose of {name} is kept as it was given")

@@ -5,8 +5,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from schemas.capture.processed import ProcessedCapture
 from schemas.errors import CaptureError, ViewError
 from schemas.job.captures import Captures
@@ -14,15 +12,14 @@ from schemas.job.job import Job
 from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import SceneOutput
 from workers.assets.captured import CaptureNames, board_asset, reconstructed_asset
-from workers.assets.step import choose_object, load_asset
+from workers.geometry.spread import spread_evenly
 from workers.pipeline.captures.capture_pair import CapturedObject, CapturedPair, make_capture_pair
 from workers.pipeline.captures.process_capture import process_capture
 from workers.pipeline.captures.rows import LeftOut, Origin, record_capture
-from workers.pipeline.captures.simulate import simulate_capture
+from workers.pipeline.captures.simulate import load_object, simulate_capture
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.stopwatch import Stopwatch
-from workers.plan.randomness import SceneChance, Stream
-from workers.plan.step import choose_category
+from workers.plan.randomness import SceneChance
 from workers.store.capture_folder import open_folder
 from workers.store.capture_inputs import digest_inputs
 from workers.store.capture_truth import read_receipt, read_truth
@@ -85,9 +82,9 @@ def open_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Ite
 def simulate_one(context: WorkerContext, scene_id: int, path: Path) -> str:
     """Simulates a capture of the job into an empty folder; the instance id of its object."""
     captures, chance = require_captures(context.job), SceneChance(context.job.seed, scene_id)
-    ref = choose_object(context.catalogue, choose_category(context.job, chance), chance.stream(Stream.OBJECT))
-    simulate_capture(captures.simulate, captures.board, load_asset(context.catalogue, ref), chance, path)
-    return ref.instance_id
+    asset = load_object(context.job, context.catalogue, chance)
+    simulate_capture(captures.simulate, captures.board, asset, chance, path)
+    return asset.instance_id
 
 
 def make_pairs(
@@ -95,7 +92,7 @@ def make_pairs(
 ) -> Iterator[CapturedPair | LeftOut]:
     """The pairs of the used views in order, and those views that have none. Raises CaptureError where none has one."""
     used = [view.number for view in done.estimates.estimate.used]
-    chosen = choose_views(used, context.job.pairs_per_scene)
+    chosen = [used[place] for place in spread_evenly(len(used), context.job.pairs_per_scene)]
     made = 0
     for at, number in enumerate(chosen):
         try:
@@ -114,14 +111,6 @@ def make_pairs(
         raise CaptureError(
             "no_pair", f"none of {len(chosen)} used views sees the object and has a view from the other side"
         )
-
-
-def choose_views(numbers: list[int], most: int) -> list[int]:
-    """At most so many of the views, evenly over their order."""
-    if len(numbers) <= most:
-        return numbers
-    places = np.round(np.linspace(0, len(numbers) - 1, most)).astype(int)
-    return [numbers[place] for place in places]
 
 
 def image_effects(job: Job) -> EffectPlan:

@@ -41,8 +41,7 @@ place and direction in any direction.
 
 def pose_rows(estimates: Estimates, camera: CaptureCamera) -> list[Row]:
     """The rows in order of estimate and number."""
-    markers = estimates.by_name.get("markers")
-    before = {view.number: view for view in markers.views} if markers is not None else {}
+    before = estimates.by_markers
     return [
         _row(view, before.get(view.number), camera) | {"estimate": name, "chosen": name == estimates.chosen}
         for name, estimate in estimates.by_name.items()

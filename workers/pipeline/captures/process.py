@@ -5,19 +5,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from schemas.capture.estimate import CaptureEstimate, Estimates
 from schemas.job.captures import Captures
 from schemas.scene.camera import Camera
 from schemas.scene.shape import Mesh
 from workers.capture.masks import silhouette
 from workers.capture.posed_view import distort_mask
-from workers.pipeline.captures.corrections import correct_manually, corrections_of, given_files
-from workers.pipeline.captures.estimate import estimate_poses
+from workers.pipeline.captures.corrections import Given, corrections_of, given_files
+from workers.pipeline.captures.estimate_surface import estimate_surface
 from workers.pipeline.captures.pose_table import pose_table
 from workers.pipeline.captures.processor_clock import ProcessorClock
-from workers.pipeline.captures.reconstruct import Merged, reconstruct
+from workers.pipeline.captures.reconstruct import Merged
 from workers.store.capture_folder import CaptureFolder, open_folder, pose_text
 from workers.store.capture_results import (
     CLOUD_FILE,
@@ -27,7 +25,7 @@ from workers.store.capture_results import (
     mesh_ply,
     write_results,
 )
-from workers.store.images import encode_png
+from workers.store.images import encode_mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +35,13 @@ class ProcessedFolder:
     folder: CaptureFolder
     estimates: Estimates
     merged: Merged
-    notes: tuple[str, ...]
     seconds: Mapping[str, float]
     users: tuple[str, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user must know of poses and surface."""
+        return self.estimates.estimate.notes
 
 
 def process_folder(path: Path, captures: Captures) -> ProcessedFolder:
@@ -50,40 +52,38 @@ def process_folder(path: Path, captures: Captures) -> ProcessedFolder:
     """
     watch = ProcessorClock()
     folder = open_folder(path)
-    with watch.stage("estimate"):
-        estimates = correct_manually(given_files(folder), estimate_poses(folder, captures.estimation))
-    merged = reconstruct(folder, estimates.estimate, captures.fusion, watch)
+    with watch.stage("read"):
+        given = given_files(folder)
+    estimates, merged = estimate_surface(given, captures, watch)
     with watch.stage("masks"):
-        files = {**_pose_files(folder, estimates), **_mask_files(folder, estimates.estimate, merged.body)}
+        files = {**_pose_files(given, estimates), **_mask_files(given, estimates.estimate, merged.body)}
     surface = merged.surface
     with watch.stage("encode"):
         files[CLOUD_FILE] = cloud_ply(surface.points, surface.normals, surface.colors, surface.views)
         files[MESH_FILE] = mesh_ply(surface.vertices, surface.faces, surface.vertex_colors)
         files[POSES_FILE] = pose_table(estimates, folder.camera)
-    notes = tuple(dict.fromkeys((*estimates.estimate.notes, *merged.notes)))
     seconds = {name: round(s, 3) for name, s in _all_seconds(estimates, watch).items()}
-    given = given_files(folder)
     masks = [f"mask_{number:05d}.png" for number in folder.numbers if given.has_mask(number)]
-    stayed = write_results(path, files, _record(captures, estimates, merged, notes) | {"seconds": seconds})
-    return ProcessedFolder(folder, estimates, merged, notes, seconds, tuple(sorted([*stayed, *masks])))
+    stayed = write_results(path, files, _record(captures, estimates, merged) | {"seconds": seconds})
+    return ProcessedFolder(folder, estimates, merged, seconds, tuple(sorted([*stayed, *masks])))
 
 
-def _pose_files(folder: CaptureFolder, estimates: Estimates) -> dict[str, bytes]:
+def _pose_files(given: Given, estimates: Estimates) -> dict[str, bytes]:
     """board_ and correction_ files of every view with a pose."""
     files = {}
-    for number, (board, correction) in corrections_of(given_files(folder), estimates).items():
+    for number, (board, correction) in corrections_of(given, estimates).items():
         files[f"board_{number:05d}.txt"] = pose_text(board).encode()
         files[f"correction_{number:05d}.txt"] = pose_text(correction).encode()
     return files
 
 
-def _mask_files(folder: CaptureFolder, estimate: CaptureEstimate, body: Mesh) -> dict[str, bytes]:
+def _mask_files(given: Given, estimate: CaptureEstimate, body: Mesh) -> dict[str, bytes]:
     """mask_ files of every view with a pose and without a mask of the user's, as the lens draws them."""
-    given, files = given_files(folder), {}
+    camera, files = given.folder.camera, {}
     for view in estimate.views:
         if view.T_board_cam is not None and not given.has_mask(view.number):
-            mask = silhouette(body, Camera(folder.camera.intrinsics, view.T_board_cam))
-            files[f"mask_{view.number:05d}.png"] = encode_png(distort_mask(mask, folder.camera).astype(np.uint8) * 255)
+            mask = silhouette(body, Camera(camera.intrinsics, view.T_board_cam))
+            files[f"mask_{view.number:05d}.png"] = encode_mask(distort_mask(mask, camera))
     return files
 
 
@@ -96,7 +96,7 @@ def _all_seconds(estimates: Estimates, watch: ProcessorClock) -> dict[str, float
     return {**own, **rest, "total": sum(watch.seconds.values())}
 
 
-def _record(captures: Captures, estimates: Estimates, merged: Merged, notes: tuple[str, ...]) -> dict[str, Any]:
+def _record(captures: Captures, estimates: Estimates, merged: Merged) -> dict[str, Any]:
     """process.json without the seconds and the files."""
     chosen, region = estimates.estimate, merged.region
     depth = chosen.depth
@@ -120,5 +120,5 @@ def _record(captures: Captures, estimates: Estimates, merged: Merged, notes: tup
         },
         "cloud_points": len(merged.surface.points),
         "mesh_faces": len(merged.surface.faces),
-        "notes": list(notes),
+        "notes": list(chosen.notes),
     }

@@ -1,15 +1,13 @@
 """A capture from its folder to poses, surface and views from elsewhere, without writing anything into the folder."""
 
-from dataclasses import replace
-
 import numpy as np
 
-from schemas.capture.estimate import CaptureEstimate, DepthCorrection, Estimates
+from schemas.capture.estimate import CaptureEstimate, DepthCorrection
 from schemas.capture.processed import CaptureScore, ProcessedCapture
 from schemas.job.captures import Captures
-from workers.pipeline.captures.corrections import correct_manually, given_files
-from workers.pipeline.captures.estimate import estimate_poses
-from workers.pipeline.captures.reconstruct import Merged, reconstruct
+from workers.pipeline.captures.corrections import given_files
+from workers.pipeline.captures.estimate_surface import estimate_surface
+from workers.pipeline.captures.reconstruct import Merged
 from workers.pipeline.captures.score import read_whole_truth, score_capture
 from workers.pipeline.captures.views import CaptureViews
 from workers.pipeline.stopwatch import Stopwatch
@@ -18,11 +16,10 @@ from workers.store.capture_folder import CaptureFolder
 
 def process_capture(folder: CaptureFolder, captures: Captures, watch: Stopwatch) -> ProcessedCapture:
     """Estimate, merge, score where there is truth. Raises CaptureError where the capture cannot be used."""
-    with watch.stage("estimate"):
-        estimates = correct_manually(given_files(folder), estimate_poses(folder, captures.estimation))
-    merged = reconstruct(folder, estimates.estimate, captures.fusion, watch)
-    estimates = with_notes(estimates, merged.notes)
-    views = CaptureViews(folder, estimates.estimate, captures, merged.body)
+    with watch.stage("read"):
+        given = given_files(folder)
+    estimates, merged = estimate_surface(given, captures, watch)
+    views = CaptureViews(given, estimates.estimate, captures, merged.body)
     with watch.stage("score"):
         score = score_against_truth(folder, estimates.estimate, merged, views)
     return ProcessedCapture(
@@ -38,13 +35,6 @@ def process_capture(folder: CaptureFolder, captures: Captures, watch: Stopwatch)
         depth_corrected=is_corrected(estimates.estimate.depth),
         score=score,
     )
-
-
-def with_notes(estimates: Estimates, notes: tuple[str, ...]) -> Estimates:
-    """The estimates with further notes in the chosen one, each once."""
-    chosen = estimates.estimate
-    told = replace(chosen, notes=tuple(dict.fromkeys((*chosen.notes, *notes))))
-    return replace(estimates, by_name={**estimates.by_name, estimates.chosen: told})
 
 
 def score_against_truth(

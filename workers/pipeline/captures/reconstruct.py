@@ -13,9 +13,9 @@ from workers.capture.fuse import fuse_views
 from workers.capture.masks import down_to_board
 from workers.capture.object_region import ObjectRegion, find_object
 from workers.capture.posed_view import PosedView, pose_view
-from workers.pipeline.captures.corrections import Given, given_files
+from workers.pipeline.captures.corrections import Given
 from workers.pipeline.stopwatch import Stopwatch
-from workers.store.capture_folder import CaptureFolder, read_view
+from workers.store.capture_folder import read_view
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,42 +28,39 @@ class Merged:
     notes: tuple[str, ...]
 
 
-def read_posed(folder: CaptureFolder, estimate: CaptureEstimate, number: int, given: Given | None = None) -> PosedView:
+def read_posed(given: Given, estimate: CaptureEstimate, number: int) -> PosedView:
     """One view with its pose in an estimate; the mask is the user's. Raises CaptureError where it has no pose or no depth."""
     own = next(view for view in estimate.views if view.number == number)
     if own.T_board_cam is None:
         raise CaptureError("no_pose", f"view {number} has no pose: {'; '.join(own.reasons)}")
-    given = given or given_files(folder)
-    stored = read_view(folder, number)
+    stored = read_view(given.folder, number)
     if not given.has_mask(number):
         stored = replace(stored, mask=None)
-    return pose_view(stored, folder.camera, own.T_board_cam, estimate.depth)
+    return pose_view(stored, given.folder.camera, own.T_board_cam, estimate.depth)
 
 
-def read_used(folder: CaptureFolder, estimate: CaptureEstimate, given: Given) -> Iterator[PosedView]:
+def read_used(given: Given, estimate: CaptureEstimate) -> Iterator[PosedView]:
     """The used views that have a depth image with anything in it, in order."""
     for view in estimate.used:
-        if (folder.path / f"depth_{view.number:05d}.png").exists():
-            posed = read_posed(folder, estimate, view.number, given)
+        if (given.folder.path / f"depth_{view.number:05d}.png").exists():
+            posed = read_posed(given, estimate, view.number)
             if posed.depth_m.any():
                 yield posed
 
 
-def reconstruct(
-    folder: CaptureFolder, estimate: CaptureEstimate, spec: Fusion, watch: Stopwatch | None = None
-) -> Merged:
+def reconstruct(given: Given, estimate: CaptureEstimate, spec: Fusion, watch: Stopwatch | None = None) -> Merged:
     """Merge the used views. Raises CaptureError where no view has depth, or no object is found or confirmed."""
     watch = watch or Stopwatch()
     with watch.stage("read"):
-        views = list(read_used(folder, estimate, given_files(folder)))
+        views = list(read_used(given, estimate))
     if not views:
         raise CaptureError(
             "no_depth",
-            f"none of the {len(estimate.used)} used views of {folder.path} has depth: depth_00000.png and so on are missing or "
-            "empty, and without depth there is no surface",
+            f"none of the {len(estimate.used)} used views of {given.folder.path} has depth: depth_00000.png and so on are "
+            "missing or empty, and without depth there is no surface",
         )
     with watch.stage("find_object"):
-        region = find_object(views, folder.board, spec)
+        region = find_object(views, given.folder.board, spec)
     with watch.stage("fuse"):
         surface = fuse_views(views, region, spec)
     missing = len(estimate.used) - len(views)

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.capture.estimate import CaptureEstimate, ViewEstimate
+from schemas.capture.estimate import CaptureEstimate
 from schemas.capture.processed import ProcessedCapture, ViewScore
 from schemas.dataset.codec import Row, matrix_column
 from schemas.dataset.layout import asset_path
+from schemas.dataset.tables import NOT_OF_CAPTURES
 from schemas.scene.camera import Role
 from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
 from workers.assets.catalogue import split_of
@@ -19,12 +20,6 @@ from workers.pipeline.image_files import encode_view
 from workers.pipeline.rows import asset_row, object_rows, view_row
 from workers.pipeline.stopwatch import Stopwatch
 from workers.store.images import encode_png
-
-ABSENT = (
-    *("pose", "penetration_mm", "hover_gap_mm", "support_margin_mm", "residual_speed_mm_s", "recheck_move_mm"),
-    *("recheck_turn_deg", "equilibrium_residual", "settle_s", "bodies"),
-)
-"""Columns of `scenes` that a capture cannot have: nothing was simulated to rest."""
 
 SCORES = ("pose_mm", "pose_deg", "cloud_median_mm", "cloud_p95_mm", "completeness", "depth_median_mm")
 
@@ -101,7 +96,7 @@ def scene_row(
     left_out: Sequence[LeftOut],
 ) -> Row:
     """The row of `scenes`: the board is the table, and the board frame the world."""
-    absent: Row = dict.fromkeys(ABSENT)
+    absent: Row = dict.fromkeys(NOT_OF_CAPTURES)
     return {
         **absent,
         "scene_id": thing.scene_id,
@@ -139,7 +134,7 @@ def quality_columns(
         "views": len(used) - len(left_out),
         "markers": sum(view.markers for view in used),
         "reprojection_before_px": _median(
-            [view.reprojection_px for view in _markers(done).values() if view.number in numbers]
+            [view.reprojection_px for number, view in done.estimates.by_markers.items() if number in numbers]
         ),
         "reprojection_px": _median([view.reprojection_px for view in used]),
         "depth_mm": _median([view.depth_mm for view in used]),
@@ -163,7 +158,7 @@ def view_columns(done: ProcessedCapture, one: CapturedPair, role: Role) -> Row:
     """The column `capture` of `views`: residuals and errors of the captured view, and of what the mirror view is made."""
     estimate: CaptureEstimate = done.estimates.estimate
     own = next(view for view in estimate.views if view.number == one.number)
-    before = _markers(done).get(one.number)
+    before = done.estimates.by_markers.get(one.number)
     score = done.score.views.get(one.number, ViewScore()) if done.score is not None else ViewScore()
     made = one.mirror if role == "mirror" else None
     return {
@@ -178,12 +173,6 @@ def view_columns(done: ProcessedCapture, one: CapturedPair, role: Role) -> Row:
         "depth_median_mm": score.depth_median_mm if role == "input" else None,
         "sources": list(made.sources) if made is not None else None,
     }
-
-
-def _markers(done: ProcessedCapture) -> dict[int, ViewEstimate]:
-    """The views of the estimate from markers alone, by number; none where it was not computed."""
-    markers = done.estimates.by_name.get("markers")
-    return {view.number: view for view in markers.views} if markers is not None else {}
 
 
 def _median(values: Sequence[float | None]) -> float | None:

@@ -29,6 +29,7 @@ from workers.capture.evaluate import (
 )
 from workers.capture.visibility import visible_points
 from workers.geometry.frames import transform
+from workers.geometry.spread import spread_evenly
 from workers.pipeline.captures.views import CaptureViews
 from workers.store.capture_folder import TRUTH, CaptureFolder
 from workers.store.capture_truth import MESH_FILE, read_truth
@@ -136,7 +137,7 @@ def score_measured(surface: Reconstruction, views: CaptureViews, truth: Truth) -
 def score_held_out(views: CaptureViews, truth: Truth, known: Sequence[int], most: int) -> dict[int, ViewErrors]:
     """Views made of the others, from their true poses, against the true depth and what was photographed."""
     found: dict[int, ViewErrors] = {}
-    for number in _spread(known, most):
+    for number in (known[place] for place in spread_evenly(len(known), most)):
         camera = Camera(views.folder.camera.intrinsics, truth.T_board_cam[number])
         depth_m: Array = true_view(truth.surface, camera)
         try:
@@ -145,9 +146,3 @@ def score_held_out(views: CaptureViews, truth: Truth, known: Sequence[int], most
         except (CaptureError, ViewError):  # the view sees nothing of the object, or nothing beside it does
             continue
     return found
-
-
-def _spread(numbers: Sequence[int], most: int) -> list[int]:
-    """At most so many, evenly over their order."""
-    places = np.unique(np.round(np.linspace(0, len(numbers) - 1, min(most, len(numbers)))).astype(int))
-    return [numbers[place] for place in places]

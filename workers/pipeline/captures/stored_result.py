@@ -13,6 +13,7 @@ from schemas.job.captures import Captures
 from schemas.scene.shape import Mesh
 from workers.capture.masks import down_to_board
 from workers.capture.object_region import Ground
+from workers.pipeline.captures.corrections import given_files
 from workers.pipeline.captures.views import CaptureViews
 from workers.store.capture_folder import CaptureFolder, open_folder, read_pose
 from workers.store.capture_results import PROCESS_FILE, read_cloud, read_mesh, read_record
@@ -44,7 +45,9 @@ def read_result(path: Path) -> StoredResult:
     vertices, faces, vertex_colors = read_mesh(path)
     surface = Reconstruction(points, normals, colors, views, vertices, faces, vertex_colors)
     body = down_to_board(Mesh(vertices, faces), ground)
-    return StoredResult(folder, captures, estimate, surface, CaptureViews(folder, estimate, captures, body))
+    return StoredResult(
+        folder, captures, estimate, surface, CaptureViews(given_files(folder), estimate, captures, body)
+    )
 
 
 def _estimate(path: Path, record: dict[str, Any]) -> CaptureEstimate:

@@ -4,8 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from schemas.base import Pose, frozen_array
 from schemas.capture.estimate import SynthesizedView
 from schemas.errors import CaptureError, OutputError, ViewError
@@ -13,7 +11,7 @@ from schemas.scene.camera import Camera
 from workers.geometry.pixels import round_depth
 from workers.pipeline.captures.stored_result import StoredResult
 from workers.store.capture_folder import write_pose
-from workers.store.images import encode_png
+from workers.store.images import encode_mask, encode_png
 
 FARTHEST_UNITS = 65_535.0
 
@@ -44,8 +42,8 @@ def _write(result: StoredResult, view: SynthesizedView, camera: Camera, out: Pat
     depth = round_depth(view.depth_m, 0.0, FARTHEST_UNITS / units, units)
     (out / f"rgb_{number:05d}.png").write_bytes(encode_png(view.rgb))
     (out / f"depth_{number:05d}.png").write_bytes(encode_png(depth))
-    (out / f"mask_{number:05d}.png").write_bytes(encode_png(view.mask.astype(np.uint8) * 255))
-    (out / f"measured_{number:05d}.png").write_bytes(encode_png(view.measured.astype(np.uint8) * 255))
+    (out / f"mask_{number:05d}.png").write_bytes(encode_mask(view.mask))
+    (out / f"measured_{number:05d}.png").write_bytes(encode_mask(view.measured))
     write_pose(out / f"board_{number:05d}.txt", camera.T_world_cam)
     return {"name": f"{number:05d}", "measured_share": view.measured_share, "sources": list(view.sources)}
 

@@ -19,7 +19,7 @@ from workers.capture.masks import silhouette
 from workers.capture.posed_view import PosedView
 from workers.capture.synthesize import choose_sources, synthesize_view
 from workers.capture.warp import Source, move_depth, prepare_source
-from workers.pipeline.captures.corrections import given_files
+from workers.pipeline.captures.corrections import Given
 from workers.pipeline.captures.reconstruct import read_posed
 from workers.store.capture_folder import CaptureFolder
 
@@ -31,14 +31,13 @@ KEPT = 12
 class CaptureViews:
     """Reads and prepares views when they are needed, and keeps the latest. `body` is the object down to the board."""
 
-    folder: CaptureFolder
+    given: Given
     estimate: CaptureEstimate
     captures: Captures
     body: Mesh
     _sources: OrderedDict[int, Source] = field(default_factory=OrderedDict)
 
     def __post_init__(self) -> None:
-        self._given = given_files(self.folder)
         self.cameras = {
             view.number: view.T_board_cam @ self.estimate.depth.T_cam_depth
             for view in self.estimate.used
@@ -46,9 +45,14 @@ class CaptureViews:
         }
         """T_board_depth [4, 4] of the views that can be sources."""
 
+    @property
+    def folder(self) -> CaptureFolder:
+        """Where the views are."""
+        return self.given.folder
+
     def posed(self, number: int) -> PosedView:
         """A used view, read anew. Raises CaptureError."""
-        return read_posed(self.folder, self.estimate, number, self._given)
+        return read_posed(self.given, self.estimate, number)
 
     def images(self, number: int) -> PosedImages:
         """A captured view: its picture without the lens, its depth in the same camera, the object's mask.

@@ -1,10 +1,14 @@
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from schemas.errors import InputError
 from schemas.job.job import Job
-from services.study.captures.study import check_captures, rows_of
+from services.run.progress import ProgressLine
+from services.study.captures import study
+from services.study.captures.study import check_captures, rows_of, run_capture_study
+from services.study.journal import Journal
 from services.study.model import Plan, Setting, Sizes
 
 OWN, COARSE, HOPELESS = Setting(), Setting((("voxel", "0.006"),)), Setting((("views", "4"),))
@@ -40,6 +44,28 @@ def test_a_setting_that_some_captures_cannot_be_made_with_says_why():
     laps = [{0: first, 1: answer(8.0, 2.0)}] * 2
     coarse = rows_of(plan({}), laps)[1]
     assert coarse.failed_share == 0.5 and coarse.notes == ("fuse: nothing is seen",)
+
+
+def test_a_study_warms_up_once_and_measures_what_its_journal_lacks(monkeypatch, tmp_path):
+    done: list[tuple] = []
+    monkeypatch.setattr(study, "simulate_one", lambda context, scene, path: done.append(("simulate", scene)))
+    monkeypatch.setattr(study, "warm_up", lambda context, setting, path: done.append(("warm", setting.name)))
+
+    def measure(context, settings, path, unit):
+        done.append(("measure", *unit))
+        return answer(4.0, 1.0)
+
+    monkeypatch.setattr(study, "measure_capture", measure)
+    with Journal(tmp_path, {}) as journal, closing(ProgressLine(0, "test", unit="measurement")) as progress:
+        journal.add("captures/0/0", answer(4.0, 1.0))
+        rows = run_capture_study(plan({}, count=3), journal, None, progress)
+        assert [row.setting for row in rows] == [OWN, COARSE]
+        assert done[:3] == [("simulate", 0), ("warm", OWN.name), ("measure", 0, 1)]
+        assert done[3:] == [
+            (step, n, *lap) for n in (1, 2) for step, *lap in (("simulate",), ("measure", 0), ("measure", 1))
+        ]
+        done.clear()
+        assert run_capture_study(plan({}, count=3), journal, None, progress) == rows and done == []
 
 
 def test_captures_without_truth_and_a_single_capture_are_refused():

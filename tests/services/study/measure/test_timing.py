@@ -2,7 +2,8 @@
 
 import pytest
 
-from services.study.measure.timing import cost_of, job_cost
+from services.study.measure.timing import cost_of, job_cost, timed_rows
+from services.study.model import Setting
 
 OWN = "the job"
 
@@ -47,6 +48,16 @@ def test_a_machine_that_is_slower_in_one_round_changes_no_ratio_but_for_what_new
     cost = cost_of("tier=flat", OWN, [alike, slow])
     assert cost is not None
     assert cost.ratio.least == pytest.approx(0.5) and cost.ratio.most == pytest.approx(0.5)
+
+
+def test_a_row_has_the_jobs_time_times_the_ratio_and_a_setting_without_a_time_has_none():
+    flat, step, never = (Setting(((knob, value),)) for knob, value in (("tier", "flat"), ("step", "60"), ("step", "1")))
+    (own, _), (second, scenes), (third, _) = timed_rows((Setting(), flat, step, never), [lap()])
+    assert (own.setting, own.ms, own.ratio) == (Setting(), pytest.approx(240.0), 1.0)
+    assert second.setting is flat and scenes == 2 and second.kilobytes == 0.4
+    assert second.ms == pytest.approx(240.0 * second.ratio) and second.ratio_least == second.ratio == second.ratio_most
+    assert third.setting is step and third.kilobytes == own.kilobytes == 1.0
+    assert own.errors == {} and own.failed_share == 0.0
 
 
 def test_scenes_that_a_setting_cannot_make_count_in_neither():

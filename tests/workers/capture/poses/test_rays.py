@@ -3,7 +3,7 @@ import pytest
 
 from tests.workers.capture.photographs import KINECT, hand_held
 from tests.workers.capture.poses.scenes import LENS, PINHOLE, project
-from workers.capture.poses.rays import camera_matrix, pixels_of_points, rays_of_pixels
+from workers.capture.poses.rays import opencv_matrix, pixels_of_points, rays_of_pixels
 from workers.geometry.frames import invert, transform
 
 
@@ -19,7 +19,7 @@ def test_rays_and_pixels_are_inverse_and_agree_with_opencv(camera):
 
 
 def test_the_principal_point_moves_by_half_a_pixel_for_opencv():
-    assert camera_matrix(PINHOLE)[0, 2] == KINECT.cx - 0.5
+    assert opencv_matrix(PINHOLE.intrinsics)[0, 2] == KINECT.cx - 0.5
 
 
 def test_a_pixel_where_the_lens_model_folds_has_no_ray():

@@ -1,13 +1,48 @@
 """Manual corrections win over every estimate, and our own files are no corrections."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from schemas.errors import CaptureError
 from tests.workers.pipeline.captures.small_capture import copy_of, made, processed, true_estimates
-from workers.geometry.frames import invert, translation
-from workers.pipeline.captures.corrections import MANUAL, correct_manually, corrections_of, given_files
-from workers.store.capture_folder import open_folder, read_pose, write_pose
+from workers.geometry.frames import invert, pose, rotation_about, translation
+from workers.pipeline.captures.corrections import MANUAL, Given, correct_manually, corrections_of, given_files
+from workers.store.capture_folder import open_folder, pose_text, read_pose, write_pose
+from workers.store.capture_results import write_results
+
+A = pose(rotation_about(np.array([0.0, 0.6, 0.8]), 0.3), np.array([0.1, 0.2, 0.3]))
+B = pose(np.eye(3), np.array([0.001, 0, 0]))
+
+
+def given_in(path) -> Given:
+    """What the user gave in a folder that has poses alone."""
+    return given_files(dataclasses.replace(open_folder(made()), path=path))
+
+
+def write_own(path):
+    write_results(path, {"board_00000.txt": pose_text(A).encode(), "correction_00000.txt": pose_text(B).encode()}, {})
+
+
+def test_files_of_our_own_are_not_taken_for_others(tmp_path):
+    write_own(tmp_path)
+    given = given_in(tmp_path)
+    assert given.pose("board", 0) is None and given.pose("correction", 0) is None
+
+
+def test_a_file_that_somebody_changed_is_theirs_and_stays(tmp_path):
+    write_own(tmp_path)
+    write_pose(tmp_path / "correction_00000.txt", A)
+    write_own(tmp_path)
+    given = given_in(tmp_path)
+    assert np.array_equal(given.pose("correction", 0), A) and given.pose("board", 0) is None
+
+
+def test_a_file_that_was_there_before_is_given(tmp_path):
+    write_pose(tmp_path / "board_00002.txt", A)
+    assert np.array_equal(given_in(tmp_path).pose("board", 2), A)
+    assert given_in(tmp_path).pose("board", 3) is None
 
 
 def test_without_files_of_the_user_estimates_stay():

@@ -7,9 +7,10 @@ from schemas.dataset.commit import FileEntry
 from schemas.errors import CaptureError
 from schemas.job.job import Job
 from schemas.scene.scene import SceneOutput
-from tests.captures import captures_job, use_exact_captures, write_folder
+from tests.captures import captures_job, exact_capture, use_exact_captures, write_folder
+from workers.pipeline.captures import make_capture
 from workers.pipeline.captures.listing import open_sources
-from workers.pipeline.captures.make_capture import choose_views, image_effects, run_capture
+from workers.pipeline.captures.make_capture import image_effects, run_capture
 from workers.pipeline.context import open_worker
 from workers.pipeline.stopwatch import Stopwatch
 from workers.store.images import decode_png
@@ -26,9 +27,13 @@ def folders(tmp_path) -> Path:
     return tmp_path
 
 
-def test_views_beyond_the_most_that_are_stored_are_left_out_evenly():
-    assert choose_views([3, 5, 9], 3) == [3, 5, 9]
-    assert choose_views(list(range(10)), 4) == [0, 3, 6, 9]
+def test_views_beyond_the_most_that_are_stored_are_left_out_evenly(monkeypatch, folders):
+    monkeypatch.setattr(make_capture, "process_capture", lambda *_: exact_capture(views=6))
+    job = captures_job(scenes=1, captures={"source": "folders", "folders": ["shots/mug"], "most_views": 3})
+    rows = made(job, folders).rows
+    assert sorted({row["capture"]["number"] for row in rows["views"]}) == [1, 3, 5]
+    told = [(one["number"], one["status"]) for one in rows["scenes"][0]["capture"]["left_out"]]
+    assert told == [(0, "flagged"), (2, "spare"), (4, "spare")]
 
 
 def test_switches_of_the_job_are_the_effects_of_a_captures_images():

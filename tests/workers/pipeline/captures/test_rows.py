@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 
 from schemas.capture.processed import ProcessedCapture
-from schemas.dataset.tables import CAPTURE_SCHEMAS, SCHEMAS
+from schemas.dataset.tables import CAPTURE_SCHEMAS, NOT_OF_CAPTURES, SCHEMAS
 from tests.captures import captures_job, exact_capture
 from workers.assets.catalogue import split_of
 from workers.pipeline.captures.listing import open_sources
 from workers.pipeline.captures.make_capture import make_pairs, place_capture
-from workers.pipeline.captures.rows import ABSENT, LeftOut, Origin, record_capture
+from workers.pipeline.captures.rows import LeftOut, Origin, record_capture
 from workers.pipeline.context import WorkerContext, open_worker
 from workers.pipeline.stopwatch import Stopwatch
 
@@ -31,9 +31,9 @@ def rows_of(context: WorkerContext, done: ProcessedCapture, scene_id: int = 0, m
 
 def test_columns_that_a_capture_cannot_have_are_those_that_its_schema_lets_be_absent():
     optional = {field.name for field in CAPTURE_SCHEMAS["scenes"] if field.nullable} - {"capture"}
-    assert set(ABSENT) == optional
+    assert set(NOT_OF_CAPTURES) == optional
     required = {field.name for field in SCHEMAS["scenes"] if not field.nullable}
-    assert set(ABSENT) & required
+    assert set(NOT_OF_CAPTURES) & required
 
 
 def test_residuals_before_and_after_are_those_of_the_used_views(context):

@@ -9,6 +9,7 @@ from schemas.capture.estimate import DepthCorrection
 from tests.workers.pipeline.captures.small_capture import CAPTURES, made, processed, true_estimates
 from workers.capture.evaluate import true_view
 from workers.geometry.frames import half_turn, translation
+from workers.pipeline.captures.corrections import given_files
 from workers.pipeline.captures.score import read_whole_truth
 from workers.pipeline.captures.stored_result import read_result
 from workers.pipeline.captures.views import CaptureViews
@@ -22,7 +23,7 @@ def result():
 
 def views_of(depth):
     estimate = dataclasses.replace(true_estimates(made()).estimate, depth=depth)
-    return CaptureViews(open_folder(made()), estimate, CAPTURES, read_result(processed()[0]).views.body)
+    return CaptureViews(given_files(open_folder(made())), estimate, CAPTURES, read_result(processed()[0]).views.body)
 
 
 def test_a_captured_view_keeps_its_picture_and_its_depth_is_what_was_measured_and_corrected():

@@ -1,0 +1,211 @@
+"""Handlers of the queue's commands: each takes the parsed options, prints, and returns the exit code."""
+
+import argparse
+import json
+import signal
+import sys
+import tempfile
+import time
+import urllib.parse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from schemas.errors import InputError, JobError, RunError
+from schemas.plain_line import plain_line
+from schemas.queue import JobRequest
+from services.cli.commands import tell_result
+from services.cli.environment import default_queue
+from services.job.read import load_job, read_text
+from services.queue.store import Queue, make_queue, new_id, open_queue
+
+if TYPE_CHECKING:
+    from schemas.job.job import Job
+    from services.queue.drive import Ending
+    from services.queue.ray_jobs import Drivers
+
+ANYWHERE = ("pybullet_data",)
+"""Names of asset folders that mean the same on every host."""
+
+
+def submit(options: argparse.Namespace) -> int:
+    """`verso submit`."""
+    changes = [*([f"scenes={options.scenes}"] if options.scenes else []), *options.changes]
+    job = load_job(options.job, changes)
+    _refuse_relative_folders(job, options.job)
+    queue = make_queue(_absolute(_named_queue(options)))
+    request = JobRequest(
+        id=new_id(),
+        name=job.name,
+        text=read_text(options.job),
+        changes=tuple(changes),
+        folder=str(options.job.parent.resolve()),
+        out=_absolute(options.out or f"data/{job.name}"),
+        scenes=job.scenes,
+        retry_failed=options.retry_failed,
+        priority=options.priority,
+        submitted=time.time(),
+    )
+    while not queue.put_request(request):
+        request = request.model_copy(update={"id": new_id()})
+    print(request.id, flush=True)
+    _say(f"job {request.id} ({job.name}, {job.scenes} scenes) waits in {queue.name}; its folder is {request.out}")
+    _say(_describe_supervisor(queue))
+    _answer(options, {"ok": True, "id": request.id, "name": job.name, "out": request.out, "queue": queue.name})
+    return 0
+
+
+def jobs(options: argparse.Namespace) -> int:
+    """`verso jobs`."""
+    from services.queue.listing import as_tree, format_rows, list_jobs
+
+    queue = _open(options)
+    rows = list_jobs(queue)
+    print("\n".join(format_rows(rows)) if rows else f"{queue.name} has no jobs")
+    if any(row.state in ("queued", "waiting", "running", "cancelling") for row in rows):
+        _say(_describe_supervisor(queue))
+    _answer(options, {"ok": True, "queue": queue.name, "jobs": [as_tree(row) for row in rows]})
+    return 0
+
+
+def logs(options: argparse.Namespace) -> int:
+    """`verso logs`."""
+    from services.queue.logs import follow_logs, header, read_logs
+
+    queue, drivers = _open(options), _drivers(options)
+    view = queue.read(options.id)
+    if options.follow:
+        if not view.ended:
+            _say(_describe_supervisor(queue))
+        for part in follow_logs(queue, drivers, options.id, _say):
+            print(part, end="", flush=True)
+        view = queue.read(options.id)
+        _answer(options, {"ok": True, "id": options.id, "state": view.state, "attempts": view.attempt})
+        return 0
+    texts = read_logs(queue, drivers, view, _say)
+    for attempt, text in texts.items():
+        print(f"{header(attempt)}{text}", end="" if text.endswith("\n") else "\n")
+    if not texts:
+        _say(f"job {view.request.id} is {view.state}: nothing is known of what it wrote")
+    known = bool(texts) or view.attempt == 0
+    _answer(options, {"ok": known, "id": options.id, "state": view.state, "logs": texts})
+    return 0 if known else 1
+
+
+def cancel(options: argparse.Namespace) -> int:
+    """`verso cancel`."""
+    queue = _open(options)
+    view = queue.append(options.id, "cancel")
+    if view is None:
+        view = queue.read(options.id)
+        if view.state not in ("cancelling", "cancelled"):
+            raise RunError(f"job {options.id} is {view.state}: there is nothing to cancel")
+    if view.state == "cancelling":
+        _say(f"job {options.id} runs: its supervisor stops it; what is committed in {view.request.out} is kept")
+        _say(_describe_supervisor(queue))
+    print(f"{options.id}: {view.state}")
+    _answer(options, {"ok": True, "id": options.id, "state": view.state})
+    return 0
+
+
+def supervise(options: argparse.Namespace) -> int:
+    """`verso supervise`."""
+    from services.queue.supervise import Rules, supervise
+
+    queue = make_queue(_absolute(_named_queue(options)))
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    rules = Rules(options.at_once, _driver_command(options))
+    try:
+        supervise(queue, _drivers(options), rules, _say)
+    except KeyboardInterrupt:
+        _say("supervision ends; jobs that run go on, the others wait for the next `verso supervise`")
+    _answer(options, {"ok": True, "queue": queue.name})
+    return 0
+
+
+def drive(options: argparse.Namespace) -> int:
+    """`verso drive`."""
+    from services.queue.drive import Ending, drive
+    from services.queue.share import Sharing
+    from services.run.step import RunRequest, run_job
+
+    queue = _open(options)
+
+    def work(asked: JobRequest) -> "Ending":
+        with tempfile.TemporaryDirectory(prefix="verso-job-") as folder:
+            file = Path(folder) / "job.yaml"
+            file.write_text(asked.text, encoding="utf-8")
+            job = load_job(file, asked.changes)
+        request = RunRequest(job, Path(asked.folder), asked.out, "auto", asked.retry_failed, sharing=Sharing(queue))
+        result = run_job(request)
+        complete, answer = tell_result(asked.out, job, result)
+        note = "" if complete else "scenes failed: `verso logs` says why"
+        _answer(options, {"ok": complete, **answer})
+        return Ending(0 if complete else 1, note, sum(answer["scenes"].values()), answer["digest"])
+
+    return drive(queue, options.id, options.attempt, work)
+
+
+def _named_queue(options: argparse.Namespace) -> str:
+    """The queue that was asked for. Raises InputError where none is."""
+    queue = options.queue or default_queue()
+    if queue is None:
+        raise InputError("which queue? name it by --queue URL or in the environment variable VERSO_QUEUE")
+    return str(queue)
+
+
+def _open(options: argparse.Namespace) -> Queue:
+    return open_queue(_absolute(_named_queue(options)))
+
+
+def _drivers(options: argparse.Namespace) -> "Drivers":
+    from services.queue.ray_jobs import RayDrivers
+
+    return RayDrivers(options.address)
+
+
+def _driver_command(options: argparse.Namespace) -> list[str]:
+    """The words that start Verso on the cluster's head."""
+    if options.driver is not None:
+        return [str(options.driver)]
+    host = urllib.parse.urlsplit(options.address).hostname
+    if host in ("127.0.0.1", "localhost", "::1"):
+        return [sys.executable, "-P", "-m", "services.cli.main"]
+    return ["verso"]
+
+
+def _absolute(place: str) -> str:
+    return place.rstrip("/") if "://" in place else str(Path(place).resolve())
+
+
+def _refuse_relative_folders(job: "Job", file: Path) -> None:
+    """Raises JobError for a folder of assets or captures that only this host, or this user, can find."""
+    sources = {
+        f"assets.{branch}.{number}.folder": getattr(source, "folder", "")
+        for branch in ("objects", "tables")
+        for number, source in enumerate(getattr(job.assets, branch))
+    }
+    folders = job.captures.folders if job.captures is not None else []
+    sources |= {f"captures.folders.{number}": folder for number, folder in enumerate(folders)}
+    for key, folder in sources.items():
+        if folder and folder not in ANYWHERE and not folder.startswith("/") and "://" not in folder:
+            told = "a job of the queue runs on a cluster: write the whole path, from / on, as all its hosts see it"
+            raise JobError(f"{plain_line(str(file), 300)}: {key}: {plain_line(repr(folder))}: {told}")
+
+
+def _describe_supervisor(queue: Queue) -> str:
+    """Whether somebody looks after the queue, as far as can be told at once."""
+    from services.run.lock import is_here, read_holder, shows_life
+
+    holder = read_holder(queue.store)
+    if holder is None or (is_here(holder) and not shows_life(queue.store, holder)):
+        return f"no supervisor is running: `verso supervise --queue {queue.name}` starts the jobs"
+    return f"supervised by process {holder.pid} on {holder.host}"
+
+
+def _say(line: str) -> None:
+    print(f"verso: {line}", file=sys.stderr, flush=True)
+
+
+def _answer(options: argparse.Namespace, answer: dict) -> None:
+    if options.json:
+        print(json.dumps(answer))

@@ -1,0 +1,121 @@
+"""`verso jobs`: a row for each job of a queue."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+from schemas.errors import VersoError
+from services.queue.decide import turn, waiting_for_folder
+from services.queue.fold import JobView
+from services.queue.store import Queue
+from workers.store.ledger import list_commits
+from workers.store.local import open_store
+
+MOST_LOOKS: Final = 20
+"""Output folders that are looked into for one listing: those of the latest jobs."""
+
+COLUMNS: Final = ("id", "name", "priority", "state", "attempts", "scenes", "age", "out")
+
+
+@dataclass(frozen=True)
+class JobRow:
+    """A job, as it is shown. `state` is `unreadable` where its files are damaged, as `note` says."""
+
+    id: str
+    name: str = ""
+    priority: int = 0
+    state: str = "unreadable"
+    attempts: int = 0
+    scenes_done: int | None = None
+    scenes_asked: int | None = None
+    out: str = ""
+    age_s: float = 0.0
+    note: str = ""
+    digest: str | None = None
+
+
+def list_jobs(queue: Queue, now_s: float | None = None) -> list[JobRow]:
+    """The jobs in the order of their turn: those that run, those that wait, and those that have ended, the latest last."""
+    views, faults = queue.read_all(queue.ids())
+    waiting = waiting_for_folder(views)
+    looks = _folders_to_look_into(views)
+    now_s = time.time() if now_s is None else now_s
+    rows = [_row(view, "waiting" if view.request.id in waiting else view.state, looks, now_s) for view in sort(views)]
+    return rows + [JobRow(id=job, note=fault) for job, fault in sorted(faults.items())]
+
+
+def sort(views: Sequence[JobView]) -> list[JobView]:
+    """Ended jobs last, in the order in which they were submitted; before them the others in the order of their turn."""
+    ended = sorted((view for view in views if view.ended), key=lambda view: view.request.submitted)
+    held = sorted((view for view in views if view.held), key=turn)
+    return [*held, *sorted((view for view in views if not view.ended and not view.held), key=turn), *ended]
+
+
+def _row(view: JobView, state: str, looks: frozenset[str], now_s: float) -> JobRow:
+    request = view.request
+    done = view.scenes
+    if done is None:
+        done = _scenes_done(request.out) if request.id in looks else 0 if view.attempt == 0 else None
+    return JobRow(
+        id=request.id,
+        name=request.name,
+        priority=request.priority,
+        state=state,
+        attempts=view.attempt,
+        scenes_done=done,
+        scenes_asked=request.scenes,
+        out=request.out,
+        age_s=round(max(0.0, now_s - request.submitted), 1),
+        note=view.note,
+        digest=view.digest,
+    )
+
+
+def _folders_to_look_into(views: Sequence[JobView]) -> frozenset[str]:
+    begun = [view for view in views if view.attempt > 0 and view.scenes is None]
+    latest = sorted(begun, key=lambda view: (view.ended, -view.request.submitted))
+    return frozenset(view.request.id for view in latest[:MOST_LOOKS])
+
+
+def _scenes_done(out: str) -> int | None:
+    """Scenes that an output folder holds; None where it cannot be read from here."""
+    try:
+        return int(list_commits(open_store(out)).committed)
+    except (VersoError, OSError):
+        return None
+
+
+def format_rows(rows: Sequence[JobRow]) -> list[str]:
+    """A table, a line each, with what there is to say about a job below it."""
+    cells = [COLUMNS, *(_cells(row) for row in rows)]
+    widths = [max(len(line[column]) for line in cells) for column in range(len(COLUMNS) - 1)]
+    lines = []
+    for number, line in enumerate(cells):
+        padded = [cell.ljust(width) for cell, width in zip(line, widths, strict=False)]
+        lines.append("  ".join([*padded, line[-1]]).rstrip())
+        if number and rows[number - 1].note:
+            lines.append(f"    {rows[number - 1].note}")
+    return lines
+
+
+def _cells(row: JobRow) -> tuple[str, ...]:
+    scenes = (
+        "" if row.scenes_asked is None else f"{'?' if row.scenes_done is None else row.scenes_done}/{row.scenes_asked}"
+    )
+    state = {"waiting": "waiting for its folder"}.get(row.state, row.state)
+    return row.id, row.name, str(row.priority), state, str(row.attempts), scenes, describe_age(row.age_s), row.out
+
+
+def describe_age(seconds: float) -> str:
+    """An age in one or two units."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    if seconds < 2 * 3600:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.0f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.0f} d"
+
+
+def as_tree(row: JobRow) -> dict[str, Any]:
+    """A row for `--json`."""
+    return asdict(row)

@@ -1,0 +1,200 @@
+"""The supervisor of a queue: the one process that gives drivers to Ray. It may be killed at any moment, and run twice."""
+
+import contextlib
+import shlex
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from schemas.errors import CorruptError, InUseError, MachineError, RunError
+from schemas.queue import submission_id
+from services.queue.decide import Action, Driver, choose_starts, pause_of, tend_drivers
+from services.queue.fold import JobView
+from services.queue.ray_jobs import Drivers
+from services.queue.store import Queue
+from services.run.lock import Lock, hold_lock
+
+EVERY_S: Final = 2.0
+"""Between two looks at the queue and at Ray."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """At most `at_once` drivers; `command` are the words that start Verso on the cluster's head."""
+
+    at_once: int
+    command: Sequence[str]
+
+
+@dataclass
+class _Memory:
+    """What a supervisor remembers between two looks, all of which it can do without."""
+
+    settled: set[str] = field(default_factory=set)
+    """Ended jobs whose logs are kept, or gone."""
+    seen: dict[str, tuple[int, float]] = field(default_factory=dict)
+    """By job: how many events it had, and when that was seen first."""
+    kept: set[str] = field(default_factory=set)
+    """Drivers whose logs are in the queue, or could not be had."""
+    share: int | None = None
+    outage: str | None = None
+    """Why the last look failed."""
+    told: set[str] = field(default_factory=set)
+    """What was said and need not be said again."""
+
+
+class Supervisor:
+    """Looks at a queue and at Ray's drivers again and again, and does what is to be done.
+
+    Before anything is done it is decided in storage, and what was decided and not done is found by the next look: a kill
+    at any place loses nothing. What was decided by another in the meantime is not decided again.
+    """
+
+    def __init__(
+        self, queue: Queue, drivers: Drivers, rules: Rules, say: Callable[[str], None], clock: Callable[[], float]
+    ) -> None:
+        self._queue = queue
+        self._drivers = drivers
+        self._rules = rules
+        self._say = say
+        self._clock = clock
+        self._memory = _Memory()
+
+    def look_if(self, lock: Lock) -> None:
+        """One round, while nobody else holds the queue. Raises RunError where another took over."""
+        self._bear(lock.require_held, self._look)
+
+    def look(self) -> None:
+        """One round. Where storage or Ray does not answer, that is told, and waited for."""
+        self._bear(self._look)
+
+    def _bear(self, *steps: Callable[[], None]) -> None:
+        try:
+            for step in steps:
+                step()
+        except (MachineError, OSError) as error:
+            if self._memory.outage is None:
+                self._say(f"{error}; it is asked again and again")
+            self._memory.outage = str(error)
+        else:
+            if self._memory.outage is not None:
+                self._say("all answer again")
+            self._memory.outage = None
+
+    def _look(self) -> None:
+        views, faults = self._queue.read_all(job for job in self._queue.ids() if job not in self._memory.settled)
+        known = self._drivers.states()
+        for job, fault in faults.items():
+            self._say_once(f"job {job} is left alone: {fault}")
+        self._do_all(tend_drivers(views, known))
+        self._keep_logs(views, known)
+        left = [view.request.id for view in views if not view.ended]
+        self._do_all(choose_starts(self._queue.read_all(left)[0], self._rules.at_once, self._is_due))
+        self._tell_share(left)
+
+    def _do_all(self, actions: Sequence[Action]) -> None:
+        """Does one thing after another; what fails is told, and done by the next look."""
+        for action in actions:
+            try:
+                self._do(action)
+            except (MachineError, CorruptError, OSError) as error:
+                self._say_once(f"job {action.job}: {error}")
+
+    def _do(self, action: Action) -> None:
+        """Does one thing, if nobody else has made it needless."""
+        job, attempt = action.job, action.attempt
+        if action.deed == "start":
+            view = self._queue.append(job, "started", attempt)
+            if view is not None:
+                self._say(f"job {job} ({view.request.name}): attempt {attempt} begins")
+                self._hand_over(view)
+        elif action.deed == "hand over":
+            view = self._queue.read(job)
+            if view.state == "running" and view.attempt == attempt and not view.began:
+                self._hand_over(view)
+        elif action.deed == "stop":
+            self._drivers.stop(submission_id(job, attempt))
+        elif action.deed == "note stop":
+            if self._queue.append(job, "stopped", attempt) is not None:
+                self._say(f"job {job}: cancelled; what it committed is kept")
+        elif (view := self._queue.append(job, "died", attempt, note=action.note)) is not None:
+            then = f"is taken up again in {pause_of(view):g} s" if not view.ended else f"is {view.state}"
+            self._say(f"job {job}, attempt {attempt}: {action.note}; it {then}")
+
+    def _hand_over(self, view: JobView) -> None:
+        """Gives the driver of a decided attempt to Ray."""
+        job, attempt = view.request.id, view.attempt
+        metadata = {"verso_job": job, "verso_queue": self._queue.name}
+        entrypoint = build_entrypoint(self._rules.command, self._queue.name, job, attempt)
+        self._drivers.hand_over(submission_id(job, attempt), entrypoint, metadata)
+
+    def _keep_logs(self, views: Sequence[JobView], known: Mapping[str, Driver]) -> None:
+        """Copies the logs of drivers that are over into the queue, while Ray still has them."""
+        for view in views:
+            job = view.request.id
+            for attempt in range(1, view.attempt + 1):
+                submission = submission_id(job, attempt)
+                if _is(known.get(submission), "over") and submission not in self._memory.kept:
+                    self._keep_log(job, attempt)
+            if view.ended and not _is(known.get(submission_id(job, view.attempt)), "running"):
+                self._memory.settled.add(job)
+
+    def _keep_log(self, job: str, attempt: int) -> None:
+        submission = submission_id(job, attempt)
+        self._memory.kept.add(submission)
+        try:
+            if not self._queue.has_log(job, attempt):
+                self._queue.put_log(job, attempt, self._drivers.log(submission) or "")
+        except (MachineError, OSError) as error:
+            self._say_once(f"job {job}, attempt {attempt}: its log is not kept: {error}")
+
+    def _is_due(self, view: JobView) -> bool:
+        """Whether a job's pause is over; it is counted from when its last event was seen, by this machine's clock."""
+        events, since = self._memory.seen.get(view.request.id, (-1, 0.0))
+        if events != view.events:
+            since = self._clock()
+            self._memory.seen[view.request.id] = (view.events, since)
+        return self._clock() - since >= pause_of(view)
+
+    def _tell_share(self, ids: Sequence[str]) -> None:
+        """Tells the drivers among how many the cluster is shared, where that has changed."""
+        running = max(1, sum(view.held for view in self._queue.read_all(ids)[0]))
+        if running != self._memory.share:
+            self._queue.put_share(running)
+            self._memory.share = running
+
+    def _say_once(self, line: str) -> None:
+        if line not in self._memory.told:
+            self._memory.told.add(line)
+            self._say(line)
+
+
+def _is(driver: Driver | None, state: str) -> bool:
+    return driver is not None and driver.state == state
+
+
+def build_entrypoint(command: Sequence[str], queue: str, job: str, attempt: int) -> str:
+    """What Ray gives to a shell: each word quoted, and none of them from a job."""
+    return shlex.join([*command, "drive", job, str(attempt), "--queue", queue])
+
+
+def supervise(queue: Queue, drivers: Drivers, rules: Rules, say: Callable[[str], None]) -> None:
+    """Looks after a queue until it is interrupted. Raises RunError where another supervisor does, or took over."""
+    drivers.states()  # an address where nothing answers is told at once
+    with hold_queue(queue) as lock:
+        supervisor = Supervisor(queue, drivers, rules, say, time.monotonic)
+        while True:
+            supervisor.look_if(lock)
+            time.sleep(EVERY_S)
+
+
+@contextlib.contextmanager
+def hold_queue(queue: Queue) -> Iterator[Lock]:
+    """Holds the queue's lock while the context lasts. Raises RunError naming the supervisor that has it."""
+    with contextlib.ExitStack() as stack:
+        try:
+            lock = stack.enter_context(hold_lock(queue.store))
+        except InUseError as error:
+            raise RunError(f"another supervisor works here: {error.place} is in use by {error.by}") from error
+        yield lock

@@ -1,0 +1,61 @@
+"""The container image, and a first start on a bare Debian, run with Docker."""
+
+import pytest
+
+from tests.containers import copy_checkout, docker, must
+
+PYTHON_IMAGE = "python:3.11-slim-bookworm"
+DEBIAN_IMAGE = "debian:bookworm-slim"
+
+MOST_BYTES = 2.1e9
+"""2.03e9 when this was written, 2.50e9 in one stage; the packages are 1.6e9 of it."""
+
+pytestmark = [pytest.mark.docker, pytest.mark.timeout(1500)]
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory):
+    return copy_checkout(tmp_path_factory.mktemp("image") / "checkout")
+
+
+def test_the_image_runs_verso_and_not_as_root(image):
+    assert "0.1.0" in must(docker("run", "--rm", image, "--version"))
+    assert must(docker("run", "--rm", "--entrypoint", "id", image, "-u")).strip() == "1000"
+
+
+def test_the_image_carries_neither_tests_nor_history(image):
+    listing = must(docker("run", "--rm", "--entrypoint", "ls", image, "-A", "/opt/verso")).split()
+    assert {"schemas", "services", "workers"} <= set(listing)
+    assert not {".git", ".venv", "tests"} & set(listing)
+
+
+def test_the_image_stays_small(image, record_figure):
+    size = float(must(docker("image", "inspect", "--format", "{{.Size}}", image)))
+    record_figure("image_bytes", "passed", size, MOST_BYTES)
+    assert size < MOST_BYTES
+
+
+def test_every_python_in_the_image_has_the_kernels_of_its_processor_and_no_cache_beside_the_code(image):
+    asks = (
+        "import os, sys; from services.cli.environment import processor_flags as flags; "
+        "from schemas.environment import settings_to_change as changes; "
+        "print(changes(os.environ, flags()), os.environ['MESA_SHADER_CACHE_DISABLE'], sys.dont_write_bytecode)"
+    )
+    answer = must(docker("run", "--rm", "--read-only", "--entrypoint", "python", image, "-c", asks))
+    assert answer.strip() == "{} true True"
+
+
+def test_without_python_it_stops_with_both_ways_on(checkout):
+    done = docker("run", "--rm", "-v", f"{checkout}:/repo", DEBIAN_IMAGE, "/repo/verso", "--version")
+    assert done.returncode == 1
+    assert "apt-get install python3.11" in done.stderr
+    assert "docker compose up" in done.stderr
+
+
+@pytest.mark.slow
+def test_a_bare_debian_with_python_311_needs_nothing_else(checkout):
+    twice = "/repo/verso --version && /repo/verso --version"
+    done = docker("run", "--rm", "-v", f"{checkout}:/repo", PYTHON_IMAGE, "bash", "-c", twice)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [done.stdout.splitlines()[0]] * 2
+    assert done.stderr.count("first start") == 1

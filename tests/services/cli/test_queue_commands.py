@@ -1,0 +1,174 @@
+"""The queue's commands as typed: what they print, refuse and store."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from services.cli.main import main
+from services.queue.store import open_queue
+from services.queue.supervise import hold_queue
+from tests.fake_drivers import ids, queue_of, request_of
+
+ROOT = Path(__file__).resolve().parents[3]
+TABLETOP = str(ROOT / "deploy" / "jobs" / "tabletop.yaml")
+HOSTILE = "$(touch x) `touch x`; touch x \"'\\"
+
+
+def told(capsys, *arguments: str) -> tuple[int, str, str]:
+    try:
+        code = main(list(arguments))
+    except SystemExit as ended:
+        code = int(ended.code or 0)
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.out + captured.err
+    return code, captured.out, captured.err
+
+
+@pytest.fixture
+def queue(tmp_path, monkeypatch) -> str:
+    monkeypatch.chdir(tmp_path)
+    return str(tmp_path / "queue")
+
+
+def test_submit_prints_the_id_alone_and_stores_what_was_asked(queue, capsys, tmp_path):
+    asked = ["--scenes", "8", "--set", "start.pose=tumbled", "--priority", "-3", "--retry-failed"]
+    code, out, err = told(capsys, "submit", TABLETOP, "--queue", queue, *asked)
+    assert code == 0
+    (job,) = open_queue(queue).ids()
+    assert out == f"{job}\n"
+    request = open_queue(queue).read(job).request
+    assert request.text == Path(TABLETOP).read_text()
+    assert request.changes == ("scenes=8", "start.pose=tumbled")
+    assert (request.name, request.scenes, request.priority, request.retry_failed) == ("tabletop", 8, -3, True)
+    assert (request.out, request.folder) == (str(tmp_path / "data/tabletop"), str(ROOT / "deploy/jobs"))
+    assert "no supervisor is running: `verso supervise --queue" in err
+
+
+def test_submit_says_who_supervises(queue, capsys):
+    told(capsys, "submit", TABLETOP, "--queue", queue)
+    with hold_queue(open_queue(queue)):
+        assert "supervised by process" in told(capsys, "submit", TABLETOP, "--queue", queue)[2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nowhere.yaml"], ["nowhere.yaml", "no such file"]),
+        ([TABLETOP, "--set", "physcs.step_hz=3"], ["physcs", "did you mean 'physics'"]),
+        ([TABLETOP, "--set", "scenes=0"], ["scenes", "greater than or equal to 1"]),
+        (
+            [TABLETOP, "--set", "assets.objects.0={source: urdf, folder: meshes}"],
+            ["assets.objects.0.folder", "'meshes'", "write the whole path"],
+        ),
+        (
+            [TABLETOP, "--set", "assets.objects.0={source: urdf, folder: ~/meshes}"],
+            ["assets.objects.0.folder", "write the whole path"],
+        ),
+    ],
+)
+def test_a_job_that_cannot_run_is_refused_with_exit_2_and_nothing_is_stored(queue, capsys, arguments, words):
+    code, out, err = told(capsys, "submit", *arguments, "--queue", queue)
+    assert (code, out) == (2, "")
+    assert all(word in err for word in words)
+    assert not Path(queue).exists()
+
+
+def test_faults_of_a_job_file_are_those_that_run_tells(queue, capsys):
+    faulty = [TABLETOP, "--set", "cameras.orbit.radius_m=-1"]
+    assert told(capsys, "submit", *faulty, "--queue", queue) == told(capsys, "run", *faulty)
+
+
+def test_text_that_a_shell_would_obey_is_kept_as_text(queue, capsys, tmp_path):
+    job = tmp_path / "job.yaml"
+    job.write_text(f"name: mugs\nscenes: 8\n# {HOSTILE}\n")
+    code, out, _ = told(capsys, "submit", str(job), "--queue", queue, "--out", f"/o {HOSTILE}")
+    assert code == 0
+    request = open_queue(queue).read(out.strip()).request
+    assert (request.out, request.text) == (f"/o {HOSTILE}", job.read_text())
+    assert told(capsys, "submit", str(job), "--queue", queue, "--out", "/o\nx")[0] == 2
+    assert told(capsys, "submit", str(job), "--queue", queue, "--set", f"name={HOSTILE}")[0] == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["job.yaml", "queue"]
+
+
+@pytest.mark.parametrize("command", [["jobs"], ["logs", "j00000001"], ["cancel", "j00000001"]])
+def test_a_queue_that_is_none_is_told_in_one_line(queue, capsys, command, tmp_path):
+    for place, words in ((queue, "no such folder"), (str(tmp_path), "holds no queue.json")):
+        code, out, err = told(capsys, *command, "--queue", place)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert place in err and words in err
+    code, _, err = told(capsys, *command)
+    assert (code, err) == (2, "verso: which queue? name it by --queue URL or in the environment variable VERSO_QUEUE\n")
+
+
+@pytest.mark.parametrize("command", ["logs", "cancel"])
+def test_an_unknown_id_is_told_in_one_line(queue, capsys, command):
+    queue_of(Path(queue))
+    code, _, err = told(capsys, command, "j00000009", "--queue", queue)
+    assert (code, err) == (2, f"verso: {queue} has no job j00000009: `verso jobs` lists those that there are\n")
+
+
+def test_jobs_for_people_and_for_programs(queue, capsys):
+    assert told(capsys, "submit", TABLETOP, "--queue", queue, "--json")[0] == 0
+    code, out, err = told(capsys, "jobs", "--queue", queue, "--json")
+    *table, last = out.splitlines()
+    answer = json.loads(last)
+    assert code == 0 and answer["ok"] and answer["queue"] == queue
+    (row,) = answer["jobs"]
+    assert (row["name"], row["state"], row["attempts"], row["scenes_done"], row["scenes_asked"]) == (
+        "tabletop",
+        "queued",
+        0,
+        0,
+        64,
+    )
+    assert table[1].startswith(f"{row['id']}  tabletop  0         queued  0         0/64")
+    assert "no supervisor is running" in err
+
+
+def test_cancel_ends_a_waiting_job_at_once_and_a_running_one_by_its_supervisor(queue, capsys):
+    first, second, third = ids(3)
+    made = queue_of(Path(queue), request_of(first), request_of(second), request_of(third))
+    made.append(second, "started", 1)
+    code, out, _ = told(capsys, "cancel", first, "--queue", queue)
+    assert (code, out) == (0, f"{first}: cancelled\n")
+    for _ in range(2):  # asked again, it says the same
+        code, out, err = told(capsys, "cancel", second, "--queue", queue)
+        assert (code, out) == (0, f"{second}: cancelling\n")
+        assert "what is committed in /out/" in err
+    assert told(capsys, "cancel", first, "--queue", queue)[:2] == (0, f"{first}: cancelled\n")
+    made.append(third, "started", 1)
+    made.append(third, "began", 1)
+    made.append(third, "ended", 1, code=1)
+    code, out, err = told(capsys, "cancel", third, "--queue", queue)
+    assert (code, out, err) == (1, "", f"verso: job {third} is failed: there is nothing to cancel\n")
+
+
+def test_logs_of_a_job_whose_cluster_is_gone(queue, capsys):
+    (job,) = ids(1)
+    made = queue_of(Path(queue), request_of(job))
+    assert "nothing is known of what it wrote" in told(capsys, "logs", job, "--queue", queue)[2]
+    for kind in ("started", "began"):
+        made.append(job, kind, 1)
+    code, _, err = told(capsys, "logs", job, "--queue", queue, "--address", "http://127.0.0.1:1")
+    assert code == 1 and "no copy of its log is in the queue yet" in err
+    made.append(job, "ended", 1, code=0)
+    made.put_log(job, 1, "8 scenes made\n")
+    assert told(capsys, "logs", job, "--queue", queue)[1] == "--- attempt 1 ---\n8 scenes made\n"
+    code, out, _ = told(capsys, "logs", job, "--queue", queue, "--follow", "--json")
+    assert (code, out.splitlines()[:2]) == (0, ["--- attempt 1 ---", "8 scenes made"])
+    assert json.loads(out.splitlines()[-1])["state"] == "done"
+
+
+def test_a_supervisor_without_a_cluster_is_told_in_one_line(queue, capsys):
+    code, _, err = told(capsys, "supervise", "--queue", queue, "--address", "http://127.0.0.1:1")
+    assert code == 1
+    assert err.startswith("verso: --address http://127.0.0.1:1: ") and err.count("\n") == 1
+
+
+def test_the_queue_may_be_named_by_the_environment(queue, capsys, monkeypatch, tmp_path):
+    queue_of(Path(queue))
+    queue_of(tmp_path / "other", request_of("j00000001"))
+    monkeypatch.setenv("VERSO_QUEUE", queue)
+    assert told(capsys, "jobs")[:2] == (0, f"{queue} has no jobs\n")
+    assert "j00000001" in told(capsys, "jobs", "--queue", str(tmp_path / "other"))[1]

@@ -1,0 +1,136 @@
+"""Three jobs on a real Ray head: one cancelled, one whose driver is killed, one that waits; supervisors are killed too."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from services.job.read import load_job
+from services.queue.store import open_queue
+from services.run.lock import read_holder
+from tests.datasets import run_here
+from tests.killed_runs import processes_with
+from tests.ray_head import ROOT, RayHead, ray_head
+
+TABLETOP = ROOT / "deploy" / "jobs" / "tabletop.yaml"
+SCENES = 16
+SLOWLY = [*("--set", "run.range_size=1"), *("--set", "run.shard_size=1"), *("--set", "run.workers=1")]
+"""Commits come one by one, so that there is time to kill between them."""
+HOSTILE = "o $(touch x) `touch x`; touch x 'y' \"z\""
+PATIENCE_S = 90.0
+
+
+def verso(head: RayHead, *words: str, **changes: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-P", "-m", "services.cli.main", *words]
+    environment = {**head.environment, **changes}
+    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+
+
+@contextlib.contextmanager
+def supervisor(head: RayHead, queue: str, log: Path) -> Iterator[subprocess.Popen]:
+    """`verso supervise` as a process; killed with -9 in the end, if it lives."""
+    command = [sys.executable, "-P", "-m", "services.cli.main", "supervise", "--queue", queue, "--address", head.http]
+    with log.open("ab") as words:
+        process = subprocess.Popen(command, cwd=ROOT, env=head.environment, stdout=words, stderr=words)
+    try:
+        wait_for("supervision", lambda: is_at_work(queue, process), log)
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def is_at_work(queue: str, process: subprocess.Popen) -> bool:
+    holder = read_holder(open_queue(queue).store)
+    return process.poll() is None and holder is not None and holder.pid == process.pid
+
+
+def wait_for(what: str, happened: Callable[[], Any], log: Path) -> Any:
+    deadline = time.monotonic() + PATIENCE_S
+    while not (found := happened()):
+        assert time.monotonic() < deadline, f"{what} did not happen: {log.read_text()}"
+        time.sleep(0.05)
+    return found
+
+
+def kill_driver(head: RayHead, job: str) -> None:
+    """Kills the innermost process of a job's `verso drive`, the one that gives work to Ray."""
+    ours = [process.pid for process in processes_with(head.mark) if f" drive {job} " in process.name]
+    threads = {pid: len(list(Path(f"/proc/{pid}/task").iterdir())) for pid in ours}
+    driver = max(threads, key=lambda pid: threads[pid])
+    assert threads[driver] > 5  # those of Ray; its supervisors have none
+    os.kill(driver, signal.SIGKILL)
+
+
+@pytest.mark.ray
+@pytest.mark.minute
+@pytest.mark.timeout(250)
+def test_three_jobs_of_which_one_is_cancelled_one_killed_and_one_waits(tmp_path):
+    _, digest = run_here(load_job(TABLETOP, [f"scenes={SCENES}"]), tmp_path / "alone")
+    queue, log = str(tmp_path / "queue"), tmp_path / "supervisor.log"
+
+    with ray_head(2) as head:
+
+        def submit(out: str, priority: int, scenes: int) -> str:
+            words = ["--out", str(tmp_path / out), "--priority", str(priority), "--scenes", str(scenes), *SLOWLY]
+            done = verso(head, "submit", str(TABLETOP), *words, VERSO_QUEUE=queue)
+            assert "no supervisor is running" in done.stderr
+            return done.stdout.strip()
+
+        def rows() -> dict[str, dict[str, Any]]:
+            told = verso(head, "jobs", "--queue", queue, "--json").stdout
+            return {row["id"]: row for row in json.loads(told.splitlines()[-1])["jobs"]}
+
+        waiting, cancelled, killed = submit(HOSTILE, 0, SCENES), submit("cancelled", 3, 64), submit("killed", 5, SCENES)
+        assert {job: (row["state"], row["scenes_asked"]) for job, row in rows().items()} == {
+            killed: ("queued", SCENES),
+            cancelled: ("queued", 64),
+            waiting: ("queued", SCENES),
+        }
+        read = open_queue(queue).read
+
+        refused = verso(head, "supervise", "--queue", queue, "--address", head.http, RAY_AUTH_TOKEN="b" * 64)
+        assert (refused.returncode, refused.stderr.count("\n")) == (1, 1)
+        assert "RAY_AUTH_TOKEN" in refused.stderr
+
+        with supervisor(head, queue, log) as first:
+            for job in (killed, cancelled):
+                wait_for("a commit", lambda job=job: list(Path(read(job).request.out).glob("manifest/_commits/*")), log)
+                if job == killed:
+                    first.kill()
+                    kill_driver(head, killed)
+            assert read(waiting).state == "queued"  # although it is the oldest
+        told = verso(head, "cancel", cancelled, "--queue", queue)
+        assert (told.returncode, told.stdout) == (0, f"{cancelled}: cancelling\n")
+
+        with supervisor(head, queue, log) as second:
+            again = verso(head, "supervise", "--queue", queue, "--address", head.http)
+            assert again.returncode == 1 and "another supervisor works here" in again.stderr
+            wait_for("the end", lambda: all(read(job).ended for job in (killed, cancelled, waiting)), log)
+            wait_for("the last log", lambda: open_queue(queue).has_log(killed, 2), log)
+            second.terminate()
+            assert second.wait(30) == 0
+            assert read_holder(open_queue(queue).store) is None
+        found = rows()
+        kept = found[cancelled].pop("scenes_done")
+        assert 0 < kept < 64
+        assert {job: (row["state"], row["attempts"]) for job, row in found.items()} == {
+            killed: ("done", 2),
+            cancelled: ("cancelled", 1),
+            waiting: ("done", 1),
+        }
+        assert (found[killed]["digest"], found[waiting]["digest"]) == (digest, digest)
+        assert (found[killed]["scenes_done"], found[waiting]["scenes_done"]) == (SCENES, SCENES)
+        assert not [one for one in processes_with(head.mark) if " drive " in one.name]
+    logs = verso(head, "logs", killed, "--queue", queue, "--address", head.http)  # the cluster is gone
+    assert logs.stdout.index("--- attempt 1 ---") < logs.stdout.index("--- attempt 2 ---")
+    assert f"dataset digest {digest}" in logs.stdout
+    assert not list(tmp_path.rglob("x")) and not (ROOT / "x").exists()

@@ -1,0 +1,161 @@
+"""Queues in folders and buckets: what is refused, and what several writers at once may not do."""
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from schemas.errors import CorruptError, InputError
+from schemas.queue import MARK_FILE, event_path, request_path
+from services.queue.store import Queue, make_queue, open_queue
+from tests.fake_drivers import ids, queue_of, request_of
+from tests.s3_server import Bucket, s3_server
+from workers.store.objects import ObjectStore
+
+A, B = ids(2)
+
+
+@pytest.fixture(params=["folder", "bucket"])
+def queue(request, tmp_path):
+    if request.param == "folder":
+        yield queue_of(tmp_path / "q", request_of(A))
+        return
+    with s3_server(Bucket()) as client:
+        made = Queue(ObjectStore(client, "s3://mine"))
+        assert made.put_request(request_of(A))
+        yield made
+
+
+def test_a_job_is_read_as_it_was_stored(queue):
+    assert queue.ids() == [A]
+    assert queue.read(A).request == request_of(A)
+    assert not queue.put_request(request_of(A, name="another"))
+
+
+def test_events_are_kept_in_their_order_and_folded(queue):
+    for kind, attempt in (("started", 1), ("began", 1), ("died", 1), ("started", 2)):
+        assert queue.append(A, kind, attempt) is not None
+    fresh = Queue(queue.store).read(A)
+    assert (fresh.state, fresh.attempt, fresh.deaths, fresh.events) == ("running", 2, 1, 4)
+
+
+def test_of_many_writers_at_once_one_decides(queue):
+    won: list[int] = []
+    start = threading.Barrier(8)
+
+    def contend(number: int) -> None:
+        own = Queue(queue.store)
+        start.wait()
+        if own.append(A, "started", 1) is not None:
+            won.append(number)
+
+    threads = [threading.Thread(target=contend, args=(number,)) for number in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(won) == 1
+    assert queue.read(A).events == 1
+
+
+def test_an_event_that_does_not_apply_is_not_stored(queue):
+    queue.append(A, "cancel")
+    assert queue.append(A, "started", 1) is None
+    assert queue.read(A).events == 1
+
+
+def test_the_share_is_what_was_said_last(queue):
+    assert queue.share() == 1
+    queue.put_share(3)
+    assert queue.share() == 3
+    queue.store.write_whole("share.json", b"{torn")
+    assert queue.share() == 1
+
+
+def test_logs_are_kept_once_and_from_their_end(queue):
+    queue.put_log(A, 1, "x" * (2 << 20) + "end")
+    queue.put_log(A, 1, "again")
+    kept = queue.read_log(A, 1)
+    assert kept.endswith("end") and len(kept) == 1 << 20
+    assert queue.read_log(A, 2) is None
+
+
+def test_an_unknown_id_is_told_in_one_line(queue):
+    with pytest.raises(InputError, match=f"^[^\n]* has no job {B}: `verso jobs` lists[^\n]*$"):
+        queue.read(B)
+
+
+@pytest.mark.parametrize(
+    ("key", "data", "words"),
+    [
+        (request_path(A), b"{", "is damaged"),
+        (request_path(A), b'{"queue": 2}', "is newer than this program"),
+        (request_path(A), b'{"queue": 1, "id": "j1"}', "was not written by this program"),
+        (event_path(A, 0), b"[]", "was not written by this program"),
+        (event_path(A, 3), b"{}", "lacks an event"),
+        (event_path(A, 0), b"x" * (2 << 20), "should have less"),
+    ],
+)
+def test_a_damaged_job_is_told_by_file_and_leaves_the_others_alone(tmp_path, key, data, words):
+    queue = queue_of(tmp_path / "q", request_of(A), request_of(B))
+    queue.store.write_whole(key, data)
+    views, faults = queue.read_all(queue.ids())
+    assert [view.request.id for view in views] == [B]
+    assert words in faults[A] and key.rpartition("/")[0] in faults[A] and "\n" not in faults[A]
+    with pytest.raises(CorruptError):
+        queue.append(A, "cancel")
+
+
+def test_a_request_in_the_place_of_another_is_refused(tmp_path):
+    queue = queue_of(tmp_path / "q", request_of(A), request_of(B))
+    queue.store.write_whole(request_path(A), queue.store.read(request_path(B)))
+    with pytest.raises(CorruptError, match="is the request of another job"):
+        queue.read(A)
+
+
+def test_a_new_or_an_empty_folder_becomes_a_queue_and_stays_one(tmp_path):
+    make_queue(str(tmp_path / "new"))
+    assert open_queue(str(tmp_path / "new")).ids() == []
+    assert {path.name for path in (tmp_path / "new").iterdir()} == {MARK_FILE, "_staging"}
+    mark = (tmp_path / "new" / MARK_FILE).read_bytes()
+    make_queue(str(tmp_path / "new"))
+    assert (tmp_path / "new" / MARK_FILE).read_bytes() == mark
+
+
+def test_many_who_make_one_queue_at_once_all_get_it(tmp_path):
+    faults: list[Exception] = []
+
+    def make() -> None:
+        try:
+            make_queue(str(tmp_path / "q"))
+        except Exception as error:
+            faults.append(error)
+
+    threads = [threading.Thread(target=make) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert faults == []
+    assert open_queue(str(tmp_path / "q")).ids() == []
+
+
+def test_what_is_no_queue_is_refused_with_one_line(tmp_path):
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters" / "to_mother.txt").write_text("dear")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").write_text("x")
+    for opener, name, words in [
+        (open_queue, "nowhere", "there is no such folder"),
+        (open_queue, "letters", f"holds no {MARK_FILE}"),
+        (open_queue, "empty", f"holds no {MARK_FILE}"),
+        (open_queue, "file", "there is no such folder"),
+        (make_queue, "letters", "to_mother.txt"),
+        (make_queue, "nowhere/deep", "there is no folder"),
+        (make_queue, "file", "Not a directory"),
+    ]:
+        with pytest.raises(InputError, match=words) as caught:
+            opener(str(tmp_path / name))
+        assert "\n" not in str(caught.value)
+        assert "--queue" in str(caught.value)
+    assert list((tmp_path / "letters").iterdir()) == [Path(tmp_path / "letters" / "to_mother.txt")]
