@@ -10,7 +10,8 @@ class Fingerprint(Frozen):
 
     `canary` is the SHA-256 of a small scene, made from plan to encoded files; `code` that of the project's source;
     `libraries` holds the versions of libraries that make bytes; `simd` is the widest instruction set that numpy may use;
-    `renderer` is GL's name of itself.
+    `renderer` is GL's name of itself; `maths` is the SHA-256 of what the C library's and numpy's functions give for many
+    numbers, of which the canary scene may meet none that shows a difference.
     """
 
     canary: str
@@ -18,6 +19,7 @@ class Fingerprint(Frozen):
     libraries: dict[str, str]
     simd: str
     renderer: str
+    maths: str = ""
 
     @property
     def digest(self) -> str:
@@ -34,6 +36,8 @@ class Fingerprint(Frozen):
             return (
                 "use processors of one kind, and set NPY_DISABLE_CPU_FEATURES alike (deploy/Dockerfile has the value)"
             )
+        if self.maths != other.maths:
+            return "use machines of one kind with the same C library, or the same image, and unset GLIBC_TUNABLES"
         return "their processors or C libraries differ: use machines of one kind, or the same image"
 
     def differences(self, other: "Fingerprint") -> list[str]:

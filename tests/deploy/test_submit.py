@@ -62,7 +62,12 @@ def touched(*folders: Path) -> list[str]:
 def test_a_job_is_made_on_the_cluster_and_its_exit_code_comes_back(head):
     code, out, err = head.submit("shapes.yaml", "--out", "made", "--scenes", "4")
     assert code == 0, out + err
-    assert "dataset digest" in out and "submit: job verso-shapes-" in err
+    assert "submit: job verso-shapes-" in err
+    here = head.cluster.verso(
+        "run", str(head.home / "verso" / "jobs" / "shapes.yaml"), "--out", str(head.home / "here")
+    )
+    digests = [re.findall(r"dataset digest (\w{64})", said) for said in (out, here.stdout)]
+    assert digests[0] == digests[1] != [], here.stderr
     assert (head.home / "storage" / "made" / "_SUCCESS").exists()
     assert (head.home / "storage" / "made" / "manifest" / "_fingerprint.json").exists()
     code, out, err = head.submit("shapes.yaml", "--out", "made", "--scenes", "2")
@@ -118,6 +123,7 @@ def test_without_the_token_nobody_submits(head):
         with pytest.raises(urllib.error.HTTPError) as refused:
             urllib.request.urlopen(asked, timeout=20)
         assert refused.value.code in (401, 403)
+        refused.value.close()
     assert not (head.home / "storage" / "none").exists()
 
 
