@@ -55,7 +55,7 @@ def test_all_passing_is_0_and_skips_are_explained(project, capfd):
     write_suite(project, measured=3)
     assert selftest.main([]) == 0
     out = capfd.readouterr().out
-    assert out.startswith("verso test: about 15 minutes on 1 core, an estimate\n== static")
+    assert out.startswith("verso test: about 13 minutes on 1 core, an estimate\n== static")
     assert "checked" in out
     (seconds,) = json.loads(selftest.LAST_RUN.read_text()).values()
     assert 0 < seconds < 300
@@ -71,13 +71,13 @@ def test_all_runs_the_slow_tests_too(project, capfd):
 
 def test_the_duration_is_that_of_the_last_run_here_or_the_measured_one(tmp_path, monkeypatch):
     monkeypatch.setattr(selftest, "LAST_RUN", tmp_path / "seconds.json")
-    assert selftest.expected_duration("default", 1) == "about 15 minutes on 1 core, an estimate"
+    assert selftest.expected_duration("default", 1) == "about 13 minutes on 1 core, an estimate"
     selftest.LAST_RUN.write_text('{"default 1": 420}')
     assert selftest.expected_duration("default", 1) == "about 7 minutes on 1 core, as the last time"
-    assert selftest.expected_duration("default", 2) == "about 8 minutes on 2 cores, an estimate"
+    assert selftest.expected_duration("default", 2) == "about 7 minutes on 2 cores, an estimate"
     for torn in ("[torn", "[]", '{"default 2": "x"}'):
         selftest.LAST_RUN.write_text(torn)
-        assert selftest.expected_duration("default", 2) == "about 8 minutes on 2 cores, an estimate"
+        assert selftest.expected_duration("default", 2) == "about 7 minutes on 2 cores, an estimate"
 
 
 SKIPS = """

@@ -54,5 +54,5 @@ def test_folders_of_a_packed_job_have_whole_paths(tmp_path):
     file.write_text("name: meshes\nscenes: 2\ncategories: [mug]\nassets: {objects: [{source: urdf, folder: meshes}]}\n")
     with pytest.raises(JobError, match=r"assets\.objects\.0\.folder: 'meshes': a packed job has no folder of its own"):
         pack_job(file)
-    file.write_text(file.read_text().replace("meshes,", "/srv/meshes,"))
+    file.write_text(file.read_text().replace("folder: meshes", "folder: /srv/meshes"))
     assert is_packed(pack_job(file))
