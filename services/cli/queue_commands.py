@@ -15,7 +15,7 @@ from schemas.plain_line import plain_line
 from schemas.queue import JobRequest
 from services.cli.commands import tell_result
 from services.cli.environment import default_queue
-from services.job.read import load_job, read_text
+from services.job.read import folders_of, load_job, read_text
 from services.queue.store import Queue, make_queue, new_id, open_queue
 
 if TYPE_CHECKING:
@@ -179,14 +179,7 @@ def _absolute(place: str) -> str:
 
 def _refuse_relative_folders(job: "Job", file: Path) -> None:
     """Raises JobError for a folder of assets or captures that only this host, or this user, can find."""
-    sources = {
-        f"assets.{branch}.{number}.folder": getattr(source, "folder", "")
-        for branch in ("objects", "tables")
-        for number, source in enumerate(getattr(job.assets, branch))
-    }
-    folders = job.captures.folders if job.captures is not None else []
-    sources |= {f"captures.folders.{number}": folder for number, folder in enumerate(folders)}
-    for key, folder in sources.items():
+    for key, folder in folders_of(job).items():
         if folder and folder not in ANYWHERE and not folder.startswith("/") and "://" not in folder:
             told = "a job of the queue runs on a cluster: write the whole path, from / on, as all its hosts see it"
             raise JobError(f"{plain_line(str(file), 300)}: {key}: {plain_line(repr(folder))}: {told}")

@@ -54,7 +54,7 @@ def name_of(path: Path) -> str:
     return "the packed job" if is_packed(str(path)) else plain_line(str(path), 300)
 
 
-def _folders(job: Job) -> dict[str, str]:
+def folders_of(job: Job) -> dict[str, str]:
     """Every folder that the job names, by its key."""
     sources = {
         f"assets.{branch}.{number}.folder": getattr(source, "folder", "")
@@ -69,7 +69,7 @@ def _check_absolute(job: Job, name: str) -> None:
     """Raises JobError for a folder that is meant from the job file's own, which a packed job has not."""
     from workers.assets.external.folder import PYBULLET_DATA
 
-    for key, folder in _folders(job).items():
+    for key, folder in folders_of(job).items():
         if folder not in ("", PYBULLET_DATA) and not folder.startswith(("/", "~")):
             raise JobError(
                 f"{name}: {key}: {plain_line(repr(folder))}: a packed job has no folder of its own: write the whole path, the "
@@ -79,7 +79,7 @@ def _check_absolute(job: Job, name: str) -> None:
 
 def _check_homes(job: Job, name: str) -> None:
     """Raises JobError for a folder that begins with the name of a user whom this machine does not know."""
-    for key, folder in _folders(job).items():
+    for key, folder in folders_of(job).items():
         try:
             Path(folder).expanduser()
         except RuntimeError as error:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from schemas.base import frozen_array
 from schemas.errors import MeshError
 from schemas.scene.shape import Asset, MassProperties, Material, Part, Shape
-from workers.assets.external.reader_process import ALIGNMENT
+from workers.assets.external.answers import ALIGNMENT
 
 _KINDS = ("float64", "int32", "uint8")
 _PLAIN = (

@@ -19,7 +19,8 @@ import numpy as np
 
 from schemas.errors import MachineError, MeshError
 from schemas.job.assets import MeshLimits
-from workers.assets.external.reader_process import NO_MEMORY, read_answers, send
+from workers.assets.external.answers import read_answers
+from workers.assets.external.reader_process import NO_MEMORY, send
 from workers.assets.external.reader_tasks import ANSWER, Request, Task, encode_request
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -16,23 +16,20 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from math import ceil
-from typing import NamedTuple, NoReturn
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
+
+if TYPE_CHECKING:
+    from workers.assets.external.answers import Answer
 
 NO_MEMORY = 12
 """Exit code of a child that had no memory left."""
 
 IDLE_S = 300
 """After this long without a request the process ends; the next request starts another."""
-
-ALIGNMENT = 16
-"""Bytes to which the blocks of an answer are aligned."""
-
-Answer = tuple[bytes, Sequence[bytes | memoryview]]
-"""One letter that says what kind of answer it is, and its blocks of bytes."""
 
 PR_SET_PDEATHSIG = 1
 """The option of prctl(2) by which a child ends with its parent."""
@@ -80,8 +77,10 @@ def _serve(work: Callable[[int, int], NoReturn], count: int, asker: socket.socke
         socket.send_fds(asker, [json.dumps(head).encode()], [sink])
 
 
-def _work(limits: Limits, answer: Callable[[int], Answer], asker: socket.socket, count: int, sink: int) -> NoReturn:
+def _work(limits: Limits, answer: "Callable[[int], Answer]", asker: socket.socket, count: int, sink: int) -> NoReturn:
     """In the child: answers every task under the limits, and exits."""
+    from workers.assets.external.answers import write_answer  # found once `main` has set the search path
+
     code = 1
     try:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -102,27 +101,6 @@ def _work(limits: Limits, answer: Callable[[int], Answer], asker: socket.socket,
         code = NO_MEMORY if error.errno in (errno.ENOMEM, errno.EFBIG) else 1
     finally:
         os._exit(code)
-
-
-def write_answer(sink: int, answer: Answer) -> None:
-    """Appends an answer: its length and kind, and its blocks, each aligned to `ALIGNMENT`."""
-    kind, blocks = answer
-    lengths = [len(block) + -len(block) % ALIGNMENT for block in blocks]
-    head = sum(lengths).to_bytes(8, "little") + kind.ljust(ALIGNMENT - 8)
-    for block, length in ((head, ALIGNMENT), *zip(blocks, lengths, strict=True)):
-        for data in (memoryview(block), memoryview(bytes(length - len(block)))):
-            while data:
-                data = data[os.write(sink, data) :]
-
-
-def read_answers(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
-    """Kind and blocks of each answer that `write_answer` wrote whole."""
-    at = 0
-    while at + ALIGNMENT <= len(data):
-        start, stop = at + ALIGNMENT, at + ALIGNMENT + int.from_bytes(data[at : at + 8], "little")
-        if stop <= len(data):
-            yield bytes(data[at + 8 : start]).rstrip(), data[start:stop]
-        at = stop
 
 
 def send(to: socket.socket, data: bytes) -> None:

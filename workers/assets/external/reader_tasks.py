@@ -14,11 +14,11 @@ from schemas.errors import MeshError
 from schemas.job.assets import Assets, FolderSource, ShapeNetSource
 from schemas.scene.shape import Asset
 from workers.assets.builtin.make import TABLE
+from workers.assets.external.answers import Answer
 from workers.assets.external.asset_bytes import pack_asset
 from workers.assets.external.caps import describe_error, one_line
 from workers.assets.external.listing import Entry, SourceFile, hash_files, list_files
 from workers.assets.external.placement import load_entry
-from workers.assets.external.reader_process import Answer
 from workers.geometry.hull import convex_hull
 
 ANSWER, REFUSAL = b"+", b"-"

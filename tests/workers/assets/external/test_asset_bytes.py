@@ -8,8 +8,8 @@ import pytest
 from schemas.base import frozen_array
 from schemas.errors import MeshError
 from schemas.scene.shape import Asset, MassProperties, Material, Part, Shape
+from workers.assets.external.answers import ALIGNMENT
 from workers.assets.external.asset_bytes import pack_asset, unpack_asset
-from workers.assets.external.reader_process import ALIGNMENT
 
 PICTURE = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
 VERTICES = np.asfortranarray(np.random.default_rng(0).random((4, 3)))

@@ -11,15 +11,14 @@ import time
 
 import pytest
 
+from workers.assets.external.answers import read_answers
 from workers.assets.external.reader_process import (
     NO_MEMORY,
     Limits,
     _serve,
     _work,
-    read_answers,
     receive,
     send,
-    write_answer,
 )
 
 
@@ -120,16 +119,3 @@ def test_a_message_is_read_whole_or_not_at_all():
         to.sendall(b"\5" + bytes(7) + b"ab")
         to.shutdown(socket.SHUT_WR)
         assert (receive(source), receive(source), receive(source)) == (b"abc", None, None)
-
-
-@pytest.mark.parametrize("cut", [0, 1, 16, 17, 60])
-def test_blocks_are_aligned_and_an_answer_that_was_not_finished_is_left_out(tmp_path, cut):
-    path = tmp_path / "answers"
-    with path.open("wb") as file:
-        for _ in range(2):
-            write_answer(file.fileno(), (b"-", [b"abc", memoryview(b"0123456789abcdefg")]))
-    data = path.read_bytes()
-    assert len(data) == 2 * (16 + 16 + 32)
-    whole = b"abc".ljust(16, b"\0") + b"0123456789abcdefg".ljust(32, b"\0")
-    found = [(kind, bytes(blocks)) for kind, blocks in read_answers(memoryview(data[: len(data) - cut]))]
-    assert found == [(b"-", whole)] * (1 if cut else 2)
