@@ -33,11 +33,11 @@ from workers.store.local import LocalStore
 SHARD, RANGE = 64, 16
 """Scenes in a shard and in a range, as a large job has them."""
 
-SHARDS_A_SLOT = 12
-"""Of each measurement: the first and the last of a slot weigh little."""
+FEW, MANY = 2, 12
+"""Shards a slot of the two runs whose difference is a measurement: how a run begins and ends is in both."""
 
-SHARD_S = (8.0, 2.0, 0.5, 0.1)
-"""Time of a shard: 8 s is that of 64 scenes of the default tier, the others have as many reports as 4 to 80 times the nodes."""
+SHARD_S = (2.0, 0.5, 0.1)
+"""Time of a shard. 64 scenes of the default tier take 8 s: these have as many reports as 4, 16 and 80 times the nodes."""
 
 NOBODY = Fingerprint(canary="", code="", libraries={}, simd="", renderer="")
 
@@ -45,16 +45,31 @@ NOBODY = Fingerprint(canary="", code="", libraries={}, simd="", renderer="")
 def measure_simulated(job: Job, folder: Path, nodes: Sequence[int], shard_s: Sequence[float]) -> list[dict[str, Any]]:
     """The overhead by number of nodes and time of a shard: wall time over what the sleeps alone take, less one.
 
-    `shards_per_s` that end; `coordinator_ms`: processor time of the coordinator's process a shard, of which the largest
-    number of shards a second follows. Raises MachineError where Ray does not start.
+    From the difference of a short and a long run; `start_s` is what a run takes beside. `shards_per_s` that end;
+    `coordinator_ms`: processor time of the coordinator's process a shard, of which the largest number of shards a second
+    follows. Raises MachineError where Ray does not start.
     """
     found = []
     for count in nodes:
         with simulated_nodes(count):
             drive = _Drive(job, folder, count)
-            drive.run("warm", 0.05, 2)
-            found += [drive.run(f"{count}-{seconds:g}", seconds, SHARDS_A_SLOT) for seconds in shard_s]
+            drive.run("warm", 0.05, FEW)
+            for seconds in shard_s:
+                few, many = (drive.run(f"{count}-{seconds:g}-{shards}", seconds, shards) for shards in (FEW, MANY))
+                found.append({"nodes": count, "shard_s": seconds, **compare(few, many, count, seconds)})
     return found
+
+
+def compare(few: tuple[float, float], many: tuple[float, float], slots: int, shard_s: float) -> dict[str, float]:
+    """The figures, from wall time and processor time of the run with `FEW` shards a slot and of that with `MANY`."""
+    wall_s, cpu_s = many[0] - few[0], many[1] - few[1]
+    shards = slots * (MANY - FEW)
+    return {
+        "overhead": wall_s / ((MANY - FEW) * shard_s) - 1.0,
+        "start_s": few[0] - FEW * wall_s / (MANY - FEW),
+        "shards_per_s": shards / wall_s,
+        "coordinator_ms": 1e3 * cpu_s / shards,
+    }
 
 
 @contextlib.contextmanager
@@ -85,8 +100,8 @@ class _Drive:
         self._job, self._folder, self._slots = job, folder, slots
         self._catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
 
-    def run(self, name: str, shard_s: float, shards: int) -> dict[str, Any]:
-        """The figures of that many shards a slot."""
+    def run(self, name: str, shard_s: float, shards: int) -> tuple[float, float]:
+        """Wall time and processor time of this process for that many shards a slot, seconds."""
         scenes = self._slots * shards * SHARD
         store = LocalStore(self._folder / name)
         store.prepare()
@@ -105,14 +120,7 @@ class _Drive:
             )
             wall_s, cpu_s = time.perf_counter() - begun, time.process_time() - cpu
         assert tally.made == scenes
-        count = self._slots * shards
-        return {
-            "nodes": self._slots,
-            "shard_s": shard_s,
-            "overhead": wall_s / (shards * shard_s) - 1.0,
-            "shards_per_s": count / wall_s,
-            "coordinator_ms": 1e3 * cpu_s / count,
-        }
+        return wall_s, cpu_s
 
 
 def sleeping(seconds: float) -> Callable[[WorkerTerms, bytes, bytes], ShardReport]:
@@ -143,13 +151,16 @@ def sleeping(seconds: float) -> Callable[[WorkerTerms, bytes, bytes], ShardRepor
 def describe(figures: dict[str, Any]) -> list[str]:
     """The figures as text, line by line."""
     lines = [
-        f"coordinator on simulated nodes of one slot, {SHARDS_A_SLOT} shards of {SHARD} sleeping scenes a slot",
+        f"coordinator on simulated nodes of one slot, shards of {SHARD} sleeping scenes",
         "",
     ]
-    lines.append(f"{'nodes':>5}  {'shard':>7}  {'overhead':>8}  {'shards/s':>8}  {'of the coordinator':>20}")
+    lines.append(
+        f"{'nodes':>5}  {'shard':>7}  {'overhead':>8}  {'start':>7}  {'shards/s':>8}  {'of the coordinator':>20}"
+    )
     for lap in figures["simulated"]:
         lines.append(
-            f"{lap['nodes']:5}  {lap['shard_s']:5.1f} s  {lap['overhead']:8.1%}  {lap['shards_per_s']:8.1f}  "
+            f"{lap['nodes']:5}  {lap['shard_s']:5.1f} s  {lap['overhead']:8.1%}  {lap['start_s']:5.2f} s  "
+            f"{lap['shards_per_s']:8.1f}  "
             f"{lap['coordinator_ms']:13.2f} ms/shard"
         )
     return lines

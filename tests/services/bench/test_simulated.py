@@ -4,12 +4,12 @@ import os
 
 import pytest
 
-from services.bench.simulated import describe, measure_simulated, simulated_nodes, sleeping
+from services.bench.simulated import compare, describe, measure_simulated, simulated_nodes, sleeping
 from services.job.read import validate_job
 from tests.services.bench.small_job import SMALL
 from tests.services.run.test_coordinator import spans
 
-KEYS = {"nodes", "shard_s", "overhead", "shards_per_s", "coordinator_ms"}
+KEYS = {"nodes", "shard_s", "overhead", "start_s", "shards_per_s", "coordinator_ms"}
 
 
 def test_a_sleeping_worker_reports_what_it_was_given():
@@ -21,9 +21,25 @@ def test_a_sleeping_worker_reports_what_it_was_given():
     assert [(span.start, span.stop, span.made) for span in made.spans] == [(0, 2, 2), (2, 4, 2), (8, 10, 2)]
 
 
+def test_the_overhead_is_of_the_shards_between_a_short_and_a_long_run():
+    """2 and 12 shards of 0.5 s on 4 slots, 0.8 s to begin, 0.05 s more for each."""
+    figures = compare((0.8 + 2 * 0.55, 0.3 + 8 * 0.002), (0.8 + 12 * 0.55, 0.3 + 48 * 0.002), 4, 0.5)
+    assert figures == pytest.approx({"overhead": 0.1, "start_s": 0.8, "shards_per_s": 4 / 0.55, "coordinator_ms": 2.0})
+
+
 def test_a_lap_is_a_line():
-    lap = {"nodes": 16, "shard_s": 2.0, "overhead": 0.031, "shards_per_s": 7.7, "coordinator_ms": 1.25}
-    assert describe({"simulated": [lap]})[-1].split() == ["16", "2.0", "s", "3.1%", "7.7", "1.25", "ms/shard"]
+    lap = {"nodes": 16, "shard_s": 2.0, "overhead": 0.031, "start_s": 0.84, "shards_per_s": 7.7, "coordinator_ms": 1.25}
+    assert describe({"simulated": [lap]})[-1].split() == [
+        "16",
+        "2.0",
+        "s",
+        "3.1%",
+        "0.84",
+        "s",
+        "7.7",
+        "1.25",
+        "ms/shard",
+    ]
 
 
 @pytest.mark.minute
