@@ -16,7 +16,7 @@ def test_the_list_of_this_project_can_be_read_and_allows_what_the_markers_skip()
     expected = read_expected((ROOT / "tests" / "expected_skips.txt").read_text())
     for scope in ("default", "ci", "all"):
         reasons = [why_skip({marker}, scope) for marker in ("slow", "minute", "docker", "root")]
-        skips = [("tests/test_image.py::test_a", reason) for reason in reasons if reason]
+        skips = [("tests/deploy/test_image.py::test_a", reason) for reason in reasons if reason]
         assert not unexpected(skips, expected, Machine(scope, ROOT))
 
 
