@@ -3,7 +3,6 @@
 import contextlib
 import os
 import secrets
-import socket
 import subprocess
 import sys
 import tempfile
@@ -11,6 +10,8 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+from tests.ports import free_port
 
 ROOT = Path(__file__).resolve().parents[1]
 RAY = str(Path(sys.executable).with_name("ray"))
@@ -29,12 +30,6 @@ class BareCluster:
         command = [sys.executable, "-P", "-m", "services.cli.main", *words]
         environ = {**self.shell, **more}
         return subprocess.run(command, cwd="/", env=environ, capture_output=True, text=True, check=False, timeout=280)
-
-
-def free_port() -> int:
-    with socket.socket() as unused:
-        unused.bind(("127.0.0.1", 0))
-        return unused.getsockname()[1]
 
 
 @contextlib.contextmanager

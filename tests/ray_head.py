@@ -5,7 +5,6 @@ import os
 import secrets
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -17,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.killed_runs import processes_with
+from tests.ports import free_ports
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -28,14 +28,6 @@ class RayHead:
     http: str
     environment: Mapping[str, str]
     mark: str
-
-
-def free_ports(count: int) -> list[int]:
-    with contextlib.ExitStack() as stack:
-        bound = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for one in bound:
-            one.bind(("127.0.0.1", 0))
-        return [one.getsockname()[1] for one in bound]
 
 
 @contextlib.contextmanager

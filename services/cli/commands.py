@@ -34,7 +34,7 @@ def run(options: argparse.Namespace) -> int:
         return 0
     result = run_job(request)
     complete, answer = tell_result(out, job, result)
-    _answer(options, {"ok": complete, **answer})
+    answer_json(options, {"ok": complete, **answer})
     return 0 if complete else 1
 
 
@@ -64,7 +64,8 @@ def _changes(options: argparse.Namespace) -> list[str]:
     return [f"{key}={value}" for key, value in named.items() if value is not None] + options.changes
 
 
-def _answer(options: argparse.Namespace, answer: dict) -> None:
+def answer_json(options: argparse.Namespace, answer: dict) -> None:
+    """Prints what `--json` asks for: one object in the last line; nothing without it."""
     if options.json:
         print(json.dumps(answer))
 
@@ -73,7 +74,7 @@ def pack(options: argparse.Namespace) -> int:
     """`verso pack`."""
     packed = pack_job(options.job)
     print(packed)
-    _answer(options, {"ok": True, "job": packed})
+    answer_json(options, {"ok": True, "job": packed})
     return 0
 
 
@@ -105,7 +106,7 @@ def status(options: argparse.Namespace) -> int:
         print(f"  {line}")
     print(f"  digest: {now.digest}" if now.digest else "  not merged: run the job again to finish it")
     whole = now.digest is not None and not now.missing and not now.lost
-    _answer(options, {"ok": whole, "lives": lives, **dataclasses.asdict(now)})
+    answer_json(options, {"ok": whole, "lives": lives, **dataclasses.asdict(now)})
     return 0 if whole else 1
 
 
@@ -145,7 +146,7 @@ def verify(options: argparse.Namespace) -> int:
             print("\n".join(describe(found)))
             faults += found.faults
             answer[name] = dataclasses.asdict(found)
-    _answer(options, {"ok": not faults, **answer})
+    answer_json(options, {"ok": not faults, **answer})
     return 1 if faults else 0
 
 
@@ -197,7 +198,7 @@ def replay(options: argparse.Namespace) -> int:
     how = "to the byte" if result.same_stack else "within tolerances, because this stack is not the one that made it"
     differ = f"{len(result.differences) or 'none'} differ"
     print(f"scene {scene_id}: {result.compared} files and tables compared {how}: {differ}")
-    _answer(options, {"ok": not result.differences, **dataclasses.asdict(result)})
+    answer_json(options, {"ok": not result.differences, **dataclasses.asdict(result)})
     return 1 if result.differences else 0
 
 
@@ -215,7 +216,7 @@ def _repair(options: argparse.Namespace) -> int:
     )
     off = len(verdict.faults) + verdict.untold
     print(f"{options.out}: {len(found.done)} files put back or written again; {off or 'nothing'} off")
-    _answer(options, {"ok": not off, "done": found.done, "left": found.left, "faults": verdict.faults})
+    answer_json(options, {"ok": not off, "done": found.done, "left": found.left, "faults": verdict.faults})
     return 1 if off else 0
 
 
@@ -228,7 +229,7 @@ def scene(options: argparse.Namespace) -> int:
     with explain_damage(store):
         size = export_scene(store, options.scene, options.glb)
     print(f"{options.glb}: {size / 1e6:.2f} MB, world frame, z up, metres")
-    _answer(options, {"ok": True, "file": str(options.glb), "bytes": size})
+    answer_json(options, {"ok": True, "file": str(options.glb), "bytes": size})
     return 0
 
 

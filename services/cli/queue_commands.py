@@ -1,7 +1,6 @@
 """Handlers of the queue's commands: each takes the parsed options, prints, and returns the exit code."""
 
 import argparse
-import json
 import signal
 import sys
 import tempfile
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING
 from schemas.errors import InputError, JobError, RunError
 from schemas.plain_line import plain_line
 from schemas.queue import JobRequest
-from services.cli.commands import tell_result
+from services.cli.commands import answer_json, tell_result
 from services.cli.environment import default_queue
 from services.job.read import folders_of, load_job, read_text
 from services.queue.store import Queue, make_queue, new_id, open_queue
@@ -22,9 +21,6 @@ if TYPE_CHECKING:
     from schemas.job.job import Job
     from services.queue.drive import Ending
     from services.queue.ray_jobs import Drivers
-
-ANYWHERE = ("pybullet_data",)
-"""Names of asset folders that mean the same on every host."""
 
 
 def submit(options: argparse.Namespace) -> int:
@@ -50,7 +46,7 @@ def submit(options: argparse.Namespace) -> int:
     print(request.id, flush=True)
     _say(f"job {request.id} ({job.name}, {job.scenes} scenes) waits in {queue.name}; its folder is {request.out}")
     _say(_describe_supervisor(queue))
-    _answer(options, {"ok": True, "id": request.id, "name": job.name, "out": request.out, "queue": queue.name})
+    answer_json(options, {"ok": True, "id": request.id, "name": job.name, "out": request.out, "queue": queue.name})
     return 0
 
 
@@ -63,7 +59,7 @@ def jobs(options: argparse.Namespace) -> int:
     print("\n".join(format_rows(rows)) if rows else f"{queue.name} has no jobs")
     if any(row.state in ("queued", "waiting", "running", "cancelling") for row in rows):
         _say(_describe_supervisor(queue))
-    _answer(options, {"ok": True, "queue": queue.name, "jobs": [as_tree(row) for row in rows]})
+    answer_json(options, {"ok": True, "queue": queue.name, "jobs": [as_tree(row) for row in rows]})
     return 0
 
 
@@ -79,7 +75,7 @@ def logs(options: argparse.Namespace) -> int:
         for part in follow_logs(queue, drivers, options.id, _say):
             print(part, end="", flush=True)
         view = queue.read(options.id)
-        _answer(options, {"ok": True, "id": options.id, "state": view.state, "attempts": view.attempt})
+        answer_json(options, {"ok": True, "id": options.id, "state": view.state, "attempts": view.attempt})
         return 0
     texts = read_logs(queue, drivers, view, _say)
     for attempt, text in texts.items():
@@ -87,7 +83,7 @@ def logs(options: argparse.Namespace) -> int:
     if not texts:
         _say(f"job {view.request.id} is {view.state}: nothing is known of what it wrote")
     known = bool(texts) or view.attempt == 0
-    _answer(options, {"ok": known, "id": options.id, "state": view.state, "logs": texts})
+    answer_json(options, {"ok": known, "id": options.id, "state": view.state, "logs": texts})
     return 0 if known else 1
 
 
@@ -103,7 +99,7 @@ def cancel(options: argparse.Namespace) -> int:
         _say(f"job {options.id} runs: its supervisor stops it; what is committed in {view.request.out} is kept")
         _say(_describe_supervisor(queue))
     print(f"{options.id}: {view.state}")
-    _answer(options, {"ok": True, "id": options.id, "state": view.state})
+    answer_json(options, {"ok": True, "id": options.id, "state": view.state})
     return 0
 
 
@@ -118,7 +114,7 @@ def supervise(options: argparse.Namespace) -> int:
         supervise(queue, _drivers(options), rules, _say)
     except KeyboardInterrupt:
         _say("supervision ends; jobs that run go on, the others wait for the next `verso supervise`")
-    _answer(options, {"ok": True, "queue": queue.name})
+    answer_json(options, {"ok": True, "queue": queue.name})
     return 0
 
 
@@ -139,7 +135,7 @@ def drive(options: argparse.Namespace) -> int:
         result = run_job(request)
         complete, answer = tell_result(asked.out, job, result)
         note = "" if complete else "scenes failed: `verso logs` says why"
-        _answer(options, {"ok": complete, **answer})
+        answer_json(options, {"ok": complete, **answer})
         return Ending(0 if complete else 1, note, sum(answer["scenes"].values()), answer["digest"])
 
     return drive(queue, options.id, options.attempt, work)
@@ -179,8 +175,10 @@ def _absolute(place: str) -> str:
 
 def _refuse_relative_folders(job: "Job", file: Path) -> None:
     """Raises JobError for a folder of assets or captures that only this host, or this user, can find."""
+    from workers.assets.external.folder import PYBULLET_DATA
+
     for key, folder in folders_of(job).items():
-        if folder and folder not in ANYWHERE and not folder.startswith("/") and "://" not in folder:
+        if folder not in ("", PYBULLET_DATA) and not folder.startswith("/") and "://" not in folder:
             told = "a job of the queue runs on a cluster: write the whole path, from / on, as all its hosts see it"
             raise JobError(f"{plain_line(str(file), 300)}: {key}: {plain_line(repr(folder))}: {told}")
 
@@ -197,8 +195,3 @@ def _describe_supervisor(queue: Queue) -> str:
 
 def _say(line: str) -> None:
     print(f"verso: {line}", file=sys.stderr, flush=True)
-
-
-def _answer(options: argparse.Namespace, answer: dict) -> None:
-    if options.json:
-        print(json.dumps(answer))

@@ -209,8 +209,7 @@ class Coordinator:
             summary = read_summary(self._store, left[0].start, left[0].retry)
             self._tally.made += summary.made
             self._tally.failed.update(kind for _, kind, _ in summary.failed)
-            self._tally.commits.append(summary)
-            self._tally.ranges += 1
+            self._tally.add_commit(summary)
             left.pop(0)
         if left:
             self._count_death(left[0], error, stalled)

@@ -48,8 +48,13 @@ class Tally:
                 self.conflicts.append(span.conflict)
             self.made += span.made
             self.failed.update(span.failed)
-            self.commits += [span.commit] if span.commit else []
-            self.ranges += span.commit is not None
+            if span.commit:
+                self.add_commit(span.commit)
+
+    def add_commit(self, commit: CommitSummary) -> None:
+        """Counts a range that was committed, and keeps it until it is taken."""
+        self.commits.append(commit)
+        self.ranges += 1
 
     def take_commits(self) -> list[CommitSummary]:
         """The commits since the last call."""

@@ -8,22 +8,11 @@ import pytest
 import yaml
 
 from tests.containers import ROOT, must, run
+from tests.json_shapes import TEXT, TRUTH, closed, each
 
 FILE = ROOT / "docker-compose.yml"
 
-TEXT = {"type": "string"}
 TEXTS = {"type": "array", "items": TEXT, "uniqueItems": True}
-TRUTH = {"type": "boolean"}
-
-
-def closed(**properties: Any) -> dict[str, Any]:
-    """A map that has these keys and no others."""
-    return {"type": "object", "properties": properties, "additionalProperties": False}
-
-
-def each(value: Any) -> dict[str, Any]:
-    """A map from names to values of one kind."""
-    return {"type": "object", "additionalProperties": value}
 
 
 SERVICE = closed(

@@ -12,19 +12,14 @@ import pytest
 import yaml
 
 from tests.containers import ROOT
+from tests.json_shapes import TEXT, TRUTH, closed, each
 
 FILE = ROOT / "deploy" / "kuberay" / "rayjob.yaml"
 
-TEXT = {"type": "string"}
-TRUTH = {"type": "boolean"}
 COUNT = {"type": "integer", "minimum": 0}
 QUANTITY = {"type": "string", "pattern": r"^[0-9]+(\.[0-9]+)?(m|[KMGT]i)?$"}
-TEXT_MAP = {"type": "object", "additionalProperties": TEXT}
+TEXT_MAP = each(TEXT)
 """rayStartParams and the like: a number that is not quoted is refused."""
-
-
-def closed(*required: str, **properties: Any) -> dict[str, Any]:
-    return {"type": "object", "properties": properties, "required": list(required), "additionalProperties": False}
 
 
 def many(value: Any) -> dict[str, Any]:
@@ -35,7 +30,7 @@ EXPRESSION = closed(
     "key", "operator", key=TEXT, operator={"enum": ["In", "NotIn", "Exists", "DoesNotExist"]}, values=many(TEXT)
 )
 TERM = closed(matchExpressions=many(EXPRESSION))
-RESOURCES = {"type": "object", "additionalProperties": QUANTITY}
+RESOURCES = each(QUANTITY)
 CONTAINER = closed(
     "name",
     "image",

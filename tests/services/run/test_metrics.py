@@ -1,7 +1,6 @@
 """The metrics of a run, as Prometheus reads them."""
 
 import contextlib
-import socket
 import urllib.error
 import urllib.request
 
@@ -15,13 +14,8 @@ from services.merge.step import merge
 from services.run.metrics import Counts, Meter, serve
 from services.run.ray_cluster import private_ray
 from services.run.step import RunRequest, run_job
+from tests.ports import free_port
 from tests.services.bench.small_job import SMALL
-
-
-def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
 
 
 @pytest.fixture
