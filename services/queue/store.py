@@ -175,7 +175,10 @@ def make_queue(url: str) -> Queue:
         raise InputError(
             f"--queue {url}: there is no folder {store.root.parent}: make it, or mount what should be there"
         )
-    if foreign := sorted(set(store.names("")) - OWN):
+    found = set(store.names(""))
+    if MARK_FILE in found:  # somebody else has made it since
+        return open_queue(url)
+    if foreign := sorted(found - OWN):
         raise InputError(
             f"--queue {url} is no queue: it holds {plain_line(', '.join(foreign[:3]))} and no {MARK_FILE}; choose a new or "
             "an empty folder"

@@ -10,6 +10,7 @@ from schemas.queue import MARK_FILE, event_path, request_path
 from services.queue.store import Queue, make_queue, open_queue
 from tests.fake_drivers import ids, queue_of, request_of
 from tests.s3_server import Bucket, s3_server
+from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 
 A, B = ids(2)
@@ -138,6 +139,20 @@ def test_many_who_make_one_queue_at_once_all_get_it(tmp_path):
         thread.join()
     assert faults == []
     assert open_queue(str(tmp_path / "q")).ids() == []
+
+
+def test_a_queue_that_another_makes_between_two_looks_is_taken(tmp_path, monkeypatch):
+    make_queue(str(tmp_path / "q"))
+    asked = []
+
+    def absent_at_first(store, key):
+        asked.append(key)
+        return None if len(asked) == 1 else real(store, key)
+
+    real = LocalStore.size
+    monkeypatch.setattr(LocalStore, "size", absent_at_first)
+    assert make_queue(str(tmp_path / "q")).ids() == []
+    assert asked[0] == MARK_FILE
 
 
 def test_what_is_no_queue_is_refused_with_one_line(tmp_path):
