@@ -174,6 +174,16 @@ def _body(scene_id: int, region: int, category: str, instance: str) -> dict[str,
         "T_world_obj": matrix_of(scene_id, 1 if region == 3 else region),
         "redraws": scene_id % 3,
         **_rest(scene_id),
+        "mass_kg": 0.5,
+        "com": [0.01 * region, 0.0, 0.8],
+        "contacts": [
+            {
+                "with_region": 2,
+                "point": [0.01 * region, 0.0, 0.75],
+                "normal": [0.0, 0.0, 1.0],
+                "force": [0.0, 0.0, 4.905],
+            }
+        ],
     }
 
 

@@ -9,7 +9,7 @@ from schemas.base import Pose, frozen_array
 from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.plan import ObjectStart
 from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
-from schemas.scene.scene import Settled
+from schemas.scene.scene import ContactForce, Settled
 from schemas.scene.view import ObjectLabel
 
 Row = dict[str, Any]
@@ -71,7 +71,16 @@ def body_columns(start: ObjectStart, rest: Settled) -> Row:
         "T_world_obj": matrix_column(rest.T_world_obj),
         "redraws": start.redraws,
         **{name: getattr(rest, name) for name in (*LARGEST, *SMALLEST)},
+        "mass_kg": start.asset.mass.mass_kg,
+        "com": (rest.T_world_obj[:3, :3] @ start.asset.mass.com + rest.T_world_obj[:3, 3]).tolist(),
+        "contacts": [contact_columns(contact) for contact in rest.contacts],
     }
+
+
+def contact_columns(contact: ContactForce) -> Row:
+    """One contact of an object: an item of `scenes.bodies.contacts`."""
+    vectors = {"point": contact.point, "normal": contact.normal, "force": contact.force}
+    return {"with_region": contact.with_region, **{name: vector.tolist() for name, vector in vectors.items()}}
 
 
 def columns_of_bodies(bodies: Sequence[Mapping[str, Any]]) -> Row:

@@ -31,6 +31,8 @@ _rest = [
     *_columns(_f64, "equilibrium_residual"),
 ]
 """Quality of rest: of one object, or of the worst of a scene."""
+_contact = pa.struct([*_columns(_i64, "with_region"), *_columns(_array(_f64, 3), "point", "normal", "force")])
+"""Contact of a body at rest: with which region, where, unit normal towards the body and force on it, newtons; world."""
 _body = pa.struct(
     [
         *_columns(_i64, "region_id"),
@@ -39,9 +41,15 @@ _body = pa.struct(
         *_columns(_matrix, "T_world_obj"),
         *_columns(_i64, "redraws"),
         *_rest,
+        *_columns(_f64, "mass_kg"),
+        *_columns(_array(_f64, 3), "com"),
+        *_columns(pa.list_(_contact), "contacts"),
     ]
 )
-"""One object of a scene; the columns of `scenes` itself follow from these (codec.columns_of_bodies)."""
+"""One object of a scene; the columns of `scenes` itself follow from these (codec.columns_of_bodies).
+
+`com`: its centre of mass at rest, metres, world. Contact forces balance the weight to within `equilibrium_residual`.
+"""
 _agreement = pa.struct(_columns(_f64, "median_mm", "share"))
 """Input depth carried into the mirror view, compared with mirror depth: median difference, share within the bound."""
 _seconds = pa.list_(pa.struct([*_columns(_str, "name"), *_columns(_f64, "seconds")]))

@@ -48,7 +48,6 @@ class Physics(Frozen):
     convex parts; hull, parts: always these; box: its bounding box along its own axes."""
     concavity: Annotated[float, Field(ge=0.01, le=1)] = 0.05
     """Largest depth of a hollow that convex parts fill, for a mesh scaled to size 2; parts of built-in shapes are exact."""
-    correction: bool = True
-    """Whether an object at rest is turned onto its face and moved along z until the meshes touch."""
-    snap_rad: NonNegative = 0.02
-    """Largest turn of the final correction onto the face that the object rests on."""
+    exact_rest: bool = True
+    """Whether what the simulation leaves calm is brought to exact rest between the true meshes, and refused where it overlaps
+    or hovers by more than 0.01 mm, or has more than 1 % of its weight out of balance."""

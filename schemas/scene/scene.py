@@ -4,7 +4,7 @@ import hashlib
 from dataclasses import dataclass
 from typing import Literal
 
-from schemas.base import Pose
+from schemas.base import Array, Pose
 from schemas.scene.appearance import Appearance
 from schemas.scene.shape import Shape
 
@@ -13,14 +13,27 @@ SupportedBy = Literal["flat_top", "mesh", "placed"]
 
 
 @dataclass(frozen=True, eq=False)
+class ContactForce:
+    """A contact of an object at rest with another region, in world coordinates.
+
+    point [3] metres; normal [3], unit, towards the object; force [3] on the object, newtons.
+    """
+
+    with_region: int
+    point: Array
+    normal: Array
+    force: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Settled:
     """One object at rest, with the quality of its rest.
 
-    penetration_mm and hover_gap_mm: between the meshes, after the correction; support_margin_mm: distance of the projected
-    centre of mass inside the hull of the contact points; equilibrium_residual: share of the weight that contact forces
-    cannot balance (0 on level ground with a margin above 0); residual_speed_mm_s: drift of the farthest point over the
-    last window, before the correction; recheck_move_mm and recheck_turn_deg: motion when released again (None where it
-    was not).
+    penetration_mm and hover_gap_mm: between the true meshes; support_margin_mm: distance of the projected centre of mass
+    inside the hull of the contacts that hold it up; equilibrium_residual: share of the weight, or of weight times size, that
+    contact forces cannot balance; contacts: those that carry it, whose forces are the proof of that; residual_speed_mm_s:
+    drift of the farthest point over the simulation's last window; recheck_move_mm and recheck_turn_deg: motion when released
+    again (None where it was not).
     """
 
     T_world_obj: Pose
@@ -31,6 +44,7 @@ class Settled:
     residual_speed_mm_s: float
     settle_s: float
     support: SupportedBy
+    contacts: tuple[ContactForce, ...] = ()
     recheck_move_mm: float | None = None
     recheck_turn_deg: float | None = None
 

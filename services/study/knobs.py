@@ -37,7 +37,7 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
             for v in (30.0, 10.0, 3.0, 1.0, 0.3)
         ],
         "collision": _collisions(job),
-        "correction": [Value("off", {"physics.correction": False}), Value("on", {"physics.correction": True})],
+        "exact_rest": [Value("off", {"physics.exact_rest": False}), Value("on", {"physics.exact_rest": True})],
     }
     units = [n for n in (1000, 2000, 5000, 8000) if n * job.images.depth_range_m.high <= 65_535]
     sensors = [Value("exact", {"sensor.depth_noise": None}), Value("azure-kinect", {"sensor.depth_noise": {}})]

@@ -17,10 +17,8 @@ from tests.hard_cases.drops import EDGE_M, X, Y, drop, level, lowered, ring, tur
 from tests.hard_cases.measures import Z
 from tests.physics.settling import settle_single
 from tests.shapes import asset_of
-from workers.geometry.elevation import prepare_terrain
 from workers.geometry.frames import transform
-from workers.physics.placement import Ground, gap_m, placed_mesh
-from workers.physics.separation import clearances
+from workers.physics.separation import Form, find_gaps_m
 from workers.plan.effects import PHYSICS_EFFECTS, Facts, plan_effects
 
 pytestmark = pytest.mark.minute
@@ -53,7 +51,8 @@ def _on_a_ring_from_1_m() -> Facts:
 def test_without_dynamics_an_object_hangs_in_the_air_by_its_clearance():
     facts = facts_with(drop(built_in("mug"), level(), 0.005))
     (start,) = facts.plan.objects
-    air_mm = gap_m(start, start.T_world_obj, Ground(facts.plan.table)) * 1e3
+    forms = [Form(start.asset.shape), Form(facts.plan.table.mesh)]
+    air_mm = find_gaps_m(forms, [start.T_world_obj, np.eye(4)])[0] * 1e3
     assert air_mm == pytest.approx(5.0, abs=1e-6)
     assert air_mm > 10 * GAP_MM
     assert settled(facts).settled[0].hover_gap_mm <= GAP_MM
@@ -90,12 +89,8 @@ def test_without_object_contacts_the_cubes_of_a_stack_overlap_by_their_size():
     alone = effects.without("object_contacts").ran
     through = [settle_single(start, plan.table, physics, alone).T_world_obj for start in plan.objects]
     stacked = [rest.T_world_obj for rest in settled(facts).settled]
-    gaps = [
-        clearances(
-            [placed_mesh(s, T) for s, T in zip(plan.objects, poses, strict=True)], prepare_terrain(plan.table.mesh)
-        )
-        for poses in (through, stacked)
-    ]
+    forms = [*(Form(start.asset.shape) for start in plan.objects), Form(plan.table.mesh)]
+    gaps = [find_gaps_m(forms, [*poses, np.eye(4)]) for poses in (through, stacked)]
     assert min(gaps[0]) < -0.09
     assert np.abs(gaps[1]).max() * 1e3 <= GAP_MM
 

@@ -9,10 +9,8 @@ import numpy as np
 from schemas.base import Array
 from schemas.scene.scene import Settled
 from tests.hard_cases.groups import Group
-from workers.geometry.elevation import prepare_terrain
 from workers.geometry.frames import transform
-from workers.physics.placement import placed_mesh
-from workers.physics.separation import clearances
+from workers.physics.separation import Form, find_gaps_m
 
 
 @dataclass(frozen=True)
@@ -26,8 +24,8 @@ class GroupMeasure:
 
 def worst_gap_mm(group: Group, rest: Sequence[Settled]) -> float:
     """The most by which any object overlaps or hovers over the table and the others."""
-    meshes = [placed_mesh(start, each.T_world_obj) for start, each in zip(group.starts, rest, strict=True)]
-    return max(map(abs, clearances(meshes, prepare_terrain(group.table.mesh)))) * 1e3
+    forms = [*(Form(start.asset.shape) for start in group.starts), Form(group.table.mesh)]
+    return max(map(abs, find_gaps_m(forms, [*(each.T_world_obj for each in rest), np.eye(4)])[:-1])) * 1e3
 
 
 def gaps(bound_mm: float = 0.1) -> GroupMeasure:

@@ -10,7 +10,7 @@ from schemas.base import Array
 from schemas.scene.scene import Settled
 from tests.hard_cases.drops import Drop
 from workers.geometry.frames import transform
-from workers.physics.placement import Ground, gap_m
+from workers.physics.separation import Form, find_gaps_m
 
 Z = np.array([0.0, 0.0, 1.0])
 
@@ -26,7 +26,8 @@ class Measure:
 
 def gap_mm(case: Drop, rest: Settled) -> float:
     """Penetration or gap, whichever there is."""
-    return abs(gap_m(case.start, rest.T_world_obj, Ground(case.table))) * 1e3
+    forms = [Form(case.start.asset.shape), Form(case.table.mesh)]
+    return abs(find_gaps_m(forms, [rest.T_world_obj, np.eye(4)])[0]) * 1e3
 
 
 def gap(bound_mm: float = 0.1) -> Measure:

@@ -1,4 +1,4 @@
-"""Compiled loops over pairs of features of two meshes, for `workers.geometry.contact_points`."""
+"""Compiled loops over pairs of features of two meshes: which are near, and how far apart they are along their normal."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,105 +13,171 @@ SLOPE = 0.02
 PARALLEL = 1e-3
 """Sine of the angle between edges below which they count as parallel: their ends lie on faces then."""
 
+BORDER_M = 1e-7
+"""Distance from a face up to which a corner above its border is above it."""
+
 Index = NDArray[np.int64]
 
 
 @compiled
-def find_near_faces(points: Array, corners: Array, low: Array, high: Array, within: float) -> Index:
-    """[N, 2]: the pairs of a point [P, 3] and a face, with its corners and bounds [F, ...], within a distance."""
+def find_near(low: Array, high: Array, others_low: Array, others_high: Array, within: float) -> Index:
+    """[N, 2]: the pairs of two lists of boxes, bounds [A, 3] and [B, 3], with at most `within` between them on each axis.
+
+    Sorted by the first box. The second list is swept along the axis on which it extends farthest.
+    """
     pairs, count = np.empty((64, 2), np.int64), 0
-    here = np.empty(3)
-    for n in range(len(points)):
-        for f in range(len(corners)):
+    if len(low) == 0 or len(others_low) == 0:
+        return pairs[:0]
+    axis, longest = 0, -1.0
+    for k in range(3):
+        extent = others_high[:, k].max() - others_low[:, k].min()
+        if extent > longest:
+            axis, longest = k, extent
+    widest = (others_high[:, axis] - others_low[:, axis]).max()
+    order = np.argsort(others_low[:, axis], kind="mergesort")
+    sorted_low = others_low[order, axis]
+    for n in range(len(low)):
+        first = np.searchsorted(sorted_low, low[n, axis] - within - widest)
+        for m in range(first, len(order)):
+            if sorted_low[m] > high[n, axis] + within:
+                break
+            f = order[m]
             near = True
             for k in range(3):
-                near = near and low[f, k] - within <= points[n, k] <= high[f, k] + within
+                near = near and others_low[f, k] - within <= high[n, k] and low[n, k] <= others_high[f, k] + within
             if not near:
                 continue
-            nearest_on_triangle(points[n], corners[f], here)
-            d2 = (here[0] - points[n, 0]) ** 2 + (here[1] - points[n, 1]) ** 2 + (here[2] - points[n, 2]) ** 2
-            if d2 <= within * within:
-                if count == len(pairs):
-                    pairs = np.concatenate((pairs, pairs))
-                pairs[count, 0], pairs[count, 1] = n, f
-                count += 1
+            if count == len(pairs):
+                pairs = np.concatenate((pairs, pairs))
+            pairs[count, 0], pairs[count, 1] = n, f
+            count += 1
     return pairs[:count]
 
 
 @compiled
-def clear_opposite_sides(
+def corners_on_faces(
+    pairs: Index,
     vertices: Array,
-    chosen: Index,
     starts: Index,
     members: Index,
-    normals: Array,
+    others: Array,
+    faces: Index,
+    side: Index,
     within: float,
-    over: NDArray[np.bool_],
-    under: NDArray[np.bool_],
-) -> None:
-    """Clears `over` [N] where a neighbour of a vertex lies below the plane through it, and `under` [N] where one lies above.
+) -> tuple[Array, Index]:
+    """(point, normal and gap [N, 7], (corner, face) [N, 2]) of corners over or in faces of another surface.
 
-    chosen [N]: the vertices; normals [N, 3]: of the planes; starts, members: the neighbours of every vertex.
+    pairs [P, 2]: of a vertex and a face that are near. The normal points from the face to the corner's body, the gap is
+    negative where the corner lies below the face. A corner touches a face where all its neighbours lie on one side of the
+    face's plane, to within `SLOPE`, and the face's own neighbours not on the same side.
     """
-    for n in range(len(chosen)):
-        v = vertices[chosen[n]]
-        for m in range(starts[chosen[n]], starts[chosen[n] + 1]):
+    found, which, count = np.empty((64, 7)), np.empty((64, 2), np.int64), 0
+    triangle, normal, foot, nearest = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
+    for row in range(len(pairs)):
+        n, f = pairs[row]
+        for k in range(3):
+            triangle[k] = others[faces[f, k]]
+        cross(triangle[1] - triangle[0], triangle[2] - triangle[0], normal)
+        normal /= np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+        height = 0.0
+        for k in range(3):
+            height += normal[k] * (vertices[n, k] - triangle[0, k])
+        if abs(height) > within:
+            continue
+        for k in range(3):
+            foot[k] = vertices[n, k] - height * normal[k]
+        nearest_on_triangle(foot, triangle, nearest)
+        beside2 = 0.0
+        for k in range(3):
+            beside2 += (nearest[k] - foot[k]) ** 2
+        if beside2 > BORDER_M * BORDER_M:
+            continue
+        over, under = True, True
+        for m in range(starts[n], starts[n + 1]):
             w = vertices[members[m]]
             up = length2 = 0.0
             for k in range(3):
-                up += normals[n, k] * (w[k] - v[k])
-                length2 += (w[k] - v[k]) ** 2
-            slack = max(2.0 * within, SLOPE * np.sqrt(length2))
-            over[n] = over[n] and up >= -slack
-            under[n] = under[n] and up <= slack
+                up += normal[k] * (w[k] - vertices[n, k])
+                length2 += (w[k] - vertices[n, k]) ** 2
+            slack = SLOPE * np.sqrt(length2)
+            over = over and up >= -slack
+            under = under and up <= slack
+        # About the deepest face of a hollow everything rises, as about the underside of a body: there the corner tells
+        upright, turned = over and (side[f] >= 0 or not under), under and side[f] <= 0
+        if not (upright or turned):
+            continue
+        if count == len(found):
+            found, which = np.concatenate((found, found)), np.concatenate((which, which))
+        sign = 1.0 if upright else -1.0
+        for k in range(3):
+            found[count, k] = 0.5 * (vertices[n, k] + foot[k])
+            found[count, 3 + k] = sign * normal[k]
+        found[count, 6] = sign * height
+        which[count, 0], which[count, 1] = n, f
+        count += 1
+    return found[:count], which[:count]
 
 
 @compiled
-def find_edge_crossings(a: Array, over: Array, b: Array, under: Array, within: float) -> Array:
-    """[K, 2, 3]: middle and normal of the places where edges a [N, 2, 3] cross edges b [M, 2, 3] within a distance.
+def cross(u: Array, v: Array, out: Array) -> None:
+    """Writes the cross product of two vectors [3] into `out` [3]."""
+    out[0], out[1], out[2] = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
-    Nearest points of two lines (Ericson 2005, 5.1.9), both within the edges. over, under: the vertices across the edges.
+
+@compiled
+def edges_across_edges(
+    pairs: Index,
+    vertices: Array,
+    edges: Index,
+    across: Index,
+    others: Array,
+    edges2: Index,
+    across2: Index,
+    within: float,
+) -> Array:
+    """[N, 7]: point, normal and gap where edges of one surface cross those of another within a distance.
+
+    Nearest points of two lines (Ericson 2005, 5.1.9), both within the edges. An edge crosses another where the faces about
+    the one lie above the plane between them and those about the other below, to within `SLOPE`.
     """
-    found, count = np.empty((64, 2, 3)), 0
+    found, count = np.empty((64, 7)), 0
     n = np.empty(3)
-    for i in range(len(a)):
-        for j in range(len(b)):
-            near = True
+    for row in range(len(pairs)):
+        i, j = pairs[row]
+        a, b = vertices[edges[i, 0]], others[edges2[j, 0]]
+        u, v, r = vertices[edges[i, 1]] - a, others[edges2[j, 1]] - b, a - b
+        cross(u, v, n)
+        uu = uv = vv = ur = vr = nn = nr = 0.0
+        for k in range(3):
+            uu, uv, vv = uu + u[k] * u[k], uv + u[k] * v[k], vv + v[k] * v[k]
+            ur, vr = ur + u[k] * r[k], vr + v[k] * r[k]
+            nn, nr = nn + n[k] * n[k], nr + n[k] * r[k]
+        if nn <= PARALLEL * PARALLEL * uu * vv or nr * nr > within * within * nn:
+            continue
+        s, t = (uv * vr - ur * vv) / nn, (uu * vr - uv * ur) / nn
+        if s < 0.0 or s > 1.0 or t < 0.0 or t > 1.0:
+            continue
+        length = np.sqrt(nn)
+        positive, negative = True, True
+        for m in range(2):
+            up = down = far_up = far_down = along_up = along_down = 0.0
             for k in range(3):
-                near = near and min(a[i, 0, k], a[i, 1, k]) - within <= max(b[j, 0, k], b[j, 1, k])
-                near = near and max(a[i, 0, k], a[i, 1, k]) + within >= min(b[j, 0, k], b[j, 1, k])
-            if not near:
-                continue
-            u, v, r = a[i, 1] - a[i, 0], b[j, 1] - b[j, 0], a[i, 0] - b[j, 0]
-            n[0], n[1], n[2] = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
-            uu = uv = vv = ur = vr = nn = nr = 0.0
-            for k in range(3):
-                uu, uv, vv = uu + u[k] * u[k], uv + u[k] * v[k], vv + v[k] * v[k]
-                ur, vr = ur + u[k] * r[k], vr + v[k] * r[k]
-                nn, nr = nn + n[k] * n[k], nr + n[k] * r[k]
-            if nn <= PARALLEL * PARALLEL * uu * vv or nr * nr > within * within * nn:
-                continue
-            s, t = (uv * vr - ur * vv) / nn, (uu * vr - uv * ur) / nn
-            if s < 0.0 or s > 1.0 or t < 0.0 or t > 1.0:
-                continue
-            length = np.sqrt(nn)
-            positive, negative = True, True  # the first edge's faces above the plane through it, the second's below
-            for m in range(2):
-                up = down = far_up = far_down = 0.0
-                for k in range(3):
-                    x, y = over[i, m, k] - a[i, 0, k], under[j, m, k] - b[j, 0, k]
-                    up, down = up + n[k] * x / length, down + n[k] * y / length
-                    far_up, far_down = far_up + x * x, far_down + y * y
-                slack_up = max(2.0 * within, SLOPE * np.sqrt(far_up))
-                slack_down = max(2.0 * within, SLOPE * np.sqrt(far_down))
-                positive = positive and up >= -slack_up and down <= slack_down
-                negative = negative and up <= slack_up and down >= -slack_down
-            if not (positive or negative):
-                continue
-            if count == len(found):
-                found = np.concatenate((found, found))
-            for k in range(3):
-                found[count, 0, k] = 0.5 * (a[i, 0, k] + s * u[k] + b[j, 0, k] + t * v[k])
-                found[count, 1, k] = n[k] / length if positive else -n[k] / length
-            count += 1
+                x, y = vertices[across[i, m], k] - a[k], others[across2[j, m], k] - b[k]
+                up, down = up + n[k] * x / length, down + n[k] * y / length
+                far_up, far_down = far_up + x * x, far_down + y * y
+                along_up, along_down = along_up + x * u[k], along_down + y * v[k]
+            slack_up = SLOPE * np.sqrt(max(0.0, far_up - along_up * along_up / uu))
+            slack_down = SLOPE * np.sqrt(max(0.0, far_down - along_down * along_down / vv))
+            positive = positive and up >= -slack_up and down <= slack_down
+            negative = negative and up <= slack_up and down >= -slack_down
+        if not (positive or negative):
+            continue
+        if count == len(found):
+            found = np.concatenate((found, found))
+        sign = 1.0 if positive else -1.0
+        for k in range(3):
+            found[count, k] = 0.5 * (a[k] + s * u[k] + b[k] + t * v[k])
+            found[count, 3 + k] = sign * n[k] / length
+        found[count, 6] = sign * nr / length
+        count += 1
     return found[:count]

@@ -1,41 +1,39 @@
-"""Objects on a table: the remaining gap, the final descent onto the mesh, and the contacts that hold them up. Pure."""
+"""Objects at poses on a table: how far they are from it and from one another, and how contacts hold them up. Pure."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from shapely.geometry import MultiPoint, Point
 
-from schemas.base import Pose
+from schemas.base import Array, Pose, frozen_array
 from schemas.scene.plan import ObjectStart, Table
+from schemas.scene.region import REGION_TABLE
+from schemas.scene.scene import ContactForce
 from schemas.scene.shape import Mesh
-from workers.geometry.contact_points import find_contact_points
-from workers.geometry.convexity import solid_of, weld
+from workers.geometry.contact_surface import crop
 from workers.geometry.elevation import Terrain, prepare_terrain
-from workers.geometry.frames import transform, translation
-from workers.physics.equilibrium import FIXED, Contact, Weight, equilibrium_residual, support_margin_m
-from workers.physics.rest_pose import CONTACT_M
-from workers.physics.separation import above_ground, between, find_near, ground_gap_m
+from workers.geometry.frames import transform
+from workers.physics.bullet import GRAVITY_M_S2
+from workers.physics.rest.contacts import Contacts, find_contacts, find_near_features
+from workers.physics.rest.rest import FALL_M, Thing
+from workers.physics.rest.step import Inertia, Motion, step
+from workers.physics.separation import NEAR_M, Form, find_gaps_m
 
-HOOKED_M = 0.03
-"""Depth below the table's top from which part of the table may be above part of the object."""
-
-FARTHEST_M = 0.01
-"""Greatest height of an object over the table before it is set down: CoACD's parts stand out of a surface by less."""
-
-NEAREST_M = 1e-6
-"""Resolution of distances."""
-
-MOST_STEPS = 16
-"""Bound on the steps of the descent, each by the distance left. Few are needed, unless the object slides past."""
+TOUCHING_M = 1e-5
+"""Distance up to which surfaces touch: the bound on overlap and hover of what rests."""
 
 HELD_FROM = 0.3
 """Least z component of the normal of a contact that holds an object up."""
 
+ROOM_M = 0.04
+"""Distance from the objects up to which a table is looked at: rest moves them by 32 mm at most."""
+
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """A table, and its mesh prepared for height queries."""
+    """A table, with its mesh prepared for queries of its height."""
 
     table: Table
 
@@ -45,18 +43,54 @@ class Ground:
         return prepare_terrain(self.table.mesh)
 
 
-@dataclass(frozen=True)
-class Support:
-    """The support of an object by its contacts.
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Objects and the table below them, with all that their rest is found and measured by.
 
-    margin_m: from the projected centre of mass to the edge of the hull of the contacts that hold it up, or minus its size
-    without such contacts; residual: the share of its weight that contacts cannot balance; highest_m: world z of the
-    highest contact.
+    things: the objects as bodies; forms: their meshes, and last the table's; friction: the coefficient of a contact.
     """
 
+    starts: tuple[ObjectStart, ...]
+    things: tuple[Thing, ...]
+    forms: tuple[Form, ...]
+    friction: float
+
+
+@dataclass(frozen=True)
+class Support:
+    """How an object rests: `gap_m` to what it touches, negative where it overlaps, and how it is held up.
+
+    margin_m: from the projected centre of mass to the edge of the hull of what holds it up; unbalanced: share of its weight,
+    or of weight times size, that contact forces cannot balance.
+    """
+
+    gap_m: float
     margin_m: float
-    residual: float
-    highest_m: float
+    unbalanced: float
+    forces: tuple[ContactForce, ...]
+
+
+def place(starts: Sequence[ObjectStart], poses: Sequence[Pose], table: Table, friction: float) -> Placement:
+    """The objects with the part of the table that they can come to from these poses."""
+    forms = [Form(start.asset.shape) for start in starts]
+    return _placement(starts, poses, forms, table, friction)
+
+
+def place_on_top(start: ObjectStart, T_world_obj: Pose, table: Table, friction: float) -> Placement:
+    """A single object over the table's flat top, with its underside alone, which is all that can touch there."""
+    world = placed_mesh(start, T_world_obj)
+    top = np.array([np.inf, np.inf, world.vertices[:, 2].min() + NEAR_M])
+    under = Mesh(start.asset.shape.vertices, crop(world, np.full(3, -np.inf), top).faces)
+    return _placement((start,), (T_world_obj,), [Form(under)], table, friction)
+
+
+def _placement(
+    starts: Sequence[ObjectStart], poses: Sequence[Pose], forms: Sequence[Form], table: Table, friction: float
+) -> Placement:
+    points = np.concatenate([transform(T, start.hull.vertices) for start, T in zip(starts, poses, strict=True)])
+    near = crop(table.mesh, points.min(axis=0) - ROOM_M, points.max(axis=0) + ROOM_M)
+    things = tuple(Thing(form.surface, start.asset.mass) for form, start in zip(forms, starts, strict=True))
+    return Placement(tuple(starts), things, (*forms, Form(near, table.mesh)), friction)
 
 
 def placed_mesh(start: ObjectStart, T_world_obj: Pose) -> Mesh:
@@ -65,81 +99,53 @@ def placed_mesh(start: ObjectStart, T_world_obj: Pose) -> Mesh:
     return Mesh(transform(T_world_obj, shape.vertices), shape.faces)
 
 
-def gap_m(start: ObjectStart, T_world_obj: Pose, ground: Ground) -> float:
-    """Metres between object and table, negative where they overlap; inf where neither is above the other.
-
-    Along z for an object on the table, exact except between crossing edges. For an object that may be hooked to the table
-    the least distance, or minus the least width of the intersection, where both enclose bodies.
-    """
-    mesh = placed_mesh(start, T_world_obj)
-    if not _may_be_hooked(mesh, ground):
-        return ground_gap_m(mesh, ground.terrain)
-    solids = solid_of(weld(mesh)), solid_of(weld(ground.table.mesh))
-    if solids[0] is not None and solids[1] is not None:
-        return between(solids[0], solids[1])
-    return _distance_m(mesh, ground)
-
-
-def touch_down(start: ObjectStart, T_world_obj: Pose, ground: Ground) -> Pose:
-    """The pose moved along z until the meshes just touch; an object that may be hooked is only lowered."""
-    mesh = placed_mesh(start, T_world_obj)
-    if not _may_be_hooked(mesh, ground):
-        return translation(0.0, 0.0, -above_ground(mesh, ground.terrain)[0]) @ T_world_obj
-    T = T_world_obj
-    for _ in range(MOST_STEPS):
-        distance = _distance_m(placed_mesh(start, T), ground)
-        if distance <= CONTACT_M / 2 or not np.isfinite(distance):
-            break
-        T = translation(0.0, 0.0, -distance) @ T
-    return T
-
-
-def measure_supports(
-    starts: Sequence[ObjectStart], poses: Sequence[Pose], table: Mesh, friction: float
-) -> tuple[Support, ...]:
-    """The support of every object by the table and the others; `friction` is the coefficient between two of them."""
-    meshes = [placed_mesh(start, T) for start, T in zip(starts, poses, strict=True)]
-    coms = [transform(T, start.asset.mass.com[None, :])[0] for start, T in zip(starts, poses, strict=True)]
-    weights = [
-        Weight(start.asset.mass.mass_kg, com, float(np.ptp(mesh.vertices, axis=0).max()))
-        for start, com, mesh in zip(starts, coms, meshes, strict=True)
-    ]
-    contacts = _find_contacts(meshes, table)
-    residuals = equilibrium_residual(weights, contacts, friction)
+def measure_supports(placement: Placement, poses: Sequence[Pose]) -> tuple[Support, ...]:
+    """How every object rests at these `T_world_obj`, by contacts of at most `TOUCHING_M`."""
+    still = (*poses, np.eye(4))
+    gaps_m = find_gaps_m(placement.forms, still)
+    surfaces = [form.surface for form in placement.forms]
+    points = [transform(T, surface.vertices) for T, surface in zip(still, surfaces, strict=True)]
+    found = find_contacts(surfaces, points, find_near_features(surfaces, points, TOUCHING_M), TOUCHING_M)
+    contacts = replace(found, gaps=np.zeros_like(found.gaps))
+    inertias = [thing.inertia(T) for T, thing in zip(poses, placement.things, strict=True)]
+    motion = step(inertias, contacts, placement.friction, FALL_M, GRAVITY_M_S2)
     return tuple(
-        _describe_support(number, contacts, weight, float(residual))
-        for number, (weight, residual) in enumerate(zip(weights, residuals, strict=True))
+        _describe(placement, number, inertia, contacts, motion, gap)
+        for number, (inertia, gap) in enumerate(zip(inertias, gaps_m, strict=False))
     )
 
 
-def _find_contacts(meshes: Sequence[Mesh], table: Mesh) -> list[Contact]:
-    """Contacts of every mesh with the table, and of every two whose boxes are near one another."""
-    found = [Contact(k, FIXED, *find_contact_points(mesh, table, CONTACT_M)) for k, mesh in enumerate(meshes)]
-    pairs = find_near(meshes, 2.0 * CONTACT_M)
-    return found + [Contact(i, j, *find_contact_points(meshes[i], meshes[j], CONTACT_M)) for i, j in pairs]
+def _describe(
+    placement: Placement, number: int, body: Inertia, contacts: Contacts, motion: Motion, gap_m: float
+) -> Support:
+    """The support of one of the bodies that these contacts are between, whose forces lead to this motion."""
+    start = placement.starts[number]
+    own, upper = contacts.of(number), contacts.upper == number
+    sign = np.where(upper[own], 1.0, -1.0)[:, None]
+    points, normals, forces = contacts.points[own], sign * contacts.normals[own], sign * motion.forces[own]
+    others = np.where(upper, contacts.lower, contacts.upper)[own]
+    regions = [*(one.region_id for one in placement.starts), REGION_TABLE]
+    moment = body.tensor @ motion.turns[number] / (body.mass_kg * float(np.ptp(start.hull.vertices, axis=0).max()))
+    held = points[normals[:, 2] > HELD_FROM]
+    return Support(
+        gap_m,
+        support_margin_m(held, body.com) if len(held) else -float(np.ptp(start.hull.vertices, axis=0).max()),
+        float(max(np.linalg.norm(motion.moves[number]), np.linalg.norm(moment))) / FALL_M,
+        tuple(
+            ContactForce(regions[others[k]], frozen_array(points[k]), frozen_array(normals[k]), frozen_array(forces[k]))
+            for k in np.flatnonzero(forces.any(axis=1))
+        ),
+    )
 
 
-def _describe_support(number: int, contacts: Sequence[Contact], weight: Weight, residual: float) -> Support:
-    """The support of one of the bodies that these contacts are between."""
-    own = [contact for contact in contacts if number in (contact.upper, contact.lower)]
-    points = np.concatenate([contact.points for contact in own])
-    up = np.concatenate([contact.normals[:, 2] * (1.0 if contact.upper == number else -1.0) for contact in own])
-    held = points[up > HELD_FROM]
-    margin_m = support_margin_m(held, weight.com) if len(held) else -weight.size_m
-    return Support(margin_m, residual, float(points[:, 2].max(initial=-np.inf)))
+def support_margin_m(points: Array, com: Array) -> float:
+    """Metres from the projected centre of mass [3] to the edge of the level hull of contact points [N, 3]; negative outside.
 
-
-def _may_be_hooked(mesh: Mesh, ground: Ground) -> bool:
-    return bool(mesh.vertices[:, 2].min() < ground.table.top.height_m - HOOKED_M)
-
-
-def _distance_m(mesh: Mesh, ground: Ground) -> float:
-    """The least distance between two meshes, to `NEAREST_M`; inf beyond `FARTHEST_M`."""
-    if len(find_contact_points(mesh, ground.table.mesh, FARTHEST_M)[0]) == 0:
-        return np.inf
-    low, high = 0.0, FARTHEST_M
-    while high - low > NEAREST_M:
-        middle = (low + high) / 2
-        near = len(find_contact_points(mesh, ground.table.mesh, middle)[0]) > 0
-        low, high = (low, middle) if near else (middle, high)
-    return high
+    For contacts on a line or a point: minus the distance to it. -inf without contacts.
+    """
+    if len(points) == 0:
+        return -np.inf
+    outline, at = MultiPoint(points[:, :2]).convex_hull, Point(com[:2])
+    if outline.geom_type == "Polygon" and outline.contains(at):
+        return float(outline.exterior.distance(at))
+    return -float(outline.distance(at))

@@ -1,101 +1,113 @@
-"""Distance or overlap of objects with the table and with one another, between their meshes. Pure."""
+"""Distance or overlap of objects with the table and with one another, between their true meshes. Pure."""
 
 import itertools
 from collections.abc import Iterator, Sequence
-from functools import cache
+from functools import cached_property
 
 import manifold3d
 import numpy as np
 
+from schemas.base import Pose
 from schemas.scene.shape import Mesh
+from workers.geometry.contact_surface import Surface, surface_of
 from workers.geometry.convexity import mesh_of, solid_of, weld
-from workers.geometry.elevation import Terrain, vertical_gap
+from workers.geometry.frames import transform
 from workers.geometry.hull import convex_hull
 from workers.geometry.hull_offset import least_width_m
 from workers.geometry.manifold import hold_to_one_thread
+from workers.physics.rest.contacts import find_contacts, find_near_features
 
-NEAR_M = 0.02
-"""Farthest distance between two objects that is measured."""
+FARTHEST_M = 0.01
+"""Farthest distance that is measured: CoACD's parts stand out of a surface by less."""
+
+NEAR_M = 1e-3
+"""Distance within which others are looked for first: what rests has one."""
 
 NO_VOLUME = 1e-15
 """Cubic metres of overlap that are rounding alone."""
 
-BESIDE_M = 1e-3
-"""Depth in the ground, along z, beyond which an object may be touching the side of a wall instead."""
 
-SIDE_M = 5e-4
-"""It touches a wall if it is less deep once its sides are moved in by this much."""
+class Form:
+    """A mesh in its own frame, with what its rest is found and measured by, made when first asked for.
 
-SIDE_TO_M = 1e-7
-"""Resolution of its depth in the wall."""
-
-
-def clearances(meshes: Sequence[Mesh], ground: Terrain) -> list[float]:
-    """For each mesh (world coordinates) the metres to the nearest other or to the ground; negative where they overlap most.
-
-    To the ground as `ground_gap_m`. Between two meshes as `between`, where a mesh that encloses no body counts as its hull.
+    `mesh` may be a part of `whole`, which decides what is inside.
     """
-    found = [ground_gap_m(mesh, ground) for mesh in meshes]
-    for i, j, gap in find_gaps_m(meshes):
-        found[i], found[j] = min(found[i], gap), min(found[j], gap)
-    return found
+
+    def __init__(self, mesh: Mesh, whole: Mesh | None = None) -> None:
+        self.mesh = mesh
+        self._whole = whole or mesh
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The features that may touch others."""
+        return surface_of(self.mesh)
+
+    @cached_property
+    def solid(self) -> manifold3d.Manifold | None:
+        """The body that the mesh encloses; None where it encloses none."""
+        return solid_of(weld(self._whole))
+
+    @cached_property
+    def body(self) -> manifold3d.Manifold:
+        """The body that the mesh encloses, or else that of its hull."""
+        hold_to_one_thread()
+        return self.solid or manifold3d.Manifold.hull_points(np.ascontiguousarray(self.mesh.vertices))
 
 
-def find_gaps_m(meshes: Sequence[Mesh], near_m: float = NEAR_M) -> Iterator[tuple[int, int, float]]:
-    """(i, j, `between` them) of every two meshes, in one frame, whose boxes are within `near_m` of one another."""
-    solids = cache(lambda k: _solid(meshes[k]))
-    for i, j in find_near(meshes, near_m):
-        yield i, j, between(solids(i), solids(j))
+def find_gaps_m(forms: Sequence[Form], poses: Sequence[Pose]) -> list[float]:
+    """For each form, at its pose [4, 4], the metres to the nearest other; minus the depth where it overlaps.
+
+    The distance is that of a corner from a face or of two edges that cross, and `FARTHEST_M` where nothing is nearer. The
+    depth is `overlap_m` for two solids, else that of the deepest corner or edge.
+    """
+    points = [transform(T, form.surface.vertices) for form, T in zip(forms, poses, strict=True)]
+    surfaces = [form.surface for form in forms]
+    solid = np.array([form.solid is not None for form in forms])
+    gaps = [FARTHEST_M] * len(forms)
+    for within_m in (NEAR_M, FARTHEST_M):
+        contacts = find_contacts(surfaces, points, find_near_features(surfaces, points, within_m), within_m)
+        known = np.where(solid[contacts.upper] & solid[contacts.lower], np.maximum(contacts.gaps, 0.0), contacts.gaps)
+        gaps = [min(FARTHEST_M, float(known[contacts.of(k)].min(initial=np.inf))) for k in range(len(forms))]
+        if max(gaps) <= within_m:
+            break
+    for i, j in _find_near(forms, poses):
+        a, b = forms[i].solid, forms[j].solid
+        if a is not None and b is not None and (depth_m := overlap_m(_place(a, poses[i]), _place(b, poses[j]))):
+            gaps[i], gaps[j] = min(gaps[i], -depth_m), min(gaps[j], -depth_m)
+    return gaps
 
 
-def find_near(meshes: Sequence[Mesh], near_m: float) -> Iterator[tuple[int, int]]:
-    """The numbers i < j of every two meshes, in one frame, whose bounding boxes are within `near_m` of one another."""
-    boxes = [(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) for mesh in meshes]
-    for i, j in itertools.combinations(range(len(meshes)), 2):
-        if (boxes[i][0] <= boxes[j][1] + near_m).all() and (boxes[j][0] <= boxes[i][1] + near_m).all():
+def find_overlaps_m(forms: Sequence[Form], poses: Sequence[Pose]) -> Iterator[tuple[int, int, float]]:
+    """(i, j, `overlap_m`) of every two forms whose boxes overlap; what encloses no body counts as its hull."""
+    for i, j in _find_near(forms, poses):
+        yield i, j, overlap_m(_place(forms[i].body, poses[i]), _place(forms[j].body, poses[j]))
+
+
+def overlap_m(a: manifold3d.Manifold, b: manifold3d.Manifold) -> float:
+    """The thickness of the thickest piece of the intersection of two bodies, metres; 0 where they have none.
+
+    Its least width, or 6 V / A of its volume and area where that is less, as for a piece that is bent: three times the
+    thickness of a plate, and the thickness of a cone or a cube.
+    """
+    hold_to_one_thread()
+    pieces = [piece for piece in (a ^ b).decompose() if piece.volume() > NO_VOLUME]
+    return max(
+        (
+            min(least_width_m(convex_hull(mesh_of(piece).vertices)), 6.0 * piece.volume() / piece.surface_area())
+            for piece in pieces
+        ),
+        default=0.0,
+    )
+
+
+def _find_near(forms: Sequence[Form], poses: Sequence[Pose]) -> Iterator[tuple[int, int]]:
+    """The numbers i < j of every two forms whose bounding boxes overlap."""
+    points = [transform(T, form.surface.vertices) for form, T in zip(forms, poses, strict=True)]
+    boxes = [(each.min(axis=0, initial=np.inf), each.max(axis=0, initial=-np.inf)) for each in points]
+    for i, j in itertools.combinations(range(len(forms)), 2):
+        if (boxes[i][0] <= boxes[j][1]).all() and (boxes[j][0] <= boxes[i][1]).all():
             yield i, j
 
 
-def above_ground(mesh: Mesh, ground: Terrain) -> tuple[float, float]:
-    """(metres along z down to the ground, negative for a mesh that reaches into it; metres of overlap with a wall's side).
-
-    Along z a hair of overlap with a wall's side is as deep as the wall is high. So where the overlap is deep, the mesh is
-    narrowed until it is not.
-    """
-    gap = vertical_gap(mesh, ground)
-    if gap >= -BESIDE_M or vertical_gap(_narrower(mesh, SIDE_M), ground) < -BESIDE_M:
-        return gap, 0.0
-    low, high = 0.0, SIDE_M
-    while high - low > SIDE_TO_M:
-        middle = (low + high) / 2
-        low, high = (middle, high) if vertical_gap(_narrower(mesh, middle), ground) < -BESIDE_M else (low, middle)
-    return vertical_gap(_narrower(mesh, high), ground), high
-
-
-def _narrower(mesh: Mesh, by_m: float) -> Mesh:
-    """The mesh scaled about its middle in x and y, so that each side moves in by `by_m`."""
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    shares = np.append(1.0 - 2.0 * by_m / np.maximum((high - low)[:2], 2.0 * by_m), 1.0)
-    middle = (low + high) / 2
-    return Mesh(middle + (mesh.vertices - middle) * shares, mesh.faces)
-
-
-def ground_gap_m(mesh: Mesh, ground: Terrain) -> float:
-    """Metres from a mesh to the ground along z; minus the depth of overlap with the ground, or with a wall's side if more."""
-    below, beside = above_ground(mesh, ground)
-    return min(below, -beside) if beside > 0.0 else below
-
-
-def between(a: manifold3d.Manifold, b: manifold3d.Manifold) -> float:
-    """Metres between two bodies, `NEAR_M` at most; minus the least width of the widest piece of their intersection."""
-    hold_to_one_thread()
-    pieces = [piece for piece in (a ^ b).decompose() if piece.volume() > NO_VOLUME]
-    if not pieces:
-        return float(a.min_gap(b, NEAR_M))
-    return -max(least_width_m(convex_hull(mesh_of(piece).vertices)) for piece in pieces)
-
-
-def _solid(mesh: Mesh) -> manifold3d.Manifold:
-    hold_to_one_thread()
-    solid = solid_of(weld(mesh))
-    return manifold3d.Manifold.hull_points(np.ascontiguousarray(mesh.vertices)) if solid is None else solid
+def _place(solid: manifold3d.Manifold, T: Pose) -> manifold3d.Manifold:
+    return solid.transform(np.ascontiguousarray(T[:3]))

@@ -8,6 +8,7 @@ import pytest
 from schemas.dataset.codec import (
     camera_columns,
     columns_of_bodies,
+    contact_columns,
     label_columns,
     read_camera,
     read_label,
@@ -15,6 +16,7 @@ from schemas.dataset.codec import (
 )
 from schemas.dataset.tables import SCHEMAS
 from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.scene import ContactForce
 from schemas.scene.view import ObjectLabel
 
 T = np.arange(16.0).reshape(4, 4) / 7.0
@@ -33,7 +35,12 @@ BODY = {
     "recheck_move_mm": None,
     "recheck_turn_deg": None,
     "equilibrium_residual": 0.0,
+    "mass_kg": 0.4,
+    "com": [0.0, 0.1, 0.8],
+    "contacts": [{"with_region": 2, "point": [0.0, 0.1, 0.7], "normal": [0.0, 0.0, 1.0], "force": [0.0, 0.0, 3.924]}],
 }
+OF_A_BODY = {"region_id", "mass_kg", "com", "contacts"}
+"""What is said of bodies alone."""
 
 
 def test_a_camera_comes_back_from_its_row():
@@ -55,10 +62,15 @@ def test_a_label_comes_back_from_its_row():
         assert np.array_equal(getattr(back, field.name), getattr(label, field.name))
 
 
+def test_a_contact_comes_into_its_row():
+    contact = ContactForce(2, np.array([0.0, 0.1, 0.7]), np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 3.924]))
+    assert [contact_columns(contact)] == BODY["contacts"]
+
+
 def test_a_bodys_columns_are_the_tables():
     names = {field.name for field in SCHEMAS["scenes"].field("bodies").type.value_type}
     assert set(BODY) == names
-    assert columns_of_bodies([BODY]).keys() == names - {"region_id"}
+    assert columns_of_bodies([BODY]).keys() == names - OF_A_BODY
     assert columns_of_bodies([BODY]).keys() <= set(SCHEMAS["scenes"].names)
 
 

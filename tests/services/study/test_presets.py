@@ -26,7 +26,7 @@ MORE_EFFORT = (
     "physics.rest.speed_mm_s",
     "physics.rest.spin_rad_s",
     "physics.collision",
-    "physics.correction",
+    "physics.exact_rest",
     "render.path_samples",
 )
 

@@ -64,11 +64,11 @@ def test_parts_of_what_is_convex_are_never_called_for():
     assert PREDICATES["decomposition"]((start_of(CAN),), TABLE, with_(collision="parts")) == "every object is convex"
 
 
-def test_without_correction_an_object_stays_where_the_simulator_left_it():
-    """Bullet leaves what rests some micrometres deep or tilted; with correction nothing of that is left."""
+def test_without_exact_rest_an_object_stays_where_the_simulator_left_it():
+    """Bullet leaves what rests some micrometres deep or tilted; with exact rest nothing of that is left."""
     tilted = rotation_about(np.array([0.8, 0.6, 0.0]), math.radians(3.0))
     for asset in (CAN, TRAY):
-        raw = settle_single(start_of(asset, tilted, 0.005), TABLE, with_(correction=False))
+        raw = settle_single(start_of(asset, tilted, 0.005), TABLE, with_(exact_rest=False))
         corrected = settle_single(start_of(asset, tilted, 0.005), TABLE, PHYSICS)
         assert 1e-5 < raw.penetration_mm + raw.hover_gap_mm < 0.1
         assert corrected.penetration_mm + corrected.hover_gap_mm < 1e-9

@@ -17,7 +17,7 @@ def setting(name: str, **changes: object) -> Setting:
     return Setting(((name, "x"),), {f"physics.{key}": value for key, value in changes.items()})
 
 
-COARSE = setting("coarse", step_hz=60, max_step_travel_mm=1.0, solver_iterations=5, correction=False)
+COARSE = setting("coarse", step_hz=60, max_step_travel_mm=1.0, solver_iterations=5, exact_rest=False)
 BOX = setting("box", collision="box")
 
 
@@ -45,8 +45,8 @@ def test_every_setting_is_measured_in_the_same_scene(scene_id):
     assert found["the job"]["moved_mm"] < 0.05
 
 
-def test_coarse_steps_without_correction_leave_things_in_the_table():
-    """Bullet leaves what rests some micrometres deep; the correction takes that away."""
+def test_coarse_steps_without_exact_rest_leave_things_in_the_table():
+    """Bullet leaves what rests some micrometres deep; exact rest takes that away."""
     assert max(answers(scene)["coarse=x"]["penetration_mm"] for scene in (0, 1, 2)) > 1e-4
 
 

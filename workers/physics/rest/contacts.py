@@ -1,0 +1,132 @@
+"""Signed contacts between the true meshes of bodies and their ground, found anew as bodies move. Pure."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array
+from workers.geometry.contact_kernels import Index, corners_on_faces, edges_across_edges, find_near
+from workers.geometry.contact_surface import Surface
+
+DEEPEST_M = 1e-3
+"""Overlap beyond which a corner belongs to another side of the body, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Contacts of body `upper` [N] with body `lower` [N], in world coordinates; the last body is the ground.
+
+    points [N, 3] metres; normals [N, 3], unit, from lower to upper; gaps [N] metres, negative where the two overlap.
+    """
+
+    upper: Index
+    lower: Index
+    points: Array
+    normals: Array
+    gaps: Array
+
+    def of(self, body: int) -> NDArray[np.bool_]:
+        """[N]: which contacts a body has."""
+        return (self.upper == body) | (self.lower == body)
+
+
+@dataclass(frozen=True, eq=False)
+class Near:
+    """The features of two surfaces, `upper` and `lower`, that are near one another, by their numbers."""
+
+    upper: int
+    lower: int
+    corners: Index
+    """[P, 2]: corner of upper, face of lower."""
+    faces: Index
+    """[P, 2]: corner of lower, face of upper."""
+    edges: Index
+    """[P, 2]: edge of upper, edge of lower."""
+
+
+def find_near_features(surfaces: Sequence[Surface], points: Sequence[Array], within_m: float) -> list[Near]:
+    """The pairs of features with at most `within_m` between their boxes; the last surface is the ground.
+
+    points: the vertices [V, 3] of each surface, world.
+    """
+    found = []
+    bounds = [(each.min(axis=0, initial=np.inf), each.max(axis=0, initial=-np.inf)) for each in points]
+    for i, j in itertools.combinations(range(len(surfaces)), 2):
+        low, high = np.maximum(bounds[i][0], bounds[j][0]) - within_m, np.minimum(bounds[i][1], bounds[j][1]) + within_m
+        if (low > high).any():
+            continue
+        here, there = (_boxes(surfaces[k], points[k], low, high) for k in (i, j))
+        found.append(
+            Near(
+                i,
+                j,
+                _pairs(here[0], there[1], within_m),
+                _pairs(there[0], here[1], within_m),
+                _pairs(here[2], there[2], within_m),
+            )
+        )
+    return found
+
+
+_Boxes = tuple[Index, Array, Array]
+
+
+def _boxes(surface: Surface, points: Array, low: Array, high: Array) -> tuple[_Boxes, _Boxes, _Boxes]:
+    """(numbers, bounds) of the corners, faces and edges of a surface whose boxes overlap a box."""
+    return (
+        _crop(points[surface.corners][:, None], low, high, surface.corners),
+        _crop(points[surface.faces], low, high),
+        _crop(points[surface.edges], low, high),
+    )
+
+
+def _crop(corners: Array, low: Array, high: Array, numbers: Index | None = None) -> _Boxes:
+    least, most = corners.min(axis=1), corners.max(axis=1)
+    near = np.flatnonzero(((least <= high) & (most >= low)).all(axis=1))
+    return near if numbers is None else numbers[near], least[near], most[near]
+
+
+def _pairs(here: _Boxes, there: _Boxes, within_m: float) -> Index:
+    pairs = find_near(here[1], here[2], there[1], there[2], within_m)
+    return np.stack([here[0][pairs[:, 0]], there[0][pairs[:, 1]]], axis=1)
+
+
+def find_contacts(
+    surfaces: Sequence[Surface], points: Sequence[Array], near: Sequence[Near], within_m: float
+) -> Contacts:
+    """The contacts with gaps of at most `within_m` among features that are near."""
+    rows, upper, lower = [np.empty((0, 7))], [], []
+    for pair in near:
+        for found in _between(surfaces, points, pair, within_m):
+            rows.append(found)
+            upper += [pair.upper] * len(found)
+            lower += [pair.lower] * len(found)
+    rows_ = np.concatenate(rows)
+    return Contacts(
+        np.array(upper, dtype=np.int64), np.array(lower, dtype=np.int64), rows_[:, :3], rows_[:, 3:6], rows_[:, 6]
+    )
+
+
+def _between(surfaces: Sequence[Surface], points: Sequence[Array], pair: Near, within_m: float) -> tuple[Array, ...]:
+    """Point, normal and gap [N, 7] of the contacts of two surfaces: corners on faces, faces on corners, edges."""
+    a, b = surfaces[pair.upper], surfaces[pair.lower]
+    p, q = points[pair.upper], points[pair.lower]
+    on_lower = corners_on_faces(pair.corners, p, a.starts, a.members, q, b.faces, b.side, within_m)
+    on_upper = corners_on_faces(pair.faces, q, b.starts, b.members, p, a.faces, a.side, within_m)
+    crossed = edges_across_edges(pair.edges, p, a.edges, a.across, q, b.edges, b.across, within_m)
+    turned = _shallowest(*on_upper)
+    turned[:, 3:6] *= -1.0
+    return _shallowest(*on_lower), turned, crossed[crossed[:, 6] >= -DEEPEST_M]
+
+
+def _shallowest(rows: Array, which: Index) -> Array:
+    """The contacts without those by which a corner would leave the other body the longer way."""
+    inside = rows[:, 6] < 0.0
+    if not inside.any():
+        return rows
+    best = np.full(int(which[:, 0].max()) + 1, -np.inf)
+    np.maximum.at(best, which[inside, 0], rows[inside, 6])
+    return rows[~inside | ((rows[:, 6] >= best[which[:, 0]]) & (rows[:, 6] >= -DEEPEST_M))]
