@@ -5,7 +5,7 @@ import trimesh
 
 from schemas.base import Array
 from schemas.scene.shape import MassProperties, Mesh
-from workers.geometry.contact_surface import surface_of
+from workers.geometry.contact_surface import is_closed, surface_of
 from workers.geometry.frames import pose, rotation_about, transform
 from workers.physics.rest.contacts import Contacts, find_contacts, find_near_features
 from workers.physics.rest.rest import Thing
@@ -30,7 +30,7 @@ def tipped(angle_rad: float) -> Array:
 
 def contacts_between(meshes: list[Mesh], within_m: float) -> Contacts:
     """Of meshes in world coordinates, the last of which is the ground."""
-    surfaces = [surface_of(mesh) for mesh in meshes]
+    surfaces = [surface_of(mesh, is_closed(mesh)) for mesh in meshes]
     points = [surface.vertices for surface in surfaces]
     return find_contacts(surfaces, points, find_near_features(surfaces, points, within_m), within_m)
 
@@ -39,4 +39,4 @@ def thing_of(mesh: Mesh, mass_kg: float = 1.0) -> Thing:
     """A body of even density, by trimesh."""
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     com, tensor = np.array(body.center_mass), np.array(body.moment_inertia) * mass_kg / body.volume
-    return Thing(surface_of(mesh), MassProperties(mass_kg, com, tensor, True))
+    return Thing(surface_of(mesh, is_closed(mesh)), MassProperties(mass_kg, com, tensor, True))

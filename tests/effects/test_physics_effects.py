@@ -51,7 +51,7 @@ def _on_a_ring_from_1_m() -> Facts:
 def test_without_dynamics_an_object_hangs_in_the_air_by_its_clearance():
     facts = facts_with(drop(built_in("mug"), level(), 0.005))
     (start,) = facts.plan.objects
-    forms = [Form(start.asset.shape), Form(facts.plan.table.mesh)]
+    forms = [Form(start.asset.shape.mesh), Form(facts.plan.table.mesh)]
     air_mm = find_gaps_m(forms, [start.T_world_obj, np.eye(4)])[0] * 1e3
     assert air_mm == pytest.approx(5.0, abs=1e-6)
     assert air_mm > 10 * GAP_MM
@@ -89,7 +89,7 @@ def test_without_object_contacts_the_cubes_of_a_stack_overlap_by_their_size():
     alone = effects.without("object_contacts").ran
     through = [settle_single(start, plan.table, physics, alone).T_world_obj for start in plan.objects]
     stacked = [rest.T_world_obj for rest in settled(facts).settled]
-    forms = [*(Form(start.asset.shape) for start in plan.objects), Form(plan.table.mesh)]
+    forms = [*(Form(start.asset.shape.mesh) for start in plan.objects), Form(plan.table.mesh)]
     gaps = [find_gaps_m(forms, [*poses, np.eye(4)]) for poses in (through, stacked)]
     assert min(gaps[0]) < -0.09
     assert np.abs(gaps[1]).max() * 1e3 <= GAP_MM

@@ -24,7 +24,7 @@ class GroupMeasure:
 
 def worst_gap_mm(group: Group, rest: Sequence[Settled]) -> float:
     """The most by which any object overlaps or hovers over the table and the others."""
-    forms = [*(Form(start.asset.shape) for start in group.starts), Form(group.table.mesh)]
+    forms = [*(Form(start.asset.shape.mesh) for start in group.starts), Form(group.table.mesh)]
     return max(map(abs, find_gaps_m(forms, [*(each.T_world_obj for each in rest), np.eye(4)])[:-1])) * 1e3
 
 

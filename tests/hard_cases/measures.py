@@ -26,7 +26,7 @@ class Measure:
 
 def gap_mm(case: Drop, rest: Settled) -> float:
     """Penetration or gap, whichever there is."""
-    forms = [Form(case.start.asset.shape), Form(case.table.mesh)]
+    forms = [Form(case.start.asset.shape.mesh), Form(case.table.mesh)]
     return abs(find_gaps_m(forms, [rest.T_world_obj, np.eye(4)])[0]) * 1e3
 
 

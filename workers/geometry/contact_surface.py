@@ -34,8 +34,8 @@ class Surface:
     members: Index
 
 
-def surface_of(mesh: Mesh) -> Surface:
-    """The features of a mesh, whichever way its faces are wound, closed or not."""
+def surface_of(mesh: Mesh, closed: bool) -> Surface:
+    """The features of a mesh, or of a part of one that is `closed`, whichever way its faces are wound."""
     mesh = weld(mesh)
     vertices, faces = np.ascontiguousarray(mesh.vertices, dtype=np.float64), mesh.faces.astype(np.int64)
     normals = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
@@ -43,12 +43,15 @@ def surface_of(mesh: Mesh) -> Surface:
     faces, normals = faces[doubled > 0.0], normals[doubled > 0.0] / doubled[doubled > 0.0, None]
     starts, members = _star(faces, len(vertices))
     edges, across = _bent_edges(vertices, faces, normals)
-    bound = np.unique(
-        np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1) @ [len(vertices), 1], return_counts=True
-    )
-    closed = (bound[1] > 1).all()
     side = _sides(vertices, faces, normals, starts, members) if closed else np.zeros(len(faces), dtype=np.int64)
     return Surface(vertices, faces, side, np.unique(edges), edges, across, starts, members)
+
+
+def is_closed(mesh: Mesh) -> bool:
+    """Whether every edge of a mesh has two faces or more, once its vertices at one place are one."""
+    mesh = weld(mesh)
+    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
+    return bool((np.unique(edges @ [len(mesh.vertices), 1], return_counts=True)[1] > 1).all())
 
 
 def crop(mesh: Mesh, low: Array, high: Array) -> Mesh:

@@ -12,7 +12,7 @@ from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.region import REGION_TABLE
 from schemas.scene.scene import ContactForce
 from schemas.scene.shape import Mesh
-from workers.geometry.contact_surface import crop
+from workers.geometry.contact_surface import crop, is_closed
 from workers.geometry.elevation import Terrain, prepare_terrain
 from workers.geometry.frames import transform
 from workers.physics.bullet import GRAVITY_M_S2
@@ -61,27 +61,29 @@ class Support:
     """How an object rests: `gap_m` to what it touches, negative where it overlaps, and how it is held up.
 
     margin_m: from the projected centre of mass to the edge of the hull of what holds it up; unbalanced: share of its weight,
-    or of weight times size, that contact forces cannot balance.
+    or of weight times size, that contact forces cannot balance; highest_m: world z of its highest contact.
     """
 
     gap_m: float
     margin_m: float
     unbalanced: float
+    highest_m: float
     forces: tuple[ContactForce, ...]
 
 
 def place(starts: Sequence[ObjectStart], poses: Sequence[Pose], table: Table, friction: float) -> Placement:
     """The objects with the part of the table that they can come to from these poses."""
-    forms = [Form(start.asset.shape) for start in starts]
+    forms = [Form(start.asset.shape.mesh, closed=start.asset.shape.closed) for start in starts]
     return _placement(starts, poses, forms, table, friction)
 
 
 def place_on_top(start: ObjectStart, T_world_obj: Pose, table: Table, friction: float) -> Placement:
     """A single object over the table's flat top, with its underside alone, which is all that can touch there."""
-    world = placed_mesh(start, T_world_obj)
+    world, shape = placed_mesh(start, T_world_obj), start.asset.shape
     top = np.array([np.inf, np.inf, world.vertices[:, 2].min() + NEAR_M])
-    under = Mesh(start.asset.shape.vertices, crop(world, np.full(3, -np.inf), top).faces)
-    return _placement((start,), (T_world_obj,), [Form(under)], table, friction)
+    under = Mesh(shape.vertices, crop(world, np.full(3, -np.inf), top).faces)
+    form = Form(under, closed=shape.closed or is_closed(shape.mesh))
+    return _placement((start,), (T_world_obj,), [form], table, friction)
 
 
 def _placement(
@@ -90,7 +92,7 @@ def _placement(
     points = np.concatenate([transform(T, start.hull.vertices) for start, T in zip(starts, poses, strict=True)])
     near = crop(table.mesh, points.min(axis=0) - ROOM_M, points.max(axis=0) + ROOM_M)
     things = tuple(Thing(form.surface, start.asset.mass) for form, start in zip(forms, starts, strict=True))
-    return Placement(tuple(starts), things, (*forms, Form(near, table.mesh)), friction)
+    return Placement(tuple(starts), things, (*forms, Form(near, table.mesh, table.asset.shape.closed)), friction)
 
 
 def placed_mesh(start: ObjectStart, T_world_obj: Pose) -> Mesh:
@@ -131,6 +133,7 @@ def _describe(
         gap_m,
         support_margin_m(held, body.com) if len(held) else -float(np.ptp(start.hull.vertices, axis=0).max()),
         float(max(np.linalg.norm(motion.moves[number]), np.linalg.norm(moment))) / FALL_M,
+        float(points[:, 2].max(initial=-np.inf)),
         tuple(
             ContactForce(regions[others[k]], frozen_array(points[k]), frozen_array(normals[k]), frozen_array(forces[k]))
             for k in np.flatnonzero(forces.any(axis=1))

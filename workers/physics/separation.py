@@ -9,7 +9,7 @@ import numpy as np
 
 from schemas.base import Pose
 from schemas.scene.shape import Mesh
-from workers.geometry.contact_surface import Surface, surface_of
+from workers.geometry.contact_surface import Surface, is_closed, surface_of
 from workers.geometry.convexity import mesh_of, solid_of, weld
 from workers.geometry.frames import transform
 from workers.geometry.hull import convex_hull
@@ -28,23 +28,22 @@ NO_VOLUME = 1e-15
 
 
 class Form:
-    """A mesh in its own frame, with what its rest is found and measured by, made when first asked for.
+    """A mesh with what its rest is found and measured by, made when first asked for.
 
-    `mesh` may be a part of `whole`, which decides what is inside.
+    `mesh` may be a part of a `whole`, which decides what is inside. `closed`: known to have an inside.
     """
 
-    def __init__(self, mesh: Mesh, whole: Mesh | None = None) -> None:
-        self.mesh = mesh
-        self._whole = whole or mesh
+    def __init__(self, mesh: Mesh, whole: Mesh | None = None, closed: bool = False) -> None:
+        self.mesh, self._whole, self._closed = mesh, whole or mesh, closed
 
     @cached_property
     def surface(self) -> Surface:
         """The features that may touch others."""
-        return surface_of(self.mesh)
+        return surface_of(self.mesh, self._closed or is_closed(self._whole))
 
     @cached_property
     def solid(self) -> manifold3d.Manifold | None:
-        """The body that the mesh encloses; None where it encloses none."""
+        """The body that the mesh encloses; None where it encloses none, as a part of one."""
         return solid_of(weld(self._whole))
 
     @cached_property

@@ -13,7 +13,7 @@ from workers.geometry.elevation import vertical_gap
 from workers.geometry.frames import transform, translation
 from workers.physics.effects import called_for_with
 from workers.physics.fall import Outcome
-from workers.physics.placement import TOUCHING_M, Placement, measure_supports, place, place_on_top, placed_mesh
+from workers.physics.placement import TOUCHING_M, Placement, Support, measure_supports, place, place_on_top, placed_mesh
 from workers.physics.release import Drop, release
 from workers.physics.rest.rest import rest
 from workers.physics.rest_pose import snap_to_face
@@ -38,8 +38,9 @@ class LeftRoomError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class _Ending:
-    """Objects at the poses [4, 4] of their rest, after `seconds` in all, with the speed that the simulation left them."""
+    """The objects of a drop at the poses [4, 4] of their rest, after `seconds` in all, with the speed that was left."""
 
+    drop: Drop
     placement: Placement
     poses: tuple[Pose, ...]
     seconds: float = 0.0
@@ -54,17 +55,17 @@ def settle(drop: Drop) -> tuple[Settled, ...]:
     """
     if not drop.effects.runs("dynamics"):
         poses = tuple(start.T_world_obj for start in drop.starts)
-        return _judged(_Ending(_place(drop, poses), poses), "placed", judged=True)
+        return _describe(_Ending(drop, _place(drop, poses), poses), "placed", judged=True)
     _require_apart(drop.starts)
     if not drop.effects.runs("table_mesh"):
         ending = _come_to_rest(drop, flat=True)
         if ending is not None:
-            return _judged(ending, "flat_top", drop.physics.exact_rest)
+            return _describe(ending, "flat_top", drop.physics.exact_rest)
         late = called_for_with("table_mesh", drop.starts, drop.physics)
         drop = dataclasses.replace(drop, effects=add_effects(drop.effects, late))
     ending = _come_to_rest(drop, flat=False)
     assert ending is not None  # only the flat top has an edge
-    return _judged(ending, "mesh", drop.physics.exact_rest)
+    return _describe(ending, "mesh", drop.physics.exact_rest)
 
 
 def add_effects(effects: EffectPlan, names: Iterable[str]) -> EffectPlan:
@@ -73,7 +74,7 @@ def add_effects(effects: EffectPlan, names: Iterable[str]) -> EffectPlan:
 
 
 def _require_apart(starts: Sequence[ObjectStart]) -> None:
-    forms = [Form(start.asset.shape) for start in starts]
+    forms = [Form(start.asset.shape.mesh) for start in starts]
     for i, j, depth_m in find_overlaps_m(forms, [start.T_world_obj for start in starts]):
         if depth_m > MOST_OVERLAP_M:
             raise SettleError(
@@ -98,90 +99,101 @@ def _come_to_rest(drop: Drop, flat: bool) -> _Ending | None:
             return None
         seconds += outcome.seconds
         _require_calm(drop, outcome)
-        if not drop.physics.exact_rest:
-            return _Ending(_place(drop, outcome.poses), outcome.poses, seconds, outcome.speed_m_s)
-        if flat and drop.single and (standing := _stand(drop, outcome.poses[0])) is not None:
-            return dataclasses.replace(standing, seconds=seconds, speed_m_s=outcome.speed_m_s)
         placement = placement or _place(drop, outcome.poses)
+        ending = _Ending(drop, placement, outcome.poses, seconds, outcome.speed_m_s)
+        if not drop.physics.exact_rest:
+            return ending
+        if flat and drop.single and (standing := _stand(ending)) is not None:
+            return standing
         rested = rest(placement.things, outcome.poses, placement.forms[-1].surface, placement.friction)
         if rested.still:
-            return _Ending(placement, rested.poses, seconds, outcome.speed_m_s)
+            return dataclasses.replace(ending, poses=rested.poses)
         starts = (dataclasses.replace(one, T_world_obj=T) for one, T in zip(drop.starts, rested.poses, strict=True))
         drop = dataclasses.replace(drop, starts=tuple(starts))
     raise SettleError(
         "not_at_rest",
-        f"{_what(drop)} tips on without end: it was released {MOST_RELEASES} times, for {seconds:.1f} s in all, and "
-        "never came into balance: lower physics.rest.speed_mm_s",
+        f"{'it tips' if drop.single else 'something tips'} on without end: released {MOST_RELEASES} times, for {seconds:.1f} "
+        "s in all, it never came into balance: lower physics.rest.speed_mm_s",
     )
-
-
-def _what(drop: Drop) -> str:
-    return "it" if drop.single else "something"
 
 
 def _place(drop: Drop, poses: Sequence[Pose]) -> Placement:
     return place(drop.starts, poses, drop.ground.table, drop.physics.friction**2)
 
 
-def _stand(drop: Drop, T_world_obj: Pose) -> _Ending | None:
+def _stand(ending: _Ending) -> _Ending | None:
     """A single object turned onto the steady face of its hull that is below it, on the flat top; None where none is near."""
-    start = drop.starts[0]
-    T = snap_to_face(T_world_obj, start.hull, start.asset.mass.com)
+    drop, (start,) = ending.drop, ending.drop.starts
+    T = snap_to_face(ending.poses[0], start.hull, start.asset.mass.com)
     if T is None:
         return None
     T = translation(0.0, 0.0, -vertical_gap(placed_mesh(start, T), drop.ground.terrain)) @ T
-    return _Ending(place_on_top(start, T, drop.ground.table, drop.physics.friction**2), (T,))
+    on_top = place_on_top(start, T, drop.ground.table, ending.placement.friction)
+    return dataclasses.replace(ending, placement=on_top, poses=(T,))
 
 
 def _require_calm(drop: Drop, outcome: Outcome) -> None:
-    lowest_m = drop.ground.table.top.height_m - LEFT_M
+    if outcome.rested:
+        return
     for start, T in zip(drop.starts, outcome.poses, strict=True):
-        com = transform(T, start.asset.mass.com[None, :])[0]
-        if com[2] >= lowest_m:
-            continue
-        whose, advice = "", "narrow start.offset_m or use larger tables"
-        if not drop.single:
-            whose = f" of region {start.region_id}"
-            advice = "fewer objects_per_scene, a narrower start.offset_m or larger tables"
-        raise SettleError(
-            "left_table",
-            f"after {outcome.seconds:.2f} s the centre of mass{whose} was at ({com[0]:.3f}, {com[1]:.3f}, {com[2]:.3f}) "
-            f"m, off the table's top: {advice}",
-        )
-    if not outcome.rested:
-        raise SettleError(
-            "not_at_rest",
-            f"{'still moving' if drop.single else 'something still moves'} at {outcome.speed_m_s * 1e3:.2f} mm/s after "
-            f"{outcome.seconds:.1f} s: raise physics.max_settle_s or physics.rolling_friction",
-        )
+        if _is_low(drop, start, T):
+            raise _left_table(drop, start, T, outcome.seconds)
+    raise SettleError(
+        "not_at_rest",
+        f"{'still moving' if drop.single else 'something still moves'} at {outcome.speed_m_s * 1e3:.2f} mm/s after "
+        f"{outcome.seconds:.1f} s: raise physics.max_settle_s or physics.rolling_friction",
+    )
 
 
-def _judged(ending: _Ending, support: SupportedBy, judged: bool) -> tuple[Settled, ...]:
-    """The rest poses with their figures, measured between the true meshes and not taken from the simulator.
+def _is_low(drop: Drop, start: ObjectStart, T: Pose) -> bool:
+    return not transform(T, start.asset.mass.com[None])[0, 2] >= drop.ground.table.top.height_m - LEFT_M
 
-    Raises SettleError `unsupported` where an object overlaps, hovers or is out of balance, and `judged`.
-    """
-    settled, starts = [], ending.placement.starts
-    for start, T, held in zip(starts, ending.poses, measure_supports(ending.placement, ending.poses), strict=True):
-        if judged and (abs(held.gap_m) > TOUCHING_M or not held.unbalanced <= UNBALANCED):
-            side = "inside what it touches" if held.gap_m < 0.0 else "from anything"
-            raise SettleError(
-                "unsupported",
-                f"{'it' if len(starts) == 1 else f'region {start.region_id}'} came to rest {abs(held.gap_m) * 1e3:.3f} mm "
-                f"{side}, with {held.unbalanced:.1%} of its weight out of balance; the bounds are {TOUCHING_M * 1e3:g} mm and "
-                f"{UNBALANCED:.0%}: lower physics.rest.speed_mm_s",
-            )
-        settled.append(
-            Settled(
-                T_world_obj=frozen_array(T),
-                penetration_mm=max(0.0, -held.gap_m) * 1e3,
-                hover_gap_mm=max(0.0, held.gap_m) * 1e3,
-                support_margin_mm=held.margin_m * 1e3,
-                equilibrium_residual=held.unbalanced,
-                residual_speed_mm_s=ending.speed_m_s * 1e3,
-                settle_s=ending.seconds,
-                support=support,
-                contacts=held.forces,
-            )
+
+def _left_table(drop: Drop, start: ObjectStart, T: Pose, seconds: float) -> SettleError:
+    x, y, z = transform(T, start.asset.mass.com[None])[0].tolist()
+    whose, advice = "", "narrow start.offset_m or use larger tables"
+    if not drop.single:
+        whose = f" of region {start.region_id}"
+        advice = "fewer objects_per_scene, a narrower start.offset_m or larger tables"
+    return SettleError(
+        "left_table",
+        f"after {seconds:.2f} s the centre of mass{whose} was at ({x:.3f}, {y:.3f}, {z:.3f}) m, off the table's top: {advice}",
+    )
+
+
+def _describe(ending: _Ending, support: SupportedBy, judged: bool) -> tuple[Settled, ...]:
+    """The rest poses with their figures, measured between the true meshes and not taken from the simulator."""
+    supports = measure_supports(ending.placement, ending.poses)
+    for start, T, held in zip(ending.drop.starts, ending.poses, supports, strict=True):
+        # What is this low may hang on the table by a handle, or stand on its foot
+        if _is_low(ending.drop, start, T) and held.highest_m < ending.drop.ground.table.top.height_m - LEFT_M:
+            raise _left_table(ending.drop, start, T, ending.seconds)
+        if judged:
+            _require_support(ending.drop, start, held)
+    return tuple(
+        Settled(
+            T_world_obj=frozen_array(T),
+            penetration_mm=max(0.0, -held.gap_m) * 1e3,
+            hover_gap_mm=max(0.0, held.gap_m) * 1e3,
+            support_margin_mm=held.margin_m * 1e3,
+            equilibrium_residual=held.unbalanced,
+            residual_speed_mm_s=ending.speed_m_s * 1e3,
+            settle_s=ending.seconds,
+            support=support,
+            contacts=held.forces,
         )
-    return tuple(settled)
+        for T, held in zip(ending.poses, supports, strict=True)
+    )
+
+
+def _require_support(drop: Drop, start: ObjectStart, held: Support) -> None:
+    """Raises SettleError `unsupported` where an object overlaps another or the table, hovers, or is out of balance."""
+    if abs(held.gap_m) <= TOUCHING_M and held.unbalanced <= UNBALANCED:
+        return
+    where = "inside what it touches" if held.gap_m < 0.0 else "from anything"
+    raise SettleError(
+        "unsupported",
+        f"{'it' if drop.single else f'region {start.region_id}'} came to rest {abs(held.gap_m) * 1e3:.3f} mm {where}, with "
+        f"{held.unbalanced:.1%} of its weight out of balance; the bounds are {TOUCHING_M * 1e3:g} mm and {UNBALANCED:.0%}: "
+        "lower physics.rest.speed_mm_s",
+    )

@@ -3,18 +3,20 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import daqp
 import numpy as np
-from scipy.optimize import nnls
 
 from schemas.base import Array
 from workers.physics.rest.contacts import Contacts
 
-CONE_EDGES = 8
-"""Edges of the pyramid inside a friction cone: it has at least cos(pi / 8) = 92 % of the friction in every direction, and all
-of it in eight."""
+CONE_EDGES = 16
+"""Edges of the pyramid inside a friction cone: it has at least cos(pi / 16) = 98 % of the friction in every direction."""
 
-JAMMED = 1e-7
-"""Distance from feasibility, in units in which 1 is a contact that is missed by the fall of a step."""
+OPTIMAL, UNBOUNDED = 1, 1e30
+"""DAQP's mark of a solution, and of a side without a bound."""
+
+EXACT = 1e-10
+"""Tolerance of the solver, in units in which 1 is the free fall of a step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +50,9 @@ def step(bodies: Sequence[Inertia], contacts: Contacts, friction: float, fall_m:
 
     The motion nearest to free fall, measured by kinetic energy, with `n . d + gap >= friction |t . d|` for the relative
     motion d at every contact: the convex relaxation of Coulomb's law by Anitescu (2006, "Optimization-based simulation of
-    nonsmooth rigid multibody dynamics"). A least-distance problem, solved by nonnegative least squares (Lawson and Hanson
-    1974, chapter 23). Its multipliers are the contact forces; where nothing moves they balance the weights, which is static
-    equilibrium. Raises JammedError.
+    nonsmooth rigid multibody dynamics"). A least-distance problem, solved by DAQP (Arnstrom et al. 2022, "A dual active-set
+    solver for embedded quadratic programming"). Its multipliers are the contact forces; where nothing moves they balance
+    the weights, which is static equilibrium. Raises JammedError.
     """
     roots = [_inverse_root(body.tensor) for body in bodies]
     root_masses = np.sqrt([body.mass_kg for body in bodies])
@@ -60,20 +62,21 @@ def step(bodies: Sequence[Inertia], contacts: Contacts, friction: float, fall_m:
     free[:, 2] = -root_masses
     # Lengths in units of `fall_m`, so that all numbers are near 1
     needed = -np.repeat(contacts.gaps / fall_m, CONE_EDGES) - matrix @ free.ravel()
-    system = np.concatenate([matrix.T, needed[None]])
-    goal = np.zeros(len(system))
-    goal[-1] = 1.0
-    if system.shape[1] == 0:
-        return _motion(free * fall_m, roots, root_masses, np.empty((0, 3)))
-    scale = np.linalg.norm(system, axis=0)
-    share, distance = nnls(system / scale, goal, maxiter=max(1000, 10 * len(scale)))
-    if distance < JAMMED:
+    away, multipliers = _least_distance(matrix, needed)
+    forces = gravity_m_s2 * (multipliers.reshape(-1, CONE_EDGES, 1) * edges).sum(axis=1)
+    return _motion((free + away.reshape(free.shape)) * fall_m, roots, root_masses, forces)
+
+
+def _least_distance(matrix: Array, least: Array) -> tuple[Array, Array]:
+    """(x [n], multipliers [m] >= 0): the least x with `matrix @ x >= least`, which is `matrix.T @ multipliers`."""
+    count, size = matrix.shape
+    if count == 0:
+        return np.zeros(size), np.zeros(0)
+    bounds = np.full(count, UNBOUNDED), least, np.zeros(count, dtype=np.int32)
+    x, _, flag, found = daqp.solve(np.eye(size), np.zeros(size), matrix, *bounds, primal_tol=EXACT, dual_tol=EXACT)
+    if flag != OPTIMAL:
         raise JammedError
-    left = system @ (share / scale) - goal
-    moved = free - (left[:-1] / left[-1]).reshape(free.shape)
-    multipliers = (share / scale / -left[-1]).reshape(-1, CONE_EDGES)
-    forces = gravity_m_s2 * (multipliers[:, :, None] * edges).sum(axis=1)
-    return _motion(moved * fall_m, roots, root_masses, forces)
+    return x, np.maximum(0.0, -found["lam"])
 
 
 def _motion(moved: Array, roots: Sequence[Array], root_masses: Array, forces: Array) -> Motion:

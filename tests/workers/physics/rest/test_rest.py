@@ -20,7 +20,7 @@ CUBE = box((0.1, 0.1, 0.1))
 def settle(meshes: list[Mesh], poses, ground: Mesh = GROUND, masses=None) -> Rested:
     masses = masses or [1.0] * len(meshes)
     things = [thing_of(mesh, mass) for mesh, mass in zip(meshes, masses, strict=True)]
-    return rest(things, poses, surface_of(ground), FRICTION)
+    return rest(things, poses, surface_of(ground, True), FRICTION)
 
 
 @pytest.mark.parametrize("gap_m", [3e-4, 1e-6, -1e-6, -3e-4])
