@@ -15,6 +15,12 @@ ROWS_AT_ONCE = 4_000_000
 PARALLEL = 1e-4
 """Sine of the angle between two edges below which they cross nowhere in particular."""
 
+SLACK_M = 1e-6
+"""Depth to which a body may be beyond the plane of its contact: a tenth of the band."""
+
+LOOKING = 1e-6
+"""Cosine from which a face looks at another: of two flush faces that look the same way, neither holds the other."""
+
 SAME_NORMAL = 1e-7
 """Difference of unit normals that are one."""
 
@@ -27,16 +33,25 @@ class Contacts:
     normals: Array
 
 
-def find_contacts(a: Surface, b: Surface, band_m: float) -> Contacts:
-    """Contacts of two surfaces up to `band_m` apart or inside one another.
+@dataclass(frozen=True)
+class _Near:
+    """Tolerances, metres: of the distance at a contact, and of the side that a body is on."""
 
-    A corner touches a face if it is over it and everything next to the corner is on the outer side of the face's plane.
-    Two edges touch where they are nearest if the plane along both has the faces of one on one side and those of the other
-    on the other. All to within the band.
+    band_m: float
+    slack_m: float
+
+
+def find_contacts(a: Surface, b: Surface, band_m: float, overlap_m: float = 0.0) -> Contacts:
+    """Contacts of two surfaces up to `band_m` apart or inside one another, where they overlap by this much at most.
+
+    A corner touches a face if it is over it and the faces at the corner are on the outer side of the face's plane. Two edges
+    touch where they are nearest if the plane along both has the faces of one on one side and those of the other on the
+    other, to within `SLACK_M` and the overlap.
     """
     i, j = _near_faces(a, b, band_m)
-    found = [_corners_on_faces(a, b, i, j, band_m), _flipped(_corners_on_faces(b, a, j, i, band_m))]
-    found.append(_edges_across_edges(a, b, i, j, band_m))
+    near = _Near(band_m, min(SLACK_M + overlap_m, band_m))
+    found = [_corners_on_faces(a, b, i, j, near), _flipped(_corners_on_faces(b, a, j, i, near))]
+    found.append(_edges_across_edges(a, b, i, j, near))
     joined = Contacts(*(np.concatenate([getattr(one, name) for one in found]) for name in ("points", "normals")))
     return _without_inner(joined)
 
@@ -47,11 +62,8 @@ def _flipped(one: Contacts) -> Contacts:
 
 def _near_faces(a: Surface, b: Surface, band_m: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The numbers of every two faces whose boxes are within the band."""
-    low, high = np.maximum(a.bounds[0], b.bounds[0]) - band_m, np.minimum(a.bounds[1], b.bounds[1]) + band_m
-    own, other = (
-        np.flatnonzero(((each.boxes[0] <= high + band_m) & (each.boxes[1] >= low - band_m)).all(axis=1))
-        for each in (a, b)
-    )
+    box = np.array([np.maximum(a.bounds[0], b.bounds[0]), np.minimum(a.bounds[1], b.bounds[1])])
+    own, other = (each.faces_in(box + np.array([[-2.0 * band_m], [2.0 * band_m]])) for each in (a, b))
     found = [np.empty((0, 2), dtype=np.intp)]
     step = max(1, ROWS_AT_ONCE // max(1, len(other)))
     for k in range(0, len(own), step):
@@ -66,28 +78,29 @@ def _near_faces(a: Surface, b: Surface, band_m: float) -> tuple[NDArray[np.intp]
     return pairs[:, 0], pairs[:, 1]
 
 
-def _corners_on_faces(a: Surface, b: Surface, i: NDArray[np.intp], j: NDArray[np.intp], band_m: float) -> Contacts:
+def _corners_on_faces(a: Surface, b: Surface, i: NDArray[np.intp], j: NDArray[np.intp], near: _Near) -> Contacts:
     """Corners of `a` on faces of `b`, with the normals of the faces."""
     pairs = np.unique(np.column_stack([a.faces[i].reshape(-1), np.repeat(j, 3)]), axis=0)
     corner, face = pairs[:, 0], pairs[:, 1]
     points, normals = a.vertices[corner], b.normals[face]
-    over = np.abs(_dot(points - b.corners[face, 0], normals)) <= band_m
+    over = np.abs(_dot(points - b.corners[face, 0], normals)) <= near.band_m
     for k in range(3):
         start, end = b.corners[face, k], b.corners[face, (k + 1) % 3]
         inward = np.cross(normals, end - start)
-        over &= _dot(points - start, inward) >= -band_m * np.linalg.norm(inward, axis=1)
+        over &= _dot(points - start, inward) >= -near.band_m * np.linalg.norm(inward, axis=1)
     corner, points, normals = corner[over], points[over], normals[over]
-    kept = np.array([_beyond(a, one, n, band_m) for one, n in zip(corner, normals, strict=True)], dtype=bool)
+    each = zip(corner, b.corners[face[over], 0], normals, strict=True)
+    kept = np.array([_is_beyond(a, a.faces_at(one), at, normal, near) for one, at, normal in each], dtype=bool)
     return Contacts(points[kept], normals[kept])
 
 
-def _beyond(a: Surface, corner: int, normal: Array, band_m: float) -> bool:
-    """Whether all neighbours of a corner are on the outer side of the plane through it, to within the band."""
-    around = a.vertices[a.around(corner)] - a.vertices[corner]
-    return bool((around @ normal >= -band_m).all())
+def _is_beyond(a: Surface, faces: NDArray[np.int64], at: Array, normal: Array, near: _Near) -> bool:
+    """Whether faces are on the outer side of the plane through a point, and one of them looks at it."""
+    beyond = ((a.corners[faces] - at) @ normal >= -near.slack_m).all()
+    return bool(beyond and (a.normals[faces] @ normal).min() < -LOOKING)
 
 
-def _edges_across_edges(a: Surface, b: Surface, i: NDArray[np.intp], j: NDArray[np.intp], band_m: float) -> Contacts:
+def _edges_across_edges(a: Surface, b: Surface, i: NDArray[np.intp], j: NDArray[np.intp], near: _Near) -> Contacts:
     """Points where edges pass one another, with the normal across both."""
     pairs = np.column_stack(
         [np.repeat(a.face_edges[i], 3, axis=1).reshape(-1), np.tile(b.face_edges[j], 3).reshape(-1)]
@@ -105,15 +118,16 @@ def _edges_across_edges(a: Surface, b: Surface, i: NDArray[np.intp], j: NDArray[
     s = (_dot(d, u) * vv - _dot(d, v) * uv) / area**2
     t = (_dot(d, u) * uv - _dot(d, v) * uu) / area**2
     normals = across / area[:, None]
-    hit = (np.abs(_dot(d, normals)) <= band_m) & _within(s, uu, band_m) & _within(t, vv, band_m)
+    hit = (np.abs(_dot(d, normals)) <= near.band_m) & _within(s, uu, near.band_m) & _within(t, vv, near.band_m)
     points = (p + s[:, None] * u + q + t[:, None] * v) / 2
     one, two, normals, points = one[hit], two[hit], normals[hit], points[hit]
-    both = Contacts(np.tile(points, (2, 1)), np.concatenate([normals, -normals]))
-    ours = a.vertices[np.tile(a.edge_wings[one], (2, 1))] - both.points[:, None]
-    theirs = b.vertices[np.tile(b.edge_wings[two], (2, 1))] - both.points[:, None]
-    parted = (np.einsum("nkx,nx->nk", ours, both.normals) >= -2.0 * band_m).all(axis=1)
-    parted &= (np.einsum("nkx,nx->nk", theirs, both.normals) <= 2.0 * band_m).all(axis=1)
-    return Contacts(both.points[parted], both.normals[parted])
+    found = [
+        (at, side)
+        for own, other, at, normal in zip(a.edge_faces[one], b.edge_faces[two], points, normals, strict=True)
+        for side in (normal, -normal)
+        if _is_beyond(a, own, at, side, near) and _is_beyond(b, other, at, -side, near)
+    ]
+    return Contacts(*np.array(found).reshape(-1, 2, 3).transpose(1, 0, 2))
 
 
 def _within(share: Array, length_squared: Array, band_m: float) -> NDArray[np.bool_]:

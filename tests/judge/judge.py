@@ -54,8 +54,9 @@ def judge(things: Sequence[Thing], ground: Mesh, friction: float) -> tuple[Verdi
         a, b = everything[i], everything[j]
         apart = boxes_apart_m(a, b)
         if apart <= BAND_M:
-            overlaps[[i, j]] = np.maximum(overlaps[[i, j]], overlap_m(a, b))
-            touches.append(Touch(i, j if j < len(things) else GROUND, find_contacts(a, b, BAND_M)))
+            deep_m = overlap_m(a, b)
+            overlaps[[i, j]] = np.maximum(overlaps[[i, j]], deep_m)
+            touches.append(Touch(i, j if j < len(things) else GROUND, find_contacts(a, b, BAND_M, deep_m)))
         if apart < max(hovers[i], hovers[j]):
             hovers[[i, j]] = np.minimum(hovers[[i, j]], distance_m(a, b))
     bodies = [Body(each.mass_kg, each.com, _size_m(of)) for each, of in zip(things, surfaces, strict=True)]

@@ -19,11 +19,13 @@ def boxes_apart_m(a: Surface, b: Surface) -> float:
     return float(np.linalg.norm(np.maximum(0.0, np.maximum(a.bounds[0] - b.bounds[1], b.bounds[0] - a.bounds[1]))))
 
 
-def distances_to_faces(points: Array, of: Surface) -> Array:
-    """[N]: metres from each point [N, 3] to the nearest face."""
-    step = max(1, PAIRS_AT_ONCE // len(of.faces))
+def distances_to_faces(points: Array, corners: Array) -> Array:
+    """[N]: metres from each point [N, 3] to the nearest of the triangles [F, 3, 3]; inf without any."""
+    if len(corners) == 0:
+        return np.full(len(points), np.inf)
+    step = max(1, PAIRS_AT_ONCE // len(corners))
     parts = [points[k : k + step] for k in range(0, len(points), step)]
-    return np.concatenate([_to_faces(part[:, None], of.corners[None]).min(axis=1) for part in parts])
+    return np.concatenate([_to_faces(part[:, None], corners[None]).min(axis=1) for part in parts])
 
 
 def _to_faces(points: Array, corners: Array) -> Array:

@@ -38,7 +38,8 @@ def _depth_m(piece: manifold3d.Manifold, a: Surface, b: Surface) -> float:
     p, q, r = (points[faces[:, k]] for k in range(3))
     where = np.concatenate([points, (p + q) / 2, (q + r) / 2, (r + p) / 2, (p + q + r) / 3])
     where = where[:: -(-len(where) // MOST_POINTS)]
-    thickness = np.maximum(distances_to_faces(where, a), distances_to_faces(where, b))
+    box = np.array([points.min(axis=0) - width, points.max(axis=0) + width])
+    thickness = np.maximum(*(distances_to_faces(where, each.corners[each.faces_in(box)]) for each in (a, b)))
     return min(width, float(thickness.max()))
 
 

@@ -49,29 +49,33 @@ class Surface:
         return self._sides[1]
 
     @cached_property
-    def edge_wings(self) -> NDArray[np.int64]:
-        """[E, 2]: the corners opposite an edge in the first and the last face that has it."""
-        wings = np.zeros((len(self.edges), 2), dtype=np.int64)
-        sides, opposite = self.face_edges.reshape(-1), self.faces.reshape(-1)
-        wings[sides[::-1], 0] = opposite[::-1]
-        wings[sides, 1] = opposite
-        return wings
+    def edge_faces(self) -> NDArray[np.int64]:
+        """[E, 2]: the first and the last face that has an edge."""
+        found = np.zeros((len(self.edges), 2), dtype=np.int64)
+        sides, face = self.face_edges.reshape(-1), np.repeat(np.arange(len(self.faces)), 3)
+        found[sides[::-1], 0] = face[::-1]
+        found[sides, 1] = face
+        return found
 
     @cached_property
-    def _neighbours(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        both = np.concatenate([self.edges, self.edges[:, ::-1]])
-        both = both[np.argsort(both[:, 0], kind="stable")]
-        return both[:, 1], np.searchsorted(both[:, 0], np.arange(len(self.vertices) + 1))
+    def _faces_at(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        order = np.argsort(self.faces.reshape(-1), kind="stable")
+        return order // 3, np.searchsorted(self.faces.reshape(-1)[order], np.arange(len(self.vertices) + 1))
 
-    def around(self, corner: int) -> NDArray[np.int64]:
-        """The corners that share an edge with one."""
-        ends, first = self._neighbours
-        return ends[first[corner] : first[corner + 1]]
+    def faces_at(self, corner: int) -> NDArray[np.int64]:
+        """The faces that have a corner."""
+        faces, first = self._faces_at
+        return faces[first[corner] : first[corner + 1]]
 
     @cached_property
     def boxes(self) -> tuple[Array, Array]:
         """(lower, upper) corners of every face's bounding box, [F, 3] each."""
         return self.corners.min(axis=1), self.corners.max(axis=1)
+
+    def faces_in(self, box: Array) -> NDArray[np.intp]:
+        """The faces whose bounding boxes meet a box [2, 3]."""
+        lower, upper = self.boxes
+        return np.flatnonzero(((lower <= box[1]) & (upper >= box[0])).all(axis=1))
 
     @cached_property
     def bounds(self) -> Array:
