@@ -68,9 +68,9 @@ def watched(assets: Sequence[Asset], spin: Sequence[float] = (0.0, 0.0, 0.0)) ->
         def set_velocity(self, velocity: Sequence[float], _: Any = None, body: int = 0) -> None:
             super().set_velocity(velocity, spin, body)
 
-    def begin(client: int, ground: int, bodies: tuple[int, ...], steps: int, repair_s: float) -> World:
+    def begin(client: int, ground: int, bodies: tuple[int, ...], steps: int) -> World:
         falls.append([])
-        return Watched(client, ground, bodies, 1, repair_s, together=steps)
+        return Watched(client, ground, bodies, 1, together=steps)
 
     with mock.patch.object(bullet, "World", begin):
         yield lambda: [np.array(energies) for energies in falls]

@@ -43,6 +43,9 @@ TOLERANCE = 1.6e-4
 COARSE = 8e-3
 """The same for many objects at once, 2 mm of 0.25 m, half of what CoACD's parts reach out: a third as many parts."""
 
+WEDGE = 4.0
+"""The same many tolerances for wedges about the axis of coarse parts: each is one of ten to twenty about a ring."""
+
 TWIST = 4.0
 """Tolerances by which a twisted facet may stand out: what it is cut into is four times as many parts."""
 
@@ -109,14 +112,15 @@ def _decompose_lathed(profiles: Array, columns: Array, size: float, tolerance: f
             wider = _widen(cell, outline, tolerance, THIN * size)
             # Facets of a solid of revolution are flat: only of others the bands that a cell borders on may be twisted
             bands = wider[np.roll(wider, -1) == wider + 1] if len(profiles) > 1 else wider[:0]
-            parts += _cut_wedges(columns, wider, bands, tolerance)
+            parts += _cut_wedges(columns, wider, bands, tolerance, WEDGE if tolerance >= COARSE * size else 1.0)
     return parts
 
 
-def _cut_wedges(columns: Array, cell: Indices, bands: Indices, tolerance: float) -> list[Array]:
+def _cut_wedges(columns: Array, cell: Indices, bands: Indices, tolerance: float, times: float) -> list[Array]:
     """Parts of a cell between neighbouring columns [P, n, 3], or over several where that is as convex.
 
-    bands [M]: the sides of the outline that the cell borders on, by their first corner.
+    bands [M]: the sides of the outline that the cell borders on, by their first corner; times: tolerances by which a part
+    over several may stand out.
     """
     count = columns.shape[1]
     begin, end = columns[cell], columns[np.roll(cell, -1)]
@@ -125,7 +129,7 @@ def _cut_wedges(columns: Array, cell: Indices, bands: Indices, tolerance: float)
         last = first + 1
         while last < count:
             over = np.arange(first, last + 2) % count
-            if _protrusion(begin[:, over], end[:, over]) > tolerance:
+            if _protrusion(begin[:, over], end[:, over]) > times * tolerance:
                 break
             last += 1
         over = np.arange(first, last + 1) % count

@@ -160,7 +160,7 @@ def _simulate(
             world.set_restitution(0.0)
             bounces, rate = False, 0.0
         if wanted != rate:
-            world.set_rate(wanted, bounces)
+            world.set_rate(wanted)
             rate = wanted
         world.advance()
         time += SAMPLE_STEPS / rate

@@ -14,7 +14,7 @@ from schemas.job.job import Job
 from tests.physics.room import at, ball_body, drop, physics
 from tests.shapes import box
 from workers.geometry.frames import pose, quaternion_from_rotation, rotation_about
-from workers.physics.bullet import GRAVITY_M_S2, REPAIR_S, WORLDS_BEFORE_RESET
+from workers.physics.bullet import GRAVITY_M_S2, WORLDS_BEFORE_RESET
 from workers.physics.rigid_body import SLOP_M, Body
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -113,10 +113,12 @@ def test_quaternions_agree_with_scipy(seed):
     assert Rotation.from_quat(quaternion_from_rotation(half)).as_matrix() == pytest.approx(half, abs=1e-12)
 
 
-@pytest.mark.parametrize("step_hz", [960, 3840, 15360])
-def test_what_overlaps_is_pushed_apart_at_its_depth_over_one_time_in_steps_of_any_length(step_hz):
+@pytest.mark.parametrize("step_hz", [240, 3840, 15360])
+def test_what_overlaps_is_moved_apart_and_gains_no_speed(step_hz):
     deep = 1e-4
     with drop(ball_body(0.05), at(0.0, 0.05 - deep), 0.0, physics(step_hz=step_hz), 1) as world:
         world.set_gravity((0.0, 0.0, 0.0))
         world.advance()
-        assert world.velocity()[0][2] == pytest.approx((deep - SLOP_M) / REPAIR_S, rel=0.01)
+        assert world.velocity()[0] == (0.0, 0.0, 0.0)
+        raised = world.pose()[0][2] - (0.05 - deep)
+        assert raised == pytest.approx(0.08 * (deep - SLOP_M), rel=0.01)  # Bullet's share
