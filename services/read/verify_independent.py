@@ -9,6 +9,7 @@ from services.job.record import require_job
 from services.merge.step import read_success
 from services.read.dataset_reader import choose_scenes, file_reader, find_scene
 from services.read.independent.derive import StoredPair
+from services.read.independent.forces import check_forces
 from services.read.independent.step import check_merged, check_pair, list_underived
 from workers.store.store import Store
 
@@ -36,6 +37,7 @@ def verify_independently(
         stored = find_scene(store, scene_id)
         scene, read = stored.scene(scene_id), file_reader(store.read, stored)
         assert scene is not None
+        found.faults += check_forces(job, scene)
         for pair_views, pair_objects in stored.pairs(scene_id):
             try:
                 found.faults += check_pair(StoredPair(job, scene, pair_views, pair_objects, read))
@@ -55,7 +57,8 @@ def describe_independent(found: IndependentVerdict) -> Iterator[str]:
     """Every fault, what was derived and what was not, line by line."""
     yield from found.faults
     yield (
-        f"labels of {found.pairs} pairs of {found.scenes} scenes derived from the article's definitions: "
+        f"labels of {found.pairs} pairs of {found.scenes} scenes derived from the article's definitions, and their rest from "
+        "contact forces: "
         f"{len(found.faults) or 'nothing'} off"
     )
     yield from (f"  {line}" for line in found.underived)
