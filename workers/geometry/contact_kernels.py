@@ -20,6 +20,31 @@ Index = NDArray[np.int64]
 
 
 @compiled
+def bounds_in(points: Array, features: Index, low: Array, high: Array) -> tuple[Index, Array, Array]:
+    """(numbers [N], lower and upper bounds [N, 3]) of the features [F, K], corners by number, whose bounds overlap a box."""
+    found, least, most, count = (
+        np.empty(len(features), np.int64),
+        np.empty((len(features), 3)),
+        np.empty((len(features), 3)),
+        0,
+    )
+    for f in range(len(features)):
+        near = True
+        for k in range(3):
+            down = up = points[features[f, 0], k]
+            for m in range(1, features.shape[1]):
+                down, up = min(down, points[features[f, m], k]), max(up, points[features[f, m], k])
+            near = near and down <= high[k] and up >= low[k]
+            if not near:
+                break
+            least[count, k], most[count, k] = down, up
+        if near:
+            found[count] = f
+            count += 1
+    return found[:count], least[:count], most[:count]
+
+
+@compiled
 def find_near(low: Array, high: Array, others_low: Array, others_high: Array, within: float) -> Index:
     """[N, 2]: the pairs of two lists of boxes, bounds [A, 3] and [B, 3], with at most `within` between them on each axis.
 

@@ -71,10 +71,9 @@ class Support:
     forces: tuple[ContactForce, ...]
 
 
-def place(starts: Sequence[ObjectStart], poses: Sequence[Pose], table: Table, friction: float) -> Placement:
-    """The objects with the part of the table that they can come to from these poses."""
-    forms = [Form(start.asset.shape.mesh, closed=start.asset.shape.closed) for start in starts]
-    return _placement(starts, poses, forms, table, friction)
+def forms_of(starts: Sequence[ObjectStart]) -> tuple[Form, ...]:
+    """The meshes of objects, each in its own frame."""
+    return tuple(Form(start.asset.shape.mesh, closed=start.asset.shape.closed) for start in starts)
 
 
 def place_on_top(start: ObjectStart, T_world_obj: Pose, table: Table, friction: float) -> Placement:
@@ -83,12 +82,13 @@ def place_on_top(start: ObjectStart, T_world_obj: Pose, table: Table, friction: 
     top = np.array([np.inf, np.inf, world.vertices[:, 2].min() + NEAR_M])
     under = Mesh(shape.vertices, crop(world, np.full(3, -np.inf), top).faces)
     form = Form(under, closed=shape.closed or is_closed(shape.mesh))
-    return _placement((start,), (T_world_obj,), [form], table, friction)
+    return place((start,), (T_world_obj,), [form], table, friction)
 
 
-def _placement(
+def place(
     starts: Sequence[ObjectStart], poses: Sequence[Pose], forms: Sequence[Form], table: Table, friction: float
 ) -> Placement:
+    """The objects, as these forms, with the part of the table that they can come to from these poses."""
     points = np.concatenate([transform(T, start.hull.vertices) for start, T in zip(starts, poses, strict=True)])
     near = crop(table.mesh, points.min(axis=0) - ROOM_M, points.max(axis=0) + ROOM_M)
     things = tuple(Thing(form.surface, start.asset.mass) for form, start in zip(forms, starts, strict=True))

@@ -101,7 +101,7 @@ def overlap_m(a: manifold3d.Manifold, b: manifold3d.Manifold) -> float:
 
 def _find_near(forms: Sequence[Form], poses: Sequence[Pose]) -> Iterator[tuple[int, int]]:
     """The numbers i < j of every two forms whose bounding boxes overlap."""
-    points = [transform(T, form.surface.vertices) for form, T in zip(forms, poses, strict=True)]
+    points = [transform(T, form.mesh.vertices[form.mesh.faces.ravel()]) for form, T in zip(forms, poses, strict=True)]
     boxes = [(each.min(axis=0, initial=np.inf), each.max(axis=0, initial=-np.inf)) for each in points]
     for i, j in itertools.combinations(range(len(forms)), 2):
         if (boxes[i][0] <= boxes[j][1]).all() and (boxes[j][0] <= boxes[i][1]).all():

@@ -13,7 +13,16 @@ from workers.geometry.elevation import vertical_gap
 from workers.geometry.frames import transform, translation
 from workers.physics.effects import called_for_with
 from workers.physics.fall import Outcome
-from workers.physics.placement import TOUCHING_M, Placement, Support, measure_supports, place, place_on_top, placed_mesh
+from workers.physics.placement import (
+    TOUCHING_M,
+    Placement,
+    Support,
+    forms_of,
+    measure_supports,
+    place,
+    place_on_top,
+    placed_mesh,
+)
 from workers.physics.release import Drop, release
 from workers.physics.rest.rest import rest
 from workers.physics.rest_pose import snap_to_face
@@ -53,17 +62,18 @@ def settle(drop: Drop) -> tuple[Settled, ...]:
     Raises SettleError `objects_overlap`, `not_at_rest`, `left_table`, `unsupported` or `table_too_fine`, and LeftRoomError
     where a single object leaves its room.
     """
+    forms = forms_of(drop.starts)
     if not drop.effects.runs("dynamics"):
         poses = tuple(start.T_world_obj for start in drop.starts)
-        return _describe(_Ending(drop, _place(drop, poses), poses), "placed", judged=True)
-    _require_apart(drop.starts)
+        return _describe(_Ending(drop, _place(drop, poses, forms), poses), "placed", judged=True)
+    _require_apart(drop.starts, forms)
     if not drop.effects.runs("table_mesh"):
-        ending = _come_to_rest(drop, flat=True)
+        ending = _come_to_rest(drop, forms, flat=True)
         if ending is not None:
             return _describe(ending, "flat_top", drop.physics.exact_rest)
         late = called_for_with("table_mesh", drop.starts, drop.physics)
         drop = dataclasses.replace(drop, effects=add_effects(drop.effects, late))
-    ending = _come_to_rest(drop, flat=False)
+    ending = _come_to_rest(drop, forms, flat=False)
     assert ending is not None  # only the flat top has an edge
     return _describe(ending, "mesh", drop.physics.exact_rest)
 
@@ -73,8 +83,7 @@ def add_effects(effects: EffectPlan, names: Iterable[str]) -> EffectPlan:
     return dataclasses.replace(effects, ran=(*effects.ran, *names))
 
 
-def _require_apart(starts: Sequence[ObjectStart]) -> None:
-    forms = [Form(start.asset.shape.mesh) for start in starts]
+def _require_apart(starts: Sequence[ObjectStart], forms: Sequence[Form]) -> None:
     for i, j, depth_m in find_overlaps_m(forms, [start.T_world_obj for start in starts]):
         if depth_m > MOST_OVERLAP_M:
             raise SettleError(
@@ -84,7 +93,7 @@ def _require_apart(starts: Sequence[ObjectStart]) -> None:
             )
 
 
-def _come_to_rest(drop: Drop, flat: bool) -> _Ending | None:
+def _come_to_rest(drop: Drop, forms: Sequence[Form], flat: bool) -> _Ending | None:
     """Release until at rest; None where a footprint left the flat top, so that the table's edges may matter.
 
     The simulation may end with objects that rolling friction or a shape's margin holds out of balance. They are followed
@@ -99,7 +108,7 @@ def _come_to_rest(drop: Drop, flat: bool) -> _Ending | None:
             return None
         seconds += outcome.seconds
         _require_calm(drop, outcome)
-        placement = placement or _place(drop, outcome.poses)
+        placement = placement or _place(drop, outcome.poses, forms)
         ending = _Ending(drop, placement, outcome.poses, seconds, outcome.speed_m_s)
         if not drop.physics.exact_rest:
             return ending
@@ -117,8 +126,8 @@ def _come_to_rest(drop: Drop, flat: bool) -> _Ending | None:
     )
 
 
-def _place(drop: Drop, poses: Sequence[Pose]) -> Placement:
-    return place(drop.starts, poses, drop.ground.table, drop.physics.friction**2)
+def _place(drop: Drop, poses: Sequence[Pose], forms: Sequence[Form]) -> Placement:
+    return place(drop.starts, poses, forms, drop.ground.table, drop.physics.friction**2)
 
 
 def _stand(ending: _Ending) -> _Ending | None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workers.geometry.contact_kernels import corners_on_faces, edges_across_edges, find_near
+from workers.geometry.contact_kernels import bounds_in, corners_on_faces, edges_across_edges, find_near
 
 PAIR = np.array([[0, 0]])
 FACE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -20,6 +20,17 @@ def test_the_pairs_that_are_near_are_those_of_every_box_with_every_other():
     assert {tuple(pair) for pair in found.tolist()} == {tuple(pair) for pair in np.argwhere(near).tolist()}
     assert (np.diff(found[:, 0]) >= 0).all()
     assert len(find_near(low, high, others[:0], others[:0], 0.03)) == 0
+
+
+def test_the_features_in_a_box_are_those_whose_bounds_overlap_it():
+    rng = np.random.default_rng(1)
+    points, triangles = rng.uniform(0, 1, (40, 3)), rng.integers(0, 40, (200, 3))
+    low, high = np.array([0.1, 0.2, 0.7]), np.array([0.2, 0.3, 0.9])
+    corners = points[triangles]
+    near = ((corners.min(axis=1) <= high) & (corners.max(axis=1) >= low)).all(axis=1)
+    found, least, most = bounds_in(points, triangles, low, high)
+    assert 0 < near.sum() < 200 and found.tolist() == np.flatnonzero(near).tolist()
+    assert np.array_equal(least, corners.min(axis=1)[near]) and np.array_equal(most, corners.max(axis=1)[near])
 
 
 def corner(at, sharp: float = 1.0, side=UP):

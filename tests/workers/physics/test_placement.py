@@ -15,6 +15,7 @@ from workers.geometry.hull import convex_hull
 from workers.physics.placement import (
     Ground,
     Support,
+    forms_of,
     measure_supports,
     place,
     place_on_top,
@@ -41,7 +42,7 @@ HOOK = start_of(asset_of(box(0.02, 0.02, 0.1, (-0.03, 0, -0.05)), box(0.08, 0.02
 
 
 def held(start: ObjectStart, T: np.ndarray, on: Table = TABLE, friction: float = FRICTION) -> Support:
-    return measure_supports(place([start], [T], on, friction), [T])[0]
+    return measure_supports(place([start], [T], forms_of([start]), on, friction), [T])[0]
 
 
 def test_a_box_on_a_level_is_held_with_a_margin_of_half_its_side():
@@ -64,7 +65,7 @@ def test_the_forces_on_a_box_carry_its_weight_from_corners_of_its_face():
 def test_of_two_each_has_the_others_force_turned_round():
     starts = [CUBE, start_of(asset_of(box(0.05, 0.05, 0.05)), 4)]
     poses = [translation(0, 0, TOP + 0.05), translation(0.01, 0, TOP + 0.125)]
-    low, high = measure_supports(place(starts, poses, TABLE, FRICTION), poses)
+    low, high = measure_supports(place(starts, poses, forms_of(starts), TABLE, FRICTION), poses)
     down = np.array([contact.force for contact in low.forces if contact.with_region == 4]).sum(axis=0)
     up = np.array([contact.force for contact in high.forces if contact.with_region == 3]).sum(axis=0)
     assert up == pytest.approx(-down) and up[2] == pytest.approx(starts[1].asset.mass.mass_kg * G)

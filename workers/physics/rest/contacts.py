@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from workers.geometry.contact_kernels import Index, corners_on_faces, edges_across_edges, find_near
+from workers.geometry.contact_kernels import Index, bounds_in, corners_on_faces, edges_across_edges, find_near
 from workers.geometry.contact_surface import Surface
 
 DEEPEST_M = 1e-3
@@ -76,17 +76,12 @@ _Boxes = tuple[Index, Array, Array]
 
 def _boxes(surface: Surface, points: Array, low: Array, high: Array) -> tuple[_Boxes, _Boxes, _Boxes]:
     """(numbers, bounds) of the corners, faces and edges of a surface whose boxes overlap a box."""
+    corner, *ends = bounds_in(points, surface.corners[:, None], low, high)
     return (
-        _crop(points[surface.corners][:, None], low, high, surface.corners),
-        _crop(points[surface.faces], low, high),
-        _crop(points[surface.edges], low, high),
+        (surface.corners[corner], *ends),
+        bounds_in(points, surface.faces, low, high),
+        bounds_in(points, surface.edges, low, high),
     )
-
-
-def _crop(corners: Array, low: Array, high: Array, numbers: Index | None = None) -> _Boxes:
-    least, most = corners.min(axis=1), corners.max(axis=1)
-    near = np.flatnonzero(((least <= high) & (most >= low)).all(axis=1))
-    return near if numbers is None else numbers[near], least[near], most[near]
 
 
 def _pairs(here: _Boxes, there: _Boxes, within_m: float) -> Index:
