@@ -169,6 +169,8 @@ CHAOTIC = (
         on_a_face(),
         lambda seed: jolted(drop(built_in("can"), level(), 0.1, turn(X, 30)), seed),
         spin=(160.0, 0.0, 120.0),
+        first="minute",
+        tier="slow",
     ),
     # Without rolling friction it may still roll after 20 s, or be off the table; see the row of the same ball alone.
     Chaotic(
@@ -177,6 +179,8 @@ CHAOTIC = (
         on_a_face(),
         lambda seed: jolted(drop(ball(0.04), level()), seed),
         physics={"rolling_friction": 0.0},
+        first="minute",
+        tier="slow",
     ),
     # Tipping over its edge by 2 degrees to either side of 45: it falls to that side, whatever the jolt.
     Chaotic(

@@ -45,17 +45,36 @@ ROLLING = (
         FALL,
         None,
         lambda: drop(rod(0.033, 0.12, 360), slope(2.0), 0.001, turn(X, 90), (0.3, 0.0)),
+        again="minute",
     ),
     # The drop leaves it over a corner, which is 32 micrometres above a face and 24 above an edge. Rolling friction stops it
     # within 1 mm; 20 are for where the landing may send it.
-    Case("ball on a level, friction", SETTLE, both(on_a_face(), shift(20.0)), lambda: drop(ball(0.04), level())),
+    Case(
+        "ball on a level, friction",
+        SETTLE,
+        both(on_a_face(), shift(20.0)),
+        lambda: drop(ball(0.04), level()),
+        again="minute",
+    ),
     # No force acts sideways. It rocks, and loses 0.6 % of that at each face.
     Case(
-        "ball on a level, no friction", SETTLE, both(on_a_face(), shift(0.1)), lambda: drop(ball(0.04), level()), SMOOTH
+        "ball on a level, no friction",
+        SETTLE,
+        both(on_a_face(), shift(0.1)),
+        lambda: drop(ball(0.04), level()),
+        SMOOTH,
+        again="minute",
     ),
     # Without rolling friction a ball of 5,120 faces that leaves a corner keeps more than it needs for an edge over a
     # thousand faces, at 0.13 % a face: it may still roll after 20 s. Whatever has stopped has stopped on a face.
-    Case("ball on a level, rolling friction 0", UNDEFINED, on_a_face(), lambda: drop(ball(0.04), level()), NO_ROLLING),
+    Case(
+        "ball on a level, rolling friction 0",
+        UNDEFINED,
+        on_a_face(),
+        lambda: drop(ball(0.04), level()),
+        NO_ROLLING,
+        tier="minute",
+    ),
     # Its meridians are 1 degree apart: it stands on none of them on a slope over half a degree. It goes 0.15 m in 1.6 s.
     Case(
         "ball on a slope of 1 degree, friction",
@@ -63,6 +82,7 @@ ROLLING = (
         None,
         lambda: drop(globe(0.04), slope(1.0), 0.001, turn(X, 90), (0.55, 0.0)),
         NO_ROLLING,
+        tier="minute",
     ),
     # It slides: 0.3 m with 0.17 m/s^2.
     Case(
@@ -71,6 +91,7 @@ ROLLING = (
         None,
         lambda: drop(ball(0.04), slope(1.0), 0.001, xy=(0.4, 0.0)),
         SMOOTH,
+        tier="minute",
     ),
     Case(
         "ball on a slope of 1 degree, rolling friction of 5 mm",
@@ -78,6 +99,7 @@ ROLLING = (
         shift(20.0),
         lambda: drop(ball(0.04), slope(1.0), 0.001),
         {"rolling_friction": 0.005},
+        again="minute",
     ),
 )
 
@@ -120,6 +142,7 @@ SPINS = (
         None,
         lambda: drop(rod(0.033, 0.12, 360), level(), R=turn(X, 90), xy=(0.4, 0.0)),
         spin=(0.0, 50.0, 0.0),
+        again="minute",
     ),
     Case(
         "coin spun on its edge at 50 rad/s",
@@ -141,5 +164,6 @@ SPINS = (
         on_a_face(),
         lambda: drop(built_in("can"), level(), 0.1, turn(X, 30)),
         spin=(160.0, 0.0, 120.0),
+        again="minute",
     ),
 )

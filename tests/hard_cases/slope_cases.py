@@ -125,6 +125,10 @@ SLOPES = (
     ),
     # A ball's faces lie up to 32 micrometres within its sphere of 40 mm. It may roll along the groove.
     Case(
-        "ball in a groove", SETTLE, height(over_groove_m(0.02), 0.1), lambda: in_groove(ball(0.02), turn(X, 0), ROUND_M)
+        "ball in a groove",
+        SETTLE,
+        height(over_groove_m(0.02), 0.1),
+        lambda: in_groove(ball(0.02), turn(X, 0), ROUND_M),
+        tier="minute",
     ),
 )

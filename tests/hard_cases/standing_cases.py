@@ -56,12 +56,13 @@ def cone_lies_deg() -> float:
 
 
 TIPPING = (
-    Case("open laptop 2 degrees before it tips over", SETTLE, tilt(0.1), lambda: laptop_leaning(-2.0)),
+    Case("open laptop 2 degrees before it tips over", SETTLE, tilt(0.1), lambda: laptop_leaning(-2.0), again="minute"),
     Case(
         "open laptop 2 degrees after it tips over",
         SETTLE,
         leaning(lambda: laptop_angles()[1], 1.0),
         lambda: laptop_leaning(2.0),
+        again="minute",
     ),
     Case("bottle upright", SETTLE, tilt(0.1), lambda: drop(built_in("bottle"), level())),
     Case("tall thin rod upright", SETTLE, tilt(0.1), lambda: drop(rod(0.01, 0.3), level())),

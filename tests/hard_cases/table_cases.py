@@ -1,6 +1,8 @@
 """Rows of the table of hard cases: edges and holes of tables, and what surfaces are set to."""
 
-from tests.hard_cases.bodies import ball, cube, mug_handle_over_edge, mug_on_peg, over_edge
+import math
+
+from tests.hard_cases.bodies import ball, built_in, cube, handle_reach, mug_handle_over_edge, mug_on_peg, over_edge
 from tests.hard_cases.case import EITHER, FALL, SETTLE, Case
 from tests.hard_cases.drops import (
     EDGE_M,
@@ -22,12 +24,13 @@ from tests.hard_cases.thin_cases import plate
 
 
 def hung_by_its_handle() -> Measure:
-    """Height of a mug that hangs by its handle.
+    """Height of a mug that hangs by its handle: as far below the peg as its centre of mass is from the handle's inner side.
 
-    From the handle's inner side to the centre of mass it is 61 to 63 mm. Friction holds it up to 26 degrees off plumb on a
-    peg that is 8 mm wide: that is 63 mm below the peg's top at the lowest, and 54 at the highest.
+    That is 67 mm. Friction holds it up to 26 degrees off plumb, on a peg 8 mm wide: 58 mm at the least.
     """
-    return height(-0.0585, 4.5)
+    com, (x, z) = built_in("mug").mass.com, handle_reach()
+    arm_m = math.hypot(com[0] - x, com[2] - z)
+    return height(-arm_m + 0.0044, 4.6)
 
 
 EDGES = (
@@ -50,7 +53,13 @@ TABLES = (
     Case("cube of 50 mm over a hole of 60 mm", FALL, None, lambda: drop(cube(0.05), with_hole(0.06))),
     Case("cube on a ring", SETTLE, tilt(0.1), lambda: drop(cube(), ring(), xy=(0.45, 0.0))),
     Case("cube over a ring's hole", FALL, None, lambda: drop(cube(), ring())),
-    Case("cube of 150 mm on a raised ring", SETTLE, height(0.08, 0.01), lambda: drop(cube(0.15), with_raised_ring())),
+    Case(
+        "cube of 150 mm on a raised ring",
+        SETTLE,
+        height(0.08, 0.01),
+        lambda: drop(cube(0.15), with_raised_ring()),
+        again="minute",
+    ),
     Case("cube inside a raised ring", SETTLE, height(0.02, 0.01), lambda: drop(cube(0.04), with_raised_ring())),
     Case("cube on a sheet without thickness", SETTLE, tilt(0.1), lambda: drop(cube(), sheet())),
     Case("cube on a slope of 1 degree", SETTLE, leaning(lambda: 1.0, 0.1), lambda: drop(cube(), slope(1.0))),
@@ -109,5 +118,6 @@ SURFACES = (
         on_a_face(),
         lambda: drop(ball(0.04), level(), 0.1),
         {"restitution": 0.9},
+        again="minute",
     ),
 )

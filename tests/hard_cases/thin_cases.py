@@ -62,6 +62,7 @@ THIN = (
         SETTLE,
         lying(0.0001),
         lambda: drop(rod(0.0001, 0.2), level(), R=turn(X, 60)),
+        again="minute",
     ),
 )
 
