@@ -1,7 +1,8 @@
 """`verso verify --audit N`: proves on N scenes that the effects which their plans left out did not matter.
 
 Exact no-ops: the scene is made again with them forced, and every byte must equal what is stored.
-Approximations: the scene at rest is released again with every effect of physics on (audit_motion.py).
+Approximations: the scene at rest is released again with every effect of physics on (audit_motion.py). Where MuJoCo is installed,
+it holds every scene as a referee (referee.py): its figures are told, and have no bound.
 """
 
 import dataclasses
@@ -15,6 +16,7 @@ from schemas.scene.scene import SceneOutput
 from services.job.record import require_job
 from services.read.audit_motion import Motion, measure_motion
 from services.read.dataset_reader import StoredRange, choose_scenes, find_scene
+from services.read.referee import Held, describe_held, hold_scene, is_installed
 from services.read.replay import compare_files, compare_rows, open_context
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.fingerprint import take_fingerprint
@@ -52,6 +54,8 @@ class Audit:
     """Scenes released again."""
     motion: Motion = field(default_factory=Motion)
     """Largest motion of any scene, and changed pixels of all."""
+    held: Held | None = None
+    """What MuJoCo found; None where it is not installed."""
     effects: dict[str, Tally] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
 
@@ -68,6 +72,7 @@ def audit(store: Store, count: int, progress: Callable[[Audit], None]) -> Audit:
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
     tallies = {effect.name: Tally(effect.kind) for effect in EFFECTS if effect.kind != "asked"}
     found = Audit(take_fingerprint(context.renderer, context.job.render.tier) == theirs, effects=tallies)
+    found.held = Held() if is_installed() else None
     for scene_id in choose_scenes(store, count, record.job.seed):
         _audit_scene(context, store, scene_id, found)
         progress(found)
@@ -95,6 +100,9 @@ def _audit_scene(context: WorkerContext, store: Store, scene_id: int, found: Aud
     found.bytes += sum(len(file.data) for file in output.files)
     plain = None if found.same_stack else make_forced(context, scene_id)[1]
     proven = _prove_no_ops(context, lambda now: _differences(store, stored, plain, now), output, no_ops, found)
+    if found.held is not None:
+        held = hold_scene(scene.plan, scene.settled, context.job.physics)
+        found.held = found.held.join(held or Held())
     if approximations:
         motion = measure_motion(context, scene)
         found.released += 1
@@ -166,6 +174,7 @@ def describe_audit(found: Audit) -> Iterator[str]:
         f"{motion.turned_deg:.5f} degrees; {motion.pixels_changed} mask pixels changed, {motion.pixels_outside} of them "
         "away from any silhouette"
     )
+    yield describe_held(found.held)
     for name, tally in found.effects.items():
         if tally.skipped:
             yield f"  {name} ({tally.kind}): left out in {tally.skipped} scenes, proven in {tally.proven}"

@@ -5,7 +5,8 @@ import subprocess
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-LOCKS = ("requirements.lock", "requirements-pathtraced.lock", "requirements-study.lock", "requirements-dev.lock")
+EXTRAS = ("pathtraced", "study", "audit")
+LOCKS = ("requirements.lock", *(f"requirements-{name}.lock" for name in (*EXTRAS, "dev")))
 
 # Answers the launcher's probe, makes a `.venv` that links back to itself, and logs every call of pip.
 # Files named after what should go wrong, in the folder $FAULTS, make it go wrong.

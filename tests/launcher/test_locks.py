@@ -22,17 +22,19 @@ def pins(lock: str) -> dict[str, str]:
 
 
 def test_the_locks_agree_on_what_they_share():
-    runtime, traced, study, development = (pins(lock) for lock in LOCKS)
+    runtime, traced, study, audit, development = (pins(lock) for lock in LOCKS)
     shared = runtime.keys() & development.keys()
     assert shared
     assert {name: runtime[name] for name in shared} == {name: development[name] for name in shared}
-    assert traced and study
-    assert (traced | study).items() <= development.items()
+    assert traced and study and audit
+    assert (traced | study | audit).items() <= development.items()
     assert not traced.keys() & runtime.keys()
-    assert {name: study[name] for name in study.keys() & runtime.keys()}.items() <= runtime.items()
+    for extra in (study, audit):
+        assert {name: extra[name] for name in extra.keys() & runtime.keys()}.items() <= runtime.items()
 
 
 def test_the_extra_is_pinned_alike_wherever_it_is_named():
     tree = tomllib.loads((ROOT / "pyproject.toml").read_text())
     asked = tree["project"]["optional-dependencies"]["pathtraced"]
     assert asked == tree["dependency-groups"]["pathtraced"] == [f"mitsuba=={pins(LOCKS[1])['mitsuba']}"]
+    assert tree["project"]["optional-dependencies"]["audit"] == tree["dependency-groups"]["audit"] == ["mujoco"]

@@ -9,6 +9,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
+import services.read.audit
 import workers.pipeline.make_pair
 import workers.plan.effects
 from schemas.dataset.layout import FINGERPRINT_FILE
@@ -17,6 +18,7 @@ from services.job.read import validate_job
 from services.read import audit_motion
 from services.read.audit import Audit, audit, describe_audit
 from services.read.audit_motion import Motion
+from services.read.referee import Held
 from tests.datasets import run_here
 from tests.effects.scenes import SMALL, merged
 from workers.geometry.frames import translation
@@ -36,6 +38,12 @@ def dataset(out: Path) -> LocalStore:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> LocalStore:
     return dataset(tmp_path_factory.mktemp("audit") / "small")
+
+
+@pytest.fixture(autouse=True)
+def no_referee(monkeypatch) -> None:
+    """Holding a scene in MuJoCo takes seconds."""
+    monkeypatch.setattr(services.read.audit, "is_installed", lambda: False)
 
 
 @pytest.fixture
@@ -138,6 +146,23 @@ def test_on_another_stack_the_forced_scene_is_held_against_a_plain_one(tmp_path)
     assert not found.same_stack
     assert found.faults == []
     assert "because another stack" in "\n".join(describe_audit(found))
+
+
+@pytest.mark.usefixtures("calm")
+def test_where_mujoco_is_installed_it_holds_every_scene_and_else_a_line_says_so(made, monkeypatch):
+    assert "MuJoCo is not installed" in "\n".join(describe_audit(run_audit(made, 1)))
+    given = []
+
+    def hold_scene(plan, settled, physics):
+        given.append((len(plan.objects), len(settled), physics))
+        return Held(0.125, 0.5, 1, {"as meshes, being convex": len(settled)})
+
+    monkeypatch.setattr(services.read.audit, "is_installed", lambda: True)
+    monkeypatch.setattr(services.read.audit, "hold_scene", hold_scene)
+    found = run_audit(made, 2)
+    assert given == [(1, 1, JOB.physics)] * 2 and found.faults == []
+    assert found.held == Held(0.125, 0.5, 2, {"as meshes, being convex": 2})
+    assert "MuJoCo held 2 scenes for 1 s: moved at most 0.1250 mm" in "\n".join(describe_audit(found))
 
 
 def test_the_command_exits_1_and_lists_what_is_off(made, capsys):

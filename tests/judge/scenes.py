@@ -1,0 +1,147 @@
+"""One scene through production's physics alone, judged, and let go again: figures in mm, degrees, shares and seconds."""
+
+import importlib
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from schemas.errors import SceneError
+from schemas.job.physics import Physics
+from schemas.scene.effects import EffectPlan
+from schemas.scene.plan import ObjectStart, ScenePlan
+from schemas.scene.scene import Settled
+from schemas.scene.shape import Mesh
+from services.read.referee import hold_scene
+from tests.judge.judge import Thing, Verdict, judge
+from workers.geometry.frames import transform
+from workers.physics.effects import called_for
+from workers.physics.step import recheck_scene, settle_scene
+
+PARTS = {"release": "workers.physics.settle.release", "rest": "workers.physics.settle.rest"}
+"""The parts of physics whose time is taken, where they exist: what moves the objects, and what brings them to rest."""
+
+CRASHED = "crashed"
+"""The reason of a scene that ended with an error that is no SceneError: always a defect."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is done with a scene beside settling and judging it."""
+
+    recheck: bool = False
+    mujoco: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One scene: the reason why it was refused, or the worst of its objects in each figure; times of one processor."""
+
+    scene_id: int
+    objects: int
+    seconds: float
+    parts_s: dict[str, float]
+    refused: str = ""
+    detail: str = ""
+    verdicts: list[Verdict] = field(default_factory=list)
+    stored: Verdict | None = None
+    """The same figures as production measured them."""
+    judge_s: float = 0.0
+    moved_mm: float | None = None
+    turned_deg: float | None = None
+    mujoco_mm: float | None = None
+    mujoco_deg: float | None = None
+
+    @property
+    def worst(self) -> Verdict:
+        """The worst of its objects in each figure."""
+        return worst_of(self.verdicts)
+
+
+def worst_of(verdicts: Sequence[Verdict]) -> Verdict:
+    """The greatest of each figure."""
+    return Verdict(
+        max(each.overlap_mm for each in verdicts),
+        max(each.hover_mm for each in verdicts),
+        max(each.unbalanced for each in verdicts),
+    )
+
+
+def try_scene(scene_id: int, plan: ScenePlan, physics: Physics, asked: Asked) -> Outcome:
+    """Settle a scene and judge it. What it raises is told in the outcome."""
+    effects = EffectPlan(tuple(sorted(called_for(plan.objects, plan.table, physics))), {})
+    began = time.process_time()
+    with _timed() as parts_s:
+        try:
+            rest = settle_scene(plan, physics, effects)
+        except SceneError as error:
+            refused, detail = error.reason, error.detail
+        except Exception:
+            refused, detail = CRASHED, traceback.format_exc()
+        else:
+            refused = detail = ""
+    seconds = time.process_time() - began
+    if refused:
+        return Outcome(scene_id, len(plan.objects), seconds, parts_s, refused, detail)
+    began = time.process_time()
+    verdicts = judge(things_at_rest(plan.objects, rest.settled), plan.table.mesh, physics.friction**2)
+    judge_s = time.process_time() - began
+    moved: tuple[float | None, float | None] = (None, None)
+    if asked.recheck:
+        again = recheck_scene(plan, rest, physics, effects).settled
+        moved = max(one.recheck_move_mm or 0.0 for one in again), max(one.recheck_turn_deg or 0.0 for one in again)
+    held = hold_scene(plan, rest.settled, physics) if asked.mujoco else None
+    return Outcome(
+        scene_id,
+        len(plan.objects),
+        seconds,
+        parts_s,
+        verdicts=list(verdicts),
+        stored=worst_of(
+            [Verdict(one.penetration_mm, one.hover_gap_mm, one.equilibrium_residual) for one in rest.settled]
+        ),
+        judge_s=judge_s,
+        moved_mm=moved[0],
+        turned_deg=moved[1],
+        mujoco_mm=None if held is None else held.moved_mm,
+        mujoco_deg=None if held is None else held.turned_deg,
+    )
+
+
+def things_at_rest(starts: Sequence[ObjectStart], settled: Sequence[Settled]) -> list[Thing]:
+    """The objects as the judge reads them."""
+    things = []
+    for start, rest in zip(starts, settled, strict=True):
+        T, shape, mass = rest.T_world_obj, start.asset.shape, start.asset.mass
+        mesh = Mesh(transform(T, shape.vertices), shape.faces)
+        things.append(Thing(mesh, mass.mass_kg, transform(T, mass.com[None, :])[0]))
+    return things
+
+
+@contextmanager
+def _timed() -> Iterator[dict[str, float]]:
+    """Processor seconds of each part of physics that exists, summed over its calls."""
+    spent: dict[str, float] = {}
+    originals = []
+    for name, path in PARTS.items():
+        place, attribute = path.rsplit(".", 1)
+        module = importlib.import_module(place)
+        part = getattr(module, attribute, None)
+        if not callable(part):
+            continue
+
+        def timed(*given, name=name, part=part, **named):
+            began = time.process_time()
+            try:
+                return part(*given, **named)
+            finally:
+                spent[name] = spent.get(name, 0.0) + time.process_time() - began
+
+        originals.append((module, attribute, part))
+        setattr(module, attribute, timed)
+    try:
+        yield spent
+    finally:
+        for module, attribute, part in originals:
+            setattr(module, attribute, part)
