@@ -3,14 +3,13 @@
 import itertools
 import math
 
-import numpy as np
 import pytest
 
 from schemas.scene.plan import ObjectStart
 from tests.hard_cases.arch_cases import THICK_M, THIN_M, thrust_fits
 from tests.hard_cases.balance_cases import BALANCE, hook_demand
 from tests.hard_cases.case import SETTLE, Case
-from tests.hard_cases.cases import CASES
+from tests.hard_cases.cases import SEVERAL
 from tests.hard_cases.hollow_cases import solid
 from tests.hard_cases.leaning_cases import (
     CUBE_DEG,
@@ -27,9 +26,6 @@ from tests.hard_cases.leaning_cases import (
 from tests.hard_cases.measures import coms_at_release
 from tests.hard_cases.stack_cases import BRICK_M, stairs
 from workers.geometry.frames import transform
-
-NOT_MEANT = ("begins", "one place")
-"""In names of cases whose objects begin inside one another or the table."""
 
 
 def wall_needs(size_m: tuple[float, float], angle_deg: float) -> float:
@@ -90,14 +86,8 @@ def volume_shared(a: ObjectStart, b: ObjectStart) -> float:
 
 @pytest.mark.parametrize(
     "case",
-    [
-        pytest.param(case, id=case.name)
-        for case in CASES
-        if case.outcome == SETTLE and not case.tier and not any(word in case.name for word in NOT_MEANT)
-    ],
+    [pytest.param(case, id=case.name) for case in SEVERAL if case.outcome == SETTLE and not case.tier],
 )
 def test_nothing_that_must_settle_begins_inside_of_something_else(case: Case):
-    starts = case.make().starts
-    if len(starts) > 1:
-        assert max(volume_shared(a, b) for a, b in itertools.combinations(starts, 2)) < 1e-4
-    assert np.isfinite([one.T_world_obj for one in starts]).all()
+    pairs = itertools.combinations(case.make().starts, 2)
+    assert max((volume_shared(a, b) for a, b in pairs), default=0.0) < 1e-4
