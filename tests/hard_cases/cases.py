@@ -43,7 +43,6 @@ AGAIN_AT_ONCE = {
     "cube against a wall, 4 degrees inside of what friction holds",
     "two cards that lean on one another at 55 degrees",
     "centre of mass 1 mm inside of the table's edge",
-    "cylinder in a groove",
     "cube in an open box",
 }
 """Cases of `SEVERAL` that the default suite too settles once more and lets go again."""

@@ -183,7 +183,7 @@ HOLLOWS = (
         heights(6.8 / 280, 0.025, bound_mm=0.02),
         lambda: in_a_tray(outside.enter(outside.of(open_box().shape.mesh))),
     ),
-    Case("ball in a bowl", SETTLE, at_the_bottom(), in_a_bowl, again="minute"),
+    Case("ball in a bowl", SETTLE, at_the_bottom(), in_a_bowl, tier="minute"),
     Case(
         "ball in a bowl from a file",
         SETTLE,

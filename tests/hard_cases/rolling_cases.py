@@ -5,6 +5,8 @@ Rolling friction of r metres on each body holds back with an arm of 2 r times th
 
 import math
 
+import trimesh
+
 from tests.hard_cases.bodies import ball, built_in, cube, globe, rod
 from tests.hard_cases.case import EITHER, FALL, SETTLE, UNDEFINED, Case
 from tests.hard_cases.drops import EDGE_M, X, drop, level, slope, turn
@@ -45,7 +47,7 @@ ROLLING = (
         FALL,
         None,
         lambda: drop(rod(0.033, 0.12, 360), slope(2.0), 0.001, turn(X, 90), (0.3, 0.0)),
-        again="minute",
+        tier="minute",
     ),
     # The drop leaves it over a corner, which is 32 micrometres above a face and 24 above an edge. Rolling friction stops it
     # within 1 mm; 20 are for where the landing may send it.
@@ -99,7 +101,7 @@ ROLLING = (
         shift(20.0),
         lambda: drop(ball(0.04), slope(1.0), 0.001),
         {"rolling_friction": 0.005},
-        again="minute",
+        tier="minute",
     ),
 )
 
@@ -165,5 +167,15 @@ SPINS = (
         lambda: drop(built_in("can"), level(), 0.1, turn(X, 30)),
         spin=(160.0, 0.0, 120.0),
         again="minute",
+    ),
+    # A solid cone 30 mm wide and high sleeps on its tip above 90 rad/s: 2 sqrt(m g l I) / I3. The arm of 0.7 mm slows it by
+    # 26 rad/s^2, and below that it falls over and lies.
+    Case(
+        "top spun at 150 rad/s on its tip, 1 degree aside",
+        SETTLE,
+        on_a_face(),
+        lambda: drop(asset_of(trimesh.creation.cone(0.03, 0.03, sections=64)), level(), 0.0002, turn(X, 181)),
+        spin=(0.0, 0.0, 150.0),
+        tier="minute",
     ),
 )

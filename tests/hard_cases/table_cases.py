@@ -37,7 +37,7 @@ EDGES = (
     Case("cube over the edge by 49 %", SETTLE, both(tilt(0.1), shift(0.1)), lambda: over_edge(0.49)),
     Case("cube over the edge by 50 %", EITHER, tilt(0.1), lambda: over_edge(0.50)),
     Case("cube over the edge by 51 %", FALL, None, lambda: over_edge(0.51)),
-    Case("mug hung by its handle on a peg at the edge", SETTLE, hung_by_its_handle(), mug_on_peg),
+    Case("mug hung by its handle on a peg at the edge", SETTLE, hung_by_its_handle(), mug_on_peg, again="minute"),
     Case("mug with nothing but its handle over the edge", FALL, None, mug_handle_over_edge),
     Case(
         "cube over the edge of a sheet by 40 %",
