@@ -89,7 +89,11 @@ def _corners_on_faces(a: Surface, b: Surface, i: NDArray[np.intp], j: NDArray[np
         inward = np.cross(normals, end - start)
         over &= _dot(points - start, inward) >= -near.band_m * np.linalg.norm(inward, axis=1)
     corner, points, normals = corner[over], points[over], normals[over]
-    each = zip(corner, b.corners[face[over], 0], normals, strict=True)
+    face = face[over]
+    both = b.open[face]  # either side of an open surface may be the outer one
+    corner, points, face = (np.concatenate([every, every[both]]) for every in (corner, points, face))
+    normals = np.concatenate([normals, -normals[both]])
+    each = zip(corner, b.corners[face, 0], normals, strict=True)
     kept = np.array([_is_beyond(a, a.faces_at(one), at, normal, near) for one, at, normal in each], dtype=bool)
     return Contacts(points[kept], normals[kept])
 
@@ -97,7 +101,8 @@ def _corners_on_faces(a: Surface, b: Surface, i: NDArray[np.intp], j: NDArray[np
 def _is_beyond(a: Surface, faces: NDArray[np.int64], at: Array, normal: Array, near: _Near) -> bool:
     """Whether faces are on the outer side of the plane through a point, and one of them looks at it."""
     beyond = ((a.corners[faces] - at) @ normal >= -near.slack_m).all()
-    return bool(beyond and (a.normals[faces] @ normal).min() < -LOOKING)
+    looks = a.normals[faces] @ normal
+    return bool(beyond and np.where(a.open[faces], -np.abs(looks), looks).min() < -LOOKING)
 
 
 def _edges_across_edges(a: Surface, b: Surface, i: NDArray[np.intp], j: NDArray[np.intp], near: _Near) -> Contacts:

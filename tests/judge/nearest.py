@@ -28,6 +28,21 @@ def distances_to_faces(points: Array, corners: Array) -> Array:
     return np.concatenate([_to_faces(part[:, None], corners[None]).min(axis=1) for part in parts])
 
 
+def winding_numbers(points: Array, corners: Array) -> Array:
+    """[N]: how often the triangles [F, 3, 3] go round each point [N, 3]: 1 inside a body, 0 outside.
+
+    By the sum of their solid angles (Van Oosterom and Strackee 1983).
+    """
+    step = max(1, PAIRS_AT_ONCE // len(corners))
+    found = [np.zeros(0)]
+    for k in range(0, len(points), step):
+        a, b, c = (corners[None, :, m] - points[k : k + step, None] for m in range(3))
+        la, lb, lc = (np.linalg.norm(each, axis=-1) for each in (a, b, c))
+        below = la * lb * lc + _dot(a, b) * lc + _dot(b, c) * la + _dot(c, a) * lb
+        found.append(2.0 * np.arctan2(_dot(a, np.cross(b, c)), below).sum(axis=1) / (4.0 * np.pi))
+    return np.concatenate(found)
+
+
 def _to_faces(points: Array, corners: Array) -> Array:
     """[N, F]: distances of points [N, 1, 3] to triangles [1, F, 3, 3]: to the plane over the face, else to the edges."""
     a, b, c = corners[:, :, 0], corners[:, :, 1], corners[:, :, 2]

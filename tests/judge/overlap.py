@@ -4,20 +4,25 @@ import itertools
 
 import manifold3d
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.base import Array
-from tests.judge.nearest import distances_to_faces
+from tests.judge.nearest import distances_to_faces, winding_numbers
 from tests.judge.surface import Surface
 
 EXACT_TO = 60
 """Corners of a hull up to which its least width is exact: beyond, over its faces alone, which is never less."""
 
-FILLED = 0.5
-"""Share of its hull's volume from which a piece is as deep as its hull is narrow. Others are bent sheets."""
+FILLED = 0.95
+"""Share of its hull's volume from which a piece is convex."""
 
 MOST_POINTS = 2000
-"""Points of a bent sheet at which its thickness is measured."""
+"""Points of a piece at which its thickness is measured."""
+
+
+TOGETHER = 32
+"""Points whose distances are measured together."""
 
 
 def overlap_m(a: Surface, b: Surface) -> float:
@@ -25,22 +30,57 @@ def overlap_m(a: Surface, b: Surface) -> float:
     if (a.bounds[0] > b.bounds[1]).any() or (b.bounds[0] > a.bounds[1]).any():
         return 0.0
     pieces = (piece for one, other in itertools.product(a.solids, b.solids) for piece in (one ^ other).decompose())
-    return max((_depth_m(piece, a, b) for piece in pieces), default=0.0)
+    depths = [_depth_m(piece, a, b) for piece in pieces]
+    return max([*depths, _open_depth_m(a, b), _open_depth_m(b, a)])
+
+
+def _open_depth_m(a: Surface, b: Surface) -> float:
+    """The depth of open pieces of `a` inside the bodies of `b`, at their corners and the middles of edges and faces.
+
+    What reaches through an open surface between these is not found: it has no inside.
+    """
+    faces = a.faces[a.open]
+    if len(faces) == 0 or not b.solids:
+        return 0.0
+    where = _samples(a.vertices, faces)
+    where = where[((where > b.bounds[0]) & (where < b.bounds[1])).all(axis=1)]
+    closed = b.corners[~b.open]
+    inside = where[winding_numbers(where, closed) > 0.5]
+    return float(distances_to_faces(inside, closed).max()) if len(inside) else 0.0
+
+
+def _samples(points: Array, faces: NDArray[np.int64]) -> Array:
+    """[N, 3]: corners of faces, middles of their edges and of themselves."""
+    p, q, r = (points[faces[:, k]] for k in range(3))
+    return np.unique(np.concatenate([p, q, r, (p + q) / 2, (q + r) / 2, (r + p) / 2, (p + q + r) / 3]), axis=0)
 
 
 def _depth_m(piece: manifold3d.Manifold, a: Surface, b: Surface) -> float:
-    """The least width of the piece; of a bent sheet, which is far thinner than its hull, its greatest thickness."""
+    """The least distance by which one must move to leave the other here, or a little less: the larger of two lower bounds.
+
+    The piece's thickness at a point is the point's depth in one of the bodies. And a convex piece, moved by less than its
+    least width, still meets itself. The second counts where edges cross, whose piece ends in edges.
+    """
     mesh = piece.to_mesh64()
     points, faces = np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts, dtype=np.int64)
-    width = least_width_m(points)
-    if piece.volume() >= FILLED * manifold3d.Manifold.hull_points(np.ascontiguousarray(points)).volume():
-        return width
-    p, q, r = (points[faces[:, k]] for k in range(3))
-    where = np.concatenate([points, (p + q) / 2, (q + r) / 2, (r + p) / 2, (p + q + r) / 3])
+    where = _samples(points, faces)
     where = where[:: -(-len(where) // MOST_POINTS)]
-    box = np.array([points.min(axis=0) - width, points.max(axis=0) + width])
-    thickness = np.maximum(*(distances_to_faces(where, each.corners[each.faces_in(box)]) for each in (a, b)))
-    return min(width, float(thickness.max()))
+    thickness = max(_greatest_distance_m(where, each) for each in (a, b))
+    if piece.volume() < FILLED * manifold3d.Manifold.hull_points(np.ascontiguousarray(points)).volume():
+        return thickness
+    return max(thickness, least_width_m(points))
+
+
+def _greatest_distance_m(points: Array, of: Surface) -> float:
+    """From points to the surface: some neighbours at a time, and of it what is nearer than their nearest corners."""
+    order = np.argsort(points[:, np.ptp(points, axis=0).argmax()])
+    greatest = 0.0
+    for k in range(0, len(points), TOGETHER):
+        some = points[order[k : k + TOGETHER]]
+        reach = of.corner_tree.query(some)[0].max()
+        near = of.faces_in(np.array([some.min(axis=0) - reach, some.max(axis=0) + reach]))
+        greatest = max(greatest, float(distances_to_faces(some, of.corners[near]).max()))
+    return greatest
 
 
 def least_width_m(points: Array) -> float:

@@ -65,11 +65,11 @@ def main() -> int:
             outcomes.append(one)
             if one.refused or not is_within(one):
                 print(describe(one), flush=True)
-    name = "hollows" if given.hollows else f"{job.name}, {job.objects_per_scene[1]} objects"
-    print(tabulate(name, outcomes))
     if given.json:
         report = {"command": sys.argv, "summary": summary(outcomes), "scenes": [asdict(one) for one in outcomes]}
         Path(given.json).write_text(json.dumps(report, indent=1))
+    name = "hollows" if given.hollows else f"{job.name}, {job.objects_per_scene[1]} objects"
+    print(tabulate(name, outcomes))
     crashed = any(one.refused == CRASHED for one in outcomes)
     return int(crashed or not all(is_within(one) for one in outcomes if not one.refused))
 

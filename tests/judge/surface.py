@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
@@ -83,6 +84,11 @@ class Surface:
         return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     @cached_property
+    def corner_tree(self) -> cKDTree:
+        """The corners of faces, for the nearest of them."""
+        return cKDTree(self.vertices[np.unique(self.faces)])
+
+    @cached_property
     def tree(self) -> fcl.CollisionObject:
         """The triangles as a hierarchy of boxes, for distances."""
         model = fcl.BVHModel()
@@ -92,27 +98,66 @@ class Surface:
         return fcl.CollisionObject(model, fcl.Transform())
 
     @cached_property
-    def solids(self) -> tuple[manifold3d.Manifold, ...]:
-        """The connected bodies; the hull of a piece that bounds none, where that has a volume."""
-        return tuple(solid for piece in self._pieces() if not (solid := _solid(self.vertices, piece)).is_empty())
+    def _pieces(self) -> list[tuple[NDArray[np.intp], manifold3d.Manifold | None]]:
+        """The numbers of the faces of every piece, and the body that it bounds, None where it is open."""
+        if len(self.faces) == 0:
+            return []
+        counts = np.bincount(self.face_edges.reshape(-1), minlength=len(self.edges))
+        one, other = self.edge_faces[counts == 2].T
+        links = coo_matrix((np.ones(len(one)), (one, other)), shape=(len(self.faces),) * 2)
+        label = connected_components(links, directed=False)[1]
+        members = [np.flatnonzero(label == k) for k in range(label.max() + 1)]
+        return [(each, _solid(self.vertices, self.faces[each])) for each in members]
 
-    def _pieces(self) -> list[NDArray[np.int64]]:
-        ends = self.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-        links = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(self.vertices),) * 2)
-        label = connected_components(links, directed=False)[1][self.faces[:, 0]]
-        return [self.faces[label == one] for one in np.unique(label)]
+    @property
+    def solids(self) -> list[manifold3d.Manifold]:
+        """The connected bodies: pieces that share no edge of two faces are apart."""
+        return [solid for _, solid in self._pieces if solid is not None]
+
+    @cached_property
+    def open(self) -> NDArray[np.bool_]:
+        """[F]: whether a face belongs to a piece that bounds no body, so that neither of its sides is the outer one."""
+        found = np.zeros(len(self.faces), dtype=bool)
+        for members, solid in self._pieces:
+            found[members] = solid is None
+        return found
 
 
 def surface(mesh: Mesh) -> Surface:
-    """The mesh with one vertex at each place and without faces of no area, turned outwards where it bounds a body."""
-    places, inverse = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    faces = inverse.reshape(-1)[mesh.faces].astype(np.int64)
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    faces = faces[np.sort(first)]
+    """The mesh without faces of no area, welded, and turned outwards where it bounds a body.
+
+    One vertex is kept at each place, and one of faces with the same corners. If that leaves it open: none of these, which
+    are common walls; then one vertex at each place of what shares vertices as it is written.
+    """
+    place = np.unique(mesh.vertices, axis=0, return_inverse=True)[1].reshape(-1)
+    once, alone = _welded(mesh, place)
+    best = once
+    if once.open.any():
+        apart = _welded(mesh, place + len(place) * _connected(len(mesh.vertices), mesh.faces))[0]
+        best = next((each for each in (alone, apart) if len(each.faces) and not each.open.any()), once)
+    turned = best.faces.copy()
+    for members, _ in best._pieces:
+        if _volume(best.vertices, turned[members]) < 0.0:
+            turned[members] = turned[members][:, ::-1]
+    return Surface(best.vertices, turned)
+
+
+def _welded(mesh: Mesh, label: NDArray[np.intp]) -> tuple[Surface, Surface]:
+    """(one of the faces with the same corners, where vertices of one label are one; the faces that are alone there)."""
+    _, where, inverse = np.unique(label, return_index=True, return_inverse=True)
+    places, faces = mesh.vertices[where], inverse.reshape(-1)[mesh.faces].astype(np.int64)
     faces = faces[np.linalg.norm(_area_vectors(places[faces]), axis=1) > 0.0]
-    found = Surface(places, faces)
-    turned = [piece[:, ::-1] if _volume(places, piece) < 0.0 else piece for piece in found._pieces()]
-    return Surface(places, np.concatenate(turned))
+    _, first, which, counts = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    return Surface(places, faces[np.sort(first)]), Surface(places, faces[counts[which.reshape(-1)] == 1])
+
+
+def _connected(count: int, faces: NDArray[np.integer]) -> NDArray[np.intp]:
+    """[count]: the number of each vertex's piece, of those that faces join."""
+    ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    links = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    return connected_components(links, directed=False)[1].astype(np.intp)
 
 
 def _area_vectors(corners: Array) -> Array:
@@ -129,10 +174,11 @@ def _volume(vertices: Array, faces: NDArray[np.int64]) -> float:
     return float(np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0)
 
 
-def _solid(vertices: Array, faces: NDArray[np.int64]) -> manifold3d.Manifold:
-    kept, inverse = np.unique(faces, return_inverse=True)
+def _solid(vertices: Array, faces: NDArray[np.int64]) -> manifold3d.Manifold | None:
+    """The body inside the faces, wound either way; None where they are open."""
+    kept = np.unique(faces)
     points = np.ascontiguousarray(vertices[kept])
-    solid = manifold3d.Manifold(manifold3d.Mesh64(points, inverse.reshape(-1, 3).astype(np.uint64)))
-    if solid.status() != manifold3d.Error.NoError or solid.volume() <= 0.0:
-        return manifold3d.Manifold.hull_points(points)
-    return solid
+    order = faces if _volume(vertices, faces) > 0.0 else faces[:, ::-1]
+    index = np.searchsorted(kept, order).astype(np.uint64)
+    solid = manifold3d.Manifold(manifold3d.Mesh64(points, np.ascontiguousarray(index)))
+    return None if solid.status() != manifold3d.Error.NoError or solid.volume() <= 0.0 else solid

@@ -44,6 +44,7 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     accepted = [one for one in outcomes if not one.refused]
     worst = [one.worst for one in accepted]
     stayed = sum(one.refused != LEFT for one in outcomes)
+    stored = [one.stored for one in accepted if one.stored is not None]
     parts = sorted({name for one in outcomes for name in one.parts_s})
     return {
         "scenes": len(outcomes),
@@ -51,7 +52,7 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "refused": dict(Counter(one.refused for one in outcomes if one.refused and one.refused != LEFT)),
         "accepted": len(accepted) / stayed if stayed else 0.0,
         "worst": worst_of(worst).__dict__ if worst else None,
-        "stored": worst_of([one.stored for one in accepted if one.stored]).__dict__ if worst else None,
+        "stored": worst_of(stored).__dict__ if stored else None,
         "over_0.01_mm": sum(max(one.overlap_mm, one.hover_mm) > APART_MM for one in worst),
         "over_1_percent": sum(one.unbalanced > BALANCED for one in worst),
         "over_0.1_percent": sum(one.unbalanced > BALANCED / 10 for one in worst),
@@ -73,7 +74,7 @@ def tabulate(name: str, outcomes: Sequence[Outcome]) -> str:
         str(found["scenes"]),
         str(found["left_table"]),
         refused,
-        f"{found['certified']:.1%}",
+        f"{found['accepted']:.1%}",
         f"{worst['overlap_mm']:.5f}",
         f"{worst['hover_mm']:.5f}",
         f"{worst['unbalanced']:.2%}",
