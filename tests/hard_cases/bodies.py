@@ -33,7 +33,7 @@ def ball(radius_m: float, subdivisions: int = 4) -> Asset:
 
 def globe(radius_m: float) -> Asset:
     """A ball about z of 360 meridians, with an even band at its equator: it stands on no slope over half a degree."""
-    meridian, parallel = np.meshgrid(np.arange(360) * np.pi / 180, (np.arange(8) + 0.5) * np.pi / 8, indexing="ij")
+    meridian, parallel = np.meshgrid(np.arange(360) * np.pi / 180, (np.arange(16) + 0.5) * np.pi / 16, indexing="ij")
     level, up = np.sin(parallel), np.cos(parallel)
     points = radius_m * np.stack([level * np.cos(meridian), level * np.sin(meridian), up], axis=-1)
     return asset_of(trimesh.convex.convex_hull(points.reshape(-1, 3)))

@@ -1,11 +1,17 @@
 """One row of the table of hard cases."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from tests.hard_cases.drops import Make
+from tests.hard_cases.drops import Drop
+from tests.hard_cases.groups import Group
 from tests.hard_cases.measures import Measure
 
 SETTLE, FALL, EITHER = "must settle", "must fall", "either"
+UNDEFINED = "either, or refused"
+
+Made = Drop | Group
+Make = Callable[[], Made]
 
 
 def refuse(reason: str) -> str:
@@ -15,16 +21,17 @@ def refuse(reason: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One row; `physics` are settings other than the defaults, `spin` is the angular velocity at release, rad/s.
+    """One row; `physics` are settings other than the defaults, `spin` is the first object's angular velocity at release, rad/s.
 
-    `miss` says why the case itself is not met, `moves` why the object moves when it is let go again.
+    `measure` is required of whatever may settle. `tier` is the marker of the tests that settle it (`minute`, `slow`, or
+    none), `again` that of the tests that settle it once more or let it go again.
     """
 
     name: str
     outcome: str
-    measure: Measure
+    measure: Measure | None
     make: Make
     physics: dict[str, float] = field(default_factory=dict)
     spin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    miss: str = ""
-    moves: str = ""
+    tier: str = ""
+    again: str = ""

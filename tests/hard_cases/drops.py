@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +29,11 @@ class Drop:
 
     start: ObjectStart
     table: Table
+
+    @property
+    def starts(self) -> tuple[ObjectStart, ...]:
+        """The object, as one of several would be."""
+        return (self.start,)
 
 
 def turn(axis: Array, degrees: float) -> Array:
@@ -88,7 +92,7 @@ def ring(thick_m: float = 0.03) -> Table:
 
 def with_raised_ring() -> Table:
     """A level table that carries a ring of 100 mm across, 5 mm high."""
-    hoop = trimesh.creation.annulus(r_min=0.046, r_max=0.05, height=0.005, sections=24)
+    hoop = trimesh.creation.annulus(r_min=0.046, r_max=0.05, height=0.005, sections=48)
     hoop.apply_translation((0, 0, 0.7025))
     return table_of(box(1.4, 1.4, 0.03, (0, 0, 0.685)), hoop)
 
@@ -113,6 +117,3 @@ def with_peg() -> Table:
     # Tables are centred on their outline; the peg makes this one's lopsided, and the edge belongs at EDGE_M.
     assert math.isclose(float(table.mesh.vertices[:, 0].max()), 0.75)
     return table
-
-
-Make = Callable[[], Drop]

@@ -2,22 +2,31 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import shapely
+import trimesh
 
 from schemas.base import Array, frozen_array
 from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import ball, built_in, cube
-from tests.hard_cases.drops import Drop, Y, level, table_of, turn
+from tests.hard_cases.drops import Y, level, table_of, turn
 from tests.shapes import asset_of, box
 from workers.geometry.frames import pose, uniform_rotation
 from workers.geometry.hull import convex_hull
 
 GAP_M = 0.0005
 """Between what is let go one above the other."""
+
+FREE_M = 1e-4
+"""Between what leans and what holds it, at release."""
+
+TOUCH_M = 1e-5
+"""The same for what balances: a fall of 0.1 mm gives what it takes to tip over an edge 1 mm from the centre of mass."""
 
 SMALL_M = 0.05
 """Side of the cubes that are piled."""
@@ -73,24 +82,19 @@ def stack(*assets: Asset, turned_deg: float = 0.0) -> Group:
     return together(table, starts)
 
 
-def tray() -> Table:
-    """A slab 300 mm square with walls 150 mm high."""
-    walls = [box(0.02, 0.34, 0.15, (x, 0, 0.075)) for x in (-0.16, 0.16)]
-    walls += [box(0.34, 0.02, 0.15, (0, y, 0.075)) for y in (-0.16, 0.16)]
-    return table_of(box(0.34, 0.34, 0.03, (0, 0, -0.015)), *walls)
+def tray(walls_m: float = 0.15, inner_m: float = 0.3) -> Table:
+    """A square slab with walls."""
+    at, long = inner_m / 2 + 0.01, inner_m + 0.04
+    walls = [box(0.02, long, walls_m, (x, 0, walls_m / 2)) for x in (-at, at)]
+    walls += [box(long, 0.02, walls_m, (0, y, walls_m / 2)) for y in (-at, at)]
+    return table_of(box(long, long, 0.03, (0, 0, -0.015)), *walls)
 
 
-def leaning_on_a_wall() -> Drop:
-    """A cube of 50 mm in a tray, on an edge and against a wall: 20 degrees from upright, 70 from the wall."""
-    table = tray()
-    return Drop(put(cube(SMALL_M), table, 0.003, (0.118, 0.0), turn(Y, -20.0)), table)
-
-
-def pile(count: int) -> Group:
+def pile(count: int, seed: int = 20, walls_m: float = 0.15) -> Group:
     """So many boxes of three kinds, each turned any way, four in a layer, into a tray."""
-    rng = np.random.default_rng(np.random.SeedSequence(20))
+    rng = np.random.default_rng(np.random.SeedSequence(seed))
     kinds = [asset_of(box(*sides)) for sides in ((0.05, 0.05, 0.05), (0.03, 0.05, 0.07), (0.02, 0.06, 0.06))]
-    table, starts = tray(), list[ObjectStart]()
+    table, starts = tray(walls_m), list[ObjectStart]()
     for number in range(count):
         layer, place = divmod(number, 4)
         xy = (0.06 * (-1) ** (place % 2), 0.06 * (-1) ** (place // 2))
@@ -104,13 +108,18 @@ def two_in_one_place() -> Group:
     return together(table, [put(cube(), table, GAP_M), put(cube(), table, GAP_M, (0.001, 0.0))])
 
 
-def in_a_tray() -> Group:
-    """A cube of 30 mm in an open box of five boards, which weighs as much."""
+def open_box() -> Asset:
+    """An open box of five boards."""
     boards = [box(0.1, 0.1, 0.01, (0, 0, 0.005))]
     boards += [box(0.01, 0.1, 0.05, (x, 0, 0.035)) for x in (-0.045, 0.045)]
     boards += [box(0.08, 0.01, 0.05, (0, y, 0.035)) for y in (-0.045, 0.045)]
+    return asset_of(*boards)
+
+
+def in_a_tray(vessel: Asset | None = None) -> Group:
+    """A cube of 30 mm in an open box, which weighs as much."""
     table = level()
-    return together(table, [put(asset_of(*boards), table, GAP_M), put(cube(0.03), table, 0.02, (0.01, 0.005))])
+    return together(table, [put(vessel or open_box(), table, GAP_M), put(cube(0.03), table, 0.02, (0.01, 0.005))])
 
 
 def in_a_bowl() -> Group:
@@ -153,4 +162,19 @@ def onto_another() -> Group:
     return together(table, [put(cube(), table, GAP_M), put(cube(SMALL_M), table, 0.4, (0.005, 0.0))])
 
 
-MakeGroup = Callable[[], Group]
+def prism(outline: Sequence[tuple[float, float]], width_m: float, mass_kg: float = 0.5) -> Asset:
+    """A solid of this outline in x and z, so wide along y."""
+    solid: Any = trimesh.creation.extrude_polygon(shapely.Polygon(outline), width_m)
+    upright = np.array(
+        [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, width_m / 2], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    )
+    solid.apply_transform(upright)
+    return asset_of(solid, mass_kg=mass_kg)
+
+
+def place(
+    asset: Asset, table: Table, offset: Sequence[float] | Array = (0.0, 0.0, 0.0), R: Array | None = None
+) -> ObjectStart:
+    """The object with its own frame's origin there, z from the table's top."""
+    T = pose(np.eye(3) if R is None else R, np.add(offset, [0.0, 0.0, table.top.height_m]))
+    return ObjectStart(asset, convex_hull(asset.shape.vertices), 3, frozen_array(T), 0, False)

@@ -1,18 +1,35 @@
-"""What is measured of an object at rest: from its mesh, its pose and the table's mesh, not from the simulator."""
+"""What is measured of objects at rest: from their meshes, their poses and the table's, not from the simulator."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from schemas.base import Array
+from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.scene import Settled
-from tests.hard_cases.drops import Drop
 from workers.geometry.frames import transform
-from workers.physics.separation import Form, find_gaps_m
 
 Z = np.array([0.0, 0.0, 1.0])
+
+SAME_PLANE = 1e-9
+"""Of cosines and metres, between triangles of one face."""
+
+
+class Made(Protocol):
+    """Objects at release, and their table."""
+
+    @property
+    def starts(self) -> tuple[ObjectStart, ...]: ...
+
+    @property
+    def table(self) -> Table: ...
+
+
+Rest = Sequence[Settled]
 
 
 @dataclass(frozen=True)
@@ -21,58 +38,159 @@ class Measure:
 
     what: str
     bound: float
-    of: Callable[[Drop, Settled], float]
+    of: Callable[[Made, Rest], float]
 
 
-def gap_mm(case: Drop, rest: Settled) -> float:
-    """Penetration or gap, whichever there is."""
-    forms = [Form(case.start.asset.shape.mesh), Form(case.table.mesh)]
-    return abs(find_gaps_m(forms, [rest.T_world_obj, np.eye(4)])[0]) * 1e3
+def coms(made: Made, rest: Rest) -> Array:
+    """[N, 3] metres: the centres of mass, z from the table's top."""
+    pairs = zip(made.starts, rest, strict=True)
+    found = [transform(each.T_world_obj, start.asset.mass.com[None, :])[0] for start, each in pairs]
+    return np.array(found) - [0.0, 0.0, made.table.top.height_m]
 
 
-def gap(bound_mm: float = 0.1) -> Measure:
-    """Penetration or gap between the meshes."""
-    return Measure("penetration or gap, mm", bound_mm, gap_mm)
+def coms_at_release(made: Made) -> Array:
+    """[N, 3] metres: the same where they are let go."""
+    found = [transform(start.T_world_obj, start.asset.mass.com[None, :])[0] for start in made.starts]
+    return np.array(found) - [0.0, 0.0, made.table.top.height_m]
 
 
-def _angle_deg(rest: Settled, axis: Array) -> float:
+# ---------------------------------------------------------------------------------------------- angles
+
+
+def angle_deg(rest: Settled, axis: Array = Z) -> float:
+    """Between an axis of the object and the vertical."""
     return math.degrees(math.acos(float(np.clip((rest.T_world_obj[:3, :3] @ axis)[2], -1.0, 1.0))))
 
 
-def tilt(bound_deg: float, axis: Array = Z) -> Measure:
-    """Between an axis of the object and the vertical."""
-    return Measure("tilt from upright, deg", bound_deg, lambda _, rest: _angle_deg(rest, axis))
+def tilt(bound_deg: float, body: int = 0) -> Measure:
+    """Between the object's z axis and the vertical."""
+    return Measure("tilt from upright, deg", bound_deg, lambda _, rest: angle_deg(rest[body]))
 
 
-def flat(bound_deg: float) -> Measure:
+def flat(bound_deg: float, body: int = 0) -> Measure:
     """Between the object's z axis and the vertical, either way up."""
-    return Measure("tilt from flat, deg", bound_deg, lambda _, r: min(_angle_deg(r, Z), 180.0 - _angle_deg(r, Z)))
+
+    def off(_: Made, rest: Rest) -> float:
+        return min(angle_deg(rest[body]), 180.0 - angle_deg(rest[body]))
+
+    return Measure("tilt from flat, deg", bound_deg, off)
 
 
-def leaning(expected_deg: Callable[[], float], bound_deg: float, axis: Array = Z) -> Measure:
+def leaning(expected_deg: Callable[[], float], bound_deg: float, axis: Array = Z, body: int = 0) -> Measure:
     """Between the angle of an axis to the vertical and what it must be."""
-    return Measure("tilt off what it must be, deg", bound_deg, lambda _, r: abs(_angle_deg(r, axis) - expected_deg()))
-
-
-def _com(case: Drop, T: Array) -> Array:
-    return transform(T, case.start.asset.mass.com[None, :])[0]
-
-
-def shift(bound_mm: float) -> Measure:
-    """How far the centre of mass went sideways."""
     return Measure(
-        "sideways from the start, mm",
-        bound_mm,
-        lambda case, rest: float(
-            np.linalg.norm((_com(case, rest.T_world_obj) - _com(case, case.start.T_world_obj))[:2]) * 1e3
-        ),
+        "tilt off what it must be, deg", bound_deg, lambda _, rest: abs(angle_deg(rest[body], axis) - expected_deg())
     )
 
 
-def height(expected_m: float, bound_mm: float) -> Measure:
+def tilts(*expected_deg: float, bound_deg: float) -> Measure:
+    """Between the angle of each object's z axis to the vertical and what it must be: the worst."""
+
+    def off(_: Made, rest: Rest) -> float:
+        return max(abs(angle_deg(one) - wanted) for one, wanted in zip(rest, expected_deg, strict=True))
+
+    return Measure("worst tilt off what it must be, deg", bound_deg, off)
+
+
+def on_a_face(bound_deg: float = 0.1, body: int = 0) -> Measure:
+    """Between the vertical and the nearest face of the object's hull that has the centre of mass over it."""
+
+    def off(made: Made, rest: Rest) -> float:
+        down = rest[body].T_world_obj[:3, :3].T @ -Z
+        normals = stable_faces(made.starts[body])
+        return math.degrees(math.acos(float(np.clip((normals @ down).max(), -1.0, 1.0))))
+
+    return Measure("tilt from a face to stand on, deg", bound_deg, off)
+
+
+def stable_faces(start: ObjectStart) -> Array:
+    """[N, 3] outward normals, in the object's frame, of the faces on which it can stand on a level."""
+    asset = start.asset
+    hull = ConvexHull(asset.shape.vertices - asset.mass.com)
+    planes, found = hull.equations, []
+    for k, plane in enumerate(planes):
+        same = (planes[:, :3] @ plane[:3] > 1.0 - SAME_PLANE) & (np.abs(planes[:, 3] - plane[3]) < SAME_PLANE)
+        if np.flatnonzero(same)[0] != k:
+            continue
+        if any(_is_inside(hull.points[triangle], plane) for triangle in hull.simplices[same]):
+            found.append(plane[:3])
+    return np.array(found)
+
+
+def _is_inside(corners: Array, plane: Array) -> bool:
+    """Whether the foot of the centre of mass, the origin, is within a triangle of this plane."""
+    foot = -plane[3] * plane[:3]
+    turns = [float(np.cross(corners[(k + 1) % 3] - corners[k], foot - corners[k]) @ plane[:3]) for k in range(3)]
+    return all(each >= -1e-12 for each in turns) or all(each <= 1e-12 for each in turns)
+
+
+# ---------------------------------------------------------------------------------------------- places
+
+
+def shift(bound_mm: float, body: int = 0) -> Measure:
+    """How far the centre of mass went sideways."""
+
+    def off(made: Made, rest: Rest) -> float:
+        return float(np.linalg.norm((coms(made, rest) - coms_at_release(made))[body, :2])) * 1e3
+
+    return Measure("sideways from the start, mm", bound_mm, off)
+
+
+def apart(bound_mm: float) -> Measure:
+    """How far the farthest went sideways from where it was let go."""
+
+    def farthest(made: Made, rest: Rest) -> float:
+        return float(np.linalg.norm((coms(made, rest) - coms_at_release(made))[:, :2], axis=1).max()) * 1e3
+
+    return Measure("farthest sideways from the start, mm", bound_mm, farthest)
+
+
+def moved(bound_mm: float) -> Measure:
+    """How far the centre of mass that moved most is from where it was let go, any way."""
+
+    def farthest(made: Made, rest: Rest) -> float:
+        return float(np.linalg.norm(coms(made, rest) - coms_at_release(made), axis=1).max()) * 1e3
+
+    return Measure("farthest from the start, mm", bound_mm, farthest)
+
+
+def height(expected_m: float, bound_mm: float, body: int = 0) -> Measure:
     """How far the centre of mass is from the height above the table's top at which it must be."""
     return Measure(
         "height off what it must be, mm",
         bound_mm,
-        lambda case, rest: abs(_com(case, rest.T_world_obj)[2] - case.table.top.height_m - expected_m) * 1e3,
+        lambda made, rest: abs(coms(made, rest)[body, 2] - expected_m) * 1e3,
+    )
+
+
+def heights(*expected_m: float, bound_mm: float = 0.1) -> Measure:
+    """The same of every object: the worst."""
+
+    def off(made: Made, rest: Rest) -> float:
+        return float(np.abs(coms(made, rest)[:, 2] - expected_m).max()) * 1e3
+
+    return Measure("worst height off what it must be, mm", bound_mm, off)
+
+
+def below(height_m: float, body: int) -> Measure:
+    """Height of a centre of mass above the table's top."""
+    return Measure("height of what must be down, mm", height_m * 1e3, lambda made, r: coms(made, r)[body, 2] * 1e3)
+
+
+def beside(bound_mm: float, body: int = 1, other: int = 0) -> Measure:
+    """Sideways between the centres of mass of two objects."""
+
+    def off(made: Made, rest: Rest) -> float:
+        found = coms(made, rest)
+        return float(np.linalg.norm((found[body] - found[other])[:2])) * 1e3
+
+    return Measure("sideways from the other, mm", bound_mm, off)
+
+
+def both(*measures: Measure) -> Measure:
+    """Several at once: the one that is worst against its bound, as a share of it."""
+    return Measure(
+        "; ".join(each.what for each in measures) + ": worst share of the bounds",
+        1.0,
+        lambda made, rest: max(each.of(made, rest) / each.bound for each in measures),
     )

@@ -48,13 +48,20 @@ def settle_single(
     return settle_group((start,), on, physics, names)[0]
 
 
-def recheck(start: ObjectStart, settled: Settled, on: Table, physics: Physics) -> tuple[float, float]:
-    """(mm that the farthest point moves, degrees that the object turns) when it is released again where it rests.
+def recheck_group(
+    starts: Sequence[ObjectStart], settled: Sequence[Settled], on: Table, physics: Physics
+) -> list[tuple[float, float]]:
+    """(mm that the farthest point moves, degrees that it turns) of every object, when all are released again.
 
-    For `RECHECK_S`, in the finest steps, on the ground that it came to rest on.
+    For `RECHECK_S`, in the finest steps, on the ground that they came to rest on.
     """
-    effects = effects_of((start,), on, physics)
-    if settled.support == "mesh":
-        effects = EffectPlan((*effects.ran, *called_for_with("table_mesh", (start,), physics)), {})
-    (after,) = release_again(scene_of((start,), on), (settled,), physics, effects, RECHECK_S)
-    return moved_by(start, settled.T_world_obj, after)
+    effects = effects_of(starts, on, physics)
+    if any(each.support == "mesh" for each in settled):
+        effects = EffectPlan((*effects.ran, *called_for_with("table_mesh", starts, physics)), {})
+    after = release_again(scene_of(starts, on), settled, physics, effects, RECHECK_S)
+    return [moved_by(one, rest.T_world_obj, T) for one, rest, T in zip(starts, settled, after, strict=True)]
+
+
+def recheck(start: ObjectStart, settled: Settled, on: Table, physics: Physics) -> tuple[float, float]:
+    """The same of one object."""
+    return recheck_group((start,), (settled,), on, physics)[0]
