@@ -118,10 +118,11 @@ BALANCE = (
         heights(0.05, 0.105, bound_mm=0.02),
         lambda: board_over_block(0.001),
     ),
+    # Its end comes down to the table. It may lean there on the edge, 100 mm high, which its middle is beyond and so below.
     Case(
         "board's centre of mass 1 mm outside of a block's edge",
         SETTLE,
-        below(0.08, 1),
+        below(0.1, 1),
         lambda: board_over_block(-0.001),
     ),
     *(

@@ -17,7 +17,7 @@ from workers.geometry.elevation import Terrain, prepare_terrain
 from workers.geometry.frames import transform
 from workers.physics.bullet import GRAVITY_M_S2
 from workers.physics.rest.contacts import Contacts, find_contacts, find_near_features
-from workers.physics.rest.rest import FALL_M, Thing
+from workers.physics.rest.rest import DOWN, FALL_M, Thing
 from workers.physics.rest.step import Inertia, Motion, step
 from workers.physics.separation import NEAR_M, Form, find_gaps_m
 
@@ -110,7 +110,7 @@ def measure_supports(placement: Placement, poses: Sequence[Pose]) -> tuple[Suppo
     found = find_contacts(surfaces, points, find_near_features(surfaces, points, TOUCHING_M), TOUCHING_M)
     contacts = replace(found, gaps=np.zeros_like(found.gaps))
     inertias = [thing.inertia(T) for T, thing in zip(poses, placement.things, strict=True)]
-    motion = step(inertias, contacts, placement.friction, FALL_M, GRAVITY_M_S2)
+    motion = step(inertias, contacts, placement.friction, FALL_M * DOWN, GRAVITY_M_S2)
     return tuple(
         _describe(placement, number, inertia, contacts, motion, gap)
         for number, (inertia, gap) in enumerate(zip(inertias, gaps_m, strict=False))

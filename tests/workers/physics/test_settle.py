@@ -15,7 +15,9 @@ from tests.physics.settling import effects_of, scene_of, settle_group, settle_si
 from tests.shapes import asset_of, box, table
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.geometry.hull import convex_hull
+from workers.physics import settle
 from workers.physics.effects import called_for
+from workers.physics.rest.rest import Rested
 from workers.physics.step import LEFT_ROOM, LEFT_TOP, Rest, settle_scene
 from workers.physics.table_top import place_table
 
@@ -152,3 +154,41 @@ def test_an_origin_away_from_the_centre_of_mass_changes_nothing():
     back = rest[1].T_world_obj @ np.linalg.inv(offset)
     assert back[2, 3] - TOP == pytest.approx(0.09, abs=5e-5)
     assert back[:2, 3] == pytest.approx([0.01, 0.0], abs=1e-3)
+
+
+def test_what_is_set_down_in_balance_is_not_simulated_and_what_is_not_falls():
+    """A cube on a cube, its middle 1 mm inside and outside of the other's edge."""
+    for beyond_m, stays in ((-0.001, True), (0.001, False)):
+        starts = [start_of(CUBE, 0, 0, 0.03 + 1e-5), start_of(CUBE, 0.03 + beyond_m, 0.0, 0.09 + 2e-5)]
+        rest = settle_group(starts, TABLE, PHYSICS, ALL)
+        assert (rest[0].settle_s == 0.0) == stays
+        assert (heights_of(rest)[1] == pytest.approx(0.09, abs=1e-8)) == stays
+
+
+def test_a_can_set_down_on_a_ridge_rolls_off_it():
+    """Exactly balanced between two of its sides: a breath would move it."""
+    can = asset_of(trimesh.creation.cylinder(0.03, 0.1, sections=24))
+    lying = rotation_about(np.array([1.0, 0, 0]), np.pi / 2)
+    rest = settle_single(start_of(can, 0, 0, 0.03, lying), TABLE, PHYSICS)
+    assert heights_of((rest,)) == pytest.approx([0.03 * np.cos(np.pi / 24)], abs=1e-7)
+    assert rest.support_margin_mm > 1.0
+
+
+def test_the_forces_of_a_pile_prove_its_balance():
+    """Of every object they add to its weight, and two that touch press one another alike."""
+    starts = [start_of(CUBE, 0.012 * k, 0.007 * (-1) ** k, 0.04 + 0.1 * k) for k in range(4)]
+    rest = settle_group(starts, TABLE, PHYSICS, ALL)
+    for each in rest:
+        force = sum(contact.force for contact in each.contacts)
+        assert force == pytest.approx([0, 0, CUBE.mass.mass_kg * 9.81], abs=1e-6)
+        assert each.equilibrium_residual < 1e-6 and each.penetration_mm < 1e-6 and each.hover_gap_mm < 1e-6
+
+
+def test_what_exact_rest_does_not_hold_is_refused(monkeypatch):
+    """An object 0.02 mm above the table: the gate, whatever brought it there."""
+    T = start_of(CUBE, 0, 0, 0.03 + 2e-5).T_world_obj
+    monkeypatch.setattr(settle, "rest", lambda things, *_: Rested((T,), None, None, True))
+    with pytest.raises(
+        SettleError, match=r"unsupported: it came to rest 0.020 mm from anything, with 100.0% of its weight"
+    ):
+        settle_single(start_of(CUBE, 0, 0, 0.03 + 2e-5), TABLE, PHYSICS)

@@ -1,5 +1,6 @@
 """Exact rest of bodies on a ground: convex steps from rest between true meshes, until nothing moves. Pure."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,9 +11,15 @@ from schemas.scene.shape import MassProperties
 from workers.geometry.contact_surface import Surface
 from workers.geometry.frames import pose, rotation_about, transform
 from workers.physics.rest.contacts import Contacts, find_contacts, find_near_features
-from workers.physics.rest.step import Inertia, JammedError, step
+from workers.physics.rest.step import Inertia, JammedError, Motion, step
 
 GRAVITY_M_S2 = 9.81
+
+DOWN = np.array([0.0, 0.0, -1.0])
+
+LEVEL = 1e-3
+"""Slope of a table that counts as level: what stands must not fall if the table leans by a millimetre in a metre. What would
+moves by about this share of a fall; what stands, by gaps of some nanometres that are left."""
 
 REACH_M = 1e-3
 """Gap up to which a contact is known. A point moves by half of it in a step at most, so that nothing is met unseen; a point
@@ -26,6 +33,12 @@ LONGEST_FALL_M = 0.05
 
 STILL = 1e-5
 """Motion as a share of free fall at which a body rests: of its weight, no more than this share is without balance."""
+
+ASLANT_RAD = 0.3
+"""Turn of these sides about z: along none of the symmetries of built shapes, which would carry one from edge to edge."""
+
+BACK_M = 2e-5
+"""What comes back as near to where it was nudged stands there."""
 
 MOST_STEPS = 64
 """Nine of eleven piles of eight needed 3 to 59 steps; what needs more has farther to go, for which the simulation is faster."""
@@ -61,12 +74,12 @@ class Rested:
 def rest(things: Sequence[Thing], poses: Sequence[Pose], ground: Surface, friction: float) -> Rested:
     """Bodies let go at rest from `poses` (`T_world_obj`), followed without speed until nothing moves any more.
 
-    What overlaps is moved apart, what hovers falls, what is out of balance tips. friction: the coefficient of a contact.
-    Not `still` after `MOST_STEPS`, or where overlapping bodies are jammed.
+    What overlaps is moved apart, what hovers falls, what is out of balance tips, also from an edge or a corner that it was
+    balanced on. friction: the coefficient of a contact. Not `still` after `MOST_STEPS`, or where overlapping bodies are jammed.
     """
     surfaces, at, near = [*(thing.surface for thing in things), ground], tuple(poses), None
     reaches = np.array([np.linalg.norm(one.surface.vertices - one.mass.com, axis=1).max() for one in things])
-    fall_m, known_m, contacts = FALL_M, 0.0, None
+    fall_m, known_m, nudged = FALL_M, 0.0, at[:0]
     for number in range(MOST_STEPS):
         points = [transform(T, thing.surface.vertices) for T, thing in zip(at, things, strict=True)] + [ground.vertices]
         if near is None or known_m <= 0.0:
@@ -74,12 +87,16 @@ def rest(things: Sequence[Thing], poses: Sequence[Pose], ground: Surface, fricti
         contacts = find_contacts(surfaces, points, near, REACH_M)
         inertias = [thing.inertia(T) for T, thing in zip(at, things, strict=True)]
         try:
-            motion = step(inertias, contacts, friction, fall_m, GRAVITY_M_S2)
+            motion = step(inertias, contacts, friction, fall_m * DOWN, GRAVITY_M_S2)
+            moved_m, forces = _farthest(motion, reaches), motion.forces
+            if moved_m <= STILL * fall_m and _apart_m(at, nudged, reaches) > BACK_M:
+                nudge, nudged = _nudge(inertias, contacts, friction, reaches), at
+                if _farthest(nudge, reaches) > LEVEL * LEVEL * LONGEST_FALL_M:
+                    motion, moved_m = nudge, _farthest(nudge, reaches)
         except JammedError:
-            break
-        moved_m = float((np.linalg.norm(motion.moves, axis=1) + np.linalg.norm(motion.turns, axis=1) * reaches).max())
+            return Rested(at, contacts, np.zeros((len(contacts.gaps), 3)), False, number)
         if moved_m <= STILL * fall_m:
-            return Rested(at, contacts, motion.forces, True, number)
+            return Rested(at, contacts, forces, True, number)
         share = min(1.0, REACH_M / 2 / moved_m)
         at = tuple(
             _moved(T, body.com, share * move, share * turn)
@@ -88,6 +105,27 @@ def rest(things: Sequence[Thing], poses: Sequence[Pose], ground: Surface, fricti
         known_m -= share * moved_m
         fall_m = _next_fall(fall_m, moved_m)
     return Rested(at, contacts, np.zeros((len(contacts.gaps), 3)), False, MOST_STEPS)
+
+
+def _farthest(motion: Motion, reaches: Array) -> float:
+    """Bound on the distance that any point moves; reaches [bodies]: of the points from their centre of mass, metres."""
+    return float((np.linalg.norm(motion.moves, axis=1) + np.linalg.norm(motion.turns, axis=1) * reaches).max())
+
+
+def _apart_m(at: Sequence[Pose], before: Sequence[Pose], reaches: Array) -> float:
+    """Bound on the distance of any point between two sets of poses; infinite where there is no other."""
+    apart = [np.linalg.norm(T - B, axis=0) for T, B in zip(at, before, strict=False)]
+    return max(
+        (float(each[3] + each[:3].max() * reach) for each, reach in zip(apart, reaches, strict=False)), default=np.inf
+    )
+
+
+def _nudge(bodies: Sequence[Inertia], contacts: Contacts, friction: float, reaches: Array) -> Motion:
+    """The farthest motion of bodies in balance on a ground that leans by `LEVEL` to one of four sides."""
+    x, y = LEVEL * math.cos(ASLANT_RAD), LEVEL * math.sin(ASLANT_RAD)
+    sides = np.array([[x, y, 0.0], [-y, x, 0.0], [-x, -y, 0.0], [y, -x, 0.0]])
+    motions = [step(bodies, contacts, friction, LONGEST_FALL_M * (DOWN + side), GRAVITY_M_S2) for side in sides]
+    return max(motions, key=lambda motion: _farthest(motion, reaches))
 
 
 def _next_fall(fall_m: float, moved_m: float) -> float:

@@ -45,8 +45,8 @@ class JammedError(Exception):
     """No small motion takes all bodies out of one another."""
 
 
-def step(bodies: Sequence[Inertia], contacts: Contacts, friction: float, fall_m: float, gravity_m_s2: float) -> Motion:
-    """The motion of bodies from rest in the time in which gravity alone moves them by `fall_m`.
+def step(bodies: Sequence[Inertia], contacts: Contacts, friction: float, fall: Array, gravity_m_s2: float) -> Motion:
+    """The motion of bodies from rest in the time in which gravity alone moves them by `fall` [3], metres.
 
     The motion nearest to free fall, measured by kinetic energy, with `n . d + gap >= friction |t . d|` for the relative
     motion d at every contact: the convex relaxation of Coulomb's law by Anitescu (2006, "Optimization-based simulation of
@@ -58,8 +58,9 @@ def step(bodies: Sequence[Inertia], contacts: Contacts, friction: float, fall_m:
     root_masses = np.sqrt([body.mass_kg for body in bodies])
     edges = _pyramid(contacts.normals, friction)
     matrix = _rows(bodies, roots, contacts, edges)
+    fall_m = float(np.linalg.norm(fall))
     free = np.zeros((len(bodies), 6))
-    free[:, 2] = -root_masses
+    free[:, :3] = root_masses[:, None] * fall / fall_m
     # Lengths in units of `fall_m`, so that all numbers are near 1
     needed = -np.repeat(contacts.gaps / fall_m, CONE_EDGES) - matrix @ free.ravel()
     away, multipliers = _least_distance(matrix, needed)

@@ -55,6 +55,16 @@ def test_a_prism_on_a_ridge_rolls_onto_the_side_that_it_leans_over():
     assert found.poses[0][2, 3] == pytest.approx(0.05 * math.cos(math.pi / 32), abs=1e-8)
 
 
+def test_what_is_balanced_on_an_edge_is_not_at_rest():
+    """A prism exactly on a ridge: in balance, and gone at a breath."""
+    prism = mesh_of(trimesh.creation.cylinder(0.05, 0.2, sections=32))
+    lying = pose(rotation_about(np.array([1.0, 0.0, 0.0]), math.pi / 2), np.array([0.0, 0.0, 0.05]))
+    low = transform(lying, prism.vertices)[:, 2].min()
+    found = settle([prism], [translation(0.0, 0.0, -low) @ lying])
+    assert found.still
+    assert found.poses[0][2, 3] == pytest.approx(0.05 * math.cos(math.pi / 32), abs=1e-8)
+
+
 def test_three_that_overlap_or_hover_come_to_a_stack():
     """By tenths of a millimetre, each turned, the second 20 times as heavy."""
     at = []

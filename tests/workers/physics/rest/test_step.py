@@ -20,7 +20,7 @@ def follow(
 ) -> Motion:
     masses = masses or [1.0] * len(bodies)
     inertias = [thing_of(mesh, mass).inertia(np.eye(4)) for mesh, mass in zip(bodies, masses, strict=True)]
-    return step(inertias, contacts_between([*bodies, ground], WITHIN_M), friction, fall_m, G)
+    return step(inertias, contacts_between([*bodies, ground], WITHIN_M), friction, -fall_m * UP, G)
 
 
 def moved(motion: Motion) -> float:
@@ -121,3 +121,10 @@ def test_what_no_motion_can_free_is_jammed():
     walls = [trimesh.creation.box((0.1, 1.0, 1.0)).apply_translation((x, 0, 0)) for x in (-0.1 + 2e-5, 0.1 - 2e-5)]
     with pytest.raises(JammedError):
         follow([box((0.1, 0.1, 0.1))], mesh_of(trimesh.util.concatenate(walls)))
+
+
+def test_what_falls_aslant_goes_the_way_of_the_fall():
+    body = [thing_of(box((0.1, 0.1, 0.1), (0, 0, 1.0))).inertia(np.eye(4))]
+    fall = np.array([1e-5, -2e-5, -1e-4])
+    motion = step(body, contacts_between([box((0.1, 0.1, 0.1), (0, 0, 1.0)), GROUND], WITHIN_M), 0.5, fall, G)
+    assert motion.moves[0] == pytest.approx(fall, abs=1e-15)
