@@ -19,6 +19,7 @@ from services.study.words import amount, duration, listed, milliseconds, short, 
 DEFAULT_TARGETS: Targets = {
     "penetration_mm": 0.1,
     "gap_mm": 0.1,
+    "unbalanced_share": 0.01,
     "pose_mm": 0.1,
     "depth_mm": 0.1,
     "mask_share": 0.001,

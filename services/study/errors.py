@@ -34,6 +34,8 @@ ERRORS = {kind.name: kind for kind in (
     ErrorKind("penetration_mm", "mm", "penetration",
               "how deep an object stands in what it rests on", "the stored shapes", "physics"),
     ErrorKind("gap_mm", "mm", "gap", "how high an object hovers", "the stored shapes", "physics"),
+    ErrorKind("unbalanced_share", "", "weight out of balance",
+              "share of a weight that contacts leave out of balance", "the stored shapes", "physics"),
     ErrorKind("moved_mm", "mm", "motion when let go again",
               "how far an object moves when it is let go again", _FINEST, "physics"),
     ErrorKind("turned_deg", "deg", "turn when let go again",

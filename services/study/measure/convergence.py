@@ -11,7 +11,9 @@ from schemas.job.job import Job
 from workers.physics.bullet import GRAVITY_M_S2, World, open_world
 from workers.physics.rigid_body import Body
 
-RATES_HZ = (960, 1920, 3840, 7680)
+RATES_HZ = (3840, 7680, 15360)
+"""An order shows in the limit: in longer steps a sliding block loses contacts for single steps, and stops a little later."""
+
 FALL_S = 0.5
 SLIDE_M_S = 1.0
 FRICTION = 0.6

@@ -42,9 +42,9 @@ def measure_settling(
 ) -> dict[str, Answer]:
     """Figures of one scene by the settings' names, and of the reference under "reference".
 
-    Each has `failed`, or else penetration_mm and gap_mm, slid_mm and rolled_deg (sideways travel of the centre of mass, and
-    turn, since the object was released; the largest of several objects). With `posed` also pose_mm, where there is a
-    truth; with `released` moved_mm and turned_deg. A scene that cannot be drawn has no answers.
+    Each has `failed`, or else penetration_mm, gap_mm and unbalanced_share, slid_mm and rolled_deg (sideways travel of the
+    centre of mass, and turn, since the object was released; the largest of several objects). With `posed` also pose_mm,
+    where there is a truth; with `released` moved_mm and turned_deg. A scene that cannot be drawn has no answers.
     """
     try:
         plan = plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
@@ -97,6 +97,7 @@ def _describe(plan: ScenePlan, rest: Rest | None) -> Answer:
         "failed": False,
         "penetration_mm": max(one.penetration_mm for one in rest.settled),
         "gap_mm": max(one.hover_gap_mm for one in rest.settled),
+        "unbalanced_share": max(one.equilibrium_residual for one in rest.settled),
         "slid_mm": max(slid),
         "rolled_deg": max(rolled),
     }

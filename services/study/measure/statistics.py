@@ -62,7 +62,7 @@ def settling_figures(name: str, scenes: Sequence[Answer]) -> dict[str, Figure]:
     if not mine:
         return {}
     found = {"failed_share": share([one["failed"] for one in mine])}
-    for error in ("penetration_mm", "gap_mm", "pose_mm", "moved_mm", "turned_deg"):
+    for error in ("penetration_mm", "gap_mm", "unbalanced_share", "pose_mm", "moved_mm", "turned_deg"):
         if figures := [one[error] for one in mine if error in one]:
             found[error] = figure_over_scenes(figures)
     both = [

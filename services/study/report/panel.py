@@ -27,7 +27,16 @@ from services.study.report.axes import (
 from services.study.report.labels import Label
 from services.study.words import cost
 
-_PHYSICS = ("pose_mm", "moved_mm", "outcome_mm", "penetration_mm", "gap_mm", "turned_deg", "outcome_deg")
+_PHYSICS = (
+    "pose_mm",
+    "moved_mm",
+    "outcome_mm",
+    "penetration_mm",
+    "gap_mm",
+    "unbalanced_share",
+    "turned_deg",
+    "outcome_deg",
+)
 
 _MAIN = (
     ("at rest", "How objects rest", _PHYSICS),
