@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from services.read.independent.derive import TABLE, Row
+from services.read.independent.derive import TABLE, Array, Row
 
 GRAVITY_M_S2 = 9.81
 
@@ -53,7 +53,7 @@ def _check_body(body: Row, friction: float) -> Iterator[str]:
 
 def _check_reactions(bodies: list[Row]) -> Iterator[str]:
     """Two bodies press one another with one force at one point."""
-    found = {}
+    found = dict[tuple[int, int], Array]()
     for body in bodies:
         for contact in body["contacts"]:
             if contact["with_region"] != TABLE:

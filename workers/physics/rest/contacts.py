@@ -76,9 +76,9 @@ _Boxes = tuple[Index, Array, Array]
 
 def _boxes(surface: Surface, points: Array, low: Array, high: Array) -> tuple[_Boxes, _Boxes, _Boxes]:
     """(numbers, bounds) of the corners, faces and edges of a surface whose boxes overlap a box."""
-    corner, *ends = bounds_in(points, surface.corners[:, None], low, high)
+    corners, least, most = bounds_in(points, surface.corners[:, None], low, high)
     return (
-        (surface.corners[corner], *ends),
+        (surface.corners[corners], least, most),
         bounds_in(points, surface.faces, low, high),
         bounds_in(points, surface.edges, low, high),
     )
