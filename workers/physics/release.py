@@ -8,7 +8,6 @@ from schemas.job.physics import Physics
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart
 from workers.geometry.frames import transform
-from workers.geometry.lathe_decomposition import COARSE, TOLERANCE
 from workers.physics.fall import Outcome, choose_steps, fall, free_fall_m
 from workers.physics.placement import Ground
 from workers.physics.rest_pose import stands_on_face
@@ -18,9 +17,9 @@ from workers.physics.stop_conditions import can_touch, falls_below, leaves_outli
 MANY = 4
 """Number of objects from which they fall as coarser convex parts: the time grows with the pairs of parts near one another."""
 
-GROUP_TRAVEL = 20.0
-"""Several objects may travel so many times further in a step. Where they come to rest is chaotic: its distribution matters and
-not the path. At 40 times, 2 mm, corners sink into the walls of mugs, which are 2 to 3 mm thick."""
+GROUP_TRAVEL = 40.0
+"""Several objects may travel so many times further in a step, 2 mm. Where they come to rest is chaotic: its distribution
+matters and not the path. At twice that corners sink into the walls of mugs, which are 2 to 3 mm thick."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +50,7 @@ def release(drop: Drop, flat: bool, damping: float = 0.0) -> Outcome:
     table, effects, physics = drop.ground.table, drop.effects, _settings(drop)
     starts = [choose_collision_shape(start, physics) for start in drop.starts]
     poses = [start.T_world_obj for start in starts]
-    share = TOLERANCE if len(starts) < MANY else COARSE
-    bodies = [build_body(start, physics, effects, damping, share) for start in starts]
+    bodies = [build_body(start, physics, effects, damping, len(starts) >= MANY) for start in starts]
     hulls = [transform(T, start.hull.vertices) for T, start in zip(poses, starts, strict=True)]
     free_m = min(free_fall_m(points, table, flat) for points in hulls)
     # On a mesh a single object keeps the shortest travel per step, however far it falls.

@@ -1,6 +1,7 @@
 """The rigid bodies that the simulator is given: convex parts about a centre of mass. Pure."""
 
 import dataclasses
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,12 +14,20 @@ from schemas.scene.shape import MassProperties
 from workers.geometry.frames import invert, pose, transform
 from workers.geometry.hull import convex_hull
 from workers.geometry.hull_offset import offset_hull
-from workers.geometry.lathe_decomposition import TOLERANCE
+from workers.geometry.lathe_decomposition import COARSE, TOLERANCE
 from workers.physics.convex_parts.step import parts_of
 from workers.physics.effects import is_convex
 
 SLOP_M = 1e-5
 """Depth of overlap that Bullet leaves between bodies at rest."""
+
+COARSE_MARGIN_M = 2e-5
+"""Collision margin of coarse parts, by which they hover: the least at which what rests is still found without overlap of the
+parts themselves, which takes Bullet longer."""
+
+DIRECTIONS = 128
+"""Directions, evenly over a sphere, in which coarse parts keep their farthest vertex: a third of the time of a pile's step
+goes where Bullet looks for it."""
 
 BodyPose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 """Position, metres, and quaternion (x, y, z, w) of a body frame, whose origin is the centre of mass."""
@@ -58,16 +67,36 @@ def choose_collision_shape(start: ObjectStart, physics: Physics) -> ObjectStart:
 
 
 def build_body(
-    start: ObjectStart, physics: Physics, effects: EffectPlan, damping: float = 0.0, share: float = TOLERANCE
+    start: ObjectStart, physics: Physics, effects: EffectPlan, damping: float = 0.0, coarse: bool = False
 ) -> Body:
     """The object as its convex parts where the effect `decomposition` runs and it has several, else as its hull.
 
-    share: of their size, by which parts of built-in shapes may stand out.
+    coarse: several parts are fewer and have fewer vertices, and are as large as the object and a margin about it.
     """
     parts: tuple[Array, ...] = ()
     if effects.runs("decomposition") and not is_convex(start):
-        parts = parts_of(start.asset, physics.concavity, share)
-    return make_body(start, physics, damping, parts if len(parts) > 1 else ())
+        parts = parts_of(start.asset, physics.concavity, COARSE if coarse else TOLERANCE)
+    if not coarse or len(parts) < 2:
+        return make_body(start, physics, damping, parts if len(parts) > 1 else ())
+    T_obj_body, moments = body_frame(start.asset.mass)
+    points = transform(invert(T_obj_body), start.hull.vertices)
+    reach_m = float(np.linalg.norm(points, axis=1).max())
+    vertices = tuple(_outermost(transform(invert(T_obj_body), part)) for part in parts)
+    return Body(start.asset.mass.mass_kg, moments, vertices, COARSE_MARGIN_M, damping, T_obj_body, reach_m)
+
+
+def _outermost(points: Array) -> Array:
+    """Those of points [N, 3] that are the farthest in one of `DIRECTIONS` directions, where there are more than half of that.
+
+    Of a ball the hull loses a three-hundredth of the radius. Of a rim that ends a cylinder nearly all points stay.
+    """
+    if len(points) <= DIRECTIONS // 2:
+        return points
+    k = np.arange(DIRECTIONS) + 0.5
+    z, angle = 1.0 - 2.0 * k / DIRECTIONS, math.pi * (1.0 + math.sqrt(5.0)) * k
+    radius = np.sqrt(1.0 - z * z)
+    directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), z])
+    return points[np.unique((points @ directions).argmax(axis=0))]
 
 
 def make_body(start: ObjectStart, physics: Physics, damping: float = 0.0, parts: tuple[Array, ...] = ()) -> Body:

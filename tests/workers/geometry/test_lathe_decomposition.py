@@ -184,6 +184,7 @@ def test_a_shape_whose_outlines_cannot_be_cut_is_cut_as_a_mesh_from_outside_is(m
 
 @pytest.mark.parametrize("category", ["mug", "bowl", "jar", "can"])
 def test_coarser_parts_are_fewer_and_reach_out_no_further_than_they_may(category):
+    """A hundredth of 0.25 m."""
     asset = make_asset(category, ProceduralSource(source="procedural"), 1, 600.0)
     fine, coarse = parts_of(asset), parts_of(asset, share=COARSE)
     assert len(coarse) < 0.5 * len(fine)
@@ -193,4 +194,4 @@ def test_coarser_parts_are_fewer_and_reach_out_no_further_than_they_may(category
     middles = np.concatenate([(part[:-1] + part[1:]) / 2 for part in coarse])
     outside = middles[~mesh.contains(middles)]
     away = np.linalg.norm(nearest_on_mesh(outside, asset.shape.mesh)[0] - outside, axis=1)
-    assert away.max(initial=0.0) < 2e-3
+    assert away.max(initial=0.0) < 2.5e-3

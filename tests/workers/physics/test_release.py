@@ -32,10 +32,10 @@ def start_of(asset: Asset, x: float, y: float, z: float, R=None) -> ObjectStart:
 
 
 @pytest.mark.parametrize(
-    ("height_m", "side_m", "travel_m"), [(0.02, 0.06, 1e-3), (0.7, 0.06, 1.4e-3), (0.3, 0.006, 3e-4)]
+    ("height_m", "side_m", "travel_m"), [(0.02, 0.06, 2e-3), (1.5, 0.06, 3e-3), (0.3, 0.006, 3e-4)]
 )
 def test_steps_are_as_fine_as_the_highest_fall_and_the_thinnest_object_ask(height_m, side_m, travel_m, monkeypatch):
-    """For several 1 mm, or 0.002 of the fall if that is more, or 0.05 of the thinnest if that is less."""
+    """For several 2 mm, or 0.002 of the fall if that is more, or 0.05 of the thinnest if that is less."""
     seen = []
 
     def told(*arguments):
