@@ -51,6 +51,10 @@ WORLDS_BEFORE_RESET = 32
 simulated time."""
 
 
+GroundShape = float | Mesh | Array
+"""Level ground at a height, metres, without an end; a mesh; or the vertices [N, 3] of a convex body."""
+
+
 @dataclass(frozen=True)
 class World:
     """A ground and bodies, numbered in order. `advance` takes `steps` steps."""
@@ -108,9 +112,9 @@ class World:
 
 @contextmanager
 def open_world(
-    placed: Sequence[tuple[Body, Pose]], ground: float | Mesh, physics: Physics, steps: int, reach_m: float = math.inf
+    placed: Sequence[tuple[Body, Pose]], ground: GroundShape, physics: Physics, steps: int, reach_m: float = math.inf
 ) -> Iterator[World]:
-    """Open a world of a ground, level at a height in metres or a mesh, and of bodies at their `T_world_body`.
+    """Open a world of a ground and of bodies at their `T_world_body`.
 
     `reach_m`: contact distance on a mesh, if less than Bullet's own. Of two contacts of a vertex with triangles of a mesh
     Bullet keeps the one found last: beside an edge a corner sinks in while the next triangle is in reach. On level ground a
@@ -182,12 +186,20 @@ def _connect() -> _Connection:
     return _Connection(pybullet.connect(pybullet.DIRECT))
 
 
-def _add_ground(client: int, mesh: float | Mesh) -> int:
-    if not isinstance(mesh, Mesh):
+def _add_ground(client: int, ground: GroundShape) -> int:
+    if isinstance(ground, Mesh):
+        return _add_mesh(client, ground)
+    if isinstance(ground, float):
+        place = {"basePosition": [0, 0, ground - SLAB_HALF_M[2]]}
         shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=SLAB_HALF_M, physicsClientId=client)
-        return pybullet.createMultiBody(
-            0, shape, basePosition=[0, 0, mesh - SLAB_HALF_M[2]], useMaximalCoordinates=1, physicsClientId=client
-        )
+    else:
+        place, vertices = {}, _BUFFERS.vertices(ground)
+        shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client)
+    thing: int = pybullet.createMultiBody(0, shape, useMaximalCoordinates=1, physicsClientId=client, **place)
+    return thing
+
+
+def _add_mesh(client: int, mesh: Mesh) -> int:
     if len(mesh.vertices) > MOST_GROUND_VERTICES or 3 * len(mesh.faces) > MOST_GROUND_INDICES:
         raise SettleError(
             "table_too_fine",
@@ -201,7 +213,8 @@ def _add_ground(client: int, mesh: float | Mesh) -> int:
         flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
         physicsClientId=client,
     )
-    return pybullet.createMultiBody(0, shape, useMaximalCoordinates=1, physicsClientId=client)
+    thing: int = pybullet.createMultiBody(0, shape, useMaximalCoordinates=1, physicsClientId=client)
+    return thing
 
 
 def _add_body(client: int, body: Body, R_world_body: Array | None) -> int:

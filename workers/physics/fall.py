@@ -11,10 +11,9 @@ from schemas.base import Array, Pose
 from schemas.job.physics import Physics
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart, Table
-from schemas.scene.shape import Mesh
 from workers.geometry.frames import invert, pose, rotation_from_quaternion, translation
 from workers.geometry.hull_offset import least_width_m
-from workers.physics.bullet import GRAVITY_M_S2, World, open_world
+from workers.physics.bullet import GRAVITY_M_S2, GroundShape, World, open_world
 from workers.physics.rigid_body import Body, BodyPose
 from workers.physics.stop_conditions import StopCondition
 from workers.physics.table_top import support_height
@@ -81,13 +80,15 @@ class Outcome:
     stopped_by: str | None = None
 
 
-def choose_steps(starts: Sequence[ObjectStart], physics: Physics, effects: EffectPlan, drop_m: float) -> StepSizes:
+def choose_steps(
+    starts: Sequence[ObjectStart], physics: Physics, effects: EffectPlan, drop_m: float, thin_share: float = THIN_SHARE
+) -> StepSizes:
     """Step sizes from the height of the drop and the thinnest object; constant without the effect `fine_step`."""
     if not effects.runs("fine_step"):
         return StepSizes(physics.step_hz, math.inf)
     thinnest_m = min(least_width_m(start.hull) for start in starts)
     travel_m = max(physics.max_step_travel_mm / 1e3, DROP_SHARE * drop_m)
-    return StepSizes(physics.step_hz, min(travel_m, THIN_SHARE * thinnest_m))
+    return StepSizes(physics.step_hz, min(travel_m, thin_share * thinnest_m))
 
 
 def free_fall_m(points: Array, table: Table, flat: bool) -> float:
@@ -99,7 +100,7 @@ def free_fall_m(points: Array, table: Table, flat: bool) -> float:
 def fall(
     bodies: Sequence[Body],
     poses: Sequence[Pose],
-    ground: float | Mesh,
+    ground: GroundShape,
     physics: Physics,
     steps: StepSizes,
     free_m: float,
@@ -107,7 +108,7 @@ def fall(
 ) -> Outcome:
     """Release objects at `poses` (`T_world_obj`) until all rest, `physics.max_settle_s` is over, or a stop condition holds.
 
-    ground: a height in metres or a mesh. The first `free_m` metres are fallen in closed form, which is exact: nothing
+    The first `free_m` metres are fallen in closed form, which is exact: nothing
     turns in the air.
     """
     fallen_m = min(max(0.0, free_m - SKIPPED_TO_M), GRAVITY_M_S2 * physics.max_settle_s**2 / 2)

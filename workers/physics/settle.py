@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,13 +26,11 @@ from workers.physics.placement import (
     place_on_top,
     placed_mesh,
 )
-from workers.physics.release import Drop, release
+from workers.physics.release import LEFT_M, Drop, release
 from workers.physics.rest.rest import rest
 from workers.physics.rest_pose import snap_to_face
 from workers.physics.separation import Form, find_gaps_m, find_overlaps_m
-
-LEFT_M = 0.05
-"""Depth of a centre of mass below the table's top at which the object has left the table."""
+from workers.physics.table_top import inside_margin
 
 UNBALANCED = 1e-3
 """Share of the weight, and of weight times size, that the contacts of what rests may leave unbalanced."""
@@ -45,8 +44,12 @@ PLACED_M = MOST_OVERLAP_M
 STAYED_M = 1e-3
 """Motion from where they were set down up to which objects stayed there: three gaps of `PLACED_M` at the end of a lever."""
 
-MOST_RELEASES = 4
+MOST_RELEASES = 2
 """Times that objects are released, each from where exact rest gave up the time before."""
+
+
+class UnsupportedError(SettleError):
+    """No balance was found, or none that holds."""
 
 
 class LeftRoomError(Exception):
@@ -75,15 +78,29 @@ def settle(drop: Drop) -> tuple[Settled, ...]:
         poses = tuple(start.T_world_obj for start in drop.starts)
         return _describe(_Ending(drop, _place(drop, poses, forms), poses), "placed", judged=True)
     _require_apart(drop.starts, forms)
+    if drop.many and drop.physics.exact_rest:
+        with suppress(UnsupportedError):
+            return _settle(dataclasses.replace(drop, quick=True), forms)
+    return _settle(drop, forms)
+
+
+def _settle(drop: Drop, forms: Sequence[Form]) -> tuple[Settled, ...]:
     if not drop.effects.runs("table_mesh"):
         ending = _come_to_rest(drop, forms, flat=True)
         if ending is not None:
-            return _describe(ending, "flat_top", drop.physics.exact_rest)
+            return _describe(ending, "flat_top" if _is_over_top(ending) else "mesh", drop.physics.exact_rest)
         late = called_for_with("table_mesh", drop.starts, drop.physics)
         drop = dataclasses.replace(drop, effects=add_effects(drop.effects, late))
     ending = _come_to_rest(drop, forms, flat=False)
     assert ending is not None  # only the flat top has an edge
     return _describe(ending, "mesh", drop.physics.exact_rest)
+
+
+def _is_over_top(ending: _Ending) -> bool:
+    """Whether every object is over the table's flat top with all of its points."""
+    outline = ending.drop.ground.table.top.outline
+    points = [transform(T, one.hull.vertices) for one, T in zip(ending.drop.starts, ending.poses, strict=True)]
+    return bool(inside_margin(np.concatenate(points)[:, :2], outline).min() >= 0.0)
 
 
 def add_effects(effects: EffectPlan, names: Iterable[str]) -> EffectPlan:
@@ -129,8 +146,8 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], flat: bool) -> _Ending | No
             return dataclasses.replace(ending, poses=rested.poses)
         starts = (dataclasses.replace(one, T_world_obj=T) for one, T in zip(drop.starts, rested.poses, strict=True))
         drop = dataclasses.replace(drop, starts=tuple(starts))
-    raise SettleError(
-        "not_at_rest",
+    raise UnsupportedError(
+        "unsupported",
         f"{'it tips' if drop.single else 'something tips'} on without end: released {MOST_RELEASES} times, for {seconds:.1f} "
         "s in all, it never came into balance: lower physics.rest.speed_mm_s",
     )
@@ -229,7 +246,7 @@ def _require_support(drop: Drop, start: ObjectStart, held: Support) -> None:
     if abs(held.gap_m) <= TOUCHING_M and held.unbalanced <= UNBALANCED:
         return
     where = "inside what it touches" if held.gap_m < 0.0 else "from anything"
-    raise SettleError(
+    raise UnsupportedError(
         "unsupported",
         f"{'it' if drop.single else f'region {start.region_id}'} came to rest {abs(held.gap_m) * 1e3:.3f} mm {where}, with "
         f"{held.unbalanced:.1%} of its weight out of balance; the bounds are {TOUCHING_M * 1e3:g} mm and {UNBALANCED:.0%}: "
