@@ -21,7 +21,7 @@ from workers.physics.stop_conditions import can_touch, falls_below, leaves_outli
 MANY = 4
 """Number of objects from which they fall as coarser convex parts: the time grows with the pairs of parts near one another."""
 
-GROUP_TRAVEL = 40.0
+GROUP_TRAVEL = 20.0
 """Several objects may travel so many times further in a step, 2 mm. Where they come to rest is chaotic: its distribution
 matters and not the path. At twice that corners sink into the walls of mugs, which are 2 to 3 mm thick."""
 
