@@ -44,7 +44,7 @@ PLACED_M = MOST_OVERLAP_M
 STAYED_M = 1e-3
 """Motion from where they were set down up to which objects stayed there: three gaps of `PLACED_M` at the end of a lever."""
 
-MOST_RELEASES = 2
+MOST_RELEASES = 3
 """Times that objects are released, each from where exact rest gave up the time before."""
 
 
@@ -135,12 +135,17 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], flat: bool) -> _Ending | No
             return None
         seconds += outcome.seconds
         _require_calm(drop, outcome)
+        if (
+            drop.physics.exact_rest
+            and flat
+            and drop.single
+            and (standing := _stand(drop, outcome, seconds)) is not None
+        ):
+            return standing
         placement = placement or _place(drop, outcome.poses, forms)
         ending = _Ending(drop, placement, outcome.poses, seconds, outcome.speed_m_s)
         if not drop.physics.exact_rest:
             return ending
-        if flat and drop.single and (standing := _stand(ending)) is not None:
-            return standing
         rested = rest(placement.things, outcome.poses, placement.forms[-1].surface, placement.friction)
         if rested.still:
             return dataclasses.replace(ending, poses=rested.poses)
@@ -176,15 +181,14 @@ def _place(drop: Drop, poses: Sequence[Pose], forms: Sequence[Form]) -> Placemen
     return place(drop.starts, poses, forms, drop.ground.table, drop.physics.friction**2)
 
 
-def _stand(ending: _Ending) -> _Ending | None:
+def _stand(drop: Drop, outcome: Outcome, seconds: float) -> _Ending | None:
     """A single object turned onto the steady face of its hull that is below it, on the flat top; None where none is near."""
-    drop, (start,) = ending.drop, ending.drop.starts
-    T = snap_to_face(ending.poses[0], start.hull, start.asset.mass.com)
+    (start,), table = drop.starts, drop.ground.table
+    T = snap_to_face(outcome.poses[0], start.hull, start.asset.mass.com)
     if T is None:
         return None
     T = translation(0.0, 0.0, -vertical_gap(placed_mesh(start, T), drop.ground.terrain)) @ T
-    on_top = place_on_top(start, T, drop.ground.table, ending.placement.friction)
-    return dataclasses.replace(ending, placement=on_top, poses=(T,))
+    return _Ending(drop, place_on_top(start, T, table, drop.physics.friction**2), (T,), seconds, outcome.speed_m_s)
 
 
 def _require_calm(drop: Drop, outcome: Outcome) -> None:
