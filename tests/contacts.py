@@ -32,7 +32,7 @@ def contacts_between(meshes: list[Mesh], within_m: float) -> Contacts:
     """Of meshes in world coordinates, the last of which is the ground."""
     surfaces = [surface_of(mesh, is_closed(mesh)) for mesh in meshes]
     points = [surface.vertices for surface in surfaces]
-    return find_contacts(surfaces, points, find_near_features(surfaces, points, within_m), within_m)
+    return find_contacts(surfaces, points, find_near_features(surfaces, points, within_m), within_m, within_m)
 
 
 def thing_of(mesh: Mesh, mass_kg: float = 1.0) -> Thing:

@@ -89,12 +89,13 @@ def corners_on_faces(
     faces: Index,
     side: Index,
     within: float,
+    deepest: float,
 ) -> tuple[Array, Index]:
     """(point, normal and gap [N, 7], (corner, face) [N, 2]) of corners over or in faces of another surface.
 
-    pairs [P, 2]: of a vertex and a face that are near. The normal points from the face to the corner's body, the gap is
-    negative where the corner lies below the face. A corner touches a face where all its neighbours lie on one side of the
-    face's plane, to within `SLOPE`, and the face's own neighbours not on the same side.
+    pairs [P, 2]: of a vertex and a face that are near. The normal points from the face to the corner's body, the gap, from
+    -`deepest` to `within`, is negative where the corner lies below the face. A corner touches a face where all its
+    neighbours lie on one side of the face's plane, to within `SLOPE`, and the face's own neighbours not on the same side.
     """
     found, which, count = np.empty((64, 7)), np.empty((64, 2), np.int64), 0
     triangle, normal, foot, nearest = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
@@ -107,7 +108,7 @@ def corners_on_faces(
         height = 0.0
         for k in range(3):
             height += normal[k] * (vertices[n, k] - triangle[0, k])
-        if abs(height) > within:
+        if abs(height) > max(within, deepest):
             continue
         for k in range(3):
             foot[k] = vertices[n, k] - height * normal[k]
@@ -129,7 +130,8 @@ def corners_on_faces(
             under = under and up <= slack
         # About the deepest face of a hollow everything rises, as about the underside of a body: there the corner tells
         upright, turned = over and (side[f] >= 0 or not under), under and side[f] <= 0
-        if not (upright or turned):
+        gap = height if upright else -height
+        if not (upright or turned) or gap > within or gap < -deepest:
             continue
         if count == len(found):
             found, which = np.concatenate((found, found)), np.concatenate((which, which))
@@ -137,7 +139,7 @@ def corners_on_faces(
         for k in range(3):
             found[count, k] = 0.5 * (vertices[n, k] + foot[k])
             found[count, 3 + k] = sign * normal[k]
-        found[count, 6] = sign * height
+        found[count, 6] = gap
         which[count, 0], which[count, 1] = n, f
         count += 1
     return found[:count], which[:count]
@@ -159,8 +161,9 @@ def edges_across_edges(
     edges2: Index,
     across2: Index,
     within: float,
+    deepest: float,
 ) -> Array:
-    """[N, 7]: point, normal and gap where edges of one surface cross those of another within a distance.
+    """[N, 7]: point, normal and gap, from -`deepest` to `within`, where edges of one surface cross those of another.
 
     Nearest points of two lines (Ericson 2005, 5.1.9), both within the edges. An edge crosses another where the faces about
     the one lie above the plane between them and those about the other below, to within `SLOPE`.
@@ -177,7 +180,7 @@ def edges_across_edges(
             uu, uv, vv = uu + u[k] * u[k], uv + u[k] * v[k], vv + v[k] * v[k]
             ur, vr = ur + u[k] * r[k], vr + v[k] * r[k]
             nn, nr = nn + n[k] * n[k], nr + n[k] * r[k]
-        if nn <= PARALLEL * PARALLEL * uu * vv or nr * nr > within * within * nn:
+        if nn <= PARALLEL * PARALLEL * uu * vv or nr * nr > max(within, deepest) ** 2 * nn:
             continue
         s, t = (uv * vr - ur * vv) / nn, (uu * vr - uv * ur) / nn
         if s < 0.0 or s > 1.0 or t < 0.0 or t > 1.0:
@@ -195,14 +198,15 @@ def edges_across_edges(
             slack_down = SLOPE * np.sqrt(max(0.0, far_down - along_down * along_down / vv))
             positive = positive and up >= -slack_up and down <= slack_down
             negative = negative and up <= slack_up and down >= -slack_down
-        if not (positive or negative):
+        sign = 1.0 if positive else -1.0
+        gap = sign * nr / length
+        if not (positive or negative) or gap > within or gap < -deepest:
             continue
         if count == len(found):
             found = np.concatenate((found, found))
-        sign = 1.0 if positive else -1.0
         for k in range(3):
             found[count, k] = 0.5 * (a[k] + s * u[k] + b[k] + t * v[k])
             found[count, 3 + k] = sign * n[k] / length
-        found[count, 6] = sign * nr / length
+        found[count, 6] = gap
         count += 1
     return found[:count]

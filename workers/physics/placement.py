@@ -107,7 +107,7 @@ def measure_supports(placement: Placement, poses: Sequence[Pose]) -> tuple[Suppo
     gaps_m = find_gaps_m(placement.forms, still)
     surfaces = [form.surface for form in placement.forms]
     points = [transform(T, surface.vertices) for T, surface in zip(still, surfaces, strict=True)]
-    found = find_contacts(surfaces, points, find_near_features(surfaces, points, TOUCHING_M), TOUCHING_M)
+    found = find_contacts(surfaces, points, find_near_features(surfaces, points, TOUCHING_M), TOUCHING_M, TOUCHING_M)
     contacts = replace(found, gaps=np.zeros_like(found.gaps))
     inertias = [thing.inertia(T) for T, thing in zip(poses, placement.things, strict=True)]
     motion = step(inertias, contacts, placement.friction, FALL_M * DOWN, GRAVITY_M_S2)

@@ -64,7 +64,7 @@ def find_gaps_m(forms: Sequence[Form], poses: Sequence[Pose]) -> list[float]:
     solid = np.array([form.solid is not None for form in forms])
     gaps = [FARTHEST_M] * len(forms)
     for within_m in (NEAR_M, FARTHEST_M):
-        contacts = find_contacts(surfaces, points, find_near_features(surfaces, points, within_m), within_m)
+        contacts = find_contacts(surfaces, points, find_near_features(surfaces, points, within_m), within_m, within_m)
         known = np.where(solid[contacts.upper] & solid[contacts.lower], np.maximum(contacts.gaps, 0.0), contacts.gaps)
         gaps = [min(FARTHEST_M, float(known[contacts.of(k)].min(initial=np.inf))) for k in range(len(forms))]
         if max(gaps) <= within_m:

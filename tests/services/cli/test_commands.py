@@ -33,7 +33,8 @@ def test_verify_with_the_second_derivation(made, capsys):
     assert (code, told["ok"], told["scenes"], told["pairs"]) == (0, True, 2, 2)
     assert (told["independent"]["scenes"], told["independent"]["faults"]) == (1, [])
     assert "2 scenes, labels of 2 pairs derived again: nothing off" in lines[0]
-    assert lines[1].startswith("labels of 1 pairs of 1 scenes derived from the article's definitions: nothing off")
+    assert lines[1].startswith("labels of 1 pairs of 1 scenes derived from the article's definitions, and ")
+    assert "their rest from contact forces: nothing off" in lines[1]
 
 
 def test_verify_exits_1_where_a_file_is_gone(capsys, tmp_path):

@@ -38,7 +38,7 @@ def corner(at, sharp: float = 1.0, side=UP):
     about = np.array([[1.0, 0, sharp], [-1.0, 0, sharp], [0, 1.0, sharp], [0, -1.0, sharp]])
     vertices = np.array(at) + np.concatenate([np.zeros((1, 3)), about])
     starts, members = np.array([0, 4, 4, 4, 4, 4]), np.arange(1, 5)
-    rows, which = corners_on_faces(PAIR, vertices, starts, members, FACE, np.array([[0, 1, 2]]), side, 0.02)
+    rows, which = corners_on_faces(PAIR, vertices, starts, members, FACE, np.array([[0, 1, 2]]), side, 0.02, 0.02)
     assert len(rows) == len(which)
     return rows
 
@@ -67,9 +67,9 @@ def test_edges_that_cross_touch_in_the_middle_between_them_with_the_normal_upwar
     lower = np.array([[-1.0, 0, 0], [1.0, 0, 0], [0, 1.0, -1], [0, -1.0, -1]])
     upper = np.array([[0, -1.0, height], [0, 1.0, height], [1.0, 0, 1], [-1.0, 0, 1]])
     ends, across = np.array([[0, 1]]), np.array([[2, 3]])
-    (row,) = edges_across_edges(PAIR, upper, ends, across, lower, ends, across, 0.02)
+    (row,) = edges_across_edges(PAIR, upper, ends, across, lower, ends, across, 0.02, 0.02)
     assert row == pytest.approx([0, 0, height / 2, 0, 0, 1, height])
-    assert len(edges_across_edges(PAIR, upper, ends, across, lower, ends, across, 0.005)) == 0
+    assert len(edges_across_edges(PAIR, upper, ends, across, lower, ends, across, 0.005, 0.005)) == 0
 
 
 def test_an_edge_over_the_bottom_of_a_groove_does_not_touch_its_edge():
@@ -77,4 +77,4 @@ def test_an_edge_over_the_bottom_of_a_groove_does_not_touch_its_edge():
     lower = np.array([[-9.0, 0, 0], [9.0, 0, 0], [9.0, 0.5, 0.2], [-9.0, -0.5, 0.2]])
     upper = np.array([[0, -1.0, 0.0], [0, 1.0, 0.0], [1.0, 0, 1], [-1.0, 0, 1]])
     ends, across = np.array([[0, 1]]), np.array([[2, 3]])
-    assert len(edges_across_edges(PAIR, upper, ends, across, lower, ends, across, 0.02)) == 0
+    assert len(edges_across_edges(PAIR, upper, ends, across, lower, ends, across, 0.02, 0.02)) == 0

@@ -11,8 +11,9 @@ from schemas.base import Array
 from workers.geometry.contact_kernels import Index, bounds_in, corners_on_faces, edges_across_edges, find_near
 from workers.geometry.contact_surface import Surface
 
-DEEPEST_M = 1e-3
-"""Overlap beyond which a corner belongs to another side of the body, metres."""
+DEEPEST_M = 3e-3
+"""Overlap from which bodies are moved apart, metres: coarse parts may be smaller than a quarter of a metre's shape by half of
+that, and the walls of mugs are as thick."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,12 +91,12 @@ def _pairs(here: _Boxes, there: _Boxes, within_m: float) -> Index:
 
 
 def find_contacts(
-    surfaces: Sequence[Surface], points: Sequence[Array], near: Sequence[Near], within_m: float
+    surfaces: Sequence[Surface], points: Sequence[Array], near: Sequence[Near], within_m: float, deepest_m: float
 ) -> Contacts:
-    """The contacts with gaps of at most `within_m` among features that are near."""
+    """The contacts with gaps from -`deepest_m` to `within_m` among features that are near."""
     rows, upper, lower = [np.empty((0, 7))], [], []
     for pair in near:
-        for found in _between(surfaces, points, pair, within_m):
+        for found in _between(surfaces, points, pair, (within_m, deepest_m)):
             rows.append(found)
             upper += [pair.upper] * len(found)
             lower += [pair.lower] * len(found)
@@ -105,16 +106,18 @@ def find_contacts(
     )
 
 
-def _between(surfaces: Sequence[Surface], points: Sequence[Array], pair: Near, within_m: float) -> tuple[Array, ...]:
+def _between(
+    surfaces: Sequence[Surface], points: Sequence[Array], pair: Near, reach: tuple[float, float]
+) -> tuple[Array, ...]:
     """Point, normal and gap [N, 7] of the contacts of two surfaces: corners on faces, faces on corners, edges."""
     a, b = surfaces[pair.upper], surfaces[pair.lower]
     p, q = points[pair.upper], points[pair.lower]
-    on_lower = corners_on_faces(pair.corners, p, a.starts, a.members, q, b.faces, b.side, within_m)
-    on_upper = corners_on_faces(pair.faces, q, b.starts, b.members, p, a.faces, a.side, within_m)
-    crossed = edges_across_edges(pair.edges, p, a.edges, a.across, q, b.edges, b.across, within_m)
+    on_lower = corners_on_faces(pair.corners, p, a.starts, a.members, q, b.faces, b.side, *reach)
+    on_upper = corners_on_faces(pair.faces, q, b.starts, b.members, p, a.faces, a.side, *reach)
+    crossed = edges_across_edges(pair.edges, p, a.edges, a.across, q, b.edges, b.across, *reach)
     turned = _shallowest(*on_upper)
     turned[:, 3:6] *= -1.0
-    return _shallowest(*on_lower), turned, crossed[crossed[:, 6] >= -DEEPEST_M]
+    return _shallowest(*on_lower), turned, crossed
 
 
 def _shallowest(rows: Array, which: Index) -> Array:
@@ -124,4 +127,4 @@ def _shallowest(rows: Array, which: Index) -> Array:
         return rows
     best = np.full(int(which[:, 0].max()) + 1, -np.inf)
     np.maximum.at(best, which[inside, 0], rows[inside, 6])
-    return rows[~inside | ((rows[:, 6] >= best[which[:, 0]]) & (rows[:, 6] >= -DEEPEST_M))]
+    return rows[~inside | (rows[:, 6] >= best[which[:, 0]])]

@@ -10,7 +10,7 @@ from schemas.base import Array, Pose
 from schemas.scene.shape import MassProperties
 from workers.geometry.contact_surface import Surface
 from workers.geometry.frames import pose, rotation_about, transform
-from workers.physics.rest.contacts import Contacts, find_contacts, find_near_features
+from workers.physics.rest.contacts import DEEPEST_M, Contacts, find_contacts, find_near_features
 from workers.physics.rest.step import Inertia, JammedError, Motion, step
 
 GRAVITY_M_S2 = 9.81
@@ -83,8 +83,8 @@ def rest(things: Sequence[Thing], poses: Sequence[Pose], ground: Surface, fricti
     for number in range(MOST_STEPS):
         points = [transform(T, thing.surface.vertices) for T, thing in zip(at, things, strict=True)] + [ground.vertices]
         if near is None or known_m <= 0.0:
-            near, known_m = find_near_features(surfaces, points, 3.0 * REACH_M), REACH_M
-        contacts = find_contacts(surfaces, points, near, REACH_M)
+            near, known_m = find_near_features(surfaces, points, DEEPEST_M + REACH_M), REACH_M
+        contacts = find_contacts(surfaces, points, near, REACH_M, DEEPEST_M)
         inertias = [thing.inertia(T) for T, thing in zip(at, things, strict=True)]
         try:
             motion = step(inertias, contacts, friction, fall_m * DOWN, GRAVITY_M_S2)
