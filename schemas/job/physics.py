@@ -25,8 +25,8 @@ class Physics(Frozen):
 
     step_hz: Annotated[int, Field(ge=30, le=20_000)] = 960
     """Steps a second while all objects move slowly; up to 16 times as many otherwise."""
-    max_step_travel_mm: Positive = 0.1
-    """Largest travel of the fastest point in a step; more in falls from above 50 mm, less for objects thinner than 2 mm; twenty
+    max_step_travel_mm: Positive = 0.05
+    """Largest travel of the fastest point in a step; more in falls from above 25 mm, less for objects thinner than 1 mm; forty
     times as much among several objects."""
     solver_iterations: Annotated[int, Field(ge=1, le=10_000)] = 100
     """Iterations of the contact solver in each step."""

@@ -13,7 +13,7 @@ from tests.hard_cases.chaotic_cases import CHAOTIC, FIRST, SEEDS, Chaotic
 from tests.hard_cases.gate import verdicts, what_is_wrong
 from tests.hard_cases.spin import spinning
 from tests.hard_cases.test_hard_cases import MOVED_MM, TURNED_DEG
-from tests.hard_cases.waiting import WAITING
+from tests.hard_cases.waiting import marks_of
 from tests.physics.settling import recheck_group, settle_group
 
 PHYSICS = Job(name="t").physics
@@ -51,8 +51,8 @@ def rows(tiers: str) -> list[Any]:
     found = []
     for case in CHAOTIC:
         names = {getattr(case, tiers)} - {""}
-        waits = [pytest.mark.waits] * (case.name in WAITING)
-        found.append(pytest.param(case, id=case.name, marks=[*(getattr(pytest.mark, n) for n in names), *waits]))
+        marks = [*(getattr(pytest.mark, name) for name in names), *marks_of(case.name)]
+        found.append(pytest.param(case, id=case.name, marks=marks))
     return found
 
 

@@ -19,7 +19,7 @@ from tests.hard_cases.chaotic_cases import CHAOTIC
 from tests.hard_cases.flight_cases import FLIGHTS
 from tests.hard_cases.gate import verdicts, what_is_wrong
 from tests.hard_cases.spin import spinning
-from tests.hard_cases.waiting import MOVES, WAITING
+from tests.hard_cases.waiting import MOVES, WAITING, marks_of
 from tests.physics.settling import recheck_group, settle_group
 
 PHYSICS = Job(name="t").physics
@@ -102,8 +102,7 @@ def rows(cases: Sequence[Case], again: bool) -> list[Any]:
     found = []
     for case in cases:
         tiers = {case.tier, case.again} if again else {case.tier}
-        waits = case.name in WAITING or (again and case.name in MOVES)
-        marks = [getattr(pytest.mark, name) for name in sorted(tiers - {""})] + [pytest.mark.waits] * waits
+        marks = [getattr(pytest.mark, name) for name in sorted(tiers - {""})] + marks_of(case.name, again)
         found.append(pytest.param(case, id=case.name, marks=marks))
     return found
 
