@@ -16,7 +16,7 @@ WAITING: dict[str, str] = {
 
 MOVES: dict[str, str] = {
     "cube of 2 mm from 1 m": "it turns by 0.14 degrees: 0.01 mm at a corner",
-    "cube against a wall, 4 degrees inside of what friction holds": "it slips by 0.5 mm: Bullet's friction is some tenths of a degree off",
+    "cube against a wall, 4 degrees inside of what friction holds": "it slips by 0.5 mm: Bullet's friction is a little off",
 }
 """What moves by more than 0.1 mm or 0.1 degrees in the second after it is let go again."""
 
