@@ -11,6 +11,7 @@ WAITING: dict[str, str] = {
     "eight balls poured into a tray": "no result in 40 s",
     "needle of 0.2 by 200 mm tumbled": "it falls through the table: two seeds of two",
     "stack of twenty-five cubes": "no result in 90 s",
+    "stack of ten cubes": "half a millimetre falls between each two: the top lands 1.2 mm aside, and 1 mm is allowed",
 }
 """What ends otherwise than declared, and how."""
 

@@ -42,7 +42,8 @@ onto the mesh, of the many that roll to an edge; a stack on it gains energy, fou
 class Drop:
     """Objects to be released over a table, with the settings and the plan of effects.
 
-    room_m: how far the centre of mass of a single object may go sideways; quick: in long steps, for many concave objects.
+    room_m: how far the centre of mass of a single object may go sideways; quick: in long steps, for many concave objects;
+    exact: as parts that are not coarser where there are many.
     """
 
     starts: tuple[ObjectStart, ...]
@@ -51,11 +52,12 @@ class Drop:
     effects: EffectPlan
     room_m: float = math.inf
     quick: bool = False
+    exact: bool = False
 
     @property
     def many(self) -> bool:
-        """Whether there are many objects, some of them concave."""
-        return len(self.starts) >= MANY and self.effects.runs("decomposition")
+        """Whether there are many objects, some of them concave, so that coarse parts have to do."""
+        return not self.exact and len(self.starts) >= MANY and self.effects.runs("decomposition")
 
     @property
     def single(self) -> bool:

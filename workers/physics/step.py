@@ -77,7 +77,7 @@ def release_again(
         dataclasses.replace(start, T_world_obj=before.T_world_obj)
         for start, before in zip(plan.objects, settled, strict=True)
     )
-    drop = Drop(starts, Ground(plan.table), physics, effects)
+    drop = Drop(starts, Ground(plan.table), physics, effects, exact=True)
     flat = [before.support != "mesh" and not effects.runs("table_mesh") for before in settled]
     if not drop.single and effects.runs("object_contacts"):
         return release(drop, all(flat)).poses

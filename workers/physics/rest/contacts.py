@@ -16,6 +16,10 @@ DEEPEST_M = 3e-3
 that, and the walls of mugs are as thick."""
 
 
+DEEP_M = 1e-3
+"""Overlap from which only a corner below a single face is believed: seams of bodies that abut have edges below one another."""
+
+
 @dataclass(frozen=True, eq=False)
 class Contacts:
     """Contacts of body `upper` [N] with body `lower` [N], in world coordinates; the last body is the ground.
@@ -117,14 +121,18 @@ def _between(
     crossed = edges_across_edges(pair.edges, p, a.edges, a.across, q, b.edges, b.across, *reach)
     turned = _shallowest(*on_upper)
     turned[:, 3:6] *= -1.0
-    return _shallowest(*on_lower), turned, crossed
+    return _shallowest(*on_lower), turned, crossed[crossed[:, 6] >= -DEEP_M]
 
 
 def _shallowest(rows: Array, which: Index) -> Array:
-    """The contacts without those by which a corner would leave the other body the longer way."""
-    inside = rows[:, 6] < 0.0
+    """The contacts without those by which a corner would leave the other body the longer way.
+
+    A corner that is on one face, or above it, is not deep below another.
+    """
+    inside, deep = rows[:, 6] < 0.0, rows[:, 6] < -DEEP_M
     if not inside.any():
         return rows
-    best = np.full(int(which[:, 0].max()) + 1, -np.inf)
-    np.maximum.at(best, which[inside, 0], rows[inside, 6])
-    return rows[~inside | (rows[:, 6] >= best[which[:, 0]])]
+    best, best_inside = (np.full(int(which[:, 0].max()) + 1, -np.inf) for _ in range(2))
+    np.maximum.at(best, which[:, 0], rows[:, 6])
+    np.maximum.at(best_inside, which[inside, 0], rows[inside, 6])
+    return rows[(~inside | (rows[:, 6] >= best_inside[which[:, 0]])) & (~deep | (rows[:, 6] >= best[which[:, 0]]))]
