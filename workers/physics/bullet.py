@@ -260,11 +260,10 @@ def _compound(client: int, parts: Sequence[Array], orientation: list[float]) -> 
 
 
 def _set_surface(client: int, thing: int, physics: Physics, body: Body | None = None) -> None:
-    """Set friction, margin and damping of a body, or of the ground."""
+    """Set friction and margin of a body, or of the ground, and no damping."""
     # A contact's arm is the sum over both of one's rolling friction times the other's friction. The bodies get the ground's
     # share too, so that rolling friction can be left out for them.
     share = 0.0 if body is None else 2.0
-    damping = 0.0 if body is None else body.damping
     pybullet.changeDynamics(
         thing,
         -1,
@@ -273,8 +272,8 @@ def _set_surface(client: int, thing: int, physics: Physics, body: Body | None = 
         spinningFriction=share * physics.spinning_friction,
         restitution=0.0,
         collisionMargin=0.0 if body is None else body.margin_m,
-        linearDamping=damping,
-        angularDamping=damping,
+        linearDamping=0.0,
+        angularDamping=0.0,
         physicsClientId=client,
     )
 

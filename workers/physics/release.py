@@ -65,7 +65,7 @@ class Drop:
         return len(self.starts) == 1
 
 
-def release(drop: Drop, flat: bool, damping: float = 0.0) -> Outcome:
+def release(drop: Drop, flat: bool) -> Outcome:
     """Release the objects where they start, onto the table's flat top or its mesh, until they rest or must be stopped.
 
     Stopped by `edge` where a footprint may leave the flat top, `below` where an object falls below the mesh, and `room`
@@ -74,7 +74,7 @@ def release(drop: Drop, flat: bool, damping: float = 0.0) -> Outcome:
     table, effects, physics = drop.ground.table, drop.effects, _settings(drop)
     starts = [choose_collision_shape(start, physics) for start in drop.starts]
     poses = [start.T_world_obj for start in starts]
-    bodies = [build_body(start, physics, effects, damping, drop.many) for start in starts]
+    bodies = [build_body(start, physics, effects, drop.many) for start in starts]
     hulls = [transform(T, start.hull.vertices) for T, start in zip(poses, starts, strict=True)]
     free_m = min(free_fall_m(points, table, flat) for points in hulls)
     # On a mesh a single object keeps the shortest travel per step, however far it falls.

@@ -38,7 +38,7 @@ class Body:
     """A rigid body in its centre of mass and principal axes, which `T_obj_body` [4, 4] takes to the object's frame.
 
     moments [3] kg m^2; parts: the vertices [N, 3], metres, of convex parts, each with a margin of `margin_m` about it. One
-    part may be a single point, which makes a ball of the margin. `damping` is Bullet's, of speed and spin; reach_m: from the
+    part may be a single point, which makes a ball of the margin. reach_m: from the
     centre of mass to the farthest vertex of the object.
     """
 
@@ -46,7 +46,6 @@ class Body:
     moments: Array
     parts: tuple[Array, ...]
     margin_m: float
-    damping: float = 0.0
     T_obj_body: Pose = field(default_factory=lambda: np.eye(4))
     reach_m: float = 0.0
 
@@ -66,9 +65,7 @@ def choose_collision_shape(start: ObjectStart, physics: Physics) -> ObjectStart:
     return dataclasses.replace(start, hull=convex_hull(corners), T_world_obj=frozen_array(T))
 
 
-def build_body(
-    start: ObjectStart, physics: Physics, effects: EffectPlan, damping: float = 0.0, coarse: bool = False
-) -> Body:
+def build_body(start: ObjectStart, physics: Physics, effects: EffectPlan, coarse: bool = False) -> Body:
     """The object as its convex parts where the effect `decomposition` runs and it has several, else as its hull.
 
     coarse: several parts are fewer and have fewer vertices, and are as large as the object and a margin about it.
@@ -77,12 +74,12 @@ def build_body(
     if effects.runs("decomposition") and not is_convex(start):
         parts = parts_of(start.asset, physics.concavity, COARSE if coarse else TOLERANCE)
     if not coarse or len(parts) < 2:
-        return make_body(start, physics, damping, parts if len(parts) > 1 else ())
+        return make_body(start, physics, parts if len(parts) > 1 else ())
     T_obj_body, moments = body_frame(start.asset.mass)
     points = transform(invert(T_obj_body), start.hull.vertices)
     reach_m = float(np.linalg.norm(points, axis=1).max())
     vertices = tuple(_outermost(transform(invert(T_obj_body), part)) for part in parts)
-    return Body(start.asset.mass.mass_kg, moments, vertices, COARSE_MARGIN_M, damping, T_obj_body, reach_m)
+    return Body(start.asset.mass.mass_kg, moments, vertices, COARSE_MARGIN_M, T_obj_body, reach_m)
 
 
 def _outermost(points: Array) -> Array:
@@ -99,7 +96,7 @@ def _outermost(points: Array) -> Array:
     return points[np.unique((points @ directions).argmax(axis=0))]
 
 
-def make_body(start: ObjectStart, physics: Physics, damping: float = 0.0, parts: tuple[Array, ...] = ()) -> Body:
+def make_body(start: ObjectStart, physics: Physics, parts: tuple[Array, ...] = ()) -> Body:
     """The object as its hull, or as convex `parts` (vertices [N, 3], object frame) where there are any.
 
     Bullet adds a margin around a collision shape. The shape is inset by the margin less `SLOP_M`, so that at rest its faces
@@ -117,7 +114,7 @@ def make_body(start: ObjectStart, physics: Physics, damping: float = 0.0, parts:
     T_body_obj = invert(T_obj_body)
     reach_m = float(np.linalg.norm(transform(T_body_obj, start.hull.vertices), axis=1).max())
     vertices = tuple(transform(T_body_obj, each.vertices) for each in insets)
-    return Body(start.asset.mass.mass_kg, moments, vertices, margin_m, damping, T_obj_body, reach_m)
+    return Body(start.asset.mass.mass_kg, moments, vertices, margin_m, T_obj_body, reach_m)
 
 
 def body_frame(mass: MassProperties) -> tuple[Pose, Array]:
