@@ -25,7 +25,11 @@ CALM_M_S = 0.05
 """Upper bound on the momentary speed of any point of a resting object: at this speed it climbs an eighth of a millimetre."""
 
 FINEST = 16
-"""Ratio of the longest step to the shortest."""
+"""Ratio of the longest step to the shortest, but for landing."""
+
+LANDING = 64
+"""The same for landing. How deep a flat landing goes is lifted out again: with 16, 23 of 2,000 upright drops gained more energy
+than a thousandth of the fall's, 1.0004 thousandths at most of 400 with this."""
 
 TOUCHDOWN_S = 0.005
 """Steps are the shortest for this time from `SKIPPED_TO_M` above the ground. A flat landing stops at once, and no later step
@@ -58,7 +62,7 @@ class StepSizes:
     def rate_hz(self, speed_m_s: float, landing: bool = False) -> float:
         """Steps per second at the fastest point's speed: `base_hz` times a power of two, the highest while `landing`."""
         if math.isfinite(self.max_travel_m) and landing:
-            return FINEST * self.base_hz
+            return LANDING * self.base_hz
         rate = self.base_hz
         while speed_m_s > rate * self.max_travel_m and rate < FINEST * self.base_hz:
             rate *= 2.0
@@ -157,6 +161,8 @@ def _simulate(
     speeds = _speeds(world, bodies)
     while True:
         wanted = steps.rate_hz(max(speeds), time < touchdown_s)
+        if bounces:  # a rebound loses speed in steps much shorter than its contact lasts
+            wanted = min(wanted, FINEST * steps.base_hz)
         if bounces and max(speeds) < BOUNCES_M_S:
             world.set_restitution(0.0)
             bounces, rate = False, 0.0
