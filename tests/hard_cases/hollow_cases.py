@@ -183,26 +183,47 @@ HOLLOWS = (
         heights(6.8 / 280, 0.025, bound_mm=0.02),
         lambda: in_a_tray(outside.enter(outside.of(open_box().shape.mesh))),
     ),
-    Case("ball in a bowl", SETTLE, at_the_bottom(), in_a_bowl, tier="minute"),
+    Case("ball in a bowl", SETTLE, at_the_bottom(), in_a_bowl, tier="minute", again="slow"),
     Case(
         "ball in a bowl from a file",
         SETTLE,
         at_the_bottom(),
         lambda: dropped_in(bowl_from_file(), ball(BALL_M, 3), 0.03),
         tier="minute",
+        again="slow",
     ),
-    Case("two bowls in one another", SETTLE, nested_up(2), lambda: nested(built_in("bowl"), 2), tier="minute"),
+    Case(
+        "two bowls in one another",
+        SETTLE,
+        nested_up(2),
+        lambda: nested(built_in("bowl"), 2),
+        tier="minute",
+        again="slow",
+    ),
     Case("five bowls in one another", SETTLE, nested_up(5), lambda: nested(built_in("bowl"), 5), tier="slow"),
     Case(
-        "two bowls from a file in one another", SETTLE, nested_up(2), lambda: nested(bowl_from_file(), 2), tier="minute"
+        "two bowls from a file in one another",
+        SETTLE,
+        nested_up(2),
+        lambda: nested(bowl_from_file(), 2),
+        tier="minute",
+        again="slow",
     ),
-    Case("two mugs linked by their handles", SETTLE, both(tilt(0.5), apart(15.0)), linked_mugs, tier="minute"),
+    Case(
+        "two mugs linked by their handles",
+        SETTLE,
+        both(tilt(0.5), apart(15.0)),
+        linked_mugs,
+        tier="minute",
+        again="slow",
+    ),
     Case(
         "spoon in a mug from a file",
         SETTLE,
         SPOONS,
         lambda: dropped_in(mug_from_file(), spoon(), 0.012, -0.012, turn(X, 12.0)),
         tier="minute",
+        again="slow",
     ),
     Case(
         "stick in a mug",
@@ -212,6 +233,7 @@ HOLLOWS = (
             built_in("mug"), asset_of(box(0.006, 0.006, 0.16), mass_kg=0.005), 0.012, -0.012, turn(X, 12.0)
         ),
         tier="minute",
+        again="slow",
     ),
     # It falls through 10 mm and lies on the table around the peg, which it can be off by no more than the slack.
     Case(
@@ -228,6 +250,7 @@ HOLLOWS = (
         heights(RING_M[2] / 2, ball_on_ring_m(), bound_mm=0.1),
         lambda: dropped_in(ring(), heavy(ball(0.02), 0.05), 0.004),
         tier="minute",
+        again="slow",
     ),
     Case(
         "marble 3 mm inside of a bowl's rim",
@@ -235,6 +258,7 @@ HOLLOWS = (
         at_the_bottom(),
         lambda: dropped_in(built_in("bowl"), heavy(ball(BALL_M, 3), 0.005), 0.079, RIM_INSIDE_M - 0.003),
         tier="minute",
+        again="slow",
     ),
     # It rolls down from 79 mm with up to 1 m/s, and 0.6 m of table may not stop it.
     Case(
@@ -243,5 +267,6 @@ HOLLOWS = (
         height(BALL_M, 0.05, body=1),
         lambda: dropped_in(built_in("bowl"), heavy(ball(BALL_M, 3), 0.005), 0.079, RIM_OUTSIDE_M + 0.003),
         tier="minute",
+        again="slow",
     ),
 )
