@@ -120,14 +120,13 @@ def open_world(
     Bullet keeps the one found last: beside an edge a corner sinks in while the next triangle is in reach. On level ground a
     shorter reach would keep more rolling bodies from gaining energy, but bowls would spin for ever.
 
-    Runs are bit-identical with deterministicOverlappingPairs, whatever ran before: a single body and the ground are one
-    pair, without an order of pairs, contacts or islands, and for more bodies everything is reset first. One connection serves
+    Runs are bit-identical with deterministicOverlappingPairs, whatever ran before, because everything is reset first: in
+    maximal coordinates a ball that rolled on came elsewhere by a last bit after other worlds. One connection serves
     the process, because a new one costs as much as a simulation. Blocks do not nest.
     """
     connection = _connect()
     client = connection.client
-    if len(placed) > 1:
-        connection.reset()
+    connection.reset()
     reach = reach_m if isinstance(ground, Mesh) else math.inf
     pybullet.setPhysicsEngineParameter(
         numSolverIterations=physics.solver_iterations,
