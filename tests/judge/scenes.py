@@ -1,11 +1,11 @@
 """One scene through production's physics alone, judged, and let go again: figures in mm, degrees, shares and seconds."""
 
-import importlib
 import time
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from unittest import mock
 
 from schemas.errors import SceneError
 from schemas.job.physics import Physics
@@ -16,11 +16,12 @@ from schemas.scene.shape import Mesh
 from services.read.referee import hold_scene
 from tests.judge.judge import Thing, Verdict, judge
 from workers.geometry.frames import transform
+from workers.physics import settle
 from workers.physics.effects import called_for
 from workers.physics.step import recheck_scene, settle_scene
 
-PARTS = {"release": "workers.physics.settle.release", "rest": "workers.physics.settle.rest"}
-"""The parts of physics whose time is taken, where they exist: what moves the objects, and what brings them to rest."""
+PARTS = ("release", "rest")
+"""The parts of `workers.physics.settle` whose time is taken: what moves the objects, and what brings them to rest."""
 
 CRASHED = "crashed"
 """The reason of a scene that ended with an error that is no SceneError: always a defect."""
@@ -121,27 +122,18 @@ def things_at_rest(starts: Sequence[ObjectStart], settled: Sequence[Settled]) ->
 
 @contextmanager
 def _timed() -> Iterator[dict[str, float]]:
-    """Processor seconds of each part of physics that exists, summed over its calls."""
+    """Processor seconds of each of `PARTS`, summed over its calls."""
     spent: dict[str, float] = {}
-    originals = []
-    for name, path in PARTS.items():
-        place, attribute = path.rsplit(".", 1)
-        module = importlib.import_module(place)
-        part = getattr(module, attribute, None)
-        if not callable(part):
-            continue
 
-        def timed(*given, name=name, part=part, **named):
+    def timed(name, part):
+        def run(*given, **named):
             began = time.process_time()
             try:
                 return part(*given, **named)
             finally:
                 spent[name] = spent.get(name, 0.0) + time.process_time() - began
 
-        originals.append((module, attribute, part))
-        setattr(module, attribute, timed)
-    try:
+        return run
+
+    with mock.patch.multiple(settle, **{name: timed(name, getattr(settle, name)) for name in PARTS}):
         yield spent
-    finally:
-        for module, attribute, part in originals:
-            setattr(module, attribute, part)

@@ -46,11 +46,6 @@ REACH_SHARE = 0.02
 NO_THRESHOLD = 1e18
 """Bullet's default: contacts are solved as soon as they are predicted."""
 
-WORLDS_BEFORE_RESET = 32
-"""Removed bodies leave some kilobytes behind, which only a reset frees; a reset costs as much as fifty milliseconds of
-simulated time."""
-
-
 GroundShape = float | Mesh | Array
 """Level ground at a height, metres, without an end; a mesh; or the vertices [N, 3] of a convex body."""
 
@@ -124,9 +119,8 @@ def open_world(
     maximal coordinates a ball that rolled on came elsewhere by a last bit after other worlds. One connection serves
     the process, because a new one costs as much as a simulation. Blocks do not nest.
     """
-    connection = _connect()
-    client = connection.client
-    connection.reset()
+    client = _connect()
+    pybullet.resetSimulation(physicsClientId=client)
     reach = reach_m if isinstance(ground, Mesh) else math.inf
     pybullet.setPhysicsEngineParameter(
         numSolverIterations=physics.solver_iterations,
@@ -138,51 +132,28 @@ def open_world(
         physicsClientId=client,
     )
     pybullet.setGravity(0.0, 0.0, -GRAVITY_M_S2, physicsClientId=client)
-    things: list[int] = []
-    try:
-        things.append(_add_ground(client, ground))
-        _set_surface(client, things[0], physics)
-        for body, T_world_body in placed:
-            level = len(placed) == 1 and stands_on_face(np.concatenate(body.parts), -T_world_body[2, :3])
-            things.append(_add_body(client, body, T_world_body[:3, :3] if level else None))
-            _set_surface(client, things[-1], physics, body)
-            position, quaternion = T_world_body[:3, 3].tolist(), quaternion_from_rotation(T_world_body[:3, :3]).tolist()
-            pybullet.resetBasePositionAndOrientation(things[-1], position, quaternion, physicsClientId=client)
-        world = World(client, things[0], tuple(things[1:]), steps)
-        world.set_rate(physics.step_hz)
-        if physics.restitution > 0.0:
-            world.set_restitution(physics.restitution)
-        yield world
-    finally:
-        connection.clear(things, 1 + len(placed))
-
-
-@dataclass
-class _Connection:
-    """The connection of the process, with the number of worlds since its last reset."""
-
-    client: int
-    worlds: int = 0
-
-    def reset(self) -> None:
-        pybullet.resetSimulation(physicsClientId=self.client)
-        self.worlds = 0
-
-    def clear(self, things: list[int], whole: int) -> None:
-        self.worlds += 1
-        if self.worlds >= WORLDS_BEFORE_RESET or len(things) < whole:
-            self.reset()
-            return
-        for thing in reversed(things):
-            pybullet.removeBody(thing, physicsClientId=self.client)
+    things = [_add_ground(client, ground)]
+    _set_surface(client, things[0], physics)
+    for body, T_world_body in placed:
+        level = len(placed) == 1 and stands_on_face(np.concatenate(body.parts), -T_world_body[2, :3])
+        things.append(_add_body(client, body, T_world_body[:3, :3] if level else None))
+        _set_surface(client, things[-1], physics, body)
+        position, quaternion = T_world_body[:3, 3].tolist(), quaternion_from_rotation(T_world_body[:3, :3]).tolist()
+        pybullet.resetBasePositionAndOrientation(things[-1], position, quaternion, physicsClientId=client)
+    world = World(client, things[0], tuple(things[1:]), steps)
+    world.set_rate(physics.step_hz)
+    if physics.restitution > 0.0:
+        world.set_restitution(physics.restitution)
+    yield world
 
 
 _BUFFERS = BulletBuffers()
 
 
 @cache
-def _connect() -> _Connection:
-    return _Connection(pybullet.connect(pybullet.DIRECT))
+def _connect() -> int:
+    client: int = pybullet.connect(pybullet.DIRECT)
+    return client
 
 
 def _add_ground(client: int, ground: GroundShape) -> int:

@@ -112,8 +112,7 @@ def fall(
 ) -> Outcome:
     """Release objects at `poses` (`T_world_obj`) until all rest, `physics.max_settle_s` is over, or a stop condition holds.
 
-    The first `free_m` metres are fallen in closed form, which is exact: nothing
-    turns in the air.
+    The first `free_m` metres are fallen in closed form, which is exact: nothing turns in the air.
     """
     fallen_m = min(max(0.0, free_m - SKIPPED_TO_M), GRAVITY_M_S2 * physics.max_settle_s**2 / 2)
     lower = translation(0.0, 0.0, -fallen_m)

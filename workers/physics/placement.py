@@ -127,11 +127,12 @@ def _describe(
     points, normals, forces = contacts.points[own], sign * contacts.normals[own], sign * motion.forces[own]
     others = np.where(upper, contacts.lower, contacts.upper)[own]
     regions = [*(one.region_id for one in placement.starts), REGION_TABLE]
-    moment = body.tensor @ motion.turns[number] / (body.mass_kg * float(np.ptp(start.hull.vertices, axis=0).max()))
+    size_m = float(np.ptp(start.hull.vertices, axis=0).max())
+    moment = body.tensor @ motion.turns[number] / (body.mass_kg * size_m)
     held = points[normals[:, 2] > HELD_FROM]
     return Support(
         gap_m,
-        support_margin_m(held, body.com) if len(held) else -float(np.ptp(start.hull.vertices, axis=0).max()),
+        support_margin_m(held, body.com) if len(held) else -size_m,
         float(max(np.linalg.norm(motion.moves[number]), np.linalg.norm(moment))) / FALL_M,
         float(points[:, 2].max(initial=-np.inf)),
         tuple(

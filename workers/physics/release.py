@@ -68,8 +68,8 @@ class Drop:
 def release(drop: Drop, flat: bool) -> Outcome:
     """Release the objects where they start, onto the table's flat top or its mesh, until they rest or must be stopped.
 
-    Stopped by `edge` where a footprint may leave the flat top, `below` where an object falls below the mesh, and `room`
-    where a single object leaves its room.
+    Stopped by `edge` where a footprint may leave the flat top, `below` where an object falls below the mesh, or among many
+    below the top, and `room` where a single object leaves its room.
     """
     table, effects, physics = drop.ground.table, drop.effects, _settings(drop)
     starts = [choose_collision_shape(start, physics) for start in drop.starts]

@@ -38,8 +38,8 @@ class Body:
     """A rigid body in its centre of mass and principal axes, which `T_obj_body` [4, 4] takes to the object's frame.
 
     moments [3] kg m^2; parts: the vertices [N, 3], metres, of convex parts, each with a margin of `margin_m` about it. One
-    part may be a single point, which makes a ball of the margin. reach_m: from the
-    centre of mass to the farthest vertex of the object.
+    part may be a single point, which makes a ball of the margin. reach_m: from the centre of mass to the farthest vertex of
+    the object.
     """
 
     mass_kg: float

@@ -78,6 +78,8 @@ def settle(drop: Drop) -> tuple[Settled, ...]:
         poses = tuple(start.T_world_obj for start in drop.starts)
         return _describe(_Ending(drop, _place(drop, poses, forms), poses), "placed", judged=True)
     _require_apart(drop.starts, forms)
+    if drop.physics.exact_rest and (placed := _rest_as_placed(drop, forms)) is not None:
+        return _describe(placed, _support_of(placed), judged=True)
     if drop.many and drop.physics.exact_rest:
         with suppress(UnsupportedError):
             return _settle(dataclasses.replace(drop, quick=True), forms)
@@ -88,19 +90,21 @@ def _settle(drop: Drop, forms: Sequence[Form]) -> tuple[Settled, ...]:
     if not drop.effects.runs("table_mesh"):
         ending = _come_to_rest(drop, forms, flat=True)
         if ending is not None:
-            return _describe(ending, "flat_top" if _is_over_top(ending) else "mesh", drop.physics.exact_rest)
+            return _describe(ending, _support_of(ending), drop.physics.exact_rest)
         late = called_for_with("table_mesh", drop.starts, drop.physics)
         drop = dataclasses.replace(drop, effects=add_effects(drop.effects, late))
     ending = _come_to_rest(drop, forms, flat=False)
     assert ending is not None  # only the flat top has an edge
-    return _describe(ending, "mesh", drop.physics.exact_rest)
+    return _describe(ending, _support_of(ending), drop.physics.exact_rest)
 
 
-def _is_over_top(ending: _Ending) -> bool:
-    """Whether every object is over the table's flat top with all of its points."""
+def _support_of(ending: _Ending) -> SupportedBy:
+    """`flat_top` where the mesh was not called for and every object is over the flat top with all of its points."""
+    if ending.drop.effects.runs("table_mesh"):
+        return "mesh"
     outline = ending.drop.ground.table.top.outline
     points = [transform(T, one.hull.vertices) for one, T in zip(ending.drop.starts, ending.poses, strict=True)]
-    return bool(inside_margin(np.concatenate(points)[:, :2], outline).min() >= 0.0)
+    return "flat_top" if inside_margin(np.concatenate(points)[:, :2], outline).min() >= 0.0 else "mesh"
 
 
 def add_effects(effects: EffectPlan, names: Iterable[str]) -> EffectPlan:
@@ -125,8 +129,6 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], flat: bool) -> _Ending | No
     as they tip, and released again where that takes them far.
     """
     seconds, placement = 0.0, None
-    if drop.physics.exact_rest and (placed := _rest_as_placed(drop, forms)) is not None:
-        return placed
     for _ in range(MOST_RELEASES):
         outcome = release(drop, flat)
         if outcome.stopped_by == "room":
@@ -204,8 +206,12 @@ def _require_calm(drop: Drop, outcome: Outcome) -> None:
     )
 
 
+def _lowest_m(drop: Drop) -> float:
+    return drop.ground.table.top.height_m - LEFT_M
+
+
 def _is_low(drop: Drop, start: ObjectStart, T: Pose) -> bool:
-    return not transform(T, start.asset.mass.com[None])[0, 2] >= drop.ground.table.top.height_m - LEFT_M
+    return not transform(T, start.asset.mass.com[None])[0, 2] >= _lowest_m(drop)
 
 
 def _left_table(drop: Drop, start: ObjectStart, T: Pose, seconds: float) -> SettleError:
@@ -225,7 +231,7 @@ def _describe(ending: _Ending, support: SupportedBy, judged: bool) -> tuple[Sett
     supports = measure_supports(ending.placement, ending.poses)
     for start, T, held in zip(ending.drop.starts, ending.poses, supports, strict=True):
         # What is this low may hang on the table by a handle, or stand on its foot
-        if _is_low(ending.drop, start, T) and held.highest_m < ending.drop.ground.table.top.height_m - LEFT_M:
+        if _is_low(ending.drop, start, T) and held.highest_m < _lowest_m(ending.drop):
             raise _left_table(ending.drop, start, T, ending.seconds)
         if judged:
             _require_support(ending.drop, start, held)
@@ -253,6 +259,6 @@ def _require_support(drop: Drop, start: ObjectStart, held: Support) -> None:
     raise UnsupportedError(
         "unsupported",
         f"{'it' if drop.single else f'region {start.region_id}'} came to rest {abs(held.gap_m) * 1e3:.3f} mm {where}, with "
-        f"{held.unbalanced:.1%} of its weight out of balance; the bounds are {TOUCHING_M * 1e3:g} mm and {UNBALANCED:.0%}: "
+        f"{held.unbalanced:.1%} of its weight out of balance; the bounds are {TOUCHING_M * 1e3:g} mm and {UNBALANCED:.1%}: "
         "lower physics.rest.speed_mm_s",
     )

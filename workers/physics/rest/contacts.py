@@ -15,7 +15,6 @@ DEEPEST_M = 3e-3
 """Overlap from which bodies are moved apart, metres: coarse parts may be smaller than a quarter of a metre's shape by half of
 that, and the walls of mugs are as thick."""
 
-
 DEEP_M = 1e-3
 """Overlap from which only a corner below a single face is believed: seams of bodies that abut have edges below one another."""
 
@@ -104,10 +103,9 @@ def find_contacts(
             rows.append(found)
             upper += [pair.upper] * len(found)
             lower += [pair.lower] * len(found)
-    rows_ = np.concatenate(rows)
-    return Contacts(
-        np.array(upper, dtype=np.int64), np.array(lower, dtype=np.int64), rows_[:, :3], rows_[:, 3:6], rows_[:, 6]
-    )
+    every = np.concatenate(rows)
+    above, below = (np.array(numbers, dtype=np.int64) for numbers in (upper, lower))
+    return Contacts(above, below, every[:, :3], every[:, 3:6], every[:, 6])
 
 
 def _between(

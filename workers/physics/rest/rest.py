@@ -10,10 +10,9 @@ from schemas.base import Array, Pose
 from schemas.scene.shape import MassProperties
 from workers.geometry.contact_surface import Surface
 from workers.geometry.frames import pose, rotation_about, transform
+from workers.physics.bullet import GRAVITY_M_S2
 from workers.physics.rest.contacts import DEEPEST_M, Contacts, find_contacts, find_near_features
 from workers.physics.rest.step import Inertia, JammedError, Motion, step
-
-GRAVITY_M_S2 = 9.81
 
 DOWN = np.array([0.0, 0.0, -1.0])
 

@@ -10,7 +10,8 @@ from schemas.scene.shape import Mesh
 from tests.contacts import UP, box, mesh_of, thing_of, tipped
 from workers.geometry.contact_surface import surface_of
 from workers.geometry.frames import pose, rotation_about, transform, translation, uniform_rotation
-from workers.physics.rest.rest import GRAVITY_M_S2, Rested, rest
+from workers.physics.bullet import GRAVITY_M_S2
+from workers.physics.rest.rest import Rested, rest
 
 FRICTION = 0.49
 GROUND = box((1.0, 1.0, 0.1), (0, 0, -0.05))
