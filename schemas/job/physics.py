@@ -34,8 +34,6 @@ class Physics(Frozen):
     """Simulated time after which an object that still moves is a failure."""
     rest: Rest = Rest()
     """When an object counts as resting."""
-    margin_mm: Annotated[float, Field(ge=0.02)] = 0.1
-    """Collision margin: the collision shape is smaller than the object by it; less for an object thinner than four margins."""
     friction: NonNegative = 0.7
     """Friction of each body; contact friction is the product of the two."""
     rolling_friction: NonNegative = 0.0005

@@ -73,4 +73,4 @@ def drop_on(case: Drop, slab: bool) -> Outcome:
     ground = case.table.top.height_m if slab else case.table.mesh
     steps = StepSizes(physics.step_hz, physics.max_step_travel_mm / 1e3)
     stops = {"below": falls_below(case.table.top.height_m - 0.2)}
-    return fall([make_body(case.start, physics)], [case.start.T_world_obj], ground, physics, steps, 0.0, stops)
+    return fall([make_body(case.start)], [case.start.T_world_obj], ground, physics, steps, 0.0, stops)

@@ -163,7 +163,7 @@ PROOFS: dict[str, Proof] = {
     "decomposition": Proof(dropped(mug_on_peg()), rests),
     "fine_step": Proof(dropped(drop(cube(0.005), ring(0.001), 1.0, xy=(0.45, 0.0))), rests),
     "rolling_friction": Proof(
-        dropped(drop(built_in("bottle"), level(), R=turn(X, 60) @ turn(Y, 20)), physics={"max_settle_s": 8.0}), rests
+        dropped(drop(built_in("bottle"), level(), R=turn(X, 60) @ turn(Y, 20)), physics={"max_settle_s": 1.5}), rests
     ),
     "restitution": switched("restitution"),
     "depth_camera": switched("depth_camera"),

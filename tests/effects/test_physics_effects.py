@@ -140,7 +140,7 @@ def test_without_fine_steps_what_is_small_falls_through_a_thin_table():
 )
 def test_without_rolling_friction_what_is_dropped_on_its_side_rolls_on_past_the_time(start):
     facts = facts_with(start())
-    hurried = facts.job.physics.model_copy(update={"max_settle_s": 8.0})
+    hurried = facts.job.physics.model_copy(update={"max_settle_s": 1.5})
     facts = replace(facts, job=facts.job.model_copy(update={"physics": hurried}))
     effects = plan_effects(facts)
     assert effects.runs("rolling_friction")

@@ -9,10 +9,12 @@ from scipy.integrate import solve_ivp
 
 from schemas.job.physics import Physics
 from tests.physics.room import G, advance, at, box_body, drop, lean, order, physics, slope
+from workers.physics.rigid_body import MARGIN_M
 
 WIDTH_M, HEIGHT_M = 0.06, 0.2
-MARGIN_M = 1e-6
 BOX = dataclasses.replace(box_body(WIDTH_M, 0.1, HEIGHT_M), margin_m=MARGIN_M)
+SHARP_M = 1e-6
+SHARP = dataclasses.replace(BOX, margin_m=SHARP_M)
 TIPPING_RAD = math.atan(WIDTH_M / HEIGHT_M)
 ARM_M = math.hypot(WIDTH_M, HEIGHT_M) / 2
 RATE2 = G * ARM_M / ((WIDTH_M**2 + HEIGHT_M**2) / 12 + ARM_M**2)
@@ -62,9 +64,9 @@ def first_quarter(settings: Physics, lean_rad: float) -> float:
     """Seconds from rest on one edge, leaning by `lean_rad`, to upright; between steps by a straight line."""
     x, z = WIDTH_M / 2, HEIGHT_M / 2
     c, s = math.cos(lean_rad), math.sin(lean_rad)
-    over = at(z * s - x * c, z * c + x * s + MARGIN_M, lean_rad)  # the edge at +x lies on the y axis
+    over = at(z * s - x * c, z * c + x * s + SHARP_M, lean_rad)  # the edge at +x lies on the y axis
     before = lean_rad
-    with drop(BOX, over, 0.0, settings, 1) as world:
+    with drop(SHARP, over, 0.0, settings, 1) as world:
         for step in range(settings.step_hz):
             world.advance()
             now = lean(world)

@@ -26,6 +26,13 @@ NO_AREA = 1e-12
 """Area, as a share of the hull's size squared, below which a triangle's normal is rounding noise."""
 
 
+SAME = 1e-9
+"""Difference in each coordinate below which normals are equal."""
+
+SCATTER = np.array([0.5773502691896258, 0.7320508075688772, 0.3618033988749895])
+"""A direction outside the symmetries of common shapes: sorted along it, equal rows are neighbours."""
+
+
 def convex_hull(vertices: Array) -> Hull:
     """The hull of points [N, 3], metres; a flat cloud is thickened by joggling it (Qhull's QJ).
 
@@ -58,3 +65,21 @@ def _thin_hull(vertices: Array) -> Hull:
     flat = float(np.linalg.svd(unique - unique.mean(axis=0), compute_uv=False)[-1]) < FLAT_M
     hull = ConvexHull(unique, qhull_options="QJ" if flat else "Qt")
     return Hull(frozen_array(unique[hull.vertices]), frozen_array(hull.equations[:, :3]))
+
+
+def least_width_m(hull: Hull) -> float:
+    """The least distance, metres, between the plane of a face and the vertex farthest from it.
+
+    Two crossing edges may be nearer: a regular tetrahedron's are by 13 %.
+    """
+    along = hull.vertices @ hull.normals[_distinct(hull.normals, SAME)].T
+    return float((along.max(axis=0) - along.min(axis=0)).min())
+
+
+def _distinct(rows: Array, near: float) -> Array:
+    """[M] ascending indices of rows [N, 3], one of those that are equal to within `near` in each coordinate."""
+    order = np.argsort(rows @ SCATTER, kind="stable")
+    ranked = rows[order]
+    new = np.ones(len(rows), dtype=bool)
+    new[1:] = (np.abs(ranked[1:] - ranked[:-1]) > near).any(axis=1)
+    return np.sort(order[new])

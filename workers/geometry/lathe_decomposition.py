@@ -32,8 +32,7 @@ from schemas.base import Array, frozen_array
 from schemas.scene.shape import Loft
 from workers.geometry.convex_partition import Indices, partition_outlines
 from workers.geometry.convexity import mesh_of
-from workers.geometry.hull import convex_hull
-from workers.geometry.hull_offset import least_width_m
+from workers.geometry.hull import convex_hull, least_width_m
 from workers.geometry.manifold import hold_to_one_thread
 from workers.geometry.visible_slabs import is_covered, ring_points, stack_slabs, trace_visible_border
 

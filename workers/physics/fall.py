@@ -12,8 +12,9 @@ from schemas.job.physics import Physics
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart, Table
 from workers.geometry.frames import invert, pose, rotation_from_quaternion, translation
-from workers.geometry.hull_offset import least_width_m
+from workers.geometry.hull import least_width_m
 from workers.physics.bullet import GRAVITY_M_S2, GroundShape, World, open_world
+from workers.physics.energy import EnergyRecord, Velocity
 from workers.physics.rigid_body import Body, BodyPose
 from workers.physics.stop_conditions import StopCondition
 from workers.physics.table_top import support_height
@@ -25,15 +26,7 @@ CALM_M_S = 0.05
 """Upper bound on the momentary speed of any point of a resting object: at this speed it climbs an eighth of a millimetre."""
 
 FINEST = 16
-"""Ratio of the longest step to the shortest, but for landing."""
-
-LANDING = 64
-"""The same for landing. How deep a flat landing goes is lifted out again: with 16, 23 of 2,000 upright drops gained more energy
-than a thousandth of the fall's, 1.0004 thousandths at most of 400 with this."""
-
-TOUCHDOWN_S = 0.005
-"""Steps are the shortest for this time from `SKIPPED_TO_M` above the ground. A flat landing stops at once, and no later step
-corrects how deep it went."""
+"""Ratio of the longest step to the shortest."""
 
 DROP_SHARE = 0.002
 """Travel per step as a share of the drop, where that is more than `physics.max_step_travel_mm`. Bounds the energy regained
@@ -59,10 +52,8 @@ class StepSizes:
     base_hz: float
     max_travel_m: float
 
-    def rate_hz(self, speed_m_s: float, landing: bool = False) -> float:
-        """Steps per second at the fastest point's speed: `base_hz` times a power of two, the highest while `landing`."""
-        if math.isfinite(self.max_travel_m) and landing:
-            return LANDING * self.base_hz
+    def rate_hz(self, speed_m_s: float) -> float:
+        """Steps per second at the fastest point's speed: `base_hz` times a power of two."""
         rate = self.base_hz
         while speed_m_s > rate * self.max_travel_m and rate < FINEST * self.base_hz:
             rate *= 2.0
@@ -74,7 +65,8 @@ class Outcome:
     """The end of a simulation, with `T_world_obj` [4, 4] of every object.
 
     speed_m_s: of the fastest point; where all `rested`, the drift over the last window. seconds: of free fall and
-    simulation. stopped_by: the name of the stop condition that ended it.
+    simulation. stopped_by: the name of the stop condition that ended it. rise: how far the energy of all rose, as a share of its
+    bound.
     """
 
     poses: tuple[Pose, ...]
@@ -82,6 +74,7 @@ class Outcome:
     seconds: float
     rested: bool
     stopped_by: str | None = None
+    rise: float = 0.0
 
 
 def choose_steps(
@@ -123,8 +116,7 @@ def fall(
     with open_world(placed, ground, physics, SAMPLE_STEPS, reach_m) as world:
         for number in range(len(bodies)):
             world.set_velocity((0.0, 0.0, -speed_m_s), body=number)
-        limits_s = (physics.max_settle_s - fallen_s, TOUCHDOWN_S if fallen_m > 0.0 else 0.0)
-        outcome = _simulate(world, bodies, physics, steps, limits_s, stops or {})
+        outcome = _simulate(world, bodies, physics, steps, physics.max_settle_s - fallen_s, stops or {})
     ended = tuple(T @ invert(one.T_obj_body) for T, one in zip(outcome.poses, bodies, strict=True))
     return dataclasses.replace(outcome, poses=ended, seconds=outcome.seconds + fallen_s)
 
@@ -143,25 +135,24 @@ def _simulate(
     bodies: Sequence[Body],
     physics: Physics,
     steps: StepSizes,
-    limits_s: tuple[float, float],
+    end_s: float,
     stops: Mapping[str, StopCondition],
 ) -> Outcome:
     """Step until all rest, the time is over or a stop condition holds; the poses are those of the body frames.
 
-    limits_s: the time to simulate, and of it the touchdown. A body rests when for the whole window no point moved further than
+    end_s: the time to simulate. A body rests when for the whole window no point moved further than
     the rest speed allows, it turned no further than the rest spin allows, and no point was faster than `CALM_M_S`. Displacement
     decides and not speed: Bullet's contact points flicker between the many vertices of a round rim, and an object at rest may
     rattle by micrometres at some millimetres per second for ever.
     """
-    rest, (end_s, touchdown_s) = physics.rest, limits_s
+    rest = physics.rest
     drift_m, turn_rad = rest.speed_mm_s / 1e3 * rest.window_s, rest.spin_rad_s * rest.window_s
     still = [_Stillness(world.pose(k)) for k in range(len(bodies))]
     time, rate, bounces = 0.0, physics.step_hz * 1.0, physics.restitution > 0.0
-    speeds = _speeds(world, bodies)
+    moving = [world.velocity(k) for k in range(len(bodies))]
+    speeds, energy = _speeds(bodies, moving), EnergyRecord(bodies, [one.anchor for one in still], moving)
     while True:
-        wanted = steps.rate_hz(max(speeds), time < touchdown_s)
-        if bounces:  # a rebound loses speed in steps much shorter than its contact lasts
-            wanted = min(wanted, FINEST * steps.base_hz)
+        wanted = steps.rate_hz(max(speeds))
         if bounces and max(speeds) < BOUNCES_M_S:
             world.set_restitution(0.0)
             bounces, rate = False, 0.0
@@ -170,7 +161,9 @@ def _simulate(
             rate = wanted
         world.advance()
         time += SAMPLE_STEPS / rate
-        speeds, at = _speeds(world, bodies), [world.pose(k) for k in range(len(bodies))]
+        at, moving = [world.pose(k) for k in range(len(bodies))], [world.velocity(k) for k in range(len(bodies))]
+        speeds = _speeds(bodies, moving)
+        energy.add(at, moving)
         for name, stop in stops.items():
             if any(stop(one) for one in at):
                 return Outcome(tuple(map(as_pose, at)), max(speeds), time, False, name)
@@ -181,14 +174,13 @@ def _simulate(
                 one.anchor, one.since = now, time
         if all(time - one.since >= rest.window_s for one in still):
             drift_m_s = max(one.moved_m / (time - one.since) for one in still)
-            return Outcome(tuple(map(as_pose, at)), drift_m_s, time, True)
+            return Outcome(tuple(map(as_pose, at)), drift_m_s, time, True, rise=energy.rise())
         if time >= end_s:
-            return Outcome(tuple(map(as_pose, at)), max(speeds), time, False)
+            return Outcome(tuple(map(as_pose, at)), max(speeds), time, False, rise=energy.rise())
 
 
-def _speeds(world: World, bodies: Sequence[Body]) -> list[float]:
+def _speeds(bodies: Sequence[Body], moving: Sequence[Velocity]) -> list[float]:
     """For each body an upper bound on the speed of its fastest point, m/s."""
-    moving = [world.velocity(k) for k in range(len(bodies))]
     return [math.hypot(*v) + math.hypot(*w) * body.reach_m for (v, w), body in zip(moving, bodies, strict=True)]
 
 

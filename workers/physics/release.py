@@ -11,12 +11,11 @@ from schemas.job.physics import Physics
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart, Table
 from workers.geometry.frames import transform
-from workers.physics.bullet import GroundShape
+from workers.physics.bullet import SLOP_SHARE, GroundShape
 from workers.physics.fall import THIN_SHARE, Outcome, choose_steps, fall, free_fall_m
 from workers.physics.placement import Ground
-from workers.physics.rest_pose import stands_on_face
 from workers.physics.rigid_body import build_body, choose_collision_shape
-from workers.physics.stop_conditions import can_touch, falls_below, leaves_outline, leaves_room, tips_over
+from workers.physics.stop_conditions import falls_below, leaves_outline, leaves_room
 
 MANY = 4
 """Number of objects from which they fall as coarser convex parts: the time grows with the pairs of parts near one another."""
@@ -28,22 +27,46 @@ matters and not the path. At twice that corners sink into the walls of mugs, whi
 LEFT_M = 0.05
 """Depth of a centre of mass below the table's top at which the object has left the table."""
 
-QUICK_RATE, QUICK_THIN = 0.5, 0.25
-"""Steps and solver iterations of a quick drop as a share of others', and its travel in a step as one of the thinnest object.
-All of 28 piles of eight that stayed on the table came to exact rest after it, and 30 of 35 with 0.25 and 0.5. What does not
-falls once more, not quickly."""
-
 PRISM_M = 0.5
 """Height of the body that stands for a flat top with its edges: nothing passes through it in a step. It spares the second drop,
 onto the mesh, of the many that roll to an edge; a stack on it gains energy, four times the bound, and none on a slab."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Steps per second, solver iterations and travel per step, as shares of what the settings say.
+
+    thin: upper bound on the travel per step, as a share of the thinnest object's width.
+    """
+
+    rate: float = 1.0
+    iterations: float = 1.0
+    travel: float = 1.0
+    thin: float = THIN_SHARE
+
+
+AS_SET = Pace()
+
+PACES = (Pace(rate=0.5, travel=6.0), Pace(travel=2.0), Pace(rate=2.0, travel=0.7), Pace(rate=4.0, travel=0.25))
+"""Of a single object, one after the other while its energy rises."""
+
+PACES_TOGETHER = (AS_SET, Pace(rate=4.0, travel=0.25))
+"""The same of several, where they are not many concave ones."""
+
+MOST_RISE = 0.4
+"""Rise of energy, as a share of its bound, up to which a pace was slow enough: the simulation looks every eight steps, and
+between two looks the energy may have been lower."""
+
+QUICK = Pace(rate=0.5, iterations=0.5, thin=0.25)
+"""For many concave objects, once more as set where they do not come to exact rest after it. All of 28 piles of eight that stayed
+on the table did, and 30 of 35 with half of the rate."""
 
 
 @dataclass(frozen=True, eq=False)
 class Drop:
     """Objects to be released over a table, with the settings and the plan of effects.
 
-    room_m: how far the centre of mass of a single object may go sideways; quick: in long steps, for many concave objects;
-    exact: as parts that are not coarser where there are many.
+    room_m: how far the centre of mass of a single object may go sideways; exact: as parts that are not coarser, and as set.
     """
 
     starts: tuple[ObjectStart, ...]
@@ -51,7 +74,7 @@ class Drop:
     physics: Physics
     effects: EffectPlan
     room_m: float = math.inf
-    quick: bool = False
+    pace: Pace = AS_SET
     exact: bool = False
 
     @property
@@ -69,37 +92,41 @@ def release(drop: Drop, flat: bool) -> Outcome:
     """Release the objects where they start, onto the table's flat top or its mesh, until they rest or must be stopped.
 
     Stopped by `edge` where a footprint may leave the flat top, `below` where an object falls below the mesh, or among many
-    below the top, and `room` where a single object leaves its room.
+    below the top, and `room` where a single object leaves its room. Released again, in shorter steps, where their energy
+    rose, but for many concave objects, whose bounces are more than the rise.
     """
+    if drop.many or drop.exact:
+        return _release(drop, flat)
+    for pace in PACES if drop.single else PACES_TOGETHER:
+        outcome = _release(dataclasses.replace(drop, pace=pace), flat)
+        if outcome.rise < MOST_RISE:
+            break
+    return outcome
+
+
+def _release(drop: Drop, flat: bool) -> Outcome:
     table, effects, physics = drop.ground.table, drop.effects, _settings(drop)
     starts = [choose_collision_shape(start, physics) for start in drop.starts]
     poses = [start.T_world_obj for start in starts]
-    bodies = [build_body(start, physics, effects, drop.many) for start in starts]
+    coarse = drop.many or (drop.single and drop.pace == PACES[0] and physics.exact_rest)
+    bodies = [build_body(start, physics, effects, coarse, level=flat and drop.single) for start in starts]
     hulls = [transform(T, start.hull.vertices) for T, start in zip(poses, starts, strict=True)]
     free_m = min(free_fall_m(points, table, flat) for points in hulls)
     # On a mesh a single object keeps the shortest travel per step, however far it falls.
     drop_m = max(float(points[:, 2].min()) for points in hulls) - table.top.height_m
-    thin = QUICK_THIN if drop.quick else THIN_SHARE
-    steps = choose_steps(starts, physics, effects, drop_m if flat or not drop.single else 0.0, thin)
+    steps = choose_steps(starts, physics, effects, drop_m if flat or not drop.single else 0.0, drop.pace.thin)
     reach_m = max(body.reach_m for body in bodies)
     lowest_m = table.top.height_m - LEFT_M if drop.many else float(table.mesh.vertices[:, 2].min())
     stops = {"below": falls_below(lowest_m - reach_m)}
     ground: GroundShape = table.mesh
     if flat and not drop.many:
-        ground, stops = table.top.height_m, {"edge": leaves_outline(table.top.outline, reach_m)}
+        hover_m = bodies[0].margin_m * (1.0 - SLOP_SHARE)
+        ground, stops = table.top.height_m - hover_m, {"edge": leaves_outline(table.top.outline, reach_m)}
     elif flat:
         ground = _prism(table)
     T_world_body = poses[0] @ bodies[0].T_obj_body
     if math.isfinite(drop.room_m):
         stops["room"] = leaves_room(T_world_body[:2, 3], drop.room_m)
-    parts, down = bodies[0].parts, -T_world_body[2, :3]
-    if flat and drop.single and len(parts) == 1 and stands_on_face(parts[0], down):
-        # An object on a level plane touches it with few vertices until it tips, and the time grows with their number. It
-        # falls with these, and once more with all of them if it tips.
-        reduced = dataclasses.replace(bodies[0], parts=(parts[0][can_touch(parts[0], down)],))
-        outcome = fall([reduced], poses, ground, physics, steps, free_m, stops | {"tilt": tips_over(T_world_body)})
-        if outcome.stopped_by != "tilt":
-            return outcome
     return fall(bodies, poses, ground, physics, steps, free_m, stops)
 
 
@@ -111,21 +138,22 @@ def _prism(table: Table) -> Array:
 
 
 def _settings(drop: Drop) -> Physics:
-    """The settings with those of effects that do not run at zero; for several objects with longer travel per step.
+    """The settings at the drop's pace, with those of effects that do not run at zero.
 
-    And with more solver iterations: the solver goes from contact to contact, and an iteration carries the less of a force the
-    more the masses differ.
+    Several objects may travel further in a step. They get more solver iterations: the solver goes from contact to contact, and
+    an iteration carries the less of a force the more the masses differ.
     """
-    changes: dict[str, float] = {}
+    pace, physics, several, iterations = drop.pace, drop.physics, 1.0, 1.0
     if not drop.single:
         masses = [start.asset.mass.mass_kg for start in drop.starts]
-        changes["solver_iterations"] = drop.physics.solver_iterations * math.ceil(math.sqrt(max(masses) / min(masses)))
-        changes["max_step_travel_mm"] = drop.physics.max_step_travel_mm * GROUP_TRAVEL
-    if drop.quick:
-        for name in ("step_hz", "solver_iterations"):
-            changes[name] = max(1, round(QUICK_RATE * changes.get(name, getattr(drop.physics, name))))
+        several, iterations = GROUP_TRAVEL, math.ceil(math.sqrt(max(masses) / min(masses)))
+    changes: dict[str, float] = {
+        "step_hz": max(1, round(pace.rate * physics.step_hz)),
+        "solver_iterations": max(1, round(pace.iterations * iterations * physics.solver_iterations)),
+        "max_step_travel_mm": pace.travel * several * physics.max_step_travel_mm,
+    }
     if not drop.effects.runs("restitution"):
         changes["restitution"] = 0.0
     if not drop.effects.runs("rolling_friction"):
         changes |= {"rolling_friction": 0.0, "spinning_friction": 0.0}
-    return drop.physics.model_copy(update=changes)
+    return physics.model_copy(update=changes)

@@ -21,9 +21,6 @@ STEADY_M = 2e-4
 NEAR_LOWEST_M = 0.02
 """Only vertices within this height of the lowest one can touch a support that is level to within a few degrees."""
 
-TIPPED_RAD = 0.2
-"""Lean at which an object on a face is tipping over: up to here it is tipped by geometry, beyond it is simulated."""
-
 SNAP_RAD = 0.02
 """Angle to a face up to which an object stands on it: the simulation leaves small ones 0.2 mm out of level."""
 

@@ -13,21 +13,24 @@ from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import MassProperties
 from workers.geometry.frames import invert, pose, transform
 from workers.geometry.hull import convex_hull
-from workers.geometry.hull_offset import offset_hull
 from workers.geometry.lathe_decomposition import COARSE, TOLERANCE
 from workers.physics.convex_parts.step import parts_of
 from workers.physics.effects import is_convex
 
-SLOP_M = 1e-5
-"""Depth of overlap that Bullet leaves between bodies at rest."""
+MARGIN_M = 2e-5
+"""Collision margin, by which shapes hover: the least at which what rests is still found without overlap of the shapes
+themselves, which takes Bullet longer."""
 
-COARSE_MARGIN_M = 2e-5
-"""Collision margin of coarse parts, by which they hover: the least at which what rests is still found without overlap of the
-parts themselves, which takes Bullet longer."""
+MARGIN_SHARE = 2e-4
+"""Upper bound on the margin as a share of the reach: what is a few millimetres small would lean by it."""
 
 DIRECTIONS = 128
 """Directions, evenly over a sphere, in which coarse parts keep their farthest vertex: a third of the time of a pile's step
 goes where Bullet looks for it."""
+
+CORE_SHARE = 0.5
+"""Radius of the core of octants, as a share of the depth of the centre of mass in the hull. It gives a volume to a part with
+a single vertex."""
 
 BodyPose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 """Position, metres, and quaternion (x, y, z, w) of a body frame, whose origin is the centre of mass."""
@@ -45,7 +48,7 @@ class Body:
     mass_kg: float
     moments: Array
     parts: tuple[Array, ...]
-    margin_m: float
+    margin_m: float = MARGIN_M
     T_obj_body: Pose = field(default_factory=lambda: np.eye(4))
     reach_m: float = 0.0
 
@@ -65,21 +68,31 @@ def choose_collision_shape(start: ObjectStart, physics: Physics) -> ObjectStart:
     return dataclasses.replace(start, hull=convex_hull(corners), T_world_obj=frozen_array(T))
 
 
-def build_body(start: ObjectStart, physics: Physics, effects: EffectPlan, coarse: bool = False) -> Body:
+def build_body(
+    start: ObjectStart, physics: Physics, effects: EffectPlan, coarse: bool = False, level: bool = False
+) -> Body:
     """The object as its convex parts where the effect `decomposition` runs and it has several, else as its hull.
 
-    coarse: several parts are fewer and have fewer vertices, and are as large as the object and a margin about it.
+    coarse: several parts are fewer and have fewer vertices. level: it meets nothing but level ground, so that a hull may be cut
+    into `octants`.
     """
-    parts: tuple[Array, ...] = ()
-    if effects.runs("decomposition") and not is_convex(start):
-        parts = parts_of(start.asset, physics.concavity, COARSE if coarse else TOLERANCE)
-    if not coarse or len(parts) < 2:
-        return make_body(start, physics, parts if len(parts) > 1 else ())
-    T_obj_body, moments = body_frame(start.asset.mass)
-    points = transform(invert(T_obj_body), start.hull.vertices)
-    reach_m = float(np.linalg.norm(points, axis=1).max())
-    vertices = tuple(_outermost(transform(invert(T_obj_body), part)) for part in parts)
-    return Body(start.asset.mass.mass_kg, moments, vertices, COARSE_MARGIN_M, T_obj_body, reach_m)
+    if not effects.runs("decomposition") or is_convex(start):
+        body = make_body(start)
+        return dataclasses.replace(body, parts=octants(body.parts[0])) if level else body
+    parts = parts_of(start.asset, physics.concavity, COARSE if coarse else TOLERANCE)
+    return make_body(start, parts if len(parts) > 1 else (), coarse)
+
+
+def octants(points: Array) -> tuple[Array, ...]:
+    """The vertices [N, 3] of a hull about the origin by the signs of their coordinates, each part with a core about the origin.
+
+    A hull meets level ground with its vertices alone, and these are the parts'. Bullet looks only at parts near the ground, and
+    finds a contact of each in a step, where it finds one of a hull: what lands flat would be turned and pushed aside.
+    """
+    normals = convex_hull(points).normals
+    core = CORE_SHARE * float((points @ normals.T).max(axis=0).min()) * np.concatenate([np.eye(3), -np.eye(3)])
+    octant = (points > 0.0) @ np.array([1, 2, 4])
+    return tuple(np.concatenate([points[octant == number], core]) for number in np.unique(octant))
 
 
 def _outermost(points: Array) -> Array:
@@ -96,24 +109,18 @@ def _outermost(points: Array) -> Array:
     return points[np.unique((points @ directions).argmax(axis=0))]
 
 
-def make_body(start: ObjectStart, physics: Physics, parts: tuple[Array, ...] = ()) -> Body:
+def make_body(start: ObjectStart, parts: tuple[Array, ...] = (), coarse: bool = False) -> Body:
     """The object as its hull, or as convex `parts` (vertices [N, 3], object frame) where there are any.
 
-    Bullet adds a margin around a collision shape. The shape is inset by the margin less `SLOP_M`, so that at rest its faces
-    coincide with the object's.
+    coarse: parts have fewer vertices.
     """
     T_obj_body, moments = body_frame(start.asset.mass)
-    hulls = [convex_hull(part) for part in parts] or [start.hull]
-    insets = [offset_hull(hull, physics.margin_mm / 1e3 - SLOP_M) for hull in hulls]
-    offset_m = min(each.offset_m for each in insets)
-    insets = [
-        each if each.offset_m == offset_m else offset_hull(hull, offset_m)
-        for each, hull in zip(insets, hulls, strict=True)
-    ]
-    margin_m = min(each.offset_m for each in insets) + SLOP_M
     T_body_obj = invert(T_obj_body)
     reach_m = float(np.linalg.norm(transform(T_body_obj, start.hull.vertices), axis=1).max())
-    vertices = tuple(transform(T_body_obj, each.vertices) for each in insets)
+    vertices = tuple(transform(T_body_obj, each) for each in parts or (start.hull.vertices,))
+    if coarse and parts:
+        vertices = tuple(map(_outermost, vertices))
+    margin_m = min(MARGIN_M, MARGIN_SHARE * reach_m)
     return Body(start.asset.mass.mass_kg, moments, vertices, margin_m, T_obj_body, reach_m)
 
 

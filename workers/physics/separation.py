@@ -12,8 +12,7 @@ from schemas.scene.shape import Mesh
 from workers.geometry.contact_surface import Surface, is_closed, surface_of
 from workers.geometry.convexity import mesh_of, solid_of, weld
 from workers.geometry.frames import transform
-from workers.geometry.hull import convex_hull
-from workers.geometry.hull_offset import least_width_m
+from workers.geometry.hull import convex_hull, least_width_m
 from workers.geometry.manifold import hold_to_one_thread
 from workers.physics.rest.contacts import find_contacts, find_near_features
 

@@ -26,7 +26,7 @@ from workers.physics.placement import (
     place_on_top,
     placed_mesh,
 )
-from workers.physics.release import LEFT_M, Drop, release
+from workers.physics.release import LEFT_M, QUICK, Drop, release
 from workers.physics.rest.rest import rest
 from workers.physics.rest_pose import snap_to_face
 from workers.physics.separation import Form, find_gaps_m, find_overlaps_m
@@ -82,7 +82,7 @@ def settle(drop: Drop) -> tuple[Settled, ...]:
         return _describe(placed, _support_of(placed), judged=True)
     if drop.many and drop.physics.exact_rest:
         with suppress(UnsupportedError):
-            return _settle(dataclasses.replace(drop, quick=True), forms)
+            return _settle(dataclasses.replace(drop, pace=QUICK), forms)
     return _settle(drop, forms)
 
 

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import ConvexHull
 
 from schemas.job.assets import ProceduralSource
 from schemas.job.job import CATEGORIES
 from workers.assets.builtin.make import make_asset
-from workers.geometry.hull import MOST_VERTICES, convex_hull
+from workers.geometry.hull import MOST_VERTICES, convex_hull, least_width_m
 
 SOURCE = ProceduralSource(source="procedural")
 
@@ -66,3 +67,14 @@ def test_a_hull_with_too_many_vertices_is_made_coarser_by_little():
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     out = (points @ directions.T).max(axis=0) - (hull.vertices @ directions.T).max(axis=0)
     assert 0.0 <= out.max() < 2e-4 * 0.54
+
+
+def test_the_least_width_of_a_plate_is_its_thickness():
+    assert least_width_m(convex_hull(trimesh.creation.box((0.2, 0.3, 0.0005)).vertices)) == pytest.approx(
+        5e-4, rel=1e-12
+    )
+    tilted = trimesh.creation.cylinder(0.004, 0.1, sections=360)
+    tilted.apply_transform(trimesh.transformations.euler_matrix(0.3, 0.4, 0.5))
+    assert least_width_m(convex_hull(np.asarray(tilted.vertices))) == pytest.approx(
+        0.008 * np.cos(np.pi / 360), rel=1e-9
+    )

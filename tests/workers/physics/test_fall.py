@@ -56,7 +56,7 @@ def test_without_a_bound_on_their_travel_steps_stay_as_long_as_they_are():
 def test_the_part_of_a_fall_that_is_not_simulated_is_exact_and_the_rest_half_a_step_ahead(free_m):
     """Semi-implicit Euler is g t h / 2 ahead after the time t (Hairer, Lubich, Wanner 2006, I.1)."""
     start = start_at(translation(0.0, 0.0, 2.0))
-    body = make_body(start, PHYSICS)
+    body = make_body(start)
     motion = fall([body], [start.T_world_obj], 0.0, for_seconds(0.4), COARSE, free_m)
     skipped_s = math.sqrt(2.0 * max(0.0, free_m - SKIPPED_TO_M) / GRAVITY_M_S2)
     ahead = GRAVITY_M_S2 * (motion.seconds - skipped_s) / PHYSICS.step_hz / 2
@@ -69,7 +69,7 @@ def test_the_part_of_a_fall_that_is_not_simulated_is_exact_and_the_rest_half_a_s
 @pytest.mark.parametrize("height_m", [0.03, 0.3])
 def test_what_falls_freely_lands_when_half_g_t_squared_says(height_m):
     start = start_at(translation(0.0, 0.0, 0.1 + height_m))
-    motion = fall([make_body(start, PHYSICS)], [start.T_world_obj], 0.0, for_seconds(8.0), COARSE, height_m)
+    motion = fall([make_body(start)], [start.T_world_obj], 0.0, for_seconds(8.0), COARSE, height_m)
     landed = math.sqrt(2.0 * height_m / GRAVITY_M_S2)
     window, looks = PHYSICS.rest.window_s, 4 * 8 / PHYSICS.step_hz
     assert motion.rested
@@ -79,7 +79,7 @@ def test_what_falls_freely_lands_when_half_g_t_squared_says(height_m):
 
 def test_a_stop_condition_ends_the_fall_and_is_named():
     start = start_at(translation(0.0, 0.0, 1.0))
-    body = make_body(start, PHYSICS)
+    body = make_body(start)
     stops = {"never": lambda at: False, "below": lambda at: at[0][2] < 0.9}
     motion = fall([body], [start.T_world_obj], 0.0, for_seconds(8.0), COARSE, 0.0, stops)
     assert (motion.stopped_by, motion.rested) == ("below", False)

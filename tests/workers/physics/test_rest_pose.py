@@ -10,7 +10,7 @@ from schemas.scene.shape import Mesh
 from tests.shapes import box
 from workers.geometry.frames import angle_between, pose, rotation_about, transform
 from workers.geometry.hull import convex_hull
-from workers.physics.rest_pose import find_contacts_xy, snap_to_face, support_margin
+from workers.physics.rest_pose import DOWN, find_contacts_xy, snap_to_face, stands_on_face, support_margin
 
 X = np.array([1.0, 0.0, 0.0])
 CUBE = convex_hull(np.asarray(box(0.1, 0.1, 0.1).vertices))
@@ -74,3 +74,8 @@ def test_a_hull_has_outward_unit_normals_and_only_its_corners():
 def test_a_flat_cloud_has_a_hull_too():
     sheet = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 0.0]])
     assert len(convex_hull(sheet).vertices) >= 4
+
+
+def test_a_cube_stands_on_its_face_and_not_on_its_edge():
+    assert stands_on_face(CUBE.vertices, DOWN)
+    assert not stands_on_face(CUBE.vertices, rotation_about(X, 0.3) @ DOWN)

@@ -1,4 +1,4 @@
-"""The shape, margin, frame and parts of the bodies that the simulator is given."""
+"""The shape, frame and parts of the bodies that the simulator is given."""
 
 import numpy as np
 import pytest
@@ -12,11 +12,10 @@ from tests.shapes import asset_of, box
 from workers.geometry.frames import pose, rotation_about, transform, uniform_rotation
 from workers.geometry.hull import convex_hull
 from workers.physics import rigid_body
-from workers.physics.rigid_body import SLOP_M, body_frame, choose_collision_shape, make_body
+from workers.physics.rigid_body import body_frame, choose_collision_shape, make_body, octants
 
 PHYSICS = Job(name="t").physics
 BOXED = PHYSICS.model_copy(update={"collision": "box"})
-MARGIN_M = PHYSICS.margin_mm / 1e3
 CAN = asset_of(trimesh.creation.cylinder(0.04, 0.12, sections=48))
 TRAY = asset_of(box(0.2, 0.2, 0.05).difference(box(0.18, 0.18, 0.05).apply_translation([0, 0, 0.01])))
 
@@ -35,54 +34,54 @@ def start_of(asset: Asset, T=None) -> ObjectStart:
     return ObjectStart(asset, convex_hull(asset.shape.vertices), 3, np.eye(4) if T is None else T, 0, False)
 
 
+def test_one_hull_has_the_vertices_of_the_objects_hull_about_its_centre_of_mass():
+    start = start_of(asset_of(SHAPES["tilted box"]))
+    made = make_body(start)
+    (part,) = made.parts
+    assert transform(made.T_obj_body, part) == pytest.approx(start.hull.vertices, abs=1e-12)
+    assert made.reach_m == pytest.approx(np.linalg.norm(start.hull.vertices - start.asset.mass.com, axis=1).max())
+
+
 @pytest.mark.parametrize("name", SHAPES)
-def test_the_shape_with_its_margin_lies_in_the_hull_and_touches_its_planes_but_for_the_slop(name):
-    """Of a body and a ball about each of its points, the support function is the body's plus the ball's radius."""
-    start = start_of(asset_of(SHAPES[name]))
-    made = make_body(start, PHYSICS)
-    vertices = transform(made.T_obj_body, made.parts[0])
-    rng = np.random.default_rng(0)
-    for normals, tight in ((start.hull.normals, True), (rng.standard_normal((500, 3)), False)):
-        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        inside = (start.hull.vertices @ normals.T).max(axis=0) - (vertices @ normals.T).max(axis=0)
-        beyond = made.margin_m - SLOP_M - inside
-        assert beyond.max() < 1e-9
-        assert not tight or beyond.min() > -1e-9
-    assert made.margin_m == pytest.approx(MARGIN_M)
+def test_the_octants_of_a_hull_lie_in_it_and_have_all_of_its_vertices(name):
+    """So that the lowest point of the parts is the hull's in every direction."""
+    (hull,) = make_body(start_of(asset_of(SHAPES[name]))).parts
+    parts = octants(hull)
+    assert len(parts) <= 8
+    every = np.concatenate(parts)
+    assert {tuple(point) for point in hull} <= {tuple(point) for point in every}
+    faces = convex_hull(hull).normals
+    assert ((every @ faces.T).max(axis=0) <= (hull @ faces.T).max(axis=0) + 1e-12).all()
+    directions = np.random.default_rng(0).standard_normal((500, 3))
+    assert (every @ directions.T).max(axis=0) == pytest.approx((hull @ directions.T).max(axis=0), abs=1e-15)
 
 
-def test_a_plate_thinner_than_four_margins_gets_a_margin_of_a_quarter_of_its_thickness():
-    start = start_of(asset_of(box(0.2, 0.2, 0.0002)))
-    made = make_body(start, PHYSICS)
-    assert made.margin_m == pytest.approx(0.0002 / 4 + SLOP_M)
-    half = transform(made.T_obj_body, made.parts[0])[:, 2].max()
-    assert half == pytest.approx(0.0001 - 0.0002 / 4, abs=1e-8)
+@pytest.mark.parametrize("size", [(0.1, 0.1, 0.1), (0.2, 0.1, 1e-4)])
+def test_every_octant_has_a_volume_even_that_of_a_plate_with_one_corner(size):
+    (hull,) = make_body(start_of(asset_of(box(*size)))).parts
+    for part in octants(hull):
+        spread = np.linalg.svd(part - part.mean(axis=0), compute_uv=False)
+        assert spread.min() > 0.1 * min(size)
 
 
-def test_parts_become_parts_of_one_body_with_one_margin_about_the_centre_of_mass_of_all():
+def test_only_a_hull_that_meets_level_ground_alone_is_cut():
+    start, none = start_of(CAN), EffectPlan((), {})
+    assert len(rigid_body.build_body(start, PHYSICS, none, level=True).parts) == 8
+    assert len(rigid_body.build_body(start, PHYSICS, none).parts) == 1
+
+
+def test_parts_become_parts_of_one_body_about_the_centre_of_mass_of_all():
     legs = [box(0.02, 0.1, 0.1, (x, 0, 0.05)) for x in (-0.09, 0.09)]
     top = box(0.2, 0.1, 0.001, (0, 0, 0.1005))
     start = start_of(asset_of(*legs, top))
-    made = make_body(start, PHYSICS, parts=tuple(np.asarray(m.vertices) for m in (*legs, top)))
+    made = make_body(start, parts=tuple(np.asarray(m.vertices) for m in (*legs, top)))
     assert len(made.parts) == 3
-    assert made.margin_m == pytest.approx(MARGIN_M)  # the board's millimetre is ten margins
     for part, mesh in zip(made.parts, (*legs, top), strict=True):
         back = transform(made.T_obj_body, part)
-        inset = made.margin_m - SLOP_M
-        assert back.min(axis=0) == pytest.approx(mesh.bounds[0] + inset, abs=2e-8)
-        assert back.max(axis=0) == pytest.approx(mesh.bounds[1] - inset, abs=2e-8)
+        assert back.min(axis=0) == pytest.approx(mesh.bounds[0], abs=1e-12)
+        assert back.max(axis=0) == pytest.approx(mesh.bounds[1], abs=1e-12)
     far = np.linalg.norm(start.hull.vertices - start.asset.mass.com, axis=1).max()
     assert made.reach_m == pytest.approx(far)
-
-
-def test_a_thin_part_makes_the_margin_of_all_smaller():
-    thin = box(0.2, 0.1, 0.0002, (0, 0, 0.1001))
-    start = start_of(asset_of(box(0.2, 0.1, 0.1, (0, 0, 0.05)), thin))
-    cut = (np.asarray(box(0.2, 0.1, 0.1, (0, 0, 0.05)).vertices), np.asarray(thin.vertices))
-    made = make_body(start, PHYSICS, parts=cut)
-    assert made.margin_m == pytest.approx(0.0002 / 4 + SLOP_M)
-    thick = transform(made.T_obj_body, made.parts[0])  # made smaller by as little as the thin one
-    assert thick.min(axis=0) == pytest.approx(np.array([-0.1, -0.05, 0.0]) + 0.0002 / 4, abs=2e-8)
 
 
 def test_the_box_about_an_object_has_its_size_along_its_own_axes_and_its_lowest_point():
