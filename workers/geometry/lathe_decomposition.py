@@ -22,6 +22,8 @@ simulator's step of a body that stands on a foot ring takes three to nine times 
 wedge of the ring touches the ground; on its side up to three times, of a bowl up to ten.
 """
 
+import itertools
+import math
 from collections.abc import Sequence
 
 import manifold3d
@@ -33,6 +35,7 @@ from schemas.scene.shape import Loft
 from workers.geometry.convex_partition import Indices, partition_outlines
 from workers.geometry.convexity import mesh_of
 from workers.geometry.hull import convex_hull, least_width_m
+from workers.geometry.jit import compiled
 from workers.geometry.manifold import hold_to_one_thread
 from workers.geometry.visible_slabs import is_covered, ring_points, stack_slabs, trace_visible_border
 
@@ -130,7 +133,10 @@ def _cut_wedges(columns: Array, cell: Indices, bands: Indices, tolerance: float,
         last = first + 1
         while last < count:
             over = np.arange(first, last + 2) % count
-            if _protrusion(begin[:, over], end[:, over]) > times * tolerance:
+            if (
+                _protrusion(np.ascontiguousarray(begin[:, over]), np.ascontiguousarray(end[:, over]))
+                > times * tolerance
+            ):
                 break
             last += 1
         over = np.arange(first, last + 1) % count
@@ -140,15 +146,27 @@ def _cut_wedges(columns: Array, cell: Indices, bands: Indices, tolerance: float,
     return parts
 
 
+@compiled
 def _protrusion(begin: Array, end: Array) -> float:
     """Distance by which a cell lies outside the planes of its facets; begin, end [M, k, 3]: of its sides, along k columns."""
-    across = np.cross(begin[:, 1:] - end[:, :-1], end[:, 1:] - begin[:, :-1]).reshape(-1, 3)
-    length = np.linalg.norm(across, axis=1)
-    kept = length > 0.0
-    normals = across[kept] / length[kept, None]
-    corners = np.stack([begin[:, 1:], end[:, :-1], end[:, 1:], begin[:, :-1]], axis=2).reshape(-1, 4, 3)[kept]
-    reach = (corners * normals[:, None]).sum(axis=2).max(axis=1)
-    return float((begin.reshape(-1, 3) @ normals.T - reach).max(initial=0.0))
+    most = 0.0
+    for side in range(begin.shape[0]):
+        for column in range(begin.shape[1] - 1):
+            a, b = begin[side, column], begin[side, column + 1]
+            c, d = end[side, column], end[side, column + 1]
+            p, q = b - c, d - a
+            x, y, z = p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
+            length = math.sqrt(x * x + y * y + z * z)
+            if length == 0.0:
+                continue
+            reach = -np.inf
+            for corner in (a, b, c, d):
+                reach = max(reach, x * corner[0] + y * corner[1] + z * corner[2])
+            for other in range(begin.shape[0]):
+                for number in range(begin.shape[1]):
+                    point = begin[other, number]
+                    most = max(most, (x * point[0] + y * point[1] + z * point[2] - reach) / length)
+    return most
 
 
 def _split_twisted(wedge: Array, begin: Array, end: Array, tolerance: float) -> list[Array]:
@@ -157,17 +175,16 @@ def _split_twisted(wedge: Array, begin: Array, end: Array, tolerance: float) -> 
     begin, end [F, k, 3]: of the outline's sides that facets are on. A facet's diagonal is the one of `loft`.
     """
     parts = [wedge]
-    corners = (begin[:, :-1], begin[:, 1:], end[:, 1:], end[:, :-1])
-    for a, b, c, d in np.stack(corners, axis=2).reshape(-1, 4, 3):
-        planes = [(np.cross(b - a, c - a), b), (np.cross(c - a, d - a), d)]
-        lengths = [float(np.linalg.norm(normal)) for normal, _ in planes]
-        if min(lengths) == 0.0 or float((d - a) @ planes[0][0]) <= tolerance * lengths[0]:
-            continue
+    a, b, c, d = (each.reshape(-1, 3) for each in (begin[:, :-1], begin[:, 1:], end[:, 1:], end[:, :-1]))
+    normals = np.stack([np.cross(b - a, c - a), np.cross(c - a, d - a)], axis=1)  # [F, 2, 3]
+    lengths = np.linalg.norm(normals, axis=2)
+    valley = ((d - a) * normals[:, 0]).sum(axis=1) > tolerance * lengths[:, 0]
+    for facet in np.flatnonzero(valley & (lengths.min(axis=1) > 0.0)):
+        planes = zip(normals[facet] / lengths[facet, :, None], (b[facet], d[facet]), strict=True)
         parts = [
             mesh_of(rest).vertices
-            for part in parts
-            for (normal, at), length in zip(planes, lengths, strict=True)
-            if not (rest := _trim_above(part, normal / length, at)).is_empty()
+            for part, (normal, at) in itertools.product(parts, tuple(planes))
+            if not (rest := _trim_above(part, normal, at)).is_empty()
         ]
     return parts
 

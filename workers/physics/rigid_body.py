@@ -24,7 +24,7 @@ themselves, which takes Bullet longer."""
 MARGIN_SHARE = 2e-4
 """Upper bound on the margin as a share of the reach: what is a few millimetres small would lean by it."""
 
-DIRECTIONS = 128
+DIRECTIONS = 96
 """Directions, evenly over a sphere, in which coarse parts keep their farthest vertex: a third of the time of a pile's step
 goes where Bullet looks for it."""
 
