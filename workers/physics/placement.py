@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from shapely.geometry import MultiPoint, Point
 
-from schemas.base import Array, Pose, frozen_array
+from schemas.base import Pose, frozen_array
 from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.region import REGION_TABLE
 from schemas.scene.scene import ContactForce
@@ -19,6 +18,7 @@ from workers.physics.bullet import GRAVITY_M_S2
 from workers.physics.rest.contacts import Contacts, find_contacts, find_near_features
 from workers.physics.rest.rest import DOWN, FALL_M, Thing
 from workers.physics.rest.step import Inertia, Motion, step
+from workers.physics.rest_pose import support_margin
 from workers.physics.separation import NEAR_M, Form, find_gaps_m
 
 TOUCHING_M = 1e-5
@@ -132,7 +132,7 @@ def _describe(
     held = points[normals[:, 2] > HELD_FROM]
     return Support(
         gap_m,
-        support_margin_m(held, body.com) if len(held) else -size_m,
+        support_margin(held[:, :2], body.com[:2]) if len(held) else -size_m,
         float(max(np.linalg.norm(motion.moves[number]), np.linalg.norm(moment))) / FALL_M,
         float(points[:, 2].max(initial=-np.inf)),
         tuple(
@@ -140,16 +140,3 @@ def _describe(
             for k in np.flatnonzero(forces.any(axis=1))
         ),
     )
-
-
-def support_margin_m(points: Array, com: Array) -> float:
-    """Metres from the projected centre of mass [3] to the edge of the level hull of contact points [N, 3]; negative outside.
-
-    For contacts on a line or a point: minus the distance to it. -inf without contacts.
-    """
-    if len(points) == 0:
-        return -np.inf
-    outline, at = MultiPoint(points[:, :2]).convex_hull, Point(com[:2])
-    if outline.geom_type == "Polygon" and outline.contains(at):
-        return float(outline.exterior.distance(at))
-    return -float(outline.distance(at))

@@ -36,7 +36,8 @@ onto the mesh, of the many that roll to an edge; a stack on it gains energy, fou
 class Pace:
     """Steps per second, solver iterations, travel per step and rest window, as shares of what the settings say.
 
-    At a share of the window objects rest at as much more speed. thin: upper bound on the travel per step, as a share of the thinnest object's width.
+    At a share of the window objects rest at as much more speed. thin: upper bound on the travel per step, as a share of the
+    thinnest object's width.
     """
 
     rate: float = 1.0

@@ -1,13 +1,12 @@
 """Rest poses on a level support: the correction onto a face, and the margin of support. Pure."""
 
 import numpy as np
-from scipy.spatial import ConvexHull
+from shapely.geometry import MultiPoint, Point
 
 from schemas.base import Array, Pose
 from schemas.scene.shape import Hull, Mesh
 from workers.geometry.elevation import Terrain, sample_elevation
 from workers.geometry.frames import pose, rotation_between, transform
-from workers.physics.table_top import inside_margin
 
 SAME_PLANE_M = 1e-6
 """Vertices within this height of the lowest one lie in one level face with it."""
@@ -53,18 +52,16 @@ def stands_on_face(vertices: Array, down: Array) -> bool:
 
 
 def support_margin(contacts_xy: Array, com_xy: Array) -> float:
-    """Metres from the projected centre of mass to the edge of the hull of contact points [N, 2]; negative outside.
+    """Metres from the projected centre of mass [2] to the edge of the hull of contact points [N, 2]; negative outside.
 
-    Without three contacts that span an area: minus the distance to the nearest contact.
+    For contacts on a line or a point: minus the distance to it. -inf without contacts.
     """
-    if len(contacts_xy) >= 3:
-        spread = np.linalg.svd(contacts_xy - contacts_xy.mean(axis=0), compute_uv=False)[-1]
-        if spread > 1e-9:
-            outline = contacts_xy[ConvexHull(contacts_xy).vertices]
-            return float(inside_margin(com_xy[None, :], outline)[0])
     if len(contacts_xy) == 0:
         return -np.inf
-    return -float(np.linalg.norm(contacts_xy - com_xy, axis=1).min())
+    outline, at = MultiPoint(contacts_xy).convex_hull, Point(com_xy)
+    if outline.geom_type == "Polygon" and outline.contains(at):
+        return float(outline.exterior.distance(at))
+    return -float(outline.distance(at))
 
 
 def find_contacts_xy(hull: Hull, T_world_obj: Pose, support: Mesh | Terrain) -> Array:

@@ -20,7 +20,6 @@ from workers.physics.placement import (
     place,
     place_on_top,
     placed_mesh,
-    support_margin_m,
 )
 from workers.physics.separation import FARTHEST_M
 from workers.physics.table_top import place_table
@@ -138,12 +137,3 @@ def test_a_steep_slope_holds_a_box_only_by_friction():
 def test_the_ground_is_as_high_as_its_table_and_a_mesh_is_where_it_was_put():
     assert Ground(TABLE).terrain.vertices is TABLE.mesh.vertices
     assert placed_mesh(CUBE, translation(1.0, 2.0, 3.0)).vertices.mean(axis=0) == pytest.approx([1.0, 2.0, 3.0])
-
-
-def test_the_margin_is_the_distance_to_the_outline():
-    square = np.array([(x, y, 0.1 * x) for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
-    assert support_margin_m(square, np.array([0.7, 0.0, 5.0])) == pytest.approx(0.3)
-    assert support_margin_m(square, np.array([1.3, 1.4, 5.0])) == pytest.approx(-0.5)
-    assert support_margin_m(square[:2], np.array([-1.2, 0.3, 0.0])) == pytest.approx(-0.2)
-    assert support_margin_m(square[:1], np.array([-1.0, -1.5, 0.0])) == pytest.approx(-0.5)
-    assert support_margin_m(np.empty((0, 3)), np.zeros(3)) == -np.inf

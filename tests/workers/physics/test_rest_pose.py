@@ -25,8 +25,8 @@ def test_the_margin_of_a_square_is_the_distance_to_its_nearest_side():
 
 
 @pytest.mark.parametrize("contacts", [np.zeros((0, 2)), np.array([[1.0, 0]]), np.array([[-1, 0], [0, 0], [2, 0.0]])])
-def test_nothing_stands_on_fewer_than_three_points_or_on_a_line(contacts):
-    assert support_margin(contacts, np.array([0.3, 0.0])) < 0
+def test_no_margin_is_left_on_fewer_than_three_points_or_on_a_line(contacts):
+    assert support_margin(contacts, np.array([0.3, 0.0])) <= 0
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.001, -0.01, 0.019])
@@ -79,3 +79,11 @@ def test_a_flat_cloud_has_a_hull_too():
 def test_a_cube_stands_on_its_face_and_not_on_its_edge():
     assert stands_on_face(CUBE.vertices, DOWN)
     assert not stands_on_face(CUBE.vertices, rotation_about(X, 0.3) @ DOWN)
+
+
+def test_on_a_line_or_a_point_the_margin_is_minus_the_distance_to_it():
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    assert support_margin(square, np.array([1.3, 1.4])) == pytest.approx(-0.5)
+    assert support_margin(square[:2], np.array([-1.2, 0.3])) == pytest.approx(-math.hypot(1.2, 0.3))
+    assert support_margin(square[:1], np.array([-1.0, -1.5])) == pytest.approx(-math.hypot(1.0, 1.5))
+    assert support_margin(np.empty((0, 2)), np.zeros(2)) == -np.inf
