@@ -24,10 +24,11 @@ class Physics(Frozen):
     """PyBullet's settings."""
 
     step_hz: Annotated[int, Field(ge=30, le=20_000)] = 960
-    """Steps a second while all objects move slowly; up to 16 times as many otherwise."""
+    """Steps a second while all objects move slowly; up to 16 times as many otherwise. A single object falls first with half as
+    many, and with up to four times as many where its energy rises."""
     max_step_travel_mm: Positive = 0.05
-    """Largest travel of the fastest point in a step; more in falls from above 25 mm, less for objects thinner than 1 mm; forty
-    times as much among several objects."""
+    """Largest travel of the fastest point in a step; more in falls from above 25 mm, less for objects thinner than 1 mm; six
+    times as much for a single object's first fall, forty times among several."""
     solver_iterations: Annotated[int, Field(ge=1, le=10_000)] = 100
     """Iterations of the contact solver in each step."""
     max_settle_s: Positive = 20.0
@@ -49,4 +50,4 @@ class Physics(Frozen):
     """Largest depth of a hollow that convex parts fill, for a mesh scaled to size 2; parts of built-in shapes are exact."""
     exact_rest: bool = True
     """Whether what the simulation leaves calm is brought to exact rest between the true meshes, and refused where it overlaps
-    or hovers by more than 0.01 mm, or has more than 1 % of its weight out of balance."""
+    or hovers by more than 0.01 mm, or has more than 0.1 % of its weight out of balance."""

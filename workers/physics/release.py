@@ -55,7 +55,7 @@ PACES = (Pace(rate=0.5, travel=6.0), Pace(travel=2.0), Pace(rate=2.0, travel=0.7
 PACES_TOGETHER = (AS_SET, Pace(rate=4.0, travel=0.25))
 """The same of several, where they are not many concave ones."""
 
-MOST_RISE = 0.4
+MOST_RISE = 0.3
 """Rise of energy, as a share of its bound, up to which a pace was slow enough: the simulation looks every eight steps, and
 between two looks the energy may have been lower."""
 
