@@ -133,6 +133,7 @@ def open_world(
     pybullet.setPhysicsEngineParameter(
         numSolverIterations=physics.solver_iterations,
         deterministicOverlappingPairs=1,
+        enableFileCaching=0,  # it would keep every object's file, 60 kB
         useSplitImpulse=1,
         splitImpulsePenetrationThreshold=0.0,
         warmStartingFactor=WARM_START if len(placed) > 1 else 0.0,
@@ -205,16 +206,12 @@ def _add_body(client: int, body: Body, R_world_body: Array | None) -> int:
     """
     parts = [np.round(part if R_world_body is None else part @ R_world_body.T, DECIMALS) for part in body.parts]
     turned = {} if R_world_body is None else _orientation(R_world_body.T)
-    if len(parts) > 1:
-        shape = _compound(client, parts, turned)
-    else:
-        vertices = _BUFFERS.vertices(parts[0])
-        shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client, **turned)
-    # The margin of a compound's parts can be set through a body in reduced coordinates alone, which shares the shape.
-    brief = pybullet.createMultiBody(body.mass_kg, shape, physicsClientId=client)
-    pybullet.changeDynamics(brief, -1, collisionMargin=body.margin_m, physicsClientId=client)
-    pybullet.removeBody(brief, physicsClientId=client)
-    thing: int = pybullet.createMultiBody(body.mass_kg, shape, useMaximalCoordinates=1, physicsClientId=client)
+    with _shape_of(client, parts, turned) as shape:
+        # The margin of a compound's parts can be set through a body in reduced coordinates alone, which shares the shape.
+        brief = pybullet.createMultiBody(body.mass_kg, shape, physicsClientId=client)
+        pybullet.changeDynamics(brief, -1, collisionMargin=body.margin_m, physicsClientId=client)
+        pybullet.removeBody(brief, physicsClientId=client)
+        thing: int = pybullet.createMultiBody(body.mass_kg, shape, useMaximalCoordinates=1, physicsClientId=client)
     moments = body.moments.tolist()
     pybullet.changeDynamics(thing, -1, mass=body.mass_kg, localInertiaDiagonal=moments, physicsClientId=client)
     return thing
@@ -224,21 +221,26 @@ def _orientation(R: Array) -> dict[str, list[float]]:
     return {"collisionFrameOrientation": quaternion_from_rotation(R).tolist()}
 
 
-def _compound(client: int, parts: Sequence[Array], turned: Mapping[str, list[float]]) -> int:
-    """A collision shape of several convex parts. PyBullet reads these from a file alone: the objects of an OBJ."""
+@contextmanager
+def _shape_of(client: int, parts: Sequence[Array], turned: Mapping[str, list[float]]) -> Iterator[int]:
+    """A collision shape of convex parts, for bodies that are made within the block.
+
+    PyBullet reads several parts from a file alone: the objects of an OBJ. It reads it again for every body.
+    """
+    if len(parts) == 1:
+        vertices = _BUFFERS.vertices(parts[0])
+        yield pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client, **turned)
+        return
     lines, first = [], 1
-    for number, vertices in enumerate(parts):
+    for number, part in enumerate(parts):
         lines.append(f"o part{number}")
-        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
-        lines += [f"f {first} {first + k} {first + k + 1}" for k in range(1, len(vertices) - 1)]
-        first += len(vertices)
+        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in part.tolist()]
+        lines += [f"f {first} {first + k} {first + k + 1}" for k in range(1, len(part) - 1)]
+        first += len(part)
     with tempfile.TemporaryDirectory(prefix="verso-parts-") as folder:
         path = Path(folder, "parts.obj")
         path.write_text("\n".join(lines), encoding="ascii")
-        shape: int = pybullet.createCollisionShape(
-            pybullet.GEOM_MESH, fileName=str(path), physicsClientId=client, **turned
-        )
-    return shape
+        yield pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path), physicsClientId=client, **turned)
 
 
 def _set_surface(client: int, thing: int, physics: Physics, body: Body | None = None) -> None:
