@@ -18,7 +18,7 @@ from services.bench.effects import (
 )
 from services.cli.main import main
 from tests.effects.physics_scenes import facts_with
-from tests.hard_cases.bodies import cube
+from tests.hard_cases.bodies import built_in, cube
 from tests.hard_cases.drops import drop, level
 from workers.physics.effects import PREDICATES
 from workers.plan.effects import names_of_kind
@@ -64,7 +64,7 @@ def test_every_approximation_is_forced_alone_and_with_the_others_once_without_de
 
 
 def test_settling_is_timed_in_each_way_but_not_with_an_effect_that_the_plan_has():
-    timed = time_settling([facts_with(drop(cube(), level()))], rounds=2)
+    timed = time_settling([facts_with(drop(built_in("mug"), level()))], rounds=2)
     seconds, failed = timed
     assert all(found.shape == (2, 1) for found in seconds.values())
     for name, found in seconds.items():
