@@ -68,11 +68,11 @@ def test_settling_is_timed_in_each_way_but_not_with_an_effect_that_the_plan_has(
     seconds, failed = timed
     assert all(found.shape == (2, 1) for found in seconds.values())
     for name, found in seconds.items():
-        if name in ("dynamics", "fine_step"):
+        if name in ("dynamics", "fine_step", "rolling_friction"):
             assert np.isnan(found).all()
         else:
             assert (found > 0.0).all()
-    assert seconds[WHOLE].sum() > seconds[PLAN].sum()
+    assert seconds[EVERYTHING].sum() > seconds[PLAN].sum()
     assert set(failed.values()) == {0}
 
 
