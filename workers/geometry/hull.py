@@ -25,7 +25,6 @@ COARSER = 1e-5
 NO_AREA = 1e-12
 """Area, as a share of the hull's size squared, below which a triangle's normal is rounding noise."""
 
-
 SAME = 1e-9
 """Difference in each coordinate below which normals are equal."""
 
@@ -72,14 +71,14 @@ def least_width_m(hull: Hull) -> float:
 
     Two crossing edges may be nearer: a regular tetrahedron's are by 13 %.
     """
-    along = hull.vertices @ hull.normals[_distinct(hull.normals, SAME)].T
+    along = hull.vertices @ hull.normals[_distinct(hull.normals)].T
     return float((along.max(axis=0) - along.min(axis=0)).min())
 
 
-def _distinct(rows: Array, near: float) -> Array:
-    """[M] ascending indices of rows [N, 3], one of those that are equal to within `near` in each coordinate."""
+def _distinct(rows: Array) -> Array:
+    """[M] ascending indices of rows [N, 3], one of those that are equal to within `SAME` in each coordinate."""
     order = np.argsort(rows @ SCATTER, kind="stable")
     ranked = rows[order]
     new = np.ones(len(rows), dtype=bool)
-    new[1:] = (np.abs(ranked[1:] - ranked[:-1]) > near).any(axis=1)
+    new[1:] = (np.abs(ranked[1:] - ranked[:-1]) > SAME).any(axis=1)
     return np.sort(order[new])

@@ -71,7 +71,7 @@ class World:
         pybullet.stepSimulation(physicsClientId=self.client)
 
     def set_rate(self, step_hz: float) -> None:
-        """Set the steps per second."""
+        """Set the steps per second, and by it how far the solver iterates."""
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=self.steps / step_hz,
             numSubSteps=self.steps,

@@ -15,7 +15,7 @@ CONTACT_M = 5e-5
 """Distance below which a vertex touches the support."""
 
 STEADY_M = 2e-4
-"""Margin of support below which a simulator may tip the object: its edges are rounded by a margin of half as much."""
+"""Margin of support below which a simulator may tip the object: its edges are rounded by a margin of a tenth of it."""
 
 NEAR_LOWEST_M = 0.02
 """Only vertices within this height of the lowest one can touch a support that is level to within a few degrees."""

@@ -1,5 +1,7 @@
 """What the simulator is told of a scene: the size of steps, and the settings of the effects that the plan runs."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,7 @@ from workers.geometry.frames import pose
 from workers.geometry.hull import convex_hull
 from workers.physics.fall import fall
 from workers.physics.placement import Ground
-from workers.physics.release import Drop, release
+from workers.physics.release import MOST_RISE, PACES, PACES_TOGETHER, Drop, release
 from workers.physics.table_top import place_table
 
 PHYSICS = Job(name="t").physics
@@ -81,3 +83,29 @@ def test_objects_as_boxes_keep_the_height_of_their_lowest_point_together_as_alon
     alone = [release(Drop((start,), GROUND, physics, plan), flat=True) for start in starts]
     for together, one in zip(both.poses, alone, strict=True):
         assert together[2, 3] == pytest.approx(one.poses[0][2, 3], abs=1e-4)
+
+
+def rates_of_falls(drop: Drop, rises: list[float], monkeypatch) -> list[float]:
+    """The rates, over the job's, of one fall after the other, when energy rises by these shares of its bound."""
+    rates, left = [], iter(rises)
+
+    def risen(*given):
+        rates.append(given[4].base_hz / PHYSICS.step_hz)
+        return dataclasses.replace(fall(*given), rise=next(left))
+
+    monkeypatch.setattr("workers.physics.release.fall", risen)
+    release(drop, flat=True)
+    return rates
+
+
+def test_what_gains_energy_falls_again_in_shorter_steps_until_it_gains_none(monkeypatch):
+    brief = PHYSICS.model_copy(update={"max_settle_s": 0.01})
+    alone = Drop((start_of(CUBE, 0, 0, 0.031),), GROUND, brief, EffectPlan(("dynamics", "fine_step"), {}))
+    both = dataclasses.replace(alone, starts=(start_of(CUBE, -0.2, 0, 0.031), start_of(CUBE, 0.2, 0, 0.031)))
+    more = 1.01 * MOST_RISE
+    assert rates_of_falls(alone, [0.99 * MOST_RISE], monkeypatch) == [PACES[0].rate]
+    assert rates_of_falls(alone, [more, more, 0.0], monkeypatch) == [pace.rate for pace in PACES[:3]]
+    assert rates_of_falls(alone, [more] * 9, monkeypatch) == [pace.rate for pace in PACES]
+    assert rates_of_falls(both, [more] * 9, monkeypatch) == [pace.rate for pace in PACES_TOGETHER]
+    exact = dataclasses.replace(alone, exact=True)
+    assert rates_of_falls(exact, [more] * 9, monkeypatch) == [1.0]
