@@ -13,7 +13,8 @@ from schemas.errors import InputError
 from schemas.job.job import Job
 from schemas.job.keys import set_key
 from schemas.job.preset import PRESETS
-from services.job.read import describe_fault, did_you_mean
+from schemas.nearest import did_you_mean
+from services.job.faults import describe_fault
 from services.study.captures.knobs import capture_knobs
 from services.study.model import Changes, Group, Knob, Setting, Value
 

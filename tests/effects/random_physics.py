@@ -10,7 +10,7 @@ import shapely
 import trimesh
 
 from schemas.base import Pose
-from schemas.job.job import CATEGORIES
+from schemas.job.category import CATEGORIES
 from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.scene import Settled
 from tests.effects.physics_cases import on_a_bumpy_table

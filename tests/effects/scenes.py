@@ -11,7 +11,7 @@ import numpy as np
 
 import workers.pipeline.make_scene
 from schemas.job.identity import settings_digest
-from schemas.job.job import Category, Job
+from schemas.job.job import Job
 from schemas.scene.plan import ScenePlan
 from schemas.scene.shape import Part, Shape
 from services.job.read import validate_job
@@ -84,7 +84,7 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
 
 
 @cache
-def _catalogue(categories: tuple[Category, ...]) -> Catalogue:
+def _catalogue(categories: tuple[str, ...]) -> Catalogue:
     return open_catalogue(Job(name="c").assets, Path(), categories)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from schemas.errors import SceneError
-from schemas.job.job import CATEGORIES
+from schemas.job.category import CATEGORIES
 from schemas.scene.camera import Camera
 from schemas.scene.region import REGION_FLOOR, REGION_TABLE
 from schemas.scene.scene import Placed

@@ -7,13 +7,14 @@ import pytest
 
 from schemas.errors import SceneError
 from schemas.job.job import Job
+from schemas.job.physics import Physics
 from schemas.scene.scene import Settled
 from tests.hard_cases.case import Made
 from tests.hard_cases.chaotic_cases import CHAOTIC, FIRST, SEEDS, Chaotic
 from tests.hard_cases.gate import verdicts, what_is_wrong
 from tests.hard_cases.spin import spinning
 from tests.hard_cases.test_hard_cases import MOVED_MM, TURNED_DEG
-from tests.hard_cases.waiting import marks_of
+from tests.hard_cases.waiting import MOVES, marks_of
 from tests.physics.settling import recheck_group, settle_group
 
 PHYSICS = Job(name="t").physics
@@ -40,10 +41,14 @@ def wrong_with(case: Chaotic, seed: int) -> str:
     found = what_is_wrong(verdicts(made, end, physics))
     if (figure := case.measure.of(made, end)) > case.measure.bound:
         found = f"{case.measure.what}: {figure:.4g} of {case.measure.bound:g}; {found}"
+    return "; ".join(filter(None, (found, "" if case.name in MOVES else moves(made, end, physics))))
+
+
+def moves(made: Made, end: tuple[Settled, ...], physics: Physics) -> str:
+    """How far something moves when all are let go again; empty within the bounds."""
     motions = recheck_group(made.starts, end, made.table, physics)
     mm, degrees = max(one for one, _ in motions), max(one for _, one in motions)
-    moved = f"moves by {mm:.3f} mm and {degrees:.3f} degrees" if mm > MOVED_MM or degrees > TURNED_DEG else ""
-    return "; ".join(filter(None, (found, moved)))
+    return f"moves by {mm:.3f} mm and {degrees:.3f} degrees" if mm > MOVED_MM or degrees > TURNED_DEG else ""
 
 
 def rows(tiers: str) -> list[Any]:
@@ -60,6 +65,18 @@ def rows(tiers: str) -> list[Any]:
 def test_the_first_seeds_rest_through_the_gate(case):
     found = {seed: wrong_with(case, seed) for seed in range(FIRST)}
     assert {seed: wrong for seed, wrong in found.items() if wrong} == {}
+
+
+@pytest.mark.minute
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, id=case.name, marks=marks_of(case.name, True)) for case in CHAOTIC if case.name in MOVES],
+)
+def test_the_first_seeds_of_what_moves_stay_where_they_are(case):
+    for seed in range(FIRST):
+        made, end = ending(case, seed)
+        assert not isinstance(end, SceneError)
+        assert moves(made, end, PHYSICS) == ""
 
 
 @pytest.mark.timeout(3600)

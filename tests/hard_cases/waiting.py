@@ -6,14 +6,19 @@ import pytest
 
 WAITING: dict[str, str] = {
     "pile of a hundred boxes": "no result in 40 s",
-    "needle of 0.2 by 200 mm tumbled": "it falls through the table: two seeds of two",
     "stack of twenty-five cubes": "no result in 90 s",
 }
 """What ends otherwise than declared, and how."""
 
 BULLET = "Bullet, which lets it go again, moves it: its parts and its friction are not quite those of exact rest"
 
-MOVES: dict[str, str] = dict.fromkeys(("ring hung on a finger", "ball in a bowl from a file"), BULLET)
+MOVES: dict[str, str] = {
+    "ring hung on a finger": BULLET,
+    "ball in a bowl from a file": BULLET,
+    "pile of twenty boxes": "Bullet moves boxes that friction holds against one another, by 0.2 to 7 mm in ten seeds of twenty; "
+    "more solver iterations, smaller margins and a smaller slop change little",
+    "needle of 0.2 by 200 mm tumbled": "its sides are 13 micrometres wide, and Bullet keeps a hull's corners on a grid of 20",
+}
 """What moves by more than 0.1 mm or 0.1 degrees in the second after it is let go again."""
 
 

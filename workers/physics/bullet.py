@@ -93,6 +93,15 @@ class World:
         """Set the velocity of a centre of mass, m/s, and the angular velocity, rad/s, world axes."""
         pybullet.resetBaseVelocity(self.bodies[body], list(velocity), list(spin), physicsClientId=self.client)
 
+    def let_sleep(self, body: int) -> None:
+        """Compute no motion of a body in the next `advance`, and no contacts among such ones, unless one that moves touches it.
+
+        Bullet wakes it after `advance` where there are other bodies.
+        """
+        pybullet.changeDynamics(
+            self.bodies[body], -1, activationState=pybullet.ACTIVATION_STATE_SLEEP, physicsClientId=self.client
+        )
+
     def set_gravity(self, gravity: Sequence[float]) -> None:
         """Set gravity, m/s^2, in this world alone."""
         pybullet.setGravity(*gravity, physicsClientId=self.client)

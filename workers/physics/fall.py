@@ -102,10 +102,12 @@ def fall(
     steps: StepSizes,
     free_m: float,
     stops: Mapping[str, StopCondition] | None = None,
+    sleeping: bool = False,
 ) -> Outcome:
     """Release objects at `poses` (`T_world_obj`) until all rest, `physics.max_settle_s` is over, or a stop condition holds.
 
-    The first `free_m` metres are fallen in closed form, which is exact: nothing turns in the air.
+    The first `free_m` metres are fallen in closed form, which is exact: nothing turns in the air. sleeping: what rests costs no
+    time until something that moves touches it.
     """
     fallen_m = min(max(0.0, free_m - SKIPPED_TO_M), GRAVITY_M_S2 * physics.max_settle_s**2 / 2)
     lower = translation(0.0, 0.0, -fallen_m)
@@ -116,7 +118,7 @@ def fall(
     with open_world(placed, ground, physics, SAMPLE_STEPS, reach_m) as world:
         for number in range(len(bodies)):
             world.set_velocity((0.0, 0.0, -speed_m_s), body=number)
-        outcome = _simulate(world, bodies, physics, steps, physics.max_settle_s - fallen_s, stops or {})
+        outcome = _simulate(world, bodies, physics, steps, physics.max_settle_s - fallen_s, stops or {}, sleeping)
     ended = tuple(T @ invert(one.T_obj_body) for T, one in zip(outcome.poses, bodies, strict=True))
     return dataclasses.replace(outcome, poses=ended, seconds=outcome.seconds + fallen_s)
 
@@ -137,6 +139,7 @@ def _simulate(
     steps: StepSizes,
     end_s: float,
     stops: Mapping[str, StopCondition],
+    sleeping: bool,
 ) -> Outcome:
     """Step until all rest, the time is over or a stop condition holds; the poses are those of the body frames.
 
@@ -167,11 +170,13 @@ def _simulate(
         for name, stop in stops.items():
             if any(stop(one) for one in at):
                 return Outcome(tuple(map(as_pose, at)), max(speeds), time, False, name)
-        for one, now, body, speed in zip(still, at, bodies, speeds, strict=True):
+        for number, (one, now, body, speed) in enumerate(zip(still, at, bodies, speeds, strict=True)):
             turned = _angle(one.anchor[1], now[1])
             one.moved_m = math.dist(one.anchor[0], now[0]) + turned * body.reach_m
             if speed > CALM_M_S or one.moved_m > drift_m or turned > turn_rad:
                 one.anchor, one.since = now, time
+            elif sleeping and time - one.since >= rest.window_s:
+                world.let_sleep(number)
         if all(time - one.since >= rest.window_s for one in still):
             drift_m_s = max(one.moved_m / (time - one.since) for one in still)
             return Outcome(tuple(map(as_pose, at)), drift_m_s, time, True, rise=energy.rise())

@@ -129,7 +129,7 @@ def _release(drop: Drop, flat: bool) -> Outcome:
     T_world_body = poses[0] @ bodies[0].T_obj_body
     if math.isfinite(drop.room_m):
         stops["room"] = leaves_room(T_world_body[:2, 3], drop.room_m)
-    return fall(bodies, poses, ground, physics, steps, free_m, stops)
+    return fall(bodies, poses, ground, physics, steps, free_m, stops, sleeping=drop.many)
 
 
 def _prism(table: Table) -> Array:

@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from schemas.job.assets import ProceduralSource
-from schemas.job.job import CATEGORIES
+from schemas.job.category import CATEGORIES
 from workers.assets.builtin.make import make_asset
 from workers.geometry.hull import MOST_VERTICES, convex_hull, least_width_m
 

@@ -14,7 +14,7 @@ from schemas.job.job import Job
 from tests.physics.room import at, ball_body, drop, physics
 from tests.shapes import box
 from workers.geometry.frames import pose, quaternion_from_rotation, rotation_about
-from workers.physics.bullet import GRAVITY_M_S2
+from workers.physics.bullet import GRAVITY_M_S2, open_world
 from workers.physics.rigid_body import Body
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -55,6 +55,20 @@ def fall(body: Body, T, advances: int = 60):
         for _ in range(advances):
             world.advance()
         return world.pose(), world.velocity()
+
+
+def test_what_sleeps_hangs_in_the_air_until_something_falls_onto_it():
+    body = body_of(box(0.1, 0.1, 0.1))
+    with open_world([(body, at(0.0, 1.0)), (body, at(0.0, 1.3))], 0.0, PHYSICS, STEPS) as world:
+        for _ in range(20):  # 0.17 s, in which the upper one falls 0.14 of the 0.2 m between them
+            world.let_sleep(0)
+            world.advance()
+        assert world.pose(0)[0][2] == 1.0
+        assert world.pose(1)[0][2] < 1.2
+        for _ in range(20):
+            world.let_sleep(0)
+            world.advance()
+        assert world.pose(0)[0][2] < 0.99
 
 
 def test_a_body_in_the_air_falls_as_half_g_t_squared():

@@ -114,3 +114,18 @@ def test_a_corner_that_comes_down_beside_an_edge_of_a_mesh_does_not_sink_in(head
     lowest = transform(end.poses[0], corners)[:, 2].min() - 1e-4
     assert end.seconds > 0.035
     assert -1.3e-5 < lowest < 1e-5
+
+
+def test_a_domino_that_sleeps_is_knocked_over_as_one_that_is_awake():
+    domino = asset_of(box(0.01, 0.08, 0.2))
+    standing = ObjectStart(domino, convex_hull(domino.shape.vertices), 3, translation(0.0, 0.0, 0.1 + 2e-5), 0, False)
+    falling = start_at(pose(rotation_about(np.array([0.0, 1.0, 0.0]), 0.5), np.array([0.05, 0.0, 2.0])))
+    poses = [start.T_world_obj for start in (standing, falling)]
+    bodies = [make_body(start) for start in (standing, falling)]
+    awake, asleep = (
+        fall(bodies, poses, 0.0, for_seconds(5.0), StepSizes(960.0, 1e-3), 0.0, sleeping=sleeping)
+        for sleeping in (False, True)
+    )
+    assert awake.rested and asleep.rested
+    assert abs(awake.poses[0][2, 2]) < 1e-6  # flat
+    assert asleep.poses[0] == pytest.approx(awake.poses[0], abs=1e-3)

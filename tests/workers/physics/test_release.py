@@ -40,9 +40,9 @@ def test_steps_are_as_fine_as_the_highest_fall_and_the_thinnest_object_ask(heigh
     """For several 2 mm, or 0.002 of the fall if that is more, or 0.05 of the thinnest if that is less."""
     seen = []
 
-    def told(*arguments):
+    def told(*arguments, **more):
         seen.append(arguments[4])
-        return fall(*arguments)
+        return fall(*arguments, **more)
 
     monkeypatch.setattr("workers.physics.release.fall", told)
     small = asset_of(box(side_m, side_m, side_m))
@@ -89,9 +89,9 @@ def rates_of_falls(drop: Drop, rises: list[float], monkeypatch) -> list[float]:
     """The rates, over the job's, of one fall after the other, when energy rises by these shares of its bound."""
     rates, left = [], iter(rises)
 
-    def risen(*given):
+    def risen(*given, **more):
         rates.append(given[4].base_hz / PHYSICS.step_hz)
-        return dataclasses.replace(fall(*given), rise=next(left))
+        return dataclasses.replace(fall(*given, **more), rise=next(left))
 
     monkeypatch.setattr("workers.physics.release.fall", risen)
     release(drop, flat=True)

@@ -103,8 +103,8 @@ def test_what_is_let_go_again_is_watched_to_the_end_however_still_it_stands(monk
     start, watched = start_of(asset_of(box(0.1, 0.08, 0.2)), translation(0.0, 0.0, TOP + 0.11)), []
     rest = settle_single(start, TABLE, PHYSICS)
 
-    def told(*arguments):
-        watched.append(fall(*arguments))
+    def told(*arguments, **more):
+        watched.append(fall(*arguments, **more))
         return watched[-1]
 
     monkeypatch.setattr("workers.physics.release.fall", told)

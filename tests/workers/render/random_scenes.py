@@ -8,7 +8,7 @@ import trimesh
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.job.assets import Assets
-from schemas.job.job import CATEGORIES
+from schemas.job.category import CATEGORIES
 from schemas.scene.appearance import Appearance, Light
 from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed
