@@ -4,9 +4,14 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from schemas.base import Folder, Frozen, Positive, PositiveInt, Seed, Share, Text, Weight
+from schemas.job.category import MappedName
+from schemas.job.pattern import matches
+
+UpAxis = Literal["x", "y", "z"]
+"""An axis of a file."""
 
 
 class ProceduralSource(Frozen):
@@ -52,11 +57,12 @@ class FolderSource(Frozen):
     """Share of this source among the sources that offer a scene's category."""
     folder: Folder
     """A folder relative to the job file, or `pybullet_data` for the meshes inside that package."""
-    category_map: dict[Folder, Text] = Field(default_factory=dict)
-    """Category by file pattern (glob relative to `folder`); the first match wins. Empty: the map that is built in for
-    `pybullet_data`."""
-    up: Literal["x", "y", "z"] = "z"
-    """Which axis of the source points up."""
+    category_map: dict[Folder, MappedName] = Field(default_factory=dict)
+    """Category, of any name, or `table`, by file pattern (glob relative to `folder`); the first match wins. Empty: the map that
+    is built in for `pybullet_data`."""
+    up: UpAxis | dict[Folder, UpAxis] = "z"
+    """Which axis of the files points up: one for all, or a map from file patterns, such as `{"*.glb": y, "**/*.obj": z}`; the
+    first match wins, and what none matches has z up."""
     scale: Positive = 1.0
     """Multiplies the source's coordinates: 0.001 for millimetres."""
     diagonal_m: Positive | None = None
@@ -65,6 +71,22 @@ class FolderSource(Frozen):
     """Licence of these shapes, for the `assets` table."""
     copy_assets: bool = False
     """Whether the cleaned shapes may be written into the dataset."""
+
+    @field_validator("up", mode="before")
+    @classmethod
+    def _names_axes(cls, value: object) -> object:
+        axes = value.values() if isinstance(value, dict) else (value,)
+        if not all(isinstance(axis, str) and axis in ("x", "y", "z") for axis in axes) or value == {}:
+            raise ValueError(
+                'must be x, y or z, or a map from file patterns to them, such as {"*.glb": y, "**/*.obj": z}'
+            )
+        return value
+
+    def up_of(self, path: str) -> UpAxis:
+        """Which axis of a file points up; `path` is relative to the folder."""
+        if isinstance(self.up, str):
+            return self.up
+        return next((axis for pattern, axis in self.up.items() if matches(path, pattern)), "z")
 
 
 Source = Annotated[ProceduralSource | ShapeNetSource | FolderSource, Field(discriminator="source")]

@@ -22,6 +22,7 @@ from schemas.base import (
     Share,
     Text,
 )
+from schemas.job.category import CategoryName
 from schemas.job.keys import set_key
 from schemas.job.sensor import Distortion, Exposure, RgbNoise
 
@@ -197,7 +198,7 @@ class Captures(Frozen):
     """Virtual captures with known truth, or folders of photographs."""
     folders: Annotated[list[Folder], Field(max_length=10_000)] = Field(default_factory=list)
     """For source `folders`: one folder a capture, in order; relative to the job file."""
-    category: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")] = "object"
+    category: CategoryName = "object"
     """For source `folders`: the category of captures whose capture.json names none."""
     board: Board = Board()
     """The marker board of simulated captures; a folder has its own board.json."""

@@ -3,14 +3,23 @@
 Every key but `name` has a default, and an unknown key is an error.
 """
 
+import re
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from schemas.base import Frozen, NonNegativeInt, PositiveInt, Seed, Weight
 from schemas.job.assets import Assets
 from schemas.job.cameras import Cameras
 from schemas.job.captures import Captures, with_capture_keys
+from schemas.job.category import CATEGORIES, CategoryName, describe_unknown, offered_by, with_categories
 from schemas.job.images import Images
 from schemas.job.physics import Physics
 from schemas.job.preset import PresetName, with_preset
@@ -20,11 +29,19 @@ from schemas.job.run import Check, Output, Run
 from schemas.job.sensor import SensorEffects
 from schemas.job.start import ONE_OBJECT, ObjectCount, Start
 
-Category = Literal["bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box"]
-CATEGORIES: tuple[Category, ...] = ("bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box")
-
 MOST_SCENE_IDS = 10**10
 """Ids of scenes have ten digits in the names of ranges, which sort like numbers."""
+
+
+_NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+def _usable(name: str) -> str:
+    if not _NAMES.fullmatch(name):
+        raise ValueError(
+            "a name is 1 to 64 letters, digits, ., - and _, the first a letter or digit: it names a folder"
+        )
+    return name
 
 
 class Job(Frozen):
@@ -32,7 +49,7 @@ class Job(Frozen):
 
     verso: Literal[1] = 1
     """schema_version."""
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+    name: Annotated[str, Field(max_length=1000), AfterValidator(_usable)]
     """Names the dataset; the default output folder is data/<name>."""
     preset: PresetName = "balanced"
     """Defaults of keys that are not given: `fast` and `exact` trade errors for time as measured in docs/tradeoff."""
@@ -46,8 +63,9 @@ class Job(Frozen):
     """Input and mirror poses of each scene."""
     objects_per_scene: ObjectCount = ONE_OBJECT
     """Number of objects on the table; from a range each number is equally likely. The scene's category is the first object's."""
-    categories: dict[Category, Weight] = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)
-    """Weights of the categories; a list of names means equal weights."""
+    categories: dict[CategoryName, Weight] = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)
+    """Weights of the categories, under any names that the sources offer; a list of names means equal weights. Default: all
+    that the sources offer."""
     assets: Assets = Assets()
     """Where shapes come from."""
     start: Start = Start()
@@ -74,7 +92,7 @@ class Job(Frozen):
     @model_validator(mode="before")
     @classmethod
     def _fill(cls, value: object) -> object:
-        return with_capture_keys(with_preset(value)) if isinstance(value, dict) else value
+        return with_categories(with_capture_keys(with_preset(value))) if isinstance(value, dict) else value
 
     @field_validator("categories", mode="before")
     @classmethod
@@ -93,6 +111,14 @@ class Job(Frozen):
             raise ValueError(
                 f"first_scene + scenes is {self.stop_scene}, and names of files have room for ids below {MOST_SCENE_IDS}"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _offers_categories(self) -> "Job":
+        sources = [source.model_dump() for source in self.assets.objects]
+        mapped = all(source.get("category_map", True) for source in sources)  # else known where files are listed
+        if mapped and (unknown := describe_unknown(self.categories, offered_by(sources))):
+            raise ValueError(unknown)
         return self
 
     @model_validator(mode="after")

@@ -21,8 +21,9 @@ from schemas.job.assets import (
     SplitShares,
     deciding_limits,
 )
+from schemas.job.category import CATEGORIES, TABLE
 from schemas.scene.shape import Asset
-from workers.assets.builtin.make import TABLE, VERSION, instance_id, make_asset
+from workers.assets.builtin.make import VERSION, instance_id, make_asset
 from workers.assets.external.folder import find_files
 from workers.assets.external.listing import Listing
 from workers.assets.external.opening import Watch, check_listing, ignore, load_asset_file, read_listing
@@ -64,7 +65,8 @@ class Catalogue:
         offers: list[tuple[int, AnySource, int]] = []
         for number, (settings, listing) in enumerate(self._sources(category)):
             if isinstance(settings, ProceduralSource):
-                offers.append((number, settings, settings.instances))
+                if category in (*CATEGORIES, TABLE):
+                    offers.append((number, settings, settings.instances))
             elif listing is not None and (count := listing.count(category)):
                 offers.append((number, settings, count))
         return offers
@@ -97,6 +99,10 @@ class Catalogue:
         """Sentences on the first files that were left out of a source's folder."""
         listings = (listing for listing in (*self.objects, *self.tables) if listing is not None)
         return next((x.examples for x in listings if x.examples and str(x.folder) == folder), ())
+
+    def doubts(self) -> list[Listing]:
+        """The listings with files that stand on another axis than `up` says."""
+        return [listing for listing in (*self.objects, *self.tables) if listing is not None and listing.doubts]
 
     def load(self, ref: InstanceRef) -> Asset:
         """An instance, made, or read in a limited process; MeshError where its mesh is refused or has changed."""

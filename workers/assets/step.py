@@ -7,8 +7,8 @@ from cachetools import LRUCache
 
 from schemas.errors import AssetSourceError
 from schemas.job.assets import ProceduralSource
+from schemas.job.category import TABLE
 from schemas.scene.shape import Asset
-from workers.assets.builtin.make import TABLE
 from workers.assets.catalogue import Catalogue, InstanceRef
 
 MAX_CACHED_INSTANCES = 10_000

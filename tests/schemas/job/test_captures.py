@@ -41,7 +41,7 @@ def test_a_capture_is_committed_by_itself_and_may_take_long_unless_the_job_says_
         ({"sensor": {"depth_noise": {}}}, "captures.simulate"),
         ({"render": {"rgb": False}}, "render.rgb"),
         ({"captures": {"source": "simulate"}}, "folders must be named"),
-        ({"captures": {"category": "a/b"}}, "pattern"),
+        ({"captures": {"category": "a/b"}}, "letters, digits, - and _"),
     ],
 )
 def test_what_a_capture_cannot_have_is_refused_with_its_key(changes, words):

@@ -10,7 +10,7 @@ import pytest
 
 from schemas.errors import AssetSourceError, MeshError
 from schemas.job.assets import Assets, FolderSource, MeshLimits, ProceduralSource, ShapeNetSource, SplitShares
-from schemas.job.job import CATEGORIES
+from schemas.job.category import CATEGORIES
 from tests.workers.assets.oracles import CUBE, write
 from workers.assets.catalogue import list_source, open_catalogue, split_of
 from workers.assets.external.verdicts import Verdicts

@@ -10,7 +10,7 @@ import trimesh
 
 from schemas.base import frozen_array
 from schemas.job.assets import MeshLimits, ProceduralSource
-from schemas.job.job import CATEGORIES
+from schemas.job.category import CATEGORIES
 from schemas.scene.shape import Material, Part, Shape
 from tests.shapes import asset_of
 from tests.workers.assets.oracles import welded, write

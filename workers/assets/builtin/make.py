@@ -7,6 +7,7 @@ import numpy as np
 
 from schemas.base import frozen_array
 from schemas.job.assets import ProceduralSource
+from schemas.job.category import TABLE
 from schemas.scene.shape import Asset, Shape
 from workers.assets.builtin.bottle import make_bottle
 from workers.assets.builtin.bowl import make_bowl
@@ -25,9 +26,6 @@ VERSION = 2
 """Part of the catalogue's digest: raise it with every change to a vertex or colour of any instance."""
 
 LICENCE = "CC0-1.0"
-TABLE = "table"
-"""The category of tables, which the job's categories of objects do not have."""
-
 GENERATORS: dict[str, tuple[int, Callable[[np.random.Generator], Model]]] = {
     "bottle": (0, make_bottle),
     "camera": (1, make_camera),

@@ -108,22 +108,26 @@ class FolderResolver(Resolver):
         self.notes: list[str] = []
 
     def get(self, key: str) -> bytes:
-        """The bytes of a file; raises FileNotFoundError where it is missing or refused."""
+        """The bytes of a material file or a picture; FileNotFoundError, and a note, where it is missing or refused."""
         name = str(key).strip().replace("\\", "/")
+        data = self.read(name)
+        if not name.lower().endswith(".mtl") and (why := self.budget.take_image(data)) is not None:
+            raise self.refuse(name, why)
+        return data
+
+    def read(self, name: str) -> bytes:
+        """The bytes of a file of any kind; FileNotFoundError, and a note, where it is missing or refused."""
         if self.budget.files >= self.limits.max_nodes:
-            raise self._refuse(name, f"is one of more than max_nodes = {self.limits.max_nodes} files")
+            raise self.refuse(name, f"is one of more than max_nodes = {self.limits.max_nodes} files")
         path = self.find(name)
         if path is None:
             self.budget.files += 1
-            raise self._refuse(name, "is missing")
+            raise self.refuse(name, "is missing")
         if path.stat().st_size > self.limits.max_file_mb * 1e6:
-            raise self._refuse(name, f"is larger than max_file_mb = {self.limits.max_file_mb:g}")
+            raise self.refuse(name, f"is larger than max_file_mb = {self.limits.max_file_mb:g}")
         if (why := self.budget.take_file(path.stat().st_size)) is not None:
-            raise self._refuse(name, why)
-        data = path.read_bytes()
-        if path.suffix.lower() != ".mtl" and (why := self.budget.take_image(data)) is not None:
-            raise self._refuse(name, why)
-        return data
+            raise self.refuse(name, why)
+        return path.read_bytes()
 
     def find(self, name: str) -> Path | None:
         """The file of a name, relative to the mesh or else beside it; None where there is none below `root`."""
@@ -132,10 +136,15 @@ class FolderResolver(Resolver):
             return None
         return find_inside(self.root, self.folder / name, self.folder / Path(name).name)
 
-    def _refuse(self, name: str, why: str) -> FileNotFoundError:
+    def refuse(self, name: str, why: str) -> FileNotFoundError:
+        """Notes why a file is not read, and returns the error that says so."""
+        self.note(name, why)
+        return FileNotFoundError(f"{name:.80} {why}")
+
+    def note(self, name: str, why: str) -> None:
+        """Notes that a picture or material is left out."""
         if len(self.notes) < MOST_NOTES:
             self.notes.append(one_line(f"{name:.{LONGEST_NAME}} {why}: plain base colour used"))
-        return FileNotFoundError(f"{name:.80}")
 
     def write(self, name: str, data: object) -> None:
         """Refused: reading never writes."""

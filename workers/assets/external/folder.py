@@ -1,13 +1,13 @@
 """Edge: a folder of URDFs or plain meshes, with a map from file patterns to categories."""
 
 import importlib.util
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 from schemas.errors import AssetSourceError
 from schemas.job.assets import FolderSource
-from schemas.job.job import CATEGORIES
-from workers.assets.builtin.make import TABLE
+from schemas.job.category import TABLE
+from schemas.job.pattern import matches
 from workers.assets.external.listing import describe_folder
 
 PYBULLET_DATA = "pybullet_data"
@@ -43,7 +43,9 @@ def find_files(
     folder = locate_folder(settings.folder, job_folder)
     category_map = _read_map(settings, folder)
     found: dict[str, list[Path]] = {category: [] for category in sorted(set(category_map.values()) & set(categories))}
-    for path, category in sorted(_match_files(category_map, folder).items()):
+    matched = _match_files(category_map, folder)
+    _check_up(settings, folder, matched)
+    for path, category in sorted(matched.items()):
         if category in found:
             found[category].append(path)
     return folder, found
@@ -63,8 +65,21 @@ def _match_files(category_map: Mapping[str, str], folder: Path) -> dict[Path, st
     return matches
 
 
+def _check_up(settings: FolderSource, folder: Path, files: Iterable[Path]) -> None:
+    """AssetSourceError for a pattern of `up` that finds none of the files: it is most likely misspelt."""
+    if isinstance(settings.up, str):
+        return
+    names = [path.relative_to(folder).as_posix() for path in files]
+    for pattern in settings.up:
+        if not any(matches(name, pattern) for name in names):
+            first = ", ".join(names[:3])
+            raise AssetSourceError(
+                f"up: {pattern!r} finds none of the {len(names)} files of {folder} (such as {first})"
+            )
+
+
 def _read_map(settings: FolderSource, folder: Path) -> Mapping[str, str]:
-    """The category by file pattern; AssetSourceError where there is none or it names another category."""
+    """The category by file pattern; AssetSourceError where there is none."""
     if not folder.is_dir():
         raise AssetSourceError(
             f"{folder} is not a folder. Set `folder` of the urdf source to one, or to `{PYBULLET_DATA}`."
@@ -75,8 +90,4 @@ def _read_map(settings: FolderSource, folder: Path) -> Mapping[str, str]:
             f'{folder} needs a `category_map`, such as {{"mugs/*.obj": mug}}: nothing says what its files are. '
             f"It has {describe_folder(folder)}."
         )
-    for pattern, category in category_map.items():
-        if category not in (*CATEGORIES, TABLE):
-            allowed = ", ".join((*CATEGORIES, TABLE))
-            raise AssetSourceError(f"category_map: {pattern!r} is given {category!r}, which is none of {allowed}.")
     return category_map

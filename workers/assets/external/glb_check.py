@@ -7,6 +7,7 @@ from typing import Any
 
 from schemas.errors import MeshError
 from workers.assets.external.caps import Budget, FolderResolver, check_counts, check_nodes, describe_error
+from workers.assets.external.gltf_file import MALFORMED, refuse_compressed
 
 
 def check_glb(path: Path, data: bytes, resolver: FolderResolver) -> bytes:
@@ -16,11 +17,12 @@ def check_glb(path: Path, data: bytes, resolver: FolderResolver) -> bytes:
         tree: dict[str, Any] = json.loads(data[20 : 20 + length])
         if magic != b"glTF" or kind != b"JSON" or not isinstance(tree, dict):
             raise ValueError("no glTF header")
+        refuse_compressed(path, tree)
         counts = [int(accessor["count"]) for accessor in tree.get("accessors", [])]
         vertices, faces, parts = _drawn_counts(tree, counts)
         children = [int(child) for node in tree.get("nodes", []) for child in node.get("children", [])]
         faults = _image_faults(tree, data[20 + length + 8 :], resolver.budget)
-    except (struct.error, ArithmeticError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except MALFORMED as error:
         raise MeshError(
             "unreadable", f"{path} is not a glb file that can be read: {describe_error(error):.200}"
         ) from error

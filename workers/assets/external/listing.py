@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from schemas.errors import MeshError
-from schemas.job.assets import FolderSource, MeshLimits, ShapeNetSource
+from schemas.job.assets import FolderSource, MeshLimits, ShapeNetSource, UpAxis
 from workers.assets.external.reading import list_mesh_files
 from workers.assets.external.urdf_file import find_mesh, mesh_names, parse_urdf
 
@@ -38,7 +38,7 @@ class Listing:
 
     refused: the numbers of entries whose content cannot be used, by category: they are never drawn, and their places stay,
     so that leaving them out moves no other draw. skipped: how many candidates are refused or could not be listed, by reason;
-    examples: a sentence on the first of them.
+    examples: a sentence on the first of them. doubts: by path, the axis on which alone a file stands where `up` names another.
     """
 
     folder: Path
@@ -46,6 +46,7 @@ class Listing:
     skipped: Mapping[str, int] = field(default_factory=dict)
     refused: Mapping[str, frozenset[int]] = field(default_factory=dict)
     examples: tuple[str, ...] = ()
+    doubts: Mapping[str, UpAxis] = field(default_factory=dict)
 
     def count(self, category: str) -> int:
         """How many entries of a category can be used."""
@@ -84,7 +85,7 @@ def instance_id_of(settings: ShapeNetSource | FolderSource, file: SourceFile) ->
         return "-".join(Path(file.path).parts[:2])
     stem = str(Path(file.path).with_suffix(""))
     word = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "-" for c in stem)
-    how = (file.path, file.sha256, settings.up, settings.scale, settings.diagonal_m)
+    how = (file.path, file.sha256, settings.up_of(file.path), settings.scale, settings.diagonal_m)
     return f"{word}-{hashlib.sha256(repr(how).encode()).hexdigest()[:8]}"
 
 

@@ -82,7 +82,7 @@ def _pieces(path: Path, scene: trimesh.Scene, limits: MeshLimits) -> tuple[list[
     pieces: list[_Piece] = []
     notes: list[str] = []
     for number, (matrix, mesh) in enumerate(meshes):
-        visual, why = read_visual(mesh, linear=path.suffix.lower() == ".glb")
+        visual, why = read_visual(mesh, linear=path.suffix.lower() in (".glb", ".gltf"))
         notes += why
         pieces.append(_piece(path, f"part{number}", mesh, np.asarray(matrix, dtype=np.float64), visual))
     if not pieces:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job.assets import Assets, FolderSource, MeshLimits, ShapeNetSource
+from schemas.job.assets import Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
 from schemas.scene.shape import Asset
 from workers.assets.external.asset_bytes import unpack_asset
 from workers.assets.external.listing import (
@@ -22,7 +22,10 @@ from workers.assets.external.listing import (
 )
 from workers.assets.external.reader import BATCH, ask_all, shared_reader
 from workers.assets.external.reader_tasks import Request, Task
-from workers.assets.external.verdicts import Verdicts, verdict_key
+from workers.assets.external.verdicts import Verdict, Verdicts, verdict_key
+
+_AXES: Mapping[bytes, UpAxis] = {b"x": "x", b"y": "y", b"z": "z"}
+"""What the check of a file may answer."""
 
 EXAMPLES = 3
 """Refused files that are described in a message."""
@@ -81,12 +84,12 @@ def check_listing(
         entry = listing.entries[category][number]
         tasks.append(Task("check", listing.folder / entry.files[0].path, category, entry))
     asked = ask_all(Request(settings, listing.folder, assets, tuple(tasks)), partial(watch, "checked"))
-    new: list[tuple[str, MeshError | None]] = []
+    new: list[tuple[str, Verdict]] = []
     for key, (_, answer) in zip(unknown, asked, strict=True):
-        error = answer if isinstance(answer, MeshError) else None
-        if error is not None and error.kind == "environmental":
-            raise AssetSourceError(f"{error.detail}, while its folder was read: start again when nobody writes there")
-        new.append((key, error))
+        verdict = answer if isinstance(answer, MeshError) else _AXES.get(bytes(answer[:1]))
+        if isinstance(verdict, MeshError) and verdict.kind == "environmental":
+            raise AssetSourceError(f"{verdict.detail}, while its folder was read: start again when nobody writes there")
+        new.append((key, verdict))
         if len(new) == BATCH["check"]:
             verdicts.put(new, listing.folder)
             new = []
@@ -94,21 +97,25 @@ def check_listing(
     return _mark(listing, {place: verdicts.get(key, listing.folder) for place, key in keys.items()})
 
 
-def _mark(listing: Listing, verdicts: Mapping[tuple[str, int], MeshError | None]) -> Listing:
-    """The listing with those refused that have an error, which are counted and the first of them described."""
+def _mark(listing: Listing, verdicts: Mapping[tuple[str, int], Verdict]) -> Listing:
+    """The listing with those refused that have an error, which are counted and the first of them described, and the doubts."""
     skipped, examples = Counter(listing.skipped), list(listing.examples)
     refused: dict[str, set[int]] = {}
-    for (category, number), error in verdicts.items():
-        if error is not None:
+    doubts: dict[str, UpAxis] = {}
+    for (category, number), verdict in verdicts.items():
+        path = listing.entries[category][number].files[0].path
+        if isinstance(verdict, MeshError):
             refused.setdefault(category, set()).add(number)
-            skipped[error.reason] += 1
-            path = listing.folder / listing.entries[category][number].files[0].path
-            examples += [_describe(path, listing.folder, error)][: EXAMPLES - len(examples)]
+            skipped[verdict.reason] += 1
+            examples += [_describe(listing.folder / path, listing.folder, verdict)][: EXAMPLES - len(examples)]
+        elif verdict is not None:
+            doubts[path] = verdict
     return replace(
         listing,
         skipped=dict(sorted(skipped.items())),
         refused={category: frozenset(numbers) for category, numbers in refused.items()},
         examples=tuple(examples),
+        doubts=doubts,
     )
 
 

@@ -7,12 +7,13 @@ import numpy as np
 
 from schemas.base import Array, frozen_array
 from schemas.errors import MeshError
-from schemas.job.assets import Assets, FolderSource, MeshLimits, ShapeNetSource
+from schemas.job.assets import Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
+from schemas.job.category import TABLE
 from schemas.scene.shape import Asset
-from workers.assets.builtin.make import TABLE
 from workers.assets.external.caps import MOST_NOTES, one_line
 from workers.assets.external.listing import Entry, check_unchanged, mesh_root
 from workers.assets.external.mesh import LoadedMesh, load_shape, transform_shape
+from workers.assets.external.upright import find_upright
 from workers.assets.external.urdf_file import load_urdf
 from workers.assets.mass import mass_properties
 from workers.geometry.frames import pose
@@ -48,7 +49,7 @@ def place_asset(
     if isinstance(settings, ShapeNetSource):
         axes, scale = UP_AXES["y"], settings.scale or (TABLE_SCALE if category == TABLE else OBJECT_SCALE)
     else:
-        axes, scale = UP_AXES[settings.up], settings.scale
+        axes, scale = UP_AXES[settings.up_of(entry.files[0].path)], settings.scale
         diagonal_m = None if category == TABLE else settings.diagonal_m
     rotated = transform_shape(loaded.shape, pose(axes, np.zeros(3)))
     lower, upper = rotated.bounds
@@ -78,6 +79,19 @@ def place_asset(
         shareable=settings.copy_assets,
         notes=tuple(one_line(note) for note in loaded.notes[:MOST_NOTES]),
     )
+
+
+def find_doubt(asset: Asset, settings: ShapeNetSource | FolderSource, hull_vertices: Array) -> UpAxis | None:
+    """The axis of its file on which alone an asset stands, where `up` names another; None where nothing speaks against `up`.
+
+    hull_vertices [H, 3] of the asset's convex hull, object frame.
+    """
+    if isinstance(settings, ShapeNetSource) or asset.path is None or not settings.category_map:
+        return None  # what pybullet_data's own map names lies as it happens to
+    R_object_source = asset.T_source_to_object[:3, :3]
+    found = find_upright(hull_vertices @ R_object_source, asset.mass.com @ R_object_source)
+    sure = found is not None and found.confidence == "sure" and found.axis != settings.up_of(asset.path)
+    return found.axis if found is not None and sure else None
 
 
 def _check_size(name: str, diagonal_m: float, limits: MeshLimits) -> None:

@@ -24,11 +24,11 @@ from workers.assets.external.reader_process import NO_MEMORY, send
 from workers.assets.external.reader_tasks import ANSWER, Request, Task, encode_request
 
 ROOT = Path(__file__).resolve().parents[3]
-BATCH = {"list": 128, "check": 32, "load": 1}
+BATCH = {"list": 128, "names": 128, "check": 32, "measure": 32, "load": 1}
 """Tasks that one child works on: a fork costs some milliseconds, and a child that ends is replaced for what is left."""
 MOST_PROCESSES = 8
 """Processes that read a source in parallel: each may take the memory that the limits allow."""
-WORTH_A_PROCESS = {"list": 4096, "check": 96, "load": 96}
+WORTH_A_PROCESS = {"list": 4096, "names": 4096, "check": 96, "measure": 96, "load": 96}
 """Tasks for which one more process is started, which takes a second or two."""
 
 Watch = Callable[[int, int], None]

@@ -3,6 +3,7 @@
 import errno
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -12,26 +13,34 @@ from scipy.spatial import QhullError
 
 from schemas.errors import MeshError
 from schemas.job.assets import Assets, FolderSource, ShapeNetSource
-from schemas.scene.shape import Asset
-from workers.assets.builtin.make import TABLE
+from schemas.job.category import TABLE
+from schemas.scene.shape import Asset, Hull
 from workers.assets.external.answers import Answer
 from workers.assets.external.asset_bytes import pack_asset
 from workers.assets.external.caps import describe_error, one_line
 from workers.assets.external.listing import Entry, SourceFile, hash_files, list_files
-from workers.assets.external.placement import load_entry
+from workers.assets.external.measured import measure_asset
+from workers.assets.external.placement import find_doubt, load_entry
+from workers.assets.external.urdf_file import all_mesh_names, find_mesh, parse_urdf
 from workers.geometry.hull import convex_hull
 
 ANSWER, REFUSAL = b"+", b"-"
 """The kinds of answers."""
+
+Kind = Literal["list", "check", "load", "measure", "names"]
 
 _SETTINGS: TypeAdapter[ShapeNetSource | FolderSource] = TypeAdapter(ShapeNetSource | FolderSource)
 
 
 @dataclass(frozen=True)
 class Task:
-    """One question about one asset of a source: its files by the `path` of the first, or a verdict or all of an `entry`."""
+    """One question about one asset of a source.
 
-    kind: Literal["list", "check", "load"]
+    By the `path` of its first file: `list`, all its files; `names`, what a URDF refers to. By an `entry`: `check`, whether it
+    can be used; `load`, all of it; `measure`, what a person asks about it.
+    """
+
+    kind: Kind
     path: Path
     category: str = ""
     entry: Entry | None = None
@@ -105,19 +114,34 @@ def _answer(request: Request, task: Task) -> Sequence[bytes | memoryview]:
             list_files(request.settings, request.folder, task.path, request.assets.limits), request.folder
         )
         return [json.dumps([[file.path, file.size, file.sha256] for file in files]).encode()]
+    if task.kind == "names":
+        named = [file.relative_to(request.folder).as_posix() for file in named_files(task.path, request)]
+        return [json.dumps(named).encode()]
     assert task.entry is not None
     asset = load_entry(request.settings, request.folder, task.entry, task.category, request.assets)
     if task.kind == "load":
         return pack_asset(asset)
-    check_fit(asset, task.path)
-    return []
+    hull = check_fit(asset, task.path)
+    if task.kind == "measure":
+        return [measure_asset(asset, hull).encode()]
+    doubt = None if hull is None else find_doubt(asset, request.settings, hull.vertices)
+    return [(doubt or "").encode()]
 
 
-def check_fit(asset: Asset, path: Path) -> None:
-    """MeshError `no_hull` where an object has no convex hull, which is what it collides and is placed by."""
+def named_files(urdf: Path, request: Request) -> list[Path]:
+    """The meshes below the folder that a URDF names, for what is seen and for what collides. MeshError as parse_urdf."""
+    found = []
+    for name in all_mesh_names(parse_urdf(urdf, request.assets.limits)):
+        with suppress(MeshError):
+            found.append(find_mesh(name, urdf, request.folder))
+    return found
+
+
+def check_fit(asset: Asset, path: Path) -> Hull | None:
+    """The convex hull, which is what an object collides and is placed by; None for a table. MeshError `no_hull`."""
     if asset.category == TABLE:
-        return
+        return None
     try:
-        convex_hull(asset.shape.vertices)
+        return convex_hull(asset.shape.vertices)
     except (QhullError, ValueError) as error:
         raise MeshError("no_hull", f"{path} is no body: it needs four points apart that are not in a line") from error

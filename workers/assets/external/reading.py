@@ -13,8 +13,9 @@ from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from workers.assets.external.caps import FolderResolver, check_counts, declared_counts, describe_error
 from workers.assets.external.glb_check import check_glb
+from workers.assets.external.gltf_file import named_by_gltf, pack_gltf
 
-MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb")
+MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".gltf")
 """Formats that trimesh reads without further libraries."""
 
 _OBJ_COUNTED_BACK = re.compile(rb"^f[ \t][^\n]*-\d", re.MULTILINE)
@@ -39,6 +40,8 @@ def read_bytes(path: Path, limits: MeshLimits) -> bytes:
 def read_scene(path: Path, data: bytes, resolver: FolderResolver) -> trimesh.Scene:
     """The file as a trimesh scene, unprocessed; MeshError `too_large`, `index_out_of_range` or `unreadable`."""
     kind = path.suffix.lower()
+    if kind == ".gltf":
+        data, kind = pack_gltf(path, data, resolver), ".glb"
     if kind == ".glb":
         data = check_glb(path, data, resolver)
     else:
@@ -67,14 +70,22 @@ def list_mesh_files(path: Path, root: Path, limits: MeshLimits) -> list[Path]:
     data = read_bytes(path, limits)
     kind = path.suffix.lower()
     # No format writes a vertex or a face in fewer than 8 bytes: a shorter file needs no counting.
-    if kind != ".glb" and len(data) > 8 * min(limits.max_vertices, limits.max_faces):
+    if kind not in (".glb", ".gltf") and len(data) > 8 * min(limits.max_vertices, limits.max_faces):
         check_counts(path, *declared_counts(kind, data), limits)
     resolver = FolderResolver(path, root, limits)
-    names = material_files(data) if kind == ".obj" else _decode(_PLY_TEXTURE.findall(data)) if kind == ".ply" else []
-    found = _find(resolver, names)
+    found = _find(resolver, _references(path, kind, data))
     for material in [file for file in found if file.suffix.lower() == ".mtl"]:
         found += _find(resolver, _decode(_MAP_KD.findall(material.read_bytes())))
     return list(dict.fromkeys([path, *found]))
+
+
+def _references(path: Path, kind: str, data: bytes) -> list[str]:
+    """Names of the files that a mesh file's bytes ask for."""
+    if kind == ".obj":
+        return material_files(data)
+    if kind == ".gltf":
+        return named_by_gltf(path, data)
+    return _decode(_PLY_TEXTURE.findall(data)) if kind == ".ply" else []
 
 
 def _find(resolver: FolderResolver, names: Iterable[str]) -> list[Path]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from schemas.errors import AssetSourceError
 from schemas.job.assets import ShapeNetSource
-from workers.assets.builtin.make import TABLE
+from schemas.job.category import TABLE
 from workers.assets.external.folder import locate_folder
 from workers.assets.external.listing import describe_folder
 

@@ -55,6 +55,11 @@ def mesh_names(robot: ElementTree.Element) -> list[str]:
     return list(dict.fromkeys(mesh.get("filename", "") for mesh in robot.iterfind("link/visual/geometry/mesh")))
 
 
+def all_mesh_names(robot: ElementTree.Element) -> list[str]:
+    """The file names of all meshes, also of those that only collide."""
+    return list(dict.fromkeys(mesh.get("filename", "") for mesh in robot.iterfind("link/*/geometry/mesh")))
+
+
 def find_mesh(name: str, urdf: Path, root: Path) -> Path:
     """The file of a mesh name inside `root`; MeshError `missing`."""
     bare = re.sub(r"^(package|file|model)://", "", name[: LONGEST_NAME + 1].strip().replace("\\", "/"))

@@ -17,9 +17,9 @@ from pathlib import Path
 
 from schemas.environment import cache_folder
 from schemas.errors import MeshError
-from schemas.job.assets import Assets, FolderSource, ShapeNetSource
+from schemas.job.assets import Assets, FolderSource, ShapeNetSource, UpAxis
+from schemas.job.category import TABLE
 from workers.assets import mass
-from workers.assets.builtin.make import TABLE
 from workers.assets.external.listing import Entry
 from workers.geometry import hull
 
@@ -55,12 +55,16 @@ def verdict_key(settings: ShapeNetSource | FolderSource, assets: Assets, categor
     return hashlib.sha256(json.dumps([plain, common, category == TABLE, files], sort_keys=True).encode()).hexdigest()
 
 
+Verdict = MeshError | UpAxis | None
+"""Of an asset: why it cannot be used; the axis on which alone it stands, where `up` names another; None: nothing is wrong."""
+
+
 class Verdicts:
-    """Verdicts by key: None for an asset that can be read, else the MeshError that says why not."""
+    """Verdicts by key."""
 
     def __init__(self, folder: Path | None = USUAL_FOLDER) -> None:
         self._path = None if folder is None else folder / code_version()
-        self._kept: dict[str, tuple[str, str] | None] = {}
+        self._kept: dict[str, tuple[str, str] | UpAxis | None] = {}
         if self._path is not None:
             with suppress(OSError):
                 self._kept = dict(filter(None, map(_parse, self._path.read_bytes().split(b"\n"))))
@@ -68,18 +72,20 @@ class Verdicts:
     def __contains__(self, key: str) -> bool:
         return key in self._kept
 
-    def get(self, key: str, folder: Path) -> MeshError | None:
-        """Why an asset below `folder` is refused; None where it can be read. KeyError where that is not known."""
+    def get(self, key: str, folder: Path) -> Verdict:
+        """The verdict on an asset below `folder`. KeyError where that is not known."""
         found = self._kept[key]
-        return None if found is None else MeshError(found[0], found[1].replace(FOLDER, str(folder)))
+        return MeshError(found[0], found[1].replace(FOLDER, str(folder))) if isinstance(found, tuple) else found
 
-    def put(self, verdicts: Iterable[tuple[str, MeshError | None]], folder: Path) -> None:
+    def put(self, verdicts: Iterable[tuple[str, Verdict]], folder: Path) -> None:
         """Keeps verdicts on assets below `folder`."""
         lines = []
-        for key, error in verdicts:
-            found = None if error is None else (error.reason, error.detail.replace(str(folder), FOLDER))
-            self._kept[key] = found
-            text = json.dumps([key, found]).encode()
+        for key, verdict in verdicts:
+            if isinstance(verdict, MeshError):
+                self._kept[key] = (verdict.reason, verdict.detail.replace(str(folder), FOLDER))
+            else:
+                self._kept[key] = verdict
+            text = json.dumps([key, self._kept[key]]).encode()
             lines.append(b"%08x %s\n" % (zlib.crc32(text), text))
         if self._path is not None and lines:
             with suppress(OSError):
@@ -95,10 +101,10 @@ def _append(path: Path, data: bytes) -> None:
         os.close(to)
 
 
-def _parse(line: bytes) -> tuple[str, tuple[str, str] | None] | None:
+def _parse(line: bytes) -> tuple[str, tuple[str, str] | UpAxis | None] | None:
     """Key and verdict of a line; None where it is torn."""
     checksum, _, text = line.partition(b" ")
     if checksum != b"%08x" % zlib.crc32(text):
         return None
     key, found = json.loads(text)
-    return key, None if found is None else (found[0], found[1])
+    return key, (found[0], found[1]) if isinstance(found, list) else found

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from schemas.job.assets import ProceduralSource
-from schemas.job.job import CATEGORIES
+from schemas.job.category import CATEGORIES
 from tests.workers.assets.oracles import faulty_rays, support_margin, welded
 from workers.assets.builtin.make import GENERATORS, instance_id, make_asset, make_model, shape_digest
 

@@ -5,7 +5,8 @@ import pytest
 import trimesh
 
 from schemas.job.assets import Assets, FolderSource
-from tests.workers.assets.oracles import shape_of, welded
+from tests.workers.assets.oracles import shape_of, welded, write
+from workers.assets.catalogue import open_catalogue
 from workers.assets.external.listing import Entry, SourceFile
 from workers.assets.external.mesh import LoadedMesh
 from workers.assets.external.placement import UP_AXES, place_asset
@@ -52,3 +53,21 @@ def test_an_open_mesh_has_no_volume_and_weighs_as_a_shell():
     assert not asset.watertight
     assert asset.volume_m3 is None
     assert asset.mass.mass_kg == pytest.approx(15.0)
+
+
+@pytest.mark.parametrize(
+    ("up", "doubt"), [("y", None), ("z", "y"), ("x", "y"), ({"*.stl": "y"}, None), ({"*.stl": "z"}, "y")]
+)
+def test_a_can_that_lies_as_the_job_has_it_names_the_axis_of_its_file_that_it_stands_on(tmp_path, up, doubt):
+    can = trimesh.creation.cylinder(0.04, 0.1, sections=48)
+    can.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0)))
+    write(tmp_path / "can.stl", can.export(file_type="stl"))
+    source = FolderSource(source="urdf", folder=str(tmp_path), category_map={"*.stl": "can"}, up=up)
+    catalogue = open_catalogue(Assets(objects=(source,)), tmp_path, ("can",))
+    assert dict(catalogue.objects[0].doubts) == ({"can.stl": doubt} if doubt else {})
+    asset = catalogue.load(catalogue.refer(0, "can", 0))
+    stands = asset.extents_m[2] == pytest.approx(0.1)
+    assert stands == (doubt is None)
+    assert (
+        open_catalogue(Assets(objects=(source,)), tmp_path, ("can",)).objects[0].doubts == catalogue.objects[0].doubts
+    )

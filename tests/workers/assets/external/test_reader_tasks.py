@@ -75,3 +75,13 @@ def test_memory_is_told_from_content(tmp_path, monkeypatch, error):
     monkeypatch.setattr(reader_tasks, "load_entry", fail)
     with pytest.raises(MemoryError):
         answer(tmp_path, CUBE)
+
+
+def test_a_urdf_names_what_is_seen_and_what_collides_below_the_folder(tmp_path):
+    for name in ("seen.obj", "hit.obj"):
+        write(tmp_path / "parts" / name, CUBE)
+    mesh = '<geometry><mesh filename="{}"/></geometry>'.format
+    text = f"<visual>{mesh('parts/seen.obj')}</visual><visual>{mesh('none.obj')}</visual>"
+    text += f"<collision>{mesh('package://parts/hit.obj')}</collision>"
+    urdf = f'<robot name="r"><link name="l">{text}</link></robot>'
+    assert json.loads(answer(tmp_path, urdf, "names", "a.urdf")[1:]) == ["parts/seen.obj", "parts/hit.obj"]

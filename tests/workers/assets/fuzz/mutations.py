@@ -32,7 +32,7 @@ VALUES: list[Any] = [
 ]  # fmt: skip
 
 _NUMBER = re.compile(rb"(?<![\w.])-?\d+(\.\d+)?([eE][-+]?\d+)?")
-_NAME = re.compile(rb"[\w./-]+\.(?:png|jpg|mtl|obj)")
+_NAME = re.compile(rb"[\w./-]+\.(?:png|jpg|mtl|obj|bin)")
 
 
 def _pick(rng: np.random.Generator, values: list[Any]) -> Any:
@@ -119,6 +119,21 @@ def tree(data: bytes, rng: np.random.Generator) -> bytes:
         root = json.loads(data[20 : 20 + length])
     except (struct.error, ValueError):
         return flip(data, rng)
+    text = json.dumps(_replaced(root, rng)).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + length :]
+    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
+
+
+def text_tree(data: bytes, rng: np.random.Generator) -> bytes:
+    """The same for a JSON file."""
+    try:
+        return json.dumps(_replaced(json.loads(data), rng)).encode()
+    except (ValueError, IndexError, RecursionError):
+        return flip(data, rng)
+
+
+def _replaced(root: Any, rng: np.random.Generator) -> Any:
     for _ in range(int(rng.integers(1, 4))):
         places = list(_places(root))
         holder, key = places[int(rng.integers(len(places)))]
@@ -128,10 +143,7 @@ def tree(data: bytes, rng: np.random.Generator) -> bytes:
             del holder[key]
         else:
             holder[key] = _pick(rng, VALUES)
-    text = json.dumps(root).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + length :]
-    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
+    return root
 
 
 def _places(value: Any) -> Any:
@@ -149,6 +161,8 @@ CHANGES: Mapping[str, tuple[Change, ...]] = {
     "ply": (*ANY, word, number, number, name),
     "stl": (*ANY, word, word, number),
     "glb": (flip, cut, word, tree, tree, tree, tree, nest),
+    "gltf": (flip, cut, text_tree, text_tree, text_tree, text_tree, nest, number, name),
+    "bin": (flip, cut, word, double),
     "png": (flip, cut, word, bomb, bomb),
     "jpg": (flip, cut, word, bomb),
 }
@@ -167,7 +181,7 @@ def mutant(seed: int, index: int) -> tuple[str, Files]:
         files[target] = change(files[target] or b"\0", rng)[:MOST_BYTES]
         how.append(f"{change.__name__} {target}")
     if rng.random() < 0.05:  # one format under another's name
-        other = str(_pick(rng, ["a.obj", "a.stl", "a.ply", "a.glb", "a.urdf"]))
+        other = str(_pick(rng, ["a.obj", "a.stl", "a.ply", "a.glb", "a.gltf", "a.urdf"]))
         files = {other: files.pop(first), **files}
         how.append(f"as {other}")
     return f"{kind}: {', '.join(how)}", files

@@ -1,6 +1,7 @@
 """Whole assets that the fuzzing starts from: one of every format, with what it refers to."""
 
 import io
+import json
 from collections.abc import Mapping
 
 import numpy as np
@@ -58,7 +59,7 @@ def coloured_ply() -> bytes:
     return data
 
 
-def textured_glb() -> bytes:
+def textured_scene() -> trimesh.Scene:
     scene = trimesh.Scene()
     for k in range(3):
         mesh = trimesh.creation.icosphere(1, 0.05)
@@ -68,9 +69,22 @@ def textured_glb() -> bytes:
         T = np.eye(4)
         T[0, 3] = 0.1
         scene.add_geometry(mesh, node_name=f"n{k}", parent_node_name=f"n{k - 1}" if k else None, transform=T)
-    data = scene.export(file_type="glb")
+    return scene
+
+
+def textured_glb() -> bytes:
+    data = textured_scene().export(file_type="glb")
     assert isinstance(data, bytes)
     return data
+
+
+def textured_gltf() -> Files:
+    """One picture beside it, the others in its buffer."""
+    files = trimesh.exchange.gltf.export_gltf(textured_scene(), merge_buffers=True)
+    tree = json.loads(files["model.gltf"])
+    tree["images"][0] = {"uri": "skin.png"}
+    tree["buffers"][0]["uri"] = "a.bin"
+    return {"a.gltf": json.dumps(tree).encode(), "a.bin": files["gltf_buffer.bin"], "skin.png": picture("PNG")}
 
 
 URDF = b"""<?xml version="1.0"?>
@@ -97,6 +111,7 @@ SEEDS: Mapping[str, Files] = {
     "stl": {"a.stl": exported("stl")},
     "stl_ascii": {"a.stl": exported("stl_ascii")},
     "glb": {"a.glb": textured_glb()},
+    "gltf": textured_gltf(),
     "urdf": {
         "a.urdf": URDF,
         "mesh/cube.obj": textured_obj("skin.png"),
