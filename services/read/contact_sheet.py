@@ -1,11 +1,8 @@
-"""Contact sheets: one page with images of a dataset's scenes.
-
-python -m services.read.contact_sheet OUT FILE.jpg [SCENES [CATEGORY]]
-"""
+"""`verso sheet`: one page with images of a dataset's scenes."""
 
 import argparse
+import json
 from collections.abc import Callable
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,6 +11,7 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from schemas.dataset.codec import Row, read_world_poses
 from schemas.dataset.layout import Content, image_path, patch_index, patch_path
+from schemas.errors import InputError
 from schemas.scene.region import REGION_FIRST_OBJECT
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, iter_stored, read_image
 from workers.store.local import open_store
@@ -46,8 +44,14 @@ MOST_PATCHES = 4
 
 
 def draw_sheet(store: Store, scenes: int, category: str | None = None) -> Image.Image:
-    """A row for each of the first scenes of every category (or of one), with its first pair's images."""
+    """A row for each of the first scenes of every category (or of one), with its first pair's images.
+
+    Raises InputError where there are none.
+    """
     rows = _choose(store, scenes, category)
+    if not rows:
+        what = f"no scene of category {category!r}" if category else "no scene"
+        raise InputError(f"{store.name} has {what} yet: `verso status {store.name}` tells which there are")
     width, height = CELL[0] + MARGIN, CELL[1] + MARGIN
     page = Image.new("RGB", (LEFT + len(COLUMNS) * width, HEADING + len(rows) * height), "white")
     pen, font = ImageDraw.Draw(page), ImageFont.load_default(15)
@@ -120,16 +124,14 @@ def _paint_regions(region: NDArray) -> Image.Image:
     return Image.fromarray(np.concatenate([first, np.resize(further, (256 - len(first), 3))])[region])
 
 
-def main() -> None:
-    """Draw what the command line asks for."""
-    parser = argparse.ArgumentParser(prog="python -m services.read.contact_sheet", description=__doc__.splitlines()[0])
-    parser.add_argument("out", metavar="OUT", help="a dataset's folder")
-    parser.add_argument("file", metavar="FILE.jpg", type=Path, help="the picture to write")
-    parser.add_argument("scenes", metavar="SCENES", type=int, nargs="?", default=1, help="scenes of each category")
-    parser.add_argument("category", metavar="CATEGORY", nargs="?", help="only this one")
-    options = parser.parse_args()
-    draw_sheet(open_store(options.out), options.scenes, options.category).save(options.file, quality=88)
-
-
-if __name__ == "__main__":
-    main()
+def main(options: argparse.Namespace) -> int:
+    """`verso sheet`. Raises InputError where no scene is there to draw, or the picture cannot be written."""
+    sheet = draw_sheet(open_store(options.out), options.scenes, options.category)
+    try:
+        sheet.save(options.file, quality=88)  # which PNG has no use for
+    except (OSError, ValueError) as error:
+        raise InputError(f"{options.file}: cannot be written as a picture: {error}; name it .jpg or .png") from error
+    print(f"{options.file}: {sheet.width} x {sheet.height} pixels")
+    if options.json:
+        print(json.dumps({"ok": True, "file": str(options.file)}))
+    return 0

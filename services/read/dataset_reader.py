@@ -103,6 +103,11 @@ def choose_evenly(scenes: Sequence[int], count: int, seed: int) -> list[int]:
 
 def find_scene(store: Store, scene_id: int) -> StoredRange:
     """The range that holds a scene. Raises InputError where it is not committed."""
+    return read_stored(store, find_records(store, scene_id))
+
+
+def find_records(store: Store, scene_id: int) -> list[CommitRecord]:
+    """The records of the range that holds a scene. Raises InputError where it is not committed."""
     codes = list_codes(store)
     before = codes[: int(np.searchsorted(codes, code_of(scene_id + 1, 0)))]
     if len(before):
@@ -110,7 +115,7 @@ def find_scene(store: Store, scene_id: int) -> StoredRange:
         retries = [split_code(code)[1] for code in before[np.searchsorted(before, code_of(start, 0)) :]]
         records = read_range(store, start, retries)
         if scene_id < records[0].span.stop:
-            return read_stored(store, records)
+            return records
     raise InputError(f"scene {scene_id} is not in {store.name}: `verso status {store.name}` tells which scenes are")
 
 

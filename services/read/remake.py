@@ -13,8 +13,8 @@ from schemas.dataset.layout import MANIFEST, RANGES, is_shape, pose_of_image, ra
 from schemas.errors import CorruptError
 from schemas.scene.scene import SceneOutput
 from services.job.record import JobRecord
-from services.read.query import read_merged
 from services.read.replay import open_context
+from services.read.stored_tables import read_merged
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.run_shard import run_scene
 from workers.pipeline.stopwatch import Stopwatch

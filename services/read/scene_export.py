@@ -4,19 +4,18 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from PIL import Image
-from trimesh.visual import ColorVisuals, TextureVisuals
-from trimesh.visual.material import PBRMaterial
+from trimesh.visual import ColorVisuals
 
 from schemas.dataset.codec import Row, read_world_poses
 from schemas.errors import InputError, OutputError
+from schemas.job.job import Job
 from schemas.scene.region import REGION_FLOOR, REGION_TABLE
-from schemas.scene.shape import Part
 from services.job.record import require_job
 from services.read.capture_export import captured_geometry
-from services.read.dataset_reader import find_scene
+from services.read.dataset_reader import StoredRange, find_scene
+from services.read.part_mesh import linear_bytes, mesh_of_part
 from services.read.replay import open_context
-from workers.pipeline.context import WorkerContext
+from workers.assets.catalogue import Catalogue
 from workers.plan.randomness import SceneChance
 from workers.plan.step import plan_scene
 from workers.store.store import Store
@@ -34,11 +33,10 @@ def export_scene(store: Store, scene_id: int, target: Path) -> int:
         reason = next((f["reason"] for f in stored.rows["failures"] if f["scene_id"] == scene_id), "unknown")
         raise InputError(f"scene {scene_id} was not made ({reason}): it has no geometry")
     if record.job.captures is not None:
-        scene = trimesh.Scene()
-        for name, mesh, T_world_mesh in captured_geometry(store, stored, row):
-            scene.add_geometry(mesh, geom_name=name, node_name=name, transform=T_world_mesh)
+        scene = captured_scene(store, stored, row)
     else:
-        scene = _planned_geometry(open_context(record), scene_id, row)
+        context = open_context(record)
+        scene = planned_scene(context.job, context.catalogue, scene_id, row)
     data: bytes = scene.export(file_type="glb")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -48,9 +46,19 @@ def export_scene(store: Store, scene_id: int, target: Path) -> int:
     return len(data)
 
 
-def _planned_geometry(context: WorkerContext, scene_id: int, row: Row) -> trimesh.Scene:
-    """Floor, table and objects of a scene, from the job's sources."""
-    plan = plan_scene(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
+def captured_scene(store: Store, stored: StoredRange, row: Row) -> trimesh.Scene:
+    """Board and object of a capture, from its stored shape. Raises CorruptError where that cannot be read."""
+    scene = trimesh.Scene()
+    for name, mesh, T_world_mesh in captured_geometry(store, stored, row):
+        if isinstance(mesh.visual, ColorVisuals):
+            mesh.visual = ColorVisuals(mesh, vertex_colors=linear_bytes(mesh.visual.vertex_colors / 255.0))
+        scene.add_geometry(mesh, geom_name=name, node_name=name, transform=T_world_mesh)
+    return scene
+
+
+def planned_scene(job: Job, catalogue: Catalogue, scene_id: int, row: Row) -> trimesh.Scene:
+    """Floor, table and objects of a scene, from the job's sources. Raises SceneError where a shape cannot be made again."""
+    plan = plan_scene(job, catalogue, SceneChance(job.seed, scene_id))
     T_world = {REGION_FLOOR: np.eye(4), **read_world_poses(row)}
     table = plan.table.asset
     placed = [("floor", REGION_FLOOR, plan.floor), (f"table {table.instance_id}", REGION_TABLE, table.shape)]
@@ -62,20 +70,6 @@ def _planned_geometry(context: WorkerContext, scene_id: int, row: Row) -> trimes
     scene = trimesh.Scene()
     for name, region_id, shape in placed:
         for number, part in enumerate(shape.parts):
-            label, look = f"{name}/{number}-{part.name}", _visual(part)
-            mesh = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=look, process=False)
-            scene.add_geometry(mesh, geom_name=label, node_name=label, transform=T_world[region_id])
+            label = f"{name}/{number}-{part.name}"
+            scene.add_geometry(mesh_of_part(part), geom_name=label, node_name=label, transform=T_world[region_id])
     return scene
-
-
-def _visual(part: Part) -> TextureVisuals | ColorVisuals:
-    material = part.material
-    if part.colors is not None and material.texture is None:
-        return ColorVisuals(vertex_colors=part.colors)
-    pbr = PBRMaterial(
-        baseColorFactor=np.round(np.array(material.base_color) * 255).astype(np.uint8),
-        metallicFactor=material.metallic,
-        roughnessFactor=material.roughness,
-        baseColorTexture=None if material.texture is None else Image.fromarray(material.texture),
-    )
-    return TextureVisuals(uv=part.uv, material=pbr)

@@ -158,3 +158,20 @@ def test_a_flipped_bit_in_a_merged_file_is_not_read_silently(tmp_path):
         else:
             assert answer.num_rows == read_success(store)["rows"]["views"]
     assert caught > 5
+
+
+def test_what_goes_wrong_while_an_answer_comes_is_told_as_what_is_wrong_at_once(dataset):
+    sql = "select case when i < 90000 then i else cast('x' || i as int) end from range(100000) t(i)"
+    with pytest.raises(InputError, match=r"the query failed: Conversion Error: Could not convert string 'x90000'"):
+        query(dataset, sql)
+
+
+def test_a_statement_without_an_answer_is_refused(dataset):
+    with pytest.raises(InputError):
+        query(dataset, "set threads = 1")
+
+
+def test_the_tables_are_shown_without_what_they_are_made_of_and_a_wrong_name_has_the_right_one_told(dataset):
+    assert query(dataset, "SHOW TABLES;").column("name").to_pylist() == sorted(TABLES)
+    with pytest.raises(InputError, match='Did you mean "scenes'):
+        query(dataset, "select * from scnes")

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from services.read.query_formats import format_rows
+from services.read.query_formats import format_rows, write_rows
 
 ROWS = pa.table({"n": [1, 2], "name": ["a,b", None], "list": [[1.5, -0.0], []], "flag": [True, False]})
 
@@ -22,8 +22,8 @@ def test_a_table_for_people_is_aligned_and_counts_its_rows():
         "(2 rows)",
     ]
     long = format_rows(pa.table({"x": ["y" * 100]}), "table").decode().splitlines()
-    assert max(map(len, long)) == 60
-    assert long[-1] == "(1 row)"
+    assert max(map(len, long[:-1])) == 60
+    assert long[-1].startswith("(1 row; cells of over 60 characters")
 
 
 def test_csv_json_and_parquet_read_back():
@@ -41,3 +41,91 @@ def test_csv_json_and_parquet_read_back():
 )
 def test_an_empty_answer_and_odd_types_have_every_format(style, sql):
     assert format_rows(duckdb.sql(sql).to_arrow_table(), style)
+
+
+class Pipe(io.RawIOBase):
+    """Takes bytes, and can neither tell nor seek, as standard output into another program."""
+
+    def __init__(self) -> None:
+        self.data = b""
+        self.largest = 0
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data) -> int:
+        self.data += bytes(data)
+        self.largest = max(self.largest, len(data))
+        return len(data)
+
+    def tell(self) -> int:
+        raise OSError("a pipe")
+
+
+def batches(count: int, size: int = 1000):
+    """So many rows in batches of `size`, each made when it is asked for."""
+    schema = pa.schema([("n", pa.int64()), ("word", pa.string())])
+    made = (
+        pa.record_batch([pa.array(range(at, at + size)), pa.array([f"word {n}" for n in range(at, at + size)])], schema)
+        for at in range(0, count, size)
+    )
+    return pa.RecordBatchReader.from_batches(schema, made)
+
+
+@pytest.mark.parametrize("style", ["table", "csv", "json", "parquet"])
+def test_a_long_answer_leaves_in_pieces_and_is_whole(style, monkeypatch):
+    monkeypatch.setattr("services.read.query_formats._ROW_GROUP_BYTES", 30_000)
+    pipe = Pipe()
+    write_rows(batches(20_000), style, pipe)
+    assert pipe.largest < len(pipe.data) / 4
+    if style == "parquet":
+        read = pq.read_table(pa.BufferReader(pipe.data)).to_pylist()
+    elif style == "json":
+        read = json.loads(pipe.data)
+    elif style == "csv":
+        read = [{"n": int(row["n"]), "word": row["word"]} for row in csv.DictReader(io.StringIO(pipe.data.decode()))]
+    else:
+        lines = pipe.data.decode().splitlines()
+        assert lines[-1] == "(20000 rows)"
+        read = [{"n": int(n), "word": word} for n, word in (line.split(None, 1) for line in lines[2:-1])]
+    assert read == batches(20_000).read_all().to_pylist()
+
+
+def test_rows_are_written_before_the_last_ones_are_made():
+    pipe, seen = Pipe(), []
+
+    def watched():
+        for batch in batches(5000):
+            seen.append(len(pipe.data))
+            yield batch
+
+    schema = batches(0).schema
+    write_rows(pa.RecordBatchReader.from_batches(schema, watched()), "csv", pipe)
+    assert seen == sorted(seen) and seen[-1] > 10_000
+
+
+def test_a_table_that_a_terminal_has_no_room_for_is_written_cell_by_cell_and_whole():
+    rows = pa.table({"category": ["mug", "can"], "detail": ["x" * 90, "short"]})
+    sink = io.BytesIO()
+    write_rows(rows.to_reader(), "table", sink, wide=80)
+    lines = sink.getvalue().decode().splitlines()
+    assert lines == [
+        *("-- row 1", "category  mug", f"detail    {'x' * 90}"),
+        *("-- row 2", "category  can", "detail    short", "(2 rows)"),
+    ]
+
+
+def test_a_table_that_has_room_is_a_table():
+    sink = io.BytesIO()
+    write_rows(pa.table({"category": ["mug"], "detail": ["x" * 90]}).to_reader(), "table", sink, wide=100)
+    assert sink.getvalue().decode().splitlines() == [
+        f"category  detail{' ' * 84}".rstrip(),
+        f"--------  {'-' * 90}",
+        f"mug       {'x' * 90}",
+        "(1 row)",
+    ]
+
+
+def test_what_is_cut_elsewhere_is_said():
+    told = format_rows(pa.table({"detail": ["x" * 90]}), "table").decode().splitlines()[-1]
+    assert told == "(1 row; cells of over 60 characters end in …: --format csv or json has them whole)"

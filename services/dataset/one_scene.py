@@ -1,0 +1,81 @@
+"""One scene of a job, made in this process and kept in memory: no Ray, no folder."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import trimesh
+
+from schemas.dataset.codec import Row
+from schemas.errors import CorruptError, SceneError
+from schemas.job.images import Patch
+from schemas.job.job import Job
+from schemas.scene.scene import SceneOutput
+from services.dataset.pair import Pair, read_pair
+from services.dataset.pair_table import PAIR_TABLES, pair_table
+from services.dataset.shapes import Shapes
+from services.job.read import load_job, validate_job
+from services.job.record import JobRecord, record_job
+from workers.pipeline.captures.listing import open_sources
+from workers.pipeline.context import open_worker
+from workers.pipeline.run_shard import run_scene
+from workers.pipeline.stopwatch import Stopwatch
+from workers.store.manifest import table_of_rows
+
+
+def make_scene(
+    job: str | Path | Mapping[str, Any] | Job, scene_id: int, changes: Sequence[str] = ()
+) -> tuple[Pair, ...]:
+    """The pairs of one scene, the same to the byte as a run of the job stores them.
+
+    `job`: a job file with `changes` such as "start.pose=tumbled", or its keys, or a Job. Relative folders start from the
+    job file, else from here. The first call of a process prepares the renderer. Raises JobError where the job is wrong,
+    SceneError where this scene cannot be made.
+    """
+    parsed, folder = _parse(job, changes)
+    catalogue = open_sources(parsed, folder)
+    output = run_scene(open_worker(parsed, catalogue), scene_id, Stopwatch())
+    for row in output.rows.get("failures", ()):
+        raise SceneError(str(row["reason"]), f"scene {scene_id} cannot be made ({row['stage']}): {row['detail']}")
+    return _pairs_of(output, record_job(parsed, catalogue.digest, folder))
+
+
+def _parse(job: str | Path | Mapping[str, Any] | Job, changes: Sequence[str]) -> tuple[Job, Path]:
+    """The job, and the folder that its relative paths start from."""
+    if isinstance(job, str | Path):
+        return load_job(Path(job), changes), Path(job).parent
+    return (job if isinstance(job, Job) else validate_job(dict(job), "the job")), Path()
+
+
+def _pairs_of(output: SceneOutput, record: JobRecord) -> tuple[Pair, ...]:
+    files = _MadeFiles(output, record)
+    table = pair_table({name: table_of_rows(name, output.rows[name]) for name in PAIR_TABLES})
+    labels: dict[tuple[int, str], list[Row]] = defaultdict(list)
+    for row in table_of_rows("objects", output.rows["objects"]).to_pylist():
+        labels[row["pose_id"], row["role"]].append(row)
+    return tuple(read_pair(row, labels, files) for row in table.to_pylist())
+
+
+class _MadeFiles:
+    """The encoded files of one scene."""
+
+    def __init__(self, output: SceneOutput, record: JobRecord) -> None:
+        self._data = {file.path: file.data for file in output.files}
+        self._shapes = Shapes(self._shape, record)
+        self.patch: Patch = record.job.images.patch
+
+    def _shape(self, path: str) -> bytes:
+        if path not in self._data:
+            raise FileNotFoundError(path)
+        return self._data[path]
+
+    def image(self, scene_id: int, path: str) -> bytes:
+        """The bytes of an image."""
+        if path not in self._data:
+            raise CorruptError(f"{path} was not made")
+        return self._data[path]
+
+    def mesh(self, scene: Row, region_id: int) -> trimesh.Trimesh:
+        """The shape of a region in its own frame."""
+        return self._shapes.mesh(scene, region_id)

@@ -1,0 +1,90 @@
+"""Shapes of a dataset's objects as meshes in the object frame: from the stored GLB, or from the job's sources."""
+
+import io
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import trimesh
+
+from schemas.dataset.layout import asset_path
+from schemas.errors import CorruptError, InputError, MachineError
+from schemas.job.category import TABLE
+from schemas.scene.region import REGION_TABLE
+from schemas.scene.shape import Asset
+from services.job.record import JobRecord
+from services.read.part_mesh import mesh_of_part
+from workers.assets.catalogue import Catalogue
+from workers.plan.randomness import SceneChance
+
+ReadShape = Callable[[str], bytes]
+"""Returns the bytes of a stored shape by its path. Raises FileNotFoundError."""
+
+
+class Shapes:
+    """Reads shapes of one job."""
+
+    def __init__(self, read: ReadShape, record: JobRecord) -> None:
+        self._read = read
+        self._record = record
+        self._catalogue: Catalogue | None = None
+        self._parts = lru_cache(16)(self._load)
+
+    def mesh(self, scene: Mapping[str, Any], region_id: int) -> trimesh.Trimesh:
+        """The shape of the table or of an object of a scene, own frame, metres; a copy that the caller may change.
+
+        Raises InputError where it is neither stored nor to be had from the job's sources, CorruptError where it is damaged.
+        """
+        return self._parts(*_name_of(scene, region_id), scene["scene_id"], region_id).copy()
+
+    def _load(self, category: str, instance_id: str, scene_id: int, region_id: int) -> trimesh.Trimesh:
+        path = asset_path(category, instance_id)
+        try:
+            data = self._read(path)
+        except FileNotFoundError:
+            return self._from_source(path, scene_id, region_id)
+        try:
+            loaded = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
+            return _join(list(loaded.geometry.values()))
+        except Exception as error:  # trimesh raises errors of many kinds for a damaged file
+            raise CorruptError(f"{path} cannot be read: {error}; `verso replay OUT --repair` makes it again") from error
+
+    def _from_source(self, path: str, scene_id: int, region_id: int) -> trimesh.Trimesh:
+        """The shape of a source whose licence keeps it out of the dataset."""
+        if self._record.job.captures is not None:
+            raise CorruptError(f"{path} is missing: restore it from a copy")
+        from workers.plan.step import plan_scene  # loads the physics
+
+        plan = plan_scene(self._record.job, self._sources(path), SceneChance(self._record.job.seed, scene_id))
+        assets: dict[int, Asset] = {start.region_id: start.asset for start in plan.objects}
+        asset = {**assets, REGION_TABLE: plan.table.asset}[region_id]
+        return _join([mesh_of_part(part) for part in asset.shape.parts])
+
+    def _sources(self, path: str) -> Catalogue:
+        from workers.pipeline.captures.listing import open_sources
+
+        if self._catalogue is None:
+            told = f"{path} is not in the dataset (its licence is not free, or assets.copy_assets is off)"
+            try:
+                self._catalogue = open_sources(self._record.job, Path(self._record.folder))
+            except InputError as error:
+                raise InputError(f"{told}, and its source cannot be read here: {error}") from error
+        if self._catalogue.digest != self._record.catalogue:
+            raise MachineError("the files of the asset folders do not hold what they held when this job was run")
+        return self._catalogue
+
+
+def _name_of(scene: Mapping[str, Any], region_id: int) -> tuple[str, str]:
+    """(category, instance id) of a region of a row of `scenes`."""
+    if region_id == REGION_TABLE:
+        return TABLE, scene["table_id"]
+    bodies = {body["region_id"]: (body["category"], body["instance_id"]) for body in scene["bodies"] or ()}
+    return bodies.get(region_id, (scene["category"], scene["instance_id"]))
+
+
+def _join(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """One mesh of all parts."""
+    joined = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
+    assert isinstance(joined, trimesh.Trimesh)
+    return joined

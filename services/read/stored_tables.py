@@ -1,0 +1,128 @@
+"""The tables of a dataset as pyarrow datasets: finished or being made, in a folder or a bucket."""
+
+import contextlib
+import urllib.parse
+from collections.abc import Iterable, Mapping
+from functools import cached_property
+from itertools import groupby
+from typing import Any, TypeAlias
+
+import pyarrow as pa
+import pyarrow.dataset as ds
+import pyarrow.parquet as pq
+
+from schemas.dataset.commit import CommitRecord
+from schemas.dataset.layout import COMMITS, MANIFEST, STAGING, SUCCESS_FILE, range_name, range_table_path
+from schemas.dataset.tables import CAPTURE_SCHEMAS, SCHEMAS, TABLES, schema_of
+from schemas.errors import CorruptError, OutputError
+from services.job.record import read_job
+from services.merge.step import read_success
+from services.read.store_files import file_system_of
+from workers.store.commit import commit_names, read_record
+from workers.store.committed_rows import range_rows
+from workers.store.manifest import join_rows
+from workers.store.store import Store
+
+Rows: TypeAlias = ds.Dataset | pa.Table
+
+_FORMAT = ds.ParquetFileFormat(
+    default_fragment_scan_options=ds.ParquetFragmentScanOptions(page_checksum_verification=True)
+)
+
+
+class StoredTables:
+    """The six tables as they are now; a table is looked up when it is asked for, and its rows are read when scanned.
+
+    A finished dataset is read from its merged tables, an unfinished one through its commits, where a retry's rows replace
+    the first try's. Raises OutputError where there is no dataset, CorruptError where `_SUCCESS` or a commit is damaged.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._done = read_success(store)
+        self._committed = _Committed(store) if self._done is None else None
+
+    @cached_property
+    def schemas(self) -> Mapping[str, pa.Schema]:
+        """The schemas of the tables: by job.yaml those of scenes or of captures."""
+        with contextlib.suppress(CorruptError):  # the tables can be asked without it
+            record = read_job(self._store)
+            if record is not None and record.job.captures is not None:
+                return CAPTURE_SCHEMAS
+        return SCHEMAS
+
+    @cached_property
+    def _merged_files(self) -> list[str]:
+        """The merged files that `_SUCCESS` names. Raises CorruptError where it does not name a file of each table."""
+        files = (self._done or {}).get("files")
+        if isinstance(files, dict) and all(
+            any(key.startswith(f"{MANIFEST}/{table}/") for key in files) for table in TABLES
+        ):
+            return list(files)
+        told = f"{SUCCESS_FILE} in {self._store.name} does not name its merged files"
+        raise CorruptError(f"{told}: `verso replay {self._store.name} --repair` writes it again")
+
+    def parts(self, table: str) -> list[Rows]:
+        """The rows of one table in one or two pieces. In `assets` of an unfinished dataset an instance may be repeated."""
+        schema = self.schemas[table]
+        if self._committed is not None:
+            return self._committed.parts(table, schema)
+        return [_merged(self._store, self._merged_files, table, schema)]
+
+    def dataset(self, table: str) -> ds.Dataset:
+        """The rows of one table as one pyarrow dataset, as `parts`."""
+        parts = self.parts(table)
+        found = [part if isinstance(part, ds.Dataset) else ds.dataset(part) for part in parts]
+        return found[0] if len(found) == 1 else ds.dataset(found)
+
+
+def _merged(store: Store, keys: Iterable[str], table: str, schema: pa.Schema) -> ds.Dataset:
+    """The merged table."""
+    folder = f"{MANIFEST}/{table}"
+    keys = [key for key in keys if key.startswith(f"{folder}/")]
+    partitioning = ds.partitioning(pa.schema([("category", pa.string())]), flavor="hive")
+    files: dict[str, Any] = {"filesystem": file_system_of(store), "partition_base_dir": folder}
+    return ds.dataset(keys, schema, _FORMAT, partitioning=partitioning, **files)
+
+
+def category_of(key: str) -> str:
+    """The category that a merged file's folder names."""
+    return urllib.parse.unquote(key.split("/")[-2].removeprefix("category="))
+
+
+def read_merged(table: str, key: str, data: bytes) -> pa.Table:
+    """The rows in the bytes of one merged file, with the category that its folder names."""
+    rows = pq.read_table(pa.BufferReader(data), page_checksum_verification=True)
+    column = pa.repeat(pa.scalar(category_of(key)), rows.num_rows)
+    schema = schema_of(table, rows.column_names)
+    return rows.append_column("category", column).select(schema.names).cast(schema)
+
+
+class _Committed:
+    """Committed rows: files in place, and rows in memory for ranges that are not published or have retries."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._plain: list[int] = []
+        self._other: list[list[CommitRecord]] = []
+        names = commit_names(store)
+        if not names:
+            raise OutputError(f"{store.name} holds no dataset that can be asked: there is nothing in {COMMITS} yet")
+        # Listed after the commits: a committed range without staging is published.
+        staged = set(store.children(STAGING))
+        for start, group in groupby(names, key=lambda name: name[0]):
+            retries = [retry for _, retry, _ in group]
+            if retries == [0] and range_name(start) not in staged:
+                self._plain.append(start)
+            else:
+                records = [record for retry in retries if (record := read_record(store, start, retry)) is not None]
+                self._other.append(records)
+
+    def parts(self, table: str, schema: pa.Schema) -> list[Rows]:
+        """The rows of one table: those in memory, and those in files."""
+        rows = [range_rows(self._store, records, table) for records in self._other]
+        parts: list[Rows] = [join_rows(table, [schema.empty_table(), *rows])]
+        if self._plain:
+            paths = [range_table_path(start, table) for start in self._plain]
+            parts.append(ds.dataset(paths, schema, _FORMAT, filesystem=file_system_of(self._store)))
+        return parts
