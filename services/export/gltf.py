@@ -1,0 +1,121 @@
+"""Format `gltf`: a GLB file for each scene, posed geometry and cameras, for people who look at it in their own viewer.
+
+glTF's y is up, the world's z is: a root node turns one into the other. Below it all is as in the dataset, in metres.
+"""
+
+import json
+import math
+import struct
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from schemas.dataset.codec import Row, read_matrix
+from schemas.errors import SceneError
+from schemas.scene.camera import ROLES
+from services.export.folder import ExportFolder
+from services.export.source import ExportScene
+from services.export.sources import unchanged_sources
+from services.export.writer import Added, LeftOut
+from services.job.record import JobRecord
+from services.read.scene_export import captured_scene, planned_scene
+from workers.assets.catalogue import Catalogue
+from workers.store.store import Store
+
+NO_SOURCES = "the sources of the shapes are not here, or have changed"
+
+_Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
+"""x, y, z, w of the rotation that takes z to y."""
+_OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""A glTF camera looks along -z, and its y is up."""
+_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+_NEAR_M = 0.05
+
+
+class Gltf:
+    """Writes <category>/<scene id>.glb."""
+
+    def __init__(self, store: Store, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None) -> None:
+        self._store, self._record, self._folder = store, record, folder
+        self._files: dict[str, int] = dict((state or {}).get("files", {}))
+
+    def add(self, scene: ExportScene) -> Added:
+        """Writes the scene's file."""
+        if self._record.job.captures is not None:
+            posed = captured_scene(self._store, scene.stored, scene.row)
+        elif self._catalogue is None:
+            return _left_out(scene, NO_SOURCES)
+        else:
+            try:
+                posed = planned_scene(self._record.job, self._catalogue, scene.scene_id, scene.row)
+            except SceneError as error:
+                return _left_out(scene, f"its shapes cannot be made again: {error.reason}")
+        data: bytes = posed.export(file_type="glb")
+        views = [pair.views[role] for pair in scene.pairs for role in ROLES if role in pair.views]
+        seen = with_cameras(data, [view for view in views if view["role"] != "projected"])
+        self._folder.put(f"{scene.category}/{scene.scene_id:06d}.glb", seen)
+        self._files[scene.category] = self._files.get(scene.category, 0) + 1
+        return Added(len(scene.pairs))
+
+    @cached_property
+    def _catalogue(self) -> Catalogue | None:
+        return unchanged_sources(self._record)
+
+    def state(self) -> dict[str, Any]:
+        """How many files there are by category."""
+        return {"files": self._files}
+
+    def finish(self) -> None:
+        """Nothing waits."""
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def describe(self) -> dict[str, Any]:
+        """Files by category, and the frame."""
+        return {
+            "files": dict(sorted(self._files.items())),
+            "not_exported": ["images and labels: the cameras stand where the views were taken from"],
+            "frame": "metres; below the root node the world frame of the dataset, z up, turned to glTF's y up by that node",
+            "cameras": "named by role and pose id; a field of view and an aspect ratio, without the principal point",
+        }
+
+
+def _left_out(scene: ExportScene, reason: str) -> Added:
+    return Added(0, tuple(LeftOut(scene.scene_id, pair.pose_id, reason) for pair in scene.pairs))
+
+
+def with_cameras(glb: bytes, views: list[Row]) -> bytes:
+    """A GLB file with a camera for each row of `views`, and a root node that turns the world's z up to glTF's y."""
+    tree, binary = split_glb(glb)
+    nodes, cameras = tree["nodes"], tree.setdefault("cameras", [])
+    roots = list(tree["scenes"][0]["nodes"])
+    for view in views:
+        matrix = read_matrix(view["T_world_cam"]) @ _OPENGL_FROM_OPTICAL
+        name = f"{view['role']} {view['pose_id']}"
+        roots.append(len(nodes))
+        nodes.append({"name": name, "camera": len(cameras), "matrix": matrix.T.ravel().tolist()})
+        cameras.append({"name": name, "type": "perspective", "perspective": _perspective(view)})
+    tree["scenes"][0]["nodes"] = [len(nodes)]
+    nodes.append({"name": "z up", "rotation": _Y_UP, "children": roots})
+    return _join_glb(tree, binary)
+
+
+def _perspective(view: Row) -> dict[str, float]:
+    width, height = view["width"] / view["fx"], view["height"] / view["fy"]
+    return {"yfov": 2.0 * math.atan(0.5 * height), "aspectRatio": width / height, "znear": _NEAR_M}
+
+
+def split_glb(glb: bytes) -> tuple[dict[str, Any], bytes]:
+    """(the JSON of a GLB file, everything behind it)."""
+    size, _ = _CHUNK.unpack_from(glb, _HEADER.size)
+    begin = _HEADER.size + _CHUNK.size
+    return json.loads(glb[begin : begin + size]), glb[begin + size :]
+
+
+def _join_glb(tree: dict[str, Any], rest: bytes) -> bytes:
+    text = json.dumps(tree, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    length = _HEADER.size + _CHUNK.size + len(text) + len(rest)
+    return _HEADER.pack(b"glTF", 2, length) + _CHUNK.pack(len(text), b"JSON") + text + rest

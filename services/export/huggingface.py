@@ -1,0 +1,143 @@
+"""Format `huggingface`: Parquet files with embedded images that `datasets.load_dataset(DIR)` reads, and a dataset card.
+
+A row is a pair. Its columns come from the manifest's schemas: what a view has is a struct `<role>_view`, its images are the
+columns `<role>_rgb`, `<role>_depth` and `<role>_region`, PNG files as they are stored.
+"""
+
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from schemas.dataset.codec import Row
+from schemas.dataset.layout import stored_images, stored_roles
+from schemas.dataset.tables import SCHEMAS
+from schemas.job.job import Job
+from services.export.folder import ExportFolder
+from services.export.huggingface_card import card_text, features_metadata
+from services.export.rounds import Rounds
+from services.export.source import ExportPair, ExportScene
+from services.export.writer import Added
+from services.job.record import JobRecord
+
+SPLITS: Final = {"train": "train", "val": "validation", "test": "test"}
+"""Ours, and Hugging Face's name for it."""
+ROW_GROUP: Final = 16
+"""Pairs in a row group: some ten megabytes, which is what a reader holds."""
+
+IMAGE: Final = pa.struct([pa.field("bytes", pa.binary()), pa.field("path", pa.string())])
+"""An image as Hugging Face stores it."""
+
+_PATTERN: Final = "data/{split}-{number:05d}.parquet"
+_OF_SCENE: Final = ("scene_id", "category", "instance_id", "source", "table_id", "T_world_obj", "T_world_table")
+_NOT_OF_VIEWS: Final = ("files", "scene_id", "category", "parent_id", "role", "capture")
+_NOT_OF_OBJECTS: Final = ("scene_id", "pose_id")
+
+
+class HuggingFace:
+    """Writes data/train-00000.parquet and so on, and README.md."""
+
+    def __init__(self, record: JobRecord, folder: ExportFolder, most_bytes: int, state: dict[str, Any] | None) -> None:
+        self._folder, self._job = folder, record.job
+        self._schema = schema_of_pairs(record.job)
+        self._rounds = Rounds(folder, self._open, _PATTERN, most_bytes, state and state["rounds"])
+        self._rows: dict[str, int] = dict(state["rows"]) if state else {}
+        self._licences: set[str] = set(state["licences"]) if state else set()
+
+    def _open(self, path: Path) -> "_Parquet":
+        return _Parquet(path, self._schema)
+
+    def add(self, scene: ExportScene) -> Added:
+        """Writes a row for each pair of the scene."""
+        split = SPLITS[scene.split]
+        shard = self._rounds.shard(split)
+        for pair in scene.pairs:
+            shard.add(row_of(self._schema, scene, pair))
+        self._rows[split] = self._rows.get(split, 0) + len(scene.pairs)
+        names = (scene.row["table_id"], *(name for _, name in scene.instances.values()))
+        self._licences |= {scene.assets[name]["licence"] for name in names}
+        self._rounds.end_if_full()
+        return Added(len(scene.pairs))
+
+    def state(self) -> dict[str, Any] | None:
+        """Numbers of files and rows, and licences; None within a round."""
+        rounds = self._rounds.state()
+        return None if rounds is None else {"rounds": rounds, "rows": self._rows, "licences": sorted(self._licences)}
+
+    def finish(self) -> None:
+        """Ends the last files, and writes the card."""
+        self._rounds.end()
+        text = card_text(self._job.name, self._schema, self._rows, sorted(self._licences))
+        self._folder.put("README.md", text.encode())
+
+    def close(self) -> None:
+        """Closes open files."""
+        self._rounds.close()
+
+    def describe(self) -> dict[str, Any]:
+        """Files and rows by split, and the conventions."""
+        return {
+            "files": self._rounds.counts,
+            "rows": dict(sorted(self._rows.items())),
+            "licences": sorted(self._licences),
+            "not_exported": ["patches, shapes of objects, the quality figures of scenes"],
+            "depth": "16-bit PNG, z along the optical axis; divide by depth_units_per_m for metres, 0 is no depth",
+            "poses": "T_world_cam camera to world, T_cam_obj object to camera; metres, optical frame, row-major 4 x 4",
+            "pixels": "cx, cy have pixel centres at +0.5; cx_opencv, cy_opencv on integers",
+        }
+
+
+def schema_of_pairs(job: Job) -> pa.Schema:
+    """The columns of a pair, of the types that the manifest gives them; only views and images that the job stores."""
+    fields = [SCHEMAS["scenes"].field(name) for name in _OF_SCENE]
+    fields += [pa.field("split", pa.string()), pa.field("pose_id", pa.int64())]
+    views = pa.struct([field for field in SCHEMAS["views"] if field.name not in _NOT_OF_VIEWS])
+    for role in stored_roles(job):
+        fields += [pa.field(f"{role}_{image.pixels}", IMAGE) for image in stored_images(role, job)]
+        fields.append(pa.field(f"{role}_view", views))
+    objects = pa.struct([field for field in SCHEMAS["objects"] if field.name not in _NOT_OF_OBJECTS])
+    schema = pa.schema([*fields, pa.field("objects", pa.list_(objects))])
+    return schema.with_metadata(features_metadata(schema, IMAGE))
+
+
+def row_of(schema: pa.Schema, scene: ExportScene, pair: ExportPair) -> Row:
+    """The row of a pair."""
+    row: Row = {name: scene.row[name] for name in _OF_SCENE}
+    row |= {"split": SPLITS[scene.split], "pose_id": pair.pose_id, "objects": list(pair.objects)}
+    for name in schema.names:
+        role, _, kind = name.partition("_")
+        if kind == "view":
+            row[name] = pair.views.get(role)
+        elif schema.field(name).type == IMAGE:
+            data = pair.image(role, kind)
+            row[name] = None if data is None else {"bytes": data, "path": f"{pair.pose_id:09d}.{role}.{kind}.png"}
+    return row
+
+
+class _Parquet:
+    """A Parquet file being written, a row group at a time."""
+
+    def __init__(self, path: Path, schema: pa.Schema) -> None:
+        plain = [name for name in schema.names if schema.field(name).type != IMAGE]
+        self._writer = pq.ParquetWriter(
+            path, schema, compression="snappy", use_dictionary=plain, write_statistics=plain
+        )
+        self._schema = schema
+        self._rows: list[Row] = []
+        self.bytes = 0
+
+    def add(self, row: Row) -> None:
+        self._rows.append(row)
+        self.bytes += sum(len(cell["bytes"]) for cell in row.values() if isinstance(cell, dict) and "bytes" in cell)
+        if len(self._rows) == ROW_GROUP:
+            self._flush()
+
+    def _flush(self) -> None:
+        if self._rows:
+            self._writer.write_table(pa.Table.from_pylist(self._rows, self._schema), row_group_size=ROW_GROUP)
+            self._rows = []
+
+    def close(self) -> None:
+        self._flush()
+        self._writer.close()

@@ -1,0 +1,135 @@
+"""What an export reads: the scenes and pairs of a dataset that were chosen, in order, from one range at a time."""
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
+from operator import itemgetter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.dataset.codec import Row
+from schemas.dataset.layout import PixelKind, patch_index
+from schemas.errors import CorruptError
+from schemas.scene.camera import Role
+from schemas.scene.region import REGION_FIRST_OBJECT
+from services.read.dataset_reader import ReadFile, StoredRange, file_reader, read_image, read_stored
+from services.read.stored_paths import patch_paths, view_paths
+from workers.store.commit import read_committed, split_code
+from workers.store.committed_rows import read_range
+from workers.store.store import Store
+
+_STRICTNESS = ("train", "val", "test")
+
+
+@dataclass(frozen=True, eq=False)
+class ExportPair:
+    """A pair of views: the rows of `views` by role, of `objects`, and its images as the PNG bytes that are stored."""
+
+    number: int
+    """Its place among the pairs of its scene, from 0."""
+    views: dict[Role, Row]
+    objects: tuple[Row, ...]
+    read: ReadFile
+
+    @property
+    def pose_id(self) -> int:
+        """Of the input pose."""
+        return int(next(iter(self.views.values()))["parent_id"])
+
+    def labels(self, role: Role) -> list[Row]:
+        """Rows of `objects` of one view, by region: the table first."""
+        return sorted((row for row in self.objects if row["role"] == role), key=itemgetter("region_id"))
+
+    def image(self, role: Role, kind: PixelKind) -> bytes | None:
+        """The PNG of an image, None where the job stores none. Raises CorruptError where it is committed and missing."""
+        row = self.views.get(role)
+        return None if row is None else self._read(view_paths(row).get(kind))
+
+    def patch(self, role: Role, kind: PixelKind, region_id: int, objects: int) -> bytes | None:
+        """The PNG of an object's patch, None where there is none: it would leave the image, or was not asked for."""
+        row = self.views.get(role)
+        return None if row is None else self._read(patch_paths(row, patch_index(region_id, objects)).get(kind))
+
+    def pixels(self, role: Role, kind: PixelKind) -> NDArray | None:
+        """An image decoded: [H, W, 3] uint8 RGB, [H, W] uint16 depth, [H, W] uint8 regions; None where there is none."""
+        data = self.image(role, kind)
+        return None if data is None else read_image(lambda _: data, f"{kind} of the {role} view of pose {self.pose_id}")
+
+    def _read(self, path: str | None) -> bytes | None:
+        return None if path is None else self.read(path)
+
+
+@dataclass(frozen=True, eq=False)
+class ExportScene:
+    """A scene that was made: its row, its pairs, and the rows of `assets` of what stands in it, by instance."""
+
+    row: Row
+    pairs: tuple[ExportPair, ...]
+    assets: dict[str, Row]
+    read: ReadFile
+    """Reads a file by its path that is not in a tar; CorruptError where there is none."""
+    stored: StoredRange
+
+    @property
+    def scene_id(self) -> int:
+        """Its id in the dataset."""
+        return int(self.row["scene_id"])
+
+    @property
+    def category(self) -> str:
+        """That of its first object."""
+        return str(self.row["category"])
+
+    @cached_property
+    def instances(self) -> dict[int, tuple[str, str]]:
+        """(category, instance id) of every object, by region id."""
+        bodies = self.row["bodies"] or [{**self.row, "region_id": REGION_FIRST_OBJECT}]
+        return {body["region_id"]: (body["category"], body["instance_id"]) for body in bodies}
+
+    @property
+    def split(self) -> str:
+        """train, val or test: the strictest of its objects, so that no scene of `train` shows an object of `test`."""
+        places = [_STRICTNESS.index(self.assets[name]["split"]) for _, name in self.instances.values()]
+        return _STRICTNESS[max(places)]
+
+
+def iter_ranges(store: Store, codes: NDArray[np.int64], first_scene: int) -> Iterator[StoredRange]:
+    """The committed ranges that `codes` name and that hold scenes from `first_scene` on, in order."""
+    for start, group in groupby(map(split_code, codes), key=itemgetter(0)):
+        records = read_range(store, start, [retry for _, retry in group])
+        if records[0].span.stop > first_scene:
+            yield read_stored(store, records)
+
+
+def scenes_of(store: Store, stored: StoredRange, chosen: Sequence[int]) -> Iterator[ExportScene]:
+    """The chosen scenes of a range, in order. Files are read when they are asked for; tars are read once."""
+    if not chosen:
+        return
+    read_plain = _committed_reader(store, stored)
+    read = file_reader(read_plain, stored)
+    assets = {row["instance_id"]: row for row in stored.rows["assets"]}
+    rows = {row["scene_id"]: row for row in stored.rows["scenes"]}
+    for scene_id in chosen:
+        pairs = tuple(
+            ExportPair(number, views, tuple(objects), read)  # type: ignore[arg-type]
+            for number, (views, objects) in enumerate(stored.pairs(scene_id))
+        )
+        yield ExportScene(rows[scene_id], pairs, assets, read_plain, stored)
+
+
+def _committed_reader(store: Store, stored: StoredRange) -> ReadFile:
+    """Reads files of a range, published or, where a run is at work, not yet. Raises CorruptError for one that is missing."""
+
+    def read(path: str) -> bytes:
+        with contextlib.suppress(FileNotFoundError):
+            return store.read(path)
+        *first, last = stored.records
+        for record in first:
+            with contextlib.suppress(CorruptError):
+                return read_committed(store, record, path)
+        return read_committed(store, last, path)
+
+    return read

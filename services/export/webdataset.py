@@ -1,0 +1,134 @@
+"""Format `webdataset`: tar shards of bounded size, a sample for each pair, by split.
+
+The members of a sample are `<pose id>.<role>.rgb.png`, `<pose id>.<role>.region.png`, `<pose id>.depth.npz` with an array for
+each role, and `<pose id>.json` with the rows of scene, views and objects. Depth is no PNG, because the usual decoders of
+WebDataset turn 16-bit pictures into 8-bit RGB.
+"""
+
+import io
+import json
+import tarfile
+import zipfile
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.dataset.codec import Row
+from schemas.dataset.layout import PixelKind
+from schemas.scene.camera import ROLES
+from services.export.folder import ExportFolder
+from services.export.rounds import Rounds
+from services.export.source import ExportPair, ExportScene
+from services.export.writer import Added
+
+_PATTERN: Final = "{split}-{number:06d}.tar"
+_PICTURES: Final[tuple[PixelKind, ...]] = ("rgb", "region")
+_OF_SCENE: Final = (
+    "scene_id",
+    "category",
+    "instance_id",
+    "source",
+    "table_id",
+    "T_world_obj",
+    "T_world_table",
+    "effects",
+)
+_NOT_OF_VIEWS: Final = ("files", "scene_id", "category", "parent_id", "capture")
+_NOT_OF_OBJECTS: Final = ("scene_id", "pose_id", "role")
+
+
+class WebDataset:
+    """Writes train-000000.tar and so on; every pair that the dataset has is a sample."""
+
+    def __init__(self, folder: ExportFolder, most_bytes: int, state: dict[str, Any] | None) -> None:
+        self._rounds = Rounds(folder, _Tar, _PATTERN, most_bytes, state and state["rounds"])
+        self._samples: dict[str, int] = dict(state["samples"]) if state else {}
+
+    def add(self, scene: ExportScene) -> Added:
+        """Writes a sample for each pair of the scene."""
+        shard = self._rounds.shard(scene.split)
+        for pair in scene.pairs:
+            for name, data in members_of(scene, pair):
+                shard.add(f"{pair.pose_id:09d}.{name}", data)
+        self._samples[scene.split] = self._samples.get(scene.split, 0) + len(scene.pairs)
+        self._rounds.end_if_full()
+        return Added(len(scene.pairs))
+
+    def state(self) -> dict[str, Any] | None:
+        """Numbers of shards and samples; None within a round."""
+        rounds = self._rounds.state()
+        return None if rounds is None else {"rounds": rounds, "samples": self._samples}
+
+    def finish(self) -> None:
+        """Ends the last shards."""
+        self._rounds.end()
+
+    def close(self) -> None:
+        """Closes open shards."""
+        self._rounds.close()
+
+    def describe(self) -> dict[str, Any]:
+        """Shards and samples by split, and the conventions."""
+        return {
+            "shards": self._rounds.counts,
+            "samples": dict(sorted(self._samples.items())),
+            "not_exported": ["patches, shapes of objects, the quality figures of scenes"],
+            "depth": "uint16, z along the optical axis; divide by depth_units_per_m for metres, 0 is no depth",
+            "poses": "T_world_cam camera to world, T_cam_obj object to camera; metres, optical frame, row-major 4 x 4",
+            "pixels": "cx, cy have pixel centres at +0.5; cx_opencv, cy_opencv on integers",
+        }
+
+
+def members_of(scene: ExportScene, pair: ExportPair) -> list[tuple[str, bytes]]:
+    """(name behind the key, bytes) of every member of a sample, in order."""
+    members: list[tuple[str, bytes]] = []
+    depths: dict[str, NDArray] = {}
+    for role in ROLES:
+        for kind in _PICTURES:
+            if (data := pair.image(role, kind)) is not None:
+                members.append((f"{role}.{kind}.png", data))
+        if (depth := pair.pixels(role, "depth")) is not None:
+            depths[role] = depth
+    return [*members, ("depth.npz", _npz(depths)), ("json", _json(scene, pair))]
+
+
+def _json(scene: ExportScene, pair: ExportPair) -> bytes:
+    """The rows of a pair, without what is stored elsewhere in the sample."""
+    tree: Row = {name: scene.row[name] for name in _OF_SCENE}
+    tree |= {"split": scene.split, "pose_id": pair.pose_id, "views": {}}
+    for role in ROLES:
+        if (row := pair.views.get(role)) is not None:
+            labels = [{k: v for k, v in one.items() if k not in _NOT_OF_OBJECTS} for one in pair.labels(role)]
+            columns = {name: value for name, value in row.items() if name not in _NOT_OF_VIEWS}
+            tree["views"][role] = {**columns, "objects": labels}
+    return json.dumps(tree).encode()
+
+
+def _npz(arrays: dict[str, NDArray]) -> bytes:
+    """What numpy.load reads, the same bytes for the same arrays."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, array in arrays.items():
+            member = io.BytesIO()
+            np.lib.format.write_array(member, array, allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), member.getvalue(), zipfile.ZIP_DEFLATED, 1)
+    return stream.getvalue()
+
+
+class _Tar:
+    """A tar being written; its members have no owner and no time."""
+
+    def __init__(self, path: Path) -> None:
+        self._tar = tarfile.open(path, "w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115 - `close` closes it
+        self.bytes = 0
+
+    def add(self, name: str, data: bytes) -> None:
+        header = tarfile.TarInfo(name)
+        header.size = len(data)
+        self._tar.addfile(header, io.BytesIO(data))
+        self.bytes += len(data) + tarfile.BLOCKSIZE
+
+    def close(self) -> None:
+        self._tar.close()

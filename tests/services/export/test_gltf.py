@@ -1,0 +1,126 @@
+"""GLB files of scenes, read by hand from glTF 2.0's container and its JSON, and with trimesh."""
+
+import json
+import math
+import shutil
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+
+from services.export.gltf import NO_SOURCES, split_glb
+from services.job.record import require_job
+from tests.exported import export_to, source_poses, source_rows
+from workers.store.local import LocalStore
+
+
+def read_glb(path):
+    """(JSON, binary chunk)."""
+    data = path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON" and size % 4 == 0
+    binary_size, binary_kind = struct.unpack_from("<I4s", data, 20 + size)
+    assert binary_kind == b"BIN\0" and 28 + size + binary_size == length
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
+def matrix_of(node):
+    """[4, 4]; glTF stores columns."""
+    T = np.eye(4)
+    if "matrix" in node:
+        return np.reshape(node["matrix"], (4, 4)).T
+    if "rotation" in node:
+        x, y, z, w = node["rotation"]
+        T[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    assert "translation" not in node and "scale" not in node
+    return T
+
+
+def placed(tree):
+    """{name: pose in the file's frame, y up} of every node."""
+    found = {}
+
+    def walk(number, above):
+        node = tree["nodes"][number]
+        T = above @ matrix_of(node)
+        found[node.get("name", str(number))] = T
+        for child in node.get("children", ()):
+            walk(child, T)
+
+    for root in tree["scenes"][0]["nodes"]:
+        walk(root, np.eye(4))
+    return found
+
+
+Y_UP_FROM_Z_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+
+
+@pytest.fixture(scope="module")
+def exported(pile, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("gltf") / "new"
+    manifest = export_to(pile, folder, "gltf").manifest
+    (path,) = folder.glob("*/000000.glb")
+    return path, manifest
+
+
+def test_every_object_stands_where_its_row_puts_it_with_y_up(pile, exported):
+    path, manifest = exported
+    assert (manifest["scenes"], sum(manifest["files"].values())) == (1, 1)
+    nodes = placed(read_glb(path)[0])
+    (row,) = source_rows(pile.root, "scenes")
+    for body in row["bodies"]:
+        own = [T for name, T in nodes.items() if name.startswith(f"{body['category']} {body['instance_id']} ")]
+        assert own
+        for T in own:
+            np.testing.assert_allclose(T, Y_UP_FROM_Z_UP @ np.reshape(body["T_world_obj"], (4, 4)), atol=1e-6)
+    table = next(T for name, T in nodes.items() if name.startswith("table "))
+    np.testing.assert_allclose(table, Y_UP_FROM_Z_UP @ np.reshape(row["T_world_table"], (4, 4)), atol=1e-6)
+
+
+def test_cameras_stand_where_the_views_were_taken_from(pile, exported):
+    tree, _ = read_glb(exported[0])
+    nodes, poses = placed(tree), source_poses(pile.root)
+    optical = np.diag([1.0, -1.0, -1.0, 1.0])  # a glTF camera looks along -z with y up
+    for name, pose_id in (("input 0", 0), ("mirror 1", 1)):
+        np.testing.assert_allclose(nodes[name], Y_UP_FROM_Z_UP @ poses[pose_id] @ optical, atol=1e-6)
+    assert [camera["name"] for camera in tree["cameras"]] == ["input 0", "aligned 0", "mirror 1"]
+    perspective = tree["cameras"][0]["perspective"]
+    assert perspective["yfov"] == pytest.approx(2 * math.atan(60 / 131.25))
+    assert perspective["aspectRatio"] == pytest.approx(160 / 120)
+
+
+def test_another_reader_finds_the_meshes_where_the_table_stands(pile, exported):
+    scene = trimesh.load(exported[0])
+    tables = [name for name in scene.graph.nodes_geometry if name.startswith("table ")]
+    tops = [trimesh.transform_points(scene.geometry[scene.graph[n][1]].vertices, scene.graph[n][0]) for n in tables]
+    highest = max(points[:, 1].max() for points in tops)
+    assert 0.3 < highest < 1.5  # metres above the floor, along y
+
+
+def test_captures_have_their_board_and_mesh(captures, tmp_path):
+    export_to(captures, tmp_path / "new", "gltf")
+    paths = sorted((tmp_path / "new" / "mug").glob("*.glb"))
+    assert [path.name for path in paths] == ["000000.glb", "000001.glb"]
+    names = placed(read_glb(paths[0])[0])
+    assert any(name.startswith("board ") for name in names) and any(name.startswith("mug ") for name in names)
+
+
+def test_scenes_whose_sources_are_gone_are_left_out(pile, tmp_path):
+    shutil.copytree(pile.name, tmp_path / "copy")
+    job, catalogue = tmp_path / "copy" / "job.yaml", require_job(pile).catalogue
+    job.write_text(job.read_text().replace(catalogue, "f" * len(catalogue)))
+    manifest = export_to(LocalStore(tmp_path / "copy"), tmp_path / "new", "gltf").manifest
+    assert (manifest["pairs"], manifest["left_out"]) == (0, {NO_SOURCES: 1})
+
+
+def test_the_container_is_split_where_its_json_ends(exported):
+    tree, rest = split_glb(exported[0].read_bytes())
+    assert tree == read_glb(exported[0])[0]
+    assert rest[8:] == read_glb(exported[0])[1]

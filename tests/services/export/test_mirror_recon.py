@@ -1,0 +1,135 @@
+"""The authors' layout, read back by a reader that knows nothing but its description (tests/authors_loader.py)."""
+
+import csv
+
+import cv2
+import numpy as np
+import pytest
+
+from services.export.mirror_recon import in_units
+from tests.authors_loader import load_pairs
+from tests.datasets import make_dataset
+from tests.exported import contents, export_to, source_image, source_poses, source_rows
+from workers.store.images import encode_png
+
+WORDS = {"rgb": "RGB", "depth": "depth", "segment": "segment"}
+
+
+@pytest.fixture(scope="module")
+def exported(files, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mirror") / "new"
+    result = export_to(files, folder, "mirror-recon")
+    return folder, result.manifest
+
+
+def source_ids(folder):
+    """Pose id in the dataset by (category, even id)."""
+    with (folder / "pairs.csv").open() as file:
+        return {(row["category"], int(row["id"])): int(row["pose_id"]) for row in csv.DictReader(file)}
+
+
+def test_the_authors_loader_pairs_every_view(files, exported):
+    folder, manifest = exported
+    categories = sorted({row["category"] for row in source_rows(files.root, "scenes")})
+    loaded = {category: list(load_pairs(folder / category)) for category in categories}
+    assert sum(map(len, loaded.values())) == 8 == manifest["pairs"]
+    assert manifest["pairs_left_out"] == 0 and manifest["left_out"] == {}
+    assert manifest["views"] == {category: 2 * len(pairs) for category, pairs in loaded.items()}
+    poses, ids = source_poses(files.root), source_ids(folder)
+    for category, pairs in loaded.items():
+        for pair in pairs:
+            source = ids[category, pair.front.number]
+            for pose, number in ((pair.front, source), (pair.back, source + 1)):
+                np.testing.assert_allclose(pose.T_world_cam, poses[number], atol=1e-6)
+                assert np.sin(pose.pitch) == pytest.approx(-pose.T_world_cam[2, 2])
+                assert np.tan(pose.yaw) == pytest.approx(pose.T_world_cam[1, 2] / pose.T_world_cam[0, 2])
+
+
+def test_depths_masks_and_colours_are_those_of_the_dataset(files, exported):
+    folder, _ = exported
+    for (category, even), source in source_ids(folder).items():
+        pair = next(one for one in load_pairs(folder / category) if one.front.number == even)
+        for name, word in WORDS.items():
+            for number in (0, 1):
+                stored = source_image(files.root, category, word, source + number)
+                np.testing.assert_array_equal(pair.images[f"{name}{number}"], stored)
+            for number, side in enumerate(("yaw0", "yaw-179")):
+                stored = source_image(files.root, f"{category}/patches", word, source + number)
+                np.testing.assert_array_equal(pair.images[f"{name}In0{side}obj0"], stored)
+        for name, word in (("rgbProj0", "RGBprojected"), ("depthProj0", "depthProjected")):
+            np.testing.assert_array_equal(pair.images[name], source_image(files.root, category, word, source))
+            patch = source_image(files.root, f"{category}/patches", word, source)
+            np.testing.assert_array_equal(pair.images[f"{name}yaw-179obj0"], patch)
+
+
+def test_the_first_object_is_the_table_and_the_last_one_the_pairs_own(files, exported):
+    folder, _ = exported
+    rows = {(row["pose_id"], row["role"], row["region_id"]): row for row in source_rows(files.root, "objects")}
+    for (category, even), source in source_ids(folder).items():
+        pair = next(one for one in load_pairs(folder / category) if one.front.number == even)
+        for pose, role, number in ((pair.front, "input", source), (pair.back, "mirror", source + 1)):
+            table, thing = pose.objects[0], pose.objects[-1]
+            assert (table.category, thing.category) == ("table", category) and len(pose.objects) == 2
+            for one, region in ((table, 2), (thing, 3)):
+                row = rows[number, role, region]
+                assert (one.instance, one.region, one.centre) == (row["instance_id"], region, (row["u"], row["v"]))
+                np.testing.assert_allclose(one.T_cam_obj.ravel(), row["T_cam_obj"], atol=1e-6)
+
+
+def test_the_map_of_distances_is_that_of_each_pixel_to_the_nearest_of_the_object(exported):
+    folder, _ = exported
+    category, even = next(iter(source_ids(folder)))
+    pair = next(one for one in load_pairs(folder / category) if one.front.number == even)
+    height, width = pair.images["distIn0yaw0obj0"].shape
+    rows, columns = np.nonzero(pair.images["segment0"] == 3)
+    u, v = pair.front.objects[-1].centre
+    expected = np.empty((height, width))
+    for row, column in np.ndindex(height, width):
+        expected[row, column] = np.hypot(rows - (v - height // 2 + row), columns - (u - width // 2 + column)).min()
+    assert np.abs(pair.images["distIn0yaw0obj0"] - expected).max() <= 0.5 + 1e-3
+    assert expected.max() > 3 and (expected == 0).any()
+
+
+def test_tars_export_the_same_bytes_as_files(files, tars, exported, tmp_path):
+    export_to(tars, tmp_path / "new", "mirror-recon")
+    theirs, ours = contents(tmp_path / "new"), contents(exported[0])
+    assert {k: v for k, v in theirs.items() if k != "export.json"} == {
+        k: v for k, v in ours.items() if k != "export.json"
+    }
+
+
+def test_captures_are_paired_too(captures, tmp_path):
+    manifest = export_to(captures, tmp_path / "new", "mirror-recon").manifest
+    pairs = list(load_pairs(tmp_path / "new" / "mug"))
+    assert len(pairs) == manifest["pairs"] and len(pairs) + manifest["pairs_left_out"] == 4
+    assert len(pairs) >= 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"render": {"rgb": False}}, "no rgb of the input view"),
+        ({"images": {"projection": {"enabled": False}}}, "no projected view"),
+        ({"images": {"patch": {"width": 120, "height": 110}}}, "no patch of the "),
+    ],
+)
+def test_a_pair_that_lacks_an_image_is_left_out_and_counted(changes, reason, tmp_path):
+    store, _ = make_dataset(tmp_path / "out", scenes=2, categories=["can"], **changes)
+    manifest = export_to(store, tmp_path / "new", "mirror-recon").manifest
+    assert (manifest["pairs"], manifest["pairs_left_out"]) == (0, 2)
+    assert all(one.startswith(reason) for one in manifest["left_out"])
+    lines = (tmp_path / "new" / "left_out.csv").read_text().splitlines()
+    assert lines[0] == "scene_id,pose_id,reason" and [line.split(",")[:2] for line in lines[1:]] == [
+        ["0", "0"],
+        ["1", "2"],
+    ]
+
+
+def test_scenes_of_several_objects_are_left_out(pile, tmp_path):
+    assert export_to(pile, tmp_path / "new", "mirror-recon").manifest["left_out"] == {"several objects": 1}
+
+
+def test_depth_in_other_units_is_converted_to_the_nearest_unit():
+    depth = np.array([[0, 1000, 1500, 65535]], np.uint16)
+    converted = cv2.imdecode(np.frombuffer(in_units(encode_png(depth), 1000.0), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert converted.tolist() == [[0, 5000, 7500, 0]]

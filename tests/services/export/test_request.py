@@ -1,0 +1,7 @@
+from services.cli.parser import EXPORT_FORMATS
+from services.export.request import FORMATS, SHARDED
+
+
+def test_the_command_line_names_every_format():
+    assert EXPORT_FORMATS == FORMATS
+    assert set(SHARDED) <= set(FORMATS)
