@@ -1,0 +1,193 @@
+"""The sections of the page that are figures: overview, histograms, effects, failures, captures. Pure: figures to HTML."""
+
+from collections.abc import Iterable, Mapping
+from functools import partial
+from html import escape
+
+from schemas.job.job import Job
+from services.report.charts import Chart, amount, chart_html, length_of_decade
+from services.report.collect import Cost, Failure, Figures
+from services.report.histogram import Histogram
+from services.study.words import duration, milliseconds, number, size
+
+
+def overview_html(figures: Figures, job: Job, failed: int) -> str:
+    """Totals, and the scenes of each category."""
+    tiles = [
+        ("scenes", f"{figures.scenes:,}", f"of {job.scenes:,} asked"),
+        ("failed", f"{failed:,}", f"{number(round(100 * failed / max(failed + figures.scenes, 1), 2))} % of those tried"),
+        ("pairs of views", f"{figures.pairs:,}", f"{figures.views:,} views"),
+        ("objects", f"{figures.instances:,}", f"different ones in {_plural(len(figures.by_category), 'category', 'categories')}"),
+        ("images", f"{figures.files:,}", size(figures.bytes / 1e3)),
+        ("time", duration(figures.seconds), f"{milliseconds(1e3 * figures.seconds / max(figures.scenes, 1))} a scene"),
+    ]  # fmt: skip
+    tiles_html = "".join(
+        f"<div><dt>{escape(name)}</dt><dd>{escape(value)}<small>{escape(more)}</small></dd></div>"
+        for name, value, more in tiles
+    )
+    most = max(figures.by_category.values(), default=1)
+    rows = "".join(
+        f'<tr><th scope="row">{escape(name)}</th><td class="wide">{_bar(count / most)}</td><td>{count:,}</td></tr>'
+        for name, count in figures.by_category.items()
+    )
+    table = f'<table class="bars"><caption>Scenes by category</caption><tbody>{rows}</tbody></table>' if rows else ""
+    return f'<dl class="tiles">{tiles_html}</dl>{table}{_sampled(figures)}'
+
+
+def charts_html(figures: Figures, depth: Mapping[str, Histogram]) -> str:
+    """The histograms."""
+    metres, degrees = partial(amount, unit="m"), partial(amount, unit="°")
+    shown = (
+        Chart(
+            "Depth of the objects", depth, "Along the optical axis, of object pixels in the scenes shown above.", metres
+        ),
+        Chart(
+            "Distance to the object",
+            {"": figures.distance},
+            "d_z of each pair, which places the mirror camera.",
+            metres,
+        ),
+        Chart(
+            "Visibility",
+            figures.visibility,
+            "Share of the object's own pixels that the frame holds and nothing covers.",
+            lambda share: amount(100.0 * share, "%"),
+        ),
+        Chart("Inclination", figures.inclination, "Angle of the optical axis below the horizontal.", degrees),
+        Chart(
+            "Resting gap",
+            {"": figures.gap},
+            "Largest height at which an object of the scene hovers; logarithmic, less than 1 nm counts as 1 nm.",
+            length_of_decade,
+        ),
+    )
+    return f'<div class="charts">{"".join(map(chart_html, shown))}</div>'
+
+
+def effects_html(figures: Figures) -> str:
+    """What ran, how often and for how long; what was left out and why; the time of each stage."""
+    ran = {name: cost for name, cost in figures.effects.items() if cost.runs}
+    plain = [name for name, cost in ran.items() if not cost.timed and not cost.skips]
+    never = {name: cost for name, cost in figures.effects.items() if not cost.runs}
+    head = ("effect", "scenes", "time", "each")
+    rows = [
+        (f"<code>{escape(name)}</code>{_why(cost)}", _share(cost.runs, figures.scenes), *_times(cost))
+        for name, cost in ran.items()
+        if name not in plain
+    ]
+    stages = [
+        (f"<code>{escape(name)}</code>", f"{cost.seconds / max(figures.seconds, 1e-9):.1%}", *_times(cost))
+        for name, cost in figures.stages.items()
+    ]
+    never_rows = "".join(
+        f"<dt><code>{escape(name)}</code></dt><dd>{escape('; '.join(cost.skips) or 'not told')}</dd>"
+        for name, cost in sorted(never.items())
+    )
+    left_out = (
+        f'<details><summary>{_plural(len(never), "effect")} that ran in no scene, and why</summary><dl class="why">{never_rows}'
+        "</dl></details>"
+    )
+    return (
+        f"{_table(head, rows, 'Effects that ran') if rows else ''}{_plain(plain)}"
+        f"{left_out if never else ''}{_table(('stage', 'share', 'time', 'each'), stages, 'Time by stage')}"
+    )
+
+
+def failures_html(failures: Iterable[Failure], scenes: int) -> str:
+    """Each way of failing, with its reason in full and scenes to look at."""
+    items = [
+        f'<li><p><strong>{escape(one.reason.replace("_", " "))}</strong> <span class="count">{_plural(one.scenes, "scene")}'
+        f"</span></p><p>{escape(one.detail)}</p><p class=\"note\">Stage {escape(one.stage)}, {escape(one.kind)}; for example "
+        f"{escape(_listed(one.examples))}.</p></li>"
+        for one in failures
+    ]  # fmt: skip
+    if not items:
+        return f'<p class="empty">No scene failed{f" of {scenes:,}" if scenes else ""}.</p>'
+    return f'<ul class="failures">{"".join(items)}</ul>'
+
+
+def captures_html(figures: Figures) -> str:
+    """The quality of each capture; empty where the dataset is of scenes."""
+    if not figures.captures:
+        return ""
+    head = ("capture", "views", "corner error", "pose", "cloud", "complete", "measured")
+    rows = [
+        (
+            f"{escape(one.name)}<small>{escape(one.category)}, scene {one.scene_id}, {escape(one.estimate)}</small>",
+            f"{one.views}{f'<small>{one.left_out} left out</small>' if one.left_out else ''}",
+            _figure(one.reprojection_px, "px"),
+            _figure(one.pose_mm, "mm"),
+            _figure(one.cloud_median_mm, "mm"),
+            _figure(one.completeness, "%", 100.0),
+            _figure(one.measured_share, "%", 100.0),
+        )
+        for one in figures.captures
+    ]
+    note = (
+        "Corner error: median over the views after estimation. Pose, cloud (median) and completeness are held against the"
+        " truth, which photographs do not have. Measured: share of the mirror views that is measured and not filled."
+    )
+    return f'{_table(head, rows, "Quality")}<p class="note">{note}</p>'
+
+
+def _table(head: Iterable[str], rows: Iterable[Iterable[str]], caption: str) -> str:
+    """A table of HTML cells; the first is the row's name."""
+    heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
+    body = "".join(
+        f'<tr><th scope="row">{first}</th>{"".join(f"<td>{cell}</td>" for cell in cells)}</tr>'
+        for first, *cells in rows
+    )
+    return f"<table><caption>{escape(caption)}</caption><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _bar(share: float) -> str:
+    return (
+        '<svg class="share" viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true">'
+        f'<rect class="bar" width="{100 * share:.1f}" height="8"/></svg>'
+    )
+
+
+def _why(cost: Cost) -> str:
+    """The most frequent reason for leaving an effect out."""
+    if not cost.skips:
+        return ""
+    (why, times), *others = cost.skips.most_common()
+    more = f", {len(others)} more {'reason' if len(others) == 1 else 'reasons'}" if others else ""
+    return f"<small>left out {times:,} ×: {escape(why)}{more}</small>"
+
+
+def _times(cost: Cost) -> tuple[str, str]:
+    """(in all, each run)."""
+    if not cost.timed:
+        return ("–", "–")
+    return duration(cost.seconds), milliseconds(1e3 * cost.seconds / cost.timed)
+
+
+def _plain(names: Iterable[str]) -> str:
+    """Effects of which there is no more to tell than that they ran."""
+    listed = ", ".join(f"<code>{escape(name)}</code>" for name in names)
+    every = f" Ran in every scene, and counted with its stage: {listed}." if listed else ""
+    return f'<p class="note">An effect without a time is counted with its stage.{every}</p>'
+
+
+def _share(part: int, whole: int) -> str:
+    return f"{part:,}<small>{part / max(whole, 1):.0%}</small>"
+
+
+def _figure(value: float | None, unit: str, times: float = 1.0) -> str:
+    return "–" if value is None else f"{number(value * times)} {unit}"
+
+
+def _plural(count: int, one: str, many: str | None = None) -> str:
+    return f"{count:,} {one if count == 1 else many or f'{one}s'}"
+
+
+def _listed(scenes: Iterable[int]) -> str:
+    numbers = [str(scene) for scene in scenes]
+    return f"scene{'s' if len(numbers) > 1 else ''} {', '.join(numbers)}"
+
+
+def _sampled(figures: Figures) -> str:
+    if not figures.sampled:
+        return ""
+    return '<p class="note">The dataset is not finished and large: the figures are of ranges chosen evenly from it.</p>'

@@ -1,0 +1,217 @@
+"""`verso serve`: the live page over HTTP, read-only. Edge: the one file that opens a port for it."""
+
+import contextlib
+import ipaddress
+import json
+import signal
+import socket
+import threading
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import quote
+
+from schemas.errors import InputError
+from services.report.follow import Follower
+from services.report.gate import HEADERS, LEAST_TOKEN, Gate, is_address, is_loopback, judge, make_token
+from services.report.page import read_web
+from services.report.view import live_page
+
+MOST_REQUESTS = 64
+"""Connections that are answered at once; more are closed."""
+
+STALLED_S = 20.0
+"""A connection on which nothing comes for so long is closed."""
+
+STATIC = {
+    "/page.css": "text/css",
+    "/page.js": "text/javascript",
+    "/space.js": "text/javascript",
+    "/live.js": "text/javascript",
+    "/icon.svg": "image/svg+xml",
+    "/three.js": "text/javascript",
+    "/three.LICENSE": "text/plain",
+}
+"""Files of the page, by their whole path: nothing is looked up on the disk by what a request names."""
+
+TOLD = {
+    401: "this page needs its token: open the address that `verso serve` printed",
+    403: "this server is not known by that name: open the address that `verso serve` printed",
+    404: "there is nothing here: the page is at /",
+    405: "this server only answers reading: GET and HEAD",
+}
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where to listen, and who may read."""
+
+    host: str
+    port: int
+    token: str | None
+
+    @property
+    def address(self) -> str:
+        """What a person opens; a server that listens everywhere is told by this machine's name."""
+        anywhere = is_address(self.host) and ipaddress.ip_address(self.host).is_unspecified
+        host = socket.gethostname() if anywhere else f"[{self.host}]" if ":" in self.host else self.host
+        return f"http://{host}:{self.port}/{f'?token={quote(self.token)}' if self.token else ''}"
+
+
+def choose_place(host: str, port: int, token: str | None) -> Place:
+    """Where to listen: a token is made where one is asked for (`auto`), or needed and not given.
+
+    Raises InputError for a token that is easily guessed.
+    """
+    if token == "auto" or (token is None and not is_loopback(host)):
+        token = make_token()
+    if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable()):
+        told = (
+            f"--token has {len(token)} characters: give at least {LEAST_TOKEN} plain ones, or `auto` for a random one"
+        )
+        raise InputError(told)
+    return Place(host, port, token)
+
+
+@contextlib.contextmanager
+def serving(follower: Follower, place: Place) -> Iterator[Place]:
+    """Answers requests while the block runs; yields the place with the port that was opened.
+
+    Raises InputError where it cannot be opened.
+    """
+    try:
+        server = _Server(follower, place)
+    except (OSError, OverflowError, UnicodeError) as error:
+        told = getattr(error, "strerror", None) or str(error)
+        remedy = "choose another --port, or a --host of this machine"
+        raise InputError(f"{place.host} port {place.port} cannot be opened: {told}; {remedy}") from error
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, name="http", daemon=True)
+    thread.start()
+    try:
+        yield Place(place.host, server.server_address[1], place.token)
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join(10)
+
+
+@contextlib.contextmanager
+def ended_by_signal() -> Iterator[threading.Event]:
+    """An event that Ctrl-C and SIGTERM set while the block runs, in place of what they would do. For the main thread."""
+    ended = threading.Event()
+    before = {one: signal.signal(one, lambda *_: ended.set()) for one in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield ended
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+
+
+class _Server(ThreadingHTTPServer):
+    """Answers each connection in a thread, of which there is a largest number."""
+
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, follower: Follower, place: Place) -> None:
+        self.follower = follower
+        self.address_family = socket.AF_INET6 if ":" in place.host else socket.AF_INET
+        self._free = threading.BoundedSemaphore(MOST_REQUESTS)
+        super().__init__((place.host, place.port), _Handler)
+        names = {"localhost", socket.gethostname().lower(), place.host.lower()}
+        self.gate = Gate(frozenset(names), place.token, f"verso_{self.server_address[1]}")
+
+    def server_bind(self) -> None:
+        """Binds without asking for the name of the address, which may take long without a network."""
+        socket_server_bind(self)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answers in a thread, or closes the connection where too many are open."""
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answers one connection."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Says nothing of a connection that the reader closed."""
+
+
+def socket_server_bind(server: ThreadingHTTPServer) -> None:
+    """Binds the socket and notes the address."""
+    server.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    server.socket.bind(server.server_address)
+    server.server_address = server.socket.getsockname()
+    server.server_name, server.server_port = str(server.server_address[0]), server.server_address[1]
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """One connection."""
+
+    server: _Server
+    timeout = STALLED_S
+    server_version, sys_version = "verso", ""
+
+    def handle_one_request(self) -> None:
+        """Reads one request and answers it, whatever its method."""
+        self.raw_requestline = self.rfile.readline(65_537)
+        if not self.raw_requestline or len(self.raw_requestline) > 65_536:
+            self.close_connection = True
+            return
+        if self.parse_request():
+            self._answer()
+
+    def _answer(self) -> None:
+        try:
+            headers = {name.lower(): value for name, value in self.headers.items()}
+            verdict = judge(self.server.gate, self.command, self.path, headers)
+        except ValueError:  # an address that is none
+            return self._send(404, "text/plain", TOLD[404].encode())
+        if verdict.status == 303:
+            cookie = f"{self.server.gate.cookie}={self.server.gate.token}; Path=/; HttpOnly; SameSite=Lax"
+            return self._send(303, "text/plain", b"", {"Location": "/", "Set-Cookie": cookie})
+        found = self._find(verdict.path) if verdict.status == 200 else None
+        if found is None:
+            status = 404 if verdict.status == 200 else verdict.status
+            more = {"Allow": "GET, HEAD"} if status == 405 else {}
+            return self._send(status, "text/plain", f"{status}: {TOLD[status]}\n".encode(), more)
+        kind, data = found
+        kept = "private, max-age=86400, immutable" if verdict.path.startswith("/picture/") else "no-store"
+        return self._send(200, kind, data, {"Cache-Control": kept})
+
+    def _find(self, path: str) -> tuple[str, bytes] | None:
+        """(content type, bytes) of a path that is known by name, None of every other."""
+        view = self.server.follower.view
+        if path == "/":
+            return "text/html", live_page(view).encode()
+        if path == "/live.json":
+            return "application/json", json.dumps(view.state()).encode()
+        if path == "/sections.json":
+            return "application/json", json.dumps(view.fragments()).encode()
+        if path in STATIC:
+            return STATIC[path], read_web(path.removeprefix("/")).encode()
+        picture = self.server.follower.shelf.get(path.removeprefix("/picture/"))
+        return None if picture is None else (f"image/{picture.kind}", picture.data)
+
+    def _send(self, status: int, kind: str, data: bytes, more: Mapping[str, str] | None = None) -> None:
+        self.close_connection = True
+        self.send_response(status, HTTPStatus(status).phrase)
+        text = "" if kind.startswith("image/") else "; charset=utf-8"
+        for name, value in {**HEADERS, "Cache-Control": "no-store", **(more or {})}.items():
+            self.send_header(name, value)
+        self.send_header("Content-Type", f"{kind}{text}")
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(data)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Logs nothing: addresses would hold the token."""
