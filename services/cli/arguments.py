@@ -43,6 +43,15 @@ def read_counts(text: str) -> list[int]:
     return [read_count(one) for one in text.split(",")]
 
 
+def read_span(text: str) -> tuple[int, int]:
+    """Two ids, FIRST-LAST, both included; one id means itself alone. Raises argparse.ArgumentTypeError."""
+    first, dash, last = text.partition("-")
+    span = read_index(first), read_index(last if dash else first)
+    if span[1] < span[0]:
+        raise argparse.ArgumentTypeError(f"{text} ends before it begins: write FIRST-LAST, such as 0-63")
+    return span
+
+
 def read_path(text: str) -> Path:
     """A file or folder. Raises argparse.ArgumentTypeError where none can have that name."""
     return Path(read_place(text))
@@ -89,6 +98,22 @@ def read_listener(text: str) -> str:
         return read_address(text)
     except argparse.ArgumentTypeError:
         raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}") from None
+
+
+def read_port(text: str) -> int:
+    """A port, or 0 for any that is free. Raises argparse.ArgumentTypeError."""
+    if read_index(text) > 65535:
+        raise argparse.ArgumentTypeError(f"{text} is not a port from 0 to 65535")
+    return int(text)
+
+
+def read_host(text: str) -> str:
+    """A name or an address to listen on, without a port. Raises argparse.ArgumentTypeError."""
+    bare = text.removeprefix("[").removesuffix("]")
+    if not re.fullmatch(r"[\w-]{1,63}(?:\.[\w-]{1,63})*|[0-9a-fA-F:.]{2,45}", bare, re.ASCII):
+        told = "write a name or an address without a port, such as 127.0.0.1 or 0.0.0.0"
+        raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)}: {told}")
+    return bare
 
 
 def read_http(text: str) -> str:

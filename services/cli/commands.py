@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from contextlib import closing
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from schemas.errors import InputError, RunError, VersoError
+from services.cli.environment import host_place
 from services.job.read import load_job, pack_job
 
 if TYPE_CHECKING:
@@ -24,12 +26,14 @@ Found = TypeVar("Found")
 def run(options: argparse.Namespace) -> int:
     """`verso run`."""
     job = load_job(options.job, _changes(options))
-    from services.run.step import RunRequest, describe_plan, run_job
+    from services.run.step import RunRequest, run_job
 
     out = options.out or f"data/{job.name}"
     absolute = out if "://" in out else str(Path(out).resolve())
     request = RunRequest(job, options.job.parent, absolute, options.address, options.retry_failed, options.metrics)
     if options.dry_run:
+        from services.run.dry_run import describe_plan
+
         print("\n".join(describe_plan(request)))
         return 0
     result = run_job(request)
@@ -39,14 +43,15 @@ def run(options: argparse.Namespace) -> int:
 
 
 def tell_result(out: str, job: "Job", result: "RunResult") -> tuple[bool, dict[str, Any]]:
-    """Prints what a run made; whether it is complete, and the answer for programs."""
+    """Prints what a run made, where, and what to do next; whether it is complete, and the answer for programs."""
     merged = result.merged
     made, failed = merged.scenes["made"], merged.scenes["intrinsic"] + merged.scenes["environmental"]
     share = failed / job.scenes
     complete = merged.complete and share <= job.run.max_failure_share
     rate = f", {result.made_now / result.seconds:.1f} scenes/s" if result.made_now else ""
-    print(f"{out}: {made} scenes made, {failed} failed, in {result.seconds:.1f} s{rate}")
-    print(f"dataset digest {merged.digest}")
+    print(f"{result.made_now} scenes made now, {made} in all, {failed} failed, in {result.seconds:.1f} s{rate}")
+    print(f"{out}{host_place(out)}: dataset digest {merged.digest}")
+    print(f'next: verso report {out} · verso query {out} "select category, count(*) from scenes group by category"')
     if again := merged.scenes["environmental"]:
         told = f"{again} scenes failed for environmental reasons: try again with --retry-failed"
         print(f"verso: {told}", file=sys.stderr)
@@ -171,12 +176,24 @@ def _with_progress(scenes: int, what: str, work: Callable[[Callable[[Any], None]
 
 def query(options: argparse.Namespace) -> int:
     """`verso query`."""
-    from services.read.query import query as run_query
-    from services.read.query_formats import format_rows
+    from services.read.query import ask
+    from services.read.query_formats import write_rows
 
-    rows = run_query(_dataset(options.out), options.sql)
-    sys.stdout.buffer.write(format_rows(rows, "json" if options.json else options.format))
+    with ask(_dataset(options.out), options.sql) as rows:
+        wide = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+        write_rows(rows, "json" if options.json else options.format, sys.stdout.buffer, wide)
     sys.stdout.flush()
+    return 0
+
+
+def columns(options: argparse.Namespace) -> int:
+    """`verso columns`."""
+    from services.read.columns_page import describe_columns, list_columns
+
+    if options.json:
+        answer_json(options, {"ok": True, "columns": list_columns(options.table)})
+    else:
+        print("\n".join(describe_columns(options.table)))
     return 0
 
 

@@ -20,3 +20,10 @@ def enter_stack_environment() -> None:
 def default_queue() -> str | None:
     """The queue that commands use where they name none: $VERSO_QUEUE."""
     return os.environ.get("VERSO_QUEUE") or None
+
+
+def host_place(out: str) -> str:
+    """In a container whose /data is a folder of the host's, $VERSO_HOST_DATA: where a place is there, in brackets; else empty."""
+    host = os.environ.get("VERSO_HOST_DATA")
+    place = os.path.realpath(out) if "://" not in out else ""
+    return f" (on the host: {host}{place.removeprefix('/data')})" if host and place.startswith("/data/") else ""

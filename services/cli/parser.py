@@ -1,18 +1,31 @@
 """The commands and their options, as one table. Handlers are named and not imported, so that `--help` loads nothing heavy."""
 
 import argparse
-import sys
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from services.cli.arguments import Parser, read_address, read_counts, read_index, read_listener, read_path, read_place
+from services.cli.arguments import (
+    Parser,
+    read_address,
+    read_count,
+    read_index,
+    read_listener,
+    read_path,
+    read_place,
+    read_span,
+)
 from services.cli.capture_parser import CAPTURE_COMMANDS
 from services.cli.command import JOB, JSON, OUT, SCENE, SET, Command, number, option
+from services.cli.init_parser import INIT
 from services.cli.queue_parser import QUEUE_COMMANDS
+from services.cli.report_parser import REPORT_COMMANDS
+from services.cli.study_parser import STUDY_COMMANDS
 
 if TYPE_CHECKING:
     Commands = argparse._SubParsersAction[Parser]
+
+EXPORT_FORMATS: Final = ("mirror-recon", "bop", "webdataset", "huggingface", "gltf")
+"""Those of services/export/formats.py, which a test compares."""
 
 KEPT: Final = "what is committed is kept, the same command goes on from there"
 
@@ -68,6 +81,7 @@ def _version() -> str:
 
 
 COMMANDS: dict[str, Command] = {
+    "init": INIT,
     "run": Command(
         "make a dataset, or go on where it stopped",
         "deploy/jobs/tabletop.yaml --scenes 128 --set start.pose=tumbled",
@@ -131,6 +145,11 @@ COMMANDS: dict[str, Command] = {
             option("--format", choices=("table", "csv", "parquet", "json"), default="table"),
         ),
     ),
+    "columns": Command(
+        "every column of the tables, with type, unit, frame and meaning",
+        "views",
+        (option("table", metavar="TABLE", nargs="?", help="scenes, views, objects, ... (default: all)"),),
+    ),
     "replay": Command(
         "make one scene again and compare it with what is stored, or put back what was lost",
         "data/tabletop 17",
@@ -149,6 +168,40 @@ COMMANDS: dict[str, Command] = {
         "data/tabletop 17 --glb scene17.glb",
         (OUT, SCENE, option("--glb", type=read_path, required=True, metavar="FILE")),
     ),
+    "sheet": Command(
+        "draw a page with images of some scenes of each category",
+        "data/tabletop sheet.jpg --scenes 3",
+        (
+            OUT,
+            option("file", type=read_path, metavar="FILE.jpg", help="the picture to write"),
+            number("--scenes", "scenes of each category (default: 1)", 1),
+            option("--category", metavar="NAME", help="only this one"),
+        ),
+        "services.read.contact_sheet:main",
+    ),
+    **REPORT_COMMANDS,
+    "export": Command(
+        "write the dataset in a layout that other people's loaders read",
+        "data/tabletop data/recon --format mirror-recon --category mug",
+        (
+            OUT,
+            option("dir", type=read_place, metavar="DIR", help="a new or an empty folder, or one to go on in"),
+            option("--format", choices=EXPORT_FORMATS, required=True, help="docs/export.md describes each"),
+            option(
+                "--category", action="append", default=[], metavar="NAME", help="only scenes of it; may be repeated"
+            ),
+            option("--scenes", type=read_span, metavar="FIRST-LAST", help="only scenes with these ids"),
+            option("--where", metavar="SQL", help="only scenes for which this holds, such as 'support_margin_mm > 5'"),
+            option(
+                "--shard-mb",
+                type=read_count,
+                metavar="N",
+                default=256,
+                help="size of a file of webdataset and huggingface, 10^6 bytes (default: 256)",
+            ),
+        ),
+        "services.export.command:main",
+    ),
     "capture": Command(
         "real photographs of an object on a marker board: print a board, simulate, import, process, make views, score",
         "process data/mug",
@@ -161,65 +214,25 @@ COMMANDS: dict[str, Command] = {
         (option("anything", nargs="*"),),
         "services.cli.selftest:main",
     ),
-    "bench": Command(
-        "time by stage on one core, beside the script that people write today and the least that is possible",
-        "deploy/jobs/tabletop.yaml --scenes 64 --memory 2000 --workers 2",
-        (
-            option("job", type=read_path, metavar="JOB.yaml", nargs="?", help="default: a job of built-in shapes"),
-            number("--scenes", "how many scenes each side makes", 48),
-            option(
-                "--folder",
-                type=read_path,
-                metavar="DIR",
-                default=Path("data"),
-                help="on the disk to measure (default: data)",
-            ),
-            number("--memory", "also watch one worker's memory over N scenes"),
-            number("--workers", "also compare N workers with one, beside N plain processes"),
-            number("--scaling-scenes", "how many scenes that comparison makes", 512),
-            SET,
-            option(
-                "--pathtraced",
-                nargs="?",
-                const=sys.executable,
-                metavar="PYTHON",
-                help="time the path-traced tier instead, beside Blender's Cycles where PYTHON (default: this one) has bpy",
-            ),
-            option(
-                "--nodes",
-                type=read_counts,
-                metavar="N,N,...",
-                help="measure the coordinator instead, on so many simulated nodes whose scenes only take their time",
-            ),
-            number(
-                "--effects",
-                "time settling instead: N scenes by their plan of effects, and with every effect of physics forced",
-            ),
-        ),
-        "services.bench.command:main",
-        starts_ray=lambda options: options.workers is not None or options.nodes is not None,
-        kept="no figures are kept",
-    ),
-    "tradeoff": Command(
-        "what accuracy costs in time, measured on the job's own scenes",
-        "deploy/jobs/tabletop.yaml --out data/tradeoff --target penetration_mm=0.1,depth_mm=0.5",
-        (
-            JOB,
-            option("--out", type=read_path, required=True, metavar="DIR", help="goes on there where it stopped"),
-            option(
-                "--target",
-                metavar="ERROR=MOST,...",
-                help="write DIR/job.yaml: the job with the cheapest setting that keeps these errors",
-            ),
-            option("--knobs", metavar="NAME,...", help="default: all that are known"),
-            number("--scenes", "scenes with images (default: 48)", 48),
-            number("--physics-scenes", "scenes that only come to rest (default: 500)", 500),
-            number("--laps", "rounds of timing (default: 3)", 3),
-            number("--workers", "default: the cores this container may use"),
-            SET,
-        ),
-        "services.study.command:main",
-    ),
+    **STUDY_COMMANDS,
     "doctor": Command("what this machine has, and what is missing", "", (), "services.cli.doctor:main"),
+    "completion": Command(
+        'print what completes commands and options in a shell: eval "$(verso completion bash)"',
+        "bash",
+        (option("shell", choices=("bash", "zsh", "tcsh")),),
+        "services.cli.completion:main",
+    ),
+    "extra": Command(
+        "install what only some commands need: Mitsuba, MuJoCo as a referee, or the plots of studies",
+        "pathtraced",
+        (option("name", choices=("pathtraced", "audit", "study")),),
+        "services.cli.launcher_commands:extra",
+    ),
+    "lock": Command(
+        "make the lock files of a checkout anew, with the newest versions that pyproject.toml allows",
+        "",
+        (),
+        "services.cli.launcher_commands:lock",
+    ),
 }
 """In the order of `verso --help`. `verso test` is parsed by its own handler: it is here for the list."""

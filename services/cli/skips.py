@@ -52,7 +52,11 @@ CONDITIONS: Final[dict[str, Callable[[Machine], bool]]] = {
     "no hosts tool": lambda machine: not (machine.root.parent / "shared" / "tools" / "hosts").exists(),
     "no shared data": lambda machine: not (machine.root.parent / "shared" / "data").is_dir(),
     "no mitsuba": lambda machine: importlib.util.find_spec("mitsuba") is None,
+    "no chromium": lambda machine: shutil.which("chromium") is None,
     "no mujoco": lambda machine: importlib.util.find_spec("mujoco") is None,
+    "no torch": lambda machine: importlib.util.find_spec("torch") is None,
+    "no webdataset": lambda machine: importlib.util.find_spec("webdataset") is None,
+    "no datasets": lambda machine: importlib.util.find_spec("datasets") is None,
     "one core": lambda machine: len(os.sched_getaffinity(0)) < 2,
     "no glibc": lambda machine: platform.libc_ver()[0] != "glibc",
 }

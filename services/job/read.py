@@ -1,7 +1,6 @@
 """Reads a job file into a `Job`. An error names the file, the key, its value and what is allowed."""
 
-import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,8 @@ from schemas.job.job import Job
 from schemas.job.keys import set_key
 from schemas.plain_line import plain_line
 from services.job.bounded_yaml import MOST_LEVELS, parse_yaml
+from services.job.faults import describe_fault
 from services.job.packed import is_packed, pack, unpack
-from services.job.reference import allowed_keys
 
 MOST_BYTES = 250_000
 """Longest job file; the longest example has 2,000 bytes."""
@@ -151,28 +150,3 @@ def validate_job(tree: dict[str, Any], name: str) -> Job:
         if len(told) > MOST_FAULTS:
             lines.append(f"{name}: and {len(told) - MOST_FAULTS} faults more")
         raise JobError("\n".join(lines)) from error
-
-
-def describe_fault(fault: Any) -> str:
-    """One line: the key's path, its value, and what is allowed."""
-    words = [plain_line(str(part)) for part in _written(fault["loc"])]
-    key = plain_line(".".join(words), 200) or "the job"
-    if fault["type"] == "extra_forbidden":
-        allowed = allowed_keys(words)
-        return f"{key}: there is no such key; {did_you_mean(words[-1], allowed)}Allowed here: {', '.join(allowed) or 'nothing'}"
-    if fault["type"] == "missing":
-        return f"{key}: is missing, and has no default"
-    message = plain_line(fault["msg"].removeprefix("Value error, "), 300)
-    return f"{key}: {plain_line(repr(fault['input']))}: {message[:1].lower()}{message[1:]}"
-
-
-def _written(place: Sequence[str | int]) -> list[str | int]:
-    """The parts of a place that the job file has: not the kind that follows a source's position, nor the mark of a key."""
-    parts = [part for before, part in zip((None, *place), place, strict=False) if not isinstance(before, int)]
-    return parts[:-1] if parts[-1:] == ["[key]"] else parts
-
-
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """A question with the nearest of the known words and a space behind it; empty where none is near."""
-    near = difflib.get_close_matches(word, known, n=1)
-    return f"did you mean '{near[0]}'? " if near else ""

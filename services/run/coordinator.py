@@ -25,7 +25,8 @@ from services.run.progress import log_event, say
 from services.run.slots import Slots
 from services.run.stalls import Stall
 from services.run.tally import Tally
-from services.run.watchdog import Watchdog, end_worker_here, find_own_workers
+from services.run.under_way import count_under_way
+from services.run.watchdog import Watchdog, end_worker_here, find_own_workers, scenes_in_progress
 from workers.pipeline.run_shard import TIMED_OUT
 from workers.store.attempt import attempts_at, blamed_scene, host_part, retry_of_attempt
 from workers.store.ledger import read_summary
@@ -34,6 +35,9 @@ from workers.store.sweep import sweep_attempt
 
 POLL_S = 0.5
 """Time of one wait for reports: Ctrl-C is seen at least this often."""
+
+MOST_LOOKED_AT = 32
+"""Shards in flight up to which the notes of their workers are read after every wait. Of more, reports come often enough."""
 
 
 @dataclass(frozen=True)
@@ -88,12 +92,20 @@ class Coordinator:
                     for stall in watchdog.take_stalls():
                         self._end_stalled(stall)
                     self._tally.in_flight = sum(len(spans) for spans in self._running.values())
+                    self._tally.under_way = self._count_under_way()
                     if self._env_vars and (lost := self._lost_nodes.take()):
                         self._give_up_on(lost)
                     progress(self._tally)
         except BaseException:
             self._cancel()
             raise
+
+    def _count_under_way(self) -> int:
+        """Scenes made in shards that have not reported; 0 where a look costs much: on an object store, or of many shards."""
+        if self._store.root is None or len(self._running) > MOST_LOOKED_AT:
+            return 0
+        scenes = scenes_in_progress(self._store, self._order.label)
+        return count_under_way(self._running.values(), {attempt.start: scene for attempt, scene in scenes.items()})
 
     def _fill_slots(self, shards: Iterator[tuple[Span, ...]]) -> bool:
         """Gives shards to Ray while there is room; False where nothing is left to wait for."""

@@ -13,7 +13,7 @@ from schemas.dataset.shard import JobChange, ShardOrder
 from schemas.errors import FingerprintError
 from schemas.job.job import Job
 from services.job.record import JobRecord, adopt, encode_job, record_job, refuse_foreign
-from services.merge.dataset_card import describe_left_out, describe_sources, write_card
+from services.merge.dataset_card import describe_doubts, describe_left_out, write_card
 from services.merge.step import MergeResult, merge
 from services.run.coordinator import Coordinator, Limits
 from services.run.joining import join_cluster, terms_of_driver, with_own_stack
@@ -23,7 +23,7 @@ from services.run.metrics import Meter, serve
 from services.run.out_folder import explain_lost_folder
 from services.run.pattern import Pattern
 from services.run.progress import ProgressLine, event_log, log_event
-from services.run.range_planner import MAX_SHARD, SpanPlan, choose_shard_size, group_shards, plan_spans
+from services.run.range_planner import SpanPlan, choose_shard_size, group_shards, plan_spans
 from services.run.ray_cluster import open_ray
 from services.run.slots import SharedSlots, Slots
 from services.run.tally import Tally
@@ -63,28 +63,6 @@ class RunResult:
     made_now: int
 
 
-def describe_plan(request: RunRequest) -> list[str]:
-    """Lines that tell what a run would do, without doing any of it."""
-    job = request.job
-    require_tier(job.drawn)
-    catalogue = _open_catalogue(request)
-    return [
-        f"job {job.name}: {describe_scenes(job)}, seed {job.seed}",
-        f"categories: {', '.join(f'{name} {weight:g}' for name, weight in sorted(job.categories.items()))}",
-        *describe_sources(catalogue),
-        f"out: {request.out}, ranges of {job.range_size}, shards of {job.run.shard_size or f'up to {MAX_SHARD}'} scenes",
-    ]
-
-
-def describe_scenes(job: Job) -> str:
-    """What a job makes, in a few words."""
-    ids = f"{job.first_scene} to {job.stop_scene - 1}"
-    if job.captures is None:
-        return f"scenes {ids}, {job.pairs_per_scene} pair(s) each"
-    virtual = f"virtual, of {job.captures.simulate.views} views"
-    return f"captures {ids}, {'in folders' if job.captures.folders else virtual}, at most {job.captures.most_views} pairs each"
-
-
 def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slots] | None = None) -> RunResult:
     """Makes the missing scenes, then merges. Raises VersoError.
 
@@ -92,9 +70,9 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     """
     begun = time.monotonic()
     require_tier(request.job.drawn)
-    catalogue = _open_catalogue(request)
+    catalogue = open_catalogue(request)
     store = open_store(request.out)
-    for line in describe_left_out(catalogue):
+    for line in (*describe_left_out(catalogue), *describe_doubts(catalogue)):
         print(f"verso: {line}", file=sys.stderr)
     refuse_foreign(store)
     store.prepare()
@@ -105,7 +83,7 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
         event_log(store.root),
         serve(meter, request.metrics),
     ):
-        record = adopt(store, _record(request, catalogue))
+        record = adopt(store, record_of(request, catalogue))
         sweep(store, fenced=None)
         ledger = list_commits(store)
         for line in find_lost(store, ledger):
@@ -117,6 +95,12 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
                 pattern = Pattern(order_pattern(store, request.out, record, ledger), catalogue, terms_of_driver())
                 if request.address is not None:
                     pattern = replace(pattern, order=with_own_stack(store, pattern.order))
+                there = f", {ledger.committed} are there" if ledger.committed else ""
+                print(
+                    f"{record.job.name}: {plan.scenes} scenes to make{there}; starting the workers",
+                    file=sys.stderr,
+                    flush=True,
+                )
                 with cluster or open_ray(request.address, record.job.run.workers) as slots:
                     if request.address is not None:
                         pattern = join_cluster(store, lock, pattern)
@@ -132,13 +116,13 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     return RunResult(merged, time.monotonic() - begun, made_now)
 
 
-def _record(request: RunRequest, catalogue: Catalogue) -> JobRecord:
+def record_of(request: RunRequest, catalogue: Catalogue) -> JobRecord:
     """The record of the job that is asked for, with what its sources hold now."""
     inputs = tuple(listing.sha256 for listing in catalogue.captures)
     return record_job(request.job, catalogue.digest, request.job_folder, inputs)
 
 
-def _open_catalogue(request: RunRequest) -> Catalogue:
+def open_catalogue(request: RunRequest) -> Catalogue:
     """The job's catalogue; shows how many files are listed and checked, which takes long where there are many new ones."""
     lines = dict[str, ProgressLine]()
 
@@ -194,7 +178,7 @@ def _make(store: Store, pattern: Pattern, plan: SpanPlan, slots: Slots, keeper: 
     with contextlib.closing(ProgressLine(tally.asked, job.name)) as line:
 
         def follow(now: Tally) -> None:
-            line.show(now.done, now.failed.total())
+            line.show(now.done + now.under_way, now.failed.total())
             keeper.add(now.take_commits())
             meter.show(now.counts(slots.now().running))
 

@@ -123,7 +123,9 @@ class _Layer:
         if line is not None:
             line += where if stopped_by is None else ""
             with contextlib.suppress(OSError):  # a terminal that was closed
-                print(f"verso: {line}", file=sys.stderr, flush=True)
+                # A bar that its process could not end stands on the terminal's line
+                wipe = "\r\x1b[K" if sys.stderr.isatty() else ""
+                print(f"{wipe}verso: {line}", file=sys.stderr, flush=True)
                 if self.answers:
                     print(json.dumps({"ok": False, "error": line, "kind": "Ended"}), flush=True)
         tell(code=code, ended_by=None)

@@ -27,6 +27,8 @@ class Tally:
     """Those committed."""
     since: float = field(default_factory=time.time)
     """When the run began to make scenes, seconds since 1970."""
+    under_way: int = 0
+    """Scenes that workers have made and not reported, as far as their notes tell."""
     in_flight: int = 0
     """Ranges given to Ray and not reported."""
     shard_wall_s: float = 0.0

@@ -38,6 +38,7 @@ def inputs(folder, content: str) -> list[np.ndarray]:
     return [np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)) for path in paths]
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("look", ["plain", "same"])
 def test_script_and_ours_write_the_same_images(bench, looks, look):
     assert pictures(looks[look]) == pictures(bench[0].store.root)

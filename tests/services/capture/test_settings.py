@@ -20,7 +20,7 @@ def test_settings_without_changes_are_the_defaults_of_a_job_file():
     ("change", "words"),
     [
         ("captures.fusion.voxl_m=0.1", "did you mean 'voxel_m'"),
-        ("captures.fusion.voxel_m=9", "less than or equal to 0.02"),
+        ("captures.fusion.voxel_m=9", "at most 0.02"),
         ("voxel_m", "path.to.key=value"),
     ],
 )

@@ -1,7 +1,10 @@
 """What is typed for an argument: taken where it can be meant, and told in a short line where not."""
 
+import argparse
+
 import pytest
 
+from services.cli.arguments import read_span
 from services.cli.parser import build_parser
 
 
@@ -47,3 +50,10 @@ def test_an_address_of_rays_client_is_refused_with_the_ways_that_work(capsys):
     assert caught.value.code == 2
     told = capsys.readouterr().err
     assert "'ray://head:10001'" in told and "HOST:PORT" in told and "deploy/submit.py" in told
+
+
+def test_a_span_is_two_ids_or_one():
+    assert (read_span("0-63"), read_span("7")) == ((0, 63), (7, 7))
+    for text in ("", "-", "3-", "5-3", "a-b", "1-2-3"):
+        with pytest.raises(argparse.ArgumentTypeError):
+            read_span(text)

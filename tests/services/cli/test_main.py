@@ -30,16 +30,16 @@ def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]
     [
         (["run", "nowhere.yaml"], 2, ["nowhere.yaml", "no such file", "deploy/jobs"]),
         (["run", TABLETOP, "--set", "physcs.step_hz=3"], 2, ["physcs", "did you mean 'physics'"]),
-        (["run", TABLETOP, "--set", "physics.step_hz=fast"], 2, ["physics.step_hz", "'fast'", "integer"]),
+        (["run", TABLETOP, "--set", "physics.step_hz=fast"], 2, ["physics.step_hz", "'fast'", "whole number"]),
         (["run", TABLETOP, "--scenes", "-3"], 2, ["--scenes", "-3"]),
-        (["run", TABLETOP, "--set", "scenes=0"], 2, ["scenes", "0", "greater than or equal to 1"]),
+        (["run", TABLETOP, "--set", "scenes=0"], 2, ["scenes", "0", "at least 1"]),
         (
             ["run", TABLETOP, "--set", "cameras.orbit.radius_m=-1"],
             2,
             ["cameras.orbit.radius_m", "-1", "greater than 0"],
         ),
         (["run", TABLETOP, "--set", "start.offset_m=[0.2, 0.1]"], 2, ["start.offset_m", "empty"]),
-        (["run", TABLETOP, "--set", "categories=[sofa]"], 2, ["categories.sofa", "'mug'"]),
+        (["run", TABLETOP, "--set", "categories=[sofa]"], 2, ["categories.sofa", "laptop, mug, bowl"]),
         (
             ["run", TABLETOP, "--set", "assets.objects.0={source: urdf, folder: /nowhere/at/all}"],
             2,

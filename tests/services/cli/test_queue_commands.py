@@ -56,7 +56,7 @@ def test_submit_says_who_supervises(queue, capsys):
     [
         (["nowhere.yaml"], ["nowhere.yaml", "no such file"]),
         ([TABLETOP, "--set", "physcs.step_hz=3"], ["physcs", "did you mean 'physics'"]),
-        ([TABLETOP, "--set", "scenes=0"], ["scenes", "greater than or equal to 1"]),
+        ([TABLETOP, "--set", "scenes=0"], ["scenes", "at least 1"]),
         (
             [TABLETOP, "--set", "assets.objects.0={source: urdf, folder: meshes}"],
             ["assets.objects.0.folder", "'meshes'", "write the whole path"],

@@ -13,6 +13,7 @@ from schemas.job.assets import ProceduralSource
 from schemas.job.job import Job
 from services.cli.main import main
 from services.job.read import load_job
+from services.run import dry_run
 from tests.mutations import mutated_bytes, mutated_tree
 
 EXAMPLES = sorted((Path(__file__).resolve().parents[3] / "deploy" / "jobs").glob("*.yaml"))
@@ -88,6 +89,12 @@ def try_jobs(numbers: range, folder: Path, capsys: pytest.CaptureFixture[str]) -
         assert time.process_time() - started < MOST_SECONDS, number
     assert sorted(folder.iterdir()) == [path]
     return outcomes
+
+
+@pytest.fixture(autouse=True)
+def unmeasured(monkeypatch):
+    """A dry run makes some scenes to tell their cost; this is about reading jobs."""
+    monkeypatch.setattr(dry_run, "measure_scene", lambda job, catalogue: None)
 
 
 def test_a_hundred_mutated_jobs_are_jobs_or_are_refused(tmp_path, capsys):

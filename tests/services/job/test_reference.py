@@ -21,7 +21,7 @@ def test_every_key_is_documented_and_the_page_is_current():
         ("start.offset_m", "[low, high]"),
         ("cameras.depth.offset_m", "list of 3 numbers"),
         ("run.workers", "whole number, >= 1, <= 100000 or nothing"),
-        ("assets.objects[urdf].up", "`x`, `y`, `z`"),
+        ("assets.objects[urdf].up", "`x`, `y`, `z` or map"),
     ],
 )
 def test_types_and_bounds_are_told_in_words(key, words):

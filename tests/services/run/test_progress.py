@@ -1,9 +1,17 @@
 import json
 import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
 
 from schemas.dataset.layout import LOG_FOLDER
 from services.run import progress as module
-from services.run.progress import ProgressLine, event_log, log_event
+from services.run.progress import ProgressLine, describe_seconds, event_log, log_event
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def test_events_are_json_lines_in_the_log_while_it_is_open(tmp_path):
@@ -20,14 +28,45 @@ def test_without_a_folder_there_is_no_log():
         log_event("nowhere")
 
 
-def test_elsewhere_than_on_a_terminal_there_is_one_line_a_minute(capsys, monkeypatch):
+def test_a_log_has_a_few_lines_soon_and_then_one_a_minute(capsys, monkeypatch):
     now = [100.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
     line = ProgressLine(20, "mugs")
-    for now[0], done in ((130.0, 2), (161.0, 5), (200.0, 9), (222.0, 11)):
+    for now[0], done in (
+        (101.0, 0),
+        (104.0, 0),
+        (105.0, 1),
+        (120.0, 2),
+        (140.0, 4),
+        (170.0, 5),
+        (219.0, 9),
+        (222.0, 20),
+    ):
         line.show(done, failed=1)
     line.close()
     assert capsys.readouterr().err.splitlines() == [
-        "mugs: 5 of 20 scenes, 1 failed, 0.1 scenes/s",
-        "mugs: 11 of 20 scenes, 1 failed, 0.1 scenes/s",
+        "mugs: 0 of 20 scenes, 1 failed",
+        "mugs: 2 of 20 scenes, 1 failed, 0.1 scenes/s, 3 min left",
+        "mugs: 4 of 20 scenes, 1 failed, 0.1 scenes/s, 3 min left",
+        "mugs: 5 of 20 scenes, 1 failed, 0.1 scenes/s, 4 min left",
+        "mugs: 20 of 20 scenes, 1 failed, 0.2 scenes/s, 0 s left",
     ]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(0.2, "1 s"), (119.0, "119 s"), (120.0, "2 min"), (7199.0, "120 min"), (9000.0, "2.5 h")]
+)
+def test_times_are_told_in_the_unit_that_fits(seconds, words):
+    assert describe_seconds(seconds) == words
+
+
+def test_a_terminal_that_tells_no_width_has_a_bar_too(tmp_path):
+    """A new pseudo-terminal has no rows and no columns."""
+    ours, theirs = os.openpty()
+    code = "from services.run.progress import ProgressLine as P; p = P(4, 'mugs'); p.show(3, 1); p.close()"
+    subprocess.run([sys.executable, "-c", code], stderr=theirs, check=True, cwd=ROOT)
+    os.close(theirs)
+    said = os.read(ours, 10_000).decode()
+    os.close(ours)
+    assert "3/4" in said
+    assert "failed=1" in said

@@ -1,0 +1,55 @@
+"""The page of commands, docs/commands.md, from the table of commands: `python -m services.cli.reference > docs/commands.md`."""
+
+from collections.abc import Iterator, Mapping
+
+from services.cli.command import Command, Option
+from services.cli.parser import COMMANDS
+
+EXIT_CODES = (
+    (0, "complete"),
+    (1, "it ran, but something is missing or wrong: the message says what, and what to do"),
+    (2, "the command line or the job file is wrong: the message names the key, the value and what is allowed"),
+)
+
+HEAD = """# Commands
+
+Every command has `--help` with an example, and `--json`, which makes the last line of standard output one JSON object.
+Messages go to standard error. In a checkout type `./verso`; where Verso was installed as a package, `verso`.
+
+| exit code | meaning |
+|---|---|"""
+
+
+def page() -> str:
+    """The whole page, in Markdown."""
+    codes = [f"| {code} | {meaning} |" for code, meaning in EXIT_CODES]
+    return "\n".join([HEAD, *codes, *_describe(COMMANDS, "")]) + "\n"
+
+
+def _describe(commands: Mapping[str, Command], above: str) -> Iterator[str]:
+    for name, command in commands.items():
+        words = f"{above}{name}"
+        what = f"{command.what[0].upper()}{command.what[1:]}."
+        if command.commands:
+            yield from (f"\n## {words}\n", what)
+            yield from _describe(command.commands, f"{words} ")
+            continue
+        yield from (f"\n##{'#' * bool(above)} {words}\n", what, "", f"    verso {words} {command.example}".rstrip())
+        options = [*command.options, *command.one_of]
+        if rows := [_row(option) for option in options]:
+            yield from ("", "| argument | |", "|---|---|", *rows)
+
+
+def _row(option: Option) -> str:
+    names, settings = option
+    choices = settings.get("choices")
+    value = settings.get("metavar") or ("|".join(map(str, choices)) if choices else "")
+    flag = settings.get("action") == "store_true"
+    shown = (
+        value or names[0] if not names[0].startswith("-") else f"{names[0]}{'' if flag or not value else f' {value}'}"
+    )
+    return f"| `{shown.replace('|', ', ')}` | {settings.get('help', '')} |"
+
+
+if __name__ == "__main__":
+    print(page(), end="")
