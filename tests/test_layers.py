@@ -12,7 +12,13 @@ PACKAGES = (
     *("schemas", *(f"schemas/{name}" for name in ("capture", "dataset", "job", "scene"))),
     *(
         "services",
-        *(f"services/{name}" for name in ("bench", "capture", "cli", "job", "merge", "queue", "read", "run", "study")),
+        *(
+            f"services/{name}"
+            for name in (
+                *("bench", "capture", "cli", "dataset", "export", "init", "job", "merge", "queue"),
+                *("read", "report", "run", "study"),
+            )
+        ),
     ),
     "services/read/independent",
     *(
@@ -59,6 +65,7 @@ def lint(project: Path, imports: dict[str, str]) -> subprocess.CompletedProcess[
         ("workers/plan/step.py", "workers.pipeline.thing", "stages do not know one another"),
         ("workers/geometry/hull.py", "subprocess", "geometry is pure"),
         ("services/merge/step.py", "services.run.thing", "services: commands"),
+        ("services/read/query.py", "services.dataset.thing", "services: commands"),
         ("services/read/independent/derive.py", "workers.geometry.thing", "the independent derivation"),
         ("services/read/independent/derive.py", "schemas.dataset.thing", "the independent derivation"),
         ("services/read/independent/step.py", "services.read.verify", "the independent derivation"),

@@ -37,11 +37,10 @@ def disturbed(tmp_path: Path, disturb, **settings) -> EndedRun:
 
 
 def line_of(run: EndedRun) -> str:
-    """What it told, all of it in one line of ours."""
+    """What it told beside its progress, all of it in one line of ours."""
     assert run.code == 1, run.told
-    lines = [
-        line for line in run.told.splitlines() if "\r" not in line and "scene/s" not in line and line.strip("\x1b[0m ")
-    ]
+    told = [line.replace("\x1b[K", "") for line in run.told.splitlines()]
+    lines = [line for line in told if not line.startswith(f"{JOB['name']}: ") and line.strip("\x1b[0m ")]
     assert len(lines) == 1, run.told
     assert run.left == []
     return lines[0].strip("\x1b[0m ")

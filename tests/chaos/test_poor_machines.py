@@ -20,6 +20,7 @@ MAY_READ_IT = {
     "services/queue/listing.py": "the age of a job, to be shown",
     "services/queue/store.py": "the time of an event, to be shown",
     "services/read/status.py": "the rate of the latest commits, to be shown",
+    "services/report/progress.py": "when a range was committed, to be shown",
     "services/run/progress.py": "the time of an event, to be logged",
     "services/run/tally.py": "when a run began, for the time that is left",
     "workers/store/local.py": "when a file was written, for the rate",
@@ -65,7 +66,8 @@ def test_without_a_temporary_folder_a_run_says_so(tmp_path):
     (tmp_path / "out").mkdir()
     done = run(tmp_path, f"{places} && {here}", TMPDIR=None)
     assert done.returncode == 1, done.stderr
-    (line,) = done.stderr.splitlines()
+    begun, line = done.stderr.splitlines()
+    assert begun.endswith("scenes to make; starting the workers")
     assert line.startswith("verso: No usable temporary directory found")
     assert line.endswith("set TMPDIR to one that can be written")
 

@@ -58,7 +58,7 @@ def test_the_plain_command_makes_the_dataset_and_ends(compose, expected_digest):
     out = compose.checkout / "data" / "tabletop"
     assert digest_of(out) == expected_digest
     assert {file.lstat().st_uid for file in [out.parent, *out.rglob("*")]} == {owner_of_checkouts()}
-    assert f"{SCENES} scenes made, 0 failed" in done.stdout + done.stderr
+    assert f"{SCENES} in all, 0 failed" in done.stdout + done.stderr
     assert f"{SCENES}" in must(compose("run", "--rm", "--no-deps", "job", "status", "data/tabletop"))
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Board, Simulate
-from schemas.job.job import CATEGORIES
+from schemas.job.category import CATEGORIES
 from workers.assets.builtin.make import make_asset
 from workers.capture.board.layout import marker_corners
 from workers.capture.simulate.place import place_object, true_board

@@ -1,0 +1,258 @@
+"""What a network may know of a pair before it sees the mirror view, the baseline made of that, and the scores.
+
+Everything lies in a crop of the mirror image about the place where the object's seen points fall. Nothing but the input
+view, the two cameras and the planes of table top and floor goes into it: the mirror view is the answer alone.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import ConvexHull
+
+from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
+from services.dataset.pair import Pair, View
+
+CROP = (96, 128)
+"""Rows and columns, as the article's patches."""
+SCALE_M = 0.1
+"""Depths are given to the network relative to the object's seen points, in this unit."""
+SEEN_M = 0.01
+"""A mirror pixel's surface counts as seen where the input depth there is nearer than it by less than this."""
+CHANNELS = 11
+
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """One pair in the crop; images [H, W] float32 in metres unless said otherwise.
+
+    features [C, H, W]; baseline: the projection, holes filled, planes put in; background: the planes alone; turned: the seen
+    points and the same turned by half a turn about the object's assumed axis. Truth: depth, 0 where unknown; mask [H, W]
+    bool, the object; unseen [H, W] bool, that part of it that the input view does not show. `middle_m`: the depth that
+    features count from.
+    """
+
+    features: Image
+    baseline: Image
+    background: Image
+    turned: Image
+    depth: Image
+    mask: NDArray[np.bool_]
+    unseen: NDArray[np.bool_]
+    middle_m: float
+
+
+def make_example(pair: Pair) -> Example | None:
+    """The example of a pair; None where the object's seen points fall so near the rim that the crop leaves the image."""
+    view, mirror = pair.input, pair.mirror
+    assert mirror is not None
+    depth, region, rgb = view.depth_m(), view.segment(), view.rgb()
+    T = np.linalg.inv(mirror.T_world_cam) @ view.T_world_cam
+    own = transform(T, unproject(view, depth, region == REGION_FIRST_OBJECT))
+    if len(own) < 20:
+        return None
+    corner = crop_corner(mirror, own)
+    if corner is None:
+        return None
+    up = mirror.T_world_cam[2, :3]
+    turned = half_turn(own, up)
+    middle = float(np.median(own[:, 2]))
+    background, gap = put_planes(pair, mirror, corner)
+    seen, other = (close_holes(splat(mirror, cloud, corner)) for cloud in (own, turned))
+    baseline = nearest(seen, background)
+    color = splat_values(mirror, own, rgb[(region == REGION_FIRST_OBJECT) & (depth > 0)], corner)
+    features = stack_features(seen, other, background, color, gap, middle)
+    window = np.s_[corner[0] : corner[0] + CROP[0], corner[1] : corner[1] + CROP[1]]
+    truth, mask = mirror.depth_m()[window], mirror.segment()[window] == REGION_FIRST_OBJECT
+    hidden = is_unseen(view, depth, mirror, truth, corner) & mask
+    return Example(features, baseline, background, nearest(seen, other, background), truth, mask, hidden, middle)
+
+
+def unproject(view: View, depth: Image, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """[N, 3] points in the camera's frame, metres, of the chosen pixels that have depth."""
+    rows, columns = np.nonzero(chosen & (depth > 0))
+    return rays_through(view, rows, columns) * depth[rows, columns, None]
+
+
+def rays_through(view: View, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """[N, 3] rays through the centres of pixels, in the camera's frame, with z = 1."""
+    k = view.camera.intrinsics
+    return np.stack([(columns + 0.5 - k.cx) / k.fx, (rows + 0.5 - k.cy) / k.fy, np.ones(len(rows))], axis=1)
+
+
+def transform(T: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[N, 3] points in the other frame."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def pixels_of(view: View, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(row, column) of the pixels that points in the camera's frame fall into."""
+    u, v, _ = view.K @ (points / points[:, 2:]).T
+    return np.floor(v).astype(int), np.floor(u).astype(int)
+
+
+def crop_corner(view: View, points: NDArray[np.float64]) -> tuple[int, int] | None:
+    """(row, column) of the crop's first pixel, None where the crop leaves the image."""
+    rows, columns = pixels_of(view, points)
+    k = view.camera.intrinsics
+    top, left = (
+        int((both.min() + both.max() + 1 - size) // 2) for both, size in zip((rows, columns), CROP, strict=True)
+    )
+    inside = top >= 0 and left >= 0 and top + CROP[0] <= k.height and left + CROP[1] <= k.width
+    return (top, left) if inside else None
+
+
+def splat(view: View, points: NDArray[np.float64], corner: tuple[int, int]) -> Image:
+    """The nearest depth of points that fill 3 x 3 pixels each, 0 where there is none."""
+    image = np.full(CROP, np.inf, np.float32)
+    rows, columns = pixels_of(view, points)
+    for dy, dx in np.ndindex(3, 3):
+        y, x = rows - corner[0] + dy - 1, columns - corner[1] + dx - 1
+        inside = (y >= 0) & (x >= 0) & (y < CROP[0]) & (x < CROP[1])
+        np.minimum.at(image, (y[inside], x[inside]), points[inside, 2].astype(np.float32))
+    return np.where(np.isfinite(image), image, np.float32(0))
+
+
+def splat_values(view: View, points: NDArray, values: NDArray, corner: tuple[int, int]) -> Image:
+    """[H, W, 3] colour, 0 to 1, of the nearest points; 0 where there is none."""
+    image = np.zeros((*CROP, 3), np.float32)
+    rows, columns = pixels_of(view, points)
+    order = np.argsort(-points[:, 2], kind="stable")
+    for dy, dx in np.ndindex(3, 3):
+        y, x = rows[order] - corner[0] + dy - 1, columns[order] - corner[1] + dx - 1
+        inside = (y >= 0) & (x >= 0) & (y < CROP[0]) & (x < CROP[1])
+        image[y[inside], x[inside]] = values[order][inside] / 255
+    return image
+
+
+def close_holes(depth: Image) -> Image:
+    """Depth with gaps up to a few pixels, and holes inside the outline, filled from the nearest pixel."""
+    known = depth > 0
+    closed = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(known, 8), iterations=4))[8:-8, 8:-8] | known
+    if not known.any():
+        return depth
+    _, (rows, columns) = ndimage.distance_transform_edt(~known, return_indices=True)
+    return np.where(closed, depth[rows, columns], np.float32(0))
+
+
+def nearest(*layers: Image) -> Image:
+    """The nearest known depth of several images; 0 is unknown."""
+    found = np.min([np.where(layer > 0, layer, np.inf) for layer in layers], axis=0)
+    return np.where(np.isfinite(found), found, 0).astype(np.float32)
+
+
+def plane_depth(mirror: View, height_m: float, corner: tuple[int, int]) -> Image:
+    """Depth of the level plane at this height in the world, 0 where the rays miss it."""
+    rays = crop_rays(mirror, corner) @ mirror.T_world_cam[:3, :3].T
+    z = (height_m - mirror.T_world_cam[2, 3]) / rays[:, 2].reshape(CROP)
+    return np.where(z > 0, z, 0).astype(np.float32)
+
+
+def crop_rays(mirror: View, corner: tuple[int, int]) -> NDArray[np.float64]:
+    """[H * W, 3] rays through the pixels of the crop, as `rays_through`."""
+    rows, columns = np.indices(CROP).reshape(2, -1)
+    return rays_through(mirror, rows + corner[0], columns + corner[1])
+
+
+def table_top(pair: Pair) -> tuple[float, NDArray[np.float64]]:
+    """(height of the table top, [E, 3] its convex outline as a x + b y + c <= 0): the known plane, in the world."""
+    vertices = pair.mesh(REGION_TABLE).vertices
+    height = float(vertices[:, 2].max())
+    return height, ConvexHull(vertices[vertices[:, 2] > height - 1e-4, :2]).equations
+
+
+def put_planes(pair: Pair, mirror: View, corner: tuple[int, int]) -> tuple[Image, Image]:
+    """(depth of the table top inside its outline and of the floor elsewhere, how much nearer the table's plane is)."""
+    height, outline = table_top(pair)
+    table, floor = plane_depth(mirror, height, corner), plane_depth(mirror, 0.0, corner)
+    hits = transform(mirror.T_world_cam, crop_rays(mirror, corner) * table.reshape(-1, 1))
+    inside = (hits[:, :2] @ outline[:, :2].T + outline[:, 2] <= 1e-6).all(axis=1).reshape(CROP)
+    return np.where(inside & (table > 0), table, floor), floor - table
+
+
+def half_turn(points: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The points turned by 180 degrees about a vertical axis, as if the object were as deep as it is wide.
+
+    The seen half is the one away from the mirror camera, so the axis lies half a width nearer to that camera.
+    """
+    forward = np.array([0.0, 0.0, 1.0]) - up[2] * up
+    forward /= np.linalg.norm(forward)
+    right = np.cross(up, forward)
+    across, along = points @ right, points @ forward
+    front = np.percentile(along, 98)
+    width = np.ptp(np.percentile(across, [1, 99]))
+    axis = right * (across.min() + across.max()) / 2 + forward * (front - width / 2)
+    level = points - np.outer(points @ up, up)
+    return points - 2 * level + 2 * (axis - (axis @ up) * up)
+
+
+def stack_features(seen: Image, other: Image, background: Image, color: Image, gap: Image, middle: float) -> Image:
+    """[CHANNELS, H, W]: depths relative to `middle`, which pixels have them, colour, and the place in the crop."""
+    relative = [np.where(one > 0, (one - middle) / SCALE_M, 0) for one in (seen, other)]
+    plane = np.clip((background - middle) / SCALE_M, -5, 5)
+    rows, columns = np.meshgrid(np.linspace(-1, 1, CROP[0]), np.linspace(-1, 1, CROP[1]), indexing="ij")
+    maps = [*relative, seen > 0, other > 0, plane, gap - 1, rows, columns, *np.moveaxis(color, -1, 0)]
+    return np.stack(maps).astype(np.float32)
+
+
+def is_unseen(view: View, depth: Image, mirror: View, truth: Image, corner: tuple[int, int]) -> NDArray[np.bool_]:
+    """Whether the surface at each mirror pixel is not what the input view shows in its direction."""
+    rows, columns = np.nonzero(truth > 0)
+    surface = rays_through(mirror, rows + corner[0], columns + corner[1]) * truth[rows, columns, None]
+    points = transform(np.linalg.inv(view.T_world_cam) @ mirror.T_world_cam, surface)
+    y, x = pixels_of(view, points)
+    inside = (y >= 0) & (x >= 0) & (y < depth.shape[0]) & (x < depth.shape[1])
+    front = np.where(inside, depth[np.clip(y, 0, depth.shape[0] - 1), np.clip(x, 0, depth.shape[1] - 1)], 0)
+    unseen = np.ones(truth.shape, bool)
+    unseen[rows, columns] = np.abs(points[:, 2] - front) > SEEN_M
+    return unseen
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Errors of predicted depth, millimetres, and its likeness to the truth."""
+
+    l1_mm: float
+    mask_l1_mm: float
+    unseen_l1_mm: float
+    ms_ssim: float
+
+
+def score(predicted: Image, example: Example) -> Scores:
+    """L1 over all known pixels, over the object's mask and over its unseen part, and MS-SSIM of the crop."""
+    known = example.depth > 0
+    error = 1000 * np.abs(predicted - example.depth)
+    parts = (known, known & example.mask, known & example.unseen)
+    l1, in_mask, unseen = (float(error[part].mean()) if part.any() else float("nan") for part in parts)
+    return Scores(l1, in_mask, unseen, ms_ssim(np.where(known, predicted, 0), example.depth))
+
+
+MS_SSIM_WEIGHTS = np.array([0.0448, 0.2856, 0.3001, 0.2363])
+"""Wang, Simoncelli and Bovik 2003; the fifth scale is left out: the crop is too small for it."""
+
+
+def ms_ssim(a: Image, b: Image, range_m: float = 1.0) -> float:
+    """Multi-scale structural similarity with a Gaussian window of 11 pixels (sigma 1.5); 1 for equal images."""
+    weights = MS_SSIM_WEIGHTS / MS_SSIM_WEIGHTS.sum()
+    c1, c2 = (0.01 * range_m) ** 2, (0.03 * range_m) ** 2
+    product = 1.0
+    for number, weight in enumerate(weights):
+        mean = [_blur(one) for one in (a, b)]
+        square = [_blur(one * one) - m * m for one, m in zip((a, b), mean, strict=True)]
+        cross = _blur(a * b) - mean[0] * mean[1]
+        structure = (2 * cross + c2) / (square[0] + square[1] + c2)
+        light = (2 * mean[0] * mean[1] + c1) / (mean[0] ** 2 + mean[1] ** 2 + c1)
+        last = number == len(weights) - 1
+        product *= max(float((structure * light if last else structure).mean()), 0.0) ** weight
+        a, b = (one[: one.shape[0] // 2 * 2, : one.shape[1] // 2 * 2] for one in (a, b))
+        a, b = (one.reshape(one.shape[0] // 2, 2, -1, 2).mean(axis=(1, 3)) for one in (a, b))
+    return product
+
+
+def _blur(image: NDArray) -> NDArray:
+    """The image under the window, where the window is whole."""
+    return cv2.GaussianBlur(image.astype(np.float64), (11, 11), 1.5)[5:-5, 5:-5]

@@ -1,0 +1,33 @@
+"""Pairs of one split, so that no object of the training pairs is in a test pair."""
+
+from collections.abc import Iterator
+from typing import Literal
+
+import pyarrow.compute as pc
+
+from services.dataset.dataset import Dataset
+from services.dataset.pair import Pair
+
+Split = Literal["train", "val", "test"]
+
+
+def pairs_of_split(dataset: Dataset, split: Split) -> Iterator[Pair]:
+    """Every pair whose objects are all of instances of this split.
+
+    The split is a column of `assets` and follows from the instance's id, so it is the same in every dataset. A scene of
+    several objects of different splits is in none.
+    """
+    splits = dict(zip(*_columns(dataset, "instance_id", "split"), strict=True))
+    for pair in dataset.pairs(pc.field("asset", "split") == split):
+        if all(splits[name] == split for name in instances_of(pair)):
+            yield pair
+
+
+def instances_of(pair: Pair) -> set[str]:
+    """The ids of all objects of a pair's scene."""
+    return {pair.instance_id, *(body["instance_id"] for body in pair.scene["bodies"] or ())}
+
+
+def _columns(dataset: Dataset, *names: str) -> list[list]:
+    objects = dataset.table("assets").to_table(columns=list(names), filter=pc.field("category") != "table")
+    return [objects.column(name).to_pylist() for name in names]

@@ -1,0 +1,149 @@
+"""Trains a small network to predict the mirror view's depth from the input view, and scores it on held-out instances.
+
+PYTHONPATH=. .venv/bin/python deploy/examples/train_mirror_depth.py data/training [--epochs N]
+
+The network sees what the baseline is made of (mirror_depth.py), and says for each pixel whether the object is there and how
+deep. The baseline is the projection of the input view, splatted and its holes filled, with the planes of table top and
+floor put in.
+"""
+
+import argparse
+import dataclasses
+import json
+import time
+
+import numpy as np
+import torch
+from mirror_depth import CHANNELS, SCALE_M, Example, make_example, score
+from splits import pairs_of_split
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.utils.data import DataLoader, TensorDataset
+from torch_pairs import MirrorDepthPairs
+
+from services.dataset.dataset import open_dataset
+
+BATCH = 16
+RATE = 2e-3
+
+
+class Net(nn.Module):
+    """A U-Net on 2 x 2 blocks of pixels: [B, CHANNELS, H, W] -> logit of the object and its depth, [B, 2, H, W]."""
+
+    def __init__(self, width: int = 32) -> None:
+        super().__init__()
+        sizes = (width, 2 * width, 3 * width)
+        self.first = block(4 * CHANNELS, width)
+        self.down = nn.ModuleList([block(a, b) for a, b in zip(sizes, (*sizes[1:], sizes[-1]), strict=True)])
+        self.up = nn.ModuleList([block(2 * sizes[2], sizes[1]), block(2 * sizes[1], sizes[0]), block(2 * width, width)])
+        self.last = nn.Conv2d(width, 8, 1)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Depth counts from the middle of the object's seen points, in SCALE_M."""
+        x = self.first(functional.pixel_unshuffle(features, 2))
+        kept = []
+        for down in self.down:
+            kept.append(x)
+            x = down(functional.max_pool2d(x, 2))
+        for up in self.up:
+            x = functional.interpolate(x, scale_factor=2, mode="nearest")
+            x = up(torch.cat([x, kept.pop()], dim=1))
+        return functional.pixel_shuffle(self.last(x), 2)
+
+
+def block(before: int, after: int) -> nn.Sequential:
+    """Two convolutions."""
+    layers: list[nn.Module] = []
+    for count in (before, after):
+        layers += [nn.Conv2d(count, after, 3, padding=1, bias=False), nn.BatchNorm2d(after), nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+def predict(net: Net, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    """(logit of the object, its depth in metres), [B, 1, H, W] each."""
+    logit, relative = net(batch["features"]).split(1, dim=1)
+    return logit, batch["middle_m"] + SCALE_M * relative
+
+
+def loss_of(net: Net, batch: dict[str, Tensor]) -> Tensor:
+    """Cross entropy of the mask, and L1 of the object's depth inside it, in SCALE_M."""
+    logit, depth = predict(net, batch)
+    mask = batch["mask"] & batch["known"]
+    error = (depth - batch["depth"]).abs() / SCALE_M
+    return functional.binary_cross_entropy_with_logits(logit, batch["mask"].float()) + error[mask].mean()
+
+
+def load(place: str) -> dict[str, Tensor]:
+    """All training pairs in memory: some hundred are small."""
+    pairs = MirrorDepthPairs(place, "train")
+    items = [pairs[number] for number in range(len(pairs))]
+    return {name: torch.stack([item[name] for item in items]) for name in items[0]}
+
+
+def train(net: Net, data: dict[str, Tensor], epochs: int) -> None:
+    """Adam with one cycle of the learning rate."""
+    names = list(data)
+    loader = DataLoader(TensorDataset(*data.values()), BATCH, shuffle=True, drop_last=len(data["mask"]) > BATCH)
+    optimiser = torch.optim.AdamW(net.parameters(), RATE, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=epochs * len(loader))
+    begun = time.monotonic()
+    for epoch in range(epochs):
+        net.train()
+        losses = []
+        for batch in loader:
+            optimiser.zero_grad()
+            loss = loss_of(net, dict(zip(names, batch, strict=True)))
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+            losses.append(loss.item())
+        print(f"epoch {epoch + 1}/{epochs}: loss {np.mean(losses):.3f}, {time.monotonic() - begun:.0f} s", flush=True)
+
+
+@torch.no_grad()
+def complete(net: Net, example: Example) -> np.ndarray:
+    """[H, W] float32 metres: the predicted object in front of the planes."""
+    net.eval()
+    middle = torch.tensor(example.middle_m).reshape(1, 1, 1, 1)
+    logit, depth = predict(net, {"features": torch.from_numpy(example.features)[None], "middle_m": middle})
+    return np.where(logit[0, 0].numpy() > 0, depth[0, 0].numpy(), example.background).astype(np.float32)
+
+
+def evaluate(net: Net, place: str) -> dict[str, dict[str, float]]:
+    """Mean scores over the test split: of the network, of the baseline, and of the planes alone."""
+    found: dict[str, list] = {"network": [], "baseline": [], "half turn": [], "planes alone": []}
+    for pair in pairs_of_split(open_dataset(place), "test"):
+        example = make_example(pair)
+        if example is not None:
+            answers = (complete(net, example), example.baseline, example.turned, example.background)
+            for scores, answer in zip(found.values(), answers, strict=True):
+                scores.append(dataclasses.asdict(score(answer, example)))
+    return {
+        name: {key: float(np.nanmean([one[key] for one in scores])) for key in scores[0]}
+        for name, scores in found.items()
+    }
+
+
+def main() -> None:
+    """Train, score, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("place", metavar="DATASET", help="a folder, or a bucket")
+    parser.add_argument("--epochs", type=int, default=12, help="default: 12")
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    torch.manual_seed(options.seed)
+    data = load(options.place)
+    net = Net()
+    print(f"{len(data['mask'])} training pairs, {sum(p.numel() for p in net.parameters()) / 1e3:.0f} thousand weights")
+    train(net, data, options.epochs)
+    scores = evaluate(net, options.place)
+    print(f"{'':14}{'L1':>10}{'in mask':>10}{'unseen':>10}{'MS-SSIM':>10}")
+    for name, one in scores.items():
+        print(
+            f"{name:14}{one['l1_mm']:7.1f} mm{one['mask_l1_mm']:7.1f} mm{one['unseen_l1_mm']:7.1f} mm{one['ms_ssim']:10.4f}"
+        )
+    print(json.dumps(scores))
+
+
+if __name__ == "__main__":
+    main()

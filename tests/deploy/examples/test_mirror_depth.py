@@ -1,0 +1,101 @@
+"""What the network may see holds nothing of the answer; planes, unseen parts and scores are what they say."""
+
+import dataclasses
+
+import mirror_depth
+import numpy as np
+import pytest
+from mirror_depth import CHANNELS, CROP, is_unseen, make_example, ms_ssim, score
+
+from services.dataset.dataset import open_dataset
+from services.dataset.pair import View
+
+
+@pytest.fixture(scope="module")
+def pairs(few):
+    return list(open_dataset(few.root).pairs())
+
+
+@pytest.fixture(scope="module")
+def examples(pairs):
+    return [make_example(pair) for pair in pairs]
+
+
+def test_features_and_baseline_hold_nothing_of_the_mirror_view(pairs, examples, monkeypatch):
+    for name in ("rgb", "depth", "depth_m", "segment"):
+        real = getattr(View, name)
+
+        def blind(self, real=real):
+            return np.zeros_like(real(self)) if self.role != "input" else real(self)
+
+        monkeypatch.setattr(View, name, blind)
+    for pair, seen in zip(pairs, examples, strict=True):
+        unlabelled = dataclasses.replace(pair, mirror=dataclasses.replace(pair.mirror, objects=()), projected=None)
+        again = make_example(unlabelled)
+        for name in ("features", "baseline", "background", "turned", "middle_m"):
+            assert np.array_equal(getattr(again, name), getattr(seen, name))
+        assert not again.mask.any()
+
+
+def test_an_example_has_the_shape_that_it_says(examples):
+    for one in examples:
+        assert one.features.shape == (CHANNELS, *CROP) and np.isfinite(one.features).all()
+        assert one.mask.any() and (one.unseen & one.mask).sum() == one.unseen.sum() > 0
+        assert (one.baseline > 0).all()
+
+
+def test_the_planes_are_the_table_and_the_floor_of_the_truth(examples):
+    for one in examples:
+        beside = ~one.mask & (one.depth > 0)
+        error = np.abs(one.background - one.depth)[beside]
+        assert np.median(error) < 2e-4 and (error < 0.002).mean() > 0.8
+
+
+def test_the_baseline_is_the_truth_where_both_cameras_see_a_solid_object(pairs, examples):
+    boxes = [one for pair, one in zip(pairs, examples, strict=True) if pair.category == "box"]  # a mug's wall is thin
+    assert boxes
+    for one in boxes:
+        both = one.mask & ~one.unseen & (one.features[2] > 0)
+        assert both.any() and np.median(np.abs(one.baseline - one.depth)[both]) < 0.004
+
+
+def test_what_is_unseen_is_what_no_ray_from_the_input_camera_reaches(pairs):
+    for pair in pairs[:3]:
+        view, mirror, mesh = pair.input, pair.mirror, pair.mesh()
+        truth = mirror.depth_m()
+        corner = (0, 0)
+        hidden = is_unseen(view, view.depth_m(), mirror, truth, corner)
+        rows, columns = np.nonzero(mirror.segment() == 3)
+        some = slice(None, None, max(1, len(rows) // 300))
+        rows, columns = rows[some], columns[some]
+        rays = np.linalg.inv(mirror.K) @ np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
+        points = (rays * truth[rows, columns]).T @ mirror.T_world_cam[:3, :3].T + mirror.T_world_cam[:3, 3]
+        origin = view.T_world_cam[:3, 3]
+        first = np.full(len(points), np.inf)
+        places, at, _ = mesh.ray.intersects_location(
+            np.tile(origin, (len(points), 1)), points - origin, multiple_hits=False
+        )
+        first[at] = np.linalg.norm(places - origin, axis=1)
+        traced = first < np.linalg.norm(points - origin, axis=1) - mirror_depth.SEEN_M
+        assert (traced == hidden[rows, columns]).mean() > 0.9
+
+
+def test_scores_are_those_of_known_errors(examples):
+    one = examples[0]
+    assert score(one.depth, one).l1_mm == 0 and score(one.depth, one).ms_ssim == pytest.approx(1.0)
+    moved = np.where(one.mask, one.depth + np.float32(0.02), one.depth)
+    found = score(moved, one)
+    assert found.mask_l1_mm == pytest.approx(20, abs=1e-3) == found.unseen_l1_mm
+    assert found.l1_mm == pytest.approx(20 * one.mask.sum() / (one.depth > 0).sum(), abs=1e-3)
+    assert ms_ssim(one.baseline, one.depth) < 1
+
+
+def test_likeness_falls_with_noise_and_one_scale_of_flat_images_is_the_formula():
+    rng = np.random.default_rng(3)
+    flat = np.full(CROP, 1.0, np.float32)
+    noisy = [ms_ssim(flat, flat + rng.normal(0, sigma, CROP).astype(np.float32)) for sigma in (0.0, 0.02, 0.05, 0.1)]
+    assert noisy[0] == pytest.approx(1.0) and sorted(noisy, reverse=True) == noisy
+    a, b, c1 = 1.0, 1.5, 1e-4
+    weight = mirror_depth.MS_SSIM_WEIGHTS[-1] / mirror_depth.MS_SSIM_WEIGHTS.sum()
+    expected = ((2 * a * b + c1) / (a * a + b * b + c1)) ** weight
+    assert ms_ssim(flat, 1.5 * flat) == pytest.approx(expected, abs=1e-6)

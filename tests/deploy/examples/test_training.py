@@ -1,0 +1,93 @@
+"""The PyTorch Dataset and the training script, where torch is installed: in a process of their own, as a user runs them.
+
+Torch's compiler brings its own LLVM, and may crash in a process that Mesa has drawn in.
+"""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.datasets import make_dataset
+from tests.deploy.examples.conftest import EXAMPLES, FULL_SIZE
+
+ROOT = Path(__file__).resolve().parents[3]
+
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("torch") is None, reason="torch is not installed: pip install torch==2.14.1"
+)
+
+CHECKS = """
+import sys
+import torch
+from mirror_depth import make_example
+from splits import pairs_of_split
+from torch_pairs import MirrorDepthPairs
+from train_mirror_depth import Net, complete, load, loss_of
+from services.dataset.dataset import open_dataset
+
+place = sys.argv[1]
+train, test = MirrorDepthPairs(place, "train"), MirrorDepthPairs(place, "test")
+assert not set(train.ids) & set(test.ids) and len(train) + len(test) == 6 and len(train) and len(test)
+assert train.ids == [pair.pose_id for pair in pairs_of_split(open_dataset(place), "train")]
+(batch,) = torch.utils.data.DataLoader(train, batch_size=len(train), num_workers=1)
+assert batch["features"].shape[0] == len(train) == batch["mask"].shape[0]
+assert torch.equal(batch["depth"][0], train[0]["depth"])
+
+torch.manual_seed(0)
+data, net = load(place), Net(8)
+optimiser = torch.optim.Adam(net.parameters(), 1e-2)
+losses = []
+for _ in range(40):
+    optimiser.zero_grad()
+    loss = loss_of(net, data)
+    loss.backward()
+    optimiser.step()
+    losses.append(loss.item())
+assert losses[-1] < 0.5 * losses[0], losses
+example = make_example(next(open_dataset(place).pairs()))
+answer = complete(net, example)
+assert answer.shape == example.depth.shape and (answer == example.background).any()
+"""
+
+
+def python(*arguments: str) -> str:
+    """What a Python with the examples' folder and the project on its path prints."""
+    path = os.pathsep.join([str(ROOT), str(EXAMPLES), *filter(None, [os.environ.get("PYTHONPATH")])])
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_a_loader_stacks_the_split_and_a_network_learns_from_it(few):
+    python("-c", CHECKS, few.name)
+
+
+def test_the_script_prints_the_scores_of_all_answers(few):
+    *lines, last = python(str(EXAMPLES / "train_mirror_depth.py"), few.name, "--epochs", "1").splitlines()
+    assert list(json.loads(last)) == ["network", "baseline", "half turn", "planes alone"]
+    assert any("MS-SSIM" in line for line in lines)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_a_network_that_saw_other_instances_beats_the_projection(tmp_path, record_figure):
+    size = {key: FULL_SIZE[key] for key in ("cameras", "images")}
+    store, _ = make_dataset(tmp_path, scenes=300, categories=["mug", "box", "can", "jar", "bottle", "bowl"], **size)
+    printed = python(str(EXAMPLES / "train_mirror_depth.py"), store.name, "--epochs", "8")
+    scores = json.loads(printed.splitlines()[-1])
+    for key in ("l1_mm", "mask_l1_mm", "unseen_l1_mm"):
+        network, baseline = scores["network"][key], scores["baseline"][key]
+        record_figure(f"mirror_depth[{key}]", "passed", network, baseline)
+        assert network < 0.7 * baseline
+    assert scores["network"]["ms_ssim"] > scores["baseline"]["ms_ssim"]
