@@ -9,6 +9,7 @@ from pathlib import Path
 
 from schemas.errors import MachineError, OutputError
 from schemas.job.job import Job
+from schemas.job.range_size import MOST
 from services.bench.handover import hand_over
 from services.bench.lower_bound import choose_encoders, images_of, run_lower_bound
 from services.bench.machine import describe_machine, pinned, process_age_s
@@ -19,6 +20,10 @@ from workers.pipeline.make_scene import Scene
 
 WARM_UP = 8
 """Scenes before the clock: they compile shaders, of which pyrender has one for each number of lights, and fill caches."""
+
+ROUND = MOST
+"""Scenes of a round where the job does not give its range's: as in a job of 512 scenes or more, whose ranges they are. A
+smaller job commits more often."""
 
 
 @dataclass
@@ -58,7 +63,7 @@ def bench_folder(parent: Path) -> Iterator[Path]:
 
 
 def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
-    """Ranges of the job's size until `scenes` are made, each by all sides in turn.
+    """Ranges until `scenes` are made, each by all sides in turn.
 
     Nothing is deleted in between: for seconds afterwards ext4 searches the deleted entries whenever it makes a file.
     """
@@ -72,8 +77,9 @@ def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
         others = start_others(sides_of(job), given, folder, running)
         laps: dict[str, list[Lap]] = {name: [] for name in ("ours", "floor", *(side.name for side in others.sides))}
         written = 0
-        for start in range(0, scenes, job.range_size):
-            span = bench.next_span(min(job.range_size, scenes - start))
+        size = job.run.range_size or ROUND
+        for start in range(0, scenes, size):
+            span = bench.next_span(min(size, scenes - start))
             laps["ours"].append(bench.run(span))
             # The input of the next side is made between the clocks.
             files = bench.files(span)

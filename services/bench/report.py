@@ -75,7 +75,7 @@ def describe(figures: dict[str, Any]) -> list[str]:
         f"           Python {machine['python']}, " + ", ".join(f"{k} {v}" for k, v in machine["versions"].items()),
         f"command    {figures['command']}",
         f"measured   {figures['scenes']} scenes in {figures['rounds']} rounds, each side in turn on core "
-        f"{figures['core']}, {figures['bytes_per_scene'] / 1e3:.0f} kB a scene on {figures['file_system']}",
+        f"{figures['core']}, a commit a round, {figures['bytes_per_scene'] / 1e3:.0f} kB a scene on {figures['file_system']}",
         "start-up   "
         + ", ".join(f"{name} {s:.1f} s" for name, s in figures["startup_s"].items())
         + ", the first scenes included; not counted below",

@@ -12,7 +12,7 @@ STUDY_COMMANDS: dict[str, Command] = {
         "deploy/jobs/tabletop.yaml --scenes 64 --memory 2000 --workers 2",
         (
             option("job", type=read_path, metavar="JOB.yaml", nargs="?", help="default: a job of built-in shapes"),
-            number("--scenes", "how many scenes each side makes", 48),
+            number("--scenes", "how many scenes each side makes", 80),
             option(
                 "--folder",
                 type=read_path,
