@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
+from schemas.durations import describe_seconds
 from schemas.errors import VersoError
 from services.queue.decide import turn, waiting_for_folder
 from services.queue.fold import JobView
@@ -104,16 +105,7 @@ def _cells(row: JobRow) -> tuple[str, ...]:
         "" if row.scenes_asked is None else f"{'?' if row.scenes_done is None else row.scenes_done}/{row.scenes_asked}"
     )
     state = {"waiting": "waiting for its folder"}.get(row.state, row.state)
-    return row.id, row.name, str(row.priority), state, str(row.attempts), scenes, describe_age(row.age_s), row.out
-
-
-def describe_age(seconds: float) -> str:
-    """An age in one or two units."""
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    if seconds < 2 * 3600:
-        return f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.0f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.0f} d"
+    return row.id, row.name, str(row.priority), state, str(row.attempts), scenes, describe_seconds(row.age_s), row.out
 
 
 def as_tree(row: JobRow) -> dict[str, Any]:

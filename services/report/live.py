@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from html import escape
 
+from schemas.durations import describe_seconds
 from services.report.gallery import Address, strip_html
 from services.report.progress import Phase, Progress
 from services.report.sample import ShownScene
-from services.study.words import duration, number
+from services.study.words import number
 
 STATES: dict[Phase, str] = {
     "empty": "Waiting for a job",
@@ -41,7 +42,7 @@ def _state(progress: Progress) -> str:
     if progress.scenes_per_s is not None:
         facts.append(f"{number(float(f'{progress.scenes_per_s:.2g}'))} a second")
     if progress.left_s:
-        facts.append(f"{duration(progress.left_s)} left")
+        facts.append(f"{describe_seconds(progress.left_s)} left")
     facts.append(f"{sum(progress.failed.values()):,} failed")
     if progress.running:
         facts.append(

@@ -4,11 +4,12 @@ from collections.abc import Iterable, Mapping
 from functools import partial
 from html import escape
 
+from schemas.durations import describe_seconds
 from schemas.job.job import Job
 from services.report.charts import Chart, amount, chart_html, length_of_decade
 from services.report.collect import Cost, Failure, Figures
 from services.report.histogram import Histogram
-from services.study.words import duration, milliseconds, number, size
+from services.study.words import milliseconds, number, size
 
 
 def overview_html(figures: Figures, job: Job, failed: int) -> str:
@@ -19,7 +20,7 @@ def overview_html(figures: Figures, job: Job, failed: int) -> str:
         ("pairs of views", f"{figures.pairs:,}", f"{figures.views:,} views"),
         ("objects", f"{figures.instances:,}", f"different ones in {_plural(len(figures.by_category), 'category', 'categories')}"),
         ("images", f"{figures.files:,}", size(figures.bytes / 1e3)),
-        ("time", duration(figures.seconds), f"{milliseconds(1e3 * figures.seconds / max(figures.scenes, 1))} a scene"),
+        ("time", describe_seconds(figures.seconds), f"{milliseconds(1e3 * figures.seconds / max(figures.scenes, 1))} a scene"),
     ]  # fmt: skip
     tiles_html = "".join(
         f"<div><dt>{escape(name)}</dt><dd>{escape(value)}<small>{escape(more)}</small></dd></div>"
@@ -160,7 +161,7 @@ def _times(cost: Cost) -> tuple[str, str]:
     """(in all, each run)."""
     if not cost.timed:
         return ("–", "–")
-    return duration(cost.seconds), milliseconds(1e3 * cost.seconds / cost.timed)
+    return describe_seconds(cost.seconds), milliseconds(1e3 * cost.seconds / cost.timed)
 
 
 def _plain(names: Iterable[str]) -> str:

@@ -4,13 +4,13 @@ import os
 import time
 
 from schemas.dataset.ledger import Ledger
+from schemas.durations import describe_seconds
 from schemas.errors import OutputError
 from schemas.job.job import Job
 from services.job.record import adopt, refuse_foreign
 from services.merge.dataset_card import describe_doubts, describe_sources
 from services.run.cores import usable_cores
 from services.run.lock import read_holder, shows_life
-from services.run.progress import describe_seconds
 from services.run.range_planner import MAX_SHARD, plan_spans
 from services.run.step import RunRequest, open_catalogue, record_of
 from workers.assets.catalogue import Catalogue

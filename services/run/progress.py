@@ -3,7 +3,6 @@
 import json
 import logging
 import logging.handlers
-import math
 import os
 import sys
 import time
@@ -15,6 +14,7 @@ from typing import Any
 from tqdm import tqdm
 
 from schemas.dataset.layout import LOG_FOLDER
+from schemas.durations import describe_seconds
 from services.run.supervisor import tell
 from workers.store.file_system import refuse_link_out
 
@@ -91,13 +91,6 @@ def _tell(done: int, asked: int, unit: str, failed: int | None, passed_s: float)
         rate = done / passed_s
         parts += [f"{rate:.1f} {unit}s/s", f"{describe_seconds(max(0, asked - done) / rate)} left"]
     return ", ".join(parts)
-
-
-def describe_seconds(seconds: float) -> str:
-    """`28 s`, `4 min`, `3.5 h`."""
-    if seconds < 120.0:
-        return f"{math.ceil(seconds)} s"
-    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
 def say(line: str) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from schemas.durations import describe_seconds
 from services.study.choose import (
     AS_CHEAP,
     TargetError,
@@ -14,7 +15,7 @@ from services.study.choose import (
     own_row,
 )
 from services.study.model import Row, Study
-from services.study.words import amount, duration, listed, milliseconds, short, size, times
+from services.study.words import amount, listed, milliseconds, short, size, times
 
 DEFAULT_TARGETS: Targets = {
     "penetration_mm": 0.1,
@@ -51,7 +52,7 @@ def answer(study: Study, targets: Targets | None = None) -> str:
     use = "use the job as it is" if chosen is own else f"use {chosen.setting.name}"
     cost, count = f"{milliseconds(chosen.ms)} of processor a scene", study.job_scenes
     if count:
-        whole = f"{duration(chosen.ms * count / 1e3)}, {size(chosen.kilobytes * count)}"
+        whole = f"{describe_seconds(chosen.ms * count / 1e3)}, {size(chosen.kilobytes * count)}"
         cost += f" ({count:,} scene{'s' * (count != 1)}: {whole})"
     saved = "" if chosen is own else f", {times(chosen.ratio)} the job's time"
     given_up = [] if bounds else worse_than(chosen, own, study.rows)

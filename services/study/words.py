@@ -2,7 +2,6 @@
 
 from services.study.errors import ERRORS
 
-_SPANS = ((60.0, 1.0, "s"), (5400.0, 60.0, "min"), (float("inf"), 3600.0, "h"))
 _SIZES = ((1e3, 1.0, "kB"), (1e6, 1e3, "MB"), (1e9, 1e6, "GB"), (float("inf"), 1e9, "TB"))
 
 
@@ -53,11 +52,6 @@ def times(ratio: float) -> str:
 def milliseconds(ms: float) -> str:
     """The time of a scene: "118 ms", "11.2 s"."""
     return f"{number(ms)} ms" if ms < 9999.5 else f"{number(ms / 1e3)} s"
-
-
-def duration(seconds: float) -> str:
-    """The time of a job: "8 s", "12 min", "31 h"."""
-    return next(f"{number(_two(seconds / one))} {name}" for most, one, name in _SPANS if seconds < most)
 
 
 def size(kilobytes: float) -> str:

@@ -7,11 +7,12 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from schemas.durations import describe_seconds
 from services.study.answer import answer
 from services.study.choose import Targets, as_cheap, front, own_row
 from services.study.errors import ERRORS
 from services.study.model import Row, Study
-from services.study.words import duration, milliseconds, number, short, shown, size, times, unit
+from services.study.words import milliseconds, number, short, shown, size, times, unit
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
@@ -98,7 +99,7 @@ def _machine(study: Study) -> str:
     ]
     if study.job_scenes:
         seconds, kilobytes = own.ms * study.job_scenes / 1e3, own.kilobytes * study.job_scenes
-        cost = f"{duration(seconds)} on one core ({number(seconds / 3600)} core-hours), {size(kilobytes)}"
+        cost = f"{describe_seconds(seconds)} on one core ({number(seconds / 3600)} core-hours), {size(kilobytes)}"
         rows.append((f"the job's {study.job_scenes:,} scenes", cost))
     return _table(rows + [(name.replace("_", " "), _words(value)) for name, value in study.machine.items()])
 
@@ -149,7 +150,7 @@ def _line(study: Study, row: Row, best: Mapping[str, Sequence[Row]]) -> str:
     cells = [escape(called), f"{same}{times(row.ratio)}{spread}", milliseconds(row.ms)]
     if study.job_scenes:
         seconds = row.ms * study.job_scenes / 1e3
-        cells.append(f"{duration(seconds)}<small>{number(seconds / 3600)} core-hours</small>")
+        cells.append(f"{describe_seconds(seconds)}<small>{number(seconds / 3600)} core-hours</small>")
     cells.append(size(row.kilobytes * (study.job_scenes or 1)))
     figures = "".join(_figure(name, row, own, rows) for name, rows in best.items())
     kind = ' class="own"' if row is own else ""

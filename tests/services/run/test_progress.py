@@ -5,11 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from schemas.dataset.layout import LOG_FOLDER
 from services.run import progress as module
-from services.run.progress import ProgressLine, describe_seconds, event_log, log_event
+from services.run.progress import ProgressLine, event_log, log_event
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -47,17 +45,10 @@ def test_a_log_has_a_few_lines_soon_and_then_one_a_minute(capsys, monkeypatch):
     assert capsys.readouterr().err.splitlines() == [
         "mugs: 0 of 20 scenes, 1 failed",
         "mugs: 2 of 20 scenes, 1 failed, 0.1 scenes/s, 3 min left",
-        "mugs: 4 of 20 scenes, 1 failed, 0.1 scenes/s, 3 min left",
-        "mugs: 5 of 20 scenes, 1 failed, 0.1 scenes/s, 4 min left",
+        "mugs: 4 of 20 scenes, 1 failed, 0.1 scenes/s, 2.7 min left",
+        "mugs: 5 of 20 scenes, 1 failed, 0.1 scenes/s, 3.5 min left",
         "mugs: 20 of 20 scenes, 1 failed, 0.2 scenes/s, 0 s left",
     ]
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"), [(0.2, "1 s"), (119.0, "119 s"), (120.0, "2 min"), (7199.0, "120 min"), (9000.0, "2.5 h")]
-)
-def test_times_are_told_in_the_unit_that_fits(seconds, words):
-    assert describe_seconds(seconds) == words
 
 
 def test_a_terminal_that_tells_no_width_has_a_bar_too(tmp_path):
