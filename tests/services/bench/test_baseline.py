@@ -45,6 +45,7 @@ def test_script_and_ours_write_the_same_images(bench, looks, look):
     assert any({1, 2, 3} <= set(image.ravel()) for image in inputs(looks[look], "segment"))
 
 
+@pytest.mark.minute
 def test_the_same_look_has_the_texture_and_the_shadows_that_ours_has(bench, looks):
     """On the floor alone, where the plain look has one colour; a floor may have hardly a pattern, and its shadow be hidden."""
     regions, alike = inputs(bench[0].store.root, "segment"), []
@@ -59,6 +60,7 @@ def test_the_same_look_has_the_texture_and_the_shadows_that_ours_has(bench, look
     assert sum(alike) >= 2
 
 
+@pytest.mark.minute
 def test_the_same_look_throws_shadows(bench, given, tmp_path):
     """On a floor of one colour, what is a fifth darker than most of it lies in a shadow."""
     regions = inputs(bench[0].store.root, "segment")

@@ -11,6 +11,7 @@ from services.bench.others import start_side
 from services.bench.stages import make_in_memory
 
 
+@pytest.mark.minute
 def test_mujoco_sees_the_regions_and_depths_that_we_see(bench, given, tmp_path):
     """An independent renderer: all but a few pixels along edges agree, in every view."""
     pytest.importorskip("mujoco")

@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import pytest
 import trimesh
 
 from services.cli.main import main
@@ -11,6 +12,7 @@ from tests.workers.pipeline.captures.small_capture import copy_of, processed
 KEYS = ("pose_mm", "pose_deg", "cloud_median_mm", "cloud_p95_mm", "completeness", "depth_median_mm")
 
 
+@pytest.mark.minute
 def test_a_simulated_capture_is_scored_against_its_truth(capsys):
     assert main(["capture", "evaluate", str(processed()[0]), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out.splitlines()[-1])

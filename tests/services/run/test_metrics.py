@@ -87,6 +87,7 @@ def test_a_port_that_is_taken_or_an_address_of_another_machine_is_told(place):
 
 
 @pytest.mark.ray
+@pytest.mark.minute
 def test_a_run_serves_what_it_has_made_and_how_long_each_stage_took(tmp_path, monkeypatch, place):
     seen = {}
 

@@ -235,6 +235,7 @@ def test_every_pairs_images_have_their_sizes_and_types(made):
         assert pixels.ndim == (3 if "RGB" in path else 2)
 
 
+@pytest.mark.minute
 def test_a_scene_that_kills_its_worker_becomes_a_row_and_the_rest_is_made(made, tmp_path):
     """The worker is killed for real, as the kernel would, each time it begins scene 6."""
     out = tmp_path / "deadly"
@@ -270,6 +271,7 @@ def test_an_interrupted_run_says_so_leaves_no_process_and_goes_on_where_it_stopp
     assert make(out, **changes) == make(tmp_path / "whole", **changes)
 
 
+@pytest.mark.minute
 def test_too_many_failures_stop_the_run_early_and_lose_nothing(cluster, tmp_path):
     out = tmp_path / "fragile"
     with deadly_scene(out, 2), pytest.raises(RunError, match="max_failure_share"):

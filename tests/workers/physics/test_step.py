@@ -86,6 +86,7 @@ def test_a_bottle_that_rolling_friction_held_on_an_edge_rolls_onto_a_face_and_no
     assert recheck(start, rest, TABLE, PHYSICS)[0] < 0.1
 
 
+@pytest.mark.minute
 def test_a_mug_on_a_mesh_that_rolling_friction_held_out_of_balance_tips_on(tmp_path):
     """Its centre of mass was half a millimetre beyond its contacts, and went on from there at a third of a mm/s."""
     job = Job.model_validate({"name": "t", "start": {"pose": "tumbled"}})
