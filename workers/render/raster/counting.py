@@ -12,7 +12,6 @@ from workers.render.raster.programs import Program
 from workers.render.raster.shaders import COUNT_VERTEX
 from workers.render.raster.tiles import TILE_PX
 
-
 LAST_NUMBER = 255
 """The greatest number that a stencil of eight bits holds."""
 
