@@ -147,8 +147,8 @@ def level_shadow(depth: NDArray[np.float32], light: Box, level: Box, towards: Ar
     narrow = cv2.GaussianBlur(dark, (0, 0), 0.8)
     wide = cv2.GaussianBlur(dark, (0, 0), wide_px)
     away = cv2.GaussianBlur(away_m, (0, 0), wide_px)
-    blurred = (np.asarray(image, np.float32) for image in (narrow, wide, away))
-    return _blend_shadows(*blurred, np.float32(farthest_m))
+    narrow, wide, away = (np.asarray(image, np.float32) for image in (narrow, wide, away))
+    return _blend_shadows(narrow, wide, away, np.float32(farthest_m))
 
 
 @compiled
