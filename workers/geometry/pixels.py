@@ -21,12 +21,13 @@ class Extent(NamedTuple):
 @compiled
 def round_depth(depth_m: NDArray[np.floating], low_m: float, high_m: float, units_per_m: float) -> NDArray[np.uint16]:
     """[H, W] uint16: depth [H, W] in units, to the nearest (ties to even); 0 unless low < depth < high (0 for nan)."""
-    units = np.zeros(depth_m.shape, np.uint16)
+    units = np.empty(depth_m.shape, np.uint16)
     for row in range(depth_m.shape[0]):
         for column in range(depth_m.shape[1]):
             z = np.float64(depth_m[row, column])
-            if low_m < z < high_m:
-                units[row, column] = np.uint16(np.rint(z * units_per_m))
+            # A choice between values and not a branch, and a conversion by way of 32 bits, so that this is vectorised.
+            nearest = np.rint(z * units_per_m) if (z > low_m) & (z < high_m) else 0.0
+            units[row, column] = np.uint16(np.int32(nearest))
     return units
 
 
@@ -34,13 +35,13 @@ def round_depth(depth_m: NDArray[np.floating], low_m: float, high_m: float, unit
 def gather_colours(rgb: NDArray[np.uint8], source: NDArray[np.integer]) -> NDArray[np.uint8]:
     """[H, W, 3] uint8: at each pixel the colour of the pixel of `rgb` with the flat index `source` [H, W]; black for -1."""
     gathered = np.zeros((source.shape[0], source.shape[1], 3), np.uint8)
-    width = rgb.shape[1]
+    pixels = np.ascontiguousarray(rgb).reshape(-1, 3)
     for row in range(source.shape[0]):
         for column in range(source.shape[1]):
             index = source[row, column]
             if index >= 0:
                 for channel in range(3):
-                    gathered[row, column, channel] = rgb[index // width, index % width, channel]
+                    gathered[row, column, channel] = pixels[index, channel]
     return gathered
 
 
@@ -51,10 +52,11 @@ def measure_regions(region: NDArray[np.uint8]) -> list[Extent]:
     whole = np.ascontiguousarray(region)
     words = whole.view(np.uint64) if region.shape[1] % 8 == 0 else np.empty((len(region), 0), np.uint64)
     _measure_regions(whole, words, counts, boxes)
-    return [
-        Extent(count, (x, y, right - x, bottom - y)) if count else Extent(0, (0, 0, 0, 0))
-        for count, (x, y, right, bottom) in zip(counts.tolist(), boxes.tolist(), strict=True)
-    ]
+    extents = [Extent(0, (0, 0, 0, 0))] * 256
+    for found in np.flatnonzero(counts).tolist():
+        x, y, right, bottom = boxes[found].tolist()
+        extents[found] = Extent(int(counts[found]), (x, y, right - x, bottom - y))
+    return extents
 
 
 @compiled
@@ -91,8 +93,7 @@ def count_filled(projected: NDArray[np.uint16], seen: NDArray[np.uint16], behind
     filled = hidden = 0
     for row in range(projected.shape[0]):
         for column in range(projected.shape[1]):
-            if projected[row, column] > 0:
-                filled += 1
-                if seen[row, column] > 0 and projected[row, column] > seen[row, column] + behind:
-                    hidden += 1
+            drawn, farthest = projected[row, column], seen[row, column] + behind
+            filled += drawn > 0
+            hidden += (drawn > 0) & (seen[row, column] > 0) & (drawn > farthest)
     return filled, hidden

@@ -62,31 +62,50 @@ def _splat(
     reach: int,
     shape: tuple[int, int],
 ) -> tuple[Array, NDArray[np.int32]]:
-    """(depth, source index); k and m: cx, cy, fx, fy of source and target. Sums in the order of `reproject_pixels`."""
-    height, width = shape
+    """(depth, source index); k and m: cx, cy, fx, fy of source and target. Sums in the order of `reproject_pixels`.
+
+    Each row of the source is carried over first, in a loop without branches that is vectorised, and drawn then.
+    """
+    (height, width), (cx, cy, fx, fy) = shape, m
     nearest, index = np.zeros(shape), np.full(shape, -1, np.int32)
-    T = T_target_source
+    (xx, xy, xz, x0), (yx, yy, yz, y0), (zx, zy, zz, z0) = _rows(T_target_source)
+    columns = depth.shape[1]
+    ray_x = (np.arange(columns) + 0.5 - k[0]) / k[2]
+    at_column, at_row, at_Z = np.empty(columns, np.int32), np.empty(columns, np.int32), np.empty(columns)
+    low, right, bottom = -float(reach), float(width + reach), float(height + reach)
     for i in range(depth.shape[0]):
-        ray_y = (i + 0.5 - k[1]) / k[3]
-        for j in range(depth.shape[1]):
-            if not depth[i, j] > 0:
+        ray_y, source = (i + 0.5 - k[1]) / k[3], depth[i]
+        for j in range(columns):
+            z = source[j] / units_per_m
+            x, y = ray_x[j] * z, ray_y * z
+            Z = zx * x + zy * y + zz * z + z0
+            u = fx * (xx * x + xy * y + xz * z + x0) / Z + cx
+            v = fy * (yx * x + yy * y + yz * z + y0) / Z + cy
+            seen = (source[j] > 0) & (Z > 0.0) & (u >= low) & (u < right) & (v >= low) & (v < bottom)
+            at_column[j], at_row[j] = np.int32(np.floor(u) if seen else 0.0), np.int32(np.floor(v) if seen else 0.0)
+            at_Z[j] = Z if seen else 0.0
+        for j in range(columns):
+            Z = at_Z[j]
+            if Z == 0.0:
                 continue
-            z = depth[i, j] / units_per_m
-            x, y = (j + 0.5 - k[0]) / k[2] * z, ray_y * z
-            Z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-            if not Z > 0.0:
-                continue
-            u = m[2] * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / Z + m[0]
-            v = m[3] * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / Z + m[1]
-            if not (-reach <= u < width + reach and -reach <= v < height + reach):
-                continue
-            column, row = int(np.floor(u)), int(np.floor(v))
-            for at_row in range(max(row - reach, 0), min(row + reach + 1, height)):
-                for at in range(max(column - reach, 0), min(column + reach + 1, width)):
-                    if index[at_row, at] < 0 or nearest[at_row, at] > Z:
-                        nearest[at_row, at] = Z
-                        index[at_row, at] = i * depth.shape[1] + j
+            first, last = max(at_row[j] - reach, 0), min(at_row[j] + reach + 1, height)
+            left, end = max(at_column[j] - reach, 0), min(at_column[j] + reach + 1, width)
+            for row in range(first, last):
+                for column in range(left, end):
+                    if index[row, column] < 0 or nearest[row, column] > Z:
+                        nearest[row, column] = Z
+                        index[row, column] = i * columns + j
     return nearest, index
+
+
+@compiled
+def _rows(T: Array) -> tuple[tuple[float, float, float, float], ...]:
+    """The upper three rows of T [4, 4] as numbers, which a loop keeps in registers."""
+    return (
+        (T[0, 0], T[0, 1], T[0, 2], T[0, 3]),
+        (T[1, 0], T[1, 1], T[1, 2], T[1, 3]),
+        (T[2, 0], T[2, 1], T[2, 2], T[2, 3]),
+    )
 
 
 @compiled

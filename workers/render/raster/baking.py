@@ -21,6 +21,7 @@ from schemas.base import Array, Pose
 from schemas.scene.region import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.scene import Placed
 from workers.geometry.frames import transform
+from workers.geometry.jit import compiled
 from workers.render.raster.occlusion import column_extents, sky_visibility
 
 SHADOW_PX = 768
@@ -112,9 +113,21 @@ def level_pixels(vertices: Array, faces: NDArray[np.int32], box: Box, hollow: bo
     from_top = sky_visibility(top, nothing, top, step_m) if not under.any() else from_level
     soft = [cv2.GaussianBlur(image, (0, 0), 0.8) for image in (from_level, from_top)]
     elevation = top / np.float32(size[2])
-    image = cv2.resize(np.stack([*soft, elevation], axis=-1), (MAP_PX, MAP_PX), interpolation=cv2.INTER_LINEAR)
-    codes = np.rint(255.0 * np.clip(image, 0.0, 1.0)).astype(np.uint8)
-    return np.dstack([codes, np.full((MAP_PX, MAP_PX), 255, np.uint8)])
+    image = cv2.resize(cv2.merge([*soft, elevation]), (MAP_PX, MAP_PX), interpolation=cv2.INTER_LINEAR)
+    pixels = np.full((MAP_PX, MAP_PX, 4), 255, np.uint8)
+    _encode_shares(np.asarray(image, np.float32), pixels)
+    return pixels
+
+
+@compiled
+def _encode_shares(shares: NDArray[np.float32], codes: NDArray[np.uint8]) -> None:
+    """Shares [H, W, C], clipped to [0, 1], in 255ths into the first C channels of codes [H, W, D]."""
+    zero, one, most = np.float32(0.0), np.float32(1.0), np.float32(255.0)
+    for row in range(shares.shape[0]):
+        for column in range(shares.shape[1]):
+            for channel in range(shares.shape[2]):
+                share = min(max(shares[row, column, channel], zero), one)
+                codes[row, column, channel] = np.uint8(np.int32(np.rint(most * share)))
 
 
 def level_shadow(depth: NDArray[np.float32], light: Box, level: Box, towards: Array) -> NDArray[np.uint8]:
@@ -126,23 +139,63 @@ def level_shadow(depth: NDArray[np.float32], light: Box, level: Box, towards: Ar
     low, high = level.bounds
     step = (high[:2] - low[:2]) / MAP_PX
     columns, rows = (low[axis] + (np.arange(MAP_PX) + 0.5) * step[axis] for axis in (0, 1))
-    M = light.unit_from_world
-    u, v, z = (
-        (M[i, 0] * columns[None, :] + M[i, 1] * rows[:, None] + M[i, 2] * low[2] + M[i, 3]).astype(np.float32)
-        for i in range(3)
-    )
-    texels = (u * len(depth) - 0.5, v * len(depth) - 0.5)
-    nearest = cv2.remap(depth, *texels, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, 1.0)
-    depth_m = float(light.bounds[1, 2] - light.bounds[0, 2])
-    away_m = (z - nearest) * depth_m
-    dark = ((away_m > BIAS_M) & (nearest < 1.0)).astype(np.float32)
+    u, v, z = _place_level(light.unit_from_world, columns, rows, float(low[2]), np.float32(len(depth)))
+    nearest = np.asarray(cv2.remap(depth, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, 1.0), np.float32)
+    away_m, dark = _compare_depth(nearest, z, np.float32(light.bounds[1, 2] - light.bounds[0, 2]), np.float32(BIAS_M))
     farthest_m = float((high[2] - low[2]) / max(float(towards[2]), LOWEST_SINE))
     wide_px = max(0.3 * LAMP_RAD * farthest_m / float(step[0]), 1.0)
     narrow = cv2.GaussianBlur(dark, (0, 0), 0.8)
     wide = cv2.GaussianBlur(dark, (0, 0), wide_px)
-    mean_away_m = cv2.GaussianBlur(away_m * dark, (0, 0), wide_px) / np.maximum(wide, 1e-4)
-    share = np.clip(mean_away_m / farthest_m, 0.0, 1.0) * np.minimum(wide * 50.0, 1.0)
-    return np.rint(255.0 * (1.0 - np.clip(narrow + share * (wide - narrow), 0.0, 1.0))).astype(np.uint8)
+    away = cv2.GaussianBlur(away_m, (0, 0), wide_px)
+    narrow, wide, away = (np.asarray(image, np.float32) for image in (narrow, wide, away))
+    return _blend_shadows(narrow, wide, away, np.float32(farthest_m))
+
+
+@compiled
+def _place_level(
+    M: Array, columns: Array, rows: Array, level_m: float, side_px: np.float32
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """(u, v, depth), each [R, C] float32: pixels of a light's map, and depth in units of its box, of points on a level."""
+    shape, half = (len(rows), len(columns)), np.float32(0.5)
+    u, v, z = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            x, y = columns[j], rows[i]
+            u[i, j] = np.float32(M[0, 0] * x + M[0, 1] * y + M[0, 2] * level_m + M[0, 3]) * side_px - half
+            v[i, j] = np.float32(M[1, 0] * x + M[1, 1] * y + M[1, 2] * level_m + M[1, 3]) * side_px - half
+            z[i, j] = np.float32(M[2, 0] * x + M[2, 1] * y + M[2, 2] * level_m + M[2, 3])
+    return u, v, z
+
+
+@compiled
+def _compare_depth(
+    nearest: NDArray[np.float32], z: NDArray[np.float32], depth_m: np.float32, bias_m: np.float32
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(metres to what is nearest to the light, 0 where that is the level itself; 1 where it is not), both [R, C]."""
+    away_m, dark = np.empty_like(z), np.empty_like(z)
+    zero, one = np.float32(0.0), np.float32(1.0)
+    for i in range(z.shape[0]):
+        for j in range(z.shape[1]):
+            away = (z[i, j] - nearest[i, j]) * depth_m
+            hidden = (away > bias_m) & (nearest[i, j] < one)
+            away_m[i, j], dark[i, j] = away if hidden else zero, one if hidden else zero
+    return away_m, dark
+
+
+@compiled
+def _blend_shadows(
+    narrow: NDArray[np.float32], wide: NDArray[np.float32], away_m: NDArray[np.float32], farthest_m: np.float32
+) -> NDArray[np.uint8]:
+    """[R, C] uint8: the share of light beside a shadow, blended by the mean distance to what casts it."""
+    codes = np.empty(narrow.shape, np.uint8)
+    zero, one, least = np.float32(0.0), np.float32(1.0), np.float32(1e-4)
+    for i in range(narrow.shape[0]):
+        for j in range(narrow.shape[1]):
+            mean_m = away_m[i, j] / max(wide[i, j], least)
+            share = min(max(mean_m / farthest_m, zero), one) * min(wide[i, j] * np.float32(50.0), one)
+            shade = min(max(narrow[i, j] + share * (wide[i, j] - narrow[i, j]), zero), one)
+            codes[i, j] = np.uint8(np.int32(np.rint(np.float32(255.0) * (one - shade))))
+    return codes
 
 
 def triangles_of(things: Sequence[Placed]) -> Triangles:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from schemas.scene.shape import Mesh, Part, Shape
 from workers.geometry.convexity import face_planes
+from workers.geometry.jit import compiled
 from workers.geometry.srgb import SRGB_STEPS, decode_srgb
 
 COLUMNS = {"position": 3, "normal_metallic": 4, "albedo_roughness": 4, "uv": 2, "face_plane": 4}
@@ -58,20 +59,42 @@ def own_vertices(faces: NDArray, vertex_count: int) -> tuple[NDArray[np.int64], 
 
     `source` names the vertex that each new vertex is a copy of; the first `vertex_count` are the vertices themselves.
     """
-    turned = faces.astype(np.int64)
-    owner = np.full(vertex_count, -1)
-    unowned = np.arange(len(faces))
-    for last in (2, 0, 1):
-        wanted = faces[unowned, last]
-        free = unowned[owner[wanted] < 0]
-        owner[faces[free, last]] = free
-        won = owner[faces[unowned, last]] == unowned
-        winners = unowned[won]
-        turned[winners] = faces[winners][:, [(last + 1) % 3, (last + 2) % 3, last]]
-        unowned = unowned[~won]
-    source = np.concatenate([np.arange(vertex_count), turned[unowned, 2]])
-    turned[unowned, 2] = vertex_count + np.arange(len(unowned))
-    return turned, source
+    turned, source = np.empty(faces.shape, np.int64), np.empty(vertex_count + len(faces), np.int64)
+    count = _own_vertices(np.ascontiguousarray(faces), vertex_count, turned, source)
+    return turned, source[:count]
+
+
+@compiled
+def _own_vertices(
+    faces: NDArray[np.integer], vertex_count: int, turned: NDArray[np.int64], source: NDArray[np.int64]
+) -> int:
+    """Fills `turned` and the first so many of `source`, whose number it returns.
+
+    In three rounds each face asks for one of its corners that is nobody's yet; of those that ask for the same, the last
+    face gets it. Who got none in any round has a copy of its last corner.
+    """
+    owner, given = np.full(vertex_count, -1), np.full(vertex_count, -1)
+    owns = np.zeros(len(faces), np.bool_)
+    for turn in range(3):
+        last = (turn + 2) % 3
+        for face in range(len(faces)):
+            wanted = faces[face, last]
+            if not owns[face] and (owner[wanted] < 0 or given[wanted] == turn):
+                owner[wanted], given[wanted] = face, turn
+        for face in range(len(faces)):
+            if not owns[face] and owner[faces[face, last]] == face:
+                owns[face] = True
+                for corner in range(3):
+                    turned[face, corner] = faces[face, (last + 1 + corner) % 3]
+    for vertex in range(vertex_count):
+        source[vertex] = vertex
+    count = vertex_count
+    for face in range(len(faces)):
+        if not owns[face]:
+            turned[face, 0], turned[face, 1], turned[face, 2] = faces[face, 0], faces[face, 1], count
+            source[count] = faces[face, 2]
+            count += 1
+    return count
 
 
 def texture_of(part: Part) -> NDArray[np.uint8] | None:

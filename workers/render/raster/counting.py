@@ -12,15 +12,22 @@ from workers.render.raster.programs import Program
 from workers.render.raster.shaders import COUNT_VERTEX
 from workers.render.raster.tiles import TILE_PX
 
+LAST_NUMBER = 255
+"""The greatest number that a stencil of eight bits holds."""
+
 
 class PixelCounter:
-    """A stencil that lets each pixel pass once, and a query that counts what passes."""
+    """A stencil that lets each pixel pass once, and a query that counts what passes.
+
+    Each count has a number of its own, which pixels take when they pass: so the stencil is cleared once in 255 counts.
+    """
 
     def __init__(self, gl: ModuleType) -> None:
         self._gl = gl
         self.program = Program(gl, COUNT_VERTEX, EMPTY_FRAGMENT)
         self._query = int(np.ravel(gl.glGenQueries(1))[0])
-        self._framebuffer = Framebuffer(gl, {gl.GL_DEPTH_STENCIL_ATTACHMENT: gl.GL_DEPTH24_STENCIL8})
+        self._framebuffer = Framebuffer(gl, {gl.GL_STENCIL_ATTACHMENT: gl.GL_STENCIL_INDEX8})
+        self._number = LAST_NUMBER
 
     def count(self, shape: UploadedShape, tile: Intrinsics) -> int:
         """Pixels of a tile, of at most `TILE_PX` a side, that the shape covers; `program` must hold its pose."""
@@ -29,12 +36,12 @@ class PixelCounter:
         gl.glViewport(0, 0, tile.width, tile.height)
         gl.glDisable(gl.GL_DEPTH_TEST)
         gl.glEnable(gl.GL_STENCIL_TEST)
-        gl.glStencilFunc(gl.GL_EQUAL, 0, 0xFF)
-        gl.glStencilOp(gl.GL_KEEP, gl.GL_INCR, gl.GL_INCR)
-        gl.glScissor(0, 0, tile.width, tile.height)
-        gl.glEnable(gl.GL_SCISSOR_TEST)
-        gl.glClearBufferiv(gl.GL_STENCIL, 0, np.zeros(1, np.int32))
-        gl.glDisable(gl.GL_SCISSOR_TEST)
+        if self._number == LAST_NUMBER:
+            gl.glClearBufferiv(gl.GL_STENCIL, 0, np.zeros(1, np.int32))
+            self._number = 0
+        self._number += 1
+        gl.glStencilFunc(gl.GL_NOTEQUAL, self._number, 0xFF)
+        gl.glStencilOp(gl.GL_KEEP, gl.GL_REPLACE, gl.GL_REPLACE)
         self.program.set_view(tile)
         gl.glBeginQuery(gl.GL_SAMPLES_PASSED, self._query)
         for batch in shape.batches:

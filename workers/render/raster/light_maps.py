@@ -144,9 +144,13 @@ class LightMaps:
         self._program.use()
         for thing in things:
             self._program.set_cast(clip_from_world @ thing.T_world_shape)
-            for batch in self._shapes.fetch(thing.shape).batches:
+            shape = self._shapes.fetch(thing.shape)
+            # A closed body is nearest to the light where it faces it.
+            (gl.glEnable if shape.closed else gl.glDisable)(gl.GL_CULL_FACE)
+            for batch in shape.batches:
                 gl.glBindVertexArray(batch.vertex_array)
                 gl.glDrawElements(gl.GL_TRIANGLES, batch.index_count, gl.GL_UNSIGNED_INT, None)
+        gl.glDisable(gl.GL_CULL_FACE)
         depth = np.empty((SHADOW_PX, SHADOW_PX), np.float32)
         gl.glReadPixels(0, 0, SHADOW_PX, SHADOW_PX, gl.GL_DEPTH_COMPONENT, gl.GL_FLOAT, depth)
         gl.glDepthFunc(gl.GL_GREATER)

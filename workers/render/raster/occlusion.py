@@ -72,22 +72,27 @@ def sky_visibility(
     size, step2 = len(top), np.float32(step_m * step_m)
     one, zero = np.float32(1.0), np.float32(0.0)
     sky = np.empty_like(top)
-    for y in range(size):
+    hidden, high, low = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
+    for y in range(size):  # a row at a time, so that the loops over it are vectorised
+        here, shown = base[y], sky[y]
+        hidden[:] = zero
+        for turn in range(OFFSETS.shape[0]):
+            high[:], low[:] = zero, one
+            for reach in range(OFFSETS.shape[1]):
+                dx, dy = OFFSETS[turn, reach, 0], OFFSETS[turn, reach, 1]
+                if not 0 <= y + dy < size:
+                    break
+                first, count = max(-dx, 0), size - abs(dx)
+                tops, unders = top[y + dy, first + dx :], under[y + dy, first + dx :]
+                bases, highs, lows = here[first:], high[first:], low[first:]
+                square = np.float32(dx * dx + dy * dy) * step2
+                for x in range(count):
+                    rise, foot = tops[x] - bases[x], max(unders[x] - bases[x], zero)
+                    to_top, to_foot = rise * rise / (rise * rise + square), foot * foot / (foot * foot + square)
+                    highs[x] = max(highs[x], to_top) if rise > zero else highs[x]
+                    lows[x] = min(lows[x], to_foot) if rise > zero else lows[x]
+            for x in range(size):
+                hidden[x] += max(high[x] - low[x], zero)
         for x in range(size):
-            hidden = zero
-            for turn in range(OFFSETS.shape[0]):
-                high, low = zero, one
-                for reach in range(OFFSETS.shape[1]):
-                    dx, dy = OFFSETS[turn, reach, 0], OFFSETS[turn, reach, 1]
-                    if not (0 <= x + dx < size and 0 <= y + dy < size):
-                        break
-                    rise = top[y + dy, x + dx] - base[y, x]
-                    if rise <= zero:
-                        continue
-                    square = np.float32(dx * dx + dy * dy) * step2
-                    foot = max(under[y + dy, x + dx] - base[y, x], zero)
-                    high = max(high, rise * rise / (rise * rise + square))
-                    low = min(low, foot * foot / (foot * foot + square))
-                hidden += max(high - low, zero)
-            sky[y, x] = one - hidden / np.float32(OFFSETS.shape[0])
+            shown[x] = one - hidden[x] / np.float32(OFFSETS.shape[0])
     return sky

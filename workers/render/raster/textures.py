@@ -16,8 +16,11 @@ from workers.geometry.texels import has_holes
 MAX_TEXTURE_PX = 2048
 """Greatest width and height of an uploaded texture; a larger picture is scaled down."""
 
-_ROOTS = np.stack([np.rint(255.0 * np.sqrt(SRGB_STEPS))] * 3 + [np.arange(256.0)], axis=-1).astype(np.uint8)[:, None, :]
-"""[256, 1, 4] uint8: the root of the linear light of each sRGB code, in 255ths; alpha unchanged."""
+_ROOT = np.rint(255.0 * np.sqrt(SRGB_STEPS)).astype(np.uint8)
+"""[256] uint8: the root of the linear light of each sRGB code, in 255ths."""
+
+_ROOTS = np.stack([_ROOT] * 3 + [np.arange(256, dtype=np.uint8)], axis=-1)[:, None, :]
+"""[256, 1, 4] uint8: the same for red, green and blue; alpha unchanged."""
 
 
 @dataclass(eq=False)
@@ -83,10 +86,11 @@ def mip_levels(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
     Colours are roots of linear light, which a shader squares in half the time of decoding sRGB. The first level is the
     picture itself, or the largest that fits into `MAX_TEXTURE_PX`; row 0 is the lowest, as in OpenGL.
     """
-    level: NDArray = np.ascontiguousarray(image[::-1])
+    level: NDArray = cv2.flip(image, 0)
     if level.shape[2] == 3:
-        level = cv2.cvtColor(level, cv2.COLOR_RGB2RGBA)
-    level = np.asarray(cv2.LUT(level, _ROOTS), np.uint8)
+        level = cv2.cvtColor(np.asarray(cv2.LUT(level, _ROOT)), cv2.COLOR_RGB2RGBA)
+    else:
+        level = np.asarray(cv2.LUT(level, _ROOTS), np.uint8)
     shrink = min(1.0, MAX_TEXTURE_PX / max(level.shape[:2]))
     width, height = (max(1, round(shrink * level.shape[axis])) for axis in (1, 0))
     levels: list[NDArray[np.uint8]] = []

@@ -56,3 +56,11 @@ def test_of_a_thing_that_reaches_behind_the_camera_the_part_in_front_is_counted(
     behind = Placed(2, rod.shape, translation(0.0, 0.0, -5.0))
     assert renderer.count_pixels(rod, camera(k)) == pytest.approx((cast_view([rod], camera(wide))[1] == 2).sum(), abs=2)
     assert renderer.count_pixels(behind, camera(k)) == 0
+
+
+def test_counts_that_follow_one_another_share_no_pixels(renderer):
+    """More of them than the stencil has numbers, so that it is cleared in between."""
+    disc = Placed(3, shape_of(trimesh.creation.cylinder(0.02, 0.01)), translation(0.0, 0.0, 1.0))
+    first = renderer.count_pixels(disc, camera())
+    assert first > 0
+    assert {renderer.count_pixels(disc, camera()) for _ in range(600)} == {first}
