@@ -1,5 +1,7 @@
 """The level top of a table and its outline."""
 
+import math
+
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
@@ -9,6 +11,7 @@ from schemas.scene.plan import Table, TableTop
 from schemas.scene.shape import Asset, Mesh, Shape
 from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import transform, translation
+from workers.geometry.jit import compiled
 
 LEVEL = 0.999
 """Cosine to the vertical of a face that counts as level: 2.6 degrees."""
@@ -71,12 +74,22 @@ def inside_margin(points_xy: Array, outline: Array) -> Array:
 
     The least signed distance to the polygon's edge lines.
     """
-    edge = np.roll(outline, -1, axis=0) - outline
-    length = np.linalg.norm(edge, axis=1)
-    keep = length > 0
-    edge, start, length = edge[keep], outline[keep], length[keep]
-    relative = points_xy[:, None, :] - start
-    return ((edge[:, 0] * relative[..., 1] - edge[:, 1] * relative[..., 0]) / length).min(axis=1)
+    return _least_distances(np.ascontiguousarray(points_xy), outline)
+
+
+@compiled
+def _least_distances(points: Array, outline: Array) -> Array:
+    """The least signed distance [N] of points to the lines through the edges of a polygon, those without length left out."""
+    least = np.full(len(points), np.inf)
+    for m in range(len(outline)):
+        start, end = outline[m], outline[(m + 1) % len(outline)]
+        x, y = end[0] - start[0], end[1] - start[1]
+        length = math.sqrt(x * x + y * y)
+        if length > 0.0:
+            for n in range(len(points)):
+                depth = (x * (points[n, 1] - start[1]) - y * (points[n, 0] - start[0])) / length
+                least[n] = min(least[n], depth)
+    return least
 
 
 def support_height(points_xy: Array, table: Mesh) -> float:

@@ -19,7 +19,7 @@ from workers.assets.step import choose_object, choose_table, load_asset
 from workers.geometry.camera import orbit_pose
 from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import UP, pose, rotation_about, transform, translation, uniform_rotation
-from workers.geometry.hull import convex_hull
+from workers.geometry.hull import hull_of
 from workers.physics.rest_pose import find_contacts_xy, support_margin
 from workers.physics.table_top import place_table, support_height
 from workers.plan.arrange import has_room, rise_above
@@ -96,7 +96,7 @@ def draw_start(
     yaw = rng.uniform(-math.pi, math.pi)
     clearance = rng.uniform(spec.clearance_m.low, spec.clearance_m.high)
     R = uniform_rotation(rng) if spec.pose == "tumbled" else rotation_about(UP, yaw)
-    hull = convex_hull(asset.shape.vertices)
+    hull = hull_of(asset.shape)
     over_table = False
     for redraws in range(spec.max_redraws + 1):
         com_xy = (R @ asset.mass.com)[:2] + xy

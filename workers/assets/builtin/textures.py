@@ -3,11 +3,11 @@
 import math
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from workers.assets.builtin.palette import BLACK, WHITE, Color, chance, ink_on, mix, pick, vivid
+from workers.geometry.jit import compiled
 
 Texture = NDArray[np.uint8]
 Plane = NDArray[np.float32]
@@ -43,10 +43,23 @@ def _stretched(lattice: Plane, size: int) -> Plane:
 
 def blend(a: Color, b: Color, share: Plane) -> Texture:
     """Colour a where `share` [h, w] is 0, colour b where it is 1, in 64 steps."""
-    t = np.minimum(np.arange(256) / 63.0, 1.0)[:, None, None]
+    t = (np.arange(64) / 63.0)[:, None]
     steps = np.round(255.0 * (np.array(a) * (1 - t) + np.array(b) * t)).astype(np.uint8)
-    level = np.clip(share * np.float32(63.0) + np.float32(0.5), 0, 63).astype(np.uint8)
-    return np.asarray(cv2.applyColorMap(level, steps), np.uint8)
+    return _graded(share, steps)
+
+
+@compiled
+def _graded(share: Plane, steps: Texture) -> Texture:
+    """The colour of `steps` [64, 3] for each share [h, w] from 0 to 1, rounded to the nearest."""
+    height, width = share.shape
+    picture = np.empty((height, width, 3), np.uint8)
+    for row in range(height):
+        for column in range(width):
+            level = share[row, column] * np.float32(63.0) + np.float32(0.5)
+            color = steps[int(min(max(level, np.float32(0.0)), np.float32(63.0)))]
+            for channel in range(3):
+                picture[row, column, channel] = color[channel]
+    return picture
 
 
 def wood(rng: np.random.Generator, light: Color, dark: Color, planks: int = 0, size: int = 256) -> Texture:
