@@ -1,11 +1,12 @@
 """The level top of a table and its outline."""
 
 import math
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from schemas.base import Array, frozen_array
+from schemas.base import Array, Pose, frozen_array
 from schemas.errors import StartError
 from schemas.scene.plan import Table, TableTop
 from schemas.scene.shape import Asset, Mesh, Shape
@@ -60,13 +61,25 @@ def _describe(points: Array, area_m2: float, highest_m: float) -> TableTop:
 
 
 def place_table(asset: Asset) -> Table:
-    """The table on the floor, the centre of its top over the origin. Raises StartError where it has no level top."""
+    """The table on the floor, the centre of its top over the origin. Raises StartError where it has no level top.
+
+    Found once for each asset, and kept as long as that is.
+    """
+    if (placed := _placed.get(asset)) is None:
+        placed = _placed[asset] = _place(asset)
+    return Table(asset, *placed)
+
+
+_placed: WeakKeyDictionary[Asset, tuple[Pose, Mesh, TableTop]] = WeakKeyDictionary()
+
+
+def _place(asset: Asset) -> tuple[Pose, Mesh, TableTop]:
     top = find_table_top(asset.shape)
     lowest = float(asset.shape.bounds[0, 2])
     T = translation(-top.centre[0], -top.centre[1], -lowest)
     mesh = Mesh(frozen_array(transform(T, asset.shape.vertices)), asset.shape.faces)
     outline, centre = frozen_array(top.outline - top.centre), frozen_array([0.0, 0.0])
-    return Table(asset, frozen_array(T), mesh, TableTop(top.height_m - lowest, centre, outline, top.convex))
+    return frozen_array(T), mesh, TableTop(top.height_m - lowest, centre, outline, top.convex)
 
 
 def inside_margin(points_xy: Array, outline: Array) -> Array:
