@@ -4,6 +4,7 @@ import math
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.base import Array, Pose, frozen_array
@@ -30,14 +31,9 @@ FILLED_SHARE = 0.999
 def find_table_top(shape: Shape) -> TableTop:
     """The level top of a table mesh. Raises StartError where no face is level."""
     vertices, faces = shape.vertices, shape.faces
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    doubled = np.linalg.norm(normal, axis=1)
-    # Both sides count: external tables may be wound inside out. Height selects the upper side of a slab.
-    level = (np.abs(normal[:, 2]) > LEVEL * doubled) & (doubled > 0)
+    height, doubled, level = _levels(vertices, faces)
     if not level.any():
         raise StartError("no_table_top", "the table's mesh has no level face within 2.6 degrees: leave this table out")
-    height = (a[:, 2] + b[:, 2] + c[:, 2]) / 3
     key = np.round(height[level] / SAME_LEVEL_M).astype(np.int64)
     _, inverse = np.unique(key, return_inverse=True)
     area = np.bincount(inverse, weights=doubled[level] / 2)
@@ -45,6 +41,25 @@ def find_table_top(shape: Shape) -> TableTop:
     members = np.flatnonzero(level)[inverse == top]
     points = vertices[np.unique(faces[members])]
     return _describe(points, float(area[top]), float(vertices[:, 2].max()))
+
+
+@compiled
+def _levels(vertices: Array, faces: NDArray[np.int32]) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """For each face its mean height, twice its area, and whether it counts as level.
+
+    Both sides count: external tables may be wound inside out. Height selects the upper side of a slab.
+    """
+    height, doubled = np.empty(len(faces)), np.empty(len(faces))
+    level = np.empty(len(faces), np.bool_)
+    for f in range(len(faces)):
+        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        x, y, z = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        u, v, w = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+        i, j, k = y * w - z * v, z * u - x * w, x * v - y * u
+        height[f] = (a[2] + b[2] + c[2]) / 3
+        doubled[f] = math.sqrt(i * i + j * j + k * k)
+        level[f] = abs(k) > LEVEL * doubled[f] and doubled[f] > 0.0
+    return height, doubled, level
 
 
 def _describe(points: Array, area_m2: float, highest_m: float) -> TableTop:

@@ -27,18 +27,27 @@ def blank(height: int, width: int, color: Color) -> Texture:
 
 def noise(rng: np.random.Generator, height: int, width: int, rows: int, columns: int) -> Plane:
     """[height, width] float32 in [0, 1]: value noise on a lattice of rows x columns; repeats in both directions."""
-    lattice = rng.random((columns, rows), dtype=np.float32)
-    return _stretched(np.ascontiguousarray(_stretched(lattice, width).T), height)
+    return _stretched(rng.random((columns, rows), dtype=np.float32), height, width)
 
 
-def _stretched(lattice: Plane, size: int) -> Plane:
-    count = len(lattice)
-    at = np.arange(size, dtype=np.float32) * np.float32(count / size)
-    low = at.astype(np.int64)
-    step = np.take(np.roll(lattice, -1, axis=0) - lattice, low, axis=0)
-    step *= (at - low.astype(np.float32))[:, None]
-    step += np.take(lattice, low, axis=0)
-    return step
+@compiled
+def _stretched(lattice: Plane, height: int, width: int) -> Plane:
+    """A lattice [columns, rows] interpolated linearly to [height, width], along both the last towards the first."""
+    columns, rows = lattice.shape
+    wide, plane = np.empty((rows, width), np.float32), np.empty((height, width), np.float32)
+    for x in range(width):
+        at = np.float32(x) * np.float32(columns / width)
+        low = int(at)
+        share, after = at - np.float32(low), (low + 1) % columns
+        for row in range(rows):
+            wide[row, x] = (lattice[after, row] - lattice[low, row]) * share + lattice[low, row]
+    for y in range(height):
+        at = np.float32(y) * np.float32(rows / height)
+        low = int(at)
+        share, after = at - np.float32(low), (low + 1) % rows
+        for x in range(width):
+            plane[y, x] = (wide[after, x] - wide[low, x]) * share + wide[low, x]
+    return plane
 
 
 def blend(a: Color, b: Color, share: Plane) -> Texture:
