@@ -28,7 +28,8 @@ _LABEL = ("region_id", "category", "instance_id", "u", "v", "pixels", "visible_f
 
 def matrix_column(T: Pose) -> list[float]:
     """16 doubles, row-major."""
-    return [float(x) for x in T.ravel()]
+    values: list[float] = T.ravel().tolist()
+    return values
 
 
 def read_matrix(values: Sequence[float]) -> Pose:

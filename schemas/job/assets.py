@@ -24,7 +24,9 @@ class ProceduralSource(Frozen):
     seed: Seed = 0
     """Seed of the shapes; instance n of a category is the same in every dataset with this seed."""
     instances: Annotated[int, Field(ge=1, le=10**12)] = 1_000_000
-    """Number of distinct instances of each category."""
+    """Number of distinct instances of each category. With the default hardly a shape comes twice. With few, such as 64, scenes
+    share shapes, as with a folder of meshes: an instance is in about scenes / (categories x `instances`) scenes. Up to 10,000 are
+    kept once made. docs/measured.md has what that saves."""
     size: Literal["article", "metric"] = "article"
     """`article`: bounding-box diagonal `diagonal_m`; `metric`: the true size of such an object. Tables are metric."""
     diagonal_m: Positive = 0.25

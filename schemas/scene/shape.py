@@ -1,6 +1,7 @@
 """Shapes: meshes, parts with materials, mass, and assets. Arrays are read-only."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,34 +66,42 @@ class Part:
 class Shape:
     """The parts of one rigid body, all in one frame.
 
-    `closed`: together they bound closed bodies, wound outwards: no back of a face is visible from outside.
+    `closed`: together they bound closed bodies, wound outwards: no back of a face is visible from outside. What follows from
+    the parts is computed once, when it is first asked for.
     """
 
     parts: tuple[Part, ...]
     closed: bool = False
 
-    @property
+    @cached_property
     def vertices(self) -> Array:
         """[V, 3] float64: the vertices of every part, in order."""
-        return np.concatenate([part.vertices for part in self.parts])
+        return _read_only(np.concatenate([part.vertices for part in self.parts]))
 
-    @property
+    @cached_property
     def faces(self) -> NDArray[np.int32]:
         """[F, 3] int32 into `vertices`."""
-        starts = np.cumsum([0] + [len(part.vertices) for part in self.parts[:-1]])
-        faces = [part.faces + start for part, start in zip(self.parts, starts, strict=True)]
-        return np.concatenate(faces, dtype=np.int32, casting="same_kind")
+        faces, start = [], 0
+        for part in self.parts:
+            faces.append(part.faces + np.int32(start))
+            start += len(part.vertices)
+        return _read_only(np.concatenate(faces, dtype=np.int32, casting="same_kind"))
 
-    @property
+    @cached_property
     def mesh(self) -> Mesh:
         """All parts as one mesh, without their materials."""
         return Mesh(self.vertices, self.faces)
 
-    @property
+    @cached_property
     def bounds(self) -> Array:
         """[2, 3] float64: lower and upper corner of the axis-aligned bounding box."""
         vertices = self.vertices
-        return np.stack([vertices.min(axis=0), vertices.max(axis=0)])
+        return _read_only(np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
+
+
+def _read_only(array: NDArray) -> NDArray:
+    array.setflags(write=False)
+    return array
 
 
 @dataclass(frozen=True, eq=False)

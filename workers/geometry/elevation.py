@@ -7,6 +7,7 @@ import numpy as np
 from schemas.base import Array
 from schemas.scene.shape import Mesh
 from workers.geometry.convexity import triangle_corners
+from workers.geometry.jit import compiled
 
 EDGE_SLACK = 1e-12
 """Barycentric slack, so that a point on the edge of two triangles lies in at least one of them."""
@@ -16,9 +17,6 @@ SAME_HEIGHT_M = 1e-9
 
 FIRST_BAND_M = 1e-4
 """Vertices this near the lowest one are compared with the ground first: they settle the gap of an object that stands."""
-
-CHUNK = 4_000_000
-"""Point-triangle pairs worked on at once: about 200 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,32 +48,31 @@ def sample_elevation(points_xy: Array, ground: Mesh | Terrain, highest: bool = T
 
     points_xy [N, 2] metres.
     """
-    result = np.full(len(points_xy), np.nan)
     if len(points_xy) == 0:
-        return result
+        return np.empty(0)
     terrain = prepare_terrain(ground) if isinstance(ground, Mesh) else ground
     low, high = points_xy.min(axis=0), points_xy.max(axis=0)
     near = np.flatnonzero(((terrain.low[:, :2] <= high) & (terrain.high[:, :2] >= low)).all(axis=1))
-    if len(near) == 0:
-        return result
     a, b, c = (corner[near] for corner in terrain.corners)
-    area = terrain.area[near]
-    size = max(1, CHUNK // len(near))
-    outside = -np.inf if highest else np.inf
-    for start in range(0, len(points_xy), size):
-        z = _crossings(points_xy[start : start + size], a, b, c, area, outside)
-        best = z.max(axis=1) if highest else z.min(axis=1)
-        result[start : start + size] = np.where(best == outside, np.nan, best)
-    return result
+    return _crossings(np.ascontiguousarray(points_xy), a, b, c, terrain.area[near], highest)
 
 
-def _crossings(points: Array, a: Array, b: Array, c: Array, area: Array, outside: float) -> Array:
-    """[N, F] heights at which vertical lines cross triangles, `outside` where they miss."""
-    x, y = points[:, :1], points[:, 1:]
-    wb = ((x - a[:, 0]) * (c[:, 1] - a[:, 1]) - (y - a[:, 1]) * (c[:, 0] - a[:, 0])) / area
-    wc = ((b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (b[:, 1] - a[:, 1]) * (x - a[:, 0])) / area
-    inside = (wb >= -EDGE_SLACK) & (wc >= -EDGE_SLACK) & (wb + wc <= 1.0 + EDGE_SLACK)
-    return np.where(inside, a[:, 2] + wb * (b[:, 2] - a[:, 2]) + wc * (c[:, 2] - a[:, 2]), outside)
+@compiled
+def _crossings(points: Array, a: Array, b: Array, c: Array, area: Array, highest: bool) -> Array:
+    """[N] the highest or the lowest height at which vertical lines cross triangles [F, 3]; nan where they miss all."""
+    found = np.full(len(points), np.nan)
+    for n in range(len(points)):
+        x, y = points[n, 0], points[n, 1]
+        for f in range(len(a)):
+            wb = ((x - a[f, 0]) * (c[f, 1] - a[f, 1]) - (y - a[f, 1]) * (c[f, 0] - a[f, 0])) / area[f]
+            if not wb >= -EDGE_SLACK:
+                continue
+            wc = ((b[f, 0] - a[f, 0]) * (y - a[f, 1]) - (b[f, 1] - a[f, 1]) * (x - a[f, 0])) / area[f]
+            if wc >= -EDGE_SLACK and wb + wc <= 1.0 + EDGE_SLACK:
+                z = a[f, 2] + wb * (b[f, 2] - a[f, 2]) + wc * (c[f, 2] - a[f, 2])
+                if not (found[n] >= z if highest else found[n] <= z):
+                    found[n] = z
+    return found
 
 
 def vertical_gap(upper: Mesh, lower: Mesh | Terrain, band_m: float = 0.02) -> float:

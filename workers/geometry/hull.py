@@ -1,12 +1,17 @@
 """Convex hulls of points, by manifold3d, and by Qhull where they are thin."""
 
+import math
+from weakref import WeakKeyDictionary
+
 import manifold3d
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from schemas.base import Array, frozen_array
-from schemas.scene.shape import Hull
-from workers.geometry.convexity import mesh_of, triangle_corners
+from schemas.scene.shape import Hull, Shape
+from workers.geometry.convexity import mesh_of
+from workers.geometry.jit import compiled
 from workers.geometry.manifold import hold_to_one_thread
 
 THIN = 1e-4
@@ -51,11 +56,34 @@ def convex_hull(vertices: Array) -> Hull:
         if solid.num_vert() <= MOST_VERTICES:
             solid = solid.hull()
     mesh = mesh_of(solid)
-    points, (a, b, c) = mesh.vertices, triangle_corners(mesh)
-    across = np.cross(b - a, c - a)
-    doubled = np.sqrt((across * across).sum(axis=1))
-    kept = doubled > NO_AREA * float(((points.max(axis=0) - points.min(axis=0)) ** 2).sum())
-    return Hull(frozen_array(points), frozen_array(across[kept] / doubled[kept, None]))
+    points = mesh.vertices
+    least = NO_AREA * float(((points.max(axis=0) - points.min(axis=0)) ** 2).sum())
+    return Hull(frozen_array(points), frozen_array(_normals(points, mesh.faces, least)))
+
+
+def hull_of(shape: Shape) -> Hull:
+    """The hull of a shape, computed once and kept as long as the shape."""
+    if (hull := _hulls.get(shape)) is None:
+        hull = _hulls[shape] = convex_hull(shape.vertices)
+    return hull
+
+
+_hulls: WeakKeyDictionary[Shape, Hull] = WeakKeyDictionary()
+
+
+@compiled
+def _normals(points: Array, faces: NDArray[np.int32], least: float) -> Array:
+    """[N, 3]: unit normals of the triangles of which twice the area is more than `least`."""
+    normals, count = np.empty((len(faces), 3)), 0
+    for a, b, c in faces:
+        x, y, z = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+        u, v, w = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+        i, j, k = y * w - z * v, z * u - x * w, x * v - y * u
+        doubled = math.sqrt(i * i + j * j + k * k)
+        if doubled > least:
+            normals[count, 0], normals[count, 1], normals[count, 2] = i / doubled, j / doubled, k / doubled
+            count += 1
+    return normals[:count]
 
 
 def _thin_hull(vertices: Array) -> Hull:

@@ -1,5 +1,7 @@
 """Patches: the crop of an image about each object. Pure."""
 
+import numpy as np
+
 from schemas.job.images import Patch
 from schemas.scene.camera import Camera
 from schemas.scene.view import ObjectLabel, View
@@ -24,4 +26,5 @@ def patch_object_fraction(view: View, label: ObjectLabel, patch: Patch) -> float
     box = crop_box(label, view.camera, patch)
     if box is None or view.region is None:
         return None
-    return float((view.region[box] == label.region_id).mean())
+    region = view.region[box]
+    return float(np.count_nonzero(region == label.region_id) / region.size)

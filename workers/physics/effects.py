@@ -12,6 +12,7 @@ from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.shape import Hull
 from workers.geometry.convexity import fills_hull
 from workers.geometry.frames import transform
+from workers.geometry.jit import compiled
 from workers.physics.table_top import inside_margin
 
 NEIGHBOUR_RAD = math.radians(30.0)
@@ -44,10 +45,22 @@ def is_round(hull: Hull, com: Array) -> bool:
     cells = np.round(hull.normals / CELL).astype(np.int64) @ np.array([10_000, 100, 1])
     normals = hull.normals[np.unique(cells, return_index=True)[1]]
     height = (hull.vertices @ normals.T).max(axis=0) - normals @ com
-    cosine = normals @ normals.T
-    near = (cosine > math.cos(NEIGHBOUR_RAD)) & (cosine < math.cos(SAME_PLANE_RAD))
-    lowest = np.where(near, height, np.inf).min(axis=1)  # over the neighbours
-    return bool(((height <= lowest) & (lowest <= height * (1.0 + ROUND_SHARE))).any())
+    return _rests_on_round(height, normals @ normals.T, math.cos(NEIGHBOUR_RAD), math.cos(SAME_PLANE_RAD))
+
+
+@compiled
+def _rests_on_round(height: Array, cosine: Array, far: float, near: float) -> bool:
+    """Whether a height [N] is at most the least of its neighbours, and that is hardly more; cosine [N, N] of the normals."""
+    for i in range(len(height)):
+        lowest = np.inf
+        for j in range(len(height)):
+            if far < cosine[i, j] < near:
+                lowest = min(lowest, height[j])
+                if lowest < height[i]:
+                    break
+        if height[i] <= lowest <= height[i] * (1.0 + ROUND_SHARE):
+            return True
+    return False
 
 
 def starts_over_top(start: ObjectStart, table: Table) -> bool:

@@ -1,14 +1,19 @@
 """The level top of a table and its outline."""
 
+import math
+from weakref import WeakKeyDictionary
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from schemas.base import Array, frozen_array
+from schemas.base import Array, Pose, frozen_array
 from schemas.errors import StartError
 from schemas.scene.plan import Table, TableTop
 from schemas.scene.shape import Asset, Mesh, Shape
 from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import transform, translation
+from workers.geometry.jit import compiled
 
 LEVEL = 0.999
 """Cosine to the vertical of a face that counts as level: 2.6 degrees."""
@@ -26,14 +31,9 @@ FILLED_SHARE = 0.999
 def find_table_top(shape: Shape) -> TableTop:
     """The level top of a table mesh. Raises StartError where no face is level."""
     vertices, faces = shape.vertices, shape.faces
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    doubled = np.linalg.norm(normal, axis=1)
-    # Both sides count: external tables may be wound inside out. Height selects the upper side of a slab.
-    level = (np.abs(normal[:, 2]) > LEVEL * doubled) & (doubled > 0)
+    height, doubled, level = _levels(vertices, faces)
     if not level.any():
         raise StartError("no_table_top", "the table's mesh has no level face within 2.6 degrees: leave this table out")
-    height = (a[:, 2] + b[:, 2] + c[:, 2]) / 3
     key = np.round(height[level] / SAME_LEVEL_M).astype(np.int64)
     _, inverse = np.unique(key, return_inverse=True)
     area = np.bincount(inverse, weights=doubled[level] / 2)
@@ -41,6 +41,25 @@ def find_table_top(shape: Shape) -> TableTop:
     members = np.flatnonzero(level)[inverse == top]
     points = vertices[np.unique(faces[members])]
     return _describe(points, float(area[top]), float(vertices[:, 2].max()))
+
+
+@compiled
+def _levels(vertices: Array, faces: NDArray[np.int32]) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """For each face its mean height, twice its area, and whether it counts as level.
+
+    Both sides count: external tables may be wound inside out. Height selects the upper side of a slab.
+    """
+    height, doubled = np.empty(len(faces)), np.empty(len(faces))
+    level = np.empty(len(faces), np.bool_)
+    for f in range(len(faces)):
+        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        x, y, z = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        u, v, w = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+        i, j, k = y * w - z * v, z * u - x * w, x * v - y * u
+        height[f] = (a[2] + b[2] + c[2]) / 3
+        doubled[f] = math.sqrt(i * i + j * j + k * k)
+        level[f] = abs(k) > LEVEL * doubled[f] and doubled[f] > 0.0
+    return height, doubled, level
 
 
 def _describe(points: Array, area_m2: float, highest_m: float) -> TableTop:
@@ -57,13 +76,25 @@ def _describe(points: Array, area_m2: float, highest_m: float) -> TableTop:
 
 
 def place_table(asset: Asset) -> Table:
-    """The table on the floor, the centre of its top over the origin. Raises StartError where it has no level top."""
+    """The table on the floor, the centre of its top over the origin. Raises StartError where it has no level top.
+
+    Found once for each asset, and kept as long as that is.
+    """
+    if (placed := _placed.get(asset)) is None:
+        placed = _placed[asset] = _place(asset)
+    return Table(asset, *placed)
+
+
+_placed: WeakKeyDictionary[Asset, tuple[Pose, Mesh, TableTop]] = WeakKeyDictionary()
+
+
+def _place(asset: Asset) -> tuple[Pose, Mesh, TableTop]:
     top = find_table_top(asset.shape)
     lowest = float(asset.shape.bounds[0, 2])
     T = translation(-top.centre[0], -top.centre[1], -lowest)
     mesh = Mesh(frozen_array(transform(T, asset.shape.vertices)), asset.shape.faces)
     outline, centre = frozen_array(top.outline - top.centre), frozen_array([0.0, 0.0])
-    return Table(asset, frozen_array(T), mesh, TableTop(top.height_m - lowest, centre, outline, top.convex))
+    return frozen_array(T), mesh, TableTop(top.height_m - lowest, centre, outline, top.convex)
 
 
 def inside_margin(points_xy: Array, outline: Array) -> Array:
@@ -71,12 +102,22 @@ def inside_margin(points_xy: Array, outline: Array) -> Array:
 
     The least signed distance to the polygon's edge lines.
     """
-    edge = np.roll(outline, -1, axis=0) - outline
-    length = np.linalg.norm(edge, axis=1)
-    keep = length > 0
-    edge, start, length = edge[keep], outline[keep], length[keep]
-    relative = points_xy[:, None, :] - start
-    return ((edge[:, 0] * relative[..., 1] - edge[:, 1] * relative[..., 0]) / length).min(axis=1)
+    return _least_distances(np.ascontiguousarray(points_xy), outline)
+
+
+@compiled
+def _least_distances(points: Array, outline: Array) -> Array:
+    """The least signed distance [N] of points to the lines through the edges of a polygon, those without length left out."""
+    least = np.full(len(points), np.inf)
+    for m in range(len(outline)):
+        start, end = outline[m], outline[(m + 1) % len(outline)]
+        x, y = end[0] - start[0], end[1] - start[1]
+        length = math.sqrt(x * x + y * y)
+        if length > 0.0:
+            for n in range(len(points)):
+                depth = (x * (points[n, 1] - start[1]) - y * (points[n, 0] - start[0])) / length
+                least[n] = min(least[n], depth)
+    return least
 
 
 def support_height(points_xy: Array, table: Mesh) -> float:

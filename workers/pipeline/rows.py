@@ -1,6 +1,7 @@
 """The output of a scene: encoded files, and its rows in each manifest table. Pure."""
 
 from collections.abc import Sequence
+from weakref import WeakKeyDictionary
 
 from schemas.dataset.codec import Row, body_columns, camera_columns, columns_of_bodies, label_columns, matrix_column
 from schemas.dataset.layout import asset_path
@@ -39,8 +40,7 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
         assets = list({asset.instance_id: asset for asset in every}.values())
         for asset in assets:
             if asset.shareable:
-                path = asset_path(asset.category, asset.instance_id)
-                files.append(encoded_file(path, asset_glb(asset, encode_png)))
+                files.append(shape_file(asset))
     rows = {
         "scenes": [scene_row(context, scene)],
         "views": views,
@@ -54,6 +54,17 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
         "failures": [],
     }
     return SceneOutput(scene.plan.scene_id, tuple(files), rows)
+
+
+def shape_file(asset: Asset) -> EncodedFile:
+    """The asset's file in the dataset, encoded once and kept as long as the asset."""
+    if (file := _shape_files.get(asset)) is None:
+        path = asset_path(asset.category, asset.instance_id)
+        file = _shape_files[asset] = encoded_file(path, asset_glb(asset, encode_png))
+    return file
+
+
+_shape_files: WeakKeyDictionary[Asset, EncodedFile] = WeakKeyDictionary()
 
 
 def scene_row(context: WorkerContext, scene: Scene) -> Row:

@@ -137,12 +137,12 @@ def _attempt_scene(
 
 def run_scene(context: WorkerContext, scene_id: int, total: Stopwatch) -> SceneOutput:
     """One scene, or one capture: made, or a row that says why not."""
-    category = _category(context, scene_id)
     stopwatch = Stopwatch()
     try:
         output = _make_output(context, scene_id, stopwatch)
         category = str(output.rows["scenes"][0]["category"])
     except SceneError as error:
+        category = _category(context, scene_id)
         output = failed_scene(scene_id, category, error)
     total.add(stopwatch)
     return replace(output, rows={**output.rows, "timings": [timing_row(scene_id, category, stopwatch)]})

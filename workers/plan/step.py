@@ -19,7 +19,7 @@ from workers.assets.step import choose_object, choose_table, load_asset
 from workers.geometry.camera import orbit_pose
 from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import UP, pose, rotation_about, transform, translation, uniform_rotation
-from workers.geometry.hull import convex_hull
+from workers.geometry.hull import hull_of
 from workers.physics.rest_pose import find_contacts_xy, support_margin
 from workers.physics.table_top import place_table, support_height
 from workers.plan.arrange import has_room, rise_above
@@ -91,13 +91,12 @@ def draw_start(
     number, piled = len(earlier), bool(earlier) and spec.arrange == "pile"
     middle, reach = (earlier[0].T_world_obj[:2, 3], spec.pile_offset_m) if piled else (np.zeros(2), spec.offset_m)
     rng = chance.object_stream(Stream.START, number)
-    redraw_rng = chance.object_stream(Stream.REDRAW, number)
     xy = middle + rng.uniform(reach.low, reach.high, size=2)
     yaw = rng.uniform(-math.pi, math.pi)
     clearance = rng.uniform(spec.clearance_m.low, spec.clearance_m.high)
     R = uniform_rotation(rng) if spec.pose == "tumbled" else rotation_about(UP, yaw)
-    hull = convex_hull(asset.shape.vertices)
-    over_table = False
+    hull = hull_of(asset.shape)
+    over_table, redraw_rng = False, None
     for redraws in range(spec.max_redraws + 1):
         com_xy = (R @ asset.mass.com)[:2] + xy
         if sample_elevation(com_xy[None, :], table.mesh)[0] >= table.top.height_m - RECESS_M:  # nan compares false
@@ -109,6 +108,7 @@ def draw_start(
                 placed = spec.pose == "placed" and not piled and stands_on(rested, hull, asset.mass.com, table.mesh)
                 T = rested if placed else translation(0.0, 0.0, lift + clearance) @ rested
                 return ObjectStart(asset, hull, REGION_FIRST_OBJECT + number, frozen_array(T), redraws, placed)
+        redraw_rng = redraw_rng or chance.object_stream(Stream.REDRAW, number)
         xy = middle + redraw_rng.uniform(reach.low, reach.high, size=2)
     raise _no_start(spec, number + 1, over_table)
 

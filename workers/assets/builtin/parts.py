@@ -10,6 +10,7 @@ import numpy as np
 from schemas.base import Array
 from schemas.scene.shape import Material, Part, Shape
 from workers.assets.builtin.solid import TRIG_DIGITS, Indices, Solid, renumber
+from workers.geometry.jit import compiled
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +58,9 @@ def cut_into_parts(solid: Solid, surfaces: Sequence[Surface], centre: Array, sca
     Points on a border between parts are the same doubles in both, so that the parts together are watertight.
     """
     vertices = (solid.vertices - centre) * scale
-    across, normals_at = _face_vectors(vertices, solid.faces)
     shaded, point = renumber(solid.smooth[:, None] * len(vertices) + solid.faces)
     point %= len(vertices)
-    normals = normals_at(shaded, len(point))
+    across, normals = _shade(vertices, solid.faces, shaded, len(point))
     order = np.argsort(solid.surface, kind="stable")
     stops = np.cumsum(np.bincount(solid.surface, minlength=len(surfaces)))
     parts = []
@@ -88,28 +88,36 @@ def _part(surface: Surface, vertices: Array, faces: Indices, normals: Array, uv:
     return Part(surface.name, vertices, corners, surface.material, normals=normals, uv=uv)
 
 
-def _face_vectors(vertices: Array, faces: Indices) -> tuple[Array, Callable[[Indices, int], Array]]:
-    """The faces' area vectors [3, F], twice their area long, and a function that gives shading normals.
+@compiled
+def _shade(vertices: Array, faces: Indices, shaded: Indices, count: int) -> tuple[Array, Array]:
+    """The faces' area vectors [3, F], twice their area long, and the shading normals [count, 3] of the points.
 
-    The function takes the faces [F, 3] as numbers of `count` points, and gives [count, 3]: for each point the unit mean
-    of the normals of the faces around it. A face counts by its area vector over the squares of the two sides that meet
-    in the point, which is exact on spheres and independent of how a rectangle is cut in two (Max, "Weights for computing
-    vertex normals from facet normals", 1999).
+    shaded [F, 3]: the faces as numbers of the points to shade. A normal is the unit mean of those of the faces around its
+    point. A face counts by its area vector over the squares of the two sides that meet in the point, which is exact on
+    spheres and independent of how a rectangle is cut in two (Max, "Weights for computing vertex normals from facet
+    normals", 1999). Terms are added corner by corner of all faces.
     """
-    axes = np.ascontiguousarray(vertices.T)
-    a, b, c = (np.take(axes, faces[:, k], axis=1) for k in range(3))
-    (x, y, z), (u, v, w) = b - a, c - a
-    across = np.stack([y * w - z * v, z * u - x * w, x * v - y * u])
-    ab, bc, ca = (side[0] * side[0] + side[1] * side[1] + side[2] * side[2] for side in (b - a, c - b, a - c))
-    pairs = np.stack([ca * ab, ab * bc, bc * ca])
-    weight = 1.0 / np.where(pairs == 0.0, 1.0, pairs)
-
-    def normals(corners: Indices, count: int) -> Array:
-        flat = np.ascontiguousarray(corners.T).ravel()
-        x, y, z = (np.bincount(flat, (weight * along).ravel(), count) for along in across)
-        length = np.sqrt(x * x + y * y + z * z)
-        return np.stack([x, y, z], axis=1) / np.where(length == 0.0, 1.0, length)[:, None]
-
+    across, pairs = np.empty((3, len(faces))), np.empty((3, len(faces)))
+    for f in range(len(faces)):
+        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        x, y, z = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        u, v, w = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+        i, j, k = c[0] - b[0], c[1] - b[1], c[2] - b[2]
+        across[0, f], across[1, f], across[2, f] = y * w - z * v, z * u - x * w, x * v - y * u
+        ab, ca, bc = x * x + y * y + z * z, u * u + v * v + w * w, i * i + j * j + k * k
+        pairs[0, f], pairs[1, f], pairs[2, f] = ca * ab, ab * bc, bc * ca
+    normals = np.zeros((count, 3))
+    for corner in range(3):
+        for f in range(len(faces)):
+            pair, point = pairs[corner, f], normals[shaded[f, corner]]
+            weight = 1.0 / (pair if pair != 0.0 else 1.0)
+            point[0] += weight * across[0, f]
+            point[1] += weight * across[1, f]
+            point[2] += weight * across[2, f]
+    for point in normals:
+        length = math.sqrt(point[0] * point[0] + point[1] * point[1] + point[2] * point[2])
+        if length != 0.0:
+            point /= length
     return across, normals
 
 
@@ -127,11 +135,9 @@ def _texture_variants(
     if surface.material.texture is None:
         return np.zeros_like(faces), None
     if surface.mapping == "cylinder":
-        turn = _turns(vertices, faces)
-        beyond = turn[faces]
-        wrapped = (beyond.max(axis=1) - beyond.min(axis=1) > 0.5)[:, None] & (beyond < 0.5)
+        turn, wrapped = _wrap(vertices, faces)
         reach = surface.high - surface.low
-        return wrapped.astype(np.int64), lambda point, variant: np.stack(
+        return wrapped, lambda point, variant: np.stack(
             [turn[point] + variant, (vertices[point, 2] - surface.low) / reach], axis=1
         )
     if surface.mapping == "plane":
@@ -141,47 +147,82 @@ def _texture_variants(
         return np.zeros_like(faces), lambda point, variant: np.stack(
             [(local[point] * axis).sum(axis=1) for axis in axes], axis=1
         )
+    low, sides = vertices.min(axis=0), np.array(_SIDES[surface.grain])
     axis = np.abs(across).argmax(axis=0)
-    low = vertices.min(axis=0)
-    sides = np.array(_SIDES[surface.grain])
-    return np.repeat(axis[:, None], 3, axis=1), lambda point, variant: np.take_along_axis(
-        (vertices[point] - low) / surface.size, sides[variant], axis=1
+    return np.repeat(axis[:, None], 3, axis=1), lambda point, variant: _lay(
+        vertices, low, surface.size, sides, point, variant
     )
-
-
-def _turns(vertices: Array, faces: Indices) -> Array:
-    """[V] float64: the angle about the z axis in turns, in [0, 1), of the points that the faces name; 0 for others."""
-    turn = np.zeros(len(vertices))
-    used = np.zeros(len(vertices), dtype=np.bool_)
-    used[faces] = True
-    turn[used] = turns_about_z(vertices[used, 0], vertices[used, 1])
-    return turn
-
-
-def turns_about_z(x: Array, y: Array) -> Array:
-    """[N] float64: the angle of (x, y) in turns, in [0, 1), to `TRIG_DIGITS` digits; 0 at the origin.
-
-    By +, -, * and / alone, where numpy's atan2 gives other bits with other vector instructions: the tangent t in [0, 1]
-    of the angle to the nearest axis, less the nearest k/8, is small enough for a short series:
-    atan t = atan k/8 + atan s, s = (t - k/8) / (1 + t k/8).
-    """
-    wide, high = np.abs(x), np.abs(y)
-    steep = high > wide
-    long, short = np.where(steep, high, wide), np.where(steep, wide, high)
-    t = short / np.where(long == 0.0, 1.0, long)
-    step = np.rint(8.0 * t)
-    near = step / 8.0
-    s = (t - near) / (1.0 + t * near)
-    square = s * s
-    series = np.zeros_like(s)
-    for power in (11.0, 9.0, 7.0, 5.0, 3.0, 1.0):
-        series = 1.0 / power - square * series
-    turn = (_EIGHTHS[step.astype(np.int64)] + s * series) / (2.0 * math.pi)
-    turn = np.where(steep, 0.25 - turn, turn)
-    turn = np.where(x < 0.0, 0.5 - turn, turn)
-    turned = np.round(np.where(y < 0.0, 1.0 - turn, turn), TRIG_DIGITS)
-    return np.where(turned >= 1.0, 0.0, turned).astype(np.float64)
 
 
 _EIGHTHS = np.array([round(math.atan(k / 8.0), 15) for k in range(9)])
 """[9] float64: the angles with tangents 0, 1/8, ... 1."""
+
+_DIGITS = 10.0**TRIG_DIGITS
+
+
+@compiled
+def _lay(vertices: Array, low: Array, size: float, sides: Indices, point: Indices, variant: Indices) -> Array:
+    """uv [N, 2] of points by number: the two of their coordinates that `sides` [3, 2] names for the variant."""
+    uv = np.empty((len(point), 2))
+    for n in range(len(point)):
+        for k in range(2):
+            side = sides[variant[n], k]
+            uv[n, k] = (vertices[point[n], side] - low[side]) / size
+    return uv
+
+
+@compiled
+def _wrap(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
+    """The turns [V] of `turns_about_z` of the points that the faces [F, 3] name, and 1 for each that is a turn further on."""
+    turn = np.zeros(len(vertices))
+    known = np.zeros(len(vertices), np.bool_)
+    wrapped = np.empty_like(faces)
+    for f in range(len(faces)):
+        for k in range(3):
+            point = faces[f, k]
+            if not known[point]:
+                turn[point], known[point] = _turn(vertices[point, 0], vertices[point, 1]), True
+        a, b, c = turn[faces[f, 0]], turn[faces[f, 1]], turn[faces[f, 2]]
+        seam = max(a, b, c) - min(a, b, c) > 0.5
+        for k in range(3):
+            wrapped[f, k] = seam and turn[faces[f, k]] < 0.5
+    return turn, wrapped
+
+
+@compiled
+def turns_about_z(x: Array, y: Array) -> Array:
+    """[N] float64: the angle of (x, y) in turns, in [0, 1), to `TRIG_DIGITS` digits; 0 at the origin."""
+    turns = np.empty(len(x))
+    for n in range(len(x)):
+        turns[n] = _turn(x[n], y[n])
+    return turns
+
+
+@compiled
+def _turn(x: float, y: float) -> float:
+    """One of `turns_about_z`.
+
+    By +, -, * and / alone, where the C library's atan2 gives other bits on other processors: the tangent t in [0, 1] of
+    the angle to the nearest axis, less the nearest k/8, is small enough for a short series:
+    atan t = atan k/8 + atan s, s = (t - k/8) / (1 + t k/8).
+    """
+    wide, high = abs(x), abs(y)
+    steep = high > wide
+    long, short = (high, wide) if steep else (wide, high)
+    t = short / (long if long != 0.0 else 1.0)
+    step = np.rint(8.0 * t)
+    near = step / 8.0
+    s = (t - near) / (1.0 + t * near)
+    square = s * s
+    series = 0.0
+    for power in (11.0, 9.0, 7.0, 5.0, 3.0, 1.0):
+        series = 1.0 / power - square * series
+    turn = (_EIGHTHS[int(step)] + s * series) / (2.0 * math.pi)
+    if steep:
+        turn = 0.25 - turn
+    if x < 0.0:
+        turn = 0.5 - turn
+    if y < 0.0:
+        turn = 1.0 - turn
+    turned = np.rint(turn * _DIGITS) / _DIGITS
+    return turned if turned < 1.0 else 0.0

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import Loft
+from workers.geometry.jit import compiled
 from workers.geometry.manifold import hold_to_one_thread
 
 Indices = NDArray[np.int64]
@@ -222,11 +223,26 @@ def union_at(solid: Solid, touched: Mask, apex: Array, others: Sequence[Solid], 
     )
 
 
+@compiled
 def renumber(keys: Indices) -> tuple[Indices, Indices]:
-    """Keys [...] int64 renumbered 0, 1, 2, ... in ascending order, and the key of each number."""
-    seen = np.zeros(int(keys.max()) + 1, dtype=np.bool_)
-    seen[keys] = True
-    return (np.cumsum(seen) - 1)[keys], np.flatnonzero(seen)
+    """Keys [F, K] int64 renumbered 0, 1, 2, ... in ascending order, and the key of each number."""
+    rows, columns = keys.shape
+    number = np.zeros(keys.max() + 1, np.int64)
+    for row in range(rows):
+        for column in range(columns):
+            number[keys[row, column]] = 1
+    names = np.empty(number.sum(), np.int64)
+    count = 0
+    for key in range(len(number)):
+        if number[key]:
+            names[count] = key
+            number[key] = count
+            count += 1
+    numbers = np.empty_like(keys)
+    for row in range(rows):
+        for column in range(columns):
+            numbers[row, column] = number[keys[row, column]]
+    return numbers, names
 
 
 def difference(solid: Solid, cutters: Sequence[Solid]) -> Solid:

@@ -3,11 +3,11 @@
 import math
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from workers.assets.builtin.palette import BLACK, WHITE, Color, chance, ink_on, mix, pick, vivid
+from workers.geometry.jit import compiled
 
 Texture = NDArray[np.uint8]
 Plane = NDArray[np.float32]
@@ -27,26 +27,48 @@ def blank(height: int, width: int, color: Color) -> Texture:
 
 def noise(rng: np.random.Generator, height: int, width: int, rows: int, columns: int) -> Plane:
     """[height, width] float32 in [0, 1]: value noise on a lattice of rows x columns; repeats in both directions."""
-    lattice = rng.random((columns, rows), dtype=np.float32)
-    return _stretched(np.ascontiguousarray(_stretched(lattice, width).T), height)
+    return _stretched(rng.random((columns, rows), dtype=np.float32), height, width)
 
 
-def _stretched(lattice: Plane, size: int) -> Plane:
-    count = len(lattice)
-    at = np.arange(size, dtype=np.float32) * np.float32(count / size)
-    low = at.astype(np.int64)
-    step = np.take(np.roll(lattice, -1, axis=0) - lattice, low, axis=0)
-    step *= (at - low.astype(np.float32))[:, None]
-    step += np.take(lattice, low, axis=0)
-    return step
+@compiled
+def _stretched(lattice: Plane, height: int, width: int) -> Plane:
+    """A lattice [columns, rows] interpolated linearly to [height, width], along both the last towards the first."""
+    columns, rows = lattice.shape
+    wide, plane = np.empty((rows, width), np.float32), np.empty((height, width), np.float32)
+    for x in range(width):
+        at = np.float32(x) * np.float32(columns / width)
+        low = int(at)
+        share, after = at - np.float32(low), (low + 1) % columns
+        for row in range(rows):
+            wide[row, x] = (lattice[after, row] - lattice[low, row]) * share + lattice[low, row]
+    for y in range(height):
+        at = np.float32(y) * np.float32(rows / height)
+        low = int(at)
+        share, after = at - np.float32(low), (low + 1) % rows
+        for x in range(width):
+            plane[y, x] = (wide[after, x] - wide[low, x]) * share + wide[low, x]
+    return plane
 
 
 def blend(a: Color, b: Color, share: Plane) -> Texture:
     """Colour a where `share` [h, w] is 0, colour b where it is 1, in 64 steps."""
-    t = np.minimum(np.arange(256) / 63.0, 1.0)[:, None, None]
+    t = (np.arange(64) / 63.0)[:, None]
     steps = np.round(255.0 * (np.array(a) * (1 - t) + np.array(b) * t)).astype(np.uint8)
-    level = np.clip(share * np.float32(63.0) + np.float32(0.5), 0, 63).astype(np.uint8)
-    return np.asarray(cv2.applyColorMap(level, steps), np.uint8)
+    return _graded(share, steps)
+
+
+@compiled
+def _graded(share: Plane, steps: Texture) -> Texture:
+    """The colour of `steps` [64, 3] for each share [h, w] from 0 to 1, rounded to the nearest."""
+    height, width = share.shape
+    picture = np.empty((height, width, 3), np.uint8)
+    for row in range(height):
+        for column in range(width):
+            level = share[row, column] * np.float32(63.0) + np.float32(0.5)
+            color = steps[int(min(max(level, np.float32(0.0)), np.float32(63.0)))]
+            for channel in range(3):
+                picture[row, column, channel] = color[channel]
+    return picture
 
 
 def wood(rng: np.random.Generator, light: Color, dark: Color, planks: int = 0, size: int = 256) -> Texture:

@@ -8,6 +8,7 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from itertools import product
 from types import ModuleType
+from weakref import ref
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from workers.render.raster.batches import COLUMNS, Batch, pack_shape
 from workers.render.raster.textures import Texture, TextureStore
 
 FLOAT_BYTES = INDEX_BYTES = 4
+
+MAX_SHAPES = 512
+"""Shapes on the GPU at most: 56 instances of each built-in category, and of tables."""
 
 FEW_TRIANGLES = 1000
 """Batches of up to so many triangles are drawn by the program variant that is fast per pixel, others by the other one."""
@@ -61,48 +65,57 @@ class UploadedShape:
 
 
 class ShapeStore:
-    """Shapes on the GPU, by identity; the least recently used are freed when there are too many or they are too big.
+    """Shapes on the GPU, by identity, as long as something else holds them.
 
-    It holds each stored shape, so that no other object can take its id.
+    So what a scene alone has goes with the scene, and what the cache of assets keeps stays. The least recently used are
+    freed when there are too many or they are too big.
     """
 
-    def __init__(self, gl: ModuleType, max_shapes: int = 16, max_bytes: int = 64 * 2**20) -> None:
+    def __init__(self, gl: ModuleType, max_shapes: int = MAX_SHAPES, max_bytes: int = 64 * 2**20) -> None:
         self._gl = gl
         self.textures = TextureStore(gl)
         self._max_shapes, self._max_bytes = max_shapes, max_bytes
-        self._stored: OrderedDict[int, tuple[Shape, UploadedShape]] = OrderedDict()
+        self._stored: OrderedDict[int, tuple[ref[Shape], UploadedShape]] = OrderedDict()
         self._bytes = 0
 
     def __len__(self) -> int:
         return len(self._stored)
 
     def __contains__(self, shape: Shape) -> bool:
-        return id(shape) in self._stored
+        stored = self._stored.get(id(shape))
+        return stored is not None and stored[0]() is shape
 
     def fetch(self, shape: Shape) -> UploadedShape:
         """The shape on the GPU, uploaded now if it is not there."""
         if shape in self:
             self._stored.move_to_end(id(shape))
             return self._stored[id(shape)][1]
+        if id(shape) in self._stored:  # of a shape that is gone, whose id this one has
+            self._free(id(shape))
         batches = tuple(_upload(self._gl, batch, self.textures) for batch in pack_shape(shape))
         corners = np.array(list(product(*shape.bounds.T)))
         uploaded = UploadedShape(batches, corners, shape.closed)
-        self._stored[id(shape)] = (shape, uploaded)
+        self._stored[id(shape)] = (ref(shape), uploaded)
         self._bytes += uploaded.bytes
         return uploaded
 
     def trim(self, in_use: int) -> None:
-        """Free the least recently used until the bounds hold, but not the `in_use` shapes that were fetched last."""
+        """Free shapes that are gone, and the least recently used until the bounds hold, but not the `in_use` fetched last."""
+        for key in [key for key, (shape, _) in self._stored.items() if shape() is None]:
+            self._free(key)
         while len(self._stored) > in_use:
             if len(self._stored) <= self._max_shapes and self._bytes <= self._max_bytes and self.textures.fits:
                 return
-            _, (_, uploaded) = self._stored.popitem(last=False)
-            self._bytes -= uploaded.bytes
-            for batch in uploaded.batches:
-                self._gl.glDeleteVertexArrays(1, [batch.vertex_array])
-                self._gl.glDeleteBuffers(2, batch.buffers)
-                if batch.texture is not None:
-                    self.textures.give_back(batch.texture)
+            self._free(next(iter(self._stored)))
+
+    def _free(self, key: int) -> None:
+        _, uploaded = self._stored.pop(key)
+        self._bytes -= uploaded.bytes
+        for batch in uploaded.batches:
+            self._gl.glDeleteVertexArrays(1, [batch.vertex_array])
+            self._gl.glDeleteBuffers(2, batch.buffers)
+            if batch.texture is not None:
+                self.textures.give_back(batch.texture)
 
 
 def _upload(gl: ModuleType, batch: Batch, textures: TextureStore) -> Uploaded:

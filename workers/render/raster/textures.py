@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import ModuleType
+from weakref import ref
 
 import cv2
 import numpy as np
@@ -25,9 +26,9 @@ _ROOTS = np.stack([_ROOT] * 3 + [np.arange(256, dtype=np.uint8)], axis=-1)[:, No
 
 @dataclass(eq=False)
 class Texture:
-    """A picture on the GPU, and the number of batches that use it. It holds the picture, so that no other can take its id."""
+    """A picture on the GPU, and the number of batches that use it."""
 
-    picture: NDArray[np.uint8]
+    picture: ref[NDArray[np.uint8]]
     name: int
     bytes: int
     holes: bool
@@ -36,9 +37,9 @@ class Texture:
 
 
 class TextureStore:
-    """Textures in use, and the most recently used others while all fit into `max_bytes`."""
+    """Textures in use, and the most recently used others that something still holds while all fit into `max_bytes`."""
 
-    def __init__(self, gl: ModuleType, max_bytes: int = 32 * 2**20) -> None:
+    def __init__(self, gl: ModuleType, max_bytes: int = 128 * 2**20) -> None:
         self._gl, self._max_bytes = gl, max_bytes
         self._stored: OrderedDict[int, Texture] = OrderedDict()
         self.bytes = 0
@@ -54,10 +55,13 @@ class TextureStore:
     def take(self, picture: NDArray[np.uint8]) -> Texture:
         """The texture of a picture [h, w, 3 or 4] uint8 sRGB, uploaded now if it is not there; counts one use more."""
         key = id(picture)
+        held = self._stored.get(key)
+        if held is not None and held.picture() is not picture:  # of a picture that is gone, whose id this one has
+            self._stored[-held.name] = self._stored.pop(key)
         if key not in self._stored:
             levels = mip_levels(picture)
             size = sum(level.nbytes for level in levels)
-            self._stored[key] = Texture(picture, upload_texture(self._gl, levels), size, has_holes(picture))
+            self._stored[key] = Texture(ref(picture), upload_texture(self._gl, levels), size, has_holes(picture))
             self.bytes += size
         texture = self._stored[key]
         self._stored.move_to_end(key)
@@ -65,11 +69,11 @@ class TextureStore:
         return texture
 
     def give_back(self, texture: Texture) -> None:
-        """Count one use less; free the least recently used textures without any use until the rest fit."""
+        """Count one use less; free unused textures whose pictures are gone, and the least recently used until the rest fit."""
         texture.uses -= 1
-        for key in [key for key, held in self._stored.items() if held.uses == 0]:
-            if self.fits:
-                return
+        for key, held in [(key, held) for key, held in self._stored.items() if held.uses == 0]:
+            if self.fits and held.picture() is not None:
+                continue
             unused = self._stored.pop(key)
             self._gl.glDeleteTextures(1, [unused.name])
             self.bytes -= unused.bytes

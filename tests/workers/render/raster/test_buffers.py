@@ -1,5 +1,6 @@
 """The store of shapes on the GPU: what was drawn last stays, and the rest goes where it is too much."""
 
+import pytest
 import trimesh
 
 from tests.shapes import shape_of
@@ -24,3 +25,16 @@ def test_a_bound_on_bytes_keeps_what_is_in_use(renderer):
         store.fetch(shape)
     store.trim(1)
     assert len(store) == 1 and shapes[2] in store
+
+
+def test_what_nothing_else_holds_goes_and_its_place_is_free_again(renderer):
+    store = ShapeStore(renderer._gl)
+    kept = shape_of(trimesh.creation.box((0.1, 0.1, 0.1)))
+    store.fetch(kept)
+    for k in range(2, 30):
+        store.fetch(shape_of(trimesh.creation.box((0.1 * k, 0.1, 0.1))))
+        assert store.fetch(shape := shape_of(trimesh.creation.box((0.1 * k, 0.2, 0.1)))).corners[-1] == pytest.approx(
+            [0.05 * k, 0.1, 0.05]
+        ), "not what had the id before"
+    store.trim(1)
+    assert len(store) == 2 and kept in store and shape in store
