@@ -119,7 +119,10 @@ def test_a_cube_beside_a_wall_that_is_let_go_again_keeps_all_four_of_its_corners
     table = tray()
     aside = turn(np.array([0.0, 0.0, 1.0]), 0.0785)
     wall_m = 0.025 * (math.cos(math.radians(0.0785)) + math.sin(math.radians(0.0785))) - 0.15
-    beside, other = put(cube(0.05), table, 0.0, (0.1187, wall_m + gap_m), aside), put(cube(0.05), table, 0.0, (0.118, -0.06))
+    beside, other = (
+        put(cube(0.05), table, 0.0, (0.1187, wall_m + gap_m), aside),
+        put(cube(0.05), table, 0.0, (0.118, -0.06)),
+    )
     group = together(table, [beside, other])
     settled = settle_group(group.starts, table, PHYSICS)
     motions = recheck_group(group.starts, settled, table, PHYSICS)
