@@ -53,16 +53,16 @@ REACH_SHARE = 0.02
 NO_THRESHOLD = 1e18
 """Bullet's default: contacts are solved as soon as they are predicted."""
 
-GroundShape = float | Mesh | Array
-"""Level ground at a height, metres, without an end; a mesh; or the vertices [N, 3] of a convex body."""
+GroundShape = float | Mesh | Array | tuple[Mesh, ...]
+"""Level ground at a height, metres, without an end; a mesh, or several; or the vertices [N, 3] of a convex body."""
 
 
 @dataclass(frozen=True)
 class World:
-    """A ground and bodies, numbered in order. `advance` takes `steps` steps."""
+    """A ground of one shape or more, and bodies, numbered in order. `advance` takes `steps` steps."""
 
     client: int
-    ground: int
+    grounds: tuple[int, ...]
     bodies: tuple[int, ...]
     steps: int
 
@@ -112,7 +112,7 @@ class World:
         Bullet solves contacts before they close and removes speed in portions too slow to bounce: with steps shorter than
         its contact distance over the speed nothing bounces. So contacts that bounce are solved only once bodies overlap.
         """
-        for thing in (self.ground, *self.bodies):
+        for thing in (*self.grounds, *self.bodies):
             pybullet.changeDynamics(
                 thing,
                 -1,
@@ -138,7 +138,7 @@ def open_world(
     """
     client = _connect()
     pybullet.resetSimulation(physicsClientId=client)
-    reach = reach_m if isinstance(ground, Mesh) else math.inf
+    reach = reach_m if isinstance(ground, Mesh | tuple) else math.inf
     pybullet.setPhysicsEngineParameter(
         numSolverIterations=physics.solver_iterations,
         deterministicOverlappingPairs=1,
@@ -151,15 +151,17 @@ def open_world(
         physicsClientId=client,
     )
     pybullet.setGravity(0.0, 0.0, -GRAVITY_M_S2, physicsClientId=client)
-    things = [_add_ground(client, ground)]
-    _set_surface(client, things[0], physics)
+    grounds = tuple(_add_ground(client, each) for each in (ground if isinstance(ground, tuple) else (ground,)))
+    for number in grounds:
+        _set_surface(client, number, physics)
+    things = []
     for body, T_world_body in placed:
         level = len(placed) == 1 and stands_on_face(np.concatenate(body.parts), -T_world_body[2, :3])
         things.append(_add_body(client, body, T_world_body[:3, :3] if level else None))
         _set_surface(client, things[-1], physics, body)
         position, quaternion = T_world_body[:3, 3].tolist(), quaternion_from_rotation(T_world_body[:3, :3]).tolist()
         pybullet.resetBasePositionAndOrientation(things[-1], position, quaternion, physicsClientId=client)
-    world = World(client, things[0], tuple(things[1:]), steps)
+    world = World(client, grounds, tuple(things), steps)
     world.set_rate(physics.step_hz)
     if physics.restitution > 0.0:
         world.set_restitution(physics.restitution)
@@ -175,7 +177,7 @@ def _connect() -> int:
     return client
 
 
-def _add_ground(client: int, ground: GroundShape) -> int:
+def _add_ground(client: int, ground: float | Mesh | Array) -> int:
     if isinstance(ground, Mesh):
         return _add_mesh(client, ground)
     if isinstance(ground, float):

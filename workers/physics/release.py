@@ -16,6 +16,7 @@ from workers.physics.fall import THIN_SHARE, Outcome, choose_steps, fall, free_f
 from workers.physics.placement import Ground
 from workers.physics.rigid_body import build_body, choose_collision_shape
 from workers.physics.stop_conditions import falls_below, leaves_outline, leaves_room
+from workers.physics.table_top import split_by_side
 
 MANY = 4
 """Number of objects from which they fall as coarser convex parts: the time grows with the pairs of parts near one another."""
@@ -126,6 +127,8 @@ def _release(drop: Drop, flat: bool) -> Outcome:
         ground, stops = table.top.height_m - hover_m, {"edge": leaves_outline(table.top.outline, reach_m)}
     elif flat:
         ground = _prism(table)
+    elif drop.exact and not drop.single:
+        ground = split_by_side(table.mesh)
     T_world_body = poses[0] @ bodies[0].T_obj_body
     if math.isfinite(drop.room_m):
         stops["room"] = leaves_room(T_world_body[:2, 3], drop.room_m)

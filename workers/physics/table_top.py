@@ -127,3 +127,22 @@ def support_height(points_xy: Array, table: Mesh) -> float:
     inside = ((table.vertices[:, :2] >= low) & (table.vertices[:, :2] <= high)).all(axis=1)
     candidates = np.concatenate([heights[np.isfinite(heights)], table.vertices[inside, 2]])
     return float(candidates.max()) if len(candidates) else -np.inf
+
+
+def split_by_side(mesh: Mesh) -> tuple[Mesh, ...]:
+    """The faces of a mesh by the axis, of six, that their normals are nearest to; those without area are left out.
+
+    Bullet keeps four contacts of two bodies. Of a body that stands in a corner, a wall would take those that the floor needs.
+    """
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    axis = np.abs(normal).argmax(axis=1)
+    along = np.take_along_axis(normal, axis[:, None], axis=1)[:, 0]
+    side = np.where(along == 0.0, -1, 2 * axis + (along < 0.0))
+    return tuple(_part(mesh, side == number) for number in range(6) if (side == number).any())
+
+
+def _part(mesh: Mesh, which: NDArray[np.bool_]) -> Mesh:
+    """Some of the faces, with the vertices that they have."""
+    used, faces = np.unique(mesh.faces[which], return_inverse=True)
+    return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32))

@@ -1,6 +1,7 @@
 """What the simulator is told of a scene: the size of steps, and the settings of the effects that the plan runs."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -9,9 +10,10 @@ from schemas.job.job import Job
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import Asset
-from tests.hard_cases.bodies import rod
+from tests.hard_cases.bodies import cube, rod
 from tests.hard_cases.drops import X, turn
-from tests.physics.settling import settle_group
+from tests.hard_cases.groups import put, together, tray
+from tests.physics.settling import recheck_group, settle_group
 from tests.shapes import asset_of, box, table
 from workers.geometry.frames import pose
 from workers.geometry.hull import convex_hull
@@ -81,8 +83,8 @@ def test_objects_as_boxes_keep_the_height_of_their_lowest_point_together_as_alon
     plan = EffectPlan(("dynamics", "fine_step"), {})
     both = release(Drop(tuple(starts), GROUND, physics, plan), flat=True)
     alone = [release(Drop((start,), GROUND, physics, plan), flat=True) for start in starts]
-    for together, one in zip(both.poses, alone, strict=True):
-        assert together[2, 3] == pytest.approx(one.poses[0][2, 3], abs=1e-4)
+    for beside, one in zip(both.poses, alone, strict=True):
+        assert beside[2, 3] == pytest.approx(one.poses[0][2, 3], abs=1e-4)
 
 
 def rates_of_falls(drop: Drop, rises: list[float], monkeypatch) -> list[float]:
@@ -109,3 +111,20 @@ def test_what_gains_energy_falls_again_in_shorter_steps_until_it_gains_none(monk
     assert rates_of_falls(both, [more] * 9, monkeypatch) == [pace.rate for pace in PACES_TOGETHER]
     exact = dataclasses.replace(alone, exact=True)
     assert rates_of_falls(exact, [more] * 9, monkeypatch) == [1.0]
+
+
+@pytest.mark.parametrize("gap_m", [0.0001, 0.0002, 0.00046])
+def test_a_cube_beside_a_wall_that_is_let_go_again_keeps_all_four_of_its_corners_on_the_floor(gap_m):
+    """Bullet keeps four contacts of two bodies, chosen for their area, up to millimetres away; those of a wall count."""
+    table = tray()
+    aside = turn(np.array([0.0, 0.0, 1.0]), 0.0785)
+    wall_m = 0.025 * (math.cos(math.radians(0.0785)) + math.sin(math.radians(0.0785))) - 0.15
+    beside, other = (
+        put(cube(0.05), table, 0.0, (0.1187, wall_m + gap_m), aside),
+        put(cube(0.05), table, 0.0, (0.118, -0.06)),
+    )
+    group = together(table, [beside, other])
+    settled = settle_group(group.starts, table, PHYSICS)
+    motions = recheck_group(group.starts, settled, table, PHYSICS)
+    assert max(mm for mm, _ in motions) < 0.01
+    assert max(degrees for _, degrees in motions) < 0.001

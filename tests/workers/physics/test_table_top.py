@@ -7,7 +7,7 @@ import trimesh
 from schemas.errors import StartError
 from schemas.scene.shape import Mesh
 from tests.shapes import asset_of, box, shape_of, table
-from workers.physics.table_top import find_table_top, inside_margin, place_table, support_height
+from workers.physics.table_top import find_table_top, inside_margin, place_table, split_by_side, support_height
 
 
 def test_the_top_is_the_top_and_not_a_shelf_or_a_rim():
@@ -71,3 +71,17 @@ def test_the_support_is_the_highest_thing_below_also_between_the_points():
     assert support_height(around, mesh) == pytest.approx(0.1)
     assert support_height(around + 0.3, mesh) == pytest.approx(0.0)
     assert support_height(around + 5.0, mesh) == -np.inf
+
+
+def test_the_sides_of_a_mesh_have_each_of_its_faces_once_and_one_direction_each():
+    mesh = place_table(asset_of(box(0.4, 0.4, 0.03), box(0.02, 0.4, 0.1, (0.19, 0, 0.065)))).mesh
+    flat = Mesh(mesh.vertices, np.concatenate([mesh.faces, [[0, 0, 1]]]).astype(np.int32))  # and one without area
+    sides = [each.vertices[each.faces] for each in split_by_side(flat)]
+    assert len(sides) == 6
+    for corners in sides:
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        assert normals == pytest.approx(np.tile(normals[0], (len(normals), 1)))
+    assert sorted(map(tuple, np.concatenate(sides).reshape(-1, 9))) == sorted(
+        map(tuple, mesh.vertices[mesh.faces].reshape(-1, 9))
+    )
