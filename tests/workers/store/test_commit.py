@@ -133,7 +133,7 @@ def test_a_published_file_of_the_wrong_size_is_told_by_name(store, undecided):
 def test_after_a_death_at_any_rename_anyone_publishes_the_rest(store, layout, monkeypatch):
     """The tables say which images there are, and may be in place before the images are, or after."""
     with monkeypatch.context() as patch:
-        patch.setattr("workers.store.attempt.publish", lambda store, record: None)
+        patch.setattr("workers.store.attempt.publish", lambda *_: None)
         record = attempt_at(store, 0, 2, terms(layout=layout)).commit().record
     whole = committed_files(store, record)
     assert any(entry.path.endswith(".png") for entry in whole) == (layout == "files")
