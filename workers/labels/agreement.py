@@ -79,4 +79,5 @@ def _smooth_around(
     column = np.clip(np.floor(u - 0.5).astype(np.int64), 0, width - 2)
     row = np.clip(np.floor(v - 0.5).astype(np.int64), 0, height - 2)
     corners = (row * width + column)[:, None] + np.array([0, 1, width, width + 1])
-    return is_smooth(depth, region, corners.ravel(), SMOOTH_MIRROR_M, units_per_m).reshape(-1, 4).all(axis=1)
+    smooth = is_smooth(depth, region, corners.ravel(), SMOOTH_MIRROR_M, units_per_m).reshape(-1, 4)
+    return smooth[:, 0] & smooth[:, 1] & smooth[:, 2] & smooth[:, 3]
