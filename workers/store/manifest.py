@@ -246,13 +246,12 @@ def _check_values(where: str, field: pa.Field, array: pa.Array) -> None:
     """Raises ValueError for an absent value that the schema requires, or a double that is not finite, at any depth."""
     if not field.nullable and array.null_count:
         raise ValueError(f"{where} is missing in {array.null_count} of {len(array)} rows")
-    kind = field.type
+    kind, present = field.type, array.drop_null() if array.null_count else array
     if pa.types.is_floating(kind):
-        values = array.drop_null().to_numpy()
+        values = present.to_numpy()
         if not np.isfinite(values).all():
             raise ValueError(f"{where} is not finite: {values[~np.isfinite(values)][0]}")
     elif pa.types.is_struct(kind):
-        present = array.drop_null()
         for i in range(kind.num_fields):
             _check_values(f"{where}.{kind.field(i).name}", kind.field(i), present.field(i))
     elif pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
