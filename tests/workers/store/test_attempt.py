@@ -286,27 +286,3 @@ def test_an_abandoned_attempt_leaves_nothing(store):
     attempt = attempt_at(store, 0, 4, terms(layout="tar"))
     attempt.abandon()
     assert not list(store.files(STAGING))
-
-
-@pytest.mark.parametrize("layout", ["files", "tar"])
-def test_a_winner_knows_its_files_as_anyone_reads_them_from_its_commit(store, layout, monkeypatch):
-    known = []
-    monkeypatch.setattr("workers.store.attempt.publish", lambda store, record, own: known.extend(own))
-    record = attempt_at(store, 0, 4, terms(layout=layout)).commit().record
-    assert any(entry.path.endswith(".glb") for entry in known)
-    assert tuple(known) == committed_files(store, record)
-
-
-def test_an_image_of_another_range_is_refused_before_the_decision(store):
-    def of_other_poses(scene_id):
-        output = made_scene(scene_id + 4)
-        rows = {
-            table: [{**row, "scene_id": scene_id} if "scene_id" in row else row for row in rows]
-            for table, rows in output.rows.items()
-        }
-        return changed(output, scene_id=scene_id, rows=rows)
-
-    attempt = attempt_at(store, 0, 4, terms(pairs_per_scene=1), make=of_other_poses)
-    with pytest.raises(ValueError, match="is not a file of the range from scene 0"):
-        attempt.commit()
-    assert read_record(store, 0) is None
