@@ -51,7 +51,7 @@ def littered(root: Path) -> None:
     loser = attempt_at(store, FIRST, FIRST + RANGE, settings, small_scene)
     fenced = attempt_at(store, FIRST, FIRST + RANGE, settings, small_scene)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(attempt_module, "publish", lambda store, record: None)
+        patch.setattr(attempt_module, "publish", lambda *_: None)
         assert attempt_at(store, FIRST, FIRST + RANGE, settings, small_scene).commit().won
     store.fence(f"_staging/{FIRST:010d}/{fenced.name}")
     attempt_at(store, FIRST + RANGE, STOP, settings, small_scene)

@@ -174,7 +174,7 @@ def test_an_attempt_that_won_before_it_was_given_up_is_published(tmp_path, coord
     for scene_id in (0, 1):
         attempt.add_scene(small_scene(scene_id))
     with monkeypatch.context() as patch:
-        patch.setattr("workers.store.attempt.publish", lambda store, record: None)
+        patch.setattr("workers.store.attempt.publish", lambda *_: None)
         record = attempt.commit().record
     coordinator_of(store)._find_evidence(Span(start=0, stop=2))
     check_published(store, record)

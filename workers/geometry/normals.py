@@ -32,6 +32,22 @@ def facing_cosine(
     return _facing_cosine(depth, units_per_m, region, pixels, (k.cx, k.cy, k.fx, k.fy), eye)
 
 
+Point = tuple[float, float, float]
+
+
+@compiled
+def _point(depth: Depth, units_per_m: float, row: int, column: int, k: tuple[float, float, float, float]) -> Point:
+    """What a pixel sees, metres, in the camera's frame; k: cx, cy, fx, fy."""
+    z = depth[row, column] / units_per_m
+    return (column + 0.5 - k[0]) / k[2] * z, (row + 0.5 - k[1]) / k[3] * z, z
+
+
+@compiled
+def _between(a: Point, b: Point) -> Point:
+    """A minus b: tuples, because numba allocates an array for each difference of arrays."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
 @compiled
 def _facing_cosine(
     depth: Depth,
@@ -44,23 +60,20 @@ def _facing_cosine(
     """k: cx, cy, fx, fy. In the camera's frame x runs right and y down, so that y across x points towards the camera."""
     height, width = depth.shape
     cosine = np.full(len(pixels), np.nan)
-    points = np.empty((5, 3))
     for n in range(len(pixels)):
         row, column = pixels[n] // width, pixels[n] % width
         if row == 0 or column == 0 or row == height - 1 or column == width - 1:
             continue
         known = True
-        for i, (dy, dx) in enumerate(((0, 0), (0, 1), (0, -1), (1, 0), (-1, 0))):
-            z = depth[row + dy, column + dx] / units_per_m
-            known = known and z > 0.0 and region[row + dy, column + dx] == region[row, column]
-            points[i, 0] = (column + dx + 0.5 - k[0]) / k[2] * z
-            points[i, 1] = (row + dy + 0.5 - k[1]) / k[3] * z
-            points[i, 2] = z
+        for dy, dx in ((0, 0), (0, 1), (0, -1), (1, 0), (-1, 0)):
+            alike = region[row + dy, column + dx] == region[row, column]
+            known = known and alike and depth[row + dy, column + dx] > 0
         if not known:
             continue
-        a, b = points[3] - points[4], points[1] - points[2]
+        a = _between(_point(depth, units_per_m, row + 1, column, k), _point(depth, units_per_m, row - 1, column, k))
+        b = _between(_point(depth, units_per_m, row, column + 1, k), _point(depth, units_per_m, row, column - 1, k))
         normal = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-        towards = eye - points[0]
+        towards = _between((eye[0], eye[1], eye[2]), _point(depth, units_per_m, row, column, k))
         along = normal[0] * towards[0] + normal[1] * towards[1] + normal[2] * towards[2]
         length2 = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
         away2 = towards[0] * towards[0] + towards[1] * towards[1] + towards[2] * towards[2]

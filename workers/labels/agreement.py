@@ -41,8 +41,8 @@ def compare_views(source: View, mirror: View, images: Images, bound_mm: float) -
     units = images.depth_units_per_m
     pixels = _sample_pixels(source.region)
     facing = facing_cosine(source.depth, source.region, pixels, source.camera, mirror.camera.position, units)
-    smooth = is_smooth(source.depth, source.region, pixels, SMOOTH_INPUT_M, units)
-    index = pixels[(np.nan_to_num(facing, nan=-1.0) > FACING) & smooth]
+    index = pixels[facing > FACING]  # false where it is nan
+    index = index[is_smooth(source.depth, source.region, index, SMOOTH_INPUT_M, units)]
     points = reproject_pixels(source.depth, index, source.camera, mirror.camera, units)
     keep = points[:, 2] > 0.0
     points, index = points[keep], index[keep]
@@ -50,9 +50,9 @@ def compare_views(source: View, mirror: View, images: Images, bound_mm: float) -
     inside = in_frame(u, v, mirror.camera.intrinsics)
     points, index, u, v = points[inside], index[inside], u[inside], v[inside]
     seen, region = sample_inverse_depth(mirror.depth, mirror.region, u, v, units)
-    seen = np.where(_smooth_around(mirror.depth, mirror.region, u, v, units), seen, 0.0)
     own = source.region.ravel()[index]
-    both = (seen > 0.0) & (region == own) & (points[:, 2] < seen + HIDDEN_M)
+    both = np.flatnonzero((seen > 0.0) & (region == own) & (points[:, 2] < seen + HIDDEN_M))
+    both = both[_smooth_around(mirror.depth, mirror.region, u[both], v[both], units)]
     difference_mm = np.abs(points[both, 2] - seen[both]) * 1e3
     object_mm = difference_mm[own[both] >= REGION_FIRST_OBJECT]
     enough = len(object_mm) >= FEWEST_POINTS
@@ -78,7 +78,6 @@ def _smooth_around(
     height, width = depth.shape
     column = np.clip(np.floor(u - 0.5).astype(np.int64), 0, width - 2)
     row = np.clip(np.floor(v - 0.5).astype(np.int64), 0, height - 2)
-    smooth = np.ones(len(u), bool)
-    for step in (0, 1, width, width + 1):
-        smooth &= is_smooth(depth, region, row * width + column + step, SMOOTH_MIRROR_M, units_per_m)
-    return smooth
+    corners = (row * width + column)[:, None] + np.array([0, 1, width, width + 1])
+    smooth = is_smooth(depth, region, corners.ravel(), SMOOTH_MIRROR_M, units_per_m).reshape(-1, 4)
+    return smooth[:, 0] & smooth[:, 1] & smooth[:, 2] & smooth[:, 3]

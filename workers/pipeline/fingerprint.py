@@ -29,6 +29,7 @@ CANARY_SCENE = 3
 LIBRARIES = (
     "coacd",
     "embreex",
+    "fpng",
     "llvmlite",
     "manifold3d",
     "numba",

@@ -21,6 +21,7 @@ from schemas.dataset.commit import (
     SceneMark,
     Span,
     TableEntry,
+    foreign_path,
 )
 from schemas.dataset.layout import (
     FENCED,
@@ -171,17 +172,18 @@ class Attempt:
         """Decides the range and, where this attempt wins, publishes it; a loser's folder is removed.
 
         Just before the decision, `_SUCCESS` goes and job.yaml is changed: an attempt that fails earlier leaves both.
-        Raises ValueError where a scene of the range is missing, RunError where the attempt was swept although nobody
-        has committed the range.
+        Raises ValueError where a scene of the range is missing or a file is not its own, RunError where the attempt was
+        swept although nobody has committed the range.
         """
         if missing := self.span.scene_ids[len(self._scenes) :]:
             first = list(missing[:5])
             raise ValueError(f"the range from {self.span.start} lacks scenes {first}: it cannot be committed")
         self._note({})
         record = self._finish()
+        own = self._own_files(record)
         if not self._put(record, job_change):
             return self._concede(record)
-        publish(self._store, record)
+        publish(self._store, record, own)
         return CommitResult(won=True, record=record)
 
     def abandon(self) -> None:
@@ -214,6 +216,17 @@ class Attempt:
             tables=tables,
             scenes=tuple(self._scenes),
         )
+
+    def _own_files(self, record: CommitRecord) -> list[FileEntry]:
+        """What `committed_files` would read from the tables: every file that this attempt wrote, sorted by path.
+
+        Raises ValueError naming one that is not the range's own.
+        """
+        by_path = self._terms.layout == "files"
+        listed = [entry for path, entry in self._files.items() if by_path or is_shape(path)]
+        if (foreign := foreign_path(listed, self.span, self._terms.pairs_per_scene)) is not None:
+            raise ValueError(f"{foreign!r} is not a file of the range from scene {self.span.start}")
+        return sorted({*record.files, *listed}, key=attrgetter("path"))
 
     def _put(self, record: CommitRecord, job_change: JobChange | None) -> bool:
         """Puts the record if absent; True where it is now this attempt's."""

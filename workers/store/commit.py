@@ -123,17 +123,19 @@ def committed_files(store: Store, record: CommitRecord) -> tuple[FileEntry, ...]
     return tuple(files[path] for path in sorted(files))
 
 
-def publish(store: Store, record: CommitRecord) -> None:
+def publish(store: Store, record: CommitRecord, own: Iterable[FileEntry] | None = None) -> None:
     """Moves the record's files from staging to their final places, then removes the staging. Idempotent.
 
-    Raises CorruptError naming a file that is nowhere or has the wrong size, CommitConflict where a shape that ranges
-    share was published with another size by the same stack.
+    `own`: all of the record's files, from who wrote them just now; others read them from its tables. Raises CorruptError
+    naming a file that is nowhere or has the wrong size, CommitConflict where a shape that ranges share was published with
+    another size by the same stack.
     """
-    files = committed_files(store, record)
+    files = committed_files(store, record) if own is None else tuple(own)
+    folders = _staging_folders(record)
     for entry in files:
         final = store.size(entry.path) if is_shape(entry.path) else None
         if final is None:
-            if not _move(store, record, entry):
+            if not _move(store, folders, entry):
                 _check_final(store, entry)
         elif final != entry.bytes and record.terms.fingerprint_mode == "strict":
             raise CommitConflict(
@@ -141,7 +143,7 @@ def publish(store: Store, record: CommitRecord) -> None:
                 f"made by {record.terms.fingerprint}: two attempts at one shape differ"
             )
     store.sync_folders_of(entry.path for entry in files)
-    for folder in _staging_folders(record):
+    for folder in folders:
         store.remove_tree(folder)
 
 
@@ -203,9 +205,9 @@ def _staging_folders(record: CommitRecord) -> tuple[str, str]:
     return staging, staging + FENCED
 
 
-def _move(store: Store, record: CommitRecord, entry: FileEntry) -> bool:
-    """Renames one file into place; False where it is not staged (any more)."""
-    for folder in _staging_folders(record):
+def _move(store: Store, folders: Iterable[str], entry: FileEntry) -> bool:
+    """Renames one file into place from one of the folders; False where it is not staged (any more)."""
+    for folder in folders:
         source = f"{folder}/{entry.path}"
         staged = store.size(source)
         if staged is None:

@@ -51,7 +51,9 @@ def file_system_of(folder: str | Path) -> str:
     best, kind = "", "unknown"
     for line in lines:
         fields, _, rest = line.partition(" - ")
-        mount = re.sub(r"\\(\d{3})", lambda octal: chr(int(octal[1], 8)), fields.split()[4])
+        mount = fields.split()[4]
+        if "\\" in mount:
+            mount = re.sub(r"\\(\d{3})", lambda octal: chr(int(octal[1], 8)), mount)
         inside = place == mount or place.startswith(mount.rstrip("/") + "/")
         if inside and len(mount) >= len(best):
             best, kind = mount, rest.split()[0]
@@ -93,14 +95,14 @@ class OpenTree:
                 sync_path(root / folder)
 
 
-def refuse_link_out(root: Path, key: str) -> None:
+def refuse_link_out(root: str | Path, key: str) -> None:
     """Raises OutputError where a folder on the way to `key`, or `key` itself, is a symbolic link that leads out of `root`.
 
     So a folder from somebody else cannot make this program write or remove elsewhere.
     """
-    place = str(root)
+    place = os.fspath(root)
     for part in key.split("/"):
-        place += f"/{part}"
+        place = f"{place}/{part}"
         if os.path.islink(place) and not Path(os.path.realpath(place)).is_relative_to(os.path.realpath(root)):
             raise OutputError(
                 f"{place} is a symbolic link that leads out of {root}, to {os.path.realpath(place)}: nothing is written "
@@ -205,6 +207,22 @@ def _probe_once(root: Path) -> None:
         for path in (source, target):
             with contextlib.suppress(OSError):
                 os.unlink(path)
+
+
+@contextlib.contextmanager
+def temporary_file(folder: Path, data: bytes, durable: bool) -> Iterator[Path]:
+    """A finished file in `folder`, gone when the context ends. Raises FileNotFoundError where there is no folder."""
+    temporary = folder / f".{uuid.uuid4().hex}"
+    try:
+        with open(temporary, "xb") as file:
+            file.write(data)
+            file.flush()
+            if durable:
+                os.fsync(file.fileno())
+        yield temporary
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(temporary)
 
 
 def remedy_of(error: OSError) -> str | None:

@@ -6,7 +6,7 @@ import re
 import shutil
 import uuid
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import IO
 
 from schemas.dataset.layout import COMMITS, FENCED, RANGES, STAGING, TEMPORARY, scratch_path
@@ -20,6 +20,7 @@ from workers.store.file_system import (
     sync_folders,
     sync_path,
     sync_tree,
+    temporary_file,
 )
 from workers.store.store import Entry, Store, Version, retry_if_swept
 
@@ -48,6 +49,7 @@ class LocalStore(Store):
     def __init__(self, root: str | os.PathLike[str]) -> None:
         self.root = Path(root)
         self.name = str(root)
+        self._folder = str(self.root)
         self._open: dict[str, OpenTree] = {}
         """By the folders of this object's attempts, each until it is durable or removed."""
 
@@ -55,10 +57,14 @@ class LocalStore(Store):
         """Where `key` lies on disk."""
         return self.root / key
 
-    def _own(self, key: str) -> Path:
+    def _at(self, key: str) -> str:
+        """The same as text, which takes a tenth of the time: hundreds of keys are asked for in a range."""
+        return f"{self._folder}/{key}"
+
+    def _own(self, key: str) -> str:
         """Where `key` lies on disk, to write or remove it. Raises OutputError where a link leads out of the folder."""
-        refuse_link_out(self.root, key)
-        return self.path(key)
+        refuse_link_out(self._folder, key)
+        return self._at(key)
 
     def prepare(self) -> None:
         """Makes the folders and probes the file system."""
@@ -82,14 +88,14 @@ class LocalStore(Store):
     @contextlib.contextmanager
     def stream_staged(self, staging: str, path: str) -> Iterator[IO[bytes]]:
         """A file below the attempt's folder, whose subfolders are made as needed."""
-        target = self.path(f"{staging}/{path}")
+        target = self._at(f"{staging}/{path}")
         with self._explained(f"{staging}/{path}"):
             try:
                 file = open(target, "wb")  # noqa: SIM115 - closed below, on every path
             except FileNotFoundError:
-                for folder in list(reversed(PurePosixPath(path).parents))[1:]:  # never the attempt's own
+                for folder in reversed(_folders_above(path)):  # never the attempt's own
                     with contextlib.suppress(FileExistsError):
-                        os.mkdir(self.path(staging) / folder)
+                        os.mkdir(self._at(f"{staging}/{folder}"))
                 file = open(target, "wb")  # noqa: SIM115
             try:
                 yield file
@@ -114,7 +120,7 @@ class LocalStore(Store):
 
     def put_if_absent(self, key: str, data: bytes, staging: str | None = None) -> bool:
         """Links a finished temporary file to `key`: the one step that refuses a second writer."""
-        return not self.path(key).exists() and self._place(os.link, key, data, staging)
+        return not os.path.exists(self._at(key)) and self._place(os.link, key, data, staging)
 
     def write_whole(self, key: str, data: bytes, durable: bool = True) -> None:
         """Renames a finished temporary file to `key`."""
@@ -127,14 +133,14 @@ class LocalStore(Store):
             try:
                 os.replace(old, new)
             except FileNotFoundError:
-                os.makedirs(new.parent, exist_ok=True)
+                os.makedirs(os.path.dirname(new), exist_ok=True)
                 os.replace(old, new)
 
     def sync_folders_of(self, keys: Iterable[str]) -> None:
         """Flushes the folders that hold `keys`, up to the output folder."""
-        folders = {PurePosixPath(key.rpartition("/")[0]) for key in keys}
+        folders = {folder for key in keys for folder in (*_folders_above(key), ".")}
         with self._explained("the output folder"):
-            sync_folders(self.root, {str(above) for folder in folders for above in (folder, *folder.parents)})
+            sync_folders(self.root, folders)
 
     def fence(self, staging: str) -> None:
         """Renames an attempt's folder: from then on the attempt cannot write, nor link a record."""
@@ -148,7 +154,8 @@ class LocalStore(Store):
 
     def read(self, key: str) -> bytes:
         """The bytes at `key`."""
-        return self.path(key).read_bytes()
+        with open(self._at(key), "rb") as file:
+            return file.read()
 
     def size(self, key: str) -> int | None:
         """Bytes at `key`, or None."""
@@ -227,7 +234,7 @@ class LocalStore(Store):
         """Flushes a file and renames it to `key`."""
         with self._explained(key):
             sync_path(local)
-            os.makedirs(self._own(key).parent, exist_ok=True)
+            os.makedirs(os.path.dirname(self._own(key)), exist_ok=True)
             os.replace(local, self.path(key))
             sync_path(self.path(key).parent)
         return None
@@ -247,24 +254,24 @@ class LocalStore(Store):
         target = self._own(key)
 
         def place_once() -> bool:
-            with _temporary_file(self.path(staging or TEMPORARY), data, durable) as temporary:
+            with temporary_file(self.path(staging or TEMPORARY), data, durable) as temporary:
                 try:
                     name_it(temporary, target)
                 except FileExistsError:
                     # Over NFS a link whose first answer was lost is refused although it is ours.
                     return os.path.samefile(temporary, target)
                 if durable:
-                    sync_path(target.parent)
+                    sync_path(os.path.dirname(target))
             return True
 
         with self._explained(key):
-            for folder in {target.parent} if staging else {target.parent, self.path(TEMPORARY)}:
+            for folder in {os.path.dirname(target)} if staging else {os.path.dirname(target), self._at(TEMPORARY)}:
                 os.makedirs(folder, exist_ok=True)
             return retry_if_swept(place_once)
 
     def _stat(self, key: str) -> os.stat_result | None:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            return os.stat(self.path(key))
+            return os.stat(self._at(key))
         return None
 
     def _scan(self, prefix: str) -> list[os.DirEntry[str]]:
@@ -277,20 +284,10 @@ class LocalStore(Store):
         return explain_disk_errors(f"{key} in {self.name} could not be written")
 
 
-@contextlib.contextmanager
-def _temporary_file(folder: Path, data: bytes, durable: bool) -> Iterator[Path]:
-    """A finished file in `folder`, gone when the context ends. Raises FileNotFoundError where there is no folder."""
-    temporary = folder / f".{uuid.uuid4().hex}"
-    try:
-        with open(temporary, "xb") as file:
-            file.write(data)
-            file.flush()
-            if durable:
-                os.fsync(file.fileno())
-        yield temporary
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(temporary)
+def _folders_above(path: str) -> list[str]:
+    """The folders on the way to a file, the nearest first."""
+    parts = path.split("/")
+    return ["/".join(parts[:end]) for end in range(len(parts) - 1, 0, -1)]
 
 
 def _ignore_missing(function: object, path: str, raised: tuple[type[BaseException], BaseException, object]) -> None:

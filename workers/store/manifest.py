@@ -27,6 +27,12 @@ from schemas.scene.scene import SceneOutput
 
 PARQUET_OPTIONS = {"compression": "zstd", "write_page_checksum": True}
 """For every Parquet file that users read: a flipped bit is found when the page is read."""
+_ROWS = {
+    (table, len(schema)): pa.struct(list(schema))
+    for table in SCHEMAS
+    for schema in (SCHEMAS[table], CAPTURE_SCHEMAS[table])
+}
+"""The type of a row, by table and number of columns: all columns of a table are made in one call."""
 _RANGE_OPTIONS: dict[str, Any] = {
     "compression": "lz4",
     "write_page_checksum": True,
@@ -51,16 +57,21 @@ def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
         if row.keys() != names:
             wrong = sorted(names.symmetric_difference(row.keys()))
             raise ValueError(f"{table}: a row has other columns than the schema: {', '.join(wrong)}")
-    arrays = []
-    for field in schema:
-        where = f"{table}.{field.name}"
-        try:
-            array = pa.array([row[field.name] for row in rows], field.type)
-        except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError) as error:
-            raise ValueError(f"{where}: {error}") from error
-        _check_values(where, field, array)
-        arrays.append(array)
+    try:
+        arrays = pa.array(rows, _ROWS[table, len(names)]).flatten()
+    except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):
+        arrays = [_column(table, field, rows) for field in schema]  # says which column it is
+    for field, array in zip(schema, arrays, strict=True):
+        _check_values(f"{table}.{field.name}", field, array)
     return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def _column(table: str, field: pa.Field, rows: Sequence[Mapping[str, object]]) -> pa.Array:
+    """One column of the rows. Raises ValueError naming it where a value has the wrong type."""
+    try:
+        return pa.array([row[field.name] for row in rows], field.type)
+    except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError) as error:
+        raise ValueError(f"{table}.{field.name}: {error}") from error
 
 
 def outcome_of(output: SceneOutput) -> Outcome:
@@ -123,12 +134,21 @@ def sorted_rows(table: str, rows: pa.Table) -> pa.Table:
     names = SORT_KEYS[table]
     if table == "assets":
         distinct = {json.dumps(row): index for index, row in enumerate(rows.to_pylist())}
-        rows = rows.take(pa.array(distinct.values(), pa.int64()))
-    result = rows.sort_by([(name, "ascending") for name in names])
-    for key, following in pairwise(zip(*(result.column(name).to_pylist() for name in names), strict=True)):
+        if len(distinct) < rows.num_rows:
+            rows = rows.take(pa.array(distinct.values(), pa.int64()))
+    keys = _keys(rows, names)
+    if keys != sorted(keys):
+        rows = rows.sort_by([(name, "ascending") for name in names])
+        keys = _keys(rows, names)
+    for key, following in pairwise(keys):
         if key == following:
             raise ValueError(f"{table}: two rows have the key {', '.join(names)} = {', '.join(map(str, key))}")
-    return result
+    return rows
+
+
+def _keys(rows: pa.Table, names: Sequence[str]) -> list[tuple[Any, ...]]:
+    """The values of these columns, a tuple for each row."""
+    return list(zip(*(rows.column(name).to_pylist() for name in names), strict=True))
 
 
 def encode_table(rows: pa.Table) -> bytes:
@@ -226,13 +246,12 @@ def _check_values(where: str, field: pa.Field, array: pa.Array) -> None:
     """Raises ValueError for an absent value that the schema requires, or a double that is not finite, at any depth."""
     if not field.nullable and array.null_count:
         raise ValueError(f"{where} is missing in {array.null_count} of {len(array)} rows")
-    kind = field.type
+    kind, present = field.type, array.drop_null() if array.null_count else array
     if pa.types.is_floating(kind):
-        values = array.drop_null().to_numpy()
+        values = present.to_numpy()
         if not np.isfinite(values).all():
             raise ValueError(f"{where} is not finite: {values[~np.isfinite(values)][0]}")
     elif pa.types.is_struct(kind):
-        present = array.drop_null()
         for i in range(kind.num_fields):
             _check_values(f"{where}.{kind.field(i).name}", kind.field(i), present.field(i))
     elif pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):

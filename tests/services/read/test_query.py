@@ -98,7 +98,7 @@ def test_only_what_is_committed_counts_even_before_it_is_published(tmp_path, mon
     store = running(tmp_path)
     attempt_at(store, 12, 16)
     with monkeypatch.context() as patch:
-        patch.setattr("workers.store.attempt.publish", lambda store, record: None)
+        patch.setattr("workers.store.attempt.publish", lambda *_: None)
         attempt_at(store, 16, 20).commit()
     answer = query(store, "select scene_id from scenes union all select scene_id from failures order by all")
     assert answer.column(0).to_pylist() == [*range(12), *range(16, 20)]
@@ -107,7 +107,7 @@ def test_only_what_is_committed_counts_even_before_it_is_published(tmp_path, mon
 def test_a_range_that_is_published_between_two_looks_is_seen_once(tmp_path, monkeypatch):
     store = running(tmp_path)
     with monkeypatch.context() as patch:
-        patch.setattr("workers.store.attempt.publish", lambda store, record: None)
+        patch.setattr("workers.store.attempt.publish", lambda *_: None)
         record = attempt_at(store, 12, 16).commit().record
     real = LocalStore.children
     looked = []

@@ -20,5 +20,5 @@ def store(tmp_path):
 def undecided(store, monkeypatch):
     """A commit that was decided and not published: its worker died in between."""
     with monkeypatch.context() as patch:
-        patch.setattr("workers.store.attempt.publish", lambda store, record: None)
+        patch.setattr("workers.store.attempt.publish", lambda *_: None)
         return attempt_at(store, 0, 4).commit().record

@@ -1,4 +1,5 @@
 import copy
+import dataclasses
 import hashlib
 import re
 
@@ -133,7 +134,7 @@ def test_a_published_file_of_the_wrong_size_is_told_by_name(store, undecided):
 def test_after_a_death_at_any_rename_anyone_publishes_the_rest(store, layout, monkeypatch):
     """The tables say which images there are, and may be in place before the images are, or after."""
     with monkeypatch.context() as patch:
-        patch.setattr("workers.store.attempt.publish", lambda store, record: None)
+        patch.setattr("workers.store.attempt.publish", lambda *_: None)
         record = attempt_at(store, 0, 2, terms(layout=layout)).commit().record
     whole = committed_files(store, record)
     assert any(entry.path.endswith(".png") for entry in whole) == (layout == "files")
@@ -197,3 +198,27 @@ def test_where_stacks_are_mixed_the_first_shape_stays(store):
     attempt_at(store, 12, 24, mixed, another_shape).commit()
     after = {entry.key: entry.bytes for entry in store.files("assets")}
     assert before.items() <= after.items()
+
+
+@pytest.mark.parametrize("layout", ["files", "tar"])
+def test_a_winner_knows_its_files_as_anyone_reads_them_from_its_commit(store, layout, monkeypatch):
+    known = []
+    monkeypatch.setattr("workers.store.attempt.publish", lambda store, record, own: known.extend(own))
+    record = attempt_at(store, 0, 4, terms(layout=layout)).commit().record
+    assert any(entry.path.endswith(".glb") for entry in known)
+    assert tuple(known) == committed_files(store, record)
+
+
+def test_an_image_of_another_range_is_refused_before_the_decision(store):
+    def of_other_poses(scene_id):
+        output = made_scene(scene_id + 4)
+        rows = {
+            table: [{**row, "scene_id": scene_id} if "scene_id" in row else row for row in rows]
+            for table, rows in output.rows.items()
+        }
+        return dataclasses.replace(output, scene_id=scene_id, rows=rows)
+
+    attempt = attempt_at(store, 0, 4, terms(pairs_per_scene=1), make=of_other_poses)
+    with pytest.raises(ValueError, match="is not a file of the range from scene 0"):
+        attempt.commit()
+    assert read_record(store, 0) is None

@@ -100,7 +100,7 @@ def test_a_damaged_or_missing_table_is_told_by_name(store):
 
 def test_a_range_is_read_while_it_is_being_published(store, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr("workers.store.attempt.publish", lambda store, record: None)
+        patch.setattr("workers.store.attempt.publish", lambda *_: None)
         attempt_at(store, 0, 4).commit()
     (records,) = iter_ranges(store, 0, 4)
     assert list(store.files(STAGING))

@@ -124,7 +124,7 @@ def test_an_attempt_that_commits_while_it_is_swept_commits_all_or_nothing(
         def commit(won=won, attempts=attempts):
             with monkeypatch.context() as patch:
                 if dies:
-                    patch.setattr("workers.store.attempt.publish", lambda store, record: None)
+                    patch.setattr("workers.store.attempt.publish", lambda *_: None)
                 try:
                     won.append(attempts[0].commit().won)
                 except RunError:

@@ -41,7 +41,7 @@ def undecided(tmp_path, monkeypatch):
     store = LocalStore(tmp_path / "work" / "out")
     store.prepare()
     with monkeypatch.context() as patch:
-        patch.setattr("workers.store.attempt.publish", lambda store, record: None)
+        patch.setattr("workers.store.attempt.publish", lambda *_: None)
         attempt_at(store, 0, 2, make=small_scene).commit()
     for place in ("victim", "work/victim", "work/out/job.yaml"):
         (tmp_path / place).write_text("precious")

@@ -146,7 +146,7 @@ def test_files_and_folders_are_listed_as_on_a_disk(store, tmp_path):
 def test_a_rename_that_was_ended_half_way_is_done_again(monkeypatch):
     store = ObjectStore(MemoryStore(), "memory://")
     with monkeypatch.context() as patch:
-        patch.setattr("workers.store.attempt.publish", lambda store, record: None)
+        patch.setattr("workers.store.attempt.publish", lambda *_: None)
         record = attempt_at(store, 0, 4, TAR).commit().record
     entry = record.files[-1]
     obstore.copy(store._bucket, f"{STAGING}/0000000000/{record.attempt}/{entry.path}", entry.path)

@@ -1,0 +1,164 @@
+"""Digests of many encoded images, to compare between processes, processors and contents of leftover memory.
+
+    python -m tests.encoded_digests render SOURCES.npy
+    python -m tests.encoded_digests digest SOURCES.npy DIGESTS.npy --images 100000
+    python -m tests.encoded_digests digest SOURCES.npy OTHER.npy --images 100000 --backward
+    python -m tests.encoded_digests compare DIGESTS.npy OTHER.npy
+
+`digest` loads the encoder and nothing else of the project, so it also runs on an emulated processor:
+
+    qemu-x86_64 -cpu Nehalem,-pclmulqdq python -m tests.encoded_digests digest SOURCES.npy OTHER.npy --images 4000
+
+With glibc, `MALLOC_PERTURB_=165` fills whatever is allocated or freed, which shows what leftovers in memory change.
+"""
+
+import argparse
+import hashlib
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workers.store.images import decode_png, encode_png
+
+BLOCK = 40
+"""Images that are encoded between the two times that each is."""
+DIGEST = 16
+"""Bytes of a digest."""
+
+
+def render(scenes: int, seed: int = 11) -> list[NDArray]:
+    """Every image of some scenes of the default job, as it comes from the renderer, and their textures."""
+    from schemas.errors import SceneError
+    from schemas.job.identity import settings_digest
+    from schemas.job.job import Job
+    from workers.assets.catalogue import open_catalogue
+    from workers.pipeline.context import WorkerContext
+    from workers.pipeline.make_scene import make_scene
+    from workers.pipeline.stopwatch import Stopwatch
+    from workers.render.raster.gbuffer import shared_renderer
+
+    job = Job(name="digests", seed=seed, scenes=scenes)
+    catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))
+    context = WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
+    images: list[NDArray] = []
+    for scene_id in range(scenes):
+        try:
+            scene = make_scene(context, scene_id, Stopwatch())
+        except SceneError:
+            continue
+        for view in (view for pair in scene.pairs for view in pair.views):
+            images += [pixels for pixels in (view.rgb, view.depth, view.region) if pixels is not None]
+        parts = [part for start in scene.plan.objects for part in start.asset.shape.parts]
+        textures = [part.material.texture for part in parts]
+        images += [texture for texture in textures if texture is not None and texture.shape[2] == 3]
+    return images
+
+
+def variant(sources: Sequence[NDArray], number: int) -> NDArray:
+    """Image `number`: a part of a source from 1 x 1 up to all of it, turned, recoloured, and with noise of any strength."""
+    rng = np.random.default_rng([3, number])
+    source = sources[int(rng.integers(len(sources)))]
+    height, width = source.shape[:2]
+    whole = rng.random() < 0.03
+    sides = [side if whole else int(np.exp(rng.uniform(0, np.log(side)))) for side in (height, width)]
+    top, left = (int(rng.integers(full - side + 1)) for full, side in zip((height, width), sides, strict=True))
+    pixels = np.rot90(source[top : top + sides[0], left : left + sides[1]], int(rng.integers(4)))
+    pixels = pixels[:: int(rng.choice((-1, 1)))]
+    if source.ndim == 3:
+        pixels = pixels[..., rng.permutation(3)]
+    strength = int(rng.choice((0, 0, 0, 1, 4, 30, 256)))
+    if strength:
+        noise = rng.integers(-strength, strength + 1, pixels.shape, dtype=np.int16)
+        pixels = pixels + noise.astype(pixels.dtype)  # wraps, so that every value comes up
+    return np.ascontiguousarray(pixels)
+
+
+def digests(sources: Sequence[NDArray], numbers: Sequence[int], seed: int) -> Iterator[tuple[int, bytes]]:
+    """(number, digest of its PNG) of each image, encoded twice, which must decode to its pixels.
+
+    Between the two times lie other images, in another order and other buffers, and memory filled with random bytes.
+    """
+    rng = np.random.default_rng(seed)
+    for begin in range(0, len(numbers), BLOCK):
+        block = {number: variant(sources, number) for number in numbers[begin : begin + BLOCK]}
+        first = {number: encode_png(pixels) for number, pixels in block.items()}
+        for number in rng.permutation(list(block)).tolist():
+            _dirty_memory(rng)
+            again = encode_png(_elsewhere(block[number], rng))
+            if again != first[number]:
+                raise AssertionError(f"image {number} has two encodings: {len(first[number])} and {len(again)} bytes")
+            decoded = decode_png(again)
+            if decoded.dtype != block[number].dtype or not np.array_equal(decoded, block[number]):
+                raise AssertionError(f"image {number} decodes to other pixels")
+            yield number, hashlib.sha256(again).digest()[:DIGEST]
+
+
+def _elsewhere(pixels: NDArray, rng: np.random.Generator) -> NDArray:
+    """The same pixels in other memory, at any address that its type allows."""
+    offset = pixels.itemsize * int(rng.integers(64))
+    memory = np.frombuffer(rng.bytes(offset + pixels.nbytes + 64), np.uint8).copy()
+    moved = memory[offset : offset + pixels.nbytes].view(pixels.dtype).reshape(pixels.shape)
+    moved[...] = pixels
+    return moved
+
+
+def _dirty_memory(rng: np.random.Generator) -> None:
+    """Leaves random bytes in memory that was just freed, in pieces as large as an encoder's tables and buffers."""
+    sizes = rng.choice((200, 3_000, 33_000, 66_000, 140_000, 300_000), 4)
+    noise = rng.bytes(4_096)
+    pieces = [bytearray(noise * (int(size) // 4_096 + 1)) for size in sizes]
+    del pieces
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs one of the commands; 1 where digests differ."""
+    parser = argparse.ArgumentParser(description="Digests of many encoded images.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    rendered = commands.add_parser("render")
+    rendered.add_argument("sources", type=Path)
+    rendered.add_argument("--scenes", type=int, default=12)
+    digested = commands.add_parser("digest")
+    digested.add_argument("sources", type=Path)
+    digested.add_argument("out", type=Path)
+    digested.add_argument("--images", type=int, default=1_000)
+    digested.add_argument("--backward", action="store_true", help="other images come before each")
+    compared = commands.add_parser("compare")
+    compared.add_argument("files", type=Path, nargs=2)
+    options = parser.parse_args(arguments)
+    if options.command == "render":
+        save_sources(options.sources, render(options.scenes))
+    elif options.command == "digest":
+        numbers = list(range(options.images))
+        order = numbers[::-1] if options.backward else numbers
+        found = dict(digests(load_sources(options.sources), order, seed=int(options.backward)))
+        np.save(options.out, np.frombuffer(b"".join(found[number] for number in numbers), np.uint8).reshape(-1, DIGEST))
+    else:
+        one, two = (np.load(path) for path in options.files)
+        common = min(len(one), len(two))
+        different = np.flatnonzero((one[:common] != two[:common]).any(axis=1))
+        print(f"{common} images, {len(different)} with other bytes: {different[:10].tolist()}")
+        return int(len(different) > 0)
+    return 0
+
+
+def save_sources(path: Path, images: Sequence[NDArray]) -> None:
+    """Writes images of any kind into one file."""
+    with open(path, "wb") as file:
+        for image in images:
+            np.save(file, image)
+
+
+def load_sources(path: Path) -> list[NDArray]:
+    """The images that `save_sources` wrote."""
+    images = []
+    with open(path, "rb") as file:
+        while file.peek(1):
+            images.append(np.load(file))
+    return images
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
