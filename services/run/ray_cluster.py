@@ -72,7 +72,8 @@ def kept_private() -> Iterator[None]:
     - the dashboard's process, which is there without a dashboard too, for usage statistics alone. It asks the metadata
       services of three clouds, even where the statistics are off;
     - the autoscaler and the log monitor, which have nothing to do here. The first serves metrics to anyone;
-    - the servers of its agent, through which jobs are submitted. Without the dashboard's packages the agent has none.
+    - the servers of its agent, through which jobs are submitted. Without the dashboard's packages the agent has none;
+    - the note in /tmp/ray of a cluster's address, by which any `ray.init()` on this machine would join it.
     """
     environ = os.environ  # noqa: TID251 - Ray and its processes read these settings nowhere else
     mine = private_environment()
@@ -82,6 +83,7 @@ def kept_private() -> Iterator[None]:
         (Node, "start_api_server", _note_that_there_is_no_dashboard),
         (Node, "start_monitor", lambda node: None),
         (Node, "start_log_monitor", lambda node: None),
+        (utils, "write_ray_address", lambda address, folder=None: None),
         (utils, "get_dashboard_dependency_error", lambda: ImportError("a private Ray has no dashboard")),
     ]
     with contextlib.ExitStack() as undo:

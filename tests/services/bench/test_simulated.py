@@ -1,8 +1,10 @@
 """The coordinator over simulated nodes."""
 
 import os
+from pathlib import Path
 
 import pytest
+from ray._common.utils import get_ray_address_file
 
 from services.bench.simulated import compare, describe, measure_simulated, simulated_nodes, sleeping
 from services.job.read import validate_job
@@ -59,6 +61,14 @@ def test_no_process_stays_when_the_nodes_are_ended():
         during = {pid for pid in set(os.listdir("/proc")) - before if pid.isdigit() and b"raylet" in command(pid)}
     assert len(during) >= 3
     assert not [pid for pid in during if b"raylet" in command(pid)]
+
+
+def test_nothing_tells_others_to_join_them():
+    """Ray notes the address of a cluster where every later `ray.init()` of the machine looks, and fails without that folder."""
+    note = Path(get_ray_address_file(None))
+    before = note.read_text() if note.exists() else None
+    with simulated_nodes(1):
+        assert (note.read_text() if note.exists() else None) == before
 
 
 def command(pid: str) -> bytes:
