@@ -32,7 +32,7 @@ def anonymous_kb():
 
 points = np.random.default_rng(0).standard_normal((400, 3))
 body = Body(1.0, np.ones(3) * 1e-3, (0.1 * points / np.linalg.norm(points, axis=1)[:, None],), 1e-4)
-bodies = [body, Body(1.0, np.ones(3) * 1e-3, octants(body.parts[0]), 1e-4)]
+bodies = [body, Body(1.0, np.ones(3) * 1e-3, octants(body.parts[0], 0.05), 1e-4)]
 square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 plate = Mesh(np.tile(square, (100, 1)), np.arange(400)[:, None] // 4 * 4 + np.array([[0, 1, 2], [0, 2, 3]]).repeat(200, 0))
 T = np.eye(4)
@@ -142,6 +142,6 @@ def test_what_overlaps_is_moved_apart_and_gains_no_speed(step_hz):
 
 def test_nothing_is_read_again_to_be_drawn():
     """PyBullet's renderer would read the file of the parts once more for each body."""
-    body = Body(1.0, np.full(3, 1e-3), octants(np.asarray(box(0.1, 0.1, 0.1).vertices)), 1e-4)
+    body = Body(1.0, np.full(3, 1e-3), octants(np.asarray(box(0.1, 0.1, 0.1).vertices), 0.05), 1e-4)
     with drop(body, at(0.0, 0.2), 0.0, PHYSICS, STEPS) as world:
         assert pybullet.getVisualShapeData(world.bodies[0], physicsClientId=world.client) == ()
