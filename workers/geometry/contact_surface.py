@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
@@ -57,12 +58,28 @@ def is_closed(mesh: Mesh) -> bool:
 
 def crop(mesh: Mesh, low: Array, high: Array) -> Mesh:
     """The triangles that overlap a box, bounds [3] and [3], with all that may share a corner with one of them."""
-    corners = mesh.vertices[mesh.faces]
-    least, most = corners.min(axis=1), corners.max(axis=1)
-    near = ((least <= high) & (most >= low)).all(axis=1)
-    if near.any():
-        near = ((least <= most[near].max(axis=0)) & (most >= least[near].min(axis=0))).all(axis=1)
-    return Mesh(mesh.vertices, mesh.faces[near])
+    return Mesh(mesh.vertices, mesh.faces[_near_box(mesh.vertices, mesh.faces, low, high)])
+
+
+@compiled
+def _near_box(vertices: Array, faces: Index, low: Array, high: Array) -> NDArray[np.bool_]:
+    """[F]: whether a face's bounds overlap those of all the faces whose bounds overlap a box."""
+    near = np.zeros(len(faces), np.bool_)
+    least, most = np.full(3, np.inf), np.full(3, -np.inf)
+    for again in range(2):
+        down, up = low.astype(np.float64), high.astype(np.float64)
+        if again:
+            down, up = least.copy(), most.copy()
+        for f in range(len(faces)):
+            a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+            inside = True
+            for k in range(3):
+                inside = inside and min(a[k], b[k], c[k]) <= up[k] and max(a[k], b[k], c[k]) >= down[k]
+            near[f] = inside
+            if inside and not again:
+                for k in range(3):
+                    least[k], most[k] = min(least[k], a[k], b[k], c[k]), max(most[k], a[k], b[k], c[k])
+    return near
 
 
 @compiled

@@ -39,12 +39,12 @@ class EnergyRecord:
         """The height at which their centre of mass has as much at rest."""
         height_m = 0.0
         for share, radii2, pose, motion in zip(self._shares, self._radii2, at, moving, strict=True):
-            height_m += share * _height_m(radii2, pose, motion)
+            height_m += share * energy_height_m(radii2, pose, motion)
         return height_m
 
 
-def _height_m(radii2: Sequence[float], at: BodyPose, moving: Velocity) -> float:
-    """The same of one body with these squares [3] of its radii of inertia."""
+def energy_height_m(radii2: Sequence[float], at: BodyPose, moving: Velocity) -> float:
+    """The energy of a body over its weight, metres, from these squares [3] of its radii of inertia, metres squared."""
     (_, _, height), (x, y, z, w) = at
     (u, v, s), (p, q, r) = moving
     # The angular velocity along the body's axes

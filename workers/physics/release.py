@@ -15,6 +15,7 @@ from workers.physics.bullet import SLOP_SHARE, GroundShape
 from workers.physics.fall import LOOK_STEPS, THIN_SHARE, Outcome, choose_steps, fall, free_fall_m
 from workers.physics.placement import Ground
 from workers.physics.rigid_body import build_body, choose_collision_shape
+from workers.physics.standing import stays_standing
 from workers.physics.stop_conditions import falls_below, leaves_outline, leaves_room
 
 MANY = 4
@@ -131,6 +132,9 @@ def _release(drop: Drop, flat: bool) -> Outcome:
     lowest_m = table.top.height_m - LEFT_M if drop.many else float(table.mesh.vertices[:, 2].min())
     stops = {"below": falls_below(lowest_m - reach_m)}
     ground: GroundShape = table.mesh
+    standing = None
+    if flat and drop.single and physics.exact_rest and not drop.exact:
+        standing = stays_standing(starts[0], bodies[0], table.top.height_m, physics.friction**2)
     if flat and not drop.many:
         hover_m = bodies[0].margin_m * (1.0 - SLOP_SHARE)
         ground, stops = table.top.height_m - hover_m, {"edge": leaves_outline(table.top.outline, reach_m)}
@@ -139,7 +143,7 @@ def _release(drop: Drop, flat: bool) -> Outcome:
     T_world_body = poses[0] @ bodies[0].T_obj_body
     if math.isfinite(drop.room_m):
         stops["room"] = leaves_room(T_world_body[:2, 3], drop.room_m)
-    return fall(bodies, poses, ground, physics, steps, free_m, stops, sleeping=drop.many)
+    return fall(bodies, poses, ground, physics, steps, free_m, stops, drop.many, standing)
 
 
 def _prism(table: Table) -> Array:

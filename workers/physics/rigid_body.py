@@ -11,7 +11,7 @@ from schemas.job.physics import Physics
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import MassProperties
-from workers.geometry.frames import invert, pose, transform
+from workers.geometry.frames import invert, pose, rotation_from_quaternion, transform
 from workers.geometry.hull import convex_hull, depth_m
 from workers.geometry.lathe_decomposition import COARSE, TOLERANCE
 from workers.physics.convex_parts.step import parts_of
@@ -132,3 +132,9 @@ def body_frame(mass: MassProperties) -> tuple[Pose, Array]:
     if np.linalg.det(axes) < 0:
         axes = axes * np.array([1.0, 1.0, -1.0])
     return pose(axes, mass.com), moments
+
+
+def as_pose(at: BodyPose) -> Pose:
+    """[4, 4] of a position and a quaternion."""
+    position, quaternion = at
+    return pose(rotation_from_quaternion(np.array(quaternion)), np.array(position))
