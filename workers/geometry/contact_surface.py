@@ -62,7 +62,7 @@ def crop(mesh: Mesh, low: Array, high: Array) -> Mesh:
 
 
 @compiled
-def _near_box(vertices: Array, faces: Index, low: Array, high: Array) -> NDArray[np.bool_]:
+def _near_box(vertices: Array, faces: NDArray[np.integer], low: Array, high: Array) -> NDArray[np.bool_]:
     """[F]: whether a face's bounds overlap those of all the faces whose bounds overlap a box."""
     near = np.zeros(len(faces), np.bool_)
     least, most = np.full(3, np.inf), np.full(3, -np.inf)

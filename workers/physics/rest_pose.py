@@ -64,7 +64,9 @@ def snap_to_face(T_world_obj: Pose, hull: Hull, com: Array) -> Pose | None:
     caller sets the height.
     """
     face = find_face(T_world_obj, hull, com)
-    return face and pose(face.turn, T_world_obj[:3, :3] @ com + T_world_obj[:3, 3] - face.turn @ com)
+    if face is None:
+        return None
+    return pose(face.turn, T_world_obj[:3, :3] @ com + T_world_obj[:3, 3] - face.turn @ com)
 
 
 def stands_on_face(vertices: Array, down: Array) -> bool:
