@@ -14,8 +14,8 @@ from schemas.job.job import Job
 from tests.physics.room import at, ball_body, drop, physics
 from tests.shapes import box
 from workers.geometry.frames import pose, quaternion_from_rotation, rotation_about
-from workers.physics.bullet import GRAVITY_M_S2, open_world, pybullet
-from workers.physics.rigid_body import Body, octants
+from workers.physics.bullet import GRAVITY_M_S2, open_world
+from workers.physics.rigid_body import Body
 
 ROOT = Path(__file__).resolve().parents[3]
 PHYSICS = Job(name="t").physics
@@ -138,10 +138,3 @@ def test_what_overlaps_is_moved_apart_and_gains_no_speed(step_hz):
         assert world.velocity()[0] == (0.0, 0.0, 0.0)
         raised = world.pose()[0][2] - (0.05 - deep)
         assert raised == pytest.approx(0.08 * (deep - 1e-5), rel=0.01)  # Bullet's share, and what it leaves
-
-
-def test_nothing_is_read_again_to_be_drawn():
-    """PyBullet's renderer would read the file of the parts once more for each body."""
-    body = Body(1.0, np.full(3, 1e-3), octants(np.asarray(box(0.1, 0.1, 0.1).vertices), 0.05), 1e-4)
-    with drop(body, at(0.0, 0.2), 0.0, PHYSICS, STEPS) as world:
-        assert pybullet.getVisualShapeData(world.bodies[0], physicsClientId=world.client) == ()
