@@ -17,7 +17,7 @@ class Rest(Frozen):
     spin_rad_s: Positive = 0.01
     """Bound on the rate at which it turns."""
     window_s: Positive = 0.25
-    """Time for which both must hold."""
+    """Time for which both must hold; a fifth of it for a single object on a flat top without the energy to tip or to slide."""
 
 
 class Physics(Frozen):

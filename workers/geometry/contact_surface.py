@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
-from workers.geometry.contact_kernels import SLOPE, Index
-from workers.geometry.convexity import weld
+from workers.geometry.contact_kernels import SLOPE, Index, cross
+from workers.geometry.convexity import numbers_in, weld
+from workers.geometry.jit import compiled
 
 FLAT = 1e-9
 """One minus the cosine between two faces, below which there is no edge between them."""
@@ -38,13 +39,14 @@ def surface_of(mesh: Mesh, closed: bool) -> Surface:
     """The features of a mesh, or of a part of one that is `closed`, whichever way its faces are wound."""
     mesh = weld(mesh)
     vertices, faces = np.ascontiguousarray(mesh.vertices, dtype=np.float64), mesh.faces.astype(np.int64)
-    normals = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
-    doubled = np.linalg.norm(normals, axis=1)
-    faces, normals = faces[doubled > 0.0], normals[doubled > 0.0] / doubled[doubled > 0.0, None]
+    normals = _across(vertices, faces)
+    doubled = np.sqrt((normals * normals).sum(axis=1))
+    solid = doubled > 0.0
+    faces, normals = faces[solid], normals[solid] / doubled[solid, None]
     starts, members = _star(faces, len(vertices))
     edges, across = _bent_edges(vertices, faces, normals)
     side = _sides(vertices, faces, normals, starts, members) if closed else np.zeros(len(faces), dtype=np.int64)
-    return Surface(vertices, faces, side, np.unique(edges), edges, across, starts, members)
+    return Surface(vertices, faces, side, numbers_in(edges, len(vertices)), edges, across, starts, members)
 
 
 def is_closed(mesh: Mesh) -> bool:
@@ -56,54 +58,114 @@ def is_closed(mesh: Mesh) -> bool:
 
 def crop(mesh: Mesh, low: Array, high: Array) -> Mesh:
     """The triangles that overlap a box, bounds [3] and [3], with all that may share a corner with one of them."""
-    corners = mesh.vertices[mesh.faces]
-    least, most = corners.min(axis=1), corners.max(axis=1)
-    near = ((least <= high) & (most >= low)).all(axis=1)
-    if near.any():
-        near = ((least <= most[near].max(axis=0)) & (most >= least[near].min(axis=0))).all(axis=1)
-    return Mesh(mesh.vertices, mesh.faces[near])
+    return Mesh(mesh.vertices, mesh.faces[_near_box(mesh.vertices, mesh.faces, low, high)])
 
 
+@compiled
+def _near_box(vertices: Array, faces: NDArray[np.integer], low: Array, high: Array) -> NDArray[np.bool_]:
+    """[F]: whether a face's bounds overlap those of all the faces whose bounds overlap a box."""
+    near = np.zeros(len(faces), np.bool_)
+    least, most = np.full(3, np.inf), np.full(3, -np.inf)
+    for again in range(2):
+        down, up = low.astype(np.float64), high.astype(np.float64)
+        if again:
+            down, up = least.copy(), most.copy()
+        for f in range(len(faces)):
+            a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+            inside = True
+            for k in range(3):
+                inside = inside and min(a[k], b[k], c[k]) <= up[k] and max(a[k], b[k], c[k]) >= down[k]
+            near[f] = inside
+            if inside and not again:
+                for k in range(3):
+                    least[k], most[k] = min(least[k], a[k], b[k], c[k]), max(most[k], a[k], b[k], c[k])
+    return near
+
+
+@compiled
+def _across(vertices: Array, faces: Index) -> Array:
+    """[F, 3]: twice the area of each face along its normal."""
+    across = np.empty((len(faces), 3))
+    for f in range(len(faces)):
+        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        cross(b - a, c - a, across[f])
+    return across
+
+
+@compiled
 def _star(faces: Index, count: int) -> tuple[Index, Index]:
-    """(starts [count + 1], members): the neighbours of each vertex, one after the other."""
-    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    keys = np.unique(np.concatenate([pairs[:, 0] * count + pairs[:, 1], pairs[:, 1] * count + pairs[:, 0]]))
-    return np.searchsorted(keys // count, np.arange(count + 1)).astype(np.int64), keys % count
+    """(starts [count + 1], members): the neighbours of each vertex, one after the other, ascending."""
+    keys = np.empty(6 * len(faces), np.int64)
+    for f in range(len(faces)):
+        for k in range(3):
+            a, b = faces[f, k], faces[f, (k + 1) % 3]
+            keys[6 * f + 2 * k], keys[6 * f + 2 * k + 1] = a * count + b, b * count + a
+    keys.sort()
+    starts, members, found = np.zeros(count + 1, np.int64), np.empty(len(keys), np.int64), 0
+    for n in range(len(keys)):
+        if n == 0 or keys[n] != keys[n - 1]:
+            members[found] = keys[n] % count
+            starts[keys[n] // count + 1] += 1
+            found += 1
+    return np.cumsum(starts), members[:found]
 
 
+@compiled
 def _sides(vertices: Array, faces: Index, normals: Array, starts: Index, members: Index) -> Index:
     """[F]: on which side of a face's plane everything about its corners lies, to within `SLOPE`."""
-    below, above = np.ones(len(faces), dtype=np.bool_), np.ones(len(faces), dtype=np.bool_)
-    for k in range(3):
-        corner = faces[:, k]
-        count = starts[corner + 1] - starts[corner]
-        face = np.repeat(np.arange(len(faces)), count)
-        at = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(starts[corner], count)
-        line = vertices[members[at]] - vertices[corner[face]]
-        up, slack = (line * normals[face]).sum(axis=1), SLOPE * np.linalg.norm(line, axis=1)
-        np.logical_and.at(below, face, up <= slack)
-        np.logical_and.at(above, face, up >= -slack)
-    return below.astype(np.int64) - above.astype(np.int64)
+    side = np.empty(len(faces), np.int64)
+    for f in range(len(faces)):
+        below, above = True, True
+        for c in range(3):
+            corner = faces[f, c]
+            for m in range(starts[corner], starts[corner + 1]):
+                up = length2 = 0.0
+                for k in range(3):
+                    line = vertices[members[m], k] - vertices[corner, k]
+                    up += line * normals[f, k]
+                    length2 += line * line
+                slack = SLOPE * np.sqrt(length2)
+                below = below and up <= slack
+                above = above and up >= -slack
+        side[f] = np.int64(below) - np.int64(above)
+    return side
 
 
+@compiled
 def _bent_edges(vertices: Array, faces: Index, normals: Array) -> tuple[Index, Index]:
     """Edges [E, 2] that are not between two coplanar faces, and the vertices across them [E, 2]."""
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    across, face = faces[:, [2, 0, 1]].ravel(), np.repeat(np.arange(len(faces)), 3)
-    key = edges[:, 0] * len(vertices) + edges[:, 1]
-    order = np.argsort(key, kind="stable")
-    key, edges, across, face = key[order], edges[order], across[order], face[order]
-    first = np.flatnonzero(np.diff(key, prepend=-1))
-    last = np.append(first, len(edges))[1:] - 1
-    flat = (last == first + 1) & (np.abs((normals[face[first]] * normals[face[last]]).sum(axis=1)) > 1.0 - FLAT)
-    across_first, across_last = across[first], across[last]
-    # Two faces folded onto one another are coplanar, and their edge is bent all the same
-    folded = flat & (across_first != across_last) & _same_side(vertices, edges[first], across_first, across_last)
-    kept = ~flat | folded
-    return edges[first][kept], np.stack([across_first, across_last], axis=1)[kept]
+    count = len(vertices)
+    keys = np.empty(3 * len(faces), np.int64)
+    for f in range(len(faces)):
+        for k in range(3):
+            a, b = faces[f, k], faces[f, (k + 1) % 3]
+            keys[3 * f + k] = min(a, b) * count + max(a, b)
+    order = np.argsort(keys, kind="mergesort")
+    edges, across, found, first = np.empty((len(keys), 2), np.int64), np.empty((len(keys), 2), np.int64), 0, 0
+    while first < len(order):
+        key, last = keys[order[first]], first
+        while last + 1 < len(order) and keys[order[last + 1]] == key:
+            last += 1
+        one, other = order[first], order[last]
+        a, b = key // count, key % count
+        p, q = faces[one // 3, (one % 3 + 2) % 3], faces[other // 3, (other % 3 + 2) % 3]
+        cosine = 0.0
+        for k in range(3):
+            cosine += normals[one // 3, k] * normals[other // 3, k]
+        flat = last == first + 1 and abs(cosine) > 1.0 - FLAT
+        # Two faces folded onto one another are coplanar, and their edge is bent all the same
+        if not flat or (p != q and _same_side(vertices, a, b, p, q)):
+            edges[found, 0], edges[found, 1] = a, b
+            across[found, 0], across[found, 1] = p, q
+            found += 1
+        first = last + 1
+    return edges[:found], across[:found]
 
 
-def _same_side(vertices: Array, edges: Index, a: Index, b: Index) -> NDArray[np.bool_]:
-    start, along = vertices[edges[:, 0]], vertices[edges[:, 1]] - vertices[edges[:, 0]]
-    one, other = np.cross(along, vertices[a] - start), np.cross(along, vertices[b] - start)
-    return (one * other).sum(axis=1) > 0.0
+@compiled
+def _same_side(vertices: Array, a: int, b: int, p: int, q: int) -> bool:
+    """Whether two vertices p and q lie on the same side of the edge from a to b, in the plane of all four."""
+    one, other = np.empty(3), np.empty(3)
+    cross(vertices[b] - vertices[a], vertices[p] - vertices[a], one)
+    cross(vertices[b] - vertices[a], vertices[q] - vertices[a], other)
+    return bool(one[0] * other[0] + one[1] * other[1] + one[2] * other[2] > 0.0)

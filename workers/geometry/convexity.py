@@ -31,14 +31,32 @@ def is_convex_surface(mesh: Mesh, solid: manifold3d.Manifold | None) -> bool:
 
 def weld(mesh: Mesh) -> Mesh:
     """The mesh with one vertex at each place, without loose vertices, repeated triangles and triangles of two corners."""
-    used = np.unique(mesh.faces)
-    vertices, inverse = np.unique(mesh.vertices[used], axis=0, return_inverse=True)
+    used = numbers_in(mesh.faces, len(mesh.vertices))
+    order, new = _ranked(mesh.vertices[used])
     place = np.zeros(len(mesh.vertices), dtype=np.int32)
-    place[used] = inverse.reshape(-1)
+    place[used[order]] = np.cumsum(new) - 1
     faces = place[mesh.faces]
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    return Mesh(vertices, faces[np.sort(first)])
+    by_corners, first = _ranked(np.sort(faces, axis=1))
+    return Mesh(mesh.vertices[used[order[new]]], faces[np.sort(by_corners[first])])
+
+
+def _ranked(rows: NDArray[np.generic]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """(numbers [N] of rows [N, 3] in ascending order, which of these differ from the one before).
+
+    By one column after the other: `np.unique` compares rows as records, which takes four times as long.
+    """
+    order = np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))
+    ranked, new = rows[order], np.ones(len(rows), dtype=np.bool_)
+    new[1:] = (ranked[1:] != ranked[:-1]).any(axis=1)
+    return order, new
+
+
+def numbers_in(numbers: NDArray[np.integer], count: int) -> NDArray[np.int64]:
+    """[N] ascending: which of the numbers below `count` occur."""
+    occurs = np.zeros(count, dtype=np.bool_)
+    occurs[numbers] = True
+    return np.flatnonzero(occurs)
 
 
 def components(mesh: Mesh) -> list[Mesh]:

@@ -103,6 +103,27 @@ def least_width_m(hull: Hull) -> float:
     return float((along.max(axis=0) - along.min(axis=0)).min())
 
 
+@compiled
+def depth_m(points: Array, normals: Array) -> float:
+    """The least, over unit normals [F, 3], of how far points [N, 3] reach along one from the origin, metres.
+
+    Of a hull's vertices and normals: the depth of the origin in it.
+    """
+    least, start = np.inf, 0
+    for f in range(len(normals)):
+        most, farthest = -np.inf, start
+        for n in range(len(points)):
+            # Begins with what is farthest along the normal before: most normals are passed over at the first point
+            at = (start + n) % len(points)
+            along = points[at, 0] * normals[f, 0] + points[at, 1] * normals[f, 1] + points[at, 2] * normals[f, 2]
+            if along > most:
+                most, farthest = along, at
+                if most >= least:
+                    break
+        least, start = min(least, most), farthest
+    return float(least)
+
+
 def _distinct(rows: Array) -> Array:
     """[M] ascending indices of rows [N, 3], one of those that are equal to within `SAME` in each coordinate."""
     order = np.argsort(rows @ SCATTER, kind="stable")

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
@@ -173,7 +172,9 @@ _BUFFERS = BulletBuffers()
 
 @cache
 def _connect() -> int:
+    """A world without a renderer, which would read the file of every body's parts again, to draw it."""
     client: int = pybullet.connect(pybullet.DIRECT)
+    pybullet.unloadPlugin(pybullet.loadPlugin("tinyRendererPlugin", physicsClientId=client), physicsClientId=client)
     return client
 
 
@@ -236,7 +237,7 @@ def _orientation(R: Array) -> dict[str, list[float]]:
 def _shape_of(client: int, parts: Sequence[Array], turned: Mapping[str, list[float]]) -> Iterator[int]:
     """A collision shape of convex parts, for bodies that are made within the block.
 
-    PyBullet reads several parts from a file alone: the objects of an OBJ. It reads it again for every body.
+    PyBullet reads several parts from a file alone: the objects of an OBJ.
     """
     if len(parts) == 1:
         vertices = _BUFFERS.vertices(parts[0])
@@ -244,14 +245,14 @@ def _shape_of(client: int, parts: Sequence[Array], turned: Mapping[str, list[flo
         return
     lines, first = [], 1
     for number, part in enumerate(parts):
-        lines.append(f"o part{number}")
-        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in part.tolist()]
-        lines += [f"f {first} {first + k} {first + k + 1}" for k in range(1, len(part) - 1)]
+        lines.append(f"o part{number}\n")
+        lines.append("v %.9g %.9g %.9g\n" * len(part) % tuple(part.ravel().tolist()))
+        lines += [f"f {first} {first + k} {first + k + 1}\n" for k in range(1, len(part) - 1)]
         first += len(part)
-    with tempfile.TemporaryDirectory(prefix="verso-parts-") as folder:
-        path = Path(folder, "parts.obj")
-        path.write_text("\n".join(lines), encoding="ascii")
-        yield pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path), physicsClientId=client, **turned)
+    with tempfile.NamedTemporaryFile("w", encoding="ascii", prefix="verso-parts-", suffix=".obj") as file:
+        file.writelines(lines)
+        file.flush()
+        yield pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=file.name, physicsClientId=client, **turned)
 
 
 def _set_surface(client: int, thing: int, physics: Physics, body: Body | None = None) -> None:

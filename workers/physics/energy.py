@@ -37,12 +37,14 @@ class EnergyRecord:
 
     def _height_m(self, at: Sequence[BodyPose], moving: Sequence[Velocity]) -> float:
         """The height at which their centre of mass has as much at rest."""
-        each = zip(self._shares, self._radii2, at, moving, strict=True)
-        return sum(share * _height_m(radii2, pose, motion) for share, radii2, pose, motion in each)
+        height_m = 0.0
+        for share, radii2, pose, motion in zip(self._shares, self._radii2, at, moving, strict=True):
+            height_m += share * energy_height_m(radii2, pose, motion)
+        return height_m
 
 
-def _height_m(radii2: Sequence[float], at: BodyPose, moving: Velocity) -> float:
-    """The same of one body with these squares [3] of its radii of inertia."""
+def energy_height_m(radii2: Sequence[float], at: BodyPose, moving: Velocity) -> float:
+    """The energy of a body over its weight, metres, from these squares [3] of its radii of inertia, metres squared."""
     (_, _, height), (x, y, z, w) = at
     (u, v, s), (p, q, r) = moving
     # The angular velocity along the body's axes
@@ -51,5 +53,5 @@ def _height_m(radii2: Sequence[float], at: BodyPose, moving: Velocity) -> float:
         2 * (x * y - z * w) * p + (1 - 2 * (x * x + z * z)) * q + 2 * (y * z + x * w) * r,
         2 * (x * z + y * w) * p + 2 * (y * z - x * w) * q + (1 - 2 * (x * x + y * y)) * r,
     )
-    turning = sum(radius2 * each * each for radius2, each in zip(radii2, along, strict=True))
+    turning = radii2[0] * along[0] * along[0] + radii2[1] * along[1] * along[1] + radii2[2] * along[2] * along[2]
     return height + (u * u + v * v + s * s + turning) / (2 * GRAVITY_M_S2)

@@ -19,7 +19,7 @@ from workers.physics.rest.contacts import Contacts, find_contacts, find_near_fea
 from workers.physics.rest.rest import DOWN, FALL_M, Thing
 from workers.physics.rest.step import Inertia, Motion, step
 from workers.physics.rest_pose import support_margin
-from workers.physics.separation import NEAR_M, Form, find_gaps_m
+from workers.physics.separation import FARTHEST_M, NEAR_M, Form, find_gaps_m
 
 TOUCHING_M = 1e-5
 """Distance up to which surfaces touch: the bound on overlap and hover of what rests."""
@@ -28,7 +28,8 @@ HELD_FROM = 0.3
 """Least z component of the normal of a contact that holds an object up."""
 
 ROOM_M = 0.04
-"""Distance from the objects up to which a table is looked at: rest moves them by 32 mm at most."""
+"""Distance from the objects up to which a table is looked at: rest moves them by 32 mm at most. What stands has come to rest, and
+its gap is measured up to `FARTHEST_M`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,15 +83,20 @@ def place_on_top(start: ObjectStart, T_world_obj: Pose, table: Table, friction: 
     top = np.array([np.inf, np.inf, world.vertices[:, 2].min() + NEAR_M])
     under = Mesh(shape.vertices, crop(world, np.full(3, -np.inf), top).faces)
     form = Form(under, closed=shape.closed or is_closed(shape.mesh))
-    return place((start,), (T_world_obj,), [form], table, friction)
+    return place((start,), (T_world_obj,), [form], table, friction, FARTHEST_M)
 
 
 def place(
-    starts: Sequence[ObjectStart], poses: Sequence[Pose], forms: Sequence[Form], table: Table, friction: float
+    starts: Sequence[ObjectStart],
+    poses: Sequence[Pose],
+    forms: Sequence[Form],
+    table: Table,
+    friction: float,
+    room_m: float = ROOM_M,
 ) -> Placement:
-    """The objects, as these forms, with the part of the table that they can come to from these poses."""
+    """The objects, as these forms, with the part of the table within `room_m` of these poses."""
     points = np.concatenate([transform(T, start.hull.vertices) for start, T in zip(starts, poses, strict=True)])
-    near = crop(table.mesh, points.min(axis=0) - ROOM_M, points.max(axis=0) + ROOM_M)
+    near = crop(table.mesh, points.min(axis=0) - room_m, points.max(axis=0) + room_m)
     things = tuple(Thing(form.surface, start.asset.mass) for form, start in zip(forms, starts, strict=True))
     return Placement(tuple(starts), things, (*forms, Form(near, table.mesh, table.asset.shape.closed)), friction)
 

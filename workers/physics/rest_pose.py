@@ -1,5 +1,7 @@
 """Rest poses on a level support: the correction onto a face, and the margin of support. Pure."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from shapely.geometry import MultiPoint, Point
 
@@ -26,6 +28,34 @@ SNAP_RAD = 0.02
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
+@dataclass(frozen=True, eq=False)
+class Face:
+    """A steady face of a hull, turned to be level below it by `turn` [3, 3], object to world.
+
+    margin_m: from the projected centre of mass to the face's edge; height_m: of the centre of mass over the face.
+    """
+
+    turn: Array
+    margin_m: float
+    height_m: float
+
+
+def find_face(T_world_obj: Pose, hull: Hull, com: Array) -> Face | None:
+    """The nearest steady face of an object's hull, at most `SNAP_RAD` from level; None where none is near."""
+    R = T_world_obj[:3, :3]
+    tilt = np.arccos(np.clip(hull.normals @ (R.T @ DOWN), -1.0, 1.0))
+    near = np.flatnonzero(tilt <= SNAP_RAD)
+    for index in near[np.argsort(tilt[near], kind="stable")]:
+        turn = rotation_between(R @ hull.normals[index], DOWN) @ R
+        points = hull.vertices @ turn.T
+        lowest_m = points[:, 2].min()
+        face = points[points[:, 2] <= lowest_m + SAME_PLANE_M]
+        margin_m = support_margin(face[:, :2], (turn @ com)[:2])
+        if margin_m > STEADY_M:
+            return Face(turn, margin_m, float((turn @ com)[2] - lowest_m))
+    return None
+
+
 def snap_to_face(T_world_obj: Pose, hull: Hull, com: Array) -> Pose | None:
     """Turn the object about its centre of mass, by at most `SNAP_RAD`, onto the nearest steady face of its hull.
 
@@ -33,16 +63,10 @@ def snap_to_face(T_world_obj: Pose, hull: Hull, com: Array) -> Pose | None:
     margins. At rest on a level plane the centre of mass is above a face of the hull. None where no steady face is near. The
     caller sets the height.
     """
-    R = T_world_obj[:3, :3]
-    tilt = np.arccos(np.clip(hull.normals @ (R.T @ DOWN), -1.0, 1.0))
-    near = np.flatnonzero(tilt <= SNAP_RAD)
-    for index in near[np.argsort(tilt[near], kind="stable")]:
-        turn = rotation_between(R @ hull.normals[index], DOWN) @ R
-        points = hull.vertices @ turn.T
-        face = points[points[:, 2] <= points[:, 2].min() + SAME_PLANE_M]
-        if support_margin(face[:, :2], (turn @ com)[:2]) > STEADY_M:
-            return pose(turn, R @ com + T_world_obj[:3, 3] - turn @ com)
-    return None
+    face = find_face(T_world_obj, hull, com)
+    if face is None:
+        return None
+    return pose(face.turn, T_world_obj[:3, :3] @ com + T_world_obj[:3, 3] - face.turn @ com)
 
 
 def stands_on_face(vertices: Array, down: Array) -> bool:

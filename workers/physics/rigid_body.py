@@ -11,8 +11,8 @@ from schemas.job.physics import Physics
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import MassProperties
-from workers.geometry.frames import invert, pose, transform
-from workers.geometry.hull import convex_hull
+from workers.geometry.frames import invert, pose, rotation_from_quaternion, transform
+from workers.geometry.hull import convex_hull, depth_m
 from workers.geometry.lathe_decomposition import COARSE, TOLERANCE
 from workers.physics.convex_parts.step import parts_of
 from workers.physics.effects import is_convex
@@ -78,19 +78,21 @@ def build_body(
     """
     if not effects.runs("decomposition") or is_convex(start):
         body = make_body(start)
-        return dataclasses.replace(body, parts=octants(body.parts[0])) if level else body
+        deep_m = depth_m(start.hull.vertices - start.asset.mass.com, start.hull.normals) if level else 0.0
+        return dataclasses.replace(body, parts=octants(body.parts[0], deep_m)) if level else body
     parts = parts_of(start.asset, physics.concavity, COARSE if coarse else TOLERANCE)
     return make_body(start, parts if len(parts) > 1 else (), coarse)
 
 
-def octants(points: Array) -> tuple[Array, ...]:
+def octants(points: Array, deep_m: float) -> tuple[Array, ...]:
     """The vertices [N, 3] of a hull about the origin by the signs of their coordinates, each part with a core about the origin.
+
+    deep_m: the depth of the origin in the hull.
 
     A hull meets level ground with its vertices alone, and these are the parts'. Bullet looks only at parts near the ground, and
     finds a contact of each in a step, where it finds one of a hull: what lands flat would be turned and pushed aside.
     """
-    normals = convex_hull(points).normals
-    core = CORE_SHARE * float((points @ normals.T).max(axis=0).min()) * np.concatenate([np.eye(3), -np.eye(3)])
+    core = CORE_SHARE * deep_m * np.concatenate([np.eye(3), -np.eye(3)])
     octant = (points > 0.0) @ np.array([1, 2, 4])
     return tuple(np.concatenate([points[octant == number], core]) for number in np.unique(octant))
 
@@ -130,3 +132,9 @@ def body_frame(mass: MassProperties) -> tuple[Pose, Array]:
     if np.linalg.det(axes) < 0:
         axes = axes * np.array([1.0, 1.0, -1.0])
     return pose(axes, mass.com), moments
+
+
+def as_pose(at: BodyPose) -> Pose:
+    """[4, 4] of a position and a quaternion."""
+    position, quaternion = at
+    return pose(rotation_from_quaternion(np.array(quaternion)), np.array(position))

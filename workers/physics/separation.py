@@ -60,7 +60,9 @@ def find_gaps_m(forms: Sequence[Form], poses: Sequence[Pose]) -> list[float]:
     """
     points = [transform(T, form.surface.vertices) for form, T in zip(forms, poses, strict=True)]
     surfaces = [form.surface for form in forms]
-    solid = np.array([form.solid is not None for form in forms])
+    # A table need not be made a solid where no object is one, as the underside of one
+    some = any(form.solid is not None for form in forms[:-1])
+    solid = np.array([some and form.solid is not None for form in forms])
     gaps = [FARTHEST_M] * len(forms)
     for within_m in (NEAR_M, FARTHEST_M):
         contacts = find_contacts(surfaces, points, find_near_features(surfaces, points, within_m), within_m, within_m)
@@ -68,7 +70,7 @@ def find_gaps_m(forms: Sequence[Form], poses: Sequence[Pose]) -> list[float]:
         gaps = [min(FARTHEST_M, float(known[contacts.of(k)].min(initial=np.inf))) for k in range(len(forms))]
         if max(gaps) <= within_m:
             break
-    for i, j in _find_near(forms, poses):
+    for i, j in _find_near(forms, poses) if some else ():
         a, b = forms[i].solid, forms[j].solid
         if a is not None and b is not None and (depth_m := overlap_m(_place(a, poses[i]), _place(b, poses[j]))):
             gaps[i], gaps[j] = min(gaps[i], -depth_m), min(gaps[j], -depth_m)
@@ -100,6 +102,8 @@ def overlap_m(a: manifold3d.Manifold, b: manifold3d.Manifold) -> float:
 
 def _find_near(forms: Sequence[Form], poses: Sequence[Pose]) -> Iterator[tuple[int, int]]:
     """The numbers i < j of every two forms whose bounding boxes overlap."""
+    if len(forms) < 2:
+        return
     points = [transform(T, form.mesh.vertices[form.mesh.faces.ravel()]) for form, T in zip(forms, poses, strict=True)]
     boxes = [(each.min(axis=0, initial=np.inf), each.max(axis=0, initial=-np.inf)) for each in points]
     for i, j in itertools.combinations(range(len(forms)), 2):

@@ -31,6 +31,28 @@ def test_a_welded_soup_has_one_vertex_at_each_place():
     assert np.concatenate(triangle_corners(welded)) == pytest.approx(np.concatenate(triangle_corners(whole)))
 
 
+def weld_by_records(mesh: Mesh) -> Mesh:
+    """The plain reference: rows compared as records by `np.unique`."""
+    used = np.unique(mesh.faces)
+    vertices, inverse = np.unique(mesh.vertices[used], axis=0, return_inverse=True)
+    place = np.zeros(len(mesh.vertices), dtype=np.int32)
+    place[used] = inverse.reshape(-1)
+    faces = place[mesh.faces]
+    faces = faces[[len(set(face)) == 3 for face in faces.tolist()]]
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return Mesh(vertices, faces[np.sort(first)])
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_triangles_of_few_places_are_welded_as_the_plain_reference_does(seed):
+    rng = np.random.default_rng(seed)
+    vertices = rng.choice([-1.0, -0.0, 0.0, 0.5], (60, 3))
+    faces = rng.integers(0, 50, (200, 3)).astype(np.int32)
+    expected, welded = weld_by_records(Mesh(vertices, faces)), weld(Mesh(vertices, faces))
+    assert np.array_equal(welded.vertices, expected.vertices)
+    assert np.array_equal(welded.faces, expected.faces) and welded.faces.dtype == expected.faces.dtype
+
+
 def test_repeated_and_collapsed_triangles_and_loose_vertices_are_left_out():
     vertices = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 0), (5, 5, 5)], dtype=np.float64)
     welded = weld(Mesh(vertices, np.array([(0, 1, 2), (1, 2, 3), (0, 1, 3)], dtype=np.int32)))

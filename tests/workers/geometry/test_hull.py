@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull
 from schemas.job.assets import ProceduralSource
 from schemas.job.category import CATEGORIES
 from workers.assets.builtin.make import make_asset
-from workers.geometry.hull import MOST_VERTICES, convex_hull, least_width_m
+from workers.geometry.hull import MOST_VERTICES, convex_hull, depth_m, least_width_m
 
 SOURCE = ProceduralSource(source="procedural")
 
@@ -78,3 +78,13 @@ def test_the_least_width_of_a_plate_is_its_thickness():
     assert least_width_m(convex_hull(np.asarray(tilted.vertices))) == pytest.approx(
         0.008 * np.cos(np.pi / 360), rel=1e-9
     )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_depth_of_a_point_in_a_hull_is_its_least_distance_from_a_plane_of_a_face(seed):
+    rng = np.random.default_rng(seed)
+    hull = convex_hull(rng.standard_normal((200, 3)))
+    qhull = ConvexHull(hull.vertices)
+    point = 0.3 * rng.standard_normal(3)
+    expected = -(qhull.equations[:, :3] @ point + qhull.equations[:, 3]).max()
+    assert depth_m(hull.vertices - point, hull.normals) == pytest.approx(expected, rel=1e-12)

@@ -32,7 +32,7 @@ def anonymous_kb():
 
 points = np.random.default_rng(0).standard_normal((400, 3))
 body = Body(1.0, np.ones(3) * 1e-3, (0.1 * points / np.linalg.norm(points, axis=1)[:, None],), 1e-4)
-bodies = [body, Body(1.0, np.ones(3) * 1e-3, octants(body.parts[0]), 1e-4)]
+bodies = [body, Body(1.0, np.ones(3) * 1e-3, octants(body.parts[0], 0.05), 1e-4)]
 square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 plate = Mesh(np.tile(square, (100, 1)), np.arange(400)[:, None] // 4 * 4 + np.array([[0, 1, 2], [0, 2, 3]]).repeat(200, 0))
 T = np.eye(4)

@@ -20,8 +20,8 @@ from workers.geometry.frames import (
 )
 from workers.geometry.hull import convex_hull
 from workers.physics.bullet import GRAVITY_M_S2
-from workers.physics.fall import FINEST, SKIPPED_TO_M, StepSizes, as_pose, fall
-from workers.physics.rigid_body import Body, make_body
+from workers.physics.fall import FINEST, SKIPPED_TO_M, StepSizes, fall
+from workers.physics.rigid_body import Body, as_pose, make_body
 
 PHYSICS = Job(name="t").physics
 Z = np.array([0.0, 0.0, 1.0])

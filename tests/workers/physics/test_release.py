@@ -17,9 +17,9 @@ from tests.physics.settling import recheck_group, settle_group
 from tests.shapes import asset_of, box, table
 from workers.geometry.frames import pose
 from workers.geometry.hull import convex_hull
-from workers.physics.fall import fall
+from workers.physics.fall import LOOK_STEPS, SAMPLE_STEPS, fall
 from workers.physics.placement import Ground
-from workers.physics.release import MOST_RISE, PACES, PACES_TOGETHER, Drop, release
+from workers.physics.release import DOUBTFUL_RISE, KNOWN_RISE, MOST_RISE, PACES, PACES_TOGETHER, Drop, release
 from workers.physics.table_top import place_table
 
 PHYSICS = Job(name="t").physics
@@ -87,30 +87,51 @@ def test_objects_as_boxes_keep_the_height_of_their_lowest_point_together_as_alon
         assert beside[2, 3] == pytest.approx(one.poses[0][2, 3], abs=1e-4)
 
 
-def rates_of_falls(drop: Drop, rises: list[float], monkeypatch) -> list[float]:
-    """The rates, over the job's, of one fall after the other, when energy rises by these shares of its bound."""
-    rates, left = [], iter(rises)
+def falls_of(drop: Drop, rises: list[float], monkeypatch) -> list[tuple[float, int]]:
+    """(rate over the job's, steps between looks) of one fall after the other, when energy rises by these shares of its bound."""
+    falls, left = [], iter(rises)
 
     def risen(*given, **more):
-        rates.append(given[4].base_hz / PHYSICS.step_hz)
+        falls.append((given[4].base_hz / PHYSICS.step_hz, given[4].looked))
         return dataclasses.replace(fall(*given, **more), rise=next(left))
 
     monkeypatch.setattr("workers.physics.release.fall", risen)
     release(drop, flat=True)
-    return rates
+    return falls
+
+
+BRIEF = PHYSICS.model_copy(update={"max_settle_s": 0.01})
+ALONE = Drop((start_of(CUBE, 0, 0, 0.031),), GROUND, BRIEF, EffectPlan(("dynamics", "fine_step"), {}))
 
 
 def test_what_gains_energy_falls_again_in_shorter_steps_until_it_gains_none(monkeypatch):
-    brief = PHYSICS.model_copy(update={"max_settle_s": 0.01})
-    alone = Drop((start_of(CUBE, 0, 0, 0.031),), GROUND, brief, EffectPlan(("dynamics", "fine_step"), {}))
-    both = dataclasses.replace(alone, starts=(start_of(CUBE, -0.2, 0, 0.031), start_of(CUBE, 0.2, 0, 0.031)))
-    more = 1.01 * MOST_RISE
-    assert rates_of_falls(alone, [0.99 * MOST_RISE], monkeypatch) == [PACES[0].rate]
-    assert rates_of_falls(alone, [more, more, 0.0], monkeypatch) == [pace.rate for pace in PACES[:3]]
-    assert rates_of_falls(alone, [more] * 9, monkeypatch) == [pace.rate for pace in PACES]
-    assert rates_of_falls(both, [more] * 9, monkeypatch) == [pace.rate for pace in PACES_TOGETHER]
-    exact = dataclasses.replace(alone, exact=True)
-    assert rates_of_falls(exact, [more] * 9, monkeypatch) == [1.0]
+    both = dataclasses.replace(ALONE, starts=(start_of(CUBE, -0.2, 0, 0.031), start_of(CUBE, 0.2, 0, 0.031)))
+    looked = [(pace.rate, LOOK_STEPS) for pace in PACES]
+    together = [(pace.rate, SAMPLE_STEPS) for pace in PACES_TOGETHER]
+    assert falls_of(ALONE, [0.99 * DOUBTFUL_RISE], monkeypatch) == looked[:1]
+    assert falls_of(ALONE, [1.01 * KNOWN_RISE] * 2 + [0.0], monkeypatch) == looked[:3]
+    assert falls_of(ALONE, [1.01 * KNOWN_RISE] * 9, monkeypatch) == looked
+    assert falls_of(both, [0.99 * MOST_RISE], monkeypatch) == together[:1]
+    assert falls_of(both, [1.01 * MOST_RISE] * 9, monkeypatch) == together
+    exact = dataclasses.replace(ALONE, exact=True)
+    assert falls_of(exact, [1.01 * KNOWN_RISE] * 9, monkeypatch) == [(1.0, LOOK_STEPS)]
+
+
+def test_a_doubtful_drop_is_looked_at_after_each_step_before_it_falls_in_shorter_ones(monkeypatch):
+    first, second = ((pace.rate, LOOK_STEPS) for pace in PACES[:2])
+    again = (PACES[0].rate, 1)
+    assert falls_of(ALONE, [1.01 * DOUBTFUL_RISE, 0.99 * KNOWN_RISE], monkeypatch) == [first, again]
+    assert falls_of(ALONE, [1.01 * DOUBTFUL_RISE, 1.01 * KNOWN_RISE, 0.0], monkeypatch) == [first, again, second]
+
+
+def test_looks_at_the_energy_change_nothing_of_a_drop():
+    start = start_of(CUBE, 0.0, 0.0, 0.1, turn(X, 40) @ turn(np.array([0.0, 1.0, 0.0]), 25))
+    drop = Drop((start,), GROUND, PHYSICS, EffectPlan(("dynamics", "fine_step"), {}), pace=PACES[0])
+    often, seldom = (
+        release(dataclasses.replace(drop, exact=True, watched=watched), flat=True) for watched in (True, False)
+    )
+    assert np.array_equal(often.poses[0], seldom.poses[0]) and often.seconds == seldom.seconds
+    assert often.rise >= seldom.rise
 
 
 @pytest.mark.parametrize("gap_m", [0.0001, 0.0002, 0.00046])
