@@ -25,7 +25,14 @@ _FPNG_SIDE = 65_535
 def encode_png(pixels: Pixels, level: int = 1) -> bytes:
     """PNG bytes of [H, W, 3] uint8 RGB, [H, W] uint8 or [H, W] uint16. Raises ValueError for anything else.
 
-    `level` 0 stores, 1 is fast, 9 is small; every level is lossless.
+    `level` 0 stores, 1 is fast, 9 is small; every level is lossless. Level 1 is fpng for colour, zlib-ng for colour with holes
+    and for all else; other levels are zlib-ng.
+
+    640 x 480, one core, rendered images: RGB at level 1 1.8 ms and 256 KiB, at 2 4.0 ms and 192 KiB, at 6 18 ms and 153 KiB
+    (OpenCV's encoder at its level 1 11 ms and 212 KiB, at 9 420 ms and 158 KiB); projected RGB 1.6 ms and 157 KiB, 2.5 and
+    119, 4.6 and 100; depth 0.4 ms and 16 KiB, region ids 0.1 ms and 6 KiB at level 1. ISA-L is as fast as fpng, but once in
+    some thousand images its level 1 makes other bytes from the same pixels, depending on leftovers in its memory;
+    tests/encoded_digests.py compares the bytes of these two over 100,000 images.
     """
     colored = pixels.dtype == np.uint8 and pixels.ndim == 3 and pixels.shape[2] == 3
     if not colored and (pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16)):
@@ -33,7 +40,10 @@ def encode_png(pixels: Pixels, level: int = 1) -> bytes:
     if 0 in pixels.shape:
         raise ValueError(f"an image of shape {pixels.shape} has no pixels")
     whole: NDArray = np.ascontiguousarray(pixels)
-    return _encode_fast(whole) if level == 1 else _encode_small(whole, level)
+    shaded = pixels.ndim == 3 and not _has_holes(pixels)
+    if level == 1 and shaded and max(pixels.shape) <= _FPNG_SIDE:
+        return _whole(fpng.from_ndarray(whole))
+    return _deflated(whole, shaded and level > 1, level)
 
 
 def encode_mask(mask: NDArray[np.bool_]) -> bytes:
@@ -41,20 +51,12 @@ def encode_mask(mask: NDArray[np.bool_]) -> bytes:
     return encode_png(mask.astype(np.uint8) * 255)
 
 
-def _encode_fast(pixels: NDArray) -> bytes:
-    """PNG bytes by fpng for colour, by zlib-ng for colour with holes and for all else.
-
-    640 x 480, one core, rendered images: RGB 1.4 ms and 311 KiB (zlib-ng at level 2: 4.4 ms, 240 KiB; libdeflate at level 1:
-    3.2 ms, 210 KiB; the best settings of OpenCV: 8.4 ms, 231 KiB), projected RGB 1.6 ms and 175 KiB (2.5 ms, 133 KiB at
-    level 2; fpng 0.9 ms, 421 KiB), depth 0.26 ms and 17 KiB, region ids 0.08 ms and 6 KiB. ISA-L is as fast, but once in
-    some thousand images its level 1 makes other bytes from the same pixels, depending on leftovers in its memory;
-    tests/encoded_digests.py compares the bytes of these two over 100,000 images.
-    """
-    if pixels.ndim == 3 and max(pixels.shape) <= _FPNG_SIDE and not _has_holes(pixels):
-        return _whole(fpng.from_ndarray(pixels))
+def _deflated(pixels: NDArray, sub: bool, level: int) -> bytes:
+    """PNG bytes by zlib-ng, of rows as they are or, with `sub`, as differences from pixel to pixel."""
     height, width = pixels.shape[:2]
     head = struct.pack(">IIBBBBB", width, height, 8 * pixels.itemsize, 2 if pixels.ndim == 3 else 0, 0, 0, 0)
-    body = zlib_ng.compress(_unfiltered_rows(pixels).reshape(-1), 1)
+    rows = _differences(pixels) if sub else _unfiltered_rows(pixels)
+    body = zlib_ng.compress(rows.reshape(-1), level)
     return b"".join((_SIGNATURE, *_chunk(b"IHDR", head), *_chunk(b"IDAT", body), *_chunk(b"IEND", b"")))
 
 
@@ -78,18 +80,19 @@ def _unfiltered_rows(pixels: NDArray) -> NDArray[np.uint8]:
     return rows
 
 
+def _differences(pixels: NDArray) -> NDArray[np.uint8]:
+    """[H, 1 + row bytes]: of RGB, each row after the number of PNG's filter `sub`: differences from the pixel to the left."""
+    samples = pixels.reshape(len(pixels), -1)
+    rows = np.empty((len(pixels), 1 + samples.shape[1]), np.uint8)
+    rows[:, 0] = 1
+    rows[:, 1:4] = samples[:, :3]
+    np.subtract(samples[:, 3:], samples[:, :-3], out=rows[:, 4:])
+    return rows
+
+
 def _chunk(kind: bytes, data: bytes) -> tuple[bytes, bytes, bytes]:
     """A PNG chunk: length and kind, data, CRC-32 of kind and data."""
     return _CHUNK.pack(len(data), kind), data, zlib_ng.crc32(data, zlib_ng.crc32(kind)).to_bytes(4, "big")
-
-
-def _encode_small(pixels: NDArray, level: int) -> bytes:
-    # OpenCV takes BGR, and reverses channels thirty times as fast as numpy.
-    turned = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
-    done, data = cv2.imencode(".png", turned, [cv2.IMWRITE_PNG_COMPRESSION, level])
-    if not done:
-        raise ValueError(f"an image of shape {pixels.shape} could not be encoded")
-    return data.tobytes()
 
 
 def decode_png(data: bytes, name: str = "an image") -> Pixels:

@@ -108,3 +108,4 @@ def test_fast_is_no_larger_than_what_opencv_does_by_itself_but_for_a_seventh_wit
     noisy = np.clip(rendered + 3 * noise, 0, 255).astype(np.uint8)
     for pixels, share in ((holes, 0.9), (depth, 0.9), (noisy, 8 / 7)):
         assert len(encode_png(pixels, 1)) <= share * len(cv2.imencode(".png", pixels)[1])
+        assert len(encode_png(pixels, 6)) < len(encode_png(pixels, 2)) < len(encode_png(pixels, 1))
