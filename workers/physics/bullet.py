@@ -14,10 +14,9 @@ from schemas.errors import SettleError
 from schemas.job.physics import Physics
 from schemas.scene.shape import Mesh
 from workers.geometry.frames import quaternion_from_rotation
-from workers.physics.bullet_buffers import BulletBuffers
+from workers.physics.pybullet_flaws import BulletBuffers, silence_stderr
 from workers.physics.rest_pose import stands_on_face
 from workers.physics.rigid_body import Body, BodyPose
-from workers.physics.silence_stderr import silence_stderr
 
 with silence_stderr():
     import pybullet

@@ -14,8 +14,7 @@ from workers.geometry.hull import least_width_m
 from workers.physics.bullet import GRAVITY_M_S2, GroundShape, World, open_world
 from workers.physics.energy import EnergyRecord, Velocity
 from workers.physics.rigid_body import Body, BodyPose, as_pose
-from workers.physics.standing import StandingCondition
-from workers.physics.stop_conditions import StopCondition
+from workers.physics.stop_conditions import StandingCondition, StopCondition
 from workers.physics.table_top import support_height
 
 SAMPLE_STEPS = 8

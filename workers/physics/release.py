@@ -15,8 +15,7 @@ from workers.physics.bullet import SLOP_SHARE, GroundShape
 from workers.physics.fall import LOOK_STEPS, THIN_SHARE, Outcome, choose_steps, fall, free_fall_m
 from workers.physics.placement import Ground
 from workers.physics.rigid_body import build_body, choose_collision_shape
-from workers.physics.standing import stays_standing
-from workers.physics.stop_conditions import falls_below, leaves_outline, leaves_room
+from workers.physics.stop_conditions import falls_below, leaves_outline, leaves_room, stays_standing
 from workers.physics.table_top import split_by_side
 
 MANY = 4

@@ -1,11 +1,17 @@
-"""Lists that are passed to PyBullet and reused, because it leaks what it is given."""
+"""What works around two flaws of PyBullet: it leaks what it is given, and it prints when it is imported."""
 
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
+
+STDERR = 2
 
 
 @dataclass(frozen=True)
@@ -34,3 +40,20 @@ class BulletBuffers:
         self.integers.extend(range(len(self.integers), int(values.max()) + 1))
         self.index_list[:] = [self.integers[value] for value in values.tolist()]
         return self.index_list
+
+
+@contextmanager
+def silence_stderr() -> Iterator[None]:
+    """Discard what C code prints to standard error; an exception is reported after the block, as usual.
+
+    PyBullet prints its build time on import, at the head of every command's messages.
+    """
+    sys.stderr.flush()
+    with open(os.devnull, "wb") as devnull:
+        kept = os.dup(STDERR)
+        os.dup2(devnull.fileno(), STDERR)
+    try:
+        yield
+    finally:
+        os.dup2(kept, STDERR)
+        os.close(kept)

@@ -1,8 +1,11 @@
-"""Lists for PyBullet: new contents in the same objects."""
+"""Lists for PyBullet, new contents in the same objects; and standard error of compiled code, within the block and after it."""
+
+import os
 
 import numpy as np
+import pytest
 
-from workers.physics.bullet_buffers import BulletBuffers
+from workers.physics.pybullet_flaws import STDERR, BulletBuffers, silence_stderr
 
 
 def test_longer_and_shorter_lists_have_their_own_contents_in_the_same_objects():
@@ -22,3 +25,17 @@ def test_an_index_is_the_same_object_each_time():
     buffers = BulletBuffers()
     first = id(buffers.indices(np.array([100_000]))[0])
     assert id(buffers.indices(np.array([3, 100_000]))[1]) == first
+
+
+def test_what_c_code_writes_is_dropped_within_the_block_alone(capfd):
+    with silence_stderr():
+        os.write(STDERR, b"banner")
+    os.write(STDERR, b"message")
+    assert capfd.readouterr().err == "message"
+
+
+def test_standard_error_is_back_after_an_exception(capfd):
+    with pytest.raises(ZeroDivisionError), silence_stderr():
+        raise ZeroDivisionError
+    os.write(STDERR, b"message")
+    assert capfd.readouterr().err == "message"
