@@ -58,7 +58,8 @@ def disk(at: int = -1, then: Callable[[], object] | None = None) -> Iterator[Dis
     with pytest.MonkeyPatch.context() as patch:
         for name in _STEPS:
             patch.setattr(os, name, _counted(watched, name, getattr(os, name)))
-        patch.setattr(local, "open", lambda path, mode="r", **more: _open(watched, path, mode, **more), raising=False)
+        for module in (local, file_system):
+            patch.setattr(module, "open", lambda path, mode="r", **more: _open(watched, path, mode, **more), raising=False)
         patch.setattr(file_system, "_syncfs", lambda descriptor: _sync_all(watched, descriptor))
         patch.setattr(file_system, "_trusts_syncfs", lambda folder: True)
         yield watched
@@ -96,22 +97,23 @@ def _counted(watched: Disk, name: str, real: Callable) -> Callable:
 
 
 def _open(watched: Disk, path, mode: str, **more):
+    """The open file; reading is no step, because it leaves nothing behind."""
+    if "r" in mode:
+        return builtins.open(path, mode, **more)
     if watched.step():
         raise Killed
     file = builtins.open(path, mode, **more)  # noqa: SIM115 - the caller's to close
-    if "r" not in mode:
-        watched.synced.discard(os.fstat(file.fileno()).st_ino)
-        write = file.write
+    watched.synced.discard(os.fstat(file.fileno()).st_ino)
+    write = file.write
 
-        def torn_or_whole(data):
-            if watched.step():
-                write(data[: len(data) // 2])
-                file.flush()
-                raise Killed
-            return write(data)
+    def torn_or_whole(data):
+        if watched.step():
+            write(data[: len(data) // 2])
+            file.flush()
+            raise Killed
+        return write(data)
 
-        return _Writing(file, torn_or_whole)
-    return file
+    return _Writing(file, torn_or_whole)
 
 
 class _Writing:
