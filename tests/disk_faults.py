@@ -59,7 +59,9 @@ def disk(at: int = -1, then: Callable[[], object] | None = None) -> Iterator[Dis
         for name in _STEPS:
             patch.setattr(os, name, _counted(watched, name, getattr(os, name)))
         for module in (local, file_system):
-            patch.setattr(module, "open", lambda path, mode="r", **more: _open(watched, path, mode, **more), raising=False)
+            patch.setattr(
+                module, "open", lambda path, mode="r", **more: _open(watched, path, mode, **more), raising=False
+            )
         patch.setattr(file_system, "_syncfs", lambda descriptor: _sync_all(watched, descriptor))
         patch.setattr(file_system, "_trusts_syncfs", lambda folder: True)
         yield watched

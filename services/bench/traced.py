@@ -38,7 +38,7 @@ from workers.render.pathtraced.materials import tint_of
 from workers.render.pathtraced.tracer import Tracer, encode_light
 from workers.render.raster.baking import LAMP_RAD
 from workers.render.raster.gbuffer import shared_renderer
-from workers.render.step import require_tier
+from workers.render.tiers import require_tier
 
 SAMPLES = (16, 1)
 

@@ -28,7 +28,7 @@ def simulate(options: argparse.Namespace) -> int:
     from workers.capture.simulate.effects import ASKED, plan_effects
     from workers.pipeline.captures.simulate import load_object, simulate_capture
     from workers.plan.randomness import SceneChance
-    from workers.render.step import require_tier
+    from workers.render.tiers import require_tier
 
     settings, chance = job.captures.simulate, SceneChance(job.seed, job.first_scene)
     require_tier(Render(tier=settings.tier))

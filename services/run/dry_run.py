@@ -17,7 +17,7 @@ from workers.assets.catalogue import Catalogue
 from workers.pipeline.context import open_worker
 from workers.pipeline.run_shard import run_scene
 from workers.pipeline.stopwatch import Stopwatch
-from workers.render.step import require_tier
+from workers.render.tiers import require_tier
 from workers.store.ledger import list_commits
 from workers.store.local import open_store
 from workers.store.store import Store

@@ -29,7 +29,7 @@ from services.run.slots import SharedSlots, Slots
 from services.run.tally import Tally
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.captures.listing import open_sources
-from workers.render.step import require_tier
+from workers.render.tiers import require_tier
 from workers.store.ledger import LedgerKeeper, list_commits
 from workers.store.local import open_store
 from workers.store.store import Store

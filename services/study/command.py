@@ -31,7 +31,7 @@ from workers.assets.catalogue import open_catalogue
 from workers.pipeline.code import code_digest
 from workers.pipeline.context import open_worker
 from workers.render.raster.context import require_device
-from workers.render.step import require_tier
+from workers.render.tiers import require_tier
 
 LEAST_SCENES = 4
 """Fewer tell nothing of a 95th percentile."""

@@ -1,4 +1,8 @@
-"""The catalogue: every asset that a job can choose from."""
+"""The catalogue: every asset that a job can choose from.
+
+What makes or reads a shape is imported where it is called: it loads trimesh, scipy and numba, which take longer than the rest of
+a command's start, and a coordinator of built-in shapes needs none of it.
+"""
 
 import hashlib
 import json
@@ -6,7 +10,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,12 +27,12 @@ from schemas.job.assets import (
 )
 from schemas.job.category import CATEGORIES, TABLE
 from schemas.scene.shape import Asset
-from workers.assets.builtin.make import VERSION, instance_id, make_asset
-from workers.assets.external.folder import find_files
-from workers.assets.external.listing import Listing
-from workers.assets.external.opening import Watch, check_listing, ignore, load_asset_file, read_listing
-from workers.assets.external.shapenet import find_models
-from workers.assets.external.verdicts import USUAL_FOLDER, Verdicts
+from workers.assets.builtin.identity import VERSION, instance_id
+from workers.assets.watch import Watch, ignore
+
+if TYPE_CHECKING:
+    from workers.assets.external.listing import Listing
+    from workers.assets.external.verdicts import Verdicts
 
 AnySource = ProceduralSource | ShapeNetSource | FolderSource
 
@@ -53,8 +57,8 @@ class Catalogue:
     """
 
     assets: Assets
-    objects: tuple[Listing | None, ...]
-    tables: tuple[Listing | None, ...]
+    objects: "tuple[Listing | None, ...]"
+    tables: "tuple[Listing | None, ...]"
     digest: str
     skipped: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     captures: tuple[CaptureListing, ...] = ()
@@ -100,7 +104,7 @@ class Catalogue:
         listings = (listing for listing in (*self.objects, *self.tables) if listing is not None)
         return next((x.examples for x in listings if x.examples and str(x.folder) == folder), ())
 
-    def doubts(self) -> list[Listing]:
+    def doubts(self) -> "list[Listing]":
         """The listings with files that stand on another axis than `up` says."""
         return [listing for listing in (*self.objects, *self.tables) if listing is not None and listing.doubts]
 
@@ -108,12 +112,16 @@ class Catalogue:
         """An instance, made, or read in a limited process; MeshError where its mesh is refused or has changed."""
         settings, listing = self._sources(ref.category)[ref.source]
         if isinstance(settings, ProceduralSource):
+            from workers.assets.builtin.make import make_asset
+
             return make_asset(ref.category, settings, ref.index, self.assets.density_kg_m3)
+        from workers.assets.external.opening import load_asset_file
+
         assert listing is not None
         entry = listing.entries[ref.category][ref.index]
         return load_asset_file(settings, listing.folder, entry, ref.category, self.assets)
 
-    def _sources(self, category: str) -> list[tuple[AnySource, Listing | None]]:
+    def _sources(self, category: str) -> "list[tuple[AnySource, Listing | None]]":
         if category == TABLE:
             return list(zip(self.assets.tables, self.tables, strict=True))
         return list(zip(self.assets.objects, self.objects, strict=True))
@@ -121,17 +129,21 @@ class Catalogue:
 
 def list_source(
     settings: AnySource, job_folder: Path, categories: Collection[str], limits: MeshLimits, watch: Watch = ignore
-) -> Listing | None:
+) -> "Listing | None":
     """What a source of files offers, None for built-in shapes; AssetSourceError where the folder cannot be used."""
     if isinstance(settings, ProceduralSource):
         return None
+    from workers.assets.external.folder import find_files
+    from workers.assets.external.opening import read_listing
+    from workers.assets.external.shapenet import find_models
+
     if isinstance(settings, ShapeNetSource):
         return read_listing(settings, *find_models(settings, job_folder, categories), limits, watch)
     return read_listing(settings, *find_files(settings, job_folder, categories), limits, watch)
 
 
 def open_catalogue(
-    assets: Assets, job_folder: Path, categories: Collection[str], watch: Watch = ignore, kept: Verdicts | None = None
+    assets: Assets, job_folder: Path, categories: Collection[str], watch: Watch = ignore, kept: "Verdicts | None" = None
 ) -> Catalogue:
     """Lists every source and finds out which files can be read, or looks that up in `kept` (default: the user's cache).
 
@@ -143,14 +155,19 @@ def open_catalogue(
     catalogue and read only what they load.
     """
 
-    def open_source(settings: AnySource, wanted: Collection[str]) -> Listing | None:
+    def open_source(settings: AnySource, wanted: Collection[str]) -> "Listing | None":
         listing = list_source(settings, job_folder, wanted, assets.limits, watch)
         if isinstance(settings, ProceduralSource) or listing is None:
             return None
-        return check_listing(settings, listing, assets, verdicts, watch)
+        from workers.assets.external.opening import check_listing
 
-    external = any(not isinstance(source, ProceduralSource) for source in (*assets.objects, *assets.tables))
-    verdicts = kept or Verdicts(USUAL_FOLDER if external else None)
+        assert kept is not None
+        return check_listing(settings, listing, assets, kept, watch)
+
+    if kept is None and any(not isinstance(source, ProceduralSource) for source in (*assets.objects, *assets.tables)):
+        from workers.assets.external.verdicts import USUAL_FOLDER, Verdicts
+
+        kept = Verdicts(USUAL_FOLDER)
     objects = tuple(open_source(source, categories) for source in assets.objects)
     tables = tuple(open_source(source, (TABLE,)) for source in assets.tables)
     _refuse_ambiguous(assets)
@@ -196,7 +213,7 @@ def _check_offered(catalogue: Catalogue, category: str) -> None:
         )
 
 
-def _describe(listing: Listing) -> str:
+def _describe(listing: "Listing") -> str:
     found = (
         ", ".join(f"{len(entries)} {category}" for category, entries in listing.entries.items()) or "nothing asked for"
     )
@@ -205,7 +222,10 @@ def _describe(listing: Listing) -> str:
 
 
 def _digest(
-    assets: Assets, objects: tuple[Listing | None, ...], tables: tuple[Listing | None, ...], categories: Collection[str]
+    assets: Assets,
+    objects: "tuple[Listing | None, ...]",
+    tables: "tuple[Listing | None, ...]",
+    categories: Collection[str],
 ) -> str:
     """SHA-256 over the settings of every source and, for files, what was found: paths, sizes and digests."""
     record = []

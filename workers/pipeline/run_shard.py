@@ -31,13 +31,10 @@ from workers.plan.randomness import SceneChance
 from workers.plan.step import choose_category
 from workers.render.raster.context import require_device
 from workers.render.raster.gbuffer import shared_renderer
-from workers.render.step import require_tier
-from workers.store.attempt import Attempt, begin_attempt
+from workers.render.tiers import require_tier
+from workers.store.attempt import TIMED_OUT, Attempt, begin_attempt
 from workers.store.local import open_store
 from workers.store.store import Store
-
-TIMED_OUT = "_timed_out"
-"""The file in an attempt's folder that holds the traceback of a worker that hung in a scene."""
 
 
 class BlamedScene(SceneError):

@@ -12,17 +12,11 @@ from schemas.scene.camera import Camera
 from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import Placed
 from schemas.scene.view import GBuffer
-from workers.render.pathtraced.tracer import Tracer, encode_light, require_mitsuba
+from workers.render.pathtraced.tracer import Tracer, encode_light
 from workers.render.raster.gbuffer import Renderer
 
 SEEDS = 2**32
 """Number of seeds that Mitsuba's samplers tell apart."""
-
-
-def require_tier(render: Render) -> None:
-    """Raises InputError, with the remedy, where the tier's packages are not installed."""
-    if render.tier == "pathtraced" and render.rgb:
-        require_mitsuba()
 
 
 def draw_view(

@@ -56,6 +56,9 @@ from workers.store.tars import Packing
 CURRENT = "_current"
 """A file in an attempt's folder that names the scene in progress, in case the worker dies."""
 
+TIMED_OUT = "_timed_out"
+"""The file there that holds the traceback of a worker that hung in a scene."""
+
 _NAME = re.compile(r"r([0-9]{1,9})-.+")
 
 

@@ -17,7 +17,6 @@ from services.read.contact_sheet import draw_sheet
 from services.read.query import query
 from services.read.replay import open_context, replay_scene
 from tests.datasets import faults_of, images_of, make_dataset
-from workers.render import step as tiers
 
 ROLES = {"input", "aligned", "mirror", "projected"}
 
@@ -156,14 +155,3 @@ def test_the_benchmark_refuses_it_by_name(name):
     with pytest.raises(InputError, match="is off"):
         refuse_unmatched(validate_job({"name": "t", **json.loads(json.dumps(changes))}, "t"))
     refuse_unmatched(Job(name="t"))
-
-
-def test_path_tracing_is_not_needed_where_no_rgb_is_asked(monkeypatch):
-    def refuse() -> None:
-        raise AssertionError("Mitsuba is looked for")
-
-    monkeypatch.setattr(tiers, "require_mitsuba", refuse)
-    job = Job.model_validate({"name": "t", "render": {"tier": "pathtraced", "rgb": False}})
-    tiers.require_tier(job.render)
-    with pytest.raises(AssertionError):
-        tiers.require_tier(job.render.model_copy(update={"rgb": True}))

@@ -33,7 +33,7 @@ def test_a_count_of_paths_that_cannot_be_is_told_by_its_key(tmp_path, capsys, ke
 
 def test_a_tier_whose_system_library_is_missing_is_refused_with_the_package(tmp_path, monkeypatch, capsys):
     pytest.importorskip("mitsuba", reason="Mitsuba is not installed: ./verso extra pathtraced")
-    monkeypatch.setattr("workers.render.pathtraced.tracer.SYSTEM_LIBRARY", "libnone-of-this-name.so.1")
+    monkeypatch.setattr("workers.render.tiers.SYSTEM_LIBRARY", "libnone-of-this-name.so.1")
     job = tmp_path / "job.yaml"
     job.write_text(json.dumps({"name": "t", "scenes": 1, "render": {"tier": "pathtraced"}}))
     assert main(["run", str(job), "--out", str(tmp_path / "out")]) == 2

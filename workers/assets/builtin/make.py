@@ -14,6 +14,7 @@ from workers.assets.builtin.bowl import make_bowl
 from workers.assets.builtin.box import make_box
 from workers.assets.builtin.camera import make_camera
 from workers.assets.builtin.can import make_can
+from workers.assets.builtin.identity import instance_id
 from workers.assets.builtin.jar import make_jar
 from workers.assets.builtin.laptop import make_laptop
 from workers.assets.builtin.mug import make_mug
@@ -21,9 +22,6 @@ from workers.assets.builtin.parts import Model, cut_into_parts
 from workers.assets.builtin.table import make_table
 from workers.assets.mass import solid_mass
 from workers.geometry.frames import pose
-
-VERSION = 2
-"""Part of the catalogue's digest: raise it with every change to a vertex or colour of any instance."""
 
 LICENCE = "CC0-1.0"
 GENERATORS: dict[str, tuple[int, Callable[[np.random.Generator], Model]]] = {
@@ -38,11 +36,6 @@ GENERATORS: dict[str, tuple[int, Callable[[np.random.Generator], Model]]] = {
     TABLE: (8, make_table),
 }
 """The number of each category in the seed's spawn key, which never changes, and its generator."""
-
-
-def instance_id(category: str, seed: int, index: int) -> str:
-    """`mug-0-000123`: category, seed, and the index in six digits, so that ids sort."""
-    return f"{category}-{seed}-{index:06d}"
 
 
 def make_model(category: str, seed: int, index: int) -> Model:

@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,19 +23,13 @@ from workers.assets.external.listing import (
 from workers.assets.external.reader import BATCH, ask_all, shared_reader
 from workers.assets.external.reader_tasks import Request, Task
 from workers.assets.external.verdicts import Verdict, Verdicts, verdict_key
+from workers.assets.watch import Watch, ignore
 
 _AXES: Mapping[bytes, UpAxis] = {b"x": "x", b"y": "y", b"z": "z"}
 """What the check of a file may answer."""
 
 EXAMPLES = 3
 """Refused files that are described in a message."""
-
-Watch = Callable[[str, int, int], None]
-"""Is told what is being done, and with how many of how many files."""
-
-
-def ignore(what: str, done: int, asked: int) -> None:
-    """A watch that says nothing."""
 
 
 def read_listing(

@@ -16,9 +16,7 @@ environment map are sampled at every bounce, straight through glass and holes, s
 `antialiasing` or `shadows` here.
 """
 
-import ctypes
 import importlib
-import importlib.util
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,6 +37,7 @@ from workers.geometry.srgb import encode_codes
 from workers.render.pathtraced.lights import lights_of
 from workers.render.pathtraced.materials import make_mesh, planned_part
 from workers.render.raster.lit_shaders import KNEE
+from workers.render.tiers import REMEDY, require_mitsuba
 
 NEAR_M = 0.05
 """Nearer surfaces are not seen, as in the other tiers."""
@@ -49,24 +48,6 @@ ROULETTE_DEPTH = 5
 FIREFLY_RATIO = 1.4
 """Greatest brightness of a pixel relative to the second brightest neighbour; pixel-sized texture stays below it. Cycles clamps
 samples instead, which Mitsuba cannot."""
-
-SYSTEM_LIBRARY = "libatomic.so.1"
-"""A library of the compiler's run time: Mitsuba's wheel does not bring it, and small images of Debian lack it."""
-
-REMEDY = "`./verso extra pathtraced` installs it (mitsuba==3.9.1), or set render.tier to raster or flat"
-
-
-def require_mitsuba() -> None:
-    """Raises InputError, with the remedy, where Mitsuba or the system library that it loads is missing."""
-    if importlib.util.find_spec("mitsuba") is None:
-        raise InputError(f"render.tier is pathtraced, and Mitsuba is not installed: {REMEDY}")
-    try:
-        ctypes.CDLL(SYSTEM_LIBRARY)
-    except OSError as error:
-        remedy = "on Debian or Ubuntu: apt-get install -y libatomic1"
-        raise InputError(
-            f"render.tier is pathtraced, and Mitsuba needs {SYSTEM_LIBRARY} ({error}): {remedy}"
-        ) from error
 
 
 def load_mitsuba() -> ModuleType:

@@ -13,7 +13,8 @@ import trimesh
 from schemas.job.assets import ProceduralSource
 from schemas.job.category import CATEGORIES
 from tests.workers.assets.oracles import faulty_rays, support_margin, welded
-from workers.assets.builtin.make import GENERATORS, instance_id, make_asset, make_model, shape_digest
+from workers.assets.builtin.identity import instance_id
+from workers.assets.builtin.make import GENERATORS, make_asset, make_model, shape_digest
 
 SOURCE = ProceduralSource(source="procedural")
 METRIC = ProceduralSource(source="procedural", size="metric")

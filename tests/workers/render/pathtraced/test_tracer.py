@@ -1,7 +1,6 @@
 """The path tracer: the camera and its samples, against the label pass and against counting."""
 
 import hashlib
-import importlib.util
 import subprocess
 import sys
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.errors import InputError
 from schemas.scene.appearance import Appearance
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.scene import Placed
@@ -34,7 +32,6 @@ from workers.geometry.frames import invert, pose, rotation_about, translation
 from workers.render.pathtraced.tracer import (
     clamp_fireflies,
     encode_light,
-    require_mitsuba,
     round_up_samples,
     square_pixels,
 )
@@ -175,13 +172,6 @@ def test_samples_fill_a_grid_and_are_never_fewer_than_asked():
         assert asked <= taken < asked + np.sqrt(asked)
         assert any(taken % side == 0 for side in range(int(np.sqrt(asked)), int(np.sqrt(asked)) + 1))
     assert [round_up_samples(n) for n in (1, 2, 4, 13, 16, 64)] == [1, 2, 4, 15, 16, 64]
-
-
-def test_without_mitsuba_the_message_says_how_to_get_it(monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"\./verso extra pathtraced.*render\.tier") as caught:
-        require_mitsuba()
-    assert caught.value.exit_code == 2
 
 
 @traced
