@@ -185,7 +185,9 @@ def make_queue(url: str) -> Queue:
         )
     try:
         retry_if_swept(store.prepare)
-    except OutputError as error:
+    except (FileNotFoundError, OutputError) as error:
+        if store.size(MARK_FILE) is not None:  # somebody else has made it since, and removed what a queue does not keep
+            return open_queue(url)
         raise InputError(f"--queue: {error}".replace("--out", "--queue")) from error
     store.put_if_absent(MARK_FILE, _encode(Mark(nonce=uuid.uuid4().hex)))
     for folder in (COMMITS, RANGES, MANIFEST):  # of a dataset, to which the same store belongs
