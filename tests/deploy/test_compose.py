@@ -253,4 +253,4 @@ def _host_of(attempt: str) -> str:
 
 def _begun(out: Path) -> set[str]:
     """Names of the hosts that are making a range, from the names of their attempts."""
-    return {_host_of(path.name) for path in out.glob("_staging/*/*")}
+    return {_host_of(path.name) for path in out.glob("_staging/*/*-*-*-*")}  # beside temporary files
