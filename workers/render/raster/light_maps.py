@@ -75,7 +75,7 @@ class LightMaps:
         stand, T = self._baked.stand, thing.T_world_shape
         if stand is None or T[2, 2] < UPRIGHT:
             return False
-        top = T[2, 3] + float(max(part.vertices[:, 2].max() for part in thing.shape.parts))
+        top = T[2, 3] + float(self._shapes.fetch(thing.shape).corners[:, 2].max())
         return abs(top - float(stand.bounds[0, 2])) < SAME_LEVEL_M
 
     def bind(self, program: Program, thing: Placed) -> None:
