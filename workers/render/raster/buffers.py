@@ -13,6 +13,7 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.scene.shape import Shape
+from workers.geometry.bounds import bounds_of
 from workers.render.raster.batches import COLUMNS, Batch, pack_shape
 from workers.render.raster.textures import Texture, TextureStore
 
@@ -85,7 +86,7 @@ class ShapeStore:
             self._stored.move_to_end(id(shape))
             return self._stored[id(shape)][1]
         batches = tuple(_upload(self._gl, batch, self.textures) for batch in pack_shape(shape))
-        corners = np.array(list(product(*shape.bounds.T)))
+        corners = np.array(list(product(*bounds_of(shape.vertices).T)))
         uploaded = UploadedShape(batches, corners, shape.closed)
         self._stored[id(shape)] = (shape, uploaded)
         self._bytes += uploaded.bytes
