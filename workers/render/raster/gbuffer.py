@@ -142,22 +142,27 @@ class Renderer:
         shadows, occlusion = (not lit or effects.runs(name) for name in ("shadows", "ambient_occlusion"))
         self._light_maps.prepare(things if effects.runs("light_maps") else (), appearance, shadows, occlusion)
 
-    def count_pixels(self, thing: Placed, camera: Camera) -> int:
-        """Pixels that a thing covers by itself, also outside the image, with nothing in front of it.
+    def count_pixels(self, things: Sequence[Placed], camera: Camera) -> list[int]:
+        """Pixels that each thing covers by itself, also outside the image, with nothing in front of it.
 
         The pixel grid is the image's, continued on all sides by one width and one height of the image; pixels beyond that,
         as of a thing that reaches behind the camera, are not counted.
         """
         self._platform.make_current()
-        T_cam_shape = invert(camera.T_world_cam) @ thing.T_world_shape
+        T_cam_world = invert(camera.T_world_cam)
         self._counter.program.use()
-        self._counter.program.set_thing(T_cam_shape, 0, 0.0, 0.0)
-        shape = self._shapes.fetch(thing.shape)
-        self._cull(shape, T_cam_shape)
-        count = sum(self._counter.count(shape, tile) for tile in tiles(thing.shape, T_cam_shape, camera.intrinsics))
+        started = []
+        for thing in things:
+            T_cam_shape = T_cam_world @ thing.T_world_shape
+            self._counter.program.set_thing(T_cam_shape, 0, 0.0, 0.0)
+            shape = self._shapes.fetch(thing.shape)
+            self._cull(shape, T_cam_shape)
+            views = tiles(thing.shape, T_cam_shape, camera.intrinsics)
+            started.append([self._counter.start(shape, tile) for tile in views])
         self._gl.glDisable(self._gl.GL_CULL_FACE)
+        counts = [sum(map(self._counter.finish, queries)) for queries in started]
         self._shapes.trim(max(1, self._scene_size))
-        return count
+        return counts
 
     def _draw_things(self, things: Sequence[Placed], view: RenderPass) -> None:
         """Draw into the bound framebuffer."""
