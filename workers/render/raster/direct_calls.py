@@ -5,7 +5,8 @@ call is raised by the next function that PyOpenGL checks: the read-back of the i
 """
 
 import importlib
-from ctypes import CFUNCTYPE, c_float, c_int, c_ubyte, c_uint, c_void_p
+from collections.abc import Callable
+from ctypes import CFUNCTYPE, c_float, c_int, c_ssize_t, c_ubyte, c_uint, c_void_p
 from types import ModuleType
 from typing import Any
 
@@ -38,42 +39,65 @@ SIGNATURES: dict[str, tuple[Any, ...]] = {
 }
 """The types of the arguments of functions that return nothing and take no array."""
 
-_VECTORS, _MATRICES = (c_int, c_int, c_void_p), (c_int, c_int, c_ubyte, c_void_p)
+ARRAYS: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "glBufferData": (None, (c_uint, c_ssize_t, c_void_p, c_uint)),
+    "glClearBufferfv": (np.float32, (c_uint, c_int, c_void_p)),
+    "glDeleteBuffers": (np.uint32, (c_int, c_void_p)),
+    "glDeleteTextures": (np.uint32, (c_int, c_void_p)),
+    "glDeleteVertexArrays": (np.uint32, (c_int, c_void_p)),
+    "glTexImage2D": (None, (c_uint, c_int, c_int, c_int, c_int, c_int, c_uint, c_uint, c_void_p)),
+    "glUniform3fv": (np.float32, (c_int, c_int, c_void_p)),
+    "glUniformMatrix3fv": (np.float32, (c_int, c_int, c_ubyte, c_void_p)),
+    "glUniformMatrix4fv": (np.float32, (c_int, c_int, c_ubyte, c_void_p)),
+}
+"""Functions that take an array: its type, where it is always the same, and the types of the arguments."""
+
+GENERATORS = ("glGenBuffers", "glGenTextures", "glGenVertexArrays")
 
 
 class DirectCalls:
-    """The module OpenGL.GL, whose functions in `SIGNATURES`, and uniforms of arrays, are plain calls."""
+    """The module OpenGL.GL, in which the functions above are plain calls."""
 
     def __init__(self, gl: ModuleType) -> None:
         self._gl = gl
-        for name, types in SIGNATURES.items():
-            setattr(self, name, _plain(name, *types))
-        self._uniform_3fv = _plain("glUniform3fv", *_VECTORS)
-        self._uniform_3x3 = _plain("glUniformMatrix3fv", *_MATRICES)
-        self._uniform_4x4 = _plain("glUniformMatrix4fv", *_MATRICES)
+        calls = {name: _plain(name, *types) for name, types in SIGNATURES.items()}
+        calls |= {name: _with_array(name, *form) for name, form in ARRAYS.items()}
+        calls |= {name: _generator(name) for name in GENERATORS}
+        vars(self).update(calls)
 
     def __getattr__(self, name: str) -> Any:
         value = getattr(self._gl, name)
         setattr(self, name, value)  # found at once the next time
         return value
 
-    def glUniform3fv(self, location: int, count: int, vectors: NDArray[np.float32]) -> None:
-        """vectors [count, 3] float32."""
-        held = np.ascontiguousarray(vectors, np.float32)
-        self._uniform_3fv(location, count, held.ctypes.data)
-
-    def glUniformMatrix3fv(self, location: int, count: int, by_rows: bool, matrix: NDArray[np.float32]) -> None:
-        """matrix [3, 3] float32, or `count` of them."""
-        held = np.ascontiguousarray(matrix, np.float32)
-        self._uniform_3x3(location, count, by_rows, held.ctypes.data)
-
-    def glUniformMatrix4fv(self, location: int, count: int, by_rows: bool, matrix: NDArray[np.float32]) -> None:
-        """matrix [4, 4] float32, or `count` of them."""
-        held = np.ascontiguousarray(matrix, np.float32)
-        self._uniform_4x4(location, count, by_rows, held.ctypes.data)
-
 
 def _plain(name: str, *types: Any) -> Any:
     """The library's function called `name`, which returns nothing."""
     library = importlib.import_module("OpenGL.platform").PLATFORM.GL
     return CFUNCTYPE(None, *types)((name, library))
+
+
+def _with_array(name: str, dtype: Any, types: tuple[Any, ...]) -> Callable[..., None]:
+    """The same for a function whose only pointer is an array, or None."""
+    call, place = _plain(name, *types), types.index(c_void_p)
+
+    def with_array(*arguments: Any) -> None:
+        if arguments[place] is None:
+            call(*arguments)
+        else:
+            held = np.ascontiguousarray(arguments[place], dtype)
+            call(*arguments[:place], held.ctypes.data, *arguments[place + 1 :])
+
+    return with_array
+
+
+def _generator(name: str) -> Callable[[int], NDArray[np.uint32] | int]:
+    """The same for a function that makes names: one of them, or an array of several."""
+    call = _plain(name, c_int, c_void_p)
+
+    def generate(count: int) -> NDArray[np.uint32] | int:
+        names = np.zeros(count, np.uint32)
+        call(count, names.ctypes.data)
+        return names if count > 1 else int(names[0])
+
+    return generate
