@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Array
 from schemas.scene.region import REGION_FLOOR
 from workers.geometry.jit import compiled
 from workers.geometry.srgb import SRGB_STEPS, encode_srgb
@@ -27,6 +26,8 @@ OFFSETS_PX = tuple(
 
 SPAN_PX = 8.0
 """Greatest distance, along an edge, of the neighbours that an edge pixel is blended with."""
+
+Floats = NDArray[np.float32]
 
 LINEAR_STEPS = 16_383
 _LINEAR = np.rint(SRGB_STEPS * LINEAR_STEPS).astype(np.uint16)
@@ -114,7 +115,14 @@ def _flat_nonzero(values: NDArray[np.uint8]) -> NDArray[np.int64]:
 
 @compiled
 def _blend_edge(
-    seen: NDArray[np.uint8], y: int, x: int, span: np.float32, around: Array, near: Array, far: Array, out: NDArray
+    seen: NDArray[np.uint8],
+    y: int,
+    x: int,
+    span: np.float32,
+    around: Floats,
+    near: Floats,
+    far: Floats,
+    out: NDArray[np.uint8],
 ) -> None:
     """The colour of one edge pixel into `out` [3]; around [3, 3], near [3] and far [3], float32, are overwritten."""
     height, width = seen.shape[:2]
