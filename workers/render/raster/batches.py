@@ -128,7 +128,7 @@ def _tops_first(
         top[face] = vertices[faces[face, 2], plane_z] > np.float32(0.0)
         for corner in range(3):
             top[face] &= vertices[faces[face, corner], 2] > lowest_m
-    count = np.count_nonzero(top)
+    count = int(np.count_nonzero(top))
     ordered, first, other = np.empty((len(faces), 3), np.uint32), 0, count
     for face in range(len(faces)):
         row = first if top[face] else other

@@ -2,6 +2,7 @@
 
 import importlib
 import socket
+from types import ModuleType
 from typing import Any, Literal
 
 from schemas.errors import MachineError
@@ -35,7 +36,7 @@ def require_device(name: str, device: Literal["any", "gpu"]) -> None:
         )
 
 
-def open_context() -> tuple[DirectCalls, Any]:
+def open_context() -> tuple[ModuleType, Any]:
     """(the functions of OpenGL.GL, pyrender's `EGLPlatform`); a core context of OpenGL 4.1 or later is current afterwards.
 
     Raises MachineError, with the packages to install, where this machine has no EGL, no OpenGL or too old a one.

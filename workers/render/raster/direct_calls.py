@@ -55,10 +55,11 @@ ARRAYS: dict[str, tuple[Any, tuple[Any, ...]]] = {
 GENERATORS = ("glGenBuffers", "glGenTextures", "glGenVertexArrays")
 
 
-class DirectCalls:
+class DirectCalls(ModuleType):
     """The module OpenGL.GL, in which the functions above are plain calls."""
 
     def __init__(self, gl: ModuleType) -> None:
+        super().__init__(gl.__name__, gl.__doc__)
         self._gl = gl
         calls = {name: _plain(name, *types) for name, types in SIGNATURES.items()}
         calls |= {name: _with_array(name, *form) for name, form in ARRAYS.items()}
