@@ -74,8 +74,11 @@ class DirectCalls(ModuleType):
 
 def _plain(name: str, *types: Any) -> Any:
     """The library's function called `name`, which returns nothing."""
-    library = importlib.import_module("OpenGL.platform").PLATFORM.GL
-    return CFUNCTYPE(None, *types)((name, library))
+    platform, kind = importlib.import_module("OpenGL.platform").PLATFORM, CFUNCTYPE(None, *types)
+    try:
+        return kind((name, platform.GL))
+    except AttributeError:  # a library need not export what is newer than OpenGL 1.1
+        return kind(platform.getExtensionProcedure(name.encode()))
 
 
 def _with_array(name: str, dtype: Any, types: tuple[Any, ...]) -> Callable[..., None]:

@@ -1,8 +1,12 @@
 """Plain calls of OpenGL, without PyOpenGL's checks."""
 
+import ctypes
+import importlib
+
 import numpy as np
 import pytest
 
+from workers.render.raster import direct_calls
 from workers.render.raster.direct_calls import ARRAYS, GENERATORS, SIGNATURES
 from workers.render.raster.programs import Program
 
@@ -16,6 +20,17 @@ def test_an_error_of_a_plain_call_is_raised_by_the_next_checked_one(renderer):
     with pytest.raises(gl.GLError, match="1280"):
         gl.glGetFloatv(gl.GL_VIEWPORT)
     assert gl.glGetError() == gl.GL_NO_ERROR
+
+
+def test_a_function_that_the_library_does_not_export_is_asked_of_egl(renderer, monkeypatch):
+    gl, platform = renderer._gl, importlib.import_module("OpenGL.platform").PLATFORM
+    monkeypatch.setattr(platform, "GL", ctypes.CDLL(None))
+    use = direct_calls._plain("glUseProgram", ctypes.c_uint)
+    program = Program(gl, VERTEX, FRAGMENT)
+    use(program._name)
+    assert gl.glGetIntegerv(gl.GL_CURRENT_PROGRAM) == program._name
+    gl.glUseProgram(0)
+    gl.glDeleteProgram(program._name)
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
