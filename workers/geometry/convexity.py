@@ -8,6 +8,7 @@ from scipy.sparse.csgraph import connected_components
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
+from workers.geometry.jit import compiled
 from workers.geometry.manifold import hold_to_one_thread
 from workers.geometry.nearest import nearest_on_mesh
 
@@ -96,11 +97,22 @@ def triangle_corners(mesh: Mesh) -> tuple[Array, Array, Array]:
 
 def face_planes(mesh: Mesh) -> tuple[Array, Array]:
     """(normals [F, 3], offsets [F]): unit normal n of each face, 0 where it has no area, and n . p of its points p."""
-    a, b, c = triangle_corners(mesh)
-    normals = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
-    return normals, np.einsum("ij,ij->i", normals, a)
+    normals = _face_normals(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces))
+    return normals, np.einsum("ij,ij->i", normals, mesh.vertices[mesh.faces[:, 0]])
+
+
+@compiled
+def _face_normals(vertices: Array, faces: NDArray[np.integer]) -> Array:
+    normals = np.zeros((len(faces), 3))
+    for face in range(len(faces)):
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+        vx, vy, vz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
+        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        length = np.sqrt(x * x + y * y + z * z)
+        if length > 0.0:
+            normals[face, 0], normals[face, 1], normals[face, 2] = x / length, y / length, z / length
+    return normals
 
 
 def solid_of(mesh: Mesh) -> manifold3d.Manifold | None:

@@ -1,6 +1,6 @@
 """The label of each region of a rendered view, from its mask and the poses. Pure."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,39 +14,48 @@ from workers.geometry.camera import image_coordinates
 from workers.geometry.frames import invert
 from workers.geometry.pixels import Extent, measure_regions
 
+CountPixels = Callable[[Sequence[Placed], Camera], list[int]]
+"""Counts, for each thing, the pixels of that thing alone, also outside the frame."""
+
 
 def label_regions(
     plan: ScenePlan,
     posed: PosedScene,
     camera: Camera,
     region: NDArray[np.uint8],
-    count_unoccluded: Callable[[Placed, Camera], int],
+    count_unoccluded: CountPixels,
 ) -> tuple[ObjectLabel, ...]:
-    """Labels of the table and of every object in a mask [H, W], in order of region id.
-
-    `count_unoccluded` counts the pixels of one thing alone, also outside the frame.
-    """
-    extents = measure_regions(region)
+    """Labels of the table and of every object in a mask [H, W], in order of region id."""
     names = {REGION_TABLE: ("table", plan.table.asset.instance_id)}
     names.update({start.region_id: (start.asset.category, start.asset.instance_id) for start in plan.objects})
+    things = [thing for thing in posed.things if thing.region_id in names]
+    return label_things(things, names, camera, region, count_unoccluded)
+
+
+def label_things(
+    things: Sequence[Placed],
+    names: Mapping[int, tuple[str, str]],
+    camera: Camera,
+    region: NDArray[np.uint8],
+    count_unoccluded: CountPixels,
+) -> tuple[ObjectLabel, ...]:
+    """Labels of things in a mask [H, W]; names: (category, instance id) by region id.
+
+    Unoccluded pixels are counted of the things that are seen, of all of them at once: so a GPU is waited for once.
+    """
+    extents = measure_regions(region)
+    seen = [thing for thing in things if extents[thing.region_id].pixels]
+    counts = dict(zip(map(id, seen), count_unoccluded(seen, camera), strict=True)) if seen else {}
     return tuple(
-        label_region(thing, names[thing.region_id], camera, extents[thing.region_id], count_unoccluded)
-        for thing in posed.things
-        if thing.region_id in names
+        label_region(thing, names[thing.region_id], camera, extents[thing.region_id], counts.get(id(thing), 0))
+        for thing in things
     )
 
 
-def label_region(
-    thing: Placed,
-    name: tuple[str, str],
-    camera: Camera,
-    extent: Extent,
-    count_unoccluded: Callable[[Placed, Camera], int],
-) -> ObjectLabel:
-    """The label of one thing in one view, `name` (category, instance id); unoccluded pixels are counted where any is seen."""
+def label_region(thing: Placed, name: tuple[str, str], camera: Camera, extent: Extent, unoccluded: int) -> ObjectLabel:
+    """The label of one thing in one view, `name` (category, instance id), which alone covers `unoccluded` pixels."""
     T_cam_obj = invert(camera.T_world_cam) @ thing.T_world_shape
     u, v = image_coordinates(T_cam_obj, camera.intrinsics)
     pixels = extent.pixels
-    unoccluded = count_unoccluded(thing, camera) if pixels else 1
     share = pixels / max(unoccluded, pixels, 1)
     return ObjectLabel(thing.region_id, *name, T_cam_obj, u, v, extent.bbox_xywh, pixels, share)

@@ -19,13 +19,11 @@ from schemas.scene.scene import Placed
 from schemas.scene.shape import Asset
 from schemas.scene.view import ObjectLabel, Pair, View
 from workers.cameras.placement import object_distance, place_mirror_camera
-from workers.geometry.pixels import measure_regions
 from workers.geometry.stored_depth import quantise_depth
 from workers.labels.board_regions import capture_regions
 from workers.labels.projected_view import derive_projected, projection_shares
-from workers.labels.regions import label_region
+from workers.labels.regions import CountPixels, label_things
 
-CountPixels = Callable[[Placed, Camera], int]
 Synthesize = Callable[[Camera], SynthesizedView]
 
 
@@ -101,9 +99,9 @@ def _labels(
     thing: CapturedObject, camera: Camera, region: NDArray[np.uint8], count: CountPixels
 ) -> tuple[ObjectLabel, ...]:
     """Labels of board and object in a mask."""
-    extents = measure_regions(region)
-    names = [(asset.category, asset.instance_id) for asset in (thing.board_asset, thing.asset)]
-    return tuple(
-        label_region(placed, name, camera, extents[placed.region_id], count)
-        for placed, name in zip(thing.things, names, strict=True)
-    )
+    assets = (thing.board_asset, thing.asset)
+    names = {
+        placed.region_id: (asset.category, asset.instance_id)
+        for placed, asset in zip(thing.things, assets, strict=True)
+    }
+    return label_things(thing.things, names, camera, region, count)

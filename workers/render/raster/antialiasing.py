@@ -27,6 +27,8 @@ OFFSETS_PX = tuple(
 SPAN_PX = 8.0
 """Greatest distance, along an edge, of the neighbours that an edge pixel is blended with."""
 
+Floats = NDArray[np.float32]
+
 LINEAR_STEPS = 16_383
 _LINEAR = np.rint(SRGB_STEPS * LINEAR_STEPS).astype(np.uint16)
 _SRGB = np.rint(255.0 * encode_srgb(np.arange(LINEAR_STEPS + 1) / LINEAR_STEPS)).astype(np.uint8)
@@ -77,49 +79,79 @@ def smooth_edges(rgb: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
     two farther the flatter the edge is, at most `SPAN_PX` away. The farther taps count only where their blend stays
     between the darkest and the brightest neighbour.
     """
-    _smooth_edges(rgb.copy(), mask, np.float32(SPAN_PX), rgb)
+    _smooth_edges(rgb, mask, np.float32(SPAN_PX))
 
 
 @compiled
-def _smooth_edges(seen: NDArray[np.uint8], mask: NDArray[np.uint8], span: np.float32, out: NDArray[np.uint8]) -> None:
-    height, width = mask.shape
-    half, quarter, one = np.float32(0.5), np.float32(0.25), np.float32(1.0)
+def _smooth_edges(rgb: NDArray[np.uint8], mask: NDArray[np.uint8], span: np.float32) -> None:
+    """Blends all edge pixels before it writes one, so that the image need not be copied."""
+    width = mask.shape[1]
+    edges = _flat_nonzero(mask.reshape(-1))
+    blended = np.empty((len(edges), 3), np.uint8)
     around = np.empty((3, 3), np.float32)
     near, far = np.empty(3, np.float32), np.empty(3, np.float32)
-    for y in range(height):
-        for x in range(width):
-            if mask[y, x] == 0:
-                continue
-            low, high = np.float32(255.0), np.float32(0.0)
-            for dy in range(3):
-                for dx in range(3):
-                    row, column = min(max(y + dy - 1, 0), height - 1), min(max(x + dx - 1, 0), width - 1)
-                    grey = _grey(seen[row, column, 0], seen[row, column, 1], seen[row, column, 2])
-                    around[dy, dx] = grey
-                    low, high = min(low, grey), max(high, grey)
-            # Binomial differences across the pixel: exactly 0 and 1 for the directions of level and upright edges.
-            two = np.float32(2.0)
-            across = (around[0, 2] + two * around[1, 2] + around[2, 2]) - (
-                around[0, 0] + two * around[1, 0] + around[2, 0]
-            )
-            down = (around[2, 0] + two * around[2, 1] + around[2, 2]) - (
-                around[0, 0] + two * around[0, 1] + around[0, 2]
-            )
-            along_x, along_y = down, -across
-            least = max(min(abs(along_x), abs(along_y)), one)
-            length = max(np.sqrt(along_x * along_x + along_y * along_y), one)
-            step_x = min(max(along_x / least, -span), span)
-            step_y = min(max(along_y / least, -span), span)
-            near[:], far[:] = np.float32(0.0), np.float32(0.0)
-            for sign in (-half, half):
-                _add_tap(seen, x + sign * along_x / length, y + sign * along_y / length, half, near)
-                _add_tap(seen, x + sign * step_x, y + sign * step_y, quarter, far)
-            for channel in range(3):
-                far[channel] += half * near[channel]
-            level = _grey(far[0], far[1], far[2])
-            for channel in range(3):
-                value = far[channel] if low <= level <= high else near[channel]
-                out[y, x, channel] = np.uint8(np.rint(value))
+    for n in range(len(edges)):
+        _blend_edge(rgb, edges[n] // width, edges[n] % width, span, around, near, far, blended[n])
+    pixels = rgb.reshape(-1, 3)
+    for n in range(len(edges)):
+        for channel in range(3):
+            pixels[edges[n], channel] = blended[n, channel]
+
+
+@compiled
+def _flat_nonzero(values: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """[N]: the indices of values [M] that are not 0; eight zeros are passed over at once."""
+    words = values[: len(values) // 8 * 8].view(np.uint64)
+    found, count = np.empty(len(values), np.int64), 0
+    for word in range(len(words) + 1):
+        if word < len(words) and words[word] == 0:
+            continue
+        for index in range(8 * word, min(8 * word + 8, len(values))):
+            if values[index]:
+                found[count] = index
+                count += 1
+    return found[:count]
+
+
+@compiled
+def _blend_edge(
+    seen: NDArray[np.uint8],
+    y: int,
+    x: int,
+    span: np.float32,
+    around: Floats,
+    near: Floats,
+    far: Floats,
+    out: NDArray[np.uint8],
+) -> None:
+    """The colour of one edge pixel into `out` [3]; around [3, 3], near [3] and far [3], float32, are overwritten."""
+    height, width = seen.shape[:2]
+    half, quarter, one, two = np.float32(0.5), np.float32(0.25), np.float32(1.0), np.float32(2.0)
+    low, high = np.float32(255.0), np.float32(0.0)
+    for dy in range(3):
+        for dx in range(3):
+            row, column = min(max(y + dy - 1, 0), height - 1), min(max(x + dx - 1, 0), width - 1)
+            grey = _grey(seen[row, column, 0], seen[row, column, 1], seen[row, column, 2])
+            around[dy, dx] = grey
+            low, high = min(low, grey), max(high, grey)
+    # Binomial differences across the pixel: exactly 0 and 1 for the directions of level and upright edges.
+    across = (around[0, 2] + two * around[1, 2] + around[2, 2]) - (around[0, 0] + two * around[1, 0] + around[2, 0])
+    down = (around[2, 0] + two * around[2, 1] + around[2, 2]) - (around[0, 0] + two * around[0, 1] + around[0, 2])
+    along_x, along_y = down, -across
+    least = max(min(abs(along_x), abs(along_y)), one)
+    length = max(np.sqrt(along_x * along_x + along_y * along_y), one)
+    step_x = min(max(along_x / least, -span), span)
+    step_y = min(max(along_y / least, -span), span)
+    near[:], far[:] = np.float32(0.0), np.float32(0.0)
+    for sign in (-half, half):
+        _add_tap(seen, x + sign * along_x / length, y + sign * along_y / length, half, near)
+        _add_tap(seen, x + sign * step_x, y + sign * step_y, quarter, far)
+    for channel in range(3):
+        far[channel] += half * near[channel]
+    level = _grey(far[0], far[1], far[2])
+    for channel in range(3):
+        value = far[channel] if low <= level <= high else near[channel]
+        out[channel] = np.uint8(np.rint(value))
 
 
 @compiled

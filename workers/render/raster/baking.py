@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from schemas.base import Array, Pose
 from schemas.scene.region import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.scene import Placed
+from workers.geometry.bounds import bounds_of
 from workers.geometry.frames import transform
 from workers.geometry.jit import compiled
 from workers.render.raster.occlusion import column_extents, sky_visibility
@@ -81,21 +82,30 @@ def light_box(vertices: Array, towards: Array) -> Box:
     x /= np.linalg.norm(x)
     T = np.eye(4)
     T[:3, :3] = np.stack([x, np.cross(z, x), z])
-    seen = transform(T, vertices)
-    margin = SCENE_MARGIN_M
-    return Box(T, np.stack([seen.min(axis=0) - margin, seen.max(axis=0) + margin]))
+    low, high = bounds_of(transform(T, vertices))
+    return Box(T, np.stack([low - SCENE_MARGIN_M, high + SCENE_MARGIN_M]))
 
 
 def level_box(vertices: Array, level_m: float, towards: Array, reach_m: float) -> Box:
     """A square on a level around vertices [N, 3] and their shadow, with a margin of `reach_m`; depth is elevation."""
-    on_level = vertices[:, :2]
+    low, high = bounds_of(vertices)
+    top = max(float(high[2]), level_m + 0.01)
+    low, high = low[:2], high[:2]
     if towards[2] > LOWEST_SINE:
-        shadow = vertices - np.maximum(vertices[:, 2:] - level_m, 0.0) / towards[2] * towards
-        on_level = np.concatenate([on_level, shadow[:, :2]])
-    low, high = on_level.min(axis=0), on_level.max(axis=0)
+        shadow_low, shadow_high = bounds_of(_fall_on_level(np.ascontiguousarray(vertices), level_m, towards))
+        low, high = np.minimum(low, shadow_low), np.maximum(high, shadow_high)
     centre, half = (low + high) / 2, float((high - low).max()) / 2 + reach_m
-    top = max(float(vertices[:, 2].max()), level_m + 0.01)
     return Box(np.eye(4), np.array([[*(centre - half), level_m], [*(centre + half), top]]))
+
+
+@compiled
+def _fall_on_level(vertices: Array, level_m: float, towards: Array) -> Array:
+    """[N, 2]: the shadows of vertices [N, 3] on a level, of vertices below it those vertices."""
+    shadows = np.empty((len(vertices), 2))
+    for n in range(len(vertices)):
+        along = max(vertices[n, 2] - level_m, 0.0) / towards[2]
+        shadows[n, 0], shadows[n, 1] = vertices[n, 0] - along * towards[0], vertices[n, 1] - along * towards[1]
+    return shadows
 
 
 def level_pixels(vertices: Array, faces: NDArray[np.int32], box: Box, hollow: bool) -> NDArray[np.uint8]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.base import Array
 from schemas.scene.shape import Mesh, Part, Shape
 from workers.geometry.convexity import face_planes
 from workers.geometry.jit import compiled
@@ -106,32 +107,58 @@ def _pack(parts: list[Part], highest_m: float) -> Batch:
     packed, indices, start = [], [], 0
     for part in parts:
         faces, source = own_vertices(part.faces, len(part.vertices))
-        vertices = _vertex_columns(part)[source]
+        vertices = _vertex_columns(part, source)
         vertices[faces[:, 2], -4:] = np.column_stack(face_planes(Mesh(part.vertices, part.faces)))
         packed.append(vertices)
         indices.append(faces + start)
         start += len(vertices)
     matte = all(p.material.metallic == 0.0 and p.material.roughness >= MATTE_ROUGHNESS for p in parts)
-    vertices, corners = np.concatenate(packed), np.concatenate(indices).astype(np.uint32)
-    upwards = vertices[corners[:, 2], _PLANE_Z] > 0.0
-    top = upwards & (vertices[corners, 2] > highest_m - SAME_LEVEL_M).all(axis=1)
-    corners = corners[np.argsort(~top, kind="stable")]
-    return Batch(vertices, corners, texture_of(parts[0]), matte, int(np.count_nonzero(top)))
+    vertices = np.concatenate(packed)
+    corners, top_faces = _tops_first(vertices, np.concatenate(indices), np.float32(highest_m - SAME_LEVEL_M), _PLANE_Z)
+    return Batch(vertices, corners, texture_of(parts[0]), matte, top_faces)
 
 
-def _vertex_columns(part: Part) -> NDArray[np.float32]:
-    """[V, 17] float32 in the columns of `COLUMNS`; missing attributes, and the plane, are 0."""
+@compiled
+def _tops_first(
+    vertices: NDArray[np.float32], faces: NDArray[np.int64], lowest_m: np.float32, plane_z: int
+) -> tuple[NDArray[np.uint32], int]:
+    """(faces [F, 3], those that face up and lie above `lowest_m` before the others; the number of them)."""
+    top = np.zeros(len(faces), np.bool_)
+    for face in range(len(faces)):
+        top[face] = vertices[faces[face, 2], plane_z] > np.float32(0.0)
+        for corner in range(3):
+            top[face] &= vertices[faces[face, corner], 2] > lowest_m
+    count = int(np.count_nonzero(top))
+    ordered, first, other = np.empty((len(faces), 3), np.uint32), 0, count
+    for face in range(len(faces)):
+        row = first if top[face] else other
+        for corner in range(3):
+            ordered[row, corner] = faces[face, corner]
+        first, other = first + top[face], other + (not top[face])
+    return ordered, count
+
+
+def _vertex_columns(part: Part, source: NDArray[np.int64]) -> NDArray[np.float32]:
+    """[V', 17] float32 in the columns of `COLUMNS`, of the vertices `source` [V']; missing attributes, and the plane, are 0."""
     material = part.material
     albedo = decode_srgb(np.array(material.base_color[:3]))
-    if part.colors is not None:
-        albedo = albedo * SRGB_STEPS[part.colors[:, :3]]
-    columns = np.zeros((len(part.vertices), sum(COLUMNS.values())), np.float32)
-    columns[:, 0:3] = part.vertices
+    row = np.zeros(sum(COLUMNS.values()), np.float32)
+    row[6], row[7:10], row[10] = material.metallic, albedo, material.roughness
+    columns = np.empty((len(source), len(row)), np.float32)
+    columns[:] = row
+    _gather_rows(np.ascontiguousarray(part.vertices), source, columns[:, 0:3])
     if part.normals is not None:
-        columns[:, 3:6] = part.normals
-    columns[:, 6] = material.metallic
-    columns[:, 7:10] = albedo
-    columns[:, 10] = material.roughness
+        _gather_rows(np.ascontiguousarray(part.normals), source, columns[:, 3:6])
+    if part.colors is not None:
+        _gather_rows(albedo * SRGB_STEPS[part.colors[:, :3]], source, columns[:, 7:10])
     if part.uv is not None:
-        columns[:, 11:13] = part.uv
+        _gather_rows(np.ascontiguousarray(part.uv), source, columns[:, 11:13])
     return columns
+
+
+@compiled
+def _gather_rows(values: Array, source: NDArray[np.int64], rows: NDArray[np.float32]) -> None:
+    """Writes values [V, C] at `source` [N] into rows [N, C]."""
+    for n in range(len(source)):
+        for column in range(values.shape[1]):
+            rows[n, column] = values[source[n], column]

@@ -14,6 +14,7 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.scene.shape import Shape
+from workers.geometry.bounds import bounds_of
 from workers.render.raster.batches import COLUMNS, Batch, pack_shape
 from workers.render.raster.textures import Texture, TextureStore
 
@@ -93,7 +94,7 @@ class ShapeStore:
         if id(shape) in self._stored:  # of a shape that is gone, whose id this one has
             self._free(id(shape))
         batches = tuple(_upload(self._gl, batch, self.textures) for batch in pack_shape(shape))
-        corners = np.array(list(product(*shape.bounds.T)))
+        corners = np.array(list(product(*bounds_of(shape.vertices).T)))
         uploaded = UploadedShape(batches, corners, shape.closed)
         self._stored[id(shape)] = (ref(shape), uploaded)
         self._bytes += uploaded.bytes

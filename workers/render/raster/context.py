@@ -6,6 +6,7 @@ from types import ModuleType
 from typing import Any, Literal
 
 from schemas.errors import MachineError
+from workers.render.raster.direct_calls import DirectCalls
 
 REMEDY = (
     "rendering needs OpenGL 4.1 through EGL. On Debian or Ubuntu: "
@@ -36,7 +37,7 @@ def require_device(name: str, device: Literal["any", "gpu"]) -> None:
 
 
 def open_context() -> tuple[ModuleType, Any]:
-    """(the module OpenGL.GL, pyrender's `EGLPlatform`); a core context of OpenGL 4.1 or later is current afterwards.
+    """(the functions of OpenGL.GL, pyrender's `EGLPlatform`); a core context of OpenGL 4.1 or later is current afterwards.
 
     Raises MachineError, with the packages to install, where this machine has no EGL, no OpenGL or too old a one.
     """
@@ -51,4 +52,4 @@ def open_context() -> tuple[ModuleType, Any]:
         # pyrender takes the first of EGL's devices.
         found = "EGL has no device" if isinstance(error, IndexError) else f"{type(error).__name__}: {error}"
         raise MachineError(f"no OpenGL context could be opened ({found}): {REMEDY}") from error
-    return gl, platform
+    return DirectCalls(gl), platform

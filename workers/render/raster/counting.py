@@ -20,17 +20,18 @@ class PixelCounter:
     """A stencil that lets each pixel pass once, and a query that counts what passes.
 
     Each count has a number of its own, which pixels take when they pass: so the stencil is cleared once in 255 counts.
+    Each has a query of its own too: a driver draws what several of them count at once, when the first is finished.
     """
 
     def __init__(self, gl: ModuleType) -> None:
         self._gl = gl
         self.program = Program(gl, COUNT_VERTEX, EMPTY_FRAGMENT)
-        self._query = int(np.ravel(gl.glGenQueries(1))[0])
+        self._unused: list[int] = []
         self._framebuffer = Framebuffer(gl, {gl.GL_STENCIL_ATTACHMENT: gl.GL_STENCIL_INDEX8})
         self._number = LAST_NUMBER
 
-    def count(self, shape: UploadedShape, tile: Intrinsics) -> int:
-        """Pixels of a tile, of at most `TILE_PX` a side, that the shape covers; `program` must hold its pose."""
+    def start(self, shape: UploadedShape, tile: Intrinsics) -> int:
+        """The query of how many pixels of a tile, of at most `TILE_PX` a side, a shape covers; `program` holds its pose."""
         gl = self._gl
         self._framebuffer.bind(TILE_PX, TILE_PX)
         gl.glViewport(0, 0, tile.width, tile.height)
@@ -43,10 +44,16 @@ class PixelCounter:
         gl.glStencilFunc(gl.GL_NOTEQUAL, self._number, 0xFF)
         gl.glStencilOp(gl.GL_KEEP, gl.GL_REPLACE, gl.GL_REPLACE)
         self.program.set_view(tile)
-        gl.glBeginQuery(gl.GL_SAMPLES_PASSED, self._query)
+        query = self._unused.pop() if self._unused else int(np.ravel(gl.glGenQueries(1))[0])
+        gl.glBeginQuery(gl.GL_SAMPLES_PASSED, query)
         for batch in shape.batches:
             gl.glBindVertexArray(batch.vertex_array)
             gl.glDrawElements(gl.GL_TRIANGLES, batch.index_count, gl.GL_UNSIGNED_INT, None)
         gl.glEndQuery(gl.GL_SAMPLES_PASSED)
         gl.glDisable(gl.GL_STENCIL_TEST)
-        return int(np.ravel(gl.glGetQueryObjectuiv(self._query, gl.GL_QUERY_RESULT))[0])
+        return query
+
+    def finish(self, query: int) -> int:
+        """The number of pixels of a query that was started."""
+        self._unused.append(query)
+        return int(np.ravel(self._gl.glGetQueryObjectuiv(query, self._gl.GL_QUERY_RESULT))[0])

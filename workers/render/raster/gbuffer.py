@@ -44,7 +44,7 @@ from workers.render.raster.counting import PixelCounter
 from workers.render.raster.draw_calls import Draw, RenderPass, is_drawn, rank_regions, sort_draws
 from workers.render.raster.framebuffer import ColourTarget, Framebuffer
 from workers.render.raster.light_maps import LightMaps
-from workers.render.raster.programs import NEAR_M, Program
+from workers.render.raster.programs import NEAR_M, Program, place_lights
 from workers.render.raster.shaders import Variant, label_sources
 from workers.render.raster.tiles import tiles
 
@@ -87,6 +87,7 @@ class Renderer:
         colors = {gl.GL_COLOR_ATTACHMENT0: gl.GL_RGBA8, gl.GL_COLOR_ATTACHMENT1: gl.GL_R32F}
         self._target = Framebuffer(gl, {**colors, gl.GL_DEPTH_ATTACHMENT: gl.GL_DEPTH_COMPONENT32F})
         self._programs: dict[Variant, Program] = {}
+        self._ranked: tuple[Sequence[Placed], dict[int, int]] = (), {}
         self._light_maps = LightMaps(gl, self._shapes)
         self._colour_target = ColourTarget(gl)
         self._rgba = np.empty((0, 0, 4), np.uint8)
@@ -141,32 +142,37 @@ class Renderer:
         shadows, occlusion = (not lit or effects.runs(name) for name in ("shadows", "ambient_occlusion"))
         self._light_maps.prepare(things if effects.runs("light_maps") else (), appearance, shadows, occlusion)
 
-    def count_pixels(self, thing: Placed, camera: Camera) -> int:
-        """Pixels that a thing covers by itself, also outside the image, with nothing in front of it.
+    def count_pixels(self, things: Sequence[Placed], camera: Camera) -> list[int]:
+        """Pixels that each thing covers by itself, also outside the image, with nothing in front of it.
 
         The pixel grid is the image's, continued on all sides by one width and one height of the image; pixels beyond that,
         as of a thing that reaches behind the camera, are not counted.
         """
         self._platform.make_current()
-        T_cam_shape = invert(camera.T_world_cam) @ thing.T_world_shape
+        T_cam_world = invert(camera.T_world_cam)
         self._counter.program.use()
-        self._counter.program.set_thing(T_cam_shape, 0, 0.0, 0.0)
-        shape = self._shapes.fetch(thing.shape)
-        self._cull(shape, T_cam_shape)
-        count = sum(self._counter.count(shape, tile) for tile in tiles(thing.shape, T_cam_shape, camera.intrinsics))
+        started = []
+        for thing in things:
+            T_cam_shape = T_cam_world @ thing.T_world_shape
+            self._counter.program.set_thing(T_cam_shape, 0, 0.0, 0.0)
+            shape = self._shapes.fetch(thing.shape)
+            self._cull(shape, T_cam_shape)
+            views = tiles(thing.shape, T_cam_shape, camera.intrinsics)
+            started.append([self._counter.start(shape, tile) for tile in views])
         self._gl.glDisable(self._gl.GL_CULL_FACE)
+        counts = [sum(map(self._counter.finish, queries)) for queries in started]
         self._shapes.trim(max(1, self._scene_size))
-        return count
+        return counts
 
     def _draw_things(self, things: Sequence[Placed], view: RenderPass) -> None:
         """Draw into the bound framebuffer."""
-        ranks = rank_regions(things, [self._shapes.fetch(thing.shape).corners for thing in things])
+        ranks, lights = self._rank(things), place_lights(view.appearance, view.T_cam_world) if view.color else None
         for variant, draws in sort_draws(things, self._shapes.fetch, view, self._light_maps.has_level_top).items():
             program = self._program(variant)
             program.use()
             program.set_view(view.k)
-            if view.color:
-                program.set_light(view.appearance, view.T_cam_world)
+            if lights is not None:
+                program.set_light(lights)
             if view.raster:
                 program.set_ambience(view.appearance, view.T_cam_world)
             for draw in draws:
@@ -179,6 +185,16 @@ class Renderer:
                 self._cull(draw.shape, T_cam_shape, through_holes=not view.labels)
                 self._draw(draw, variant.textured)
         self._gl.glDisable(self._gl.GL_CULL_FACE)
+
+    def _rank(self, things: Sequence[Placed]) -> dict[int, int]:
+        """The ranks of `rank_regions`, found once for the views of one scene."""
+        shapes = [self._shapes.fetch(thing.shape) for thing in things]  # all of them, as in use
+        if things is not self._ranked[0]:
+            ranks = rank_regions(things, [shape.corners for shape in shapes])
+            if not isinstance(things, tuple):  # may hold other things the next time
+                return ranks
+            self._ranked = things, ranks
+        return self._ranked[1]
 
     def _refine(
         self,

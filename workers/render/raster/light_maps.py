@@ -75,7 +75,7 @@ class LightMaps:
         stand, T = self._baked.stand, thing.T_world_shape
         if stand is None or T[2, 2] < UPRIGHT:
             return False
-        top = T[2, 3] + float(max(part.vertices[:, 2].max() for part in thing.shape.parts))
+        top = T[2, 3] + float(self._shapes.fetch(thing.shape).corners[:, 2].max())
         return abs(top - float(stand.bounds[0, 2])) < SAME_LEVEL_M
 
     def bind(self, program: Program, thing: Placed) -> None:
@@ -96,8 +96,11 @@ class LightMaps:
         casters, objects = baking.shadow_casters(things), baking.objects_of(things)
         if not casters or not appearance.lights or not (shadows or occlusion):
             return Baked()
-        towards, triangles = appearance.lights[0].direction, baking.triangles_of(casters)
-        light = baking.light_box(triangles[0], towards) if shadows else None
+        towards = appearance.lights[0].direction
+        below = [thing for thing in casters if thing not in objects]
+        lower, upper = baking.triangles_of(below or objects), baking.triangles_of(objects) if objects else None
+        vertices = lower[0] if upper is None else np.concatenate([lower[0], upper[0]])
+        light = baking.light_box(vertices, towards) if shadows else None
         depth = None if light is None else self._cast(casters, light.clip_from_world)
 
         def bake_level(texture: int, above: baking.Triangles, level: Box, hollow: bool) -> None:
@@ -108,12 +111,10 @@ class LightMaps:
                 pixels[..., 3] = baking.level_shadow(depth, light, level, towards)
             self._upload(texture, pixels)
 
-        floor = baking.level_box(triangles[0], 0.0, towards, baking.FLOOR_REACH_M)
-        below = [thing for thing in casters if thing not in objects] or casters
-        bake_level(self._floor, baking.triangles_of(below), floor, True)
-        if not objects:
+        floor = baking.level_box(vertices, 0.0, towards, baking.FLOOR_REACH_M)
+        bake_level(self._floor, lower, floor, True)
+        if upper is None:
             return Baked(light, floor)
-        upper = baking.triangles_of(objects)
         stand = baking.level_box(upper[0], float(upper[0][:, 2].min()), towards, baking.STAND_REACH_M)
         bake_level(self._stand, upper, stand, False)
         return Baked(light, floor, stand)

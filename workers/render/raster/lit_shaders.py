@@ -83,8 +83,8 @@ float key_share(float on_map, float facing) {
 
 // Tone curve: linear below the knee, approaching 1 above it.
 vec3 tone_map(vec3 c) {
-    vec3 over = max(c - KNEE, 0.0) / (1.0 - KNEE);
-    return min(c, KNEE) + (1.0 - KNEE) * over / (1.0 + over);
+    vec3 over = max(c - KNEE, 0.0);
+    return min(c, KNEE) + (1.0 - KNEE) * over / ((1.0 - KNEE) + over);
 }
 
 // Lambert, GGX's lobe as in the flat tier with Schlick's Fresnel, and a sky over a ground (hemispherical ambient).

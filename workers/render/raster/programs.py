@@ -31,6 +31,14 @@ class MapPlacement(NamedTuple):
     softness: tuple[float, float, float]
 
 
+class PlacedLights(NamedTuple):
+    """The ambient light [3], and distant lights in a camera's frame, each [N, 3] float32; unused slots are dark."""
+
+    ambient: tuple[float, ...]
+    towards: NDArray[np.float32]
+    color: NDArray[np.float32]
+
+
 class Program:
     """A linked program; raises RuntimeError, with the compiler's log, where the driver refuses it."""
 
@@ -51,15 +59,12 @@ class Program:
         self._gl.glUniformMatrix4fv(self._location("clip_from_cam"), 1, True, matrix)
         self._gl.glUniform4f(self._location("view"), k.cx, k.cy, 1.0 / k.fx, 1.0 / k.fy)
 
-    def set_light(self, appearance: Appearance, T_cam_world: Pose) -> None:
-        """Set the ambient and the distant lights, in the camera's frame; unused slots are dark."""
-        gl, count = self._gl, light_slots(appearance)
-        towards, color = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
-        for i, light in enumerate(appearance.lights):
-            towards[i], color[i] = T_cam_world[:3, :3] @ light.direction, light.color
-        gl.glUniform3f(self._location("ambient"), *appearance.ambient)
-        gl.glUniform3fv(self._location("light_towards"), count, towards)
-        gl.glUniform3fv(self._location("light_color"), count, color)
+    def set_light(self, lights: PlacedLights) -> None:
+        """Set the ambient and the distant lights."""
+        gl, count = self._gl, len(lights.towards)
+        gl.glUniform3f(self._location("ambient"), *lights.ambient)
+        gl.glUniform3fv(self._location("light_towards"), count, lights.towards)
+        gl.glUniform3fv(self._location("light_color"), count, lights.color)
 
     def set_ambience(self, appearance: Appearance, T_cam_world: Pose) -> None:
         """Set, for tier raster, the world's up, the light from below, and the units of the light maps."""
@@ -95,6 +100,15 @@ class Program:
     def _location(self, name: str) -> int:
         """A uniform's location; -1, which OpenGL ignores, where the compiler removed it."""
         return self._locations.get(name, -1)
+
+
+def place_lights(appearance: Appearance, T_cam_world: Pose) -> PlacedLights:
+    """The lights of a scene as a camera sees them. Raises ValueError above `MAX_LIGHTS`."""
+    count = light_slots(appearance)
+    towards, color = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
+    for i, light in enumerate(appearance.lights):
+        towards[i], color[i] = T_cam_world[:3, :3] @ light.direction, light.color
+    return PlacedLights(appearance.ambient, towards, color)
 
 
 def light_slots(appearance: Appearance) -> int:

@@ -164,10 +164,12 @@ vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float rou
 
 // The curve is within 0.1 of a step of 8 bits of 1.055 c^(1 / 2.4) - 0.055, and square roots cost a third of powers.
 vec3 encode_srgb(vec3 c) {
+#if !RASTER                        // whose tone curve ends at 1
     c = clamp(c, 0.0, 1.0);
+#endif
     vec3 root = sqrt(c);
     vec3 curve = 0.83375144 * root + 0.29810974 * sqrt(root) - 0.05531654 * c - 0.07690398;
-    return mix(12.92 * c, curve, step(0.0031308, c));
+    return mix(12.92 * c, curve, greaterThanEqual(c, vec3(0.0031308)));
 }
 
 void main() {

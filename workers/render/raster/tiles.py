@@ -9,8 +9,8 @@ import numpy as np
 from schemas.base import Array, Pose
 from schemas.scene.camera import Intrinsics
 from schemas.scene.shape import Shape
-from workers.geometry.camera import project
 from workers.geometry.frames import transform
+from workers.geometry.jit import compiled
 from workers.render.raster.programs import NEAR_M
 
 TILE_PX = 1024
@@ -36,12 +36,25 @@ def window(vertices: Array, k: Intrinsics) -> tuple[int, int, int, int]:
     behind it gets nothing.
     """
     reach = (-k.width, -k.height, 2 * k.width, 2 * k.height)
-    seen = vertices[:, 2] > NEAR_M
-    if not seen.any():
+    seen, *bounds = _projected_bounds(np.ascontiguousarray(vertices), (k.fx, k.fy, k.cx, k.cy), NEAR_M)
+    if not seen:
         return (0, 0, 0, 0)
-    if not seen.all():
+    if seen < len(vertices):
         return reach
-    u, v = project(vertices, k)
-    low = (math.floor(np.clip(u.min(), reach[0], reach[2])), math.floor(np.clip(v.min(), reach[1], reach[3])))
-    high = (math.ceil(np.clip(u.max(), reach[0], reach[2])), math.ceil(np.clip(v.max(), reach[1], reach[3])))
-    return (*low, *high)
+    left, top, right, bottom = (min(max(bounds[n], reach[n % 2]), reach[n % 2 + 2]) for n in range(4))
+    return (math.floor(left), math.floor(top), math.ceil(right), math.ceil(bottom))
+
+
+@compiled
+def _projected_bounds(
+    vertices: Array, k: tuple[float, float, float, float], near_m: float
+) -> tuple[int, float, float, float, float]:
+    """(number of vertices [V, 3] beyond the near plane, their left, top, right and bottom in pixels)."""
+    seen, left, top, right, bottom = 0, np.inf, np.inf, -np.inf, -np.inf
+    for n in range(len(vertices)):
+        z = vertices[n, 2]
+        if z > near_m:
+            u, v = k[0] * vertices[n, 0] / z + k[2], k[1] * vertices[n, 1] / z + k[3]
+            left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+            seen += 1
+    return seen, left, top, right, bottom

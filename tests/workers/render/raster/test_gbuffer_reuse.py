@@ -35,7 +35,7 @@ def test_drawing_again_gives_the_same_bytes(renderer):
     for seed in range(30):
         others, _ = random_things(np.random.default_rng(100 + seed))
         renderer.draw(others, APPEARANCE, camera(small(100 + seed, 50), view.T_world_cam))
-        renderer.count_pixels(others[-1], view)
+        renderer.count_pixels([others[-1]], view)
     again = renderer.draw(things, APPEARANCE, view)
     for name in ("rgb", "depth_m", "region"):
         assert getattr(first, name).tobytes() == getattr(again, name).tobytes(), name
@@ -72,7 +72,7 @@ def test_the_shapes_of_a_scene_stay_on_the_gpu_between_its_views_however_many(re
     things = [Placed(k, shape, translation(0.3 * k - 3.0, 0, 6)) for k, shape in enumerate(shapes, start=1)]
     renderer.draw(things, APPEARANCE, camera())
     for thing in things:
-        renderer.count_pixels(thing, camera())
+        renderer.count_pixels([thing], camera())
     assert all(shape in renderer._shapes for shape in shapes)
     del things[1:], shapes, thing
     renderer.draw(things, APPEARANCE, camera())
@@ -89,7 +89,7 @@ def test_memory_stays_flat_over_scenes_with_new_meshes(renderer, record_figure):
         textured = Part("p", part.vertices, part.faces, Material(texture=texture.copy()), uv=part.vertices[:, :2])
         things = [Placed(3, shape_of(mesh), translation(0, 0, 1)), Placed(2, Shape((textured,)), EYE)]
         renderer.draw(things, APPEARANCE, view)
-        renderer.count_pixels(things[0], view)
+        renderer.count_pixels([things[0]], view)
         if n % 100 == 99:
             resident.append(resident_mib())
     growth = resident[2] - resident[1]
