@@ -111,10 +111,10 @@ def once(shared: Path, name: str, make: Callable[[Path], str]) -> str:
         return kept.read_text()
 
 
-def wait_for(condition: Callable[[], bool], seconds: float, what: str) -> float:
-    """Seconds until the condition held; fails after `seconds`."""
+def wait_for(condition: Callable[[], bool], seconds: float, what: str, every_s: float = 0.3) -> float:
+    """Seconds until the condition held, looked at again after `every_s`; fails after `seconds`."""
     begun = time.monotonic()
     while not condition():
         assert time.monotonic() - begun < seconds, f"{what}: not within {seconds:.0f} s"
-        time.sleep(0.3)
+        time.sleep(every_s)
     return time.monotonic() - begun
