@@ -1,5 +1,6 @@
 """A supervised command, with plain Python in place of Ray: every end is told, and nothing is left behind."""
 
+import contextlib
 import json
 import os
 import signal
@@ -34,6 +35,13 @@ def start(body: str) -> subprocess.Popen[str]:
 def spawn(code: str, *arguments: str) -> subprocess.Popen[str]:
     pipe = subprocess.PIPE
     return subprocess.Popen([sys.executable, "-c", code, *arguments], cwd=ROOT, stdout=pipe, stderr=pipe, text=True)
+
+
+def kill_each(pids: list[int], numbers: tuple[int, ...]) -> None:
+    """SIGKILL to those of the numbers; one may have ended already, because another was killed."""
+    for number in numbers:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pids[number], signal.SIGKILL)
 
 
 def end(run: subprocess.Popen[str]) -> tuple[int, str, str]:
@@ -114,8 +122,7 @@ def test_whichever_processes_are_killed_nothing_goes_on(killed):
     run.stdout.readline()
     below = descendants(run.pid)
     pids = chain_of(run.pid)
-    for number in killed:
-        os.kill(pids[number], signal.SIGKILL)
+    kill_each(pids, killed)
     code, _, wrong = end(run)
     deadline = time.monotonic() + 15
     while left := [process.name for process in below if Path(f"/proc/{process.pid}").exists()]:
@@ -133,8 +140,7 @@ def test_its_temporary_folder_goes_whichever_processes_are_killed(tmp_path, kill
     assert run.stdout is not None
     run.stdout.readline()
     pids = chain_of(run.pid)
-    for number in killed:
-        os.kill(pids[number], signal.SIGKILL)
+    kill_each(pids, killed)
     end(run)
     deadline = time.monotonic() + 15
     while folder.exists():
