@@ -85,7 +85,7 @@ def test_three_workers_make_the_same_bytes_also_where_one_is_told_to_leave(clust
     with ThreadPoolExecutor() as beside:
         job = beside.submit(cluster, "run", "--rm", "job", "run", JOB, "--out", "data/three", *SMALL_RANGES, "--json")
         # Workers need not be at work at the same moment: one may have ended its range before another begins.
-        wait_for(lambda: set(names.values()) <= _begun(out) | _hosts(out), 90, "a range of each worker", every_s=0.02)
+        wait_for(lambda: set(names.values()) <= _begun(out) | _hosts(out), 240, "a range of each worker", every_s=0.02)
         begun = time.monotonic()
         must(docker("stop", "--time", "60", cluster.container("worker", 3)))
         assert time.monotonic() - begun < 30
@@ -178,7 +178,7 @@ def test_a_worker_that_is_killed_costs_no_byte(cluster, expected_digest):
     with ThreadPoolExecutor() as beside:
         job = beside.submit(cluster, "run", "--rm", "job", "run", JOB, "--out", "data/killed", *SMALL_RANGES, "--json")
         name = _name_of(second)
-        wait_for(lambda: name in _begun(out), 60, "a range of worker 2", every_s=0.02)  # a range takes 0.3 s
+        wait_for(lambda: name in _begun(out), 240, "a range of worker 2", every_s=0.02)  # a range takes 0.3 s
         must(docker("kill", "--signal", "KILL", second))
         answer = must(job.result())
     assert digest_in(answer) == expected_digest
