@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.scene.shape import Mesh
 from workers.geometry.contact_kernels import SLOPE, Index, cross
-from workers.geometry.convexity import numbers_in, weld
+from workers.geometry.convexity import face_normals, numbers_in, weld
 from workers.geometry.jit import compiled
 
 FLAT = 1e-9
@@ -39,10 +39,9 @@ def surface_of(mesh: Mesh, closed: bool) -> Surface:
     """The features of a mesh, or of a part of one that is `closed`, whichever way its faces are wound."""
     mesh = weld(mesh)
     vertices, faces = np.ascontiguousarray(mesh.vertices, dtype=np.float64), mesh.faces.astype(np.int64)
-    normals = _across(vertices, faces)
-    doubled = np.sqrt((normals * normals).sum(axis=1))
-    solid = doubled > 0.0
-    faces, normals = faces[solid], normals[solid] / doubled[solid, None]
+    normals = face_normals(vertices, faces)
+    solid = normals.any(axis=1)
+    faces, normals = faces[solid], normals[solid]
     starts, members = _star(faces, len(vertices))
     edges, across = _bent_edges(vertices, faces, normals)
     side = _sides(vertices, faces, normals, starts, members) if closed else np.zeros(len(faces), dtype=np.int64)
@@ -80,16 +79,6 @@ def _near_box(vertices: Array, faces: NDArray[np.integer], low: Array, high: Arr
                 for k in range(3):
                     least[k], most[k] = min(least[k], a[k], b[k], c[k]), max(most[k], a[k], b[k], c[k])
     return near
-
-
-@compiled
-def _across(vertices: Array, faces: Index) -> Array:
-    """[F, 3]: twice the area of each face along its normal."""
-    across = np.empty((len(faces), 3))
-    for f in range(len(faces)):
-        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-        cross(b - a, c - a, across[f])
-    return across
 
 
 @compiled

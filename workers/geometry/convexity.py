@@ -97,12 +97,13 @@ def triangle_corners(mesh: Mesh) -> tuple[Array, Array, Array]:
 
 def face_planes(mesh: Mesh) -> tuple[Array, Array]:
     """(normals [F, 3], offsets [F]): unit normal n of each face, 0 where it has no area, and n . p of its points p."""
-    normals = _face_normals(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces))
+    normals = face_normals(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces))
     return normals, np.einsum("ij,ij->i", normals, mesh.vertices[mesh.faces[:, 0]])
 
 
 @compiled
-def _face_normals(vertices: Array, faces: NDArray[np.integer]) -> Array:
+def face_normals(vertices: Array, faces: NDArray[np.integer]) -> Array:
+    """[F, 3]: unit normals of faces [F, 3] with contiguous vertices [V, 3]; zeros of a face without an area."""
     normals = np.zeros((len(faces), 3))
     for face in range(len(faces)):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
