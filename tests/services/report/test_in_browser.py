@@ -63,8 +63,10 @@ def picture(tab, where: str, folder: Path) -> np.ndarray:
 
 
 def draw_space(tab) -> None:
-    tab.run("document.getElementById('space-canvas').scrollIntoView({block: 'center', behavior: 'instant'})")
-    tab.until("Number(document.getElementById('space-canvas').dataset.drawn) > 0")
+    """Scrolls to the view in space until it is drawn; again and again, for the live page may load itself anew."""
+    canvas = "document.getElementById('space-canvas')"
+    scrolled = f"{canvas}?.scrollIntoView({{block: 'center', behavior: 'instant'}})"
+    tab.until(f"({scrolled}, Number({canvas}?.dataset.drawn) > 0)")
 
 
 def test_the_console_is_silent_and_nothing_is_fetched(opened):
