@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -12,7 +11,6 @@ from schemas.scene.region import REGION_TABLE
 from schemas.scene.scene import ContactForce
 from schemas.scene.shape import Mesh
 from workers.geometry.contact_surface import crop, is_closed
-from workers.geometry.elevation import Terrain, prepare_terrain
 from workers.geometry.frames import transform
 from workers.physics.bullet import GRAVITY_M_S2
 from workers.physics.rest.contacts import Contacts, find_contacts, find_near_features
@@ -34,14 +32,9 @@ its gap is measured up to `FARTHEST_M`."""
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """A table, with its mesh prepared for queries of its height."""
+    """What objects fall on."""
 
     table: Table
-
-    @cached_property
-    def terrain(self) -> Terrain:
-        """The mesh, prepared."""
-        return prepare_terrain(self.table.mesh)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from shapely.geometry import MultiPoint, Point
 
 from schemas.base import Array, Pose
 from schemas.scene.shape import Hull, Mesh
-from workers.geometry.elevation import Terrain, sample_elevation
+from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import pose, rotation_between, transform
 
 SAME_PLANE_M = 1e-6
@@ -88,7 +88,7 @@ def support_margin(contacts_xy: Array, com_xy: Array) -> float:
     return -float(outline.distance(at))
 
 
-def find_contacts_xy(hull: Hull, T_world_obj: Pose, support: Mesh | Terrain) -> Array:
+def find_contacts_xy(hull: Hull, T_world_obj: Pose, support: Mesh) -> Array:
     """[N, 2] float64, world: the vertices of the hull within `CONTACT_M` of the mesh below them."""
     points = transform(T_world_obj, hull.vertices)
     points = points[points[:, 2] <= points[:, 2].min() + NEAR_LOWEST_M]

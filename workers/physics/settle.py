@@ -189,7 +189,7 @@ def _stand(drop: Drop, outcome: Outcome, seconds: float) -> _Ending | None:
     T = snap_to_face(outcome.poses[0], start.hull, start.asset.mass.com)
     if T is None:
         return None
-    T = translation(0.0, 0.0, -vertical_gap(placed_mesh(start, T), drop.ground.terrain)) @ T
+    T = translation(0.0, 0.0, -vertical_gap(placed_mesh(start, T), table.mesh)) @ T
     return _Ending(drop, place_on_top(start, T, table, drop.physics.friction**2), (T,), seconds, outcome.speed_m_s)
 
 

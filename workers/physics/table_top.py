@@ -11,6 +11,7 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.errors import StartError
 from schemas.scene.plan import Table, TableTop
 from schemas.scene.shape import Asset, Mesh, Shape
+from workers.geometry.bounds import bounds_of
 from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import transform, translation
 from workers.geometry.jit import compiled
@@ -122,11 +123,11 @@ def _least_distances(points: Array, outline: Array) -> Array:
 
 def support_height(points_xy: Array, table: Mesh) -> float:
     """Height of the table's highest point below, or within the bounding box of, points [N, 2]; -inf off the table."""
-    heights = sample_elevation(points_xy, table)
-    low, high = points_xy.min(axis=0), points_xy.max(axis=0)
-    inside = ((table.vertices[:, :2] >= low) & (table.vertices[:, :2] <= high)).all(axis=1)
-    candidates = np.concatenate([heights[np.isfinite(heights)], table.vertices[inside, 2]])
-    return float(candidates.max()) if len(candidates) else -np.inf
+    (left, front), (right, back) = bounds_of(points_xy)
+    x, y, z = table.vertices.T
+    inside = (x >= left) & (x <= right) & (y >= front) & (y <= back)
+    highest = np.fmax.reduce(sample_elevation(points_xy, table), initial=-np.inf)
+    return float(np.max(z[inside], initial=highest))
 
 
 def split_by_side(mesh: Mesh) -> tuple[Mesh, ...]:
