@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.scene.shape import Material
+from workers.assets.builtin.textures import Plane, Texture, stretched
 
 TEXTURE_PX = 512
 PERIOD_M = (2.6, 4.2)
 """After how many metres a pattern repeats: more than a camera of the default orbit sees of the floor nearby."""
 
-Texture: TypeAlias = NDArray[np.uint8]
-Plane: TypeAlias = NDArray[np.float32]
 Color: TypeAlias = tuple[float, float, float]
 
 _SEED = 48_271
@@ -150,13 +149,4 @@ def _cells(count: int) -> tuple[NDArray[np.int64], Plane]:
 def _noise(rng: np.random.Generator, across: int, down: int, size: float) -> Plane:
     """[N, N] repeating value noise of about +- size, smooth on a lattice of across x down cells (powers of 2)."""
     lattice = (rng.random((across, down), dtype=np.float32) * np.float32(2.0) - np.float32(1.0)) * np.float32(size)
-    return _interpolate(np.ascontiguousarray(_interpolate(lattice).T))
-
-
-def _interpolate(lattice: Plane) -> Plane:
-    """Rows [C, K] interpolated to [N, K] by smoothstep, the last towards the first; C divides N."""
-    count, width = lattice.shape
-    t = np.arange(TEXTURE_PX // count, dtype=np.float32) * np.float32(count / TEXTURE_PX)
-    share = (t * t * (np.float32(3.0) - np.float32(2.0) * t))[None, :, None]
-    step = np.roll(lattice, -1, axis=0) - lattice
-    return (lattice[:, None, :] + share * step[:, None, :]).reshape(TEXTURE_PX, width)
+    return stretched(lattice, TEXTURE_PX, TEXTURE_PX, True)

@@ -27,27 +27,42 @@ def blank(height: int, width: int, color: Color) -> Texture:
 
 def noise(rng: np.random.Generator, height: int, width: int, rows: int, columns: int) -> Plane:
     """[height, width] float32 in [0, 1]: value noise on a lattice of rows x columns; repeats in both directions."""
-    return _stretched(rng.random((columns, rows), dtype=np.float32), height, width)
+    return stretched(rng.random((columns, rows), dtype=np.float32), height, width, False)
 
 
 @compiled
-def _stretched(lattice: Plane, height: int, width: int) -> Plane:
-    """A lattice [columns, rows] interpolated linearly to [height, width], along both the last towards the first."""
+def stretched(lattice: Plane, height: int, width: int, smooth: bool) -> Plane:
+    """A lattice [columns, rows] interpolated to [height, width], along both the last towards the first.
+
+    Linearly or, where `smooth`, by smoothstep, whose slope is 0 at the points of the lattice.
+    """
     columns, rows = lattice.shape
     wide, plane = np.empty((rows, width), np.float32), np.empty((height, width), np.float32)
-    for x in range(width):
-        at = np.float32(x) * np.float32(columns / width)
-        low = int(at)
-        share, after = at - np.float32(low), (low + 1) % columns
-        for row in range(rows):
-            wide[row, x] = (lattice[after, row] - lattice[low, row]) * share + lattice[low, row]
-    for y in range(height):
-        at = np.float32(y) * np.float32(rows / height)
-        low = int(at)
-        share, after = at - np.float32(low), (low + 1) % rows
+    turned, before, after, shares = lattice.T.copy(), *_cells(columns, width, smooth)
+    for row in range(rows):
         for x in range(width):
-            plane[y, x] = (wide[after, x] - wide[low, x]) * share + wide[low, x]
+            low = turned[row, before[x]]
+            wide[row, x] = (turned[row, after[x]] - low) * shares[x] + low
+    before, after, shares = _cells(rows, height, smooth)
+    for y in range(height):
+        below, above, share = wide[before[y]], wide[after[y]], shares[y]
+        for x in range(width):
+            plane[y, x] = (above[x] - below[x]) * share + below[x]
     return plane
+
+
+@compiled
+def _cells(count: int, size: int, smooth: bool) -> tuple[NDArray[np.int64], NDArray[np.int64], Plane]:
+    """For each of `size` pixels, the points of a lattice before and after it, and its share of the way between them."""
+    before, after, shares = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.float32)
+    for x in range(size):
+        at = np.float32(x) * np.float32(count / size)
+        low = int(at)
+        share = at - np.float32(low)
+        if smooth:
+            share = share * share * (np.float32(3.0) - np.float32(2.0) * share)
+        before[x], after[x], shares[x] = low, (low + 1) % count, share
+    return before, after, shares
 
 
 def blend(a: Color, b: Color, share: Plane) -> Texture:

@@ -18,6 +18,16 @@ def test_a_colour_is_rounded_to_bytes_and_a_blend_ends_on_both_colours():
     assert picture[0].tolist() == [[51, 102, 153], [230, 204, 26], [51, 102, 153], [230, 204, 26]]
 
 
+@pytest.mark.parametrize(("smooth", "quarter"), [(False, 0.25), (True, 0.25**2 * (3 - 2 * 0.25))])
+def test_a_stretched_lattice_keeps_its_points_and_lies_between_them_otherwise(smooth, quarter):
+    lattice = np.array([[0.0, 8.0, 4.0], [2.0, 6.0, 1.0]], np.float32)  # two columns, three rows
+    plane = textures.stretched(lattice, 12, 8, smooth)
+    assert plane.shape == (12, 8)
+    assert np.array_equal(plane[::4, ::4], lattice.T)
+    assert plane[0, [1, 2, 5]] == pytest.approx([2.0 * quarter, 1.0, 2.0 - 2.0 * quarter])
+    assert plane[[1, 2, 9], 0] == pytest.approx([8.0 * quarter, 4.0, 4.0 - 4.0 * quarter])
+
+
 def test_noise_is_smooth_within_its_bounds_and_repeats_in_both_directions():
     plane = textures.noise(rng(), 64, 96, 4, 6)
     assert plane.shape == (64, 96)
