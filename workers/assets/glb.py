@@ -17,6 +17,7 @@ from PIL import Image
 
 from schemas.scene.shape import Asset, Part
 from workers.assets.external.materials import linear_from_srgb
+from workers.geometry.bounds import bounds_of
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
@@ -76,7 +77,10 @@ def asset_glb(asset: Asset, encode_opaque: EncodeImage = encode_with_pillow) -> 
     `encode_opaque` makes the PNGs of images without alpha.
     """
     writer = _Writer(encode_opaque)
-    materials = [_material(writer, part, asset.watertight) for part in asset.shape.parts]
+    colors = linear_from_srgb(np.array([part.material.base_color[:3] for part in asset.shape.parts])).tolist()
+    materials = [
+        _material(writer, part, rgb, asset.watertight) for part, rgb in zip(asset.shape.parts, colors, strict=True)
+    ]
     primitives = [_primitive(writer, part, number) for number, part in enumerate(asset.shape.parts)]
     extras = {
         "frame": "object frame: metres, z up, origin at the centre of the bounding box",
@@ -110,10 +114,9 @@ def _container(text: bytes, binary: bytes) -> bytes:
     return head + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
 
 
-def _material(writer: _Writer, part: Part, watertight: bool) -> dict[str, Any]:
-    """glTF's colour factors are linear, ours sRGB; textures are sRGB in both."""
+def _material(writer: _Writer, part: Part, rgb: list[float], watertight: bool) -> dict[str, Any]:
+    """The material of a part whose colour is `rgb`, linear: glTF's factors are, ours are sRGB; textures are sRGB in both."""
     material = part.material
-    rgb = [float(c) for c in linear_from_srgb(np.array(material.base_color[:3]))]
     rough: dict[str, Any] = {
         "baseColorFactor": [*rgb, material.base_color[3]],
         "metallicFactor": material.metallic,
@@ -129,13 +132,15 @@ def _material(writer: _Writer, part: Part, watertight: bool) -> dict[str, Any]:
 
 def _primitive(writer: _Writer, part: Part, material: int) -> dict[str, Any]:
     positions = part.vertices.astype("<f4")
-    bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+    low, high = bounds_of(part.vertices).astype("<f4").tolist()  # rounding keeps the order, so these are their bounds
+    bounds = {"min": low, "max": high}
     attributes = {"POSITION": writer.add_accessor(positions, "VEC3", _FLOAT, **bounds)}
     if part.normals is not None:
         attributes["NORMAL"] = writer.add_accessor(part.normals.astype("<f4"), "VEC3", _FLOAT)
     if part.uv is not None:
-        flipped = np.stack([part.uv[:, 0], 1.0 - part.uv[:, 1]], axis=1)  # glTF's v runs down
-        attributes["TEXCOORD_0"] = writer.add_accessor(flipped.astype("<f4"), "VEC2", _FLOAT)
+        flipped = part.uv.astype("<f4")
+        flipped[:, 1] = 1.0 - part.uv[:, 1]  # glTF's v runs down
+        attributes["TEXCOORD_0"] = writer.add_accessor(flipped, "VEC2", _FLOAT)
     if part.colors is not None:
         color = part.colors / 255.0
         color[:, :3] = linear_from_srgb(color[:, :3])
