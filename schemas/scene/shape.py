@@ -95,8 +95,9 @@ class Shape:
     @cached_property
     def bounds(self) -> Array:
         """[2, 3] float64: lower and upper corner of the axis-aligned bounding box."""
-        vertices = self.vertices
-        return _read_only(np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
+        # Along rows: numpy takes ten times as long to find the least of each of three columns.
+        rows = np.ascontiguousarray(self.vertices.T)
+        return _read_only(np.stack([rows.min(axis=1), rows.max(axis=1)]))
 
 
 def _read_only(array: NDArray) -> NDArray:
@@ -131,6 +132,23 @@ class Loft:
 
 
 @dataclass(frozen=True, eq=False)
+class Lofted:
+    """A body that is a union of lofts, and the map from their frame to its own, as `Loft.mapped` takes it.
+
+    Few bodies are asked for their lofts, so they are mapped when they are first asked for.
+    """
+
+    unmapped: tuple[Loft, ...]
+    axes: Array
+    origin: Array
+
+    @cached_property
+    def lofts(self) -> tuple[Loft, ...]:
+        """The lofts in the body's own frame."""
+        return tuple(loft.mapped(self.axes, self.origin) for loft in self.unmapped)
+
+
+@dataclass(frozen=True, eq=False)
 class MassProperties:
     """Mass properties of the true mesh, not of its collision shape.
 
@@ -151,8 +169,8 @@ class Asset:
     `source`: `procedural`, `shapenet` or `urdf`; `path`: the file within that source or None; `sha256`: digest of the
     source file, or of the generated arrays. `T_source_to_object` takes the source's coordinates, multiplied by `scale`, to
     the object frame. `shareable`: whether the cleaned mesh may be written into the dataset. `volume_m3` is None where the
-    mesh is not watertight. `notes`: what was repaired or left out. `lofts`: the union that the shape is, object frame,
-    where known.
+    mesh is not watertight. `notes`: what was repaired or left out. `lofted`: the lofts that the shape is the union of, where
+    they are known.
     """
 
     instance_id: str
@@ -169,7 +187,7 @@ class Asset:
     volume_m3: float | None
     shareable: bool
     notes: tuple[str, ...] = ()
-    lofts: tuple[Loft, ...] | None = None
+    lofted: Lofted | None = None
 
     @property
     def extents_m(self) -> Array:

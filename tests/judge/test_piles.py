@@ -85,7 +85,7 @@ def test_every_kind_is_dropped_into_every_hollow_the_same_way_each_time():
     plans = [draw_hollow(job, k) for k in range(len(HOLLOWS) * len(CONTENTS))]
     pairs = {(plan.objects[0].asset.sha256, plan.objects[1].asset.sha256) for plan in plans}
     assert len(pairs) == len(HOLLOWS) * len(CONTENTS)
-    assert all(plan.objects[0].asset.watertight and plan.objects[1].asset.lofts is None for plan in plans)
+    assert all(plan.objects[0].asset.watertight and plan.objects[1].asset.lofted is None for plan in plans)
     assert (draw_hollow(job, 3).objects[1].T_world_obj == plans[3].objects[1].T_world_obj).all()
     rims = [plan.objects[0].asset.extents_m[2] for plan in plans]
     assert all(

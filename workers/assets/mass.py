@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from schemas.base import Array, frozen_array
 from schemas.scene.shape import MassProperties, Shape
 from workers.assets.external.topology import is_solid
+from workers.geometry.bounds import bounds_of
 from workers.geometry.jit import compiled
 
 
@@ -29,7 +30,8 @@ def solid_mass(vertices: Array, faces: np.ndarray, density_kg_m3: float) -> Mass
     volume det/6, first moment det/24 s, second moment det/120 (a a^T + b b^T + c c^T + s s^T)
     (Blow and Binstock, "How to find the inertia tensor of a solid body", 2004).
     """
-    middle, corners, det = _tetrahedra(vertices, faces)
+    middle = bounds_of(vertices).sum(axis=0) * 0.5
+    corners, det = _tetrahedra(vertices, faces, middle)
     mass = density_kg_m3 * float(det.sum()) / 6.0
     return _assemble(middle, corners, density_kg_m3 * det / 24.0, density_kg_m3 * det / 120.0, mass, solid=True)
 
@@ -56,23 +58,20 @@ def _corners(vertices: Array, faces: np.ndarray) -> tuple[Array, Array]:
 
 
 @compiled
-def _tetrahedra(vertices: Array, faces: NDArray[np.int64]) -> tuple[Array, Array, Array]:
-    """What `_corners` returns, and six times the signed volume [F] of the tetrahedra from its middle to the faces."""
-    middle = np.empty(3)
-    for axis in range(3):
-        middle[axis] = 0.5 * (vertices[:, axis].min() + vertices[:, axis].max())
+def _tetrahedra(vertices: Array, faces: NDArray[np.int64], middle: Array) -> tuple[Array, Array]:
+    """The faces' corners measured from `middle` [3], [corner, axis, F], and six times the volumes [F] of their tetrahedra."""
     count = len(faces)
     corners, det = np.empty((3, 3, count)), np.empty(count)
     for f in range(count):
         for k in range(3):
             for axis in range(3):
                 corners[k, axis, f] = vertices[faces[f, k], axis] - middle[axis]
-    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = corners[0], corners[1], corners[2]
-    for f in range(count):
-        x = ax[f] * (by[f] * cz[f] - bz[f] * cy[f])
-        y = ay[f] * (bz[f] * cx[f] - bx[f] * cz[f])
-        det[f] = x + y + az[f] * (bx[f] * cy[f] - by[f] * cx[f])
-    return middle, corners, det
+        bx, by, bz = corners[1, 0, f], corners[1, 1, f], corners[1, 2, f]
+        cx, cy, cz = corners[2, 0, f], corners[2, 1, f], corners[2, 2, f]
+        x = corners[0, 0, f] * (by * cz - bz * cy)
+        y = corners[0, 1, f] * (bz * cx - bx * cz)
+        det[f] = x + y + corners[0, 2, f] * (bx * cy - by * cx)
+    return corners, det
 
 
 @compiled

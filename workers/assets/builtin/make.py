@@ -8,7 +8,7 @@ import numpy as np
 from schemas.base import frozen_array
 from schemas.job.assets import ProceduralSource
 from schemas.job.category import TABLE
-from schemas.scene.shape import Asset, Shape
+from schemas.scene.shape import Asset, Lofted, Shape
 from workers.assets.builtin.bottle import make_bottle
 from workers.assets.builtin.bowl import make_bowl
 from workers.assets.builtin.box import make_box
@@ -21,6 +21,7 @@ from workers.assets.builtin.mug import make_mug
 from workers.assets.builtin.parts import Model, cut_into_parts
 from workers.assets.builtin.table import make_table
 from workers.assets.mass import solid_mass
+from workers.geometry.bounds import bounds_of
 from workers.geometry.frames import pose
 
 LICENCE = "CC0-1.0"
@@ -47,7 +48,7 @@ def make_model(category: str, seed: int, index: int) -> Model:
 def make_asset(category: str, settings: ProceduralSource, index: int, density_kg_m3: float) -> Asset:
     """Instance `index` of a category as an asset; objects are scaled to `diagonal_m` unless `size` is metric."""
     model = make_model(category, settings.seed, index)
-    lower, upper = model.solid.vertices.min(axis=0), model.solid.vertices.max(axis=0)
+    lofts, (lower, upper) = model.solid.lofts, bounds_of(model.solid.vertices)
     centre, extent = 0.5 * (lower + upper), upper - lower
     scale = 1.0
     if category != TABLE and settings.size == "article":
@@ -68,7 +69,7 @@ def make_asset(category: str, settings: ProceduralSource, index: int, density_kg
         watertight=True,
         volume_m3=mass.mass_kg / density_kg_m3,
         shareable=True,
-        lofts=model.solid.map_lofts(scale * np.eye(3), -scale * centre),
+        lofted=None if lofts is None else Lofted(lofts, scale * np.eye(3), -scale * centre),
     )
 
 

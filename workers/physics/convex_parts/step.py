@@ -89,12 +89,12 @@ def parts_of(asset: Asset, threshold: float = THRESHOLD, share: float = TOLERANC
     `threshold` is CoACD's, `share` that of `decompose_lofts`. CoACD also cuts a built-in shape whose outlines touch except
     for the last bits, which cannot be cut by its making.
     """
-    lofts = asset.lofts
-    if lofts is None:
+    lofted = asset.lofted
+    if lofted is None:
         return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
     key = key_of("lofts", repr(share), asset.sha256, asset.shape.mesh.vertices.tobytes())
     try:
-        return _CACHE.get(key, None, lambda: Parts(decompose_lofts(lofts, share), "lofts")).clouds
+        return _CACHE.get(key, None, lambda: Parts(decompose_lofts(lofted.lofts, share), "lofts")).clouds
     except (ValueError, shapely.errors.GEOSException):
         return decompose(asset.shape.mesh, asset.sha256, threshold).clouds
 

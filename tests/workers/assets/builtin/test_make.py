@@ -50,6 +50,15 @@ def test_every_instance_is_one_closed_body_with_volume(category):
         assert asset(category, index).volume_m3 == pytest.approx(whole.volume, rel=1e-9)
 
 
+@pytest.mark.parametrize("category", ["bottle", "can", "mug", "laptop"])
+def test_lofts_of_an_asset_lie_within_its_shape_and_reach_as_far(category):
+    for index in range(3):
+        made = asset(category, index)
+        points = np.concatenate([loft.rings.reshape(-1, 3) for loft in made.lofted.lofts])
+        assert points.min(axis=0) == pytest.approx(made.shape.bounds[0], abs=1e-12)
+        assert points.max(axis=0) == pytest.approx(made.shape.bounds[1], abs=1e-12)
+
+
 @pytest.mark.parametrize("category", EVERYTHING)
 def test_rays_go_in_and_out_by_turns_so_nothing_overlaps_or_lies_inside(category):
     for index in INSTANCES:
