@@ -1,15 +1,17 @@
 """Pure: cuts a solid into the parts of a shape, with shading normals and texture coordinates."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import Material, Part, Shape
 from workers.assets.builtin.solid import TRIG_DIGITS, Indices, Solid, renumber
+from workers.geometry.bounds import bounds_of
 from workers.geometry.jit import compiled
 
 
@@ -48,8 +50,28 @@ def over_top(name: str, material: Material, width: float, depth: float) -> Surfa
     return Surface(name, material, "plane", origin=origin, across=(width, 0.0, 0.0), up=(0.0, depth, 0.0))
 
 
-_SIDES = (((1, 2), (0, 2), (0, 1)), ((1, 2), (0, 2), (1, 0)), ((2, 1), (2, 0), (0, 1)))
+_SIDES = np.array([[[1, 2], [0, 2], [0, 1]], [[1, 2], [0, 2], [1, 0]], [[2, 1], [2, 0], [0, 1]]])
 """u and v for the axis that the grain runs along and the axis that a face looks along."""
+
+_NONE, _CYLINDER, _PLANE, _BOX = range(4)
+"""Mappings by number; `_NONE` where there is no texture."""
+
+
+class _Mapping(NamedTuple):
+    """How a texture is laid: `Surface` in numbers.
+
+    origin [3]; reach: over how many metres v of a cylinder, or u and v of a box, grow by 1; axes [2, 3]: the gradients of u
+    and v of a plane; sides [3, 2]: of a box.
+    """
+
+    kind: int
+    origin: Array
+    reach: float
+    axes: Array
+    sides: Indices
+
+
+_NO_MAPPING = _Mapping(_NONE, np.zeros(3), 1.0, np.zeros((2, 3)), _SIDES[0])
 
 
 def cut_into_parts(solid: Solid, surfaces: Sequence[Surface], centre: Array, scale: float) -> Shape:
@@ -58,34 +80,141 @@ def cut_into_parts(solid: Solid, surfaces: Sequence[Surface], centre: Array, sca
     Points on a border between parts are the same doubles in both, so that the parts together are watertight.
     """
     vertices = (solid.vertices - centre) * scale
-    shaded, point = renumber(solid.smooth[:, None] * len(vertices) + solid.faces)
-    point %= len(vertices)
-    across, normals = _shade(vertices, solid.faces, shaded, len(point))
-    order = np.argsort(solid.surface, kind="stable")
-    stops = np.cumsum(np.bincount(solid.surface, minlength=len(surfaces)))
-    parts = []
-    for surface, start, stop in zip(surfaces, [0, *stops[:-1]], stops, strict=True):
-        if start < stop:
-            chosen = order[start:stop]
-            corners = shaded[chosen]
-            variant, coordinates = _texture_variants(surface, solid.vertices, point[corners], across[:, chosen])
-            if coordinates is None:
-                index, origin = renumber(corners)
-                uv = None
-            else:
-                index, origin = renumber(corners * 3 + variant)
-                origin, which = np.divmod(origin, 3)
-                uv = coordinates(point[origin], which)
-            parts.append(_part(surface, vertices[point[origin]], index, normals[origin], uv))
-    return Shape(tuple(parts), closed=True)
+    corners, place = renumber(solid.smooth[:, None] * len(vertices) + solid.faces)
+    place %= len(vertices)
+    across, normals = _shade(vertices, solid.faces, corners, len(place))
+    low = bounds_of(solid.vertices)[0]
+    mappings = [_mapping(surface, low) for surface in surfaces]
+    kinds, *how = (np.array(column) for column in zip(*mappings, strict=True))
+    keys, turn = _vary(solid.vertices, solid.faces, corners, solid.surface, across, kinds)
+    faces, names, stops = _collect(keys, solid.surface, len(place), len(surfaces))
+    shaded, variant = np.divmod(names, 3)
+    uv = _lay(solid.vertices, place[shaded], variant, turn, stops, kinds, *how)
+    arrays = faces, vertices[place[shaded]], normals[shaded], uv
+    for array in arrays:
+        array.setflags(write=False)
+    return Shape(tuple(_parts(surfaces, stops.tolist(), *arrays)), closed=True)
 
 
-def _part(surface: Surface, vertices: Array, faces: Indices, normals: Array, uv: Array | None) -> Part:
-    corners = faces.astype(np.int32)
-    for array in (vertices, corners, normals, uv):
-        if array is not None:
-            array.setflags(write=False)
-    return Part(surface.name, vertices, corners, surface.material, normals=normals, uv=uv)
+def _parts(
+    surfaces: Sequence[Surface],
+    stops: list[list[int]],
+    faces: NDArray[np.int32],
+    points: Array,
+    normals: Array,
+    uv: Array,
+) -> Iterator[Part]:
+    """The parts that the arrays hold one after another; stops: where each one's faces and points end, from [0, 0]."""
+    for surface, (a, c), (b, d) in zip(surfaces, stops[:-1], stops[1:], strict=True):
+        if a < b:
+            laid = None if surface.material.texture is None else uv[c:d]
+            yield Part(surface.name, points[c:d], faces[a:b], surface.material, normals=normals[c:d], uv=laid)
+
+
+def _mapping(surface: Surface, low: Array) -> _Mapping:
+    """The mapping of a surface; low [3]: the least coordinates of the solid, metres."""
+    if surface.material.texture is None:
+        return _NO_MAPPING
+    if surface.mapping == "cylinder":
+        origin = np.array([0.0, 0.0, surface.low])
+        return _NO_MAPPING._replace(kind=_CYLINDER, origin=origin, reach=surface.high - surface.low)
+    if surface.mapping == "plane":
+        axes, origin = np.array([surface.across, surface.up], np.float64), np.array(surface.origin, np.float64)
+        axes /= (axes * axes).sum(axis=1)[:, None]
+        return _NO_MAPPING._replace(kind=_PLANE, origin=origin, axes=axes)
+    return _NO_MAPPING._replace(kind=_BOX, origin=low, reach=surface.size, sides=_SIDES[surface.grain])
+
+
+@compiled
+def _vary(
+    laid: Array, faces: Indices, corners: Indices, surface: Indices, across: Array, kinds: Indices
+) -> tuple[Indices, Array]:
+    """A key [F, 3] for each face's use of a shaded point: 3 * point + variant; and the turns [V] of points of cylinders.
+
+    corners [F, 3]: the shaded points of faces [F, 3] into `laid` [V, 3]. The variant is, on a cylinder, 1 for a point that is
+    a turn further on, in a box the axis that the face's area vector (across [3, F]) is nearest to, else 0.
+    """
+    keys, turn = np.empty((len(faces), 3), np.int64), np.full(len(laid), -1.0)
+    for f in range(len(faces)):
+        kind, a, b, c = kinds[surface[f]], faces[f, 0], faces[f, 1], faces[f, 2]
+        u = v = w = 0
+        if kind == _CYLINDER:
+            for k in range(3):
+                point = faces[f, k]
+                if turn[point] < 0.0:
+                    turn[point] = turn_about_z(laid[point, 0], laid[point, 1])
+            if max(turn[a], turn[b], turn[c]) - min(turn[a], turn[b], turn[c]) > 0.5:
+                u, v, w = int(turn[a] < 0.5), int(turn[b] < 0.5), int(turn[c] < 0.5)
+        elif kind == _BOX:
+            x, y, z = abs(across[0, f]), abs(across[1, f]), abs(across[2, f])
+            u = v = w = (1 if z <= y else 2) if y > x else (2 if z > x else 0)
+        keys[f, 0], keys[f, 1], keys[f, 2] = 3 * corners[f, 0] + u, 3 * corners[f, 1] + v, 3 * corners[f, 2] + w
+    return keys, turn
+
+
+@compiled
+def _collect(
+    keys: Indices, surface: Indices, points: int, surfaces: int
+) -> tuple[NDArray[np.int32], Indices, NDArray[np.int64]]:
+    """The faces [F, 3] of each surface after the other, into its points, the keys [P] of these, ascending, and the stops.
+
+    stops [surfaces + 1, 2]: where each surface's faces and points end, from 0, 0.
+    """
+    faces, names = np.empty((len(keys), 3), np.int32), np.empty(3 * len(keys), np.int64)
+    stops = np.zeros((surfaces + 1, 2), np.int64)
+    number = np.zeros(3 * points, np.int32)
+    row = count = 0
+    for s in range(surfaces):
+        start, first, least, most = row, count, 3 * points, -1
+        for f in range(len(keys)):
+            if surface[f] == s:
+                for k in range(3):
+                    key = keys[f, k]
+                    faces[row, k], number[key] = key, 1
+                    least, most = min(least, key), max(most, key)
+                row += 1
+        for key in range(least, most + 1):
+            if number[key]:
+                number[key], names[count] = count - first, key
+                count += 1
+        for f in range(start, row):
+            for k in range(3):
+                faces[f, k] = number[faces[f, k]]
+        number[least : most + 1] = 0
+        stops[s + 1, 0], stops[s + 1, 1] = row, count
+    return faces, names[:count].copy(), stops
+
+
+@compiled
+def _lay(
+    laid: Array,
+    place: Indices,
+    variant: Indices,
+    turn: Array,
+    stops: Indices,
+    kinds: Indices,
+    origins: Array,
+    reaches: Array,
+    axes: Array,
+    sides: Indices,
+) -> Array:
+    """uv [P, 2] of variants [P] of the points of `laid` [V, 3] at `place` [P]; the rest: the mappings' fields, [S, ...]."""
+    uv = np.zeros((len(place), 2))
+    for s in range(len(kinds)):
+        for n in range(stops[s, 1], stops[s + 1, 1]):
+            point = place[n]
+            if kinds[s] == _CYLINDER:
+                uv[n, 0] = turn[point] + variant[n]
+                uv[n, 1] = (laid[point, 2] - origins[s, 2]) / reaches[s]
+            elif kinds[s] == _BOX:
+                for k in range(2):
+                    side = sides[s, variant[n], k]
+                    uv[n, k] = (laid[point, side] - origins[s, side]) / reaches[s]
+            elif kinds[s] == _PLANE:
+                for k in range(2):
+                    for axis in range(3):
+                        uv[n, k] += (laid[point, axis] - origins[s, axis]) * axes[s, k, axis]
+    return uv
 
 
 @compiled
@@ -121,39 +250,6 @@ def _shade(vertices: Array, faces: Indices, shaded: Indices, count: int) -> tupl
     return across, normals
 
 
-Coordinates = Callable[[Indices, Indices], Array]
-"""Function of point numbers and variants (0, 1 or 2) that gives uv [N, 2]: at a seam or an edge a point has several."""
-
-
-def _texture_variants(
-    surface: Surface, vertices: Array, faces: Indices, across: Array
-) -> tuple[Indices, Coordinates | None]:
-    """The variant [F, 3] of its points that each face uses, and the texture coordinates of a point's variants.
-
-    across [3, F]: the faces' area vectors.
-    """
-    if surface.material.texture is None:
-        return np.zeros_like(faces), None
-    if surface.mapping == "cylinder":
-        turn, wrapped = _wrap(vertices, faces)
-        reach = surface.high - surface.low
-        return wrapped, lambda point, variant: np.stack(
-            [turn[point] + variant, (vertices[point, 2] - surface.low) / reach], axis=1
-        )
-    if surface.mapping == "plane":
-        axes = np.array([surface.across, surface.up])
-        axes /= (axes * axes).sum(axis=1)[:, None]
-        local = vertices - np.array(surface.origin)
-        return np.zeros_like(faces), lambda point, variant: np.stack(
-            [(local[point] * axis).sum(axis=1) for axis in axes], axis=1
-        )
-    low, sides = vertices.min(axis=0), np.array(_SIDES[surface.grain])
-    axis = np.abs(across).argmax(axis=0)
-    return np.repeat(axis[:, None], 3, axis=1), lambda point, variant: _lay(
-        vertices, low, surface.size, sides, point, variant
-    )
-
-
 _EIGHTHS = np.array([round(math.atan(k / 8.0), 15) for k in range(9)])
 """[9] float64: the angles with tangents 0, 1/8, ... 1."""
 
@@ -161,46 +257,8 @@ _DIGITS = 10.0**TRIG_DIGITS
 
 
 @compiled
-def _lay(vertices: Array, low: Array, size: float, sides: Indices, point: Indices, variant: Indices) -> Array:
-    """uv [N, 2] of points by number: the two of their coordinates that `sides` [3, 2] names for the variant."""
-    uv = np.empty((len(point), 2))
-    for n in range(len(point)):
-        for k in range(2):
-            side = sides[variant[n], k]
-            uv[n, k] = (vertices[point[n], side] - low[side]) / size
-    return uv
-
-
-@compiled
-def _wrap(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
-    """The turns [V] of `turns_about_z` of the points that the faces [F, 3] name, and 1 for each that is a turn further on."""
-    turn = np.zeros(len(vertices))
-    known = np.zeros(len(vertices), np.bool_)
-    wrapped = np.empty_like(faces)
-    for f in range(len(faces)):
-        for k in range(3):
-            point = faces[f, k]
-            if not known[point]:
-                turn[point], known[point] = _turn(vertices[point, 0], vertices[point, 1]), True
-        a, b, c = turn[faces[f, 0]], turn[faces[f, 1]], turn[faces[f, 2]]
-        seam = max(a, b, c) - min(a, b, c) > 0.5
-        for k in range(3):
-            wrapped[f, k] = seam and turn[faces[f, k]] < 0.5
-    return turn, wrapped
-
-
-@compiled
-def turns_about_z(x: Array, y: Array) -> Array:
-    """[N] float64: the angle of (x, y) in turns, in [0, 1), to `TRIG_DIGITS` digits; 0 at the origin."""
-    turns = np.empty(len(x))
-    for n in range(len(x)):
-        turns[n] = _turn(x[n], y[n])
-    return turns
-
-
-@compiled
-def _turn(x: float, y: float) -> float:
-    """One of `turns_about_z`.
+def turn_about_z(x: float, y: float) -> float:
+    """The angle of (x, y) in turns, in [0, 1), to `TRIG_DIGITS` digits; 0 at the origin.
 
     By +, -, * and / alone, where the C library's atan2 gives other bits on other processors: the tangent t in [0, 1] of
     the angle to the nearest axis, less the nearest k/8, is small enough for a short series:

@@ -227,22 +227,25 @@ def union_at(solid: Solid, touched: Mask, apex: Array, others: Sequence[Solid], 
 def renumber(keys: Indices) -> tuple[Indices, Indices]:
     """Keys [F, K] int64 renumbered 0, 1, 2, ... in ascending order, and the key of each number."""
     rows, columns = keys.shape
-    number = np.zeros(keys.max() + 1, np.int64)
+    highest = -1
+    for row in range(rows):
+        for column in range(columns):
+            highest = max(highest, keys[row, column])
+    number = np.zeros(highest + 1, np.int64)
     for row in range(rows):
         for column in range(columns):
             number[keys[row, column]] = 1
-    names = np.empty(number.sum(), np.int64)
-    count = 0
-    for key in range(len(number)):
+    names, count = np.empty(highest + 1, np.int64), 0
+    for key in range(highest + 1):
         if number[key]:
             names[count] = key
             number[key] = count
             count += 1
-    numbers = np.empty_like(keys)
+    numbers = np.empty((rows, columns), np.int64)
     for row in range(rows):
         for column in range(columns):
             numbers[row, column] = number[keys[row, column]]
-    return numbers, names
+    return numbers, names[:count].copy()
 
 
 def difference(solid: Solid, cutters: Sequence[Solid]) -> Solid:

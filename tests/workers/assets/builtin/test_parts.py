@@ -7,7 +7,7 @@ import pytest
 
 from schemas.scene.shape import Material
 from tests.workers.assets.oracles import welded
-from workers.assets.builtin.parts import Surface, cut_into_parts, turns_about_z
+from workers.assets.builtin.parts import Surface, cut_into_parts, turn_about_z
 from workers.assets.builtin.solid import lathe, union
 from workers.assets.builtin.sweeps import bevelled_profile, prism
 
@@ -93,7 +93,7 @@ def test_turns_are_the_angles_that_python_finds():
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.normal(size=(5000, 2)), [[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1]]])
     points = np.concatenate([points, points * [1.0, 1e-9], points * [1e-9, 1.0], [[0.0, 0.0], [1.0, -1e-17]]])
-    turns = turns_about_z(points[:, 0], points[:, 1])
+    turns = np.array([turn_about_z(x, y) for x, y in points.tolist()])
     expected = np.array([math.atan2(y, x) / (2 * math.pi) % 1.0 for x, y in points.tolist()])
     assert np.abs((turns - expected + 0.5) % 1.0 - 0.5).max() < 1.1e-14
     assert turns.min() >= 0.0 and turns.max() < 1.0
