@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.scene.camera import Camera, Intrinsics
-from workers.geometry.frames import UP, invert, pose, transform
+from workers.geometry.frames import UP, cross, invert, pose, transform
 
 MARGIN_PX = 2.0
 """Width by which the image is extended on each side: what lies outside of that touches no sample of a pixel."""
@@ -21,11 +21,10 @@ def look_at(position: Array, target: Array, up: Array = UP) -> Pose:
     """
     z = target - position
     z = z / np.linalg.norm(z)
-    x = np.cross(z, up)
+    x = cross(z, up)
     length = float(np.linalg.norm(x))
     x = x / length if length > 1e-12 else np.array([1.0, 0.0, 0.0])
-    y = np.cross(z, x)
-    return pose(np.stack([x, y, z], axis=1), position)
+    return pose(np.array([x, cross(z, x), z]).T, position)
 
 
 def orbit_pose(centre: Array, inclination_rad: float, yaw_rad: float, radius_m: float) -> Pose:
