@@ -12,6 +12,7 @@ from schemas.base import Array, frozen_array
 from schemas.scene.shape import Hull, Shape
 from workers.geometry.bounds import bounds_of
 from workers.geometry.convexity import mesh_of
+from workers.geometry.first_equal import first_equal
 from workers.geometry.jit import compiled
 from workers.geometry.manifold import hold_to_one_thread
 
@@ -30,10 +31,6 @@ COARSER = 1e-5
 
 NO_AREA = 1e-12
 """Area, as a share of the hull's size squared, below which a triangle's normal is rounding noise."""
-
-FRACTION_OF_2_64 = -0x61C8864680B583EB
-"""2^64 over the golden ratio, as a signed number: its multiples are spread evenly (Knuth, The Art of Computer Programming
-vol. 3, 6.4)."""
 
 SAME = 1e-9
 """Difference in each coordinate below which normals are equal."""
@@ -54,7 +51,9 @@ def convex_hull(vertices: Array) -> Hull:
     if spread[0] < THIN * spread[2]:
         return _thin_hull(vertices)
     hold_to_one_thread()
-    solid = manifold3d.Manifold.hull_points(vertices[_first_places(vertices.view(np.int64))])
+    # Faces that are shaded apart repeat their corners, and a hull takes as long over a point that it has already.
+    distinct = first_equal(vertices.view(np.int64)) == np.arange(len(vertices))
+    solid = manifold3d.Manifold.hull_points(vertices[distinct])
     step = COARSER * float(np.linalg.norm(np.ptp(bounds_of(vertices), axis=0)))
     while solid.num_vert() > MOST_VERTICES:
         solid, step = solid.simplify(step), 4.0 * step
@@ -88,34 +87,6 @@ def _scatter(points: Array) -> Array:
             for k in range(3):
                 scatter[j, k] += (point[j] - mean[j]) * (point[k] - mean[k])
     return scatter
-
-
-@compiled
-def _first_places(rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """[M] ascending: the first place of each of the distinct rows [N, 3] of bits.
-
-    Faces that are shaded apart repeat their corners, and a hull takes as long over a point that it has already. By a hash
-    table: `np.unique` takes forty times as long.
-    """
-    size, shift = 4, 62
-    while size < 2 * len(rows):
-        size, shift = 2 * size, shift - 1
-    slots, places = np.full(size, -1), np.empty(len(rows), np.int64)
-    count = 0
-    for n in range(len(rows)):
-        x, y, z = rows[n, 0], rows[n, 1], rows[n, 2]
-        mixed = (x ^ (y >> 21) ^ (y << 43) ^ (z >> 42) ^ (z << 22)) * FRACTION_OF_2_64
-        slot = (mixed >> shift) & (size - 1)
-        while slots[slot] >= 0:
-            known = slots[slot]
-            if rows[known, 0] == x and rows[known, 1] == y and rows[known, 2] == z:
-                break
-            slot = (slot + 1) & (size - 1)
-        if slots[slot] < 0:
-            slots[slot] = n
-            places[count] = n
-            count += 1
-    return places[:count]
 
 
 @compiled

@@ -12,6 +12,7 @@ from schemas.errors import StartError
 from schemas.scene.plan import Table, TableTop
 from schemas.scene.shape import Asset, Mesh, Shape
 from workers.geometry.bounds import bounds_of
+from workers.geometry.convexity import numbers_in
 from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import transform, translation
 from workers.geometry.jit import compiled
@@ -40,7 +41,7 @@ def find_table_top(shape: Shape) -> TableTop:
     area = np.bincount(inverse, weights=doubled[level] / 2)
     top = int(np.flatnonzero(area >= TOP_SHARE * area.max()).max())
     members = np.flatnonzero(level)[inverse == top]
-    points = vertices[np.unique(faces[members])]
+    points = vertices[numbers_in(faces[members], len(vertices))]
     return _describe(points, float(area[top]), float(vertices[:, 2].max()))
 
 

@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull
 from schemas.job.assets import ProceduralSource
 from schemas.job.category import CATEGORIES
 from workers.assets.builtin.make import make_asset
-from workers.geometry.hull import MOST_VERTICES, _first_places, convex_hull, depth_m, least_width_m
+from workers.geometry.hull import MOST_VERTICES, convex_hull, depth_m, least_width_m
 
 SOURCE = ProceduralSource(source="procedural")
 
@@ -49,18 +49,12 @@ def test_points_that_come_often_and_points_within_change_nothing():
 
 @pytest.mark.parametrize("scale", [1.0, 0.1])
 def test_repeated_points_change_no_bit_of_a_hull(scale):
-    """The points of a lattice share most of their bits, which is the hardest case for a hash of them."""
     lattice = np.stack(np.meshgrid(*[np.arange(-4.0, 5.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) * scale
     ball = lattice[np.linalg.norm(lattice, axis=1) < 4.3 * scale]
     shuffled = np.random.default_rng(4).permutation(np.repeat(ball, 3, axis=0))
     once, often = convex_hull(ball), convex_hull(np.concatenate([ball, shuffled]))
     assert np.array_equal(once.vertices, often.vertices)
     assert np.array_equal(once.normals, often.normals)
-    assert np.array_equal(_first_places(shuffled.view(np.int64)), first_places_by_sorting(shuffled))
-
-
-def first_places_by_sorting(rows):
-    return np.sort(np.unique(rows, axis=0, return_index=True)[1])
 
 
 @pytest.mark.parametrize("thick", [0.0, 1e-8, 1e-6, 1e-5, 1e-3])

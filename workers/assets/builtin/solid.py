@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import Loft
+from workers.geometry.convexity import numbers_in
+from workers.geometry.first_equal import first_equal
 from workers.geometry.jit import compiled
 from workers.geometry.manifold import hold_to_one_thread
 
@@ -205,11 +207,12 @@ def union_at(solid: Solid, touched: Mask, apex: Array, others: Sequence[Solid], 
     smooth = np.concatenate([solid.smooth[touched], np.zeros(len(fan), dtype=np.int64)])
     vertices = np.concatenate([solid.vertices, apex[None]])
     joined = union([combine([Solid(vertices[names], faces, surface, smooth), *beside]), *others])
-    place = {point: number for number, point in enumerate(map(tuple, joined.vertices.tolist()))}
-    rim = np.unique(a[border])
-    at = [place.get(point, -1) for point in map(tuple, solid.vertices[rim].tolist())]
+    rim = numbers_in(a[border], size)
+    # The sum with 0.0 turns -0.0, whose bits differ, into 0.0.
+    points = np.concatenate([joined.vertices, solid.vertices[rim]]) + 0.0
+    at = first_equal(points.view(np.int64))[len(joined.vertices) :]
     kept = joined.surface != _FAN
-    if int((~kept).sum()) != len(fan) or -1 in at:
+    if int((~kept).sum()) != len(fan) or (at >= len(joined.vertices)).any():
         return union([combine([solid, *beside]), *others])
     target = len(joined.vertices) + np.arange(size)
     target[rim] = at
