@@ -11,6 +11,7 @@ from schemas.job.physics import Physics
 from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.shape import Hull
 from workers.geometry.convexity import fills_hull
+from workers.geometry.first_equal import first_equal
 from workers.geometry.frames import transform
 from workers.geometry.jit import compiled
 from workers.physics.table_top import inside_margin
@@ -42,25 +43,42 @@ def is_round(hull: Hull, com: Array) -> bool:
     At rest the centre of mass is lower over the plane than over all its neighbours, and on a round stretch hardly lower
     than over some of them.
     """
-    cells = np.round(hull.normals / CELL).astype(np.int64) @ np.array([10_000, 100, 1])
-    normals = hull.normals[np.unique(cells, return_index=True)[1]]
-    height = (hull.vertices @ normals.T).max(axis=0) - normals @ com
-    return _rests_on_round(height, normals @ normals.T, math.cos(NEIGHBOUR_RAD), math.cos(SAME_PLANE_RAD))
+    cells = np.rint(hull.normals / CELL).astype(np.int64)
+    normals = hull.normals[first_equal(cells) == np.arange(len(cells))]
+    return _rests_on_round(hull.vertices, normals, com, math.cos(NEIGHBOUR_RAD), math.cos(SAME_PLANE_RAD))
 
 
 @compiled
-def _rests_on_round(height: Array, cosine: Array, far: float, near: float) -> bool:
-    """Whether a height [N] is at most the least of its neighbours, and that is hardly more; cosine [N, N] of the normals."""
-    for i in range(len(height)):
-        lowest = np.inf
-        for j in range(len(height)):
-            if far < cosine[i, j] < near:
-                lowest = min(lowest, height[j])
-                if lowest < height[i]:
+def _rests_on_round(points: Array, normals: Array, com: Array, far: float, near: float) -> bool:
+    """Whether com [3] is at most as high over a normal's plane as over its neighbours', and hardly lower than over one.
+
+    points [V, 3] and normals [N, 3] of the hull. Most normals have a lower neighbour, and one that has none ends the search:
+    few heights are ever asked for.
+    """
+    heights = np.full(len(normals), np.nan)
+    for i in range(len(normals)):
+        here, lowest = _height(points, normals, com, i, heights), np.inf
+        for j in range(len(normals)):
+            cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
+            if far < cosine < near:
+                lowest = min(lowest, _height(points, normals, com, j, heights))
+                if lowest < here:
                     break
-        if height[i] <= lowest <= height[i] * (1.0 + ROUND_SHARE):
+        if here <= lowest <= here * (1.0 + ROUND_SHARE):
             return True
     return False
+
+
+@compiled
+def _height(points: Array, normals: Array, com: Array, i: int, heights: Array) -> float:
+    """How far points reach beyond com [3] along normal i; kept in heights [N], where nan is not known yet."""
+    if np.isnan(heights[i]):
+        x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
+        farthest = -np.inf
+        for n in range(len(points)):
+            farthest = max(farthest, points[n, 0] * x + points[n, 1] * y + points[n, 2] * z)
+        heights[i] = farthest - (com[0] * x + com[1] * y + com[2] * z)
+    return heights[i]
 
 
 def starts_over_top(start: ObjectStart, table: Table) -> bool:
