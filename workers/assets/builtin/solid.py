@@ -153,15 +153,27 @@ def _profiles(profile: Array, section: Array | None) -> Array:
 
 def smoothing_groups(profile: Array) -> Indices:
     """[P - 1] int64: the smoothing group of each segment of a profile [P, 2]; flat ends have one of their own."""
-    step = np.diff(profile, axis=0)
-    length = np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2)
-    along = step / np.where(length == 0.0, 1.0, length)[:, None]
-    cosine = along[1:, 0] * along[:-1, 0] + along[1:, 1] * along[:-1, 1]
-    sharp = cosine < SMOOTH_COSINE
-    # A flat end is large beside its rounded rim: averaged normals would shade it as a dome.
-    sharp[0] |= step[0, 1] == 0.0
-    sharp[-1] |= step[-1, 1] == 0.0
-    return np.concatenate([[0], np.cumsum(sharp)]).astype(np.int64)
+    return _smoothing_groups(np.ascontiguousarray(profile, dtype=np.float64))
+
+
+@compiled
+def _smoothing_groups(profile: Array) -> Indices:
+    """A profile has a few dozen segments: numpy takes longer to begin than to count them."""
+    count = len(profile) - 1
+    groups = np.zeros(count, np.int64)
+    before_x = before_y = 0.0
+    for k in range(count):
+        x, y = profile[k + 1, 0] - profile[k, 0], profile[k + 1, 1] - profile[k, 1]
+        length = math.sqrt(x * x + y * y)
+        along_x, along_y = (x / length, y / length) if length != 0.0 else (x, y)
+        if k > 0:
+            sharp = along_x * before_x + along_y * before_y < SMOOTH_COSINE
+            # A flat end is large beside its rounded rim: averaged normals would shade it as a dome.
+            sharp |= k == 1 and profile[1, 1] == profile[0, 1]
+            sharp |= k == count - 1 and y == 0.0
+            groups[k] = groups[k - 1] + int(sharp)
+        before_x, before_y = along_x, along_y
+    return groups
 
 
 def combine(solids: Sequence[Solid]) -> Solid:

@@ -20,9 +20,9 @@ def rgb(color: Color) -> NDArray[np.uint8]:
 
 def blank(height: int, width: int, color: Color) -> Texture:
     """A texture of one colour."""
-    picture = np.empty((height, width, 3), dtype=np.uint8)
-    picture[:] = rgb(color)
-    return picture
+    picture = np.empty((height, 3 * width), dtype=np.uint8)
+    picture[:] = np.tile(rgb(color), width)  # row by row, because numpy is slow to repeat three bytes
+    return picture.reshape(height, width, 3)
 
 
 def noise(rng: np.random.Generator, height: int, width: int, rows: int, columns: int) -> Plane:
@@ -188,9 +188,13 @@ def draw_emblem(
     """Draws a round, square, diamond or ring-shaped emblem about (row, column), `size` its radius in pixels."""
     height, width = picture.shape[:2]
     y, x = (np.arange(height) - centre[0])[:, None] / size, (np.arange(width) - centre[1])[None] / size
-    disc, square = x * x + y * y < 1.0, np.maximum(np.abs(x) * 0.7, np.abs(y) * 1.2) < 0.9
-    diamond, ring = np.abs(x) + np.abs(y) < 1.1, np.abs(x * x + y * y - 0.75) < 0.3
-    picture[pick(rng, (disc, square, diamond, ring))] = rgb(color)
+    shapes = (
+        lambda: x * x + y * y < 1.0,
+        lambda: np.maximum(np.abs(x) * 0.7, np.abs(y) * 1.2) < 0.9,
+        lambda: np.abs(x) + np.abs(y) < 1.1,
+        lambda: np.abs(x * x + y * y - 0.75) < 0.3,
+    )
+    picture[pick(rng, shapes)()] = rgb(color)
 
 
 def label(rng: np.random.Generator, paper: Color, height: int = 128, width: int = 256, faces: int = 2) -> Texture:
