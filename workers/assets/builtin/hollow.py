@@ -62,7 +62,8 @@ def wall_around(hollow: Array, thickness_m: float, foot_radius: float, foot_widt
 
 def with_handles(body: Solid, outside: int, handles: Sequence[Solid]) -> Solid:
     """A vessel about the z axis with handles that end inside its wall; `outside`: the surface number of its outside."""
-    low, high = (body.vertices[body.faces].min(axis=1), body.vertices[body.faces].max(axis=1))
+    a, b, c = (body.vertices[body.faces[:, k]] for k in range(3))
+    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
     touched = np.zeros(len(body.faces), dtype=np.bool_)
     for handle in handles:
         start, stop = handle.vertices.min(axis=0) - HANDLE_ROOM_M, handle.vertices.max(axis=0) + HANDLE_ROOM_M

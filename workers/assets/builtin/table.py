@@ -1,5 +1,6 @@
 """Pure: tables: round, oval, square and rectangular, of wood, stone or paint, on legs, pedestals, sleds or panels."""
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from workers.assets.builtin.curves import bezier, rounded_rectangle, squircle
 from workers.assets.builtin.materials import metal, solid_color, textured
 from workers.assets.builtin.palette import BLACK, WHITE, chance, jitter, mix, pale, pick, vivid, wood_colors
 from workers.assets.builtin.parts import Model, Surface
-from workers.assets.builtin.solid import Solid, circle, combine, lathe, level_ring, loft, union
+from workers.assets.builtin.solid import Indices, Solid, circle, combine, lathe, level_ring, loft, union
 from workers.assets.builtin.sweeps import prism
 from workers.assets.builtin.textures import speckled, stone, wood
 
@@ -158,14 +159,23 @@ def _frame(size: tuple[float, float], wide: float, low: float, high: float) -> S
     square = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
     outer, inner = square * np.array(size), square * (np.array(size) - 2 * wide)
     loops = [level_ring(xy, z) for xy, z in ((inner, low), (outer, low), (outer, high), (inner, high))]
+    faces, smooth = _frame_faces()
+    return Solid(np.concatenate(loops), faces, np.full(len(faces), FRAME), smooth)
+
+
+@functools.cache
+def _frame_faces() -> tuple[Indices, Indices]:
+    """The faces [32, 3] of every frame, through its four loops of four corners, and the smoothing group [32] of each."""
     j = np.arange(4)
     faces, smooth = [], []
     for k in range(4):
         a, b, c, d = 4 * k + j, 4 * k + (j + 1) % 4, 4 * ((k + 1) % 4) + (j + 1) % 4, 4 * ((k + 1) % 4) + j
         faces.append(np.stack([np.stack([a, b, c], 1), np.stack([a, c, d], 1)], 1).reshape(-1, 3))
         smooth.append(np.repeat(4 * k + j, 2))
-    number = np.full(32, FRAME)
-    return Solid(np.concatenate(loops), np.concatenate(faces), number, np.concatenate(smooth))
+    table = np.concatenate(faces), np.concatenate(smooth)
+    for array in table:
+        array.setflags(write=False)
+    return table
 
 
 def _pedestal(rng: np.random.Generator, plan: TableSize) -> list[Solid]:
