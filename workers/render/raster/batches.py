@@ -105,10 +105,11 @@ def texture_of(part: Part) -> NDArray[np.uint8] | None:
 
 def _pack(parts: list[Part], highest_m: float) -> Batch:
     packed, indices, start = [], [], 0
-    for part in parts:
+    albedos = decode_srgb(np.array([part.material.base_color[:3] for part in parts]))
+    for part, albedo in zip(parts, albedos, strict=True):
         faces, source = own_vertices(part.faces, len(part.vertices))
-        vertices = _vertex_columns(part, source)
-        vertices[faces[:, 2], -4:] = np.column_stack(face_planes(Mesh(part.vertices, part.faces)))
+        vertices = _vertex_columns(part, albedo, source)
+        _write_planes(vertices, faces, *face_planes(Mesh(part.vertices, part.faces)))
         packed.append(vertices)
         indices.append(faces + start)
         start += len(vertices)
@@ -138,14 +139,22 @@ def _tops_first(
     return ordered, count
 
 
-def _vertex_columns(part: Part, source: NDArray[np.int64]) -> NDArray[np.float32]:
-    """[V', 17] float32 in the columns of `COLUMNS`, of the vertices `source` [V']; missing attributes, and the plane, are 0."""
-    material = part.material
-    albedo = decode_srgb(np.array(material.base_color[:3]))
+@compiled
+def _write_planes(vertices: NDArray[np.float32], faces: NDArray[np.int64], normals: Array, offsets: Array) -> None:
+    """Writes each face's plane, normals [F, 3] and offsets [F], into the last columns of its last vertex."""
+    for face in range(len(faces)):
+        row = vertices[faces[face, 2], -4:]
+        row[0], row[1], row[2], row[3] = normals[face, 0], normals[face, 1], normals[face, 2], offsets[face]
+
+
+def _vertex_columns(part: Part, albedo: Array, source: NDArray[np.int64]) -> NDArray[np.float32]:
+    """[V', 17] float32 in the columns of `COLUMNS`, of the vertices `source` [V']; missing attributes, and the plane, are 0.
+
+    albedo [3]: the part's colour in linear light.
+    """
     row = np.zeros(sum(COLUMNS.values()), np.float32)
-    row[6], row[7:10], row[10] = material.metallic, albedo, material.roughness
-    columns = np.empty((len(source), len(row)), np.float32)
-    columns[:] = row
+    row[6], row[7:10], row[10] = part.material.metallic, albedo, part.material.roughness
+    columns = np.tile(row, (len(source), 1))
     _gather_rows(np.ascontiguousarray(part.vertices), source, columns[:, 0:3])
     if part.normals is not None:
         _gather_rows(np.ascontiguousarray(part.normals), source, columns[:, 3:6])
