@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from workers.geometry.convexity import components, concavity_m, mesh_of, solid_of, triangle_corners, weld
+from workers.geometry.convexity import components, concavity_m, face_planes, mesh_of, solid_of, triangle_corners, weld
 
 
 def as_mesh(*bodies: trimesh.Trimesh) -> Mesh:
@@ -29,6 +29,18 @@ def test_a_welded_soup_has_one_vertex_at_each_place():
     welded = weld(soup_of(whole))
     assert len(welded.vertices) == 8 and len(welded.faces) == 12
     assert np.concatenate(triangle_corners(welded)) == pytest.approx(np.concatenate(triangle_corners(whole)))
+
+
+def test_the_corners_of_a_face_lie_in_its_plane_and_a_face_without_area_has_none():
+    ball = trimesh.creation.icosphere(2, 0.3)
+    ball.apply_translation((1.0, -2.0, 0.5))
+    mesh = as_mesh(ball)
+    flat = Mesh(mesh.vertices, np.concatenate([mesh.faces, [[0, 1, 1]]]).astype(np.int32))
+    normals, offsets = face_planes(flat)
+    assert normals[:-1] == pytest.approx(ball.face_normals, abs=1e-12)
+    for corner in triangle_corners(mesh):
+        assert (normals[:-1] * corner).sum(axis=1) == pytest.approx(offsets[:-1], abs=1e-12)
+    assert (*normals[-1], offsets[-1]) == (0.0, 0.0, 0.0, 0.0)
 
 
 def weld_by_records(mesh: Mesh) -> Mesh:

@@ -19,9 +19,13 @@ def test_the_points_of_a_lattice_are_found_again(scale):
     assert np.array_equal(first_equal(rows.view(np.int64)), by_sorting(rows))
 
 
-def test_rows_that_differ_in_one_number_are_not_equal():
-    rows = np.array([[1, 2, 3], [1, 2, 4], [1, 3, 3], [2, 2, 3], [1, 2, 3], [3, 2, 1]])
-    assert first_equal(rows).tolist() == [0, 1, 2, 3, 0, 5]
+@pytest.mark.parametrize("column", [0, 1, 2])
+def test_rows_that_differ_in_one_number_are_not_equal(column):
+    """Of so many rows some have the same place in the table."""
+    rows = np.full((5000, 3), 7)
+    rows[:, column] = np.random.default_rng(column).choice(2**40, 5000, replace=False)
+    assert np.array_equal(first_equal(rows), np.arange(5000))
+    assert np.array_equal(first_equal(np.concatenate([rows, rows[::-1]]))[5000:], np.arange(5000)[::-1])
 
 
 def test_no_row_and_one_row():

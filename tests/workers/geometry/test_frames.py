@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from workers.geometry.frames import (
+    cross,
     half_turn,
     invert,
     pose,
@@ -19,6 +20,12 @@ from workers.geometry.frames import (
 def random_unit(rng: np.random.Generator) -> np.ndarray:
     v = rng.standard_normal(3)
     return v / np.linalg.norm(v)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_cross_product_is_numpys_to_the_bit(seed):
+    a, b = np.random.default_rng(seed).standard_normal((2, 3))
+    assert np.array_equal(cross(a, b), np.cross(a, b))
 
 
 @pytest.mark.parametrize("seed", range(5))
