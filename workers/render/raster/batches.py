@@ -41,7 +41,7 @@ class Batch:
     indices: NDArray[np.uint32]
     texture: NDArray[np.uint8] | None
     matte: bool
-    """Whether no part is metal or smoother than `MATTE_ROUGHNESS`."""
+    """Whether no part is metal or smoother than `MATTE_ROUGHNESS`, or has normals or colours of its own."""
     top_faces: int = 0
     """The first so many faces are horizontal, face up, and lie within `SAME_LEVEL_M` of the shape's highest point."""
 
@@ -113,7 +113,10 @@ def _pack(parts: list[Part], highest_m: float) -> Batch:
         packed.append(vertices)
         indices.append(faces + start)
         start += len(vertices)
-    matte = all(p.material.metallic == 0.0 and p.material.roughness >= MATTE_ROUGHNESS for p in parts)
+    matte = all(
+        p.material.metallic == 0.0 and p.material.roughness >= MATTE_ROUGHNESS and p.normals is p.colors is None
+        for p in parts
+    )
     vertices = np.concatenate(packed)
     corners, top_faces = _tops_first(vertices, np.concatenate(indices), np.float32(highest_m - SAME_LEVEL_M), _PLANE_Z)
     return Batch(vertices, corners, texture_of(parts[0]), matte, top_faces)

@@ -84,9 +84,9 @@ def sort_draws(
         for batch in shape.batches:
             textured = view.color and is_drawn(view.effects, "textures", batch.texture is not None)
             cutout = view.cut and textured and is_drawn(view.effects, "transparency", batch.holes)
-            # Each program takes megabytes; only a floor is large enough to gain from one without highlights.
-            matte = view.color and batch.matte and ground
             for first, count, level in _ranges(batch, split, raster and ground):
+                # Each program takes megabytes; only a floor is large enough to gain from one for planes.
+                matte = view.color and batch.matte and ground and (level or not raster)
                 look = (view.color, textured, batch.few_triangles, matte, lights, raster)
                 variant = Variant(*look, ground, level, view.labels, cutout)
                 by_variant.setdefault(variant, []).append(Draw(thing, shape, batch, first, count))

@@ -22,7 +22,7 @@ out vec3 v_shadow;
 flat out vec2 v_slope;
 flat out vec2 v_aside;
 #endif
-#if FEW_TRIANGLES
+#if FEW_TRIANGLES && !MATTE
 flat out vec3 v_up;
 flat out vec3 v_below;
 #endif
@@ -36,7 +36,7 @@ void pass_light() {
     v_slope = abs(n.z) > 1e-6 * length(n) ? clamp(-n.xy / n.z, -40.0, 40.0) : vec2(0.0);
     v_aside = ASIDE_M * (mat3(level_from_shape) * face_plane.xyz).xy;
 #endif
-#if FEW_TRIANGLES
+#if FEW_TRIANGLES && !MATTE
     v_up = up;
     v_below = below;
 #endif
@@ -45,7 +45,11 @@ void pass_light() {
 
 LIT_FRAGMENT = """
 in vec3 v_level;
-#if FEW_TRIANGLES
+#if MATTE
+flat in vec3 v_plane_open;
+flat in vec3 v_plane_key;
+flat in vec3 v_plane_mirror;
+#elif FEW_TRIANGLES
 flat in vec3 v_up;
 flat in vec3 v_below;
 #else
@@ -87,6 +91,13 @@ vec3 tone_map(vec3 c) {
     return min(c, KNEE) + (1.0 - KNEE) * over / ((1.0 - KNEE) + over);
 }
 
+#if MATTE
+// A matte plane lies on the level of its map.
+vec3 shade_plane(vec3 tint) {
+    vec4 level = textureLod(level_map, v_level.xy, 0.0);
+    return tint * (level.r * v_plane_open + level.a * v_plane_key) + level.r * v_plane_mirror;
+}
+#else
 // Lambert, GGX's lobe as in the flat tier with Schlick's Fresnel, and a sky over a ground (hemispherical ambient).
 vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float roughness) {
 #if LEVEL
@@ -103,11 +114,6 @@ vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float rou
     vec3 diffuse = albedo * (1.0 - metallic);
     vec3 mirror = mix(vec3(0.04), albedo, metallic);
     vec3 around = mix(v_below, v_ambient, 0.5 + 0.5 * dot(normal, v_up)) * open;
-#if MATTE
-    vec3 sum = around * (diffuse + mirror);
-    sum += lit * v_light_color[0] * diffuse * max(dot(normal, v_light_towards[0]), 0.0);
-    for (int i = 1; i < LIGHTS; ++i) sum += open * v_light_color[i] * diffuse * max(dot(normal, v_light_towards[i]), 0.0);
-#else
     float facing = clamp(dot(normal, towards_eye), 0.0, 1.0), miss_eye = 1.0 - facing;
     float grazing = miss_eye * miss_eye * miss_eye * miss_eye * miss_eye * (1.0 - roughness);
     mirror += (1.0 - mirror) * grazing;
@@ -120,9 +126,9 @@ vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float rou
         float lobe = width / mix(0.5 * miss, 1.0, width);
         sum += v_light_color[i] * reach * (diffuse + mirror * (0.25 / width * lobe * lobe));
     }
-#endif
     return sum;
 }
+#endif
 """.replace("KNEE", str(KNEE))
 
 CAST_VERTEX = """

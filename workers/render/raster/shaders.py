@@ -22,6 +22,7 @@ class Variant(NamedTuple):
     textured: bool
     few_triangles: bool
     matte: bool
+    """A plane without highlights, whose light is therefore the same everywhere but for shadows: for the floor only."""
     lights: int
     raster: bool = False
     """Lit as in tier raster (lit_shaders.py)."""
@@ -52,26 +53,33 @@ flat out vec4 v_plane;
 uniform float nearer;
 #endif
 
-#if FEW_TRIANGLES
-uniform vec4 view;
-uniform vec2 thing;
+#if FEW_TRIANGLES || MATTE
 uniform vec3 ambient;
 uniform vec3 light_towards[LIGHTS];
 uniform vec3 light_color[LIGHTS];
+#endif
+
+#if FEW_TRIANGLES
+uniform vec4 view;
+uniform vec2 thing;
 flat out vec4 v_view;
 flat out vec2 v_thing;
+#if !MATTE
 flat out vec3 v_ambient;
 flat out vec3 v_light_towards[LIGHTS];
 flat out vec3 v_light_color[LIGHTS];
+#endif
 
 void pass_on() {
     v_view = view;
     v_thing = thing;
+#if !MATTE
     v_ambient = ambient;
     for (int i = 0; i < LIGHTS; ++i) {
         v_light_towards[i] = light_towards[i];
         v_light_color[i] = light_color[i];
     }
+#endif
 }
 #else
 void pass_on() {}
@@ -79,6 +87,27 @@ void pass_on() {}
 
 #if RASTER
 LIT_VERTEX
+#endif
+
+#if MATTE
+// Light from a plane towards the eye, per unit of a texel's: from the sky and all lights without shadows, and from the key
+// light with them; `v_plane_mirror` is the part that a texel does not tint.
+flat out vec3 v_plane_open;
+flat out vec3 v_plane_key;
+flat out vec3 v_plane_mirror;
+
+void light_plane() {
+    vec3 normal = v_plane.w > 0.0 ? -v_plane.xyz : v_plane.xyz;    // towards the eye
+#if RASTER
+    vec3 around = mix(below, ambient, 0.5 + 0.5 * dot(normal, up));
+#else
+    vec3 around = ambient;
+#endif
+    v_plane_mirror = 0.04 * around;
+    for (int i = RASTER; i < LIGHTS; ++i) around += light_color[i] * max(dot(normal, light_towards[i]), 0.0);
+    v_plane_open = albedo_roughness.rgb * around;
+    v_plane_key = albedo_roughness.rgb * light_color[0] * max(dot(normal, light_towards[0]), 0.0);
+}
 #endif
 
 void main() {
@@ -90,6 +119,9 @@ void main() {
     vec3 shift = cam_from_shape[3].xyz;
     vec3 face_normal = turn * face_plane.xyz;
     v_plane = vec4(face_normal, face_plane.w + dot(face_normal, shift));
+#if MATTE
+    light_plane();
+#endif
     v_normal_metallic = vec4(turn * normal_metallic.xyz, normal_metallic.w);
     v_albedo_roughness = albedo_roughness;
     v_uv = uv;
@@ -113,9 +145,11 @@ flat in vec4 v_plane;
 #if FEW_TRIANGLES
 flat in vec4 v_view;               // cx, cy, 1 / fx, 1 / fy
 flat in vec2 v_thing;              // region id / 255, depth bias as a share of the distance
+#if !MATTE
 flat in vec3 v_ambient;
 flat in vec3 v_light_towards[LIGHTS];
 flat in vec3 v_light_color[LIGHTS];
+#endif
 #else
 uniform vec4 view;
 uniform vec2 thing;
@@ -142,13 +176,16 @@ LIT_FRAGMENT
 // Radiance towards the eye: Lambert, and GGX's lobe (Walter et al. 2007) with its masking term taken as 1. The lobe is
 // written by the angle between the mirrored ray and the light, 1 - cos = 2 sin^2 of the half vector's, which saves the
 // half vectors. On a matte surface it is under 0.03 of the light, and is left out.
+#if MATTE
+flat in vec3 v_plane_open;
+flat in vec3 v_plane_mirror;
+
+vec3 shade_plane(vec3 tint) { return tint * v_plane_open + v_plane_mirror; }
+#else
 vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float roughness) {
     vec3 diffuse = albedo * (1.0 - metallic);
     vec3 mirror = mix(vec3(0.04), albedo, metallic);
     vec3 sum = v_ambient * (diffuse + mirror);
-#if MATTE
-    for (int i = 0; i < LIGHTS; ++i) sum += v_light_color[i] * diffuse * max(dot(normal, v_light_towards[i]), 0.0);
-#else
     float width = max(roughness * roughness * roughness * roughness, 0.002);
     vec3 bounced = 2.0 * dot(normal, towards_eye) * normal - towards_eye;
     for (int i = 0; i < LIGHTS; ++i) {
@@ -157,9 +194,9 @@ vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float rou
         float lobe = width / mix(0.5 * miss, 1.0, width);
         sum += v_light_color[i] * level * (diffuse + mirror * (0.25 / width * lobe * lobe));
     }
-#endif
     return sum;
 }
+#endif
 #endif
 
 // The curve is within 0.1 of a step of 8 bits of 1.055 c^(1 / 2.4) - 0.055, and square roots cost a third of powers.
@@ -186,20 +223,25 @@ void main() {
 #endif
 
 #if COLOR
+    vec3 tint = vec3(1.0);
+#if TEXTURED
+    vec4 texel = texture(albedo_map, v_uv);
+    tint = texel.rgb * texel.rgb;
+#if CUTOUT && !LABELS
+    if (texel.a < HOLE) discard;
+#endif
+#endif
+#if MATTE
+    vec3 light = shade_plane(tint);
+#else
     vec3 face_normal = across > 0.0 ? -v_plane.xyz : v_plane.xyz;
     vec3 normal = v_normal_metallic.xyz;
     float length2 = dot(normal, normal);
     normal = length2 > 0.01 ? normal * inversesqrt(length2) : face_normal;
     normal = dot(normal, face_normal) < 0.0 ? -normal : normal;
-    vec3 albedo = v_albedo_roughness.rgb;
-#if TEXTURED
-    vec4 texel = texture(albedo_map, v_uv);
-    albedo *= texel.rgb * texel.rgb;
-#if CUTOUT && !LABELS
-    if (texel.a < HOLE) discard;
-#endif
-#endif
+    vec3 albedo = v_albedo_roughness.rgb * tint;
     vec3 light = shade(normal, -ray * per_length, albedo, v_normal_metallic.w, v_albedo_roughness.w);
+#endif
 #if RASTER
     light = tone_map(light);
 #endif

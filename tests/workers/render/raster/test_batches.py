@@ -1,5 +1,7 @@
 """Packing of shapes for the GPU."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -84,6 +86,16 @@ def test_a_batch_is_matte_where_all_of_it_is():
         other = Part("p", plain.vertices, plain.faces, Material(roughness=roughness, metallic=metallic))
         dull = Part("p", plain.vertices, plain.faces, Material(roughness=1.0))
         assert pack_shape(Shape((dull, other)))[0].matte == matte
+
+
+def test_a_batch_whose_normals_or_colours_vary_is_not_matte():
+    """Its light differs from vertex to vertex."""
+    (plain,) = Shape((part_of(BODIES["box"]),)).parts
+    dull = Part("p", plain.vertices, plain.faces, Material(roughness=1.0))
+    normals = frozen_array(np.tile([0.0, 0.0, 1.0], (len(plain.vertices), 1)))
+    colors = np.full((len(plain.vertices), 4), 200, np.uint8)
+    for varied in (replace(dull, normals=normals), replace(dull, colors=colors)):
+        assert not pack_shape(Shape((dull, varied)))[0].matte
 
 
 def test_srgb_goes_there_and_back_and_has_its_known_values():

@@ -8,6 +8,7 @@ from schemas.base import frozen_array
 from schemas.scene.appearance import Appearance, Light
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Material, Part, Shape
+from tests.workers.render.looks import FLAT, RASTER
 from tests.workers.render.random_scenes import (
     EYE,
     WHITE,
@@ -18,6 +19,7 @@ from tests.workers.render.random_scenes import (
     small,
 )
 from workers.geometry.camera import orbit_pose
+from workers.geometry.frames import translation
 from workers.geometry.srgb import decode_srgb, encode_srgb
 
 PLANE_MM = 0.001
@@ -55,6 +57,20 @@ def test_light_comes_from_where_it_comes_from_in_the_world(renderer):
         view = camera(small(9, 9), orbit_pose(np.zeros(3), inclination, yaw, 2.0))
         linear = decode_srgb(renderer.draw([floor()], look, view).rgb[4, 4] / 255.0)
         assert linear == pytest.approx(0.5 * 0.8 * grey, abs=0.005)
+
+
+@pytest.mark.parametrize("tier", ["flat", "raster"])
+def test_the_open_floor_has_the_light_of_the_sky_and_of_all_lamps(renderer, tier):
+    """Away from all things: albedo times the light of the sky and of each lamp by its cosine, and 4 % of the sky mirrored."""
+    box = Shape((part_of(trimesh.creation.box((0.1, 0.1, 0.1))),))
+    colors, sky = ((0.3, 0.1, 0.2), (0.1, 0.2, 0.05)), np.array((0.2, 0.3, 0.4))
+    lights = tuple(Light(frozen_array([x, 0.0, 0.8]), color) for x, color in zip((0.6, -0.6), colors, strict=True))
+    look = Appearance(tuple(sky), lights, (0.1, 0.0, 0.0))
+    view = camera(small(9, 9), orbit_pose(np.array([4.0, 4.0, 0.0]), 0.6, 1.0, 1.0))
+    things = [floor(), Placed(3, box, translation(0.0, 0.0, 0.06))]
+    rgb = renderer.draw(things, look, view, *(FLAT if tier == "flat" else RASTER)).rgb
+    expected = decode_srgb(np.array(0.7)) * (sky + 0.8 * np.sum(colors, axis=0)) + 0.04 * sky
+    assert np.abs(rgb[4, 4] - 255 * encode_srgb(expected)).max() <= 0.7
 
 
 def test_a_smooth_metal_mirrors_a_light_and_a_rough_one_spreads_it(renderer):
