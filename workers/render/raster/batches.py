@@ -114,7 +114,10 @@ def _pack(parts: list[Part], highest_m: float) -> Batch:
         indices.append(faces + start)
         start += len(vertices)
     matte = all(
-        p.material.metallic == 0.0 and p.material.roughness >= MATTE_ROUGHNESS and p.normals is p.colors is None
+        p.material.metallic == 0.0
+        and p.material.roughness >= MATTE_ROUGHNESS
+        and p.normals is None
+        and p.colors is None
         for p in parts
     )
     vertices = np.concatenate(packed)

@@ -42,14 +42,19 @@ class Framebuffer:
             raise RuntimeError(f"a framebuffer of {width} x {height} is not complete: status {status:#x}")
         self.size = (width, height)
 
-    def clear(self, appearance: Appearance) -> None:
-        """Set every pixel to the background, infinitely far away: depth falls with distance."""
+    def clear(self, appearance: Appearance, filled: bool = False) -> None:
+        """Set every pixel to the background, infinitely far away: depth falls with distance.
+
+        `filled`: what is drawn next covers every pixel, so that colours need not be cleared.
+        """
         gl = self._gl
+        gl.glClearBufferfv(gl.GL_DEPTH, 0, np.zeros(1, np.float32))
+        if filled:
+            return
         background = np.append(encode_srgb(np.array(appearance.background)), 0.0)
         gl.glClearBufferfv(gl.GL_COLOR, 0, background.astype(np.float32))
         if gl.GL_COLOR_ATTACHMENT1 in self._formats:
             gl.glClearBufferfv(gl.GL_COLOR, 1, np.zeros(4, np.float32))
-        gl.glClearBufferfv(gl.GL_DEPTH, 0, np.zeros(1, np.float32))
 
     def read(self, rgba: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Read the first colour attachment into `rgba` [H, W, 4], and return it."""

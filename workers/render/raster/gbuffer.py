@@ -34,6 +34,7 @@ from schemas.job.render import Render
 from schemas.scene.appearance import Appearance
 from schemas.scene.camera import Camera
 from schemas.scene.effects import EffectPlan
+from schemas.scene.region import REGION_FLOOR
 from schemas.scene.scene import Placed
 from schemas.scene.view import GBuffer
 from workers.geometry.frames import invert
@@ -46,7 +47,7 @@ from workers.render.raster.framebuffer import ColourTarget, Framebuffer
 from workers.render.raster.light_maps import LightMaps
 from workers.render.raster.programs import NEAR_M, Program, place_lights
 from workers.render.raster.shaders import Variant, label_sources
-from workers.render.raster.tiles import tiles
+from workers.render.raster.tiles import fills_image, tiles
 
 DEPTH_BIAS = 2e-6
 """Share of its distance, along its normal, by which each rank of `rank_regions` moves a face back in the depth test: 5
@@ -118,7 +119,7 @@ class Renderer:
         view = RenderPass(appearance, k, invert(camera.T_world_cam), effects, color, _is_lit(render, effects))
         self._target.bind(k.width, k.height)
         self._gl.glEnable(self._gl.GL_DEPTH_TEST)
-        self._target.clear(appearance)
+        self._target.clear(appearance, filled=_floor_fills(things, view))
         self._draw_things(things, view)
         rgb, depth_m, region = self._read(view)
         if rgb is not None:
@@ -270,6 +271,12 @@ class Renderer:
         rgb: NDArray | None = cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB) if view.color else None
         region: NDArray = cv2.extractChannel(rgba, 3)
         return rgb, depth, region
+
+
+def _floor_fills(things: Sequence[Placed], view: RenderPass) -> bool:
+    """Whether a floor is drawn that covers every pixel."""
+    floors = [thing for thing in things if thing.region_id == REGION_FLOOR] if view.effects.runs("floor") else []
+    return any(fills_image(thing.shape, view.T_cam_world @ thing.T_world_shape, view.k) for thing in floors)
 
 
 def _is_lit(render: Render, effects: EffectPlan) -> bool:

@@ -1,4 +1,4 @@
-"""Tiles of the pixel grid that a thing covers, inside the image and around it: pure functions."""
+"""What a thing covers of the pixel grid, inside the image and around it: pure functions."""
 
 import math
 from collections.abc import Iterator
@@ -9,12 +9,16 @@ import numpy as np
 from schemas.base import Array, Pose
 from schemas.scene.camera import Intrinsics
 from schemas.scene.shape import Shape
+from workers.geometry.bounds import bounds_of
 from workers.geometry.frames import transform
 from workers.geometry.jit import compiled
 from workers.render.raster.programs import NEAR_M
 
 TILE_PX = 1024
 """Side of a tile, pixels."""
+
+BORDER_PX = 1.0
+"""A rasteriser moves edges by at most 1/256 of a pixel."""
 
 
 def tiles(shape: Shape, T_cam_shape: Pose, k: Intrinsics) -> Iterator[Intrinsics]:
@@ -58,3 +62,37 @@ def _projected_bounds(
             left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
             seen += 1
     return seen, left, top, right, bottom
+
+
+def fills_image(shape: Shape, T_cam_shape: Pose, k: Intrinsics) -> bool:
+    """Whether a shape covers every pixel of the image, seen from either side: of rectangles that are floors alone.
+
+    True only where the shape is two triangles that make a rectangle along x and y of its frame, and only where that reaches
+    beyond the image by `BORDER_PX` on all sides, twice as far away as the near plane.
+    """
+    if shape.closed or not _is_rectangle(shape):
+        return False
+    low, high = bounds_of(shape.vertices)
+    x, y = np.array([-BORDER_PX, k.width + BORDER_PX]), np.array([-BORDER_PX, k.height + BORDER_PX])
+    rays = np.array([((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0) for u, v in product(x, y)]) @ T_cam_shape[:3, :3]
+    eye = -T_cam_shape[:3, 3] @ T_cam_shape[:3, :3]
+    fall = float(low[2] - eye[2])
+    if not (rays[:, 2] * fall > 0.0).all():
+        return False
+    away_m = fall / rays[:, 2]  # along the optical axis, as rays are of that length
+    met = eye[:2] + away_m[:, None] * rays[:, :2]
+    return bool((away_m > 2.0 * NEAR_M).all() and (met > low[:2]).all() and (met < high[:2]).all())
+
+
+def _is_rectangle(shape: Shape) -> bool:
+    """Whether a shape is a rectangle along x and y at one z: four corners, and two triangles on either side of a diagonal."""
+    if len(shape.vertices) != 4 or len(shape.faces) != 2:
+        return False
+    vertices, faces = shape.vertices.tolist(), shape.faces.tolist()
+    x, y, z = ({vertex[axis] for vertex in vertices} for axis in range(3))
+    if len({tuple(vertex) for vertex in vertices}) != 4 or [len(x), len(y), len(z)] != [2, 2, 1]:
+        return False
+    if any(len(set(face)) != 3 for face in faces):
+        return False
+    first, second = (vertices[6 - sum(face)] for face in faces)  # the corner that a face lacks
+    return first[0] != second[0] and first[1] != second[1]

@@ -41,6 +41,20 @@ def test_drawing_again_gives_the_same_bytes(renderer):
         assert getattr(first, name).tobytes() == getattr(again, name).tobytes(), name
 
 
+@pytest.mark.parametrize("inclination", [-0.9, 0.05, 0.3, 0.9])
+def test_nothing_of_the_image_before_is_left_whether_or_not_the_floor_fills_the_image(renderer, inclination):
+    """With a horizon in two of these views, which show the background above it; from below and from above."""
+    view = camera(small(64, 48), orbit_pose(np.zeros(3), inclination, 0.3, 1.0))
+    body = Placed(3, shape_of(trimesh.creation.box((0.1, 0.1, 0.1))), translation(0.0, 0.0, 0.06))
+    seen = []
+    for before, distance_m in ((9, 0.5), (200, 3.0)):
+        renderer.draw([Placed(before, facing(distance_m), EYE)], WHITE, camera(small(64, 48)))
+        seen.append(renderer.draw([floor(), body], WHITE, view))
+    for name in ("rgb", "depth_m", "region"):
+        np.testing.assert_array_equal(*(getattr(one, name) for one in seen))
+    assert (seen[0].region == 0).any() == (abs(inclination) < 0.5)
+
+
 def test_what_is_returned_is_frozen_and_not_the_next_views(renderer):
     first = renderer.draw([floor()], WHITE, camera(T=orbit_pose(np.zeros(3), 0.8, 0.0, 2.5)))
     kept = first.rgb.copy(), first.depth_m.copy(), first.region.copy()

@@ -1,12 +1,15 @@
-"""The part of the pixel grid on which a thing is counted."""
+"""The part of the pixel grid on which a thing is counted, and what covers all of the image."""
 
 import numpy as np
 import trimesh
 
+from schemas.base import frozen_array
 from schemas.scene.camera import Intrinsics
-from tests.workers.render.random_scenes import shape_of
-from workers.geometry.frames import translation
-from workers.render.raster.tiles import TILE_PX, tiles, window
+from schemas.scene.shape import Part, Shape
+from tests.workers.render.random_scenes import FLOOR_HALF_M, floor, shape_of
+from workers.geometry.camera import orbit_pose
+from workers.geometry.frames import invert, translation
+from workers.render.raster.tiles import TILE_PX, fills_image, tiles, window
 
 K = Intrinsics(width=100, height=80, fx=100.0, fy=100.0, cx=50.0, cy=40.0)
 
@@ -47,3 +50,35 @@ def test_tiles_cover_the_window_once_on_the_same_pixel_grid():
     expected = np.zeros_like(seen)
     expected[top:bottom, left:right] = 1
     np.testing.assert_array_equal(seen, expected)
+
+
+def test_a_floor_that_fills_the_image_is_met_by_the_ray_of_every_pixel():
+    """True for nearly all views that meet it in every pixel; never for one that misses it somewhere."""
+    rng, agreed = np.random.default_rng(5), []
+    shape = floor().shape
+    for _ in range(300):
+        T_world_cam = orbit_pose(rng.normal(0.0, 12.0, 3) * [1, 1, 0], rng.uniform(-1.5, 1.5), rng.uniform(-3, 3), 3.0)
+        x, y = np.meshgrid(np.linspace(0, K.width, 41), np.linspace(0, K.height, 41))
+        rays = np.stack([(x - K.cx) / K.fx, (y - K.cy) / K.fy, np.ones_like(x)], -1) @ T_world_cam[:3, :3].T
+        away = -T_world_cam[2, 3] / rays[..., 2]
+        met = T_world_cam[:2, 3] + away[..., None] * rays[..., :2]
+        every = bool((away > 0.05).all() and (abs(met) < FLOOR_HALF_M).all())
+        fills = fills_image(shape, invert(T_world_cam), K)
+        assert every or not fills
+        agreed.append((every, fills))
+    every, fills = np.array(agreed).T
+    assert 30 < fills.sum() < 270
+    assert fills.sum() >= 0.95 * every.sum()
+
+
+def test_only_a_rectangle_of_two_triangles_fills_an_image():
+    corners, above = [[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], invert(orbit_pose(np.zeros(3), 1.0, 0.0, 1.0))
+    whole = np.array(corners, float)
+    tilted, slanted = whole.copy(), whole.copy()
+    tilted[2:, 2] = slanted[2, 0] = 10.0
+    halves, twice = [[0, 1, 2], [0, 2, 3]], [[0, 1, 2], [1, 2, 3]]
+    cases = [(whole, halves, True), (whole, twice, False), (tilted, halves, False), (slanted, halves, False)]
+    cases += [(whole, halves[:1] * 2, False), (whole, halves[:1], False), (0.01 * whole, halves, False)]
+    for vertices, faces, fills in cases:
+        shape = Shape((Part("p", frozen_array(vertices), np.array(faces, np.int32)),))
+        assert fills_image(shape, above, K) == fills
