@@ -69,19 +69,23 @@ uniform vec3 softness;             // filter radius, depth bias and pixel size o
 const vec2 RING[4] = vec2[4](vec2(0.92, 0.38), vec2(-0.38, 0.92), vec2(-0.92, -0.38), vec2(0.38, -0.92));
 
 // Share of the key light that arrives. On the level it is in the map; elsewhere each tap compares with the face's own
-// plane, so that no face shades itself. A loop instead of a branch, because llvmpipe skips a loop that no fragment enters:
-// none does on the level or on a face turned away from the light.
+// plane, so that no face shades itself. A loop that ends after one turn instead of a branch, because llvmpipe skips a loop
+// that no fragment enters: none does on the level or on a face turned away from the light.
 float key_share(float on_map, float facing) {
     bool on_level = abs(v_level.z) < 0.01, inside = all(lessThan(abs(v_level.xy - 0.5), vec2(0.5)));
     int taps = facing <= 0.0 ? 0 : on_level ? (inside ? 0 : 1) : 4;
     // The map's pixels hold the depth of their centres, up to a pixel away from the point that is compared.
     float depth = v_shadow.z - softness.y - dot(abs(v_slope), vec2(softness.z));
-    float sum = 0.0;
-    for (int i = 0; i < taps; ++i) {
-        vec2 d = RING[i] * softness.x;
-        sum += textureLod(shadow_map, vec3(v_shadow.xy + d, min(depth + dot(v_slope, d), 1.0)), 0.0);
+    float share = on_map;
+    for (int turn = 0; turn < min(taps, 1); ++turn) {
+        vec4 lit;
+        for (int i = 0; i < 4; ++i) {
+            vec2 d = RING[i] * softness.x;
+            lit[i] = textureLod(shadow_map, vec3(v_shadow.xy + d, min(depth + dot(v_slope, d), 1.0)), 0.0);
+        }
+        share = taps == 1 ? lit[0] : (lit[0] + lit[1] + lit[2] + lit[3]) / 4.0;
     }
-    return taps == 0 ? on_map : sum / float(taps);
+    return share;
 }
 #endif
 
