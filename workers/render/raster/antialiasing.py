@@ -27,7 +27,7 @@ OFFSETS_PX = tuple(
 SPAN_PX = 8.0
 """Greatest distance, along an edge, of the neighbours that an edge pixel is blended with."""
 
-Floats = NDArray[np.float32]
+Color = tuple[np.float32, np.float32, np.float32]
 
 LINEAR_STEPS = 16_383
 _LINEAR = np.rint(SRGB_STEPS * LINEAR_STEPS).astype(np.uint16)
@@ -88,10 +88,8 @@ def _smooth_edges(rgb: NDArray[np.uint8], mask: NDArray[np.uint8], span: np.floa
     width = mask.shape[1]
     edges = _flat_nonzero(mask.reshape(-1))
     blended = np.empty((len(edges), 3), np.uint8)
-    around = np.empty((3, 3), np.float32)
-    near, far = np.empty(3, np.float32), np.empty(3, np.float32)
     for n in range(len(edges)):
-        _blend_edge(rgb, edges[n] // width, edges[n] % width, span, around, near, far, blended[n])
+        blended[n, 0], blended[n, 1], blended[n, 2] = _blend_edge(rgb, edges[n] // width, edges[n] % width, span)
     pixels = rgb.reshape(-1, 3)
     for n in range(len(edges)):
         for channel in range(3):
@@ -114,48 +112,47 @@ def _flat_nonzero(values: NDArray[np.uint8]) -> NDArray[np.int64]:
 
 
 @compiled
-def _blend_edge(
-    seen: NDArray[np.uint8],
-    y: int,
-    x: int,
-    span: np.float32,
-    around: Floats,
-    near: Floats,
-    far: Floats,
-    out: NDArray[np.uint8],
-) -> None:
-    """The colour of one edge pixel into `out` [3]; around [3, 3], near [3] and far [3], float32, are overwritten."""
-    height, width = seen.shape[:2]
+def _blend_edge(seen: NDArray[np.uint8], y: int, x: int, span: np.float32) -> tuple[np.uint8, np.uint8, np.uint8]:
+    """The colour of one edge pixel. Written with scalars, because numba keeps small arrays in memory."""
     half, quarter, one, two = np.float32(0.5), np.float32(0.25), np.float32(1.0), np.float32(2.0)
-    low, high = np.float32(255.0), np.float32(0.0)
-    for dy in range(3):
-        for dx in range(3):
-            row, column = min(max(y + dy - 1, 0), height - 1), min(max(x + dx - 1, 0), width - 1)
-            grey = _grey(seen[row, column, 0], seen[row, column, 1], seen[row, column, 2])
-            around[dy, dx] = grey
-            low, high = min(low, grey), max(high, grey)
+    above, below, left, right = max(y - 1, 0), min(y + 1, len(seen) - 1), max(x - 1, 0), min(x + 1, seen.shape[1] - 1)
+    a, b, c = _grey_at(seen, above, left), _grey_at(seen, above, x), _grey_at(seen, above, right)
+    d, e, f = _grey_at(seen, y, left), _grey_at(seen, y, x), _grey_at(seen, y, right)
+    g, h, i = _grey_at(seen, below, left), _grey_at(seen, below, x), _grey_at(seen, below, right)
     # Binomial differences across the pixel: exactly 0 and 1 for the directions of level and upright edges.
-    across = (around[0, 2] + two * around[1, 2] + around[2, 2]) - (around[0, 0] + two * around[1, 0] + around[2, 0])
-    down = (around[2, 0] + two * around[2, 1] + around[2, 2]) - (around[0, 0] + two * around[0, 1] + around[0, 2])
-    along_x, along_y = down, -across
+    along_y = -((c + two * f + i) - (a + two * d + g))
+    along_x = (g + two * h + i) - (a + two * b + c)
     least = max(min(abs(along_x), abs(along_y)), one)
     length = max(np.sqrt(along_x * along_x + along_y * along_y), one)
     step_x = min(max(along_x / least, -span), span)
     step_y = min(max(along_y / least, -span), span)
-    near[:], far[:] = np.float32(0.0), np.float32(0.0)
-    for sign in (-half, half):
-        _add_tap(seen, x + sign * along_x / length, y + sign * along_y / length, half, near)
-        _add_tap(seen, x + sign * step_x, y + sign * step_y, quarter, far)
-    for channel in range(3):
-        far[channel] += half * near[channel]
+    before = _tap(seen, x - half * along_x / length, y - half * along_y / length)
+    after = _tap(seen, x + half * along_x / length, y + half * along_y / length)
+    far_before, far_after = (
+        _tap(seen, x - half * step_x, y - half * step_y),
+        _tap(seen, x + half * step_x, y + half * step_y),
+    )
+    near = _mix(half, before, half, after)
+    far = _mix(one, _mix(quarter, far_before, quarter, far_after), half, near)
     level = _grey(far[0], far[1], far[2])
-    for channel in range(3):
-        value = far[channel] if low <= level <= high else near[channel]
-        out[channel] = np.uint8(np.rint(value))
+    between = min(a, b, c, d, e, f, g, h, i) <= level <= max(a, b, c, d, e, f, g, h, i)
+    red, green, blue = far if between else near
+    return np.uint8(np.rint(red)), np.uint8(np.rint(green)), np.uint8(np.rint(blue))
 
 
 @compiled
-def _grey(red: float, green: float, blue: float) -> np.float32:
+def _mix(p: np.float32, a: Color, q: np.float32, b: Color) -> Color:
+    """p a + q b."""
+    return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2]
+
+
+@compiled
+def _grey_at(seen: NDArray[np.uint8], y: int, x: int) -> np.float32:
+    return _grey(seen[y, x, 0], seen[y, x, 1], seen[y, x, 2])
+
+
+@compiled
+def _grey(red: np.floating, green: np.floating, blue: np.floating) -> np.float32:
     return (
         np.float32(0.299) * np.float32(red)
         + np.float32(0.587) * np.float32(green)
@@ -164,18 +161,30 @@ def _grey(red: float, green: float, blue: float) -> np.float32:
 
 
 @compiled
-def _add_tap(image: NDArray[np.uint8], x: float, y: float, weight: np.float32, total: NDArray[np.float32]) -> None:
-    """Add the bilinear colour at (x, y); pixels at the border are repeated."""
+def _tap(image: NDArray[np.uint8], x: np.floating, y: np.floating) -> Color:
+    """The bilinear colour at (x, y); pixels at the border are repeated."""
     height, width = image.shape[:2]
     x0, y0 = np.floor(x), np.floor(y)
     fx, fy = np.float32(x - x0), np.float32(y - y0)
     left, top = min(max(int(x0), 0), width - 1), min(max(int(y0), 0), height - 1)
     right, bottom = min(max(int(x0) + 1, 0), width - 1), min(max(int(y0) + 1, 0), height - 1)
-    one = np.float32(1.0)
-    for channel in range(3):
-        above = (one - fx) * np.float32(image[top, left, channel]) + fx * np.float32(image[top, right, channel])
-        below = (one - fx) * np.float32(image[bottom, left, channel]) + fx * np.float32(image[bottom, right, channel])
-        total[channel] += weight * ((one - fy) * above + fy * below)
+    return _mix(
+        np.float32(1.0) - fy,
+        _between(image[top, left], image[top, right], fx),
+        fy,
+        _between(image[bottom, left], image[bottom, right], fx),
+    )
+
+
+@compiled
+def _between(a: NDArray[np.uint8], b: NDArray[np.uint8], share: np.float32) -> Color:
+    """The colour at a share of the way from pixel a [3] to pixel b [3]."""
+    rest = np.float32(1.0) - share
+    return (
+        rest * np.float32(a[0]) + share * np.float32(b[0]),
+        rest * np.float32(a[1]) + share * np.float32(b[1]),
+        rest * np.float32(a[2]) + share * np.float32(b[2]),
+    )
 
 
 def blend_samples(rgb: NDArray[np.uint8], others: Sequence[NDArray[np.uint8]], mask: NDArray[np.uint8]) -> None:
