@@ -6,16 +6,19 @@ Everything takes `gl`, the module that `open_context` loaded: importing this mod
 import ctypes
 from collections import OrderedDict
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from types import ModuleType
 from weakref import ref
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import Shape
 from workers.geometry.bounds import bounds_of
 from workers.render.raster.batches import COLUMNS, Batch, pack_shape
+from workers.render.raster.covers import Cover, find_cover
 from workers.render.raster.textures import Texture, TextureStore
 
 FLOAT_BYTES = INDEX_BYTES = 4
@@ -39,6 +42,9 @@ class Uploaded:
     """The first so many indices belong to the shape's top (batches.py)."""
     matte: bool
     bytes: int
+    positions: NDArray[np.float32]
+    faces: NDArray[np.uint32]
+    """Positions [V, 3] in the shape's frame, and faces [F, 3]: for what is decided before drawing. None of many faces."""
 
     @property
     def holes(self) -> bool:
@@ -58,6 +64,14 @@ class UploadedShape:
     batches: tuple[Uploaded, ...]
     corners: Array
     closed: bool
+
+    @cached_property
+    def cover(self) -> Cover | None:
+        """Its top, if that hides what is below it: if it has no holes, also no holes in its texture."""
+        if any(batch.holes for batch in self.batches):
+            return None
+        tops = [batch.positions[batch.faces[: batch.top_count // 3]] for batch in self.batches]
+        return find_cover(np.concatenate(tops))
 
     @property
     def bytes(self) -> int:
@@ -136,4 +150,8 @@ def _upload(gl: ModuleType, batch: Batch, textures: TextureStore) -> Uploaded:
     texture = None if batch.texture is None else textures.take(batch.texture)
     size = batch.vertices.nbytes + batch.indices.nbytes
     buffers = (vertex_buffer, index_buffer)
-    return Uploaded(vertex_array, buffers, texture, batch.indices.size, 3 * batch.top_faces, batch.matte, size)
+    top_count = 3 * batch.top_faces
+    # Copies, so that the other columns are not kept.
+    faces = batch.indices if len(batch.indices) <= FEW_TRIANGLES else batch.indices[:0]
+    positions = batch.vertices[: len(batch.vertices) if len(faces) else 0, :3].copy()
+    return Uploaded(vertex_array, buffers, texture, batch.indices.size, top_count, batch.matte, size, positions, faces)

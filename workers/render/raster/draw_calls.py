@@ -14,7 +14,8 @@ from schemas.scene.scene import Placed
 from schemas.scene.shape import Shape
 from workers.geometry.frames import transform
 from workers.render.raster.buffers import Uploaded, UploadedShape
-from workers.render.raster.programs import light_slots
+from workers.render.raster.covers import Cover, seen_ranges
+from workers.render.raster.programs import NEAR_M, light_slots
 from workers.render.raster.shaders import Variant
 
 NAMES = {REGION_FLOOR: "floor", REGION_TABLE: "table"}
@@ -81,10 +82,14 @@ def sort_draws(
             continue
         shape, ground = fetch(thing.shape), thing.region_id == REGION_FLOOR
         split = raster and has_level_top(thing)
+        hides = thing.region_id == REGION_TABLE and not view.cut
+        T_cam_shape = view.T_cam_world @ thing.T_world_shape
+        cover = shape.cover if hides and is_beyond_near(shape, T_cam_shape) else None
+        eye = -T_cam_shape[:3, 3] @ T_cam_shape[:3, :3]
         for batch in shape.batches:
             textured = view.color and is_drawn(view.effects, "textures", batch.texture is not None)
             cutout = view.cut and textured and is_drawn(view.effects, "transparency", batch.holes)
-            for first, count, level in _ranges(batch, split, raster and ground):
+            for first, count, level in _ranges(batch, split, raster and ground, cover, eye):
                 # Each program takes megabytes; only a floor is large enough to gain from one for planes.
                 matte = view.color and batch.matte and ground and (level or not raster)
                 look = (view.color, textured, batch.few_triangles, matte, lights, raster)
@@ -93,14 +98,29 @@ def sort_draws(
     return by_variant
 
 
-def _ranges(batch: Uploaded, split: bool, level: bool) -> Iterator[tuple[int, int, bool]]:
-    """(first index, count, whether all of them lie on a level) of a batch; `split`: its top apart from the rest."""
-    if not split:
+def is_beyond_near(shape: UploadedShape, T_cam_shape: Pose) -> bool:
+    """Whether the near plane cuts nothing off a shape."""
+    return bool((shape.corners @ T_cam_shape[2, :3] + T_cam_shape[2, 3] > NEAR_M).all())
+
+
+def _ranges(
+    batch: Uploaded, split: bool, level: bool, cover: Cover | None, eye: Array
+) -> Iterator[tuple[int, int, bool]]:
+    """(first index, count, whether all of them lie on a level) of what is drawn of a batch.
+
+    `split`: its top apart from the rest. With a cover, without what that hides from an eye [3] in its frame.
+    """
+    hides = cover is not None and len(batch.faces) > 0
+    if not split and not hides:
         yield 0, batch.index_count, level
         return
     if batch.top_count:
-        yield 0, batch.top_count, True
-    if batch.top_count < batch.index_count:
+        yield 0, batch.top_count, split or level
+    if cover is not None and hides:
+        lower = batch.faces[batch.top_count // 3 :]
+        for first, count in seen_ranges(batch.positions, lower, cover, eye):
+            yield batch.top_count + 3 * first, 3 * count, level and not split
+    elif batch.top_count < batch.index_count:
         yield batch.top_count, batch.index_count - batch.top_count, False
 
 

@@ -42,10 +42,10 @@ from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_e
 from workers.render.raster.buffers import INDEX_BYTES, ShapeStore, UploadedShape
 from workers.render.raster.context import open_context
 from workers.render.raster.counting import PixelCounter
-from workers.render.raster.draw_calls import Draw, RenderPass, is_drawn, rank_regions, sort_draws
+from workers.render.raster.draw_calls import Draw, RenderPass, is_beyond_near, is_drawn, rank_regions, sort_draws
 from workers.render.raster.framebuffer import ColourTarget, Framebuffer
 from workers.render.raster.light_maps import LightMaps
-from workers.render.raster.programs import NEAR_M, Program, place_lights
+from workers.render.raster.programs import Program, place_lights
 from workers.render.raster.shaders import Variant, label_sources
 from workers.render.raster.tiles import fills_image, tiles
 
@@ -246,9 +246,10 @@ class Renderer:
     def _cull(self, shape: UploadedShape, T_cam_shape: Pose, through_holes: bool = False) -> None:
         """Skip the back faces of closed bodies, unless the near plane cuts the body or its texture has holes."""
         gl = self._gl
-        whole = bool((shape.corners @ T_cam_shape[2, :3] + T_cam_shape[2, 3] > NEAR_M).all())
         cut = through_holes and any(batch.holes for batch in shape.batches)
-        (gl.glEnable if shape.closed and whole and not cut else gl.glDisable)(gl.GL_CULL_FACE)
+        (gl.glEnable if shape.closed and not cut and is_beyond_near(shape, T_cam_shape) else gl.glDisable)(
+            gl.GL_CULL_FACE
+        )
 
     def _draw(self, draw: Draw, textured: bool) -> None:
         gl = self._gl
