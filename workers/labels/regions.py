@@ -11,6 +11,7 @@ from schemas.scene.region import REGION_TABLE
 from schemas.scene.scene import Placed, PosedScene
 from schemas.scene.view import ObjectLabel
 from workers.geometry.camera import image_coordinates
+from workers.geometry.coverage import count_covered
 from workers.geometry.frames import invert
 from workers.geometry.pixels import Extent, measure_regions
 
@@ -41,7 +42,7 @@ def label_things(
 ) -> tuple[ObjectLabel, ...]:
     """Labels of things in a mask [H, W]; names: (category, instance id) by region id.
 
-    Unoccluded pixels are counted of the things that are seen, of all of them at once: so a GPU is waited for once.
+    Unoccluded pixels are counted of the things that are seen, of all of them at once.
     """
     extents = measure_regions(region)
     seen = [thing for thing in things if extents[thing.region_id].pixels]
@@ -50,6 +51,19 @@ def label_things(
         label_region(thing, names[thing.region_id], camera, extents[thing.region_id], counts.get(id(thing), 0))
         for thing in things
     )
+
+
+def count_unoccluded(things: Sequence[Placed], camera: Camera, count_drawn: CountPixels) -> list[int]:
+    """Pixels that each thing covers by itself, also outside the image; `count_drawn` counts what is too near or too large.
+
+    A count by the processor takes a quarter of the time of a renderer's, which is waited for, and does not depend on the
+    device.
+    """
+    T_cam_world = invert(camera.T_world_cam)
+    counts = [count_covered(thing.shape, T_cam_world @ thing.T_world_shape, camera.intrinsics) for thing in things]
+    others = [thing for thing, count in zip(things, counts, strict=True) if count is None]
+    drawn = iter(count_drawn(others, camera) if others else ())
+    return [next(drawn) if count is None else count for count in counts]
 
 
 def label_region(thing: Placed, name: tuple[str, str], camera: Camera, extent: Extent, unoccluded: int) -> ObjectLabel:

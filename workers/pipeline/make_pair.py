@@ -1,6 +1,7 @@
 """One pair of a settled scene: its views as they are stored, and how they agree."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 from schemas.dataset.layout import file_pose_id, input_pose_id
 from schemas.scene.camera import ROLES, Camera, Role
@@ -13,7 +14,7 @@ from workers.geometry.stored_depth import quantise_depth
 from workers.labels.agreement import compare_views
 from workers.labels.projected_view import derive_projected, projection_shares
 from workers.labels.ray_check import check_against_rays
-from workers.labels.regions import label_regions
+from workers.labels.regions import count_unoccluded, label_regions
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.stopwatch import Stopwatch
 from workers.plan.randomness import SceneChance, Stream
@@ -79,7 +80,8 @@ def render_view(scene: SettledScene, role: Role, number: int, camera: Camera) ->
         with stopwatch.stage("raycast", "raycast_check"):
             check_against_rays(scene.posed, camera, buffer, job.images.depth_range_m)
     with stopwatch.stage("labels"):
-        labels = label_regions(scene.plan, scene.posed, camera, buffer.region, renderer.count_pixels)
+        count = partial(count_unoccluded, count_drawn=renderer.count_pixels)
+        labels = label_regions(scene.plan, scene.posed, camera, buffer.region, count)
         depth = quantise_depth(buffer.depth_m, job.images)
     return View(role, pose_id, parent_id, camera, buffer.rgb, depth, buffer.region, labels)
 

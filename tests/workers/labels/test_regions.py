@@ -9,7 +9,7 @@ from tests.shapes import asset_of, box, table
 from tests.workers.labels.planes import HERE, K
 from workers.geometry.frames import translation
 from workers.geometry.pixels import Extent
-from workers.labels.regions import label_region, label_regions, label_things
+from workers.labels.regions import count_unoccluded, label_region, label_regions, label_things
 from workers.plan.randomness import SceneChance
 from workers.plan.step import draw_scene
 
@@ -59,3 +59,17 @@ def test_only_things_that_are_seen_are_counted():
     assert [label.visible_fraction for label in labels] == [0.5, 0.0, 0.25]
     nothing = label_things(things, names, HERE, np.zeros_like(region), lambda seen, camera: pytest.fail("none is seen"))
     assert [label.pixels for label in nothing] == [0, 0, 0]
+
+
+def test_what_the_processor_cannot_count_is_counted_by_the_renderer():
+    near, far = (Placed(n, asset_of(box(0.1, 0.1, 0.1)).shape, HERE.T_world_cam @ translation(0, 0, n)) for n in (0, 2))
+    asked = []
+
+    def count_drawn(things, camera):
+        asked.extend(things)
+        return [77 for _ in things]
+
+    counts = count_unoccluded([far, near, far], HERE, count_drawn)
+    assert counts == [36, 77, 36]  # its side is 6.7 pixels
+    assert asked == [near]
+    assert count_unoccluded([far], HERE, lambda things, camera: pytest.fail("nothing is left")) == [36]
