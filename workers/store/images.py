@@ -69,14 +69,13 @@ def _whole(data: bytes) -> bytes:
 
 def _unfiltered_rows(pixels: NDArray) -> NDArray[np.uint8]:
     """[H, 1 + row bytes]: each row after the number of its PNG filter, `none`, with the high byte of a sample first."""
-    height, row_bytes = len(pixels), pixels[0].nbytes
-    rows = np.empty((height, 1 + row_bytes), np.uint8)
+    if pixels.dtype == np.uint16:
+        from workers.geometry.pixels import split_samples  # numba loads only where something is encoded
+
+        return split_samples(pixels)
+    rows = np.empty((len(pixels), 1 + pixels[0].nbytes), np.uint8)
     rows[:, 0] = 0
-    # Its samples lie at odd addresses: numpy copies and swaps them in one pass all the same.
-    samples = np.ndarray(
-        (height, pixels[0].size), pixels.dtype.newbyteorder(">"), rows, 1, (1 + row_bytes, pixels.itemsize)
-    )
-    samples[...] = pixels.reshape(height, -1)
+    rows[:, 1:] = pixels.reshape(len(pixels), -1)
     return rows
 
 

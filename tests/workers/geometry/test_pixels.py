@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workers.geometry.pixels import Extent, count_filled, gather_colours, measure_regions, round_depth
+from workers.geometry.pixels import Extent, count_filled, gather_colours, measure_regions, round_depth, split_samples
 
 
 @pytest.mark.parametrize("width", [70, 72])
@@ -55,3 +55,8 @@ def test_what_is_filled_and_what_lies_behind_is_counted():
     projected = np.array([[0, 10, 20, 65535, 30]], np.uint16)
     seen = np.array([[5, 0, 14, 65500, 30]], np.uint16)
     assert count_filled(projected, seen, 5.5) == (4, 2)
+
+
+def test_samples_are_split_into_bytes_with_the_high_one_first():
+    pixels = np.array([[0x1234, 0x00FF, 0xFF00], [0, 0xFFFF, 0x0102]], np.uint16)
+    assert split_samples(pixels).tolist() == [[0, 0x12, 0x34, 0, 0xFF, 0xFF, 0], [0, 0, 0, 0xFF, 0xFF, 1, 2]]
