@@ -68,6 +68,7 @@ def _splat(
     """
     (height, width), (cx, cy, fx, fy) = shape, m
     nearest, index = np.zeros(shape), np.full(shape, -1, np.int32)
+    all_nearest, all_index = nearest.ravel(), index.ravel()
     (xx, xy, xz, x0), (yx, yy, yz, y0), (zx, zy, zz, z0) = _rows(T_target_source)
     columns = depth.shape[1]
     ray_x = (np.arange(columns) + 0.5 - k[0]) / k[2]
@@ -87,6 +88,12 @@ def _splat(
         for j in range(columns):
             Z = at_Z[j]
             if Z == 0.0:
+                continue
+            if reach == 0:  # one pixel, without the work of four bounds
+                at = at_row[j] * width + at_column[j]
+                if all_index[at] < 0 or all_nearest[at] > Z:
+                    all_nearest[at] = Z
+                    all_index[at] = i * columns + j
                 continue
             first, last = max(at_row[j] - reach, 0), min(at_row[j] + reach + 1, height)
             left, end = max(at_column[j] - reach, 0), min(at_column[j] + reach + 1, width)
