@@ -24,6 +24,7 @@ from schemas.dataset.tables import (
 )
 from schemas.errors import CorruptError
 from schemas.scene.scene import SceneOutput
+from workers.store.row_values import buffers_of, check_values, is_sound
 
 PARQUET_OPTIONS = {"compression": "zstd", "write_page_checksum": True}
 """For every Parquet file that users read: a flipped bit is found when the page is read."""
@@ -33,6 +34,8 @@ _ROWS = {
     for schema in (SCHEMAS[table], CAPTURE_SCHEMAS[table])
 }
 """The type of a row, by table and number of columns: all columns of a table are made in one call."""
+_BUFFERS = {key: buffers_of(kind) for key, kind in _ROWS.items()}
+_EMPTY = {table: schema.empty_table() for table, schema in SCHEMAS.items()}
 _RANGE_OPTIONS: dict[str, Any] = {
     "compression": "lz4",
     "write_page_checksum": True,
@@ -50,7 +53,7 @@ def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
     required one is absent or a number is not finite.
     """
     if not rows:
-        return SCHEMAS[table].empty_table()
+        return _EMPTY[table]
     schema = schema_of(table, rows[0].keys())
     names = set(schema.names)
     for row in rows:
@@ -58,11 +61,13 @@ def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
             wrong = sorted(names.symmetric_difference(row.keys()))
             raise ValueError(f"{table}: a row has other columns than the schema: {', '.join(wrong)}")
     try:
-        arrays = pa.array(rows, _ROWS[table, len(names)]).flatten()
+        whole = pa.array(rows, _ROWS[table, len(names)])
+        arrays, sound = whole.flatten(), is_sound(whole, _BUFFERS[table, len(names)])
     except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):
-        arrays = [_column(table, field, rows) for field in schema]  # says which column it is
-    for field, array in zip(schema, arrays, strict=True):
-        _check_values(f"{table}.{field.name}", field, array)
+        arrays, sound = [_column(table, field, rows) for field in schema], False  # says which column it is
+    if not sound:
+        for field, array in zip(schema, arrays, strict=True):
+            check_values(f"{table}.{field.name}", field, array)
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
@@ -240,19 +245,3 @@ def _fitted(table: str, rows: pa.Table, schema: pa.Schema, name: str) -> pa.Tabl
         return rows.select(schema.names).cast(schema)  # Parquet has other names inside lists
     except (pa.ArrowException, ValueError) as error:
         raise CorruptError(f"{name} cannot be read: {error}; `verso verify` lists every damaged file") from error
-
-
-def _check_values(where: str, field: pa.Field, array: pa.Array) -> None:
-    """Raises ValueError for an absent value that the schema requires, or a double that is not finite, at any depth."""
-    if not field.nullable and array.null_count:
-        raise ValueError(f"{where} is missing in {array.null_count} of {len(array)} rows")
-    kind, present = field.type, array.drop_null() if array.null_count else array
-    if pa.types.is_floating(kind):
-        values = present.to_numpy()
-        if not np.isfinite(values).all():
-            raise ValueError(f"{where} is not finite: {values[~np.isfinite(values)][0]}")
-    elif pa.types.is_struct(kind):
-        for i in range(kind.num_fields):
-            _check_values(f"{where}.{kind.field(i).name}", kind.field(i), present.field(i))
-    elif pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
-        _check_values(where, kind.value_field, array.flatten())
