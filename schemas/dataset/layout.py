@@ -68,7 +68,8 @@ IMAGES = tuple(Image(word, role, kind) for role, words in _CONTENTS.items() for 
 """(a)-(k) of the article's figure 1; each also has a patch of every object, (l)-(u)."""
 
 
-_UNSAFE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\\]")
+_UNSAFE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\\]|(?:^|/)\.{0,2}(?:/|\Z)")
+"""A letter that no path may have, or a part that is empty, `.` or `..`."""
 _CATEGORY = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _IMAGE = re.compile(
     rf"{_CATEGORY.pattern}/(?:patches/)?(?:{'|'.join(sorted({image.content for image in IMAGES}))})([0-9]{{5,19}})"
@@ -143,7 +144,7 @@ def is_plain_path(path: str) -> bool:
 
     Parts are neither empty nor `.` nor `..`, and hold no backslash and no control character.
     """
-    return not _UNSAFE.search(path) and all(part not in ("", ".", "..") for part in path.split("/"))
+    return not _UNSAFE.search(path)
 
 
 def is_attempt_name(name: str, retry: int) -> bool:

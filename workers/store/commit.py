@@ -131,11 +131,11 @@ def publish(store: Store, record: CommitRecord, own: Iterable[FileEntry] | None 
     another size by the same stack.
     """
     files = committed_files(store, record) if own is None else tuple(own)
-    folders = _staging_folders(record)
+    folders, plain = _staging_folders(record), set[str]()
     for entry in files:
         final = store.size(entry.path) if is_shape(entry.path) else None
         if final is None:
-            if not _move(store, folders, entry):
+            if not _move(store, folders, entry, plain):
                 _check_final(store, entry)
         elif final != entry.bytes and record.terms.fingerprint_mode == "strict":
             raise CommitConflict(
@@ -205,8 +205,11 @@ def _staging_folders(record: CommitRecord) -> tuple[str, str]:
     return staging, staging + FENCED
 
 
-def _move(store: Store, folders: Iterable[str], entry: FileEntry) -> bool:
-    """Renames one file into place from one of the folders; False where it is not staged (any more)."""
+def _move(store: Store, folders: Iterable[str], entry: FileEntry, plain: set[str]) -> bool:
+    """Renames one file into place from one of the folders; False where it is not staged (any more).
+
+    `plain`: folders that are known to be no links out of the output folder.
+    """
     for folder in folders:
         source = f"{folder}/{entry.path}"
         staged = store.size(source)
@@ -215,7 +218,7 @@ def _move(store: Store, folders: Iterable[str], entry: FileEntry) -> bool:
         if staged != entry.bytes:
             raise CorruptError(f"{source} has {staged} bytes, and its commit says {entry.bytes}")
         with contextlib.suppress(FileNotFoundError):
-            store.rename(source, entry.path)
+            store.rename(source, entry.path, plain)
             return True
     return False
 

@@ -95,19 +95,31 @@ class OpenTree:
                 sync_path(root / folder)
 
 
-def refuse_link_out(root: str | Path, key: str) -> None:
+def refuse_link_out(root: str | Path, key: str, plain: set[str] | None = None) -> None:
     """Raises OutputError where a folder on the way to `key`, or `key` itself, is a symbolic link that leads out of `root`.
 
-    So a folder from somebody else cannot make this program write or remove elsewhere.
+    So a folder from somebody else cannot make this program write or remove elsewhere. `plain` collects the folders that were
+    asked: a caller with many keys asks each of them once.
     """
-    place = os.fspath(root)
-    for part in key.split("/"):
-        place = f"{place}/{part}"
-        if os.path.islink(place) and not Path(os.path.realpath(place)).is_relative_to(os.path.realpath(root)):
-            raise OutputError(
-                f"{place} is a symbolic link that leads out of {root}, to {os.path.realpath(place)}: nothing is written "
-                "through it; put a folder in its place, or choose another --out"
-            )
+    base = os.fspath(root)
+    folder, _, _ = key.rpartition("/")
+    if plain is None or folder not in plain:
+        ends = (at for at, letter in enumerate(key) if letter == "/")
+        for end in ends:
+            _refuse_if_link_out(base, key[:end])
+        if plain is not None:
+            plain.add(folder)
+    _refuse_if_link_out(base, key)
+
+
+def _refuse_if_link_out(root: str, key: str) -> None:
+    """Raises OutputError where `key` itself is a symbolic link that leads out of `root`."""
+    place = f"{root}/{key}"
+    if os.path.islink(place) and not Path(os.path.realpath(place)).is_relative_to(os.path.realpath(root)):
+        raise OutputError(
+            f"{place} is a symbolic link that leads out of {root}, to {os.path.realpath(place)}: nothing is written "
+            "through it; put a folder in its place, or choose another --out"
+        )
 
 
 def sync_tree(folder: Path) -> None:

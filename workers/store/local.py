@@ -61,9 +61,9 @@ class LocalStore(Store):
         """The same as text, which takes a tenth of the time: hundreds of keys are asked for in a range."""
         return f"{self._folder}/{key}"
 
-    def _own(self, key: str) -> str:
+    def _own(self, key: str, plain: set[str] | None = None) -> str:
         """Where `key` lies on disk, to write or remove it. Raises OutputError where a link leads out of the folder."""
-        refuse_link_out(self._folder, key)
+        refuse_link_out(self._folder, key, plain)
         return self._at(key)
 
     def prepare(self) -> None:
@@ -126,9 +126,9 @@ class LocalStore(Store):
         """Renames a finished temporary file to `key`."""
         self._place(os.replace, key, data, durable=durable)
 
-    def rename(self, source: str, target: str) -> None:
+    def rename(self, source: str, target: str, plain: set[str] | None = None) -> None:
         """Moves a file; makes the target's folder where it is missing."""
-        old, new = self._own(source), self._own(target)
+        old, new = self._own(source, plain), self._own(target, plain)
         with self._explained(target):
             try:
                 os.replace(old, new)
@@ -138,7 +138,8 @@ class LocalStore(Store):
 
     def sync_folders_of(self, keys: Iterable[str]) -> None:
         """Flushes the folders that hold `keys`, up to the output folder."""
-        folders = {folder for key in keys for folder in (*_folders_above(key), ".")}
+        holders = {key.rpartition("/")[0] for key in keys}
+        folders = {".", *holders, *(folder for holder in holders for folder in _folders_above(holder))} - {""}
         with self._explained("the output folder"):
             sync_folders(self.root, folders)
 

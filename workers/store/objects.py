@@ -143,7 +143,7 @@ class ObjectStore(Store):
                 return
         raise MachineError(f"{key} in {self.name}: the store lost the parts of an upload {_TRIES} times")
 
-    def rename(self, source: str, target: str) -> None:
+    def rename(self, source: str, target: str, plain: set[str] | None = None) -> None:
         """Copies, then deletes: a kill in between leaves both, and a second call deletes the first."""
         with self._explained(target):
             obstore.copy(self._bucket, source, target)

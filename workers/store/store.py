@@ -78,8 +78,11 @@ class Store(Protocol):
     def write_whole(self, key: str, data: bytes, durable: bool = True) -> None:
         """Puts `data` at `key` in one step, replacing what was there."""
 
-    def rename(self, source: str, target: str) -> None:
-        """Moves a file, replacing the target in one step. Raises FileNotFoundError where the source is gone."""
+    def rename(self, source: str, target: str, plain: set[str] | None = None) -> None:
+        """Moves a file, replacing the target in one step. Raises FileNotFoundError where the source is gone.
+
+        `plain` collects folders that were found to lead nowhere else: calls that share it ask each of them once.
+        """
 
     def sync_folders_of(self, keys: Iterable[str]) -> None:
         """Returns when the names `keys` survive a loss of power. By default, names are durable at once."""

@@ -140,11 +140,11 @@ def test_after_a_death_at_any_rename_anyone_publishes_the_rest(store, layout, mo
     assert any(entry.path.endswith(".png") for entry in whole) == (layout == "files")
     rename, left = store.rename, [0]
 
-    def dying(source, target):
+    def dying(source, target, plain=None):
         if left[0] == 0:
             raise KeyboardInterrupt
         left[0] -= 1
-        rename(source, target)
+        rename(source, target, plain)
 
     monkeypatch.setattr(store, "rename", dying)
     for target in [f"{RANGES}/0000000000/views.parquet", f"{RANGES}/0000000000/assets.parquet"]:

@@ -6,7 +6,7 @@ import pytest
 from schemas.dataset.layout import TEMPORARY
 from schemas.errors import MachineError, OutputError
 from workers.store import file_system
-from workers.store.file_system import explain_disk_errors, file_system_of
+from workers.store.file_system import explain_disk_errors, file_system_of, refuse_link_out
 from workers.store.local import LocalStore
 from workers.store.sweep import sweep
 
@@ -128,6 +128,24 @@ def test_a_probe_whose_files_are_swept_by_a_coordinator_at_work_is_made_again(tm
     monkeypatch.setattr(os, "link", link)
     store.prepare()
     assert swept
+
+
+def test_many_keys_ask_each_folder_once_and_each_file(tmp_path, monkeypatch):
+    root, asked = tmp_path / "out", []
+    (root / "a/b").mkdir(parents=True)
+    islink = os.path.islink
+    monkeypatch.setattr(os.path, "islink", lambda path: asked.append(os.path.relpath(path, root)) or islink(path))
+    plain: set[str] = set()
+    for name in ("x", "y"):
+        refuse_link_out(root, f"a/b/{name}", plain)
+    assert asked == ["a", "a/b", "a/b/x", "a/b/y"]
+    (root / "a/b/z").symlink_to(tmp_path / "secret")
+    with pytest.raises(OutputError, match="a/b/z is a symbolic link that leads out of "):
+        refuse_link_out(root, "a/b/z", plain)
+    (root / "c").symlink_to(tmp_path)
+    with pytest.raises(OutputError, match="/c is a symbolic link that leads out of "):
+        refuse_link_out(root, "c/x", plain)
+    assert plain == {"a/b"}
 
 
 def test_a_full_disk_is_told_with_what_to_do(store, monkeypatch):
