@@ -57,50 +57,63 @@ def _facing_cosine(
     k: tuple[float, float, float, float],
     eye: Array,
 ) -> Array:
-    """k: cx, cy, fx, fy. In the camera's frame x runs right and y down, so that y across x points towards the camera."""
-    height, width = depth.shape
+    """k: cx, cy, fx, fy."""
     cosine = np.full(len(pixels), np.nan)
     for n in range(len(pixels)):
-        row, column = pixels[n] // width, pixels[n] % width
-        if row == 0 or column == 0 or row == height - 1 or column == width - 1:
-            continue
-        known = True
-        for dy, dx in ((0, 0), (0, 1), (0, -1), (1, 0), (-1, 0)):
-            alike = region[row + dy, column + dx] == region[row, column]
-            known = known and alike and depth[row + dy, column + dx] > 0
-        if not known:
-            continue
-        a = _between(_point(depth, units_per_m, row + 1, column, k), _point(depth, units_per_m, row - 1, column, k))
-        b = _between(_point(depth, units_per_m, row, column + 1, k), _point(depth, units_per_m, row, column - 1, k))
-        normal = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-        towards = _between((eye[0], eye[1], eye[2]), _point(depth, units_per_m, row, column, k))
-        along = normal[0] * towards[0] + normal[1] * towards[1] + normal[2] * towards[2]
-        length2 = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
-        away2 = towards[0] * towards[0] + towards[1] * towards[1] + towards[2] * towards[2]
-        if length2 > 0.0 and away2 > 0.0:
-            cosine[n] = along / (math.sqrt(length2) * math.sqrt(away2))
+        row, column = pixels[n] // depth.shape[1], pixels[n] % depth.shape[1]
+        cosine[n] = facing_at(depth, units_per_m, region, row, column, k, (eye[0], eye[1], eye[2]))
     return cosine
 
 
 @compiled
+def facing_at(
+    depth: Depth,
+    units_per_m: float,
+    region: NDArray[np.uint8],
+    row: int,
+    column: int,
+    k: tuple[float, float, float, float],
+    eye: Point,
+) -> float:
+    """The cosine of `facing_cosine` at one pixel; k: cx, cy, fx, fy; eye: the viewpoint in the camera's frame.
+
+    In that frame x runs right and y down, so that y across x points towards the camera.
+    """
+    if row == 0 or column == 0 or row == depth.shape[0] - 1 or column == depth.shape[1] - 1:
+        return np.nan
+    known = True
+    for dy, dx in ((0, 0), (0, 1), (0, -1), (1, 0), (-1, 0)):
+        alike = region[row + dy, column + dx] == region[row, column]
+        known = known and alike and depth[row + dy, column + dx] > 0
+    if not known:
+        return np.nan
+    a = _between(_point(depth, units_per_m, row + 1, column, k), _point(depth, units_per_m, row - 1, column, k))
+    b = _between(_point(depth, units_per_m, row, column + 1, k), _point(depth, units_per_m, row, column - 1, k))
+    normal = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    towards = _between(eye, _point(depth, units_per_m, row, column, k))
+    along = normal[0] * towards[0] + normal[1] * towards[1] + normal[2] * towards[2]
+    length2 = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
+    away2 = towards[0] * towards[0] + towards[1] * towards[1] + towards[2] * towards[2]
+    if length2 > 0.0 and away2 > 0.0:
+        return along / (math.sqrt(length2) * math.sqrt(away2))
+    return np.nan
+
+
+@compiled
 def is_smooth(
-    depth: Depth, region: NDArray[np.uint8], pixels: NDArray[np.int64], bound_m: float, units_per_m: float = 1.0
-) -> NDArray[np.bool_]:
-    """[N] bool: whether a pixel (flat index) and its four neighbours see one smooth surface of one region.
+    depth: Depth, region: NDArray[np.uint8], row: int, column: int, bound_m: float, units_per_m: float
+) -> bool:
+    """Whether a pixel and its four neighbours see one smooth surface of one region.
 
     On a plane 1/z is linear in the image; its second differences, times z squared, are the step in depth that
     a plane does not explain, and must stay below `bound_m` along rows and along columns.
     """
     height, width = depth.shape
-    smooth = np.zeros(len(pixels), np.bool_)
-    for n in range(len(pixels)):
-        row, column = pixels[n] // width, pixels[n] % width
-        z = depth[row, column] / units_per_m
-        good = 0 < row < height - 1 and 0 < column < width - 1 and z > 0.0
-        for dy, dx in ((0, 1), (1, 0)):
-            if good:
-                a, b = depth[row + dy, column + dx] / units_per_m, depth[row - dy, column - dx] / units_per_m
-                alike = region[row + dy, column + dx] == region[row, column] == region[row - dy, column - dx]
-                good = alike and a > 0.0 and b > 0.0 and abs(1.0 / a + 1.0 / b - 2.0 / z) * z * z < bound_m
-        smooth[n] = good
-    return smooth
+    z = depth[row, column] / units_per_m
+    good = 0 < row < height - 1 and 0 < column < width - 1 and z > 0.0
+    for dy, dx in ((0, 1), (1, 0)):
+        if good:
+            a, b = depth[row + dy, column + dx] / units_per_m, depth[row - dy, column - dx] / units_per_m
+            alike = region[row + dy, column + dx] == region[row, column] == region[row - dy, column - dx]
+            good = alike and a > 0.0 and b > 0.0 and abs(1.0 / a + 1.0 / b - 2.0 / z) * z * z < bound_m
+    return good

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.camera import Camera, Intrinsics
-from workers.geometry.camera import unproject
-from workers.geometry.frames import invert, transform
+from workers.geometry.frames import invert
 from workers.geometry.jit import compiled
 from workers.geometry.normals import Depth
 
@@ -22,19 +21,6 @@ class Projected:
 
     depth_m: Array
     source: NDArray[np.int32]
-
-
-def reproject_pixels(
-    depth: Depth, pixels: NDArray[np.int64], source: Camera, target: Camera, units_per_m: float = 1.0
-) -> Array:
-    """[N, 3] float64: points in the target's frame of the source's pixels (flat indices [N]).
-
-    depth [H, W] is z along the source's axis.
-    """
-    rows, columns = np.divmod(pixels, depth.shape[1])
-    z = depth.ravel()[pixels].astype(np.float64) / units_per_m
-    points = unproject(rows, columns, z, source.intrinsics)
-    return transform(invert(target.T_world_cam) @ source.T_world_cam, points)
 
 
 def forward_project(
@@ -62,7 +48,7 @@ def _splat(
     reach: int,
     shape: tuple[int, int],
 ) -> tuple[Array, NDArray[np.int32]]:
-    """(depth, source index); k and m: cx, cy, fx, fy of source and target. Sums in the order of `reproject_pixels`.
+    """(depth, source index); k and m: cx, cy, fx, fy of source and target.
 
     Each row of the source is carried over first, in a loop without branches that is vectorised, and drawn then.
     """
@@ -117,31 +103,27 @@ def _rows(T: Array) -> tuple[tuple[float, float, float, float], ...]:
 
 @compiled
 def sample_inverse_depth(
-    depth: Depth, region: NDArray[np.uint8], u: Array, v: Array, units_per_m: float = 1.0
-) -> tuple[Array, NDArray[np.uint8]]:
-    """Depth at image coordinates (u, v), interpolated bilinearly in 1/z, and the region there.
+    depth: Depth, region: NDArray[np.uint8], u: float, v: float, units_per_m: float
+) -> tuple[float, int]:
+    """Depth in metres at image coordinates (u, v), interpolated bilinearly in 1/z, and the region there.
 
     Only where the four pixels about the point lie in the image, have depth and share one region; elsewhere depth is 0
-    and region 0. On a plane 1/z is linear in the image, so this is exact there. Returns [N] float64 metres and [N] uint8.
+    and region 0. On a plane 1/z is linear in the image, so this is exact there.
     """
-    sampled, regions = np.zeros(len(u)), np.zeros(len(u), np.uint8)
     height, width = depth.shape
-    for n in range(len(u)):
-        x, y = u[n] - 0.5, v[n] - 0.5
-        if not (0.0 <= x < width - 1 and 0.0 <= y < height - 1):
-            continue
-        column, row = int(np.floor(x)), int(np.floor(y))
-        inverse, good = 0.0, True
-        for dy in range(2):
-            for dx in range(2):
-                z = depth[row + dy, column + dx] / units_per_m
-                good = good and z > 0.0 and region[row + dy, column + dx] == region[row, column]
-                share = abs(1 - dx - (x - column)) * abs(1 - dy - (y - row))
-                if z > 0.0:
-                    inverse += share / z
-        if good:
-            sampled[n], regions[n] = 1.0 / inverse, region[row, column]
-    return sampled, regions
+    x, y = u - 0.5, v - 0.5
+    if not (0.0 <= x < width - 1 and 0.0 <= y < height - 1):
+        return 0.0, 0
+    column, row = int(np.floor(x)), int(np.floor(y))
+    inverse, good = 0.0, True
+    for dy in range(2):
+        for dx in range(2):
+            z = depth[row + dy, column + dx] / units_per_m
+            good = good and z > 0.0 and region[row + dy, column + dx] == region[row, column]
+            share = abs(1 - dx - (x - column)) * abs(1 - dy - (y - row))
+            if z > 0.0:
+                inverse += share / z
+    return (1.0 / inverse, int(region[row, column])) if good else (0.0, 0)
 
 
 def in_frame(u: Array, v: Array, intrinsics: Intrinsics) -> NDArray[np.bool_]:

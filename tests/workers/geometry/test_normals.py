@@ -44,16 +44,17 @@ def test_units_change_nothing_and_a_hole_or_another_region_beside_a_pixel_does()
 
 
 def test_a_plane_is_smooth_and_a_step_is_not():
-    assert is_smooth(plane(), ONE, MIDDLE, 1e-9).all()
+    assert is_smooth(plane(), ONE, 5, 6, 1e-9, 1.0)
     step = plane()
     step[5, 7:] += 0.01
-    assert not is_smooth(step, ONE, MIDDLE, 5e-3).any()
-    assert is_smooth(step, ONE, MIDDLE, 2e-2).all()
+    assert not is_smooth(step, ONE, 5, 6, 5e-3, 1.0)
+    assert is_smooth(step, ONE, 5, 6, 2e-2, 1.0)
 
 
 def test_border_pixels_and_images_without_an_inner_pixel_are_not_smooth():
-    assert not is_smooth(plane(), ONE, np.array([0, 11, 119]), 1.0).any()
-    assert not is_smooth(np.ones((2, 9)), np.ones((2, 9), np.uint8), np.arange(18), 1.0).any()
+    assert not any(is_smooth(plane(), ONE, row, column, 1.0, 1.0) for row, column in ((0, 0), (0, 11), (9, 11)))
+    flat, ones = np.ones((2, 9)), np.ones((2, 9), np.uint8)
+    assert not any(is_smooth(flat, ones, row, column, 1.0, 1.0) for row in range(2) for column in range(9))
 
 
 def test_a_surface_faces_the_side_it_is_seen_from():

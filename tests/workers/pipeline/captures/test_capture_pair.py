@@ -7,8 +7,8 @@ from schemas.job.assets import Assets
 from tests.captures import captures_job, exact_capture
 from workers.assets.captured import CaptureNames, board_asset, reconstructed_asset
 from workers.geometry.camera import project
+from workers.geometry.covisibility import Bounds, Seen, compare_covisible
 from workers.geometry.frames import invert, transform
-from workers.geometry.projection import reproject_pixels, sample_inverse_depth
 from workers.pipeline.captures.capture_pair import CapturedObject, CapturedPair, make_capture_pair
 from workers.pipeline.captures.make_capture import image_effects
 from workers.render.raster.gbuffer import shared_renderer
@@ -44,12 +44,12 @@ def test_the_board_has_one_place_in_both_views_so_poses_and_depth_have_one_frame
     pair = pair_of(DONE.images(1)).pair
     first, mirror = pair.input, pair.mirror
     units = JOB.images.depth_units_per_m
-    points = reproject_pixels(first.depth, np.flatnonzero(first.region == 2), first.camera, mirror.camera, units)
-    u, v = project(points, mirror.camera.intrinsics)
-    seen, region = sample_inverse_depth(mirror.depth, mirror.region, u, v, units)
-    board = (seen > 0) & (region == 2)
-    assert board.sum() > 1000
-    assert np.median(np.abs(seen[board] - points[board, 2])) < 0.0005
+    source, target = (Seen(view.depth, view.region, view.camera) for view in (first, mirror))
+    wide = Bounds(facing=-1.0, smooth_m=(1.0, 1.0), hidden_m=1.0)
+    difference_m, region = compare_covisible(source, target, np.flatnonzero(first.region == 2), wide, units)
+    assert len(difference_m) > 1000
+    assert set(region.tolist()) == {2}
+    assert np.median(difference_m) < 0.0005
     assert pair.agreement is None
 
 
