@@ -56,6 +56,9 @@ from workers.store.tars import Packing
 CURRENT = "_current"
 """A file in an attempt's folder that names the scene in progress, in case the worker dies."""
 
+_NOTE_BYTES = 64
+"""Of every note, so that one replaces the other in place: more than the largest scene id needs."""
+
 TIMED_OUT = "_timed_out"
 """The file there that holds the traceback of a worker that hung in a scene."""
 
@@ -254,7 +257,7 @@ class Attempt:
 
     def _note(self, current: Mapping[str, object]) -> None:
         with self._skip_if_swept():
-            self._store.write_staged(self._staging, CURRENT, json.dumps(current).encode())
+            self._store.write_note(self._staging, CURRENT, json.dumps(current).encode().ljust(_NOTE_BYTES))
 
     @contextlib.contextmanager
     def _skip_if_swept(self) -> Iterator[None]:

@@ -8,7 +8,7 @@ import pwd
 import re
 import uuid
 import weakref
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import IO
@@ -28,6 +28,9 @@ _AT_ONCE = 8
 
 _FEW_FOLDERS = 3
 """Up to this many folders are flushed one by one; for more, one syncfs is less work where it can be trusted."""
+
+Opener = Callable[[str, int], int]
+"""Opens a path with flags, as `open` takes it."""
 
 _REMEDIES = {
     errno.ENOSPC: "the disk is full; free some space and start again, nothing finished is lost",
@@ -219,6 +222,17 @@ def _probe_once(root: Path) -> None:
         for path in (source, target):
             with contextlib.suppress(OSError):
                 os.unlink(path)
+
+
+def open_uncut(path: str, flags: int) -> int:
+    """A descriptor as `open` asks for it, except that a file that is there keeps its bytes."""
+    return os.open(path, flags & ~os.O_TRUNC, 0o666)
+
+
+def ignore_missing(function: object, path: str, raised: tuple[type[BaseException], BaseException, object]) -> None:
+    """For `shutil.rmtree`: what is gone already need not be removed."""
+    if not isinstance(raised[1], FileNotFoundError):
+        raise raised[1]
 
 
 @contextlib.contextmanager

@@ -12,8 +12,11 @@ from typing import IO
 from schemas.dataset.layout import COMMITS, FENCED, RANGES, STAGING, TEMPORARY, scratch_path
 from schemas.errors import OutputError
 from workers.store.file_system import (
+    Opener,
     OpenTree,
     explain_disk_errors,
+    ignore_missing,
+    open_uncut,
     probe_folder,
     refuse_link_out,
     remedy_of,
@@ -86,17 +89,17 @@ class LocalStore(Store):
                 self._open[staging] = OpenTree(self.path(staging))
 
     @contextlib.contextmanager
-    def stream_staged(self, staging: str, path: str) -> Iterator[IO[bytes]]:
-        """A file below the attempt's folder, whose subfolders are made as needed."""
+    def stream_staged(self, staging: str, path: str, opener: Opener | None = None) -> Iterator[IO[bytes]]:
+        """A file below the attempt's folder, whose subfolders are made as needed; `opener`: as of `open`."""
         target = self._at(f"{staging}/{path}")
         with self._explained(f"{staging}/{path}"):
             try:
-                file = open(target, "wb")  # noqa: SIM115 - closed below, on every path
+                file = open(target, "wb", opener=opener)  # noqa: SIM115 - closed below, on every path
             except FileNotFoundError:
                 for folder in reversed(_folders_above(path)):  # never the attempt's own
                     with contextlib.suppress(FileExistsError):
                         os.mkdir(self._at(f"{staging}/{folder}"))
-                file = open(target, "wb")  # noqa: SIM115
+                file = open(target, "wb", opener=opener)  # noqa: SIM115
             try:
                 yield file
                 if tree := self._open.get(staging):
@@ -106,6 +109,11 @@ class LocalStore(Store):
                     file.close()
                 raise
             file.close()
+
+    def write_note(self, staging: str, path: str, data: bytes) -> None:
+        """In place: a file that is cut to nothing first is written to the disk as soon as it is closed."""
+        with self.stream_staged(staging, path, open_uncut) as file:
+            file.write(data)
 
     def make_durable(self, staging: str) -> None:
         """Flushes an attempt. Not to be repeated after an error, which is told once."""
@@ -202,7 +210,7 @@ class LocalStore(Store):
         if tree := self._open.pop(prefix, None):
             tree.close()
         with self._explained(prefix):
-            shutil.rmtree(self._own(prefix), onerror=_ignore_missing)
+            shutil.rmtree(self._own(prefix), onerror=ignore_missing)
 
     def remove_empty(self, prefix: str) -> None:
         """Removes an empty folder."""
@@ -289,8 +297,3 @@ def _folders_above(path: str) -> list[str]:
     """The folders on the way to a file, the nearest first."""
     parts = path.split("/")
     return ["/".join(parts[:end]) for end in range(len(parts) - 1, 0, -1)]
-
-
-def _ignore_missing(function: object, path: str, raised: tuple[type[BaseException], BaseException, object]) -> None:
-    if not isinstance(raised[1], FileNotFoundError):
-        raise raised[1]

@@ -64,6 +64,10 @@ class Store(Protocol):
     def stream_staged(self, staging: str, path: str) -> contextlib.AbstractContextManager[IO[bytes]]:
         """A writable file at `staging/path`, stored when the context ends without an error. Raises as `write_staged`."""
 
+    def write_note(self, staging: str, path: str, data: bytes) -> None:
+        """Writes `staging/path` anew, with as many bytes as every time. Raises as `write_staged`."""
+        self.write_staged(staging, path, data)
+
     def make_durable(self, staging: str) -> None:
         """Returns when everything under `staging` survives a loss of power. By default, writes are durable at once."""
         return

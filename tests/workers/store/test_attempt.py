@@ -4,7 +4,7 @@ import hashlib
 import pytest
 
 from schemas.dataset.commit import Span
-from schemas.dataset.layout import STAGING, commit_path, range_table_path
+from schemas.dataset.layout import MAX_SCENE, STAGING, commit_path, range_table_path
 from schemas.dataset.tables import TABLES
 from schemas.errors import RunError
 from schemas.scene.scene import SceneOutput, encoded_file
@@ -105,6 +105,26 @@ def test_a_worker_that_dies_while_it_commits_blames_no_scene(store, monkeypatch)
         attempt.commit()
     assert attempts_at(store, 0) == [attempt.name]
     assert blamed_scene(store, 0, attempt.name) is None
+
+
+def test_a_shorter_note_replaces_a_longer_one_in_place(store):
+    attempt = begin_attempt(store, Span(start=0, stop=MAX_SCENE), terms())
+    note = store.root / f"{STAGING}/0000000000/{attempt.name}/_current"
+    attempt.begin_scene(MAX_SCENE)
+    before = note.stat()
+    assert blamed_scene(store, 0, attempt.name) == MAX_SCENE
+    attempt.begin_scene(7)
+    assert blamed_scene(store, 0, attempt.name) == 7
+    assert (note.stat().st_ino, note.stat().st_size) == (before.st_ino, before.st_size)
+
+
+def test_a_note_is_not_written_where_the_folder_was_swept(store):
+    attempt = begin_attempt(store, Span(start=0, stop=2), terms())
+    attempt.begin_scene(0)
+    store.fence(f"{STAGING}/0000000000/{attempt.name}")
+    attempt.begin_scene(1)
+    assert attempt.fenced
+    assert not (store.root / f"{STAGING}/0000000000/{attempt.name}").exists()
 
 
 @pytest.mark.parametrize("torn", [b"", b"{", b"[1]", b'{"scene_id": "x"}'])
