@@ -40,7 +40,7 @@ def read_matrix(values: Sequence[float]) -> Pose:
 def camera_columns(camera: Camera) -> Row:
     """The pose and the intrinsics of a camera, the principal point in both pixel conventions."""
     k = camera.intrinsics
-    both = {**k.model_dump(), "cx_opencv": k.cx_opencv, "cy_opencv": k.cy_opencv}
+    both = {**dict(k), "cx_opencv": k.cx_opencv, "cy_opencv": k.cy_opencv}
     return {"T_world_cam": matrix_column(camera.T_world_cam), **both}
 
 

@@ -76,10 +76,10 @@ def project_bounds(points_cam: Array, intrinsics: Intrinsics, near_m: float) -> 
 
 def image_coordinates(T_cam_obj: Pose, intrinsics: Intrinsics) -> tuple[int, int]:
     """The pixel of an object's origin, (-1, -1) where it is outside the image or behind the camera (dataset.md)."""
-    origin = T_cam_obj[:3, 3]
-    if origin[2] <= 0.0:
+    x, y, z = T_cam_obj[:3, 3].tolist()
+    if z <= 0.0:
         return -1, -1
-    (u,), (v,) = project(origin[None, :], intrinsics)
+    u, v = intrinsics.fx * x / z + intrinsics.cx, intrinsics.fy * y / z + intrinsics.cy
     if not (0.0 <= u < intrinsics.width and 0.0 <= v < intrinsics.height):
         return -1, -1
     return math.floor(u), math.floor(v)

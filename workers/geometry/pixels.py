@@ -65,9 +65,10 @@ def measure_regions(region: NDArray[np.uint8]) -> list[Extent]:
     words = whole.view(np.uint64) if region.shape[1] % 8 == 0 else np.empty((len(region), 0), np.uint64)
     _measure_regions(whole, words, counts, boxes)
     extents = [Extent(0, (0, 0, 0, 0))] * 256
-    for found in np.flatnonzero(counts).tolist():
-        x, y, right, bottom = boxes[found].tolist()
-        extents[found] = Extent(int(counts[found]), (x, y, right - x, bottom - y))
+    for found, pixels in enumerate(counts.tolist()):
+        if pixels:
+            x, y, right, bottom = boxes[found].tolist()
+            extents[found] = Extent(pixels, (x, y, right - x, bottom - y))
     return extents
 
 

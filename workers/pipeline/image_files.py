@@ -33,14 +33,13 @@ def image_boxes(
 
     objects: the labels that have patches. `category` is the scene's.
     """
+    boxes = [(patch_index(label.region_id, len(objects)), crop_box(label, view.camera, patch)) for label in objects]
     for image in IMAGES:
         if image.role != view.role or view_pixels(view, image.pixels) is None:
             continue
         yield image_path(category, image.content, view.pose_id), image.pixels, None
-        for label in objects:
-            box = crop_box(label, view.camera, patch)
+        for index, box in boxes:
             if box is not None:
-                index = patch_index(label.region_id, len(objects))
                 yield patch_path(category, image.content, view.pose_id, index), image.pixels, box
 
 
