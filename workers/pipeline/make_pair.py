@@ -74,7 +74,7 @@ def render_view(scene: SettledScene, role: Role, number: int, camera: Camera) ->
     parent_id = input_pose_id(scene.plan.scene_id, number, job.pairs_per_scene)
     pose_id = file_pose_id(role, parent_id)
     with stopwatch.stage("render"):
-        rng = scene.chance.stream(Stream.PATHS, pose_id, parent_id, ROLES.index(role))
+        rng = partial(scene.chance.stream, Stream.PATHS, pose_id, parent_id, ROLES.index(role))
         buffer = draw_view(renderer, scene.posed.things, scene.posed.appearance, camera, job.render, rng, scene.effects)
     if scene.effects.runs("raycast_check"):
         with stopwatch.stage("raycast", "raycast_check"):

@@ -1,6 +1,6 @@
 """Rendering of one view: labels by the label pass in all tiers; colour by the same pass or by the path tracer."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -25,14 +25,17 @@ def draw_view(
     appearance: Appearance,
     camera: Camera,
     render: Render,
-    rng: np.random.Generator,
+    rng: Callable[[], np.random.Generator],
     effects: EffectPlan,
 ) -> GBuffer:
-    """What one camera sees, drawn with the effects of the plan; `rng` seeds the paths. RGB is None without `rgb`."""
+    """What one camera sees, drawn with the effects of the plan. RGB is None without `rgb`.
+
+    `rng` makes the generator that seeds the paths: a tenth of a millisecond, which tiers without paths do without.
+    """
     drawn = renderer.draw(things, appearance, camera, render, effects)
     if render.tier != "pathtraced" or not effects.runs("rgb"):
         return drawn
-    seed = int(rng.integers(SEEDS))
+    seed = int(rng().integers(SEEDS))
     rgb = encode_light(shared_tracer().radiance(things, appearance, camera, render, effects, seed))
     rgb.setflags(write=False)
     return replace(drawn, rgb=rgb)

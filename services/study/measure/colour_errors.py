@@ -83,7 +83,9 @@ def converged_colour(context: WorkerContext, scene: Scene, paths: int, salt: int
     render = Render(tier="pathtraced", path_samples=paths, path_bounces=BOUNCES)
     effects = plan_effects(Facts(context.job.model_copy(update={"render": render}), plan, False))
     rng = np.random.default_rng([TRUTH_SEED, scene.plan.scene_id, salt])
-    drawn = draw_view(context.renderer, things, plan.appearance, crop_camera(camera, crop), render, rng, effects)
+    drawn = draw_view(
+        context.renderer, things, plan.appearance, crop_camera(camera, crop), render, lambda: rng, effects
+    )
     assert drawn.rgb is not None
     return ColourTruth(crop, drawn.rgb)
 

@@ -19,7 +19,7 @@ def test_labels_are_the_same_to_the_byte_in_all_tiers(renderer):
     things, height = random_things(rng)
     view = camera(small(64, 48), orbit_and_mirror(rng, height)[0].T_world_cam)
     drawn = [
-        draw_view(renderer, things, APPEARANCE, view, render, rng, effects)
+        draw_view(renderer, things, APPEARANCE, view, render, lambda: rng, effects)
         for render, effects in (FLAT, RASTER, paths(1))
     ]
     assert len({one.depth_m.tobytes() for one in drawn}) == 1
@@ -35,7 +35,7 @@ def test_without_rgb_nothing_is_traced(renderer, monkeypatch):
     labels = []
     for look in (FLAT, RASTER, FOUR, paths(1)):
         render, effects = without(look, "rgb")
-        seen = draw_view(renderer, things, APPEARANCE, view, render, rng, effects)
+        seen = draw_view(renderer, things, APPEARANCE, view, render, lambda: rng, effects)
         assert seen.rgb is None
         labels.append((seen.depth_m.tobytes(), seen.region.tobytes()))
     assert len(set(labels)) == 1

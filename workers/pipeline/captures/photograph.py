@@ -115,7 +115,9 @@ def take_light(studio: Studio, number: int, T_world_cam: Pose) -> Array:
     for sample in samples:
         drawn_at = point_drawn(sample, studio)
         camera = Camera(shift_camera(studio.drawn_color, drawn_at), pose_at(T_world_cam, motion, sample.moment))
-        drawn = draw_view(shared_renderer(), studio.things, studio.appearance, camera, render, rng, studio.effects)
+        drawn = draw_view(
+            shared_renderer(), studio.things, studio.appearance, camera, render, lambda: rng, studio.effects
+        )
         assert drawn.rgb is not None
         if studio.lookup is None:
             add_light(total, drawn.rgb, light_of)
