@@ -99,11 +99,14 @@ def corners_on_faces(
     """
     found, which, count = np.empty((64, 7)), np.empty((64, 2), np.int64), 0
     triangle, normal, foot, nearest = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
+    u, v = np.empty(3), np.empty(3)
     for row in range(len(pairs)):
-        n, f = pairs[row]
+        n, f = pairs[row, 0], pairs[row, 1]
         for k in range(3):
-            triangle[k] = others[faces[f, k]]
-        cross(triangle[1] - triangle[0], triangle[2] - triangle[0], normal)
+            for corner in range(3):
+                triangle[corner, k] = others[faces[f, corner], k]
+            u[k], v[k] = triangle[1, k] - triangle[0, k], triangle[2, k] - triangle[0, k]
+        cross(u, v, normal)
         normal /= np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
         height = 0.0
         for k in range(3):
@@ -120,11 +123,11 @@ def corners_on_faces(
             continue
         over, under = True, True
         for m in range(starts[n], starts[n + 1]):
-            w = vertices[members[m]]
             up = length2 = 0.0
             for k in range(3):
-                up += normal[k] * (w[k] - vertices[n, k])
-                length2 += (w[k] - vertices[n, k]) ** 2
+                along = vertices[members[m], k] - vertices[n, k]
+                up += normal[k] * along
+                length2 += along * along
             slack = SLOPE * np.sqrt(length2)
             over = over and up >= -slack
             under = under and up <= slack
@@ -169,11 +172,12 @@ def edges_across_edges(
     the one lie above the plane between them and those about the other below, to within `SLOPE`.
     """
     found, count = np.empty((64, 7)), 0
-    n = np.empty(3)
+    n, u, v, r = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for row in range(len(pairs)):
-        i, j = pairs[row]
+        i, j = pairs[row, 0], pairs[row, 1]
         a, b = vertices[edges[i, 0]], others[edges2[j, 0]]
-        u, v, r = vertices[edges[i, 1]] - a, others[edges2[j, 1]] - b, a - b
+        for k in range(3):
+            u[k], v[k], r[k] = vertices[edges[i, 1], k] - a[k], others[edges2[j, 1], k] - b[k], a[k] - b[k]
         cross(u, v, n)
         uu = uv = vv = ur = vr = nn = nr = 0.0
         for k in range(3):
