@@ -33,7 +33,7 @@ import shapely
 from schemas.base import Array, frozen_array
 from schemas.scene.shape import Loft
 from workers.geometry.convex_partition import Indices, partition_outlines
-from workers.geometry.convexity import mesh_of
+from workers.geometry.convexity import mesh_of, rank_rows
 from workers.geometry.hull import convex_hull, least_width_m
 from workers.geometry.jit import compiled
 from workers.geometry.manifold import hold_to_one_thread
@@ -108,7 +108,7 @@ def _decompose_lathed(profiles: Array, columns: Array, size: float, tolerance: f
     border = trace_visible_border(outline)
     visible = shapely.Polygon([outline[0], *((ring.radius, ring.height) for ring in border), outline[-1]])
     stacks = stack_slabs(border, profiles, visible, tolerance, THIN * size)
-    parts = [np.unique(ring_points(columns, outline, stack), axis=0) for stack in stacks]
+    parts = [_unique(ring_points(columns, outline, stack)) for stack in stacks]
     if is_covered(outline, visible, tolerance):
         return parts
     for cell in partition_outlines(profiles, tolerance):
@@ -118,6 +118,12 @@ def _decompose_lathed(profiles: Array, columns: Array, size: float, tolerance: f
             bands = wider[np.roll(wider, -1) == wider + 1] if len(profiles) > 1 else wider[:0]
             parts += _cut_wedges(columns, wider, bands, tolerance, WEDGE if tolerance >= COARSE * size else 1.0)
     return parts
+
+
+def _unique(points: Array) -> Array:
+    """The points [N, 3] without repetitions, in ascending order."""
+    order, new = rank_rows(points)
+    return points[order[new]]
 
 
 def _cut_wedges(columns: Array, cell: Indices, bands: Indices, tolerance: float, times: float) -> list[Array]:
@@ -131,29 +137,26 @@ def _cut_wedges(columns: Array, cell: Indices, bands: Indices, tolerance: float,
     parts, first = [], 0
     while first < count:
         last = first + 1
-        while last < count:
-            over = np.arange(first, last + 2) % count
-            if (
-                _protrusion(np.ascontiguousarray(begin[:, over]), np.ascontiguousarray(end[:, over]))
-                > times * tolerance
-            ):
-                break
+        while last < count and _protrusion(begin, end, first, last + 1) <= times * tolerance:
             last += 1
         over = np.arange(first, last + 1) % count
-        wedge = np.unique(begin[:, over].reshape(-1, 3), axis=0)
+        wedge = _unique(begin[:, over].reshape(-1, 3))
         parts += _split_twisted(wedge, columns[bands][:, over], columns[bands + 1][:, over], TWIST * tolerance)
         first = last
     return parts
 
 
 @compiled
-def _protrusion(begin: Array, end: Array) -> float:
-    """Distance by which a cell lies outside the planes of its facets; begin, end [M, k, 3]: of its sides, along k columns."""
-    most = 0.0
+def _protrusion(begin: Array, end: Array, first: int, last: int) -> float:
+    """Distance by which a cell lies outside the planes of its facets; begin, end [M, k, 3]: of its sides, along k columns.
+
+    The cell is that from the column `first` to `last`, counted on beyond the end.
+    """
+    most, count = 0.0, begin.shape[1]
     for side in range(begin.shape[0]):
-        for column in range(begin.shape[1] - 1):
-            a, b = begin[side, column], begin[side, column + 1]
-            c, d = end[side, column], end[side, column + 1]
+        for column in range(first, last):
+            a, b = begin[side, column % count], begin[side, (column + 1) % count]
+            c, d = end[side, column % count], end[side, (column + 1) % count]
             p, q = b - c, d - a
             x, y, z = p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
             length = math.sqrt(x * x + y * y + z * z)
@@ -163,8 +166,8 @@ def _protrusion(begin: Array, end: Array) -> float:
             for corner in (a, b, c, d):
                 reach = max(reach, x * corner[0] + y * corner[1] + z * corner[2])
             for other in range(begin.shape[0]):
-                for number in range(begin.shape[1]):
-                    point = begin[other, number]
+                for number in range(first, last + 1):
+                    point = begin[other, number % count]
                     most = max(most, (x * point[0] + y * point[1] + z * point[2] - reach) / length)
     return most
 
@@ -175,6 +178,8 @@ def _split_twisted(wedge: Array, begin: Array, end: Array, tolerance: float) -> 
     begin, end [F, k, 3]: of the outline's sides that facets are on. A facet's diagonal is the one of `loft`.
     """
     parts = [wedge]
+    if not begin.size:
+        return parts
     a, b, c, d = (each.reshape(-1, 3) for each in (begin[:, :-1], begin[:, 1:], end[:, 1:], end[:, :-1]))
     normals = np.stack([np.cross(b - a, c - a), np.cross(c - a, d - a)], axis=1)  # [F, 2, 3]
     lengths = np.linalg.norm(normals, axis=2)
@@ -241,6 +246,8 @@ def _subtract(part: Array, body: Array, thin: float) -> list[Array]:
         for earlier in taken:
             inner = (-normals[earlier]).tolist(), -float(reach[earlier])
             new, less = new.trim_by_plane(*inner), rest.trim_by_plane(*inner)
+            if new.is_empty():
+                break
             if not less.is_empty() and least_width_m(convex_hull(mesh_of(less).vertices)) >= thin:
                 rest = less
         if new.is_empty():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ import numpy as np
 import shapely
 
 from schemas.base import Array
+from workers.geometry.jit import compiled
 
 INNER_SCALE = 0.5
 """Scale of the ring that makes a thin body thicker, relative to the body's widest ring."""
@@ -70,8 +72,35 @@ def _is_convex(rings: Sequence[Ring], outline: Array, tolerance: float) -> bool:
     """Whether no ring lies deeper than the tolerance below the hull of the body of revolution through all."""
     at = [outline[ring.corner, 0] * (1.0 - ring.share) + outline[ring.corner + 1, 0] * ring.share for ring in rings]
     line = [(float(radius) * ring.scale, ring.height) for radius, ring in zip(at, rings, strict=True)]
-    border = shapely.MultiPoint([*line, *((-r, z) for r, z in line)]).convex_hull.exterior
-    return bool(shapely.distance(border, shapely.points(line)).max() <= tolerance)
+    return _deepest(np.array(line)) <= tolerance
+
+
+@compiled
+def _deepest(line: Array) -> float:
+    """The most by which points [N, 2], radius and height, ascending, lie below the hull of them and their mirror images."""
+    hull, count = np.empty_like(line), 0
+    for n in range(len(line)):
+        # Andrew's monotone chain (1979), of the side away from the axis
+        while count > 1 and _left_of(line[n], hull[count - 2], hull[count - 1]) <= 0.0:
+            count -= 1
+        hull[count] = line[n]
+        count += 1
+    deepest = 0.0
+    for n in range(len(line)):
+        # The ends of the hull are level
+        depth = min(line[n, 1] - line[0, 1], line[-1, 1] - line[n, 1])
+        for k in range(count - 1):
+            depth = min(depth, _left_of(line[n], hull[k], hull[k + 1]))
+        deepest = max(deepest, depth)
+    return deepest
+
+
+@compiled
+def _left_of(point: Array, start: Array, stop: Array) -> float:
+    """Distance of a point [2] to the left of the line from start to stop, 0 where these are the same."""
+    x, y = stop[0] - start[0], stop[1] - start[1]
+    length = math.sqrt(x * x + y * y)
+    return (x * (point[1] - start[1]) - y * (point[0] - start[0])) / length if length > 0.0 else 0.0
 
 
 def _thicken(rings: list[Ring], visible: shapely.Polygon, tolerance: float, thin: float) -> list[Ring]:

@@ -34,6 +34,15 @@ def test_a_spool_is_three_bodies_and_a_cone_is_one():
     assert len(stack_slabs(trace_visible_border(CONE), CONE[None], visible(CONE), 1e-3, 0.1)) == 1
 
 
+@pytest.mark.parametrize(("depth", "bodies"), [(0.9e-3, 1), (1.1e-3, 3)])
+def test_a_groove_parts_a_body_if_it_is_deeper_than_the_tolerance_in_any_outline(depth, bodies):
+    grooved = SPOOL.copy()
+    grooved[3:5, 0] = 3.0 - depth
+    smooth = np.array([(3.0 if radius > 0.0 else 0.0, height) for radius, height in grooved])
+    stacks = stack_slabs(trace_visible_border(grooved), np.stack([smooth, grooved]), visible(grooved), 1e-3, 0.1)
+    assert len(stacks) == bodies
+
+
 def test_a_thin_neck_reaches_into_its_wider_neighbours():
     neck = SPOOL.copy()
     neck[4:, 1] -= 2.9
