@@ -32,12 +32,6 @@ COARSER = 1e-5
 NO_AREA = 1e-12
 """Area, as a share of the hull's size squared, below which a triangle's normal is rounding noise."""
 
-SAME = 1e-9
-"""Difference in each coordinate below which normals are equal."""
-
-SCATTER = np.array([0.5773502691896258, 0.7320508075688772, 0.3618033988749895])
-"""A direction outside the symmetries of common shapes: sorted along it, equal rows are neighbours."""
-
 
 def convex_hull(vertices: Array) -> Hull:
     """The hull of points [N, 3], metres; a flat cloud is thickened by joggling it (Qhull's QJ).
@@ -117,8 +111,28 @@ def least_width_m(hull: Hull) -> float:
 
     Two crossing edges may be nearer: a regular tetrahedron's are by 13 %.
     """
-    along = hull.vertices @ hull.normals[_distinct(hull.normals)].T
-    return float((along.max(axis=0) - along.min(axis=0)).min())
+    return float(_least_width(hull.vertices, hull.normals))
+
+
+@compiled
+def _least_width(points: Array, normals: Array) -> float:
+    """The least, over unit normals [F, 3], of the length of points [N, 3] along one."""
+    least, top, bottom = np.inf, 0, 0
+    for f in range(len(normals)):
+        x, y, z = normals[f]
+        # Begins with what is farthest along the normal before: most normals are passed over at these two points
+        high = x * points[top, 0] + y * points[top, 1] + z * points[top, 2]
+        low = x * points[bottom, 0] + y * points[bottom, 1] + z * points[bottom, 2]
+        for n in range(len(points)):
+            if high - low >= least:
+                break
+            along = x * points[n, 0] + y * points[n, 1] + z * points[n, 2]
+            if along > high:
+                high, top = along, n
+            if along < low:
+                low, bottom = along, n
+        least = min(least, high - low)
+    return least
 
 
 @compiled
@@ -140,12 +154,3 @@ def depth_m(points: Array, normals: Array) -> float:
                     break
         least, start = min(least, most), farthest
     return float(least)
-
-
-def _distinct(rows: Array) -> Array:
-    """[M] ascending indices of rows [N, 3], one of those that are equal to within `SAME` in each coordinate."""
-    order = np.argsort(rows @ SCATTER, kind="stable")
-    ranked = rows[order]
-    new = np.ones(len(rows), dtype=bool)
-    new[1:] = (np.abs(ranked[1:] - ranked[:-1]) > SAME).any(axis=1)
-    return np.sort(order[new])

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from shapely.geometry import MultiPoint, Point
+import shapely
 
 from schemas.base import Array, Pose
 from schemas.scene.shape import Hull, Mesh
@@ -82,7 +82,7 @@ def support_margin(contacts_xy: Array, com_xy: Array) -> float:
     """
     if len(contacts_xy) == 0:
         return -np.inf
-    outline, at = MultiPoint(contacts_xy).convex_hull, Point(com_xy)
+    outline, at = shapely.convex_hull(shapely.multipoints(contacts_xy)), shapely.points(com_xy)
     if outline.geom_type == "Polygon" and outline.contains(at):
         return float(outline.exterior.distance(at))
     return -float(outline.distance(at))

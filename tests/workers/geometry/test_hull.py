@@ -91,6 +91,13 @@ def test_the_least_width_of_a_plate_is_its_thickness():
 
 
 @pytest.mark.parametrize("seed", range(4))
+def test_the_least_width_is_over_all_faces(seed):
+    hull = convex_hull(np.random.default_rng(seed).normal(size=(200, 3)) * [0.3, 0.2, 0.1])
+    along = hull.vertices @ hull.normals.T
+    assert least_width_m(hull) == pytest.approx((along.max(axis=0) - along.min(axis=0)).min(), rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
 def test_the_depth_of_a_point_in_a_hull_is_its_least_distance_from_a_plane_of_a_face(seed):
     rng = np.random.default_rng(seed)
     hull = convex_hull(rng.standard_normal((200, 3)))

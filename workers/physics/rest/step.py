@@ -126,7 +126,7 @@ def _pyramid(normals: Array, friction: float) -> Array:
     level = np.linalg.norm(up, axis=1) < 1e-3
     up[level] = np.cross(normals[level], [0.0, 1.0, 0.0])
     first = up / np.linalg.norm(up, axis=1, keepdims=True)
-    second = np.cross(normals, first)
+    second = _moments(normals, first[:, None])[:, 0]
     angle = 2.0 * np.pi * np.arange(CONE_EDGES) / CONE_EDGES
     side = np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
     return normals[:, None] + friction * side
