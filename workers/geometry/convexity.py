@@ -33,16 +33,22 @@ def is_convex_surface(mesh: Mesh, solid: manifold3d.Manifold | None) -> bool:
 def weld(mesh: Mesh) -> Mesh:
     """The mesh with one vertex at each place, without loose vertices, repeated triangles and triangles of two corners."""
     used = numbers_in(mesh.faces, len(mesh.vertices))
-    order, new = rank_rows(mesh.vertices[used])
+    order, new = _ranked(mesh.vertices[used])
     place = np.zeros(len(mesh.vertices), dtype=np.int32)
     place[used[order]] = np.cumsum(new) - 1
     faces = place[mesh.faces]
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
-    by_corners, first = rank_rows(np.sort(faces, axis=1))
+    by_corners, first = _ranked(np.sort(faces, axis=1))
     return Mesh(mesh.vertices[used[order[new]]], faces[np.sort(by_corners[first])])
 
 
-def rank_rows(rows: NDArray[np.generic]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def unique_rows(rows: Array) -> Array:
+    """The rows [N, 3] without repetitions, in ascending order."""
+    order, new = _ranked(rows)
+    return rows[order[new]]
+
+
+def _ranked(rows: NDArray[np.generic]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """(numbers [N] of rows [N, 3] in ascending order, which of these differ from the one before).
 
     By one column after the other: `np.unique` compares rows as records, which takes four times as long.

@@ -33,7 +33,7 @@ import shapely
 from schemas.base import Array, frozen_array
 from schemas.scene.shape import Loft
 from workers.geometry.convex_partition import Indices, partition_outlines
-from workers.geometry.convexity import mesh_of, rank_rows
+from workers.geometry.convexity import mesh_of, unique_rows
 from workers.geometry.hull import convex_hull, least_width_m
 from workers.geometry.jit import compiled
 from workers.geometry.manifold import hold_to_one_thread
@@ -108,7 +108,7 @@ def _decompose_lathed(profiles: Array, columns: Array, size: float, tolerance: f
     border = trace_visible_border(outline)
     visible = shapely.Polygon([outline[0], *((ring.radius, ring.height) for ring in border), outline[-1]])
     stacks = stack_slabs(border, profiles, visible, tolerance, THIN * size)
-    parts = [_unique(ring_points(columns, outline, stack)) for stack in stacks]
+    parts = [unique_rows(ring_points(columns, outline, stack)) for stack in stacks]
     if is_covered(outline, visible, tolerance):
         return parts
     for cell in partition_outlines(profiles, tolerance):
@@ -118,12 +118,6 @@ def _decompose_lathed(profiles: Array, columns: Array, size: float, tolerance: f
             bands = wider[np.roll(wider, -1) == wider + 1] if len(profiles) > 1 else wider[:0]
             parts += _cut_wedges(columns, wider, bands, tolerance, WEDGE if tolerance >= COARSE * size else 1.0)
     return parts
-
-
-def _unique(points: Array) -> Array:
-    """The points [N, 3] without repetitions, in ascending order."""
-    order, new = rank_rows(points)
-    return points[order[new]]
 
 
 def _cut_wedges(columns: Array, cell: Indices, bands: Indices, tolerance: float, times: float) -> list[Array]:
@@ -140,7 +134,7 @@ def _cut_wedges(columns: Array, cell: Indices, bands: Indices, tolerance: float,
         while last < count and _protrusion(begin, end, first, last + 1) <= times * tolerance:
             last += 1
         over = np.arange(first, last + 1) % count
-        wedge = _unique(begin[:, over].reshape(-1, 3))
+        wedge = unique_rows(begin[:, over].reshape(-1, 3))
         parts += _split_twisted(wedge, columns[bands][:, over], columns[bands + 1][:, over], TWIST * tolerance)
         first = last
     return parts

@@ -7,8 +7,7 @@ import daqp
 import numpy as np
 
 from schemas.base import Array
-from workers.geometry.contact_kernels import cross
-from workers.geometry.jit import compiled
+from workers.geometry.frames import cross_each
 from workers.physics.rest.contacts import Contacts
 
 CONE_EDGES = 16
@@ -103,18 +102,8 @@ def _rows(bodies: Sequence[Inertia], roots: Sequence[Array], contacts: Contacts,
             own = np.flatnonzero(who == number)
             levers, along = contacts.points[own] - body.com, edges[own]
             rows[own, :, number, :3] = sign * along / np.sqrt(body.mass_kg)
-            rows[own, :, number, 3:] = sign * _moments(levers, along) @ root
+            rows[own, :, number, 3:] = sign * cross_each(levers, along) @ root
     return rows.reshape(-1, 6 * len(bodies))
-
-
-@compiled
-def _moments(levers: Array, along: Array) -> Array:
-    """[N, K, 3]: the cross products of levers [N, 3] with K vectors each [N, K, 3]; `numpy.cross` takes five times as long."""
-    moments = np.empty_like(along)
-    for n in range(len(levers)):
-        for k in range(along.shape[1]):
-            cross(levers[n], along[n, k], moments[n, k])
-    return moments
 
 
 def _pyramid(normals: Array, friction: float) -> Array:
@@ -126,7 +115,7 @@ def _pyramid(normals: Array, friction: float) -> Array:
     level = np.linalg.norm(up, axis=1) < 1e-3
     up[level] = np.cross(normals[level], [0.0, 1.0, 0.0])
     first = up / np.linalg.norm(up, axis=1, keepdims=True)
-    second = _moments(normals, first[:, None])[:, 0]
+    second = cross_each(normals, first[:, None])[:, 0]
     angle = 2.0 * np.pi * np.arange(CONE_EDGES) / CONE_EDGES
     side = np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
     return normals[:, None] + friction * side
