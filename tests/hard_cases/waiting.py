@@ -16,8 +16,6 @@ BULLET = "Bullet, which lets it go again, moves it: its parts and its friction a
 MOVES: dict[str, str] = {
     "ring hung on a finger": BULLET,
     "ball in a bowl from a file": BULLET,
-    "pile of twenty boxes": "0.1 to 2.3 mm in eight seeds of twenty: forces within the friction cones balance all weights, and "
-    "boxes that are wedged slide nevertheless, the worst seed in MuJoCo as in Bullet (docs/rest.md)",
     "needle of 0.2 by 200 mm tumbled": "its sides are 13 micrometres wide, and Bullet keeps a hull's corners on a grid of 20",
 }
 """What moves by more than 0.1 mm or 0.1 degrees in the second after it is let go again."""

@@ -79,3 +79,27 @@ def nearest_on_triangle(p: Array, corners: Array, nearest: Array) -> None:
         v, w = vb / (va + vb + vc), vc / (va + vb + vc)
     for k in range(3):
         nearest[k] = a[k] + v * (b[k] - a[k]) + w * (c[k] - a[k])
+
+
+@compiled
+def nearest_on_segments(a: Array, b: Array, c: Array, d: Array, here: Array, there: Array) -> None:
+    """Writes the nearest points [3] of the segments from a to b and from c to d into `here` and `there`.
+
+    Ericson, Real-Time Collision Detection 2005, 5.1.9.
+    """
+    aa = cc = ac = ar = cr = 0.0
+    for k in range(3):
+        u, v, r = b[k] - a[k], d[k] - c[k], a[k] - c[k]
+        aa += u * u
+        cc += v * v
+        ac += u * v
+        ar += u * r
+        cr += v * r
+    along = aa * cc - ac * ac
+    s = min(1.0, max(0.0, (ac * cr - ar * cc) / along)) if along > 0.0 else 0.0
+    t = (ac * s + cr) / cc if cc > 0.0 else 0.0
+    if t < 0.0 or t > 1.0 or cc == 0.0:
+        t = min(1.0, max(0.0, t))
+        s = min(1.0, max(0.0, (ac * t - ar) / aa)) if aa > 0.0 else 0.0
+    for k in range(3):
+        here[k], there[k] = a[k] + s * (b[k] - a[k]), c[k] + t * (d[k] - c[k])

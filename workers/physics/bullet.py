@@ -126,7 +126,7 @@ def open_world(
 ) -> Iterator[World]:
     """Open a world of a ground and of bodies at their `T_world_body`.
 
-    `reach_m`: contact distance on a mesh, if less than Bullet's own. Of two contacts of a vertex with triangles of a mesh
+    `reach_m`: contact distance, if less than Bullet's own. Of two contacts of a vertex with triangles of a mesh
     Bullet keeps the one found last: beside an edge a corner sinks in while the next triangle is in reach. On level ground a
     shorter reach would keep more rolling bodies from gaining energy, but bowls would spin for ever.
 
@@ -136,7 +136,6 @@ def open_world(
     """
     client = _connect()
     pybullet.resetSimulation(physicsClientId=client)
-    reach = reach_m if isinstance(ground, Mesh | tuple) else math.inf
     pybullet.setPhysicsEngineParameter(
         numSolverIterations=physics.solver_iterations,
         deterministicOverlappingPairs=1,
@@ -145,7 +144,7 @@ def open_world(
         splitImpulsePenetrationThreshold=0.0,
         warmStartingFactor=WARM_START if len(placed) > 1 else 0.0,
         contactSlop=min(SLOP_M, SLOP_SHARE * min(body.margin_m for body, _ in placed)),
-        contactBreakingThreshold=min(REACH_SHARE, reach / min(_size_m(body) for body, _ in placed)),
+        contactBreakingThreshold=min(REACH_SHARE, reach_m / min(_size_m(body) for body, _ in placed)),
         physicsClientId=client,
     )
     pybullet.setGravity(0.0, 0.0, -GRAVITY_M_S2, physicsClientId=client)

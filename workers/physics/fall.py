@@ -9,6 +9,7 @@ from schemas.base import Array, Pose
 from schemas.job.physics import Physics
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart, Table
+from schemas.scene.shape import Mesh
 from workers.geometry.frames import invert, translation
 from workers.geometry.hull import least_width_m
 from workers.physics.bullet import GRAVITY_M_S2, GroundShape, World, open_world
@@ -113,18 +114,21 @@ def fall(
     stops: Mapping[str, StopCondition] | None = None,
     sleeping: bool = False,
     standing: StandingCondition | None = None,
+    reach_m: float = math.inf,
 ) -> Outcome:
     """Release objects at `poses` (`T_world_obj`) until all rest, `physics.max_settle_s` is over, or a stop condition holds.
 
     The first `free_m` metres are fallen in closed form, which is exact: nothing turns in the air. sleeping: what rests costs no
-    time until something that moves touches it. standing: ends the fall of a single object sooner.
+    time until something that moves touches it. standing: ends the fall of a single object sooner. reach_m: contact distance, if
+    less than Bullet's own; on a mesh it follows from the steps.
     """
     fallen_m = min(max(0.0, free_m - SKIPPED_TO_M), GRAVITY_M_S2 * physics.max_settle_s**2 / 2)
     lower = translation(0.0, 0.0, -fallen_m)
     placed = [(one, lower @ T @ one.T_obj_body) for one, T in zip(bodies, poses, strict=True)]
     speed_m_s = math.sqrt(2.0 * GRAVITY_M_S2 * fallen_m)
     fallen_s = speed_m_s / GRAVITY_M_S2
-    reach_m = REACH_STEPS * max(steps.max_travel_m, speed_m_s / (FINEST * physics.step_hz))
+    if isinstance(ground, Mesh | tuple):
+        reach_m = min(reach_m, REACH_STEPS * max(steps.max_travel_m, speed_m_s / (FINEST * physics.step_hz)))
     with open_world(placed, ground, physics, steps.looked, reach_m) as world:
         for number in range(len(bodies)):
             world.set_velocity((0.0, 0.0, -speed_m_s), body=number)
@@ -182,7 +186,7 @@ def _simulate(
         time += SAMPLE_STEPS / rate
         speeds = _speeds(bodies, moving)
         for name, stop in stops.items():
-            if any(stop(one) for one in at):
+            if any(stop(number, one) for number, one in enumerate(at)):
                 return Outcome(tuple(map(as_pose, at)), max(speeds), time, False, name)
         for number, (one, now, body, speed) in enumerate(zip(still, at, bodies, speeds, strict=True)):
             turned = _angle(one.anchor[1], now[1])

@@ -16,7 +16,6 @@ from workers.physics.fall import LOOK_STEPS, THIN_SHARE, Outcome, choose_steps, 
 from workers.physics.placement import Ground
 from workers.physics.rigid_body import build_body, choose_collision_shape
 from workers.physics.stop_conditions import falls_below, leaves_outline, leaves_room, stays_standing
-from workers.physics.table_top import split_by_side
 
 MANY = 4
 """Number of objects from which they fall as coarser convex parts: the time grows with the pairs of parts near one another."""
@@ -116,7 +115,7 @@ def release(drop: Drop, flat: bool) -> Outcome:
 
 
 def _release(drop: Drop, flat: bool) -> Outcome:
-    table, effects, physics = drop.ground.table, drop.effects, _settings(drop)
+    table, effects, physics = drop.ground.table, drop.effects, settings_of(drop)
     starts = [choose_collision_shape(start, physics) for start in drop.starts]
     poses = [start.T_world_obj for start in starts]
     coarse = drop.many or (drop.single and drop.pace == PACES[0] and physics.exact_rest)
@@ -140,8 +139,6 @@ def _release(drop: Drop, flat: bool) -> Outcome:
         ground, stops = table.top.height_m - hover_m, {"edge": leaves_outline(table.top.outline, reach_m)}
     elif flat:
         ground = _prism(table)
-    elif drop.exact and not drop.single:
-        ground = split_by_side(table.mesh)
     T_world_body = poses[0] @ bodies[0].T_obj_body
     if math.isfinite(drop.room_m):
         stops["room"] = leaves_room(T_world_body[:2, 3], drop.room_m)
@@ -155,7 +152,7 @@ def _prism(table: Table) -> Array:
     return np.concatenate([np.hstack([outline, level]) for level in levels])
 
 
-def _settings(drop: Drop) -> Physics:
+def settings_of(drop: Drop) -> Physics:
     """The settings at the drop's pace, with those of effects that do not run at zero.
 
     Several objects may travel further in a step. They get more solver iterations: the solver goes from contact to contact, and

@@ -16,6 +16,7 @@ from workers.geometry.elevation import vertical_gap
 from workers.geometry.frames import motion_between, transform, translation
 from workers.physics.effects import called_for_with
 from workers.physics.fall import Outcome
+from workers.physics.hold import MOST_HOLDS, hold
 from workers.physics.placement import (
     TOUCHING_M,
     Placement,
@@ -26,7 +27,7 @@ from workers.physics.placement import (
     place_on_top,
     placed_mesh,
 )
-from workers.physics.release import LEFT_M, QUICK, Drop, release
+from workers.physics.release import LEFT_M, PACES_TOGETHER, QUICK, Drop, release
 from workers.physics.rest.rest import rest
 from workers.physics.rest_pose import snap_to_face
 from workers.physics.separation import Form, find_gaps_m, find_overlaps_m
@@ -80,10 +81,13 @@ def settle(drop: Drop) -> tuple[Settled, ...]:
     _require_apart(drop.starts, forms)
     if drop.physics.exact_rest and (placed := _rest_as_placed(drop, forms)) is not None:
         return _describe(placed, _support_of(placed), judged=True)
-    if drop.many and drop.physics.exact_rest:
-        with suppress(UnsupportedError):
-            return _settle(dataclasses.replace(drop, pace=QUICK), forms)
-    return _settle(drop, forms)
+    if drop.single or not drop.physics.exact_rest:
+        return _settle(drop, forms)
+    first = dataclasses.replace(drop, pace=QUICK) if drop.many else drop
+    with suppress(UnsupportedError):
+        return _settle(first, forms)
+    again = drop if drop.many else dataclasses.replace(drop, pace=PACES_TOGETHER[-1], exact=True)
+    return _settle(again, forms)
 
 
 def _settle(drop: Drop, forms: Sequence[Form]) -> tuple[Settled, ...]:
@@ -150,7 +154,7 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], flat: bool) -> _Ending | No
             return ending
         rested = rest(placement.things, outcome.poses, placement.forms[-1].surface, placement.friction)
         if rested.still:
-            return dataclasses.replace(ending, poses=rested.poses)
+            return dataclasses.replace(ending, poses=_held(drop, placement, rested.poses))
         starts = (dataclasses.replace(one, T_world_obj=T) for one, T in zip(drop.starts, rested.poses, strict=True))
         drop = dataclasses.replace(drop, starts=tuple(starts))
     raise UnsupportedError(
@@ -158,6 +162,17 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], flat: bool) -> _Ending | No
         f"{'it tips' if drop.single else 'something tips'} on without end: released {MOST_RELEASES} times, for {seconds:.1f} "
         "s in all, it never came into balance: lower physics.rest.speed_mm_s",
     )
+
+
+def _held(drop: Drop, placement: Placement, poses: tuple[Pose, ...]) -> tuple[Pose, ...]:
+    """Where objects stay that came to exact rest at `poses`. Raises UnsupportedError."""
+    if (held := hold(drop, placement, poses)) is None:
+        raise UnsupportedError(
+            "unsupported",
+            f"something slips each time that all are let go again, {MOST_HOLDS} times: raise physics.friction, or have fewer "
+            "objects_per_scene",
+        )
+    return held
 
 
 def _rest_as_placed(drop: Drop, forms: Sequence[Form]) -> _Ending | None:

@@ -13,7 +13,8 @@ from schemas.scene.scene import Settled
 from workers.geometry.frames import motion_between
 from workers.physics.effects import called_for_with, rooms_m
 from workers.physics.fall import FINEST
-from workers.physics.placement import Ground
+from workers.physics.hold import let_go
+from workers.physics.placement import Ground, forms_of, place
 from workers.physics.release import Drop, release
 from workers.physics.settle import LeftRoomError, add_effects, settle
 
@@ -68,7 +69,8 @@ def release_again(
 ) -> tuple[Pose, ...]:
     """`T_world_obj` [4, 4] of every object this long after its release from where it rests.
 
-    With the effects of the plan and in the finest steps, without correction. Nothing counts as resting before the end.
+    With the effects of the plan and in the finest steps, without correction. Nothing counts as resting before the end. Of objects
+    that may touch one another, until one moved by `hold.FAR_M`.
     """
     rest = physics.rest.model_copy(update={"window_s": 2.0 * seconds})
     fine = {"step_hz": FINEST * physics.step_hz, "max_settle_s": seconds, "rest": rest}
@@ -80,7 +82,9 @@ def release_again(
     drop = Drop(starts, Ground(plan.table), physics, effects, exact=True)
     flat = [before.support != "mesh" and not effects.runs("table_mesh") for before in settled]
     if not drop.single and effects.runs("object_contacts"):
-        return release(drop, all(flat)).poses
+        poses = [start.T_world_obj for start in starts]
+        placement = place(starts, poses, forms_of(starts), plan.table, physics.friction**2)
+        return let_go(drop, placement, poses).poses
     alone = (dataclasses.replace(drop, starts=(start,)) for start in starts)
     return tuple(release(each, on_top).poses[0] for each, on_top in zip(alone, flat, strict=True))
 

@@ -16,8 +16,8 @@ from workers.physics.table_top import inside_margin
 SLIDE_M = 1e-7
 """Distance that an object may still slide. Bullet's own steps at rest move it by as much."""
 
-StopCondition = Callable[[BodyPose], bool]
-"""Whether the pose of a body ends the simulation."""
+StopCondition = Callable[[int, BodyPose], bool]
+"""Whether a body, by its number, at this pose ends the simulation."""
 
 StandingCondition = Callable[[BodyPose, Velocity], bool]
 """Whether a body at this pose and velocity stays on the face below it."""
@@ -32,7 +32,7 @@ def leaves_outline(outline: Array, reach_m: float) -> StopCondition:
     x, y = middle.tolist()
     safe_m = float(inside_margin(middle[None, :], outline)[0]) - reach_m
 
-    def leaves(at: BodyPose) -> bool:
+    def leaves(_: int, at: BodyPose) -> bool:
         if math.hypot(at[0][0] - x, at[0][1] - y) < safe_m:
             return False
         return bool(inside_margin(np.array([at[0][:2]]), outline)[0] < reach_m)
@@ -43,12 +43,12 @@ def leaves_outline(outline: Array, reach_m: float) -> StopCondition:
 def leaves_room(middle: Array, room_m: float) -> StopCondition:
     """Stop when a centre of mass is further than `room_m` from the vertical line through `middle` [2]."""
     x, y = float(middle[0]), float(middle[1])
-    return lambda at: math.hypot(at[0][0] - x, at[0][1] - y) > room_m
+    return lambda _, at: math.hypot(at[0][0] - x, at[0][1] - y) > room_m
 
 
 def falls_below(height_m: float) -> StopCondition:
     """Stop when a centre of mass is below this height, world z."""
-    return lambda at: at[0][2] < height_m
+    return lambda _, at: at[0][2] < height_m
 
 
 def stays_standing(start: ObjectStart, body: Body, top_m: float, friction: float) -> StandingCondition:

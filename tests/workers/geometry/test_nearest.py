@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from workers.geometry.nearest import nearest_on_mesh
+from workers.geometry.nearest import nearest_on_mesh, nearest_on_segments
 
 
 def test_the_nearest_point_is_the_one_that_trimesh_finds():
@@ -37,3 +37,27 @@ def test_a_triangle_without_area_is_a_line_or_a_point(corners):
     flat = Mesh(np.array(corners, dtype=np.float64), np.array([(0, 1, 2)], dtype=np.int32))
     found, _ = nearest_on_mesh(np.array([(1.5, 1.0, 0.0)]), flat)
     assert found[0] == pytest.approx([min(1.5, max(c[0] for c in corners)), 0.0, 0.0])
+
+
+def test_the_nearest_points_of_two_segments_are_as_near_as_any_of_many():
+    """Against all pairs of 400 points of each; and parallel segments and points as segments, in closed form."""
+    chance, here, there = np.random.default_rng(5), np.empty(3), np.empty(3)
+    share = np.linspace(0.0, 1.0, 400)[:, None]
+    for _ in range(200):
+        a, b, c, d = chance.uniform(-1.0, 1.0, (4, 3))
+        nearest_on_segments(a, b, c, d, here, there)
+        points, others = a + share * (b - a), c + share * (d - c)
+        least = np.linalg.norm(points[:, None] - others[None], axis=2).min()
+        assert least - 0.004 < np.linalg.norm(there - here) <= least + 1e-12
+        assert np.linalg.norm(np.cross(here - a, b - a)) < 1e-12
+        assert np.linalg.norm(np.cross(there - c, d - c)) < 1e-12
+    x, y = np.eye(3)[:2]
+    for a, b, c, d, far in (
+        (0 * x, x, y, x + y, 1.0),
+        (0 * x, x, 3 * x, 2 * x, 1.0),
+        (0 * x, 0 * x, y, y, 1.0),
+        (0 * x, 0 * x, y - x, y + x, 1.0),
+        (y - x, y + x, 0 * x, 0 * x, 1.0),
+    ):
+        nearest_on_segments(a, b, c, d, here, there)
+        assert np.linalg.norm(there - here) == pytest.approx(far)

@@ -101,7 +101,7 @@ def test_an_edge_is_near_where_the_nearest_one_is_within_reach():
     near = leaves_outline(outline, 0.1)
     rng = np.random.default_rng(0)
     for x, y in rng.uniform([-0.6, -0.4], [1.0, 0.4], (500, 2)):
-        assert near(fallen_at(x, y)) == (min(x + 0.5, 0.9 - x, y + 0.3, 0.3 - y) < 0.1)
+        assert near(0, fallen_at(x, y)) == (min(x + 0.5, 0.9 - x, y + 0.3, 0.3 - y) < 0.1)
 
 
 def test_a_room_is_a_circle_about_where_the_body_began_however_high_it_is():
@@ -109,13 +109,13 @@ def test_a_room_is_a_circle_about_where_the_body_began_however_high_it_is():
     for way in (0.0, 1.0, 2.5, 4.0):
         for far, expected in ((0.0, False), (0.0499, False), (0.0501, True), (3.0, True)):
             x, y = 0.3 + far * math.cos(way), -0.2 + far * math.sin(way)
-            assert strays(((x, y, 7.0 * way), fallen_at(0, 0)[1])) == expected
-    assert not leaves_room(np.zeros(2), math.inf)(fallen_at(1e9, 1e9))
+            assert strays(0, ((x, y, 7.0 * way), fallen_at(0, 0)[1])) == expected
+    assert not leaves_room(np.zeros(2), math.inf)(0, fallen_at(1e9, 1e9))
 
 
 def test_what_is_gone_is_below_everything_that_it_could_land_on():
     gone = falls_below(-0.1)
-    assert [gone(((5.0, 5.0, z), fallen_at(0, 0)[1])) for z in (0.0, -0.0999, -0.1001, -9.0)] == [
+    assert [gone(0, ((5.0, 5.0, z), fallen_at(0, 0)[1])) for z in (0.0, -0.0999, -0.1001, -9.0)] == [
         False,
         False,
         True,

@@ -1,0 +1,125 @@
+"""The outermost layer of a mesh as small convex pieces, exact where bodies touch. Pure."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull
+
+from schemas.base import Array
+from workers.geometry.contact_kernels import Index, bounds_in, find_near
+from workers.geometry.contact_surface import FLAT, Surface
+from workers.geometry.convexity import face_normals
+from workers.geometry.jit import compiled
+from workers.geometry.nearest import nearest_on_segments, nearest_on_triangle
+
+WHOLE = 1e-6
+"""Share of its area by which a patch may miss its hull and still count as convex."""
+
+
+def faces_within(one: tuple[Array, Index], other: tuple[Array, Index], within_m: float) -> tuple[Index, Index]:
+    """The faces of each of two meshes, vertices [V, 3] and faces [F, 3], that are at most `within_m` from the other's."""
+    low = np.maximum(one[0].min(axis=0), other[0].min(axis=0)) - within_m
+    high = np.minimum(one[0].max(axis=0), other[0].max(axis=0)) + within_m
+    (m, a, b), (n, c, d) = (bounds_in(points, faces, low, high) for points, faces in (one, other))
+    pairs = find_near(a, b, c, d, within_m)
+    pairs = np.stack([m[pairs[:, 0]], n[pairs[:, 1]]], axis=1)
+    near = _near(one[0], one[1], other[0], other[1], pairs, within_m)
+    return np.unique(pairs[near, 0]), np.unique(pairs[near, 1])
+
+
+@compiled
+def _near(p: Array, p_faces: Index, q: Array, q_faces: Index, pairs: Index, within: float) -> NDArray[np.bool_]:
+    """[N]: whether two triangles that do not pierce one another are within a distance."""
+    near, limit, here, there = np.zeros(len(pairs), np.bool_), within * within, np.empty(3), np.empty(3)
+    for n in range(len(pairs)):
+        a, b = p[p_faces[pairs[n, 0]]], q[q_faces[pairs[n, 1]]]
+        for k in range(3):
+            if near[n]:
+                break
+            nearest_on_triangle(a[k], b, here)
+            near[n] = ((a[k] - here) ** 2).sum() <= limit
+            nearest_on_triangle(b[k], a, here)
+            near[n] = near[n] or ((b[k] - here) ** 2).sum() <= limit
+        for k in range(9):
+            if near[n]:
+                break
+            nearest_on_segments(a[k // 3], a[(k // 3 + 1) % 3], b[k % 3], b[(k % 3 + 1) % 3], here, there)
+            near[n] = ((there - here) ** 2).sum() <= limit
+    return near
+
+
+def skin_of(surface: Surface, which: Index, deepest_m: float) -> tuple[Array, ...]:
+    """Pyramids [N, 3] below these faces: their corners, and a point at most `deepest_m` below their middle.
+
+    Faces in one plane that fill a convex outline are one piece, else each is its own. No pyramid reaches out of a wedge between
+    faces: its sides lean by at most half of the wedge's angle, and by 45 degrees at most. On a surface without an inside, and
+    where a wedge is sharp, it is flat.
+    """
+    vertices, faces = surface.vertices, surface.faces
+    normals = face_normals(vertices, faces)
+    patch, lean = _patches(vertices, faces, normals)
+    pieces, outward = [], _outward(surface)
+    members = np.argsort(patch, kind="stable")
+    first = np.searchsorted(patch[members], np.arange(patch.max(initial=-1) + 2))
+    for number in np.unique(patch[which]).tolist():
+        group = members[first[number] : first[number + 1]]
+        whole = _outline(vertices, faces[group], normals[group[0]])
+        if whole is not None:
+            pieces.append(_pyramid(whole, outward * normals[group[0]], lean[group].min(), deepest_m))
+        else:
+            for face in group[np.isin(group, which)]:
+                pieces.append(_pyramid(vertices[faces[face]], outward * normals[face], lean[face], deepest_m))
+    return tuple(pieces)
+
+
+def _pyramid(outline: Array, outward: Array, lean: float, deepest_m: float) -> Array:
+    """The corners [N, 3] of a convex outline, in order, with a point below its middle."""
+    middle, ahead = outline.mean(axis=0), np.roll(outline, -1, axis=0) - outline
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    inside_m = float(np.linalg.norm(np.cross(ahead, middle - outline), axis=1).min())
+    return np.concatenate([outline, (middle - min(deepest_m, lean * inside_m) * outward)[None]])
+
+
+def _outline(vertices: Array, faces: Index, normal: Array) -> Array | None:
+    """The corners [N, 3] of coplanar faces, in order, where they fill a convex outline."""
+    if len(faces) == 1:
+        return vertices[faces[0]]
+    corners = vertices[np.unique(faces)]
+    x = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    x /= np.linalg.norm(x)
+    flat = (corners - corners.mean(axis=0)) @ np.stack([x, np.cross(normal, x)]).T
+    hull = ConvexHull(flat)
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area2 = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    return corners[hull.vertices] if abs(2.0 * hull.volume - area2) <= WHOLE * area2 else None
+
+
+def _patches(vertices: Array, faces: Index, normals: Array) -> tuple[NDArray[np.int32], Array]:
+    """(patch [F] of each face, those that follow one another in a plane are one; lean [F]).
+
+    lean: tangent of half the sharpest angle between a face and a neighbour that is not of its patch, as if all edges were
+    convex; at most 1.
+    """
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    keys = edges[:, 0] * len(vertices) + edges[:, 1]
+    order = np.argsort(keys, kind="stable")
+    same = keys[order[1:]] == keys[order[:-1]]
+    one, other = order[:-1][same] // 3, order[1:][same] // 3
+    cosine = np.einsum("ij,ij->i", normals[one], normals[other])
+    even = cosine > 1.0 - FLAT
+    links = coo_array((np.ones(even.sum()), (one[even], other[even])), shape=(len(faces), len(faces)))
+    patch = connected_components(links, directed=False)[1]
+    tangent = np.sqrt(np.maximum(0.0, 1.0 + cosine) / np.maximum(1e-12, 1.0 - cosine))
+    lean = np.ones(len(faces))
+    np.minimum.at(lean, one[~even], tangent[~even])
+    np.minimum.at(lean, other[~even], tangent[~even])
+    return patch, lean
+
+
+def _outward(surface: Surface) -> float:
+    """1 where normals point out of the body, -1 where they point into it, 0 where there is none."""
+    if not surface.side.any():
+        return 0.0
+    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    return float(np.sign(np.einsum("ij,ij->", a, np.cross(b, c))))

@@ -1,0 +1,117 @@
+"""Objects at rest on one another, let go again: whether they stay, and where they come to rest if friction lets go."""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from schemas.base import Array, Pose
+from schemas.scene.plan import Table
+from workers.geometry.frames import motion_between, transform
+from workers.geometry.skin import faces_within, skin_of
+from workers.physics.bullet import SLOP_SHARE, GroundShape
+from workers.physics.fall import Outcome, StepSizes, fall
+from workers.physics.placement import Placement
+from workers.physics.release import AS_SET, Drop, settings_of
+from workers.physics.rest.rest import rest
+from workers.physics.rigid_body import Body, make_body
+from workers.physics.stop_conditions import StopCondition
+from workers.physics.table_top import inside_margin, split_by_side
+
+HELD_FROM = 9
+"""Number of objects from which rest is held: of piles of eight none moved that was let go again, of twenty one in ten."""
+
+HELD_M = 8e-5
+"""Motion in a rest window up to which objects stay: Bullet pushes what is in touch apart by its margins, and many by 0.06 mm."""
+
+MOST_HOLDS = 6
+"""Times that objects are let go, each from where they came to rest the time before."""
+
+FAR_M = 2e-4
+"""Motion of a centre of mass at which they are stopped: only faces within twice that are there to meet."""
+
+FARTHEST_M, LONGEST_S = 16.0 * FAR_M, 1.0
+"""How far and how long they go where something slipped: each time twice as much, so that what slides slowly comes to an end."""
+
+RATE = 4
+"""Steps to one of the fall's. In as many as the fall's the solver itself lets piles creep, by 0.1 mm in a window."""
+
+DEEP_M = 1e-4
+"""Depth of skins, above five margins."""
+
+REACH_M = 1e-4
+"""Contact distance, above both margins. Bullet's own, some millimetres, finds many contacts between skins that do nothing."""
+
+
+def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> tuple[Pose, ...] | None:
+    """The `T_world_obj` of objects that stay where they are when they are let go, from where they came to exact rest; else None.
+
+    Forces that balance all weights do not exclude that friction lets go: of more contacts than equations there are many such
+    forces, and bodies need not find them. What slips comes to exact rest anew, from where it went.
+    """
+    if len(drop.starts) < HELD_FROM:
+        return tuple(poses)
+    far_m, seconds = FAR_M, drop.physics.rest.window_s
+    for _ in range(MOST_HOLDS):
+        window = drop.physics.rest.model_copy(update={"window_s": 2.0 * seconds})
+        changes = {"step_hz": RATE * drop.physics.step_hz, "max_settle_s": seconds, "rest": window}
+        held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes), pace=AS_SET)
+        went = let_go(held, placement, poses, far_m).poses
+        if _farthest_m(drop, poses, went) <= HELD_M:
+            return tuple(poses)
+        rested = rest(placement.things, went, placement.forms[-1].surface, placement.friction)
+        if not rested.still:
+            break
+        poses = rested.poses
+        far_m, seconds = min(FARTHEST_M, 2.0 * far_m), min(LONGEST_S, 2.0 * seconds)
+    return None
+
+
+def let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: float = FAR_M) -> Outcome:
+    """What objects at these `T_world_obj` do in steps of `physics.step_hz`, until one of them moved by `far_m`.
+
+    Their shapes are the skins of their meshes where they are near one another, in convex pieces: exact, and each with contacts of
+    its own. Of two bodies that are one piece each Bullet keeps four contacts, chosen from some millimetres away, so that a
+    box stands on three corners of four and on what it does not touch.
+    """
+    physics, table = settings_of(drop), drop.ground.table
+    bodies = [
+        make_body(start, parts) for start, parts in zip(drop.starts, _skins(placement, poses, 2.0 * far_m), strict=True)
+    ]
+    points = np.concatenate([transform(T, one.hull.vertices) for one, T in zip(drop.starts, poses, strict=True)])
+    ground: GroundShape = split_by_side(table.mesh)
+    if table.top.convex and _is_over(points, table, 2.0 * far_m):
+        ground = table.top.height_m - bodies[0].margin_m * (1.0 - SLOP_SHARE)
+    stops = {"far": _goes_far(bodies, poses, far_m)}
+    return fall(bodies, poses, ground, physics, StepSizes(physics.step_hz, math.inf), 0.0, stops, reach_m=REACH_M)
+
+
+def _is_over(points: Array, table: Table, near_m: float) -> bool:
+    """Whether points [N, 3] are over a table's flat top, and further than this from its edges."""
+    top = table.top
+    return bool(inside_margin(points[:, :2], top.outline).min() > near_m and points[:, 2].min() > top.height_m - near_m)
+
+
+def _goes_far(bodies: Sequence[Body], poses: Sequence[Pose], far_m: float) -> StopCondition:
+    """Stop when a centre of mass is further than this from where it was."""
+    at = [(T @ body.T_obj_body)[:3, 3].tolist() for body, T in zip(bodies, poses, strict=True)]
+    return lambda number, now: math.dist(now[0], at[number]) > far_m
+
+
+def _farthest_m(drop: Drop, poses: Sequence[Pose], others: Sequence[Pose]) -> float:
+    return max(
+        motion_between(one.hull.vertices, T, other)[0] for one, T, other in zip(drop.starts, poses, others, strict=True)
+    )
+
+
+def _skins(placement: Placement, poses: Sequence[Pose], near_m: float) -> list[tuple[Array, ...]]:
+    """The pieces [N, 3] of each object, in its own frame, that are within this of others or of the table."""
+    surfaces = [form.surface for form in placement.forms]
+    points = [transform(T, one.vertices) for T, one in zip((*poses, np.eye(4)), surfaces, strict=True)]
+    near = [np.zeros(len(one.faces), dtype=np.bool_) for one in surfaces]
+    for i, j in itertools.combinations(range(len(surfaces)), 2):
+        here, there = faces_within((points[i], surfaces[i].faces), (points[j], surfaces[j].faces), near_m)
+        near[i][here] = near[j][there] = True
+    return [skin_of(one, np.flatnonzero(each), DEEP_M) for one, each in zip(surfaces[:-1], near, strict=False)]
