@@ -14,35 +14,30 @@ from workers.geometry.skin import faces_within, skin_of
 from workers.physics.bullet import SLOP_SHARE, GroundShape
 from workers.physics.fall import Outcome, StepSizes, fall
 from workers.physics.placement import Placement
-from workers.physics.release import AS_SET, Drop, settings_of
+from workers.physics.release import AS_SET, PACES_TOGETHER, Drop, settings_of
 from workers.physics.rest.rest import rest
 from workers.physics.rigid_body import Body, make_body
 from workers.physics.stop_conditions import StopCondition
 from workers.physics.table_top import inside_margin, split_by_side
 
 HELD_FROM = 9
-"""Number of objects from which rest is held: of piles of eight none moved that was let go again, of twenty one in ten."""
+"""Number of objects from which rest is held: of fifteen piles of eight none moved when let go again, of twenty boxes a fifth."""
 
 HELD_M = 8e-5
 """Motion in a rest window up to which objects stay: Bullet pushes what is in touch apart by its margins, and many by 0.06 mm."""
 
 MOST_HOLDS = 6
-"""Times that objects are let go, each from where they came to rest the time before."""
+"""Times that objects are let go, each from where they came to rest the time before; of twenty boxes most need one, some three."""
 
-FAR_M = 2e-4
-"""Motion of a centre of mass at which they are stopped: only faces within twice that are there to meet."""
+FAR_M, FARTHEST_M = 2e-4, 3.2e-3
+"""Motion of a centre of mass at which they are stopped, at first and at most: only faces within twice that are there to meet."""
 
-FARTHEST_M, LONGEST_S = 16.0 * FAR_M, 1.0
-"""How far and how long they go where something slipped: each time twice as much, so that what slides slowly comes to an end."""
+LONGEST_S = 1.0
+"""How long they are let go at most. How far and how long doubles where something slipped, so that what slides slowly stops."""
 
-RATE = 4
-"""Steps to one of the fall's. In as many as the fall's the solver itself lets piles creep, by 0.1 mm in a window."""
-
-DEEP_M = 1e-4
-"""Depth of skins, above five margins."""
-
-REACH_M = 1e-4
-"""Contact distance, above both margins. Bullet's own, some millimetres, finds many contacts between skins that do nothing."""
+SKIN_M = 1e-4
+"""Depth of skins, and contact distance, above both margins. Bullet's own distance, some millimetres, finds many contacts between
+skins that do nothing."""
 
 
 def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> tuple[Pose, ...] | None:
@@ -56,7 +51,7 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> tuple[Pose,
     far_m, seconds = FAR_M, drop.physics.rest.window_s
     for _ in range(MOST_HOLDS):
         window = drop.physics.rest.model_copy(update={"window_s": 2.0 * seconds})
-        changes = {"step_hz": RATE * drop.physics.step_hz, "max_settle_s": seconds, "rest": window}
+        changes = {"step_hz": PACES_TOGETHER[-1].rate * drop.physics.step_hz, "max_settle_s": seconds, "rest": window}
         held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes), pace=AS_SET)
         went = let_go(held, placement, poses, far_m).poses
         if _farthest_m(drop, poses, went) <= HELD_M:
@@ -85,7 +80,7 @@ def let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: float
     if table.top.convex and _is_over(points, table, 2.0 * far_m):
         ground = table.top.height_m - bodies[0].margin_m * (1.0 - SLOP_SHARE)
     stops = {"far": _goes_far(bodies, poses, far_m)}
-    return fall(bodies, poses, ground, physics, StepSizes(physics.step_hz, math.inf), 0.0, stops, reach_m=REACH_M)
+    return fall(bodies, poses, ground, physics, StepSizes(physics.step_hz, math.inf), 0.0, stops, reach_m=SKIN_M)
 
 
 def _is_over(points: Array, table: Table, near_m: float) -> bool:
@@ -114,4 +109,4 @@ def _skins(placement: Placement, poses: Sequence[Pose], near_m: float) -> list[t
     for i, j in itertools.combinations(range(len(surfaces)), 2):
         here, there = faces_within((points[i], surfaces[i].faces), (points[j], surfaces[j].faces), near_m)
         near[i][here] = near[j][there] = True
-    return [skin_of(one, np.flatnonzero(each), DEEP_M) for one, each in zip(surfaces[:-1], near, strict=False)]
+    return [skin_of(one, np.flatnonzero(each), SKIN_M) for one, each in zip(surfaces[:-1], near, strict=False)]
