@@ -80,7 +80,7 @@ def test_what_falls_freely_lands_when_half_g_t_squared_says(height_m):
 def test_a_stop_condition_ends_the_fall_and_is_named():
     start = start_at(translation(0.0, 0.0, 1.0))
     body = make_body(start)
-    stops = {"never": lambda at: False, "below": lambda at: at[0][2] < 0.9}
+    stops = {"never": lambda _, at: False, "below": lambda _, at: at[0][2] < 0.9}
     motion = fall([body], [start.T_world_obj], 0.0, for_seconds(8.0), COARSE, 0.0, stops)
     assert (motion.stopped_by, motion.rested) == ("below", False)
     assert 0.9 - 8 * 2.0 / PHYSICS.step_hz <= motion.poses[0][2, 3] < 0.9
