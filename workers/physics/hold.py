@@ -75,7 +75,7 @@ def let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: float
     its own. Of two bodies that are one piece each Bullet keeps four contacts, chosen from some millimetres away, so that a
     box stands on three corners of four and on what it does not touch.
     """
-    physics, table = settings_of(drop), drop.ground.table
+    physics, table = settings_of(drop), drop.table
     skins = _skins(placement, poses, 2.0 * far_m)
     bodies = [_thinly(make_body(start, parts)) for start, parts in zip(drop.starts, skins, strict=True)]
     points = np.concatenate([transform(T, one.hull.vertices) for one, T in zip(drop.starts, poses, strict=True)])

@@ -31,13 +31,6 @@ its gap is measured up to `FARTHEST_M`."""
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
-    """What objects fall on."""
-
-    table: Table
-
-
-@dataclass(frozen=True, eq=False)
 class Placement:
     """Objects and the table below them, with all that their rest is found and measured by.
 

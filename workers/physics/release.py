@@ -13,7 +13,6 @@ from schemas.scene.plan import ObjectStart, Table
 from workers.geometry.frames import transform
 from workers.physics.bullet import SLOP_SHARE, GroundShape
 from workers.physics.fall import LOOK_STEPS, THIN_SHARE, Outcome, choose_steps, fall, free_fall_m
-from workers.physics.placement import Ground
 from workers.physics.rigid_body import build_body, choose_collision_shape
 from workers.physics.stop_conditions import falls_below, leaves_outline, leaves_room, stays_standing
 
@@ -77,7 +76,7 @@ class Drop:
     """
 
     starts: tuple[ObjectStart, ...]
-    ground: Ground
+    table: Table
     physics: Physics
     effects: EffectPlan
     room_m: float = math.inf
@@ -115,7 +114,7 @@ def release(drop: Drop, flat: bool) -> Outcome:
 
 
 def _release(drop: Drop, flat: bool) -> Outcome:
-    table, effects, physics = drop.ground.table, drop.effects, settings_of(drop)
+    table, effects, physics = drop.table, drop.effects, settings_of(drop)
     starts = [choose_collision_shape(start, physics) for start in drop.starts]
     poses = [start.T_world_obj for start in starts]
     coarse = drop.many or (drop.single and drop.pace == PACES[0] and physics.exact_rest)

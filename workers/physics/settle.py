@@ -106,7 +106,7 @@ def _support_of(ending: _Ending) -> SupportedBy:
     """`flat_top` where the mesh was not called for and every object is over the flat top with all of its points."""
     if ending.drop.effects.runs("table_mesh"):
         return "mesh"
-    outline = ending.drop.ground.table.top.outline
+    outline = ending.drop.table.top.outline
     points = [transform(T, one.hull.vertices) for one, T in zip(ending.drop.starts, ending.poses, strict=True)]
     return "flat_top" if inside_margin(np.concatenate(points)[:, :2], outline).min() >= 0.0 else "mesh"
 
@@ -181,7 +181,7 @@ def _rest_as_placed(drop: Drop, forms: Sequence[Form]) -> _Ending | None:
     lowest_m = min(
         float(transform(T, one.hull.vertices)[:, 2].min()) for T, one in zip(poses, drop.starts, strict=True)
     )
-    if lowest_m > drop.ground.table.top.height_m + PLACED_M:
+    if lowest_m > drop.table.top.height_m + PLACED_M:
         return None
     placement = _place(drop, poses, forms)
     if max(find_gaps_m(placement.forms, [*poses, np.eye(4)])[:-1]) > PLACED_M:
@@ -195,12 +195,12 @@ def _rest_as_placed(drop: Drop, forms: Sequence[Form]) -> _Ending | None:
 
 
 def _place(drop: Drop, poses: Sequence[Pose], forms: Sequence[Form]) -> Placement:
-    return place(drop.starts, poses, forms, drop.ground.table, drop.physics.friction**2)
+    return place(drop.starts, poses, forms, drop.table, drop.physics.friction**2)
 
 
 def _stand(drop: Drop, outcome: Outcome, seconds: float) -> _Ending | None:
     """A single object turned onto the steady face of its hull that is below it, on the flat top; None where none is near."""
-    (start,), table = drop.starts, drop.ground.table
+    (start,), table = drop.starts, drop.table
     T = snap_to_face(outcome.poses[0], start.hull, start.asset.mass.com)
     if T is None:
         return None
@@ -222,7 +222,7 @@ def _require_calm(drop: Drop, outcome: Outcome) -> None:
 
 
 def _lowest_m(drop: Drop) -> float:
-    return drop.ground.table.top.height_m - LEFT_M
+    return drop.table.top.height_m - LEFT_M
 
 
 def _is_low(drop: Drop, start: ObjectStart, T: Pose) -> bool:

@@ -14,7 +14,7 @@ from workers.geometry.frames import motion_between
 from workers.physics.effects import called_for_with, rooms_m
 from workers.physics.fall import FINEST
 from workers.physics.hold import let_go
-from workers.physics.placement import Ground, forms_of, place
+from workers.physics.placement import forms_of, place
 from workers.physics.release import Drop, release
 from workers.physics.settle import LeftRoomError, add_effects, settle
 
@@ -39,16 +39,16 @@ def settle_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan) -> Rest
     Objects that cannot meet settle one by one. Raises SettleError `objects_overlap`, `not_at_rest`, `left_table`,
     `unsupported` or `table_too_fine`. A pure function: every simulation starts from an empty world.
     """
-    starts, ground, called = plan.objects, Ground(plan.table), dict[str, str]()
+    starts, table, called = plan.objects, plan.table, dict[str, str]()
     if len(starts) > 1 and effects.runs("object_contacts"):
-        settled = settle(Drop(starts, ground, physics, effects))
+        settled = settle(Drop(starts, table, physics, effects))
     else:
         try:
             rooms = zip(starts, rooms_m(starts), strict=True)
-            settled = tuple(settle(Drop((start,), ground, physics, effects, room_m))[0] for start, room_m in rooms)
+            settled = tuple(settle(Drop((start,), table, physics, effects, room_m))[0] for start, room_m in rooms)
         except LeftRoomError:
             called = dict.fromkeys(called_for_with("object_contacts", starts, physics), LEFT_ROOM)
-            settled = settle(Drop(starts, ground, physics, add_effects(effects, called)))
+            settled = settle(Drop(starts, table, physics, add_effects(effects, called)))
     if any(rest.support == "mesh" for rest in settled):
         called |= dict.fromkeys(called_for_with("table_mesh", starts, physics), LEFT_TOP)
     return Rest(settled, {name: why for name, why in called.items() if not effects.runs(name)})
@@ -79,7 +79,7 @@ def release_again(
         dataclasses.replace(start, T_world_obj=before.T_world_obj)
         for start, before in zip(plan.objects, settled, strict=True)
     )
-    drop = Drop(starts, Ground(plan.table), physics, effects, exact=True)
+    drop = Drop(starts, plan.table, physics, effects, exact=True)
     flat = [before.support != "mesh" and not effects.runs("table_mesh") for before in settled]
     if not drop.single and effects.runs("object_contacts"):
         poses = [start.T_world_obj for start in starts]

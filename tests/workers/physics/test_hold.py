@@ -18,7 +18,7 @@ from workers.geometry.frames import motion_between, transform, translation
 from workers.physics import hold as module
 from workers.physics.fall import FINEST, Outcome
 from workers.physics.hold import FAR_M, HELD_FROM, HELD_M, MOST_HOLDS, hold, let_go
-from workers.physics.placement import Ground, Placement, forms_of, place
+from workers.physics.placement import Placement, forms_of, place
 from workers.physics.release import Drop
 from workers.physics.rest.rest import rest
 
@@ -43,7 +43,7 @@ def let_go_for(seconds: float, starts: Sequence[ObjectStart], table: Table, shar
 def released(starts: Sequence[ObjectStart], table: Table, physics=PHYSICS) -> tuple[Drop, Placement]:
     poses = [one.T_world_obj for one in starts]
     placement = place(starts, poses, forms_of(starts), table, physics.friction**2)
-    return Drop(tuple(starts), Ground(table), physics, PLAN), placement
+    return Drop(tuple(starts), table, physics, PLAN), placement
 
 
 def overhanging(by_m: float) -> tuple[tuple[ObjectStart, ...], Table]:

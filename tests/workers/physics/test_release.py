@@ -18,13 +18,11 @@ from tests.shapes import asset_of, box, table
 from workers.geometry.frames import pose
 from workers.geometry.hull import convex_hull
 from workers.physics.fall import LOOK_STEPS, SAMPLE_STEPS, fall
-from workers.physics.placement import Ground
 from workers.physics.release import DOUBTFUL_RISE, KNOWN_RISE, MOST_RISE, PACES, PACES_TOGETHER, Drop, release
 from workers.physics.table_top import place_table
 
 PHYSICS = Job(name="t").physics
 TABLE = place_table(table())
-GROUND = Ground(TABLE)
 TOP = TABLE.top.height_m
 ALL = ("dynamics", "fine_step", "object_contacts", "rolling_friction")
 CUBE = asset_of(box(0.06, 0.06, 0.06))
@@ -55,7 +53,7 @@ def test_steps_are_as_fine_as_the_highest_fall_and_the_thinnest_object_ask(heigh
 
 def seconds_to_rest(start: ObjectStart, names: tuple[str, ...], **changes) -> float:
     physics = PHYSICS.model_copy(update={"max_settle_s": 3.0, **changes})
-    return release(Drop((start,), GROUND, physics, EffectPlan(names, {})), flat=True).seconds
+    return release(Drop((start,), TABLE, physics, EffectPlan(names, {})), flat=True).seconds
 
 
 def test_a_cube_bounces_only_where_the_plan_runs_restitution():
@@ -81,8 +79,8 @@ def test_objects_as_boxes_keep_the_height_of_their_lowest_point_together_as_alon
     starts = [start_of(can, x, 0.0, 0.001 - low, tilted) for x in (-0.1, 0.1)]
     physics = PHYSICS.model_copy(update={"collision": "box", "max_settle_s": 0.01})
     plan = EffectPlan(("dynamics", "fine_step"), {})
-    both = release(Drop(tuple(starts), GROUND, physics, plan), flat=True)
-    alone = [release(Drop((start,), GROUND, physics, plan), flat=True) for start in starts]
+    both = release(Drop(tuple(starts), TABLE, physics, plan), flat=True)
+    alone = [release(Drop((start,), TABLE, physics, plan), flat=True) for start in starts]
     for beside, one in zip(both.poses, alone, strict=True):
         assert beside[2, 3] == pytest.approx(one.poses[0][2, 3], abs=1e-4)
 
@@ -101,7 +99,7 @@ def falls_of(drop: Drop, rises: list[float], monkeypatch) -> list[tuple[float, i
 
 
 BRIEF = PHYSICS.model_copy(update={"max_settle_s": 0.01})
-ALONE = Drop((start_of(CUBE, 0, 0, 0.031),), GROUND, BRIEF, EffectPlan(("dynamics", "fine_step"), {}))
+ALONE = Drop((start_of(CUBE, 0, 0, 0.031),), TABLE, BRIEF, EffectPlan(("dynamics", "fine_step"), {}))
 
 
 def test_what_gains_energy_falls_again_in_shorter_steps_until_it_gains_none(monkeypatch):
@@ -126,7 +124,7 @@ def test_a_doubtful_drop_is_looked_at_after_each_step_before_it_falls_in_shorter
 
 def test_looks_at_the_energy_change_nothing_of_a_drop():
     start = start_of(CUBE, 0.0, 0.0, 0.1, turn(X, 40) @ turn(np.array([0.0, 1.0, 0.0]), 25))
-    drop = Drop((start,), GROUND, PHYSICS, EffectPlan(("dynamics", "fine_step"), {}), pace=PACES[0])
+    drop = Drop((start,), TABLE, PHYSICS, EffectPlan(("dynamics", "fine_step"), {}), pace=PACES[0])
     often, seldom = (
         release(dataclasses.replace(drop, exact=True, watched=watched), flat=True) for watched in (True, False)
     )

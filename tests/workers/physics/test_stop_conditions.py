@@ -15,7 +15,6 @@ from workers.geometry.frames import pose, quaternion_from_rotation
 from workers.geometry.hull import convex_hull
 from workers.physics.bullet import GRAVITY_M_S2
 from workers.physics.energy import LIFT_M
-from workers.physics.placement import Ground
 from workers.physics.release import PACES, Drop, release
 from workers.physics.rigid_body import body_frame, make_body
 from workers.physics.stop_conditions import SLIDE_M, falls_below, leaves_outline, leaves_room, stays_standing
@@ -85,7 +84,7 @@ def test_a_drop_ends_sooner_where_the_object_stands_and_as_it_would_have():
     T[2, 3] = table_.top.height_m + 0.1 + 0.01
     start = dataclasses.replace(start_of(0.1, 0.08, 0.2), T_world_obj=T)
     plan = EffectPlan(("dynamics", "fine_step"), {})
-    drop = Drop((start,), Ground(table_), PHYSICS, plan, pace=PACES[0])
+    drop = Drop((start,), table_, PHYSICS, plan, pace=PACES[0])
     sooner = release(drop, flat=True)
     later = release(dataclasses.replace(drop, physics=PHYSICS.model_copy(update={"exact_rest": False})), flat=True)
     assert sooner.rested and sooner.seconds < later.seconds - PHYSICS.rest.window_s / 2

@@ -17,13 +17,6 @@ from workers.store.manifest import decode_table
 pytestmark = pytest.mark.usefixtures("unflushed")
 
 
-@pytest.fixture
-def store(tmp_path):
-    store = LocalStore(tmp_path)
-    store.prepare()
-    return store
-
-
 def changed(output: SceneOutput, **changes) -> SceneOutput:
     return dataclasses.replace(output, **changes)
 

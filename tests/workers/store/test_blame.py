@@ -6,14 +6,6 @@ from schemas.dataset.commit import Span
 from schemas.dataset.layout import MAX_SCENE, STAGING
 from tests.made_up_scenes import attempt_at, made_scene, terms
 from workers.store.attempt import attempts_at, begin_attempt, blamed_scene
-from workers.store.local import LocalStore
-
-
-@pytest.fixture
-def store(tmp_path):
-    store = LocalStore(tmp_path)
-    store.prepare()
-    return store
 
 
 def test_a_scene_is_blamed_from_its_beginning_until_the_commit(store):
