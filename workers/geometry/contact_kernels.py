@@ -22,12 +22,8 @@ Index = NDArray[np.int64]
 @compiled
 def bounds_in(points: Array, features: Index, low: Array, high: Array) -> tuple[Index, Array, Array]:
     """(numbers [N], lower and upper bounds [N, 3]) of the features [F, K], corners by number, whose bounds overlap a box."""
-    found, least, most, count = (
-        np.empty(len(features), np.int64),
-        np.empty((len(features), 3)),
-        np.empty((len(features), 3)),
-        0,
-    )
+    found, count = np.empty(len(features), np.int64), 0
+    least, most = np.empty((len(features), 3)), np.empty((len(features), 3))
     for f in range(len(features)):
         near = True
         for k in range(3):

@@ -1,18 +1,25 @@
-"""The features of a mesh that may touch another: corners, edges and faces, each with what is about it."""
+"""What of a mesh may touch another: its corners, edges and faces, each with what is about it, and its outermost layer. Pure."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
-from workers.geometry.contact_kernels import SLOPE, Index, cross
+from workers.geometry.contact_kernels import SLOPE, Index, bounds_in, find_near
 from workers.geometry.convexity import face_normals, numbers_in, weld
 from workers.geometry.jit import compiled
+from workers.geometry.nearest import nearest_on_segments, nearest_on_triangle
 
 FLAT = 1e-9
 """One minus the cosine between two faces, below which there is no edge between them."""
+
+WHOLE = 1e-6
+"""Share of its area by which a patch of faces in one plane may miss its hull and still count as convex."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,52 +58,33 @@ def surface_of(mesh: Mesh, closed: bool) -> Surface:
 def is_closed(mesh: Mesh) -> bool:
     """Whether every edge of a mesh has two faces or more, once its vertices at one place are one."""
     mesh = weld(mesh)
-    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
-    return bool((np.unique(edges @ [len(mesh.vertices), 1], return_counts=True)[1] > 1).all())
+    keys, _ = _half_edges(mesh.faces.astype(np.int64), len(mesh.vertices))
+    return bool((np.unique(keys, return_counts=True)[1] > 1).all())
 
 
 def crop(mesh: Mesh, low: Array, high: Array) -> Mesh:
     """The triangles that overlap a box, bounds [3] and [3], with all that may share a corner with one of them."""
-    return Mesh(mesh.vertices, mesh.faces[_near_box(mesh.vertices, mesh.faces, low, high)])
+    vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
+    faces = mesh.faces.astype(np.int64)
+    near, least, most = bounds_in(vertices, faces, low, high)
+    if len(near):
+        near, _, _ = bounds_in(vertices, faces, least.min(axis=0), most.max(axis=0))
+    return Mesh(mesh.vertices, mesh.faces[near])
 
 
-@compiled
-def _near_box(vertices: Array, faces: NDArray[np.integer], low: Array, high: Array) -> NDArray[np.bool_]:
-    """[F]: whether a face's bounds overlap those of all the faces whose bounds overlap a box."""
-    near = np.zeros(len(faces), np.bool_)
-    least, most = np.full(3, np.inf), np.full(3, -np.inf)
-    for again in range(2):
-        down, up = low.astype(np.float64), high.astype(np.float64)
-        if again:
-            down, up = least.copy(), most.copy()
-        for f in range(len(faces)):
-            a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-            inside = True
-            for k in range(3):
-                inside = inside and min(a[k], b[k], c[k]) <= up[k] and max(a[k], b[k], c[k]) >= down[k]
-            near[f] = inside
-            if inside and not again:
-                for k in range(3):
-                    least[k], most[k] = min(least[k], a[k], b[k], c[k]), max(most[k], a[k], b[k], c[k])
-    return near
-
-
-@compiled
 def _star(faces: Index, count: int) -> tuple[Index, Index]:
     """(starts [count + 1], members): the neighbours of each vertex, one after the other, ascending."""
-    keys = np.empty(6 * len(faces), np.int64)
-    for f in range(len(faces)):
-        for k in range(3):
-            a, b = faces[f, k], faces[f, (k + 1) % 3]
-            keys[6 * f + 2 * k], keys[6 * f + 2 * k + 1] = a * count + b, b * count + a
-    keys.sort()
-    starts, members, found = np.zeros(count + 1, np.int64), np.empty(len(keys), np.int64), 0
-    for n in range(len(keys)):
-        if n == 0 or keys[n] != keys[n - 1]:
-            members[found] = keys[n] % count
-            starts[keys[n] // count + 1] += 1
-            found += 1
-    return np.cumsum(starts), members[:found]
+    one, other = faces[:, [0, 1, 2, 1, 2, 0]], faces[:, [1, 2, 0, 0, 1, 2]]
+    keys = np.unique(one * count + other)
+    return np.searchsorted(keys, np.arange(count + 1) * count), keys % count
+
+
+def _half_edges(faces: Index, count: int) -> tuple[Index, Index]:
+    """(keys [3 F], ascending, the same for the sides of one edge; which [3 F] sides these are, three times their face and on)."""
+    one, other = faces, np.roll(faces, -1, axis=1)
+    keys = (np.minimum(one, other) * count + np.maximum(one, other)).ravel()
+    which = np.argsort(keys, kind="stable")
+    return keys[which], which
 
 
 @compiled
@@ -120,41 +108,122 @@ def _sides(vertices: Array, faces: Index, normals: Array, starts: Index, members
     return side
 
 
-@compiled
 def _bent_edges(vertices: Array, faces: Index, normals: Array) -> tuple[Index, Index]:
     """Edges [E, 2] that are not between two coplanar faces, and the vertices across them [E, 2]."""
-    count = len(vertices)
-    keys = np.empty(3 * len(faces), np.int64)
-    for f in range(len(faces)):
-        for k in range(3):
-            a, b = faces[f, k], faces[f, (k + 1) % 3]
-            keys[3 * f + k] = min(a, b) * count + max(a, b)
-    order = np.argsort(keys, kind="mergesort")
-    edges, across, found, first = np.empty((len(keys), 2), np.int64), np.empty((len(keys), 2), np.int64), 0, 0
-    while first < len(order):
-        key, last = keys[order[first]], first
-        while last + 1 < len(order) and keys[order[last + 1]] == key:
-            last += 1
-        one, other = order[first], order[last]
-        a, b = key // count, key % count
-        p, q = faces[one // 3, (one % 3 + 2) % 3], faces[other // 3, (other % 3 + 2) % 3]
-        cosine = 0.0
-        for k in range(3):
-            cosine += normals[one // 3, k] * normals[other // 3, k]
-        flat = last == first + 1 and abs(cosine) > 1.0 - FLAT
-        # Two faces folded onto one another are coplanar, and their edge is bent all the same
-        if not flat or (p != q and _same_side(vertices, a, b, p, q)):
-            edges[found, 0], edges[found, 1] = a, b
-            across[found, 0], across[found, 1] = p, q
-            found += 1
-        first = last + 1
-    return edges[:found], across[:found]
+    keys, which = _half_edges(faces, len(vertices))
+    first, last = np.flatnonzero(np.diff(keys, prepend=-1)), np.flatnonzero(np.diff(keys, append=-1))
+    edges = np.stack(np.divmod(keys[first], len(vertices)), axis=1)
+    sides = which[np.stack([first, last], axis=1)]
+    across = faces[sides // 3, (sides + 2) % 3]
+    cosine = (normals[sides[:, 0] // 3] * normals[sides[:, 1] // 3]).sum(axis=1)
+    a, b, p, q = (vertices[each] for each in (*edges.T, *across.T))
+    # Two faces folded onto one another are coplanar, and their edge is bent all the same
+    folded = (across[:, 0] != across[:, 1]) & ((np.cross(b - a, p - a) * np.cross(b - a, q - a)).sum(axis=1) > 0.0)
+    bent = (last != first + 1) | (np.abs(cosine) <= 1.0 - FLAT) | folded
+    return edges[bent], across[bent]
+
+
+def faces_within(one: tuple[Array, Index], other: tuple[Array, Index], within_m: float) -> tuple[Index, Index]:
+    """The faces of each of two meshes, vertices [V, 3] and faces [F, 3], that are at most `within_m` from the other's."""
+    low = np.maximum(one[0].min(axis=0), other[0].min(axis=0)) - within_m
+    high = np.minimum(one[0].max(axis=0), other[0].max(axis=0)) + within_m
+    (m, a, b), (n, c, d) = (bounds_in(points, faces, low, high) for points, faces in (one, other))
+    pairs = find_near(a, b, c, d, within_m)
+    pairs = np.stack([m[pairs[:, 0]], n[pairs[:, 1]]], axis=1)
+    near = _near(one[0], one[1], other[0], other[1], pairs, within_m)
+    return np.unique(pairs[near, 0]), np.unique(pairs[near, 1])
 
 
 @compiled
-def _same_side(vertices: Array, a: int, b: int, p: int, q: int) -> bool:
-    """Whether two vertices p and q lie on the same side of the edge from a to b, in the plane of all four."""
-    one, other = np.empty(3), np.empty(3)
-    cross(vertices[b] - vertices[a], vertices[p] - vertices[a], one)
-    cross(vertices[b] - vertices[a], vertices[q] - vertices[a], other)
-    return bool(one[0] * other[0] + one[1] * other[1] + one[2] * other[2] > 0.0)
+def _near(p: Array, p_faces: Index, q: Array, q_faces: Index, pairs: Index, within: float) -> NDArray[np.bool_]:
+    """[N]: whether two triangles that do not pierce one another are within a distance."""
+    near, limit, here, there = np.zeros(len(pairs), np.bool_), within * within, np.empty(3), np.empty(3)
+    for n in range(len(pairs)):
+        a, b = p[p_faces[pairs[n, 0]]], q[q_faces[pairs[n, 1]]]
+        for k in range(3):
+            if near[n]:
+                break
+            nearest_on_triangle(a[k], b, here)
+            near[n] = ((a[k] - here) ** 2).sum() <= limit
+            nearest_on_triangle(b[k], a, here)
+            near[n] = near[n] or ((b[k] - here) ** 2).sum() <= limit
+        for k in range(9):
+            if near[n]:
+                break
+            nearest_on_segments(a[k // 3], a[(k // 3 + 1) % 3], b[k % 3], b[(k % 3 + 1) % 3], here, there)
+            near[n] = ((there - here) ** 2).sum() <= limit
+    return near
+
+
+def skin_of(surface: Surface, which: Index, deepest_m: float) -> tuple[Array, ...]:
+    """Pyramids [N, 3] below these faces: their corners, and a point at most `deepest_m` below their middle.
+
+    Faces in one plane that fill a convex outline are one piece, else each is its own. No pyramid reaches out of a wedge between
+    faces: its sides lean by at most half of the wedge's angle, and by 45 degrees at most. On a surface without an inside, and
+    where a wedge is sharp, it is flat.
+    """
+    vertices, faces = surface.vertices, surface.faces
+    normals = face_normals(vertices, faces)
+    patch, lean = _patches(vertices, faces, normals)
+    pieces, outward = [], _outward(surface)
+    members = np.argsort(patch, kind="stable")
+    first = np.searchsorted(patch[members], np.arange(patch.max(initial=-1) + 2))
+    for number in np.unique(patch[which]).tolist():
+        group = members[first[number] : first[number + 1]]
+        whole = _outline(vertices, faces[group], normals[group[0]])
+        if whole is not None:
+            pieces.append(_pyramid(whole, outward * normals[group[0]], lean[group].min(), deepest_m))
+        else:
+            for face in group[np.isin(group, which)]:
+                pieces.append(_pyramid(vertices[faces[face]], outward * normals[face], lean[face], deepest_m))
+    return tuple(pieces)
+
+
+def _pyramid(outline: Array, outward: Array, lean: float, deepest_m: float) -> Array:
+    """The corners [N, 3] of a convex outline, in order, with a point below its middle."""
+    middle, ahead = outline.mean(axis=0), np.roll(outline, -1, axis=0) - outline
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    inside_m = float(np.linalg.norm(np.cross(ahead, middle - outline), axis=1).min())
+    return np.concatenate([outline, (middle - min(deepest_m, lean * inside_m) * outward)[None]])
+
+
+def _outline(vertices: Array, faces: Index, normal: Array) -> Array | None:
+    """The corners [N, 3] of coplanar faces, in order, where they fill a convex outline."""
+    if len(faces) == 1:
+        return vertices[faces[0]]
+    corners = vertices[np.unique(faces)]
+    x = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    x /= np.linalg.norm(x)
+    flat = (corners - corners.mean(axis=0)) @ np.stack([x, np.cross(normal, x)]).T
+    hull = ConvexHull(flat)
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area2 = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    return corners[hull.vertices] if abs(2.0 * hull.volume - area2) <= WHOLE * area2 else None
+
+
+def _patches(vertices: Array, faces: Index, normals: Array) -> tuple[NDArray[np.int32], Array]:
+    """(patch [F] of each face, those that follow one another in a plane are one; lean [F]).
+
+    lean: tangent of half the sharpest angle between a face and a neighbour that is not of its patch, as if all edges were
+    convex; at most 1.
+    """
+    keys, which = _half_edges(faces, len(vertices))
+    same = keys[1:] == keys[:-1]
+    one, other = which[:-1][same] // 3, which[1:][same] // 3
+    cosine = np.einsum("ij,ij->i", normals[one], normals[other])
+    even = cosine > 1.0 - FLAT
+    links = coo_array((np.ones(even.sum()), (one[even], other[even])), shape=(len(faces), len(faces)))
+    patch = connected_components(links, directed=False)[1]
+    tangent = np.sqrt(np.maximum(0.0, 1.0 + cosine) / np.maximum(1e-12, 1.0 - cosine))
+    lean = np.ones(len(faces))
+    np.minimum.at(lean, one[~even], tangent[~even])
+    np.minimum.at(lean, other[~even], tangent[~even])
+    return patch, lean
+
+
+def _outward(surface: Surface) -> float:
+    """1 where normals point out of the body, -1 where they point into it, 0 where there is none."""
+    if not surface.side.any():
+        return 0.0
+    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    return float(np.sign(np.einsum("ij,ij->", a, np.cross(b, c))))

@@ -73,10 +73,13 @@ def components(mesh: Mesh) -> list[Mesh]:
     links = coo_matrix((np.ones(len(ends), dtype=np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
     label = connected_components(links, directed=False)[1]
     used, first = np.unique(label[mesh.faces[:, 0]], return_index=True)
-    return [_piece(mesh, mesh.faces[label[mesh.faces[:, 0]] == one]) for one in used[np.argsort(first, kind="stable")]]
+    return [
+        piece_of(mesh, mesh.faces[label[mesh.faces[:, 0]] == one]) for one in used[np.argsort(first, kind="stable")]
+    ]
 
 
-def _piece(mesh: Mesh, faces: NDArray[np.int32]) -> Mesh:
+def piece_of(mesh: Mesh, faces: NDArray[np.int32]) -> Mesh:
+    """These faces [F, 3] of a mesh, with the vertices that they have."""
     kept, inverse = np.unique(faces, return_inverse=True)
     return Mesh(mesh.vertices[kept], inverse.reshape(-1, 3).astype(np.int32))
 

@@ -7,8 +7,8 @@ import numpy as np
 from schemas.base import Array, Pose
 from workers.geometry.jit import compiled
 
-UP = np.array([0.0, 0.0, 1.0])
-"""The world's up: the floor's normal."""
+UP, DOWN = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])
+"""The world's up, the floor's normal, and its down."""
 
 
 def pose(rotation: Array, position: Array) -> Pose:

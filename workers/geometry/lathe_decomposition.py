@@ -183,13 +183,9 @@ def _split_twisted(wedge: Array, begin: Array, end: Array, tolerance: float) -> 
         parts = [
             mesh_of(rest).vertices
             for part, (normal, at) in itertools.product(parts, tuple(planes))
-            if not (rest := _trim_above(part, normal, at)).is_empty()
+            if not (rest := _hull_of(part).trim_by_plane((-normal).tolist(), -float(normal @ at))).is_empty()
         ]
     return parts
-
-
-def _trim_above(part: Array, normal: Array, at: Array) -> manifold3d.Manifold:
-    return _hull_of(part).trim_by_plane((-normal).tolist(), -float(normal @ at))
 
 
 def _widen(cell: Indices, outline: Array, tolerance: float, thin: float) -> Indices:

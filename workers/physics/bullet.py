@@ -177,34 +177,34 @@ def _connect() -> int:
 
 
 def _add_ground(client: int, ground: float | Mesh | Array) -> int:
+    place = {}
     if isinstance(ground, Mesh):
-        return _add_mesh(client, ground)
-    if isinstance(ground, float):
+        shape = _shape_of_mesh(client, ground)
+    elif isinstance(ground, float):
         place = {"basePosition": [0, 0, ground - SLAB_HALF_M[2]]}
         shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=SLAB_HALF_M, physicsClientId=client)
     else:
-        place, vertices = {}, _BUFFERS.vertices(ground)
+        vertices = _BUFFERS.vertices(ground)
         shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client)
     thing: int = pybullet.createMultiBody(0, shape, useMaximalCoordinates=1, physicsClientId=client, **place)
     return thing
 
 
-def _add_mesh(client: int, mesh: Mesh) -> int:
+def _shape_of_mesh(client: int, mesh: Mesh) -> int:
     if len(mesh.vertices) > MOST_GROUND_VERTICES or 3 * len(mesh.faces) > MOST_GROUND_INDICES:
         raise SettleError(
             "table_too_fine",
             f"the table has {len(mesh.vertices)} vertices and {len(mesh.faces)} faces, and PyBullet takes "
             f"{MOST_GROUND_VERTICES} and {MOST_GROUND_INDICES // 3}: use a coarser table, or lower assets.limits",
         )
-    shape = pybullet.createCollisionShape(
+    shape: int = pybullet.createCollisionShape(
         pybullet.GEOM_MESH,
         vertices=_BUFFERS.vertices(mesh.vertices),
         indices=_BUFFERS.indices(mesh.faces.ravel()),
         flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
         physicsClientId=client,
     )
-    thing: int = pybullet.createMultiBody(0, shape, useMaximalCoordinates=1, physicsClientId=client)
-    return thing
+    return shape
 
 
 def _add_body(client: int, body: Body, R_world_body: Array | None) -> int:
@@ -215,7 +215,9 @@ def _add_body(client: int, body: Body, R_world_body: Array | None) -> int:
     own is a compound to Bullet, and compounds are less stable on one another.
     """
     parts = [np.round(part if R_world_body is None else part @ R_world_body.T, DECIMALS) for part in body.parts]
-    turned = {} if R_world_body is None else _orientation(R_world_body.T)
+    turned = {}
+    if R_world_body is not None:
+        turned["collisionFrameOrientation"] = quaternion_from_rotation(R_world_body.T).tolist()
     with _shape_of(client, parts, turned) as shape:
         # The margin of a compound's parts can be set through a body in reduced coordinates alone, which shares the shape.
         brief = pybullet.createMultiBody(body.mass_kg, shape, physicsClientId=client)
@@ -225,10 +227,6 @@ def _add_body(client: int, body: Body, R_world_body: Array | None) -> int:
     moments = body.moments.tolist()
     pybullet.changeDynamics(thing, -1, mass=body.mass_kg, localInertiaDiagonal=moments, physicsClientId=client)
     return thing
-
-
-def _orientation(R: Array) -> dict[str, list[float]]:
-    return {"collisionFrameOrientation": quaternion_from_rotation(R).tolist()}
 
 
 @contextmanager

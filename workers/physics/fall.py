@@ -13,9 +13,8 @@ from schemas.scene.shape import Mesh
 from workers.geometry.frames import invert, translation
 from workers.geometry.hull import least_width_m
 from workers.physics.bullet import GRAVITY_M_S2, GroundShape, World, open_world
-from workers.physics.energy import EnergyRecord, Velocity
+from workers.physics.monitors import EnergyRecord, StandingCondition, StopCondition, Velocity
 from workers.physics.rigid_body import Body, BodyPose, as_pose
-from workers.physics.stop_conditions import StandingCondition, StopCondition
 from workers.physics.table_top import support_height
 
 SAMPLE_STEPS = 8

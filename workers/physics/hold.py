@@ -8,16 +8,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from schemas.base import Array, Pose
-from schemas.scene.plan import Table
-from workers.geometry.frames import motion_between, transform
-from workers.geometry.skin import faces_within, skin_of
+from workers.geometry.contact_surface import faces_within, skin_of
+from workers.geometry.frames import transform
 from workers.physics.bullet import SLOP_SHARE, GroundShape
 from workers.physics.fall import Outcome, StepSizes, fall
-from workers.physics.placement import Placement
-from workers.physics.release import AS_SET, PACES_TOGETHER, Drop, settings_of
+from workers.physics.monitors import strays
+from workers.physics.placement import Placement, farthest_m
+from workers.physics.release import PACES_TOGETHER, Drop, Pace, settings_of
 from workers.physics.rest.rest import rest
-from workers.physics.rigid_body import Body, make_body
-from workers.physics.stop_conditions import StopCondition
+from workers.physics.rigid_body import make_body
 from workers.physics.table_top import inside_margin, split_by_side
 
 HELD_FROM = 9
@@ -56,9 +55,9 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> tuple[Pose,
     for _ in range(MOST_HOLDS):
         window = drop.physics.rest.model_copy(update={"window_s": 2.0 * seconds})
         changes = {"step_hz": PACES_TOGETHER[-1].rate * drop.physics.step_hz, "max_settle_s": seconds, "rest": window}
-        held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes), pace=AS_SET)
+        held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes))
         went = let_go(held, placement, poses, far_m).poses
-        if _farthest_m(drop, poses, went) <= HELD_M:
+        if farthest_m(drop.starts, poses, went) <= HELD_M:
             return tuple(poses)
         rested = rest(placement.things, went, placement.forms[-1].surface, placement.friction)
         if not rested.still:
@@ -75,37 +74,18 @@ def let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: float
     its own. Of two bodies that are one piece each Bullet keeps four contacts, chosen from some millimetres away, so that a
     box stands on three corners of four and on what it does not touch.
     """
-    physics, table = settings_of(drop), drop.table
-    skins = _skins(placement, poses, 2.0 * far_m)
-    bodies = [_thinly(make_body(start, parts)) for start, parts in zip(drop.starts, skins, strict=True)]
+    physics, top, near_m = settings_of(drop, Pace()), drop.table.top, 2.0 * far_m
+    skins = _skins(placement, poses, near_m)
+    whole = [make_body(start, parts) for start, parts in zip(drop.starts, skins, strict=True)]
+    bodies = [dataclasses.replace(body, margin_m=THIN * body.margin_m) for body in whole]
     points = np.concatenate([transform(T, one.hull.vertices) for one, T in zip(drop.starts, poses, strict=True)])
-    ground: GroundShape = split_by_side(table.mesh)
-    if table.top.convex and _is_over(points, table, 2.0 * far_m):
-        ground = table.top.height_m - bodies[0].margin_m * (1.0 - SLOP_SHARE)
-    stops = {"far": _goes_far(bodies, poses, far_m)}
+    low_m, inside_m = points[:, 2].min(), inside_margin(points[:, :2], top.outline).min()
+    ground: GroundShape = split_by_side(drop.table.mesh)
+    if top.convex and low_m > top.height_m - near_m and inside_m > near_m:
+        ground = top.height_m - bodies[0].margin_m * (1.0 - SLOP_SHARE)
+    begun = np.stack([(T @ body.T_obj_body)[:3, 3] for T, body in zip(poses, bodies, strict=True)])
+    stops = {"far": strays(begun, far_m)}
     return fall(bodies, poses, ground, physics, StepSizes(physics.step_hz, math.inf), 0.0, stops, reach_m=SKIN_M)
-
-
-def _thinly(body: Body) -> Body:
-    return dataclasses.replace(body, margin_m=THIN * body.margin_m)
-
-
-def _is_over(points: Array, table: Table, near_m: float) -> bool:
-    """Whether points [N, 3] are over a table's flat top, and further than this from its edges."""
-    top = table.top
-    return bool(inside_margin(points[:, :2], top.outline).min() > near_m and points[:, 2].min() > top.height_m - near_m)
-
-
-def _goes_far(bodies: Sequence[Body], poses: Sequence[Pose], far_m: float) -> StopCondition:
-    """Stop when a centre of mass is further than this from where it was."""
-    at = [(T @ body.T_obj_body)[:3, 3].tolist() for body, T in zip(bodies, poses, strict=True)]
-    return lambda number, now: math.dist(now[0], at[number]) > far_m
-
-
-def _farthest_m(drop: Drop, poses: Sequence[Pose], others: Sequence[Pose]) -> float:
-    return max(
-        motion_between(one.hull.vertices, T, other)[0] for one, T, other in zip(drop.starts, poses, others, strict=True)
-    )
 
 
 def _skins(placement: Placement, poses: Sequence[Pose], near_m: float) -> list[tuple[Array, ...]]:

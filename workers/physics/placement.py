@@ -11,10 +11,10 @@ from schemas.scene.region import REGION_TABLE
 from schemas.scene.scene import ContactForce
 from schemas.scene.shape import Mesh
 from workers.geometry.contact_surface import crop, is_closed
-from workers.geometry.frames import transform
+from workers.geometry.frames import DOWN, motion_between, transform
 from workers.physics.bullet import GRAVITY_M_S2
 from workers.physics.rest.contacts import Contacts, find_contacts, find_near_features
-from workers.physics.rest.rest import DOWN, FALL_M, Thing
+from workers.physics.rest.rest import FALL_M, Thing
 from workers.physics.rest.step import Inertia, Motion, step
 from workers.physics.rest_pose import support_margin
 from workers.physics.separation import FARTHEST_M, NEAR_M, Form, find_gaps_m
@@ -85,6 +85,12 @@ def place(
     near = crop(table.mesh, points.min(axis=0) - room_m, points.max(axis=0) + room_m)
     things = tuple(Thing(form.surface, start.asset.mass) for form, start in zip(forms, starts, strict=True))
     return Placement(tuple(starts), things, (*forms, Form(near, table.mesh, table.asset.shape.closed)), friction)
+
+
+def farthest_m(starts: Sequence[ObjectStart], poses: Sequence[Pose], others: Sequence[Pose]) -> float:
+    """The farthest that any point of the objects moves between two `T_world_obj`, metres."""
+    each = zip(starts, poses, others, strict=True)
+    return max(motion_between(start.hull.vertices, T, other)[0] for start, T, other in each)
 
 
 def placed_mesh(start: ObjectStart, T_world_obj: Pose) -> Mesh:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,9 +13,9 @@ from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart, Table
 from workers.geometry.frames import transform
 from workers.physics.bullet import SLOP_SHARE, GroundShape
-from workers.physics.fall import LOOK_STEPS, THIN_SHARE, Outcome, choose_steps, fall, free_fall_m
+from workers.physics.fall import LOOK_STEPS, SAMPLE_STEPS, THIN_SHARE, Outcome, choose_steps, fall, free_fall_m
+from workers.physics.monitors import falls_below, leaves_outline, stays_standing, strays
 from workers.physics.rigid_body import build_body, choose_collision_shape
-from workers.physics.stop_conditions import falls_below, leaves_outline, leaves_room, stays_standing
 
 MANY = 4
 """Number of objects from which they fall as coarser convex parts: the time grows with the pairs of parts near one another."""
@@ -36,7 +37,7 @@ class Pace:
     """Steps per second, solver iterations, travel per step and rest window, as shares of what the settings say.
 
     At a share of the window objects rest at as much more speed. thin: upper bound on the travel per step, as a share of the
-    thinnest object's width.
+    thinnest object's width. coarse: convex parts are fewer and have fewer vertices, where exact rest follows.
     """
 
     rate: float = 1.0
@@ -44,15 +45,19 @@ class Pace:
     travel: float = 1.0
     window: float = 1.0
     thin: float = THIN_SHARE
+    coarse: bool = False
 
 
-AS_SET = Pace()
-
-PACES = (Pace(rate=0.5, travel=6.0), Pace(travel=2.0), Pace(rate=2.0, travel=0.7), Pace(rate=4.0, travel=0.25))
+PACES = (
+    Pace(rate=0.5, travel=6.0, coarse=True),
+    Pace(travel=2.0),
+    Pace(rate=2.0, travel=0.7),
+    Pace(rate=4.0, travel=0.25),
+)
 """Of a single object, one after the other while its energy rises."""
 
-PACES_TOGETHER = (AS_SET, Pace(rate=4.0, travel=0.25))
-"""The same of several, where they are not many concave ones."""
+PACES_TOGETHER = (Pace(), Pace(rate=4.0, travel=0.25))
+"""The same of several, where they are not many concave ones; the last once more where they do not come to exact rest."""
 
 MOST_RISE = 0.3
 """Rise of energy, as a share of its bound, up to which a pace was slow enough for several: the simulation looks every eight
@@ -62,17 +67,16 @@ DOUBTFUL_RISE, KNOWN_RISE = 0.4, 0.9
 """The same for a single object. From the first share a drop is repeated with a look after each step, which changes nothing of
 it; up to the second, known so, the pace was slow enough."""
 
-QUICK = Pace(rate=0.5, iterations=0.25, window=0.4, thin=0.25)
-"""For many concave objects, once more as set where they do not come to exact rest after it: all of the 36 of 48 piles of eight
-that stayed on the table did, in 1.5 s of processor each on average."""
+PACES_MANY = (Pace(rate=0.5, iterations=0.25, window=0.4, thin=0.25, coarse=True), Pace(coarse=True))
+"""Of many concave objects, the second where they do not come to exact rest after the first: all of the 36 of 48 piles of eight
+that stayed on the table did, in 1.5 s of processor each on average. Their bounces are more than a rise of energy."""
 
 
 @dataclass(frozen=True, eq=False)
 class Drop:
     """Objects to be released over a table, with the settings and the plan of effects.
 
-    room_m: how far the centre of mass of a single object may go sideways; exact: as parts that are not coarser, and as set;
-    watched: with a look at the energy after each step.
+    room_m: how far the centre of mass of a single object may go sideways.
     """
 
     starts: tuple[ObjectStart, ...]
@@ -80,58 +84,58 @@ class Drop:
     physics: Physics
     effects: EffectPlan
     room_m: float = math.inf
-    pace: Pace = AS_SET
-    exact: bool = False
-    watched: bool = False
 
     @property
     def many(self) -> bool:
-        """Whether there are many objects, some of them concave, so that coarse parts have to do."""
-        return not self.exact and len(self.starts) >= MANY and self.effects.runs("decomposition")
+        """Whether there are many objects, some of them concave."""
+        return len(self.starts) >= MANY and self.effects.runs("decomposition")
 
     @property
     def single(self) -> bool:
         """Whether there is one object."""
         return len(self.starts) == 1
 
+    @property
+    def ways(self) -> tuple[tuple[Pace, ...], ...]:
+        """The paces to fall at, and those to fall at once more where what comes to rest is refused."""
+        if self.single:
+            return (PACES,)
+        return (PACES_MANY[:1], PACES_MANY[1:]) if self.many else (PACES_TOGETHER, PACES_TOGETHER[-1:])
 
-def release(drop: Drop, flat: bool) -> Outcome:
+
+def release(drop: Drop, flat: bool, paces: Sequence[Pace]) -> Outcome:
     """Release the objects where they start, onto the table's flat top or its mesh, until they rest or must be stopped.
 
     Stopped by `edge` where a footprint may leave the flat top, `below` where an object falls below the mesh, or among many
-    below the top, and `room` where a single object leaves its room. Released again, in shorter steps, where their energy
-    rose, but for many concave objects, whose bounces are more than the rise.
+    below the top, and `room` where a single object leaves its room. Released again at the next pace where their energy rose.
     """
-    if drop.many or drop.exact:
-        return _release(drop, flat)
-    for pace in PACES if drop.single else PACES_TOGETHER:
-        outcome = _release(dataclasses.replace(drop, pace=pace), flat)
-        if drop.single and pace != PACES[-1] and DOUBTFUL_RISE <= outcome.rise < KNOWN_RISE:
-            outcome = _release(dataclasses.replace(drop, pace=pace, watched=True), flat)
+    for pace in paces:
+        outcome = _release(drop, flat, pace, LOOK_STEPS if drop.single else SAMPLE_STEPS)
+        if drop.single and pace != paces[-1] and DOUBTFUL_RISE <= outcome.rise < KNOWN_RISE:
+            outcome = _release(drop, flat, pace, 1)
         if outcome.rise < (KNOWN_RISE if drop.single else MOST_RISE):
             break
     return outcome
 
 
-def _release(drop: Drop, flat: bool) -> Outcome:
-    table, effects, physics = drop.table, drop.effects, settings_of(drop)
+def _release(drop: Drop, flat: bool, pace: Pace, looked: int) -> Outcome:
+    table, effects, physics = drop.table, drop.effects, settings_of(drop, pace)
     starts = [choose_collision_shape(start, physics) for start in drop.starts]
     poses = [start.T_world_obj for start in starts]
-    coarse = drop.many or (drop.single and drop.pace == PACES[0] and physics.exact_rest)
+    coarse = pace.coarse and physics.exact_rest
     bodies = [build_body(start, physics, effects, coarse, level=flat and drop.single) for start in starts]
     hulls = [transform(T, start.hull.vertices) for T, start in zip(poses, starts, strict=True)]
     free_m = min(free_fall_m(points, table, flat) for points in hulls)
     # On a mesh a single object keeps the shortest travel per step, however far it falls.
     drop_m = max(float(points[:, 2].min()) for points in hulls) - table.top.height_m
-    steps = choose_steps(starts, physics, effects, drop_m if flat or not drop.single else 0.0, drop.pace.thin)
-    if drop.single:
-        steps = dataclasses.replace(steps, looked=1 if drop.watched else LOOK_STEPS)
+    steps = choose_steps(starts, physics, effects, drop_m if flat or not drop.single else 0.0, pace.thin)
+    steps = dataclasses.replace(steps, looked=looked)
     reach_m = max(body.reach_m for body in bodies)
     lowest_m = table.top.height_m - LEFT_M if drop.many else float(table.mesh.vertices[:, 2].min())
     stops = {"below": falls_below(lowest_m - reach_m)}
     ground: GroundShape = table.mesh
     standing = None
-    if flat and drop.single and physics.exact_rest and not drop.exact:
+    if flat and drop.single and physics.exact_rest:
         standing = stays_standing(starts[0], bodies[0], table.top.height_m, physics.friction**2)
     if flat and not drop.many:
         hover_m = bodies[0].margin_m * (1.0 - SLOP_SHARE)
@@ -140,7 +144,7 @@ def _release(drop: Drop, flat: bool) -> Outcome:
         ground = _prism(table)
     T_world_body = poses[0] @ bodies[0].T_obj_body
     if math.isfinite(drop.room_m):
-        stops["room"] = leaves_room(T_world_body[:2, 3], drop.room_m)
+        stops["room"] = strays(T_world_body[None, :2, 3], drop.room_m)
     return fall(bodies, poses, ground, physics, steps, free_m, stops, drop.many, standing)
 
 
@@ -151,13 +155,13 @@ def _prism(table: Table) -> Array:
     return np.concatenate([np.hstack([outline, level]) for level in levels])
 
 
-def settings_of(drop: Drop) -> Physics:
-    """The settings at the drop's pace, with those of effects that do not run at zero.
+def settings_of(drop: Drop, pace: Pace) -> Physics:
+    """The settings at this pace, with those of effects that do not run at zero.
 
     Several objects may travel further in a step. They get more solver iterations: the solver goes from contact to contact, and
     an iteration carries the less of a force the more the masses differ.
     """
-    pace, physics, several, iterations = drop.pace, drop.physics, 1.0, 1.0
+    physics, several, iterations = drop.physics, 1.0, 1.0
     if not drop.single:
         masses = [start.asset.mass.mass_kg for start in drop.starts]
         several, iterations = GROUP_TRAVEL, math.ceil(math.sqrt(max(masses) / min(masses)))

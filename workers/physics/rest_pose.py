@@ -6,26 +6,17 @@ import numpy as np
 import shapely
 
 from schemas.base import Array, Pose
-from schemas.scene.shape import Hull, Mesh
-from workers.geometry.elevation import sample_elevation
-from workers.geometry.frames import pose, rotation_between, transform
+from schemas.scene.shape import Hull
+from workers.geometry.frames import DOWN, pose, rotation_between
 
 SAME_PLANE_M = 1e-6
 """Vertices within this height of the lowest one lie in one level face with it."""
 
-CONTACT_M = 5e-5
-"""Distance below which a vertex touches the support."""
-
 STEADY_M = 2e-4
 """Margin of support below which a simulator may tip the object: its edges are rounded by a margin of a tenth of it."""
 
-NEAR_LOWEST_M = 0.02
-"""Only vertices within this height of the lowest one can touch a support that is level to within a few degrees."""
-
 SNAP_RAD = 0.02
 """Angle to a face up to which an object stands on it: the simulation leaves small ones 0.2 mm out of level."""
-
-DOWN = np.array([0.0, 0.0, -1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,11 +77,3 @@ def support_margin(contacts_xy: Array, com_xy: Array) -> float:
     if outline.geom_type == "Polygon" and outline.contains(at):
         return float(outline.exterior.distance(at))
     return -float(outline.distance(at))
-
-
-def find_contacts_xy(hull: Hull, T_world_obj: Pose, support: Mesh) -> Array:
-    """[N, 2] float64, world: the vertices of the hull within `CONTACT_M` of the mesh below them."""
-    points = transform(T_world_obj, hull.vertices)
-    points = points[points[:, 2] <= points[:, 2].min() + NEAR_LOWEST_M]
-    gap = points[:, 2] - sample_elevation(points[:, :2], support)
-    return points[np.isfinite(gap) & (np.abs(gap) <= CONTACT_M)][:, :2]

@@ -13,7 +13,7 @@ from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart
 from schemas.scene.scene import Settled, SupportedBy
 from workers.geometry.elevation import vertical_gap
-from workers.geometry.frames import motion_between, transform, translation
+from workers.geometry.frames import transform, translation
 from workers.physics.effects import called_for_with
 from workers.physics.fall import Outcome
 from workers.physics.hold import MOST_HOLDS, hold
@@ -21,13 +21,14 @@ from workers.physics.placement import (
     TOUCHING_M,
     Placement,
     Support,
+    farthest_m,
     forms_of,
     measure_supports,
     place,
     place_on_top,
     placed_mesh,
 )
-from workers.physics.release import LEFT_M, PACES_TOGETHER, QUICK, Drop, release
+from workers.physics.release import LEFT_M, Drop, Pace, release
 from workers.physics.rest.rest import rest
 from workers.physics.rest_pose import snap_to_face
 from workers.physics.separation import Form, find_gaps_m, find_overlaps_m
@@ -36,11 +37,9 @@ from workers.physics.table_top import inside_margin
 UNBALANCED = 1e-3
 """Share of the weight, and of weight times size, that the contacts of what rests may leave unbalanced."""
 
-MOST_OVERLAP_M = 1e-4
-"""Greatest overlap of objects at release. Correcting centimetres by a share per step gives tens of metres per second."""
-
-PLACED_M = MOST_OVERLAP_M
-"""Height up to which an object was set down and not dropped: it lands at 44 mm/s."""
+PLACED_M = 1e-4
+"""Height up to which an object was set down and not dropped, where it lands at 44 mm/s, and greatest overlap of objects at
+release: correcting centimetres by a share per step gives tens of metres per second."""
 
 STAYED_M = 1e-3
 """Motion from where they were set down up to which objects stayed there: three gaps of `PLACED_M` at the end of a lever."""
@@ -81,23 +80,21 @@ def settle(drop: Drop) -> tuple[Settled, ...]:
     _require_apart(drop.starts, forms)
     if drop.physics.exact_rest and (placed := _rest_as_placed(drop, forms)) is not None:
         return _describe(placed, _support_of(placed), judged=True)
-    if drop.single or not drop.physics.exact_rest:
-        return _settle(drop, forms)
-    first = dataclasses.replace(drop, pace=QUICK) if drop.many else drop
-    with suppress(UnsupportedError):
-        return _settle(first, forms)
-    again = drop if drop.many else dataclasses.replace(drop, pace=PACES_TOGETHER[-1], exact=True)
-    return _settle(again, forms)
+    *earlier, last = drop.ways
+    for paces in earlier:
+        with suppress(UnsupportedError):
+            return _settle(drop, forms, paces)
+    return _settle(drop, forms, last)
 
 
-def _settle(drop: Drop, forms: Sequence[Form]) -> tuple[Settled, ...]:
+def _settle(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace]) -> tuple[Settled, ...]:
     if not drop.effects.runs("table_mesh"):
-        ending = _come_to_rest(drop, forms, flat=True)
+        ending = _come_to_rest(drop, forms, paces, flat=True)
         if ending is not None:
             return _describe(ending, _support_of(ending), drop.physics.exact_rest)
         late = called_for_with("table_mesh", drop.starts, drop.physics)
         drop = dataclasses.replace(drop, effects=add_effects(drop.effects, late))
-    ending = _come_to_rest(drop, forms, flat=False)
+    ending = _come_to_rest(drop, forms, paces, flat=False)
     assert ending is not None  # only the flat top has an edge
     return _describe(ending, _support_of(ending), drop.physics.exact_rest)
 
@@ -118,7 +115,7 @@ def add_effects(effects: EffectPlan, names: Iterable[str]) -> EffectPlan:
 
 def _require_apart(starts: Sequence[ObjectStart], forms: Sequence[Form]) -> None:
     for i, j, depth_m in find_overlaps_m(forms, [start.T_world_obj for start in starts]):
-        if depth_m > MOST_OVERLAP_M:
+        if depth_m > PLACED_M:
             raise SettleError(
                 "objects_overlap",
                 f"regions {starts[i].region_id} and {starts[j].region_id} begin {depth_m * 1e3:.2f} mm inside one another: let "
@@ -126,31 +123,27 @@ def _require_apart(starts: Sequence[ObjectStart], forms: Sequence[Form]) -> None
             )
 
 
-def _come_to_rest(drop: Drop, forms: Sequence[Form], flat: bool) -> _Ending | None:
-    """Release until at rest; None where a footprint left the flat top, so that the table's edges may matter.
+def _come_to_rest(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace], flat: bool) -> _Ending | None:
+    """Release at these paces until at rest; None where a footprint left the flat top, so that the table's edges may matter.
 
     The simulation may end with objects that rolling friction or a shape's margin holds out of balance. They are followed
     as they tip, and released again where that takes them far.
     """
     seconds, placement = 0.0, None
     for _ in range(MOST_RELEASES):
-        outcome = release(drop, flat)
+        outcome = release(drop, flat, paces)
         if outcome.stopped_by == "room":
             raise LeftRoomError
         if outcome.stopped_by == "edge":
             return None
         seconds += outcome.seconds
         _require_calm(drop, outcome)
-        if (
-            drop.physics.exact_rest
-            and flat
-            and drop.single
-            and (standing := _stand(drop, outcome, seconds)) is not None
-        ):
+        exact = drop.physics.exact_rest
+        if exact and flat and drop.single and (standing := _stand(drop, outcome, seconds)) is not None:
             return standing
         placement = placement or _place(drop, outcome.poses, forms)
         ending = _Ending(drop, placement, outcome.poses, seconds, outcome.speed_m_s)
-        if not drop.physics.exact_rest:
+        if not exact:
             return ending
         rested = rest(placement.things, outcome.poses, placement.forms[-1].surface, placement.friction)
         if rested.still:
@@ -187,11 +180,8 @@ def _rest_as_placed(drop: Drop, forms: Sequence[Form]) -> _Ending | None:
     if max(find_gaps_m(placement.forms, [*poses, np.eye(4)])[:-1]) > PLACED_M:
         return None
     rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction)
-    moved_m = (
-        motion_between(one.hull.vertices, one.T_world_obj, T)[0]
-        for one, T in zip(drop.starts, rested.poses, strict=True)
-    )
-    return _Ending(drop, placement, rested.poses) if rested.still and max(moved_m) <= STAYED_M else None
+    stayed = rested.still and farthest_m(drop.starts, poses, rested.poses) <= STAYED_M
+    return _Ending(drop, placement, rested.poses) if stayed else None
 
 
 def _place(drop: Drop, poses: Sequence[Pose], forms: Sequence[Form]) -> Placement:
@@ -212,7 +202,7 @@ def _require_calm(drop: Drop, outcome: Outcome) -> None:
     if outcome.rested:
         return
     for start, T in zip(drop.starts, outcome.poses, strict=True):
-        if _is_low(drop, start, T):
+        if _is_low(drop, _com(start, T)[2]):
             raise _left_table(drop, start, T, outcome.seconds)
     raise SettleError(
         "not_at_rest",
@@ -221,16 +211,17 @@ def _require_calm(drop: Drop, outcome: Outcome) -> None:
     )
 
 
-def _lowest_m(drop: Drop) -> float:
-    return drop.table.top.height_m - LEFT_M
+def _is_low(drop: Drop, height_m: float) -> bool:
+    return not height_m >= drop.table.top.height_m - LEFT_M  # true of nan
 
 
-def _is_low(drop: Drop, start: ObjectStart, T: Pose) -> bool:
-    return not transform(T, start.asset.mass.com[None])[0, 2] >= _lowest_m(drop)
+def _com(start: ObjectStart, T: Pose) -> list[float]:
+    com: list[float] = transform(T, start.asset.mass.com[None])[0].tolist()
+    return com
 
 
 def _left_table(drop: Drop, start: ObjectStart, T: Pose, seconds: float) -> SettleError:
-    x, y, z = transform(T, start.asset.mass.com[None])[0].tolist()
+    x, y, z = _com(start, T)
     whose, advice = "", "narrow start.offset_m or use larger tables"
     if not drop.single:
         whose = f" of region {start.region_id}"
@@ -246,7 +237,7 @@ def _describe(ending: _Ending, support: SupportedBy, judged: bool) -> tuple[Sett
     supports = measure_supports(ending.placement, ending.poses)
     for start, T, held in zip(ending.drop.starts, ending.poses, supports, strict=True):
         # What is this low may hang on the table by a handle, or stand on its foot
-        if _is_low(ending.drop, start, T) and held.highest_m < _lowest_m(ending.drop):
+        if _is_low(ending.drop, _com(start, T)[2]) and _is_low(ending.drop, held.highest_m):
             raise _left_table(ending.drop, start, T, ending.seconds)
         if judged:
             _require_support(ending.drop, start, held)

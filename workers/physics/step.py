@@ -15,14 +15,13 @@ from workers.physics.effects import called_for_with, rooms_m
 from workers.physics.fall import FINEST
 from workers.physics.hold import let_go
 from workers.physics.placement import forms_of, place
-from workers.physics.release import Drop, release
+from workers.physics.release import Drop
 from workers.physics.settle import LeftRoomError, add_effects, settle
 
 RECHECK_S = 1.0
 """Simulated time of the second release."""
 
-LEFT_TOP = "a footprint left the table's flat top"
-LEFT_ROOM = "an object left the room that it had to itself"
+LEFT_TOP, LEFT_ROOM = "a footprint left the table's flat top", "an object left the room that it had to itself"
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,26 +66,15 @@ def recheck_scene(plan: ScenePlan, rest: Rest, physics: Physics, effects: Effect
 def release_again(
     plan: ScenePlan, settled: Sequence[Settled], physics: Physics, effects: EffectPlan, seconds: float
 ) -> tuple[Pose, ...]:
-    """`T_world_obj` [4, 4] of every object this long after its release from where it rests.
+    """`T_world_obj` [4, 4] of every object this long after its release from where it rests, or once one moved by `hold.FAR_M`.
 
-    With the effects of the plan and in the finest steps, without correction. Nothing counts as resting before the end. Of objects
-    that may touch one another, until one moved by `hold.FAR_M`.
+    With the effects of the plan and in the finest steps, without correction. Nothing counts as resting before the end.
     """
     rest = physics.rest.model_copy(update={"window_s": 2.0 * seconds})
     fine = {"step_hz": FINEST * physics.step_hz, "max_settle_s": seconds, "rest": rest}
-    physics = physics.model_copy(update=fine)
-    starts = tuple(
-        dataclasses.replace(start, T_world_obj=before.T_world_obj)
-        for start, before in zip(plan.objects, settled, strict=True)
-    )
-    drop = Drop(starts, plan.table, physics, effects, exact=True)
-    flat = [before.support != "mesh" and not effects.runs("table_mesh") for before in settled]
-    if not drop.single and effects.runs("object_contacts"):
-        poses = [start.T_world_obj for start in starts]
-        placement = place(starts, poses, forms_of(starts), plan.table, physics.friction**2)
-        return let_go(drop, placement, poses).poses
-    alone = (dataclasses.replace(drop, starts=(start,)) for start in starts)
-    return tuple(release(each, on_top).poses[0] for each, on_top in zip(alone, flat, strict=True))
+    starts, poses = plan.objects, [each.T_world_obj for each in settled]
+    placement = place(starts, poses, forms_of(starts), plan.table, physics.friction**2)
+    return let_go(Drop(starts, plan.table, physics.model_copy(update=fine), effects), placement, poses).poses
 
 
 def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, float]:

@@ -4,7 +4,6 @@ import math
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.base import Array, Pose, frozen_array
@@ -12,7 +11,7 @@ from schemas.errors import StartError
 from schemas.scene.plan import Table, TableTop
 from schemas.scene.shape import Asset, Mesh, Shape
 from workers.geometry.bounds import bounds_of
-from workers.geometry.convexity import numbers_in
+from workers.geometry.convexity import face_normals, numbers_in, piece_of, triangle_corners
 from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import transform, translation
 from workers.geometry.jit import compiled
@@ -33,35 +32,17 @@ FILLED_SHARE = 0.999
 def find_table_top(shape: Shape) -> TableTop:
     """The level top of a table mesh. Raises StartError where no face is level."""
     vertices, faces = shape.vertices, shape.faces
-    height, doubled, level = _levels(vertices, faces)
-    if not level.any():
+    # Both sides count: external tables may be wound inside out. Height selects the upper side of a slab.
+    level = faces[np.abs(face_normals(np.ascontiguousarray(vertices), faces)[:, 2]) > LEVEL]
+    if not len(level):
         raise StartError("no_table_top", "the table's mesh has no level face within 2.6 degrees: leave this table out")
-    key = np.round(height[level] / SAME_LEVEL_M).astype(np.int64)
+    a, b, c = triangle_corners(Mesh(vertices, level))
+    key = np.round((a + b + c)[:, 2] / (3 * SAME_LEVEL_M)).astype(np.int64)
     _, inverse = np.unique(key, return_inverse=True)
-    area = np.bincount(inverse, weights=doubled[level] / 2)
+    area = np.bincount(inverse, weights=np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
     top = int(np.flatnonzero(area >= TOP_SHARE * area.max()).max())
-    members = np.flatnonzero(level)[inverse == top]
-    points = vertices[numbers_in(faces[members], len(vertices))]
+    points = vertices[numbers_in(level[inverse == top], len(vertices))]
     return _describe(points, float(area[top]), float(vertices[:, 2].max()))
-
-
-@compiled
-def _levels(vertices: Array, faces: NDArray[np.int32]) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """For each face its mean height, twice its area, and whether it counts as level.
-
-    Both sides count: external tables may be wound inside out. Height selects the upper side of a slab.
-    """
-    height, doubled = np.empty(len(faces)), np.empty(len(faces))
-    level = np.empty(len(faces), np.bool_)
-    for f in range(len(faces)):
-        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-        x, y, z = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-        u, v, w = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-        i, j, k = y * w - z * v, z * u - x * w, x * v - y * u
-        height[f] = (a[2] + b[2] + c[2]) / 3
-        doubled[f] = math.sqrt(i * i + j * j + k * k)
-        level[f] = abs(k) > LEVEL * doubled[f] and doubled[f] > 0.0
-    return height, doubled, level
 
 
 def _describe(points: Array, area_m2: float, highest_m: float) -> TableTop:
@@ -136,15 +117,8 @@ def split_by_side(mesh: Mesh) -> tuple[Mesh, ...]:
 
     Bullet keeps four contacts of two bodies. Of a body that stands in a corner, a wall would take those that the floor needs.
     """
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
+    normal = face_normals(np.ascontiguousarray(mesh.vertices), mesh.faces)
     axis = np.abs(normal).argmax(axis=1)
     along = np.take_along_axis(normal, axis[:, None], axis=1)[:, 0]
     side = np.where(along == 0.0, -1, 2 * axis + (along < 0.0))
-    return tuple(_part(mesh, side == number) for number in range(6) if (side == number).any())
-
-
-def _part(mesh: Mesh, which: NDArray[np.bool_]) -> Mesh:
-    """Some of the faces, with the vertices that they have."""
-    used, faces = np.unique(mesh.faces[which], return_inverse=True)
-    return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32))
+    return tuple(piece_of(mesh, mesh.faces[side == number]) for number in range(6) if (side == number).any())

@@ -20,13 +20,16 @@ from workers.geometry.camera import orbit_pose
 from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import UP, pose, rotation_about, transform, translation, uniform_rotation
 from workers.geometry.hull import hull_of
-from workers.physics.rest_pose import find_contacts_xy, support_margin
+from workers.physics.rest_pose import support_margin
 from workers.physics.table_top import place_table, support_height
 from workers.plan.arrange import has_room, rise_above
 from workers.plan.randomness import SceneChance, Stream
 
 RECESS_M = 0.05
 """Table this far below its top still counts as table under an object: a tray's bottom does, a lower shelf does not."""
+
+CONTACT_M = 5e-5
+"""Distance below which a vertex touches the table."""
 
 
 def plan_scene(job: Job, catalogue: Catalogue, chance: SceneChance) -> ScenePlan:
@@ -136,9 +139,11 @@ def set_down(T_world_obj: Pose, hull: Hull, table: Mesh) -> Pose:
 
 
 def stands_on(T_world_obj: Pose, hull: Hull, com: Array, table: Mesh) -> bool:
-    """Whether the centre of mass [3] lies inside the hull of the points that touch the table."""
-    contacts = find_contacts_xy(hull, T_world_obj, table)
-    return support_margin(contacts, transform(T_world_obj, com[None, :])[0, :2]) > 0.0
+    """Whether the centre of mass [3] lies inside the hull of the vertices that touch the table."""
+    points = transform(T_world_obj, hull.vertices)
+    gap_m = points[:, 2] - sample_elevation(points[:, :2], table)
+    contacts = points[np.isfinite(gap_m) & (np.abs(gap_m) <= CONTACT_M)]
+    return support_margin(contacts[:, :2], transform(T_world_obj, com[None, :])[0, :2]) > 0.0
 
 
 def draw_camera(rng: np.random.Generator, cameras: Cameras, centre: Array) -> Camera:

@@ -10,7 +10,7 @@ from schemas.job.job import Job
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import Asset
-from tests.hard_cases.bodies import cube, rod
+from tests.hard_cases.bodies import built_in, cube, rod
 from tests.hard_cases.drops import X, turn
 from tests.hard_cases.groups import put, together, tray
 from tests.physics.settling import recheck_group, settle_group
@@ -18,7 +18,17 @@ from tests.shapes import asset_of, box, table
 from workers.geometry.frames import pose
 from workers.geometry.hull import convex_hull
 from workers.physics.fall import LOOK_STEPS, SAMPLE_STEPS, fall
-from workers.physics.release import DOUBTFUL_RISE, KNOWN_RISE, MOST_RISE, PACES, PACES_TOGETHER, Drop, release
+from workers.physics.release import (
+    DOUBTFUL_RISE,
+    KNOWN_RISE,
+    MANY,
+    MOST_RISE,
+    PACES,
+    PACES_MANY,
+    PACES_TOGETHER,
+    Drop,
+    release,
+)
 from workers.physics.table_top import place_table
 
 PHYSICS = Job(name="t").physics
@@ -53,7 +63,7 @@ def test_steps_are_as_fine_as_the_highest_fall_and_the_thinnest_object_ask(heigh
 
 def seconds_to_rest(start: ObjectStart, names: tuple[str, ...], **changes) -> float:
     physics = PHYSICS.model_copy(update={"max_settle_s": 3.0, **changes})
-    return release(Drop((start,), TABLE, physics, EffectPlan(names, {})), flat=True).seconds
+    return release(Drop((start,), TABLE, physics, EffectPlan(names, {})), True, PACES).seconds
 
 
 def test_a_cube_bounces_only_where_the_plan_runs_restitution():
@@ -79,8 +89,8 @@ def test_objects_as_boxes_keep_the_height_of_their_lowest_point_together_as_alon
     starts = [start_of(can, x, 0.0, 0.001 - low, tilted) for x in (-0.1, 0.1)]
     physics = PHYSICS.model_copy(update={"collision": "box", "max_settle_s": 0.01})
     plan = EffectPlan(("dynamics", "fine_step"), {})
-    both = release(Drop(tuple(starts), TABLE, physics, plan), flat=True)
-    alone = [release(Drop((start,), TABLE, physics, plan), flat=True) for start in starts]
+    both = release(Drop(tuple(starts), TABLE, physics, plan), True, PACES_TOGETHER)
+    alone = [release(Drop((start,), TABLE, physics, plan), True, PACES) for start in starts]
     for beside, one in zip(both.poses, alone, strict=True):
         assert beside[2, 3] == pytest.approx(one.poses[0][2, 3], abs=1e-4)
 
@@ -94,7 +104,7 @@ def falls_of(drop: Drop, rises: list[float], monkeypatch) -> list[tuple[float, i
         return dataclasses.replace(fall(*given, **more), rise=next(left))
 
     monkeypatch.setattr("workers.physics.release.fall", risen)
-    release(drop, flat=True)
+    release(drop, True, drop.ways[0])
     return falls
 
 
@@ -111,8 +121,12 @@ def test_what_gains_energy_falls_again_in_shorter_steps_until_it_gains_none(monk
     assert falls_of(ALONE, [1.01 * KNOWN_RISE] * 9, monkeypatch) == looked
     assert falls_of(both, [0.99 * MOST_RISE], monkeypatch) == together[:1]
     assert falls_of(both, [1.01 * MOST_RISE] * 9, monkeypatch) == together
-    exact = dataclasses.replace(ALONE, exact=True)
-    assert falls_of(exact, [1.01 * KNOWN_RISE] * 9, monkeypatch) == [(1.0, LOOK_STEPS)]
+    assert falls_of(many_mugs(), [1.01 * MOST_RISE] * 9, monkeypatch) == [(PACES_MANY[0].rate, SAMPLE_STEPS)]
+
+
+def many_mugs() -> Drop:
+    starts = tuple(start_of(built_in("mug"), 0.2 * k - 0.3, 0.0, 0.06) for k in range(MANY))
+    return Drop(starts, TABLE, BRIEF, EffectPlan(("dynamics", "fine_step", "object_contacts", "decomposition"), {}))
 
 
 def test_a_doubtful_drop_is_looked_at_after_each_step_before_it_falls_in_shorter_ones(monkeypatch):
@@ -122,12 +136,12 @@ def test_a_doubtful_drop_is_looked_at_after_each_step_before_it_falls_in_shorter
     assert falls_of(ALONE, [1.01 * DOUBTFUL_RISE, 1.01 * KNOWN_RISE, 0.0], monkeypatch) == [first, again, second]
 
 
-def test_looks_at_the_energy_change_nothing_of_a_drop():
+def test_looks_at_the_energy_change_nothing_of_a_drop(monkeypatch):
     start = start_of(CUBE, 0.0, 0.0, 0.1, turn(X, 40) @ turn(np.array([0.0, 1.0, 0.0]), 25))
-    drop = Drop((start,), TABLE, PHYSICS, EffectPlan(("dynamics", "fine_step"), {}), pace=PACES[0])
-    often, seldom = (
-        release(dataclasses.replace(drop, exact=True, watched=watched), flat=True) for watched in (True, False)
-    )
+    drop = Drop((start,), TABLE, PHYSICS, EffectPlan(("dynamics", "fine_step"), {}))
+    seldom = release(drop, True, PACES[:1])
+    monkeypatch.setattr("workers.physics.release.LOOK_STEPS", 1)
+    often = release(drop, True, PACES[:1])
     assert np.array_equal(often.poses[0], seldom.poses[0]) and often.seconds == seldom.seconds
     assert often.rise >= seldom.rise
 

@@ -8,9 +8,9 @@ import trimesh
 
 from schemas.scene.shape import Mesh
 from tests.shapes import box
-from workers.geometry.frames import angle_between, pose, rotation_about, transform
+from workers.geometry.frames import DOWN, angle_between, pose, rotation_about, transform
 from workers.geometry.hull import convex_hull
-from workers.physics.rest_pose import DOWN, find_contacts_xy, snap_to_face, stands_on_face, support_margin
+from workers.physics.rest_pose import snap_to_face, stands_on_face, support_margin
 
 X = np.array([1.0, 0.0, 0.0])
 CUBE = convex_hull(np.asarray(box(0.1, 0.1, 0.1).vertices))
@@ -50,14 +50,6 @@ def test_a_face_without_the_centre_of_mass_over_it_is_not_chosen():
     T = pose(np.eye(3), np.zeros(3))
     assert snap_to_face(T, slab, com) is None
     assert snap_to_face(T, slab, np.array([0.04, 0.0, 0.0])) == pytest.approx(T)
-
-
-def test_only_vertices_near_the_support_touch_it():
-    flat = pose(np.eye(3), np.array([0, 0, 0.05]))
-    assert len(find_contacts_xy(CUBE, flat, GROUND)) == 4
-    assert len(find_contacts_xy(CUBE, pose(np.eye(3), np.array([0, 0, 0.0502])), GROUND)) == 0
-    edge = pose(rotation_about(X, math.pi / 4), np.array([0, 0, 0.05 * math.sqrt(2)]))
-    assert len(find_contacts_xy(CUBE, edge, GROUND)) == 2
 
 
 def test_a_hull_has_outward_unit_normals_and_only_its_corners():

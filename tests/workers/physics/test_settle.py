@@ -189,7 +189,7 @@ def test_the_forces_of_a_pile_prove_its_balance():
 def test_what_exact_rest_does_not_hold_is_refused(monkeypatch):
     """An object 0.02 mm above the table: the gate, whatever brought it there."""
     T = start_of(CUBE, 0, 0, 0.03 + 2e-5).T_world_obj
-    monkeypatch.setattr(settle, "rest", lambda things, *_: Rested((T,), None, None, True))
+    monkeypatch.setattr(settle, "rest", lambda things, *_: Rested((T,), True, 0))
     with pytest.raises(
         SettleError, match=r"unsupported: it came to rest 0.020 mm from anything, with 100.0% of its weight"
     ):

@@ -108,7 +108,7 @@ def test_what_is_let_go_again_is_watched_to_the_end_however_still_it_stands(monk
         watched.append(fall(*arguments, **more))
         return watched[-1]
 
-    monkeypatch.setattr("workers.physics.release.fall", told)
+    monkeypatch.setattr("workers.physics.hold.fall", told)
     recheck(start, rest, TABLE, PHYSICS)
     plan = draw_scene(Job(name="t"), SceneChance(0, 0), table(), start.asset)
     plan = dataclasses.replace(plan, objects=(start,), table=TABLE)

@@ -9,9 +9,11 @@ from schemas.errors import StartError
 from schemas.job.job import Job
 from tests.shapes import asset_of, box, table
 from workers.geometry.camera import inclination, yaw
-from workers.geometry.frames import transform
+from workers.geometry.frames import pose, rotation_about, transform, translation
+from workers.geometry.hull import hull_of
+from workers.physics.table_top import place_table
 from workers.plan.randomness import SceneChance
-from workers.plan.step import choose_category, draw_scene
+from workers.plan.step import choose_category, draw_scene, stands_on
 
 BOX = asset_of(box(0.1, 0.08, 0.2))
 TABLE = table()
@@ -72,6 +74,17 @@ def test_a_placed_object_touches_the_table_and_needs_no_drop():
     start = draw_scene(job(start={"pose": "placed"}), SceneChance(5, 2), TABLE, BOX).objects[0]
     assert start.placed
     assert transform(start.T_world_obj, BOX.shape.vertices)[:, 2].min() == pytest.approx(0.7, abs=1e-12)
+
+
+def test_a_box_stands_on_a_face_within_reach_of_the_table_and_on_no_edge():
+    hull, com, top_m = hull_of(BOX.shape), BOX.mass.com, place_table(TABLE).top.height_m
+    flat = translation(0.0, 0.0, top_m + 0.1)
+    on_edge = pose(rotation_about(np.array([1.0, 0.0, 0.0]), math.atan(0.08 / 0.2)), np.array([0.0, 0.0, top_m]))
+    on_edge[2, 3] -= (transform(on_edge, hull.vertices)[:, 2] - top_m).min()
+    tables = place_table(TABLE).mesh
+    assert stands_on(flat, hull, com, tables)
+    assert not stands_on(translation(0.0, 0.0, 6e-5) @ flat, hull, com, tables)
+    assert not stands_on(on_edge, hull, com, tables)
 
 
 def test_a_placed_object_that_would_tip_is_dropped_instead():

@@ -4,21 +4,19 @@ import hashlib
 import io
 import os
 import tempfile
-from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from cachetools import LRUCache
 
 from schemas.base import Array, frozen_array
 from schemas.environment import cache_folder
 
 CAPACITY_BYTES = 64 * 1024 * 1024
 """Memory per process: a thousand mugs."""
-
-DIGEST_BYTES = 32
 
 
 class Parts(NamedTuple):
@@ -45,35 +43,27 @@ def key_of(*inputs: str | bytes) -> str:
 
 
 class PartsCache:
-    """The parts used last that fit `capacity_bytes`, at least of one body, and files of all parts if a folder is given.
+    """The parts used last that fit `capacity_bytes` together, and files of all parts if a folder is given.
 
     A file begins with the SHA-256 of its content, by which a torn one is found and made again, and is renamed into place. A
     folder that cannot be written is ignored.
     """
 
     def __init__(self, capacity_bytes: int = CAPACITY_BYTES) -> None:
-        self.capacity_bytes = capacity_bytes
-        self.bytes = 0
-        self._kept: OrderedDict[str, Parts] = OrderedDict()
-
-    def __len__(self) -> int:
-        return len(self._kept)
+        self._kept: LRUCache[str, Parts] = LRUCache(capacity_bytes, lambda parts: sum(c.nbytes for c in parts.clouds))
 
     def get(self, key: str, folder: Path | None, make: Callable[[], Parts]) -> Parts:
         """The parts of this key: from memory, from the folder, or made. An exception of `make` leaves no trace."""
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            return self._kept[key]
+        if (parts := self._kept.get(key)) is not None:
+            return parts
         parts = None if folder is None else _read(folder / key)
         if parts is None:
             parts = make()
             if folder is not None:
                 with suppress(OSError):
                     _write(folder, key, parts)
-        self._kept[key] = parts
-        self.bytes += sum(cloud.nbytes for cloud in parts.clouds)
-        while self.bytes > self.capacity_bytes and len(self._kept) > 1:
-            self.bytes -= sum(cloud.nbytes for cloud in self._kept.popitem(last=False)[1].clouds)
+        with suppress(ValueError):  # larger than all that is kept
+            self._kept[key] = parts
         return parts
 
 
@@ -82,9 +72,10 @@ def _read(path: Path) -> Parts | None:
         data = path.read_bytes()
     except OSError:
         return None
-    if hashlib.sha256(data[DIGEST_BYTES:]).digest() != data[:DIGEST_BYTES]:
+    size = hashlib.sha256().digest_size
+    if hashlib.sha256(data[size:]).digest() != data[:size]:
         return None
-    with np.load(io.BytesIO(data[DIGEST_BYTES:])) as stored:
+    with np.load(io.BytesIO(data[size:])) as stored:
         counts = stored["counts"]
         clouds = np.split(stored["vertices"], np.cumsum(counts)[:-1]) if len(counts) else []
         return Parts(tuple(frozen_array(cloud) for cloud in clouds), str(stored["method"]))

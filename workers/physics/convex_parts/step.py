@@ -57,8 +57,6 @@ OPTIONS = {"mcts_iterations": 10, "mcts_nodes": 6, "mcts_max_depth": 1, "resolut
 OPEN = {"preprocess_mode": "on", "preprocess_resolution": 40}
 """For a mesh that is not a closed manifold, which is wrapped in voxels first: without, CoACD ends the process."""
 
-CLOSED = {"preprocess_mode": "off"}
-
 LIBRARIES = ("coacd", "manifold3d", "numpy", "scipy")
 """Libraries whose versions change the parts of a mesh."""
 
@@ -140,7 +138,9 @@ def _decompose(mesh: Mesh, threshold: float) -> Parts:
             if _has_hull(piece.vertices):
                 made.append(_parts_of(piece, threshold, stop_s))
             else:
-                made.append(("convex", [_wedge(piece.vertices, middle)]))
+                # And a point a little nearer to the middle of the mesh, hence within its hull
+                inner = piece.vertices.mean(axis=0) * (1.0 - SCRAP) + SCRAP * middle
+                made.append(("convex", [np.concatenate([piece.vertices, [inner]])]))
         except subprocess.TimeoutExpired:
             return Parts((), NO_PARTS)
     method = max((method for method, _ in made), key=("convex", "coacd", "pieces").index)
@@ -157,12 +157,6 @@ def _has_hull(points: Array) -> bool:
     return True
 
 
-def _wedge(points: Array, middle: Array) -> Array:
-    """The points of a scrap and one a little nearer to the middle [3] of the mesh, hence within its hull."""
-    centre = points.mean(axis=0)
-    return np.concatenate([points, [centre + SCRAP * (middle - centre)]])
-
-
 def _children_s() -> float:
     """Processor seconds of all processes that this one has started and that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -174,7 +168,7 @@ def _parts_of(piece: Mesh, threshold: float, stop_s: float) -> tuple[str, list[A
     hull, solid = convex_hull(piece.vertices), solid_of(piece)
     if is_convex_surface(piece, solid):
         return "convex", [hull.vertices]
-    options = {**OPTIONS, **(OPEN if solid is None else CLOSED), "threshold": threshold}
+    options = {**OPTIONS, **(OPEN if solid is None else {"preprocess_mode": "off"}), "threshold": threshold}
     size = float(np.linalg.norm(np.ptp(hull.vertices, axis=0)))
     cut = _run(piece if solid is None else mesh_of(solid.simplify(SIMPLER * size)), options, stop_s - _children_s())
     fitted = _fit(cut, hull.vertices, hull.normals)

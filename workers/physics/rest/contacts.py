@@ -63,15 +63,8 @@ def find_near_features(surfaces: Sequence[Surface], points: Sequence[Array], wit
         if (low > high).any():
             continue
         here, there = (_boxes(surfaces[k], points[k], low, high) for k in (i, j))
-        found.append(
-            Near(
-                i,
-                j,
-                _pairs(here[0], there[1], within_m),
-                _pairs(there[0], here[1], within_m),
-                _pairs(here[2], there[2], within_m),
-            )
-        )
+        pairs = ((here[0], there[1]), (there[0], here[1]), (here[2], there[2]))
+        found.append(Near(i, j, *(_pairs(*each, within_m) for each in pairs)))
     return found
 
 

@@ -9,12 +9,10 @@ import numpy as np
 from schemas.base import Array, Pose
 from schemas.scene.shape import MassProperties
 from workers.geometry.contact_surface import Surface
-from workers.geometry.frames import pose, rotation_about, transform
+from workers.geometry.frames import DOWN, pose, rotation_about, transform
 from workers.physics.bullet import GRAVITY_M_S2
 from workers.physics.rest.contacts import DEEPEST_M, Contacts, find_contacts, find_near_features
 from workers.physics.rest.step import Inertia, JammedError, Motion, step
-
-DOWN = np.array([0.0, 0.0, -1.0])
 
 LEVEL = 1e-3
 """Slope of a table that counts as level: what stands must not fall if the table leans by a millimetre in a metre. What would
@@ -58,16 +56,11 @@ class Thing:
 
 @dataclass(frozen=True, eq=False)
 class Rested:
-    """Where bodies came to rest, or how far they came: `T_world_obj` [4, 4] of each, their contacts and the forces there.
-
-    forces [contacts, 3]: on the upper bodies, newtons. `still`: whether they rest.
-    """
+    """Where bodies came to rest, or how far they came: `T_world_obj` [4, 4] of each. `still`: whether they rest."""
 
     poses: tuple[Pose, ...]
-    contacts: Contacts
-    forces: Array
     still: bool
-    steps: int = 0
+    steps: int
 
 
 def rest(things: Sequence[Thing], poses: Sequence[Pose], ground: Surface, friction: float) -> Rested:
@@ -87,15 +80,15 @@ def rest(things: Sequence[Thing], poses: Sequence[Pose], ground: Surface, fricti
         inertias = [thing.inertia(T) for T, thing in zip(at, things, strict=True)]
         try:
             motion = step(inertias, contacts, friction, fall_m * DOWN, GRAVITY_M_S2)
-            moved_m, forces = _farthest(motion, reaches), motion.forces
+            moved_m = _farthest(motion, reaches)
             if moved_m <= STILL * fall_m and nudges < MOST_NUDGES:
                 nudge, nudges = _nudge(inertias, contacts, friction, reaches), nudges + 1
                 if _farthest(nudge, reaches) > LEVEL * LEVEL * LONGEST_FALL_M:
                     motion, moved_m = nudge, _farthest(nudge, reaches)
         except JammedError:
-            return Rested(at, contacts, np.zeros((len(contacts.gaps), 3)), False, number)
+            return Rested(at, False, number)
         if moved_m <= STILL * fall_m:
-            return Rested(at, contacts, forces, True, number)
+            return Rested(at, True, number)
         share = min(1.0, REACH_M / 2 / moved_m)
         at = tuple(
             _moved(T, body.com, share * move, share * turn)
@@ -103,7 +96,7 @@ def rest(things: Sequence[Thing], poses: Sequence[Pose], ground: Surface, fricti
         )
         known_m -= share * moved_m
         fall_m = _next_fall(fall_m, moved_m)
-    return Rested(at, contacts, np.zeros((len(contacts.gaps), 3)), False, MOST_STEPS)
+    return Rested(at, False, MOST_STEPS)
 
 
 def _farthest(motion: Motion, reaches: Array) -> float:

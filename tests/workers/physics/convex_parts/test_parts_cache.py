@@ -47,8 +47,14 @@ def test_memory_is_bounded_and_the_latest_stay():
     cache = PartsCache(capacity_bytes=100)
     for key in "abc":
         cache.get(key, None, lambda: Parts((np.zeros((2, 3)),), "convex"))
-    assert (len(cache), cache.bytes) == (2, 96)
-    cache.get("c", None, lambda: pytest.fail("forgotten"))
+    for key in "bc":
+        cache.get(key, None, lambda: pytest.fail("forgotten"))
+    made = []
+    for key in ("a", "large", "large"):
+        cache.get(
+            key, None, lambda key=key: made.append(key) or Parts((np.zeros((9 if key == "large" else 2, 3)),), "convex")
+        )
+    assert made == ["a", "large", "large"]
 
 
 def test_a_key_depends_on_where_one_input_ends():
