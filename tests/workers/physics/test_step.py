@@ -116,6 +116,20 @@ def test_what_is_let_go_again_is_watched_to_the_end_however_still_it_stands(monk
     assert [each.seconds for each in watched] == pytest.approx([RECHECK_S, 0.5], abs=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("x_m", "up_m", "least_mm", "most_mm"),
+    [(0.0, 0.0, 0.0, 1e-3), (0.0, 1.5e-4, 0.14, 0.16), (0.699, 0.0, 0.0, 1e-3), (0.701, 0.0, 0.2, 0.5)],
+    ids=["on the table", "0.15 mm above it", "1 mm inside an overhang", "1 mm outside"],
+)
+def test_what_is_let_go_again_shows_whether_it_rested(x_m, up_m, least_mm, most_mm):
+    """A cube of 60 mm on a top that ends at 0.7 m; what tips is stopped once its centre of mass went 0.2 mm."""
+    asset = asset_of(box(0.06, 0.06, 0.06))
+    rest = settle_single(start_of(asset, translation(0.0, 0.0, TOP + 0.03)), TABLE, PHYSICS)
+    T = translation(x_m, 0.0, TOP + 0.03 + up_m)
+    moved_mm, _ = recheck(start_of(asset, T), dataclasses.replace(rest, T_world_obj=T), TABLE, PHYSICS)
+    assert least_mm <= moved_mm <= most_mm
+
+
 def test_the_same_start_gives_the_same_bits():
     asset = asset_of(trimesh.creation.icosphere(subdivisions=1, radius=0.06))
     plan = draw_scene(
