@@ -14,7 +14,7 @@ from tests.hard_cases.chaotic_cases import CHAOTIC, FIRST, SEEDS, Chaotic
 from tests.hard_cases.gate import verdicts, what_is_wrong
 from tests.hard_cases.spin import spinning
 from tests.hard_cases.test_hard_cases import MOVED_MM, TURNED_DEG
-from tests.hard_cases.waiting import MOVES, marks_of
+from tests.hard_cases.waiting import marks_of
 from tests.physics.settling import recheck_group, settle_group
 from workers.physics.hold import HELD_FROM
 
@@ -43,7 +43,7 @@ def wrong_with(case: Chaotic, seed: int) -> str:
     found = what_is_wrong(verdicts(made, end, physics))
     if (figure := case.measure.of(made, end)) > case.measure.bound:
         found = f"{case.measure.what}: {figure:.4g} of {case.measure.bound:g}; {found}"
-    return "; ".join(filter(None, (found, "" if case.name in MOVES else moves(made, end, physics))))
+    return "; ".join(filter(None, (found, moves(made, end, physics))))
 
 
 def moves(made: Made, end: tuple[Settled, ...], physics: Physics) -> str:
@@ -67,18 +67,6 @@ def rows(tiers: str) -> list[Any]:
 def test_the_first_seeds_rest_through_the_gate(case):
     found = {seed: wrong_with(case, seed) for seed in range(FIRST)}
     assert {seed: wrong for seed, wrong in found.items() if wrong} == {}
-
-
-@pytest.mark.minute
-@pytest.mark.parametrize(
-    "case",
-    [pytest.param(case, id=case.name, marks=marks_of(case.name, True)) for case in CHAOTIC if case.name in MOVES],
-)
-def test_the_first_seeds_of_what_moves_stay_where_they_are(case):
-    for seed in range(FIRST):
-        made, end = ending(case, seed)
-        assert not isinstance(end, SceneError)
-        assert moves(made, end, PHYSICS) == ""
 
 
 @pytest.mark.timeout(3600)

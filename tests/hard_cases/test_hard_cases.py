@@ -19,7 +19,7 @@ from tests.hard_cases.chaotic_cases import CHAOTIC
 from tests.hard_cases.flight_cases import FLIGHTS
 from tests.hard_cases.gate import verdicts, what_is_wrong
 from tests.hard_cases.spin import spinning
-from tests.hard_cases.waiting import MOVES, WAITING, marks_of
+from tests.hard_cases.waiting import WAITING, marks_of
 from tests.physics.settling import recheck_group, settle_group
 
 PHYSICS = Job(name="t").physics
@@ -97,12 +97,12 @@ def judge(case: Case, made: Made | None, end: End) -> tuple[str, float | None, f
     return "reason", None, None, "" if allowed else str(end)
 
 
-def rows(cases: Sequence[Case], again: bool, let_go: bool = False) -> list[Any]:
+def rows(cases: Sequence[Case], again: bool) -> list[Any]:
     """The cases, with the markers of their time and of what is not met yet."""
     found = []
     for case in cases:
         tiers = {case.tier, case.again} if again else {case.tier}
-        marks = [getattr(pytest.mark, name) for name in sorted(tiers - {""})] + marks_of(case.name, let_go)
+        marks = [getattr(pytest.mark, name) for name in sorted(tiers - {""})] + marks_of(case.name)
         found.append(pytest.param(case, id=case.name, marks=marks))
     return found
 
@@ -120,7 +120,7 @@ def test_a_hard_case_ends_alike_to_the_last_bit_when_it_is_made_again(case):
 
 
 @pytest.mark.parametrize(
-    "case", rows([case for case in CASES if case.outcome in (SETTLE, EITHER, UNDEFINED)], again=True, let_go=True)
+    "case", rows([case for case in CASES if case.outcome in (SETTLE, EITHER, UNDEFINED)], again=True)
 )
 def test_what_rests_stays_where_it_is_when_it_is_let_go_again(case, record_figure):
     made, end = first_ending(case)
@@ -149,4 +149,4 @@ def test_whatever_may_settle_has_a_pose_that_it_must_have():
 
 
 def test_what_is_said_to_wait_is_in_the_table():
-    assert {*WAITING, *MOVES} <= {case.name for case in (*CASES, *CHAOTIC, *FLIGHTS)}
+    assert set(WAITING) <= {case.name for case in (*CASES, *CHAOTIC, *FLIGHTS)}

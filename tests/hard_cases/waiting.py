@@ -11,17 +11,8 @@ WAITING: dict[str, str] = {
 }
 """What ends otherwise than declared, and how."""
 
-BULLET = "Bullet, which lets it go again, moves it: its parts and its friction are not quite those of exact rest"
 
-MOVES: dict[str, str] = {
-    "ring hung on a finger": BULLET,
-    "ball in a bowl from a file": BULLET,
-    "needle of 0.2 by 200 mm tumbled": "its sides are 13 micrometres wide, and Bullet keeps a hull's corners on a grid of 20",
-}
-"""What moves by more than 0.1 mm or 0.1 degrees in the second after it is let go again."""
-
-
-def marks_of(name: str, let_go: bool = False) -> list[Any]:
-    """The mark of a case that is not met, or that moves when it is `let_go` again."""
-    why = WAITING.get(name) or (MOVES.get(name) if let_go else None)
+def marks_of(name: str) -> list[Any]:
+    """The mark of a case that is not met."""
+    why = WAITING.get(name)
     return [pytest.mark.xfail(reason=why, strict=False)] if why else []
