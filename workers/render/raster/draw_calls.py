@@ -17,6 +17,7 @@ from workers.render.raster.buffers import Uploaded, UploadedShape
 from workers.render.raster.covers import Cover, seen_ranges
 from workers.render.raster.programs import NEAR_M, light_slots
 from workers.render.raster.shaders import Variant
+from workers.render.raster.tiles import is_steep
 
 NAMES = {REGION_FLOOR: "floor", REGION_TABLE: "table"}
 """Effects that draw one thing; objects are always drawn."""
@@ -74,7 +75,7 @@ def sort_draws(
     `has_level_top` tells whether the top of a thing has a level map; only tier raster asks. Raises ValueError above six
     lights.
     """
-    lights, raster = light_slots(view.appearance) if view.color else 1, view.raster
+    lights, raster = light_slots(view.appearance, view.raster) if view.color else 1, view.raster
     by_variant: dict[Variant, list[Draw]] = {}
     for thing in reversed(things):
         name = NAMES.get(thing.region_id)
@@ -86,6 +87,7 @@ def sort_draws(
         T_cam_shape = view.T_cam_world @ thing.T_world_shape
         cover = shape.cover if hides and is_beyond_near(shape, T_cam_shape) else None
         eye = -T_cam_shape[:3, 3] @ T_cam_shape[:3, :3]
+        steep = ground and is_steep(thing.shape, T_cam_shape, view.k)
         for batch in shape.batches:
             textured = view.color and is_drawn(view.effects, "textures", batch.texture is not None)
             cutout = view.cut and textured and is_drawn(view.effects, "transparency", batch.holes)
@@ -93,7 +95,7 @@ def sort_draws(
                 # Each program takes megabytes; only a floor is large enough to gain from one for planes.
                 matte = view.color and batch.matte and ground and (level or not raster)
                 look = (view.color, textured, batch.few_triangles, matte, lights, raster)
-                variant = Variant(*look, ground, level, view.labels, cutout)
+                variant = Variant(*look, ground, level, view.labels, cutout, steep)
                 by_variant.setdefault(variant, []).append(Draw(thing, shape, batch, first, count))
     return by_variant
 

@@ -167,7 +167,8 @@ class Renderer:
 
     def _draw_things(self, things: Sequence[Placed], view: RenderPass) -> None:
         """Draw into the bound framebuffer."""
-        ranks, lights = self._rank(things), place_lights(view.appearance, view.T_cam_world) if view.color else None
+        ranks = self._rank(things)
+        lights = place_lights(view.appearance, view.T_cam_world, view.raster) if view.color else None
         for variant, draws in sort_draws(things, self._shapes.fetch, view, self._light_maps.has_level_top).items():
             program = self._program(variant)
             program.use()

@@ -102,21 +102,22 @@ class Program:
         return self._locations.get(name, -1)
 
 
-def place_lights(appearance: Appearance, T_cam_world: Pose) -> PlacedLights:
-    """The lights of a scene as a camera sees them. Raises ValueError above `MAX_LIGHTS`."""
-    count = light_slots(appearance)
+def place_lights(appearance: Appearance, T_cam_world: Pose, raster: bool) -> PlacedLights:
+    """The lights of a scene as a camera sees them, for programs of tier raster or flat. Raises as `light_slots`."""
+    count = light_slots(appearance, raster)
     towards, color = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
     for i, light in enumerate(appearance.lights):
         towards[i], color[i] = T_cam_world[:3, :3] @ light.direction, light.color
     return PlacedLights(appearance.ambient, towards, color)
 
 
-def light_slots(appearance: Appearance) -> int:
-    """Number of lights that the program has: one, three or `MAX_LIGHTS`, unused ones dark.
+def light_slots(appearance: Appearance, raster: bool) -> int:
+    """Number of lights that the program has: one, two for tier flat, three or `MAX_LIGHTS`, unused ones dark.
 
-    Each number of lights needs programs of its own, of some megabytes each. Raises ValueError above `MAX_LIGHTS`.
+    Each number of lights needs programs of its own, of some megabytes each. All scenes of tier flat have two lights; those of
+    tier raster have one, two or three. Raises ValueError above `MAX_LIGHTS`.
     """
-    for slots in (1, 3, MAX_LIGHTS):
+    for slots in (1, 3, MAX_LIGHTS) if raster else (1, 2, 3, MAX_LIGHTS):
         if len(appearance.lights) <= slots:
             return slots
     raise ValueError(f"{len(appearance.lights)} lights: the renderer takes at most {MAX_LIGHTS}")

@@ -10,6 +10,9 @@ from typing import NamedTuple
 
 from workers.render.raster.lit_shaders import LIT_FRAGMENT, LIT_VERTEX
 
+GRAZING = 0.01
+"""Cosine of incidence below which a face's plane does not determine z."""
+
 MAX_LIGHTS = 6
 """More do not fit into the 60 floats between the two shaders that OpenGL 4.1 guarantees."""
 
@@ -34,7 +37,21 @@ class Variant(NamedTuple):
     """False: colour alone, tested by the rasteriser's depth, so that hidden fragments are not shaded."""
     cutout: bool = False
     """Its texture has holes. A variant of its own, because a program that may discard also shades hidden fragments."""
+    steep: bool = False
+    """One level plane, seen everywhere at an angle at which it determines z (`tiles.is_steep`): for `ground` only."""
 
+
+_ENCODE_SRGB = """
+// The curve is within 0.1 of a step of 8 bits of 1.055 c^(1 / 2.4) - 0.055, and square roots cost a third of powers.
+vec3 encode_srgb(vec3 c) {
+#if !RASTER                        // whose tone curve ends at 1
+    c = clamp(c, 0.0, 1.0);
+#endif
+    vec3 root = sqrt(c);
+    vec3 curve = 0.83375144 * root + 0.29810974 * sqrt(root) - 0.05531654 * c - 0.07690398;
+    return mix(12.92 * c, curve, greaterThanEqual(c, vec3(0.0031308)));
+}
+"""
 
 _VERTEX = """
 layout(location = 0) in vec3 position;
@@ -91,10 +108,15 @@ LIT_VERTEX
 
 #if MATTE
 // Light from a plane towards the eye, per unit of a texel's: from the sky and all lights without shadows, and from the key
-// light with them; `v_plane_mirror` is the part that a texel does not tint.
+// light with them; `v_plane_mirror` is the part that a texel does not tint. Where there are neither texels nor shadows, all
+// of the plane has one colour.
+#if TEXTURED || RASTER
 flat out vec3 v_plane_open;
 flat out vec3 v_plane_key;
 flat out vec3 v_plane_mirror;
+#else
+flat out vec3 v_plane_srgb;
+#endif
 
 void light_plane() {
     vec3 normal = v_plane.w > 0.0 ? -v_plane.xyz : v_plane.xyz;    // towards the eye
@@ -103,10 +125,16 @@ void light_plane() {
 #else
     vec3 around = ambient;
 #endif
-    v_plane_mirror = 0.04 * around;
+    vec3 mirror = 0.04 * around;
     for (int i = RASTER; i < LIGHTS; ++i) around += light_color[i] * max(dot(normal, light_towards[i]), 0.0);
-    v_plane_open = albedo_roughness.rgb * around;
+    vec3 open = albedo_roughness.rgb * around;
+#if TEXTURED || RASTER
+    v_plane_open = open;
     v_plane_key = albedo_roughness.rgb * light_color[0] * max(dot(normal, light_towards[0]), 0.0);
+    v_plane_mirror = mirror;
+#else
+    v_plane_srgb = encode_srgb(open + mirror);
+#endif
 }
 #endif
 
@@ -135,7 +163,7 @@ void main() {
 _FRAGMENT = """
 const float NEAR_M = 0.05;         // of any length: it scales what the depth test compares
 const float HOLE = 0.5;          // texels more transparent than this are holes in colour, never in labels
-const float GRAZING = 0.01;        // cosine of incidence below which a face's plane does not determine z
+const float GRAZING = GRAZING_COSINE;
 
 in vec4 v_normal_metallic;
 in vec4 v_albedo_roughness;
@@ -176,11 +204,13 @@ LIT_FRAGMENT
 // Radiance towards the eye: Lambert, and GGX's lobe (Walter et al. 2007) with its masking term taken as 1. The lobe is
 // written by the angle between the mirrored ray and the light, 1 - cos = 2 sin^2 of the half vector's, which saves the
 // half vectors. On a matte surface it is under 0.03 of the light, and is left out.
-#if MATTE
+#if MATTE && TEXTURED
 flat in vec3 v_plane_open;
 flat in vec3 v_plane_mirror;
 
 vec3 shade_plane(vec3 tint) { return tint * v_plane_open + v_plane_mirror; }
+#elif MATTE
+flat in vec3 v_plane_srgb;
 #else
 vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float roughness) {
     vec3 diffuse = albedo * (1.0 - metallic);
@@ -199,22 +229,16 @@ vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float rou
 #endif
 #endif
 
-// The curve is within 0.1 of a step of 8 bits of 1.055 c^(1 / 2.4) - 0.055, and square roots cost a third of powers.
-vec3 encode_srgb(vec3 c) {
-#if !RASTER                        // whose tone curve ends at 1
-    c = clamp(c, 0.0, 1.0);
-#endif
-    vec3 root = sqrt(c);
-    vec3 curve = 0.83375144 * root + 0.29810974 * sqrt(root) - 0.05531654 * c - 0.07690398;
-    return mix(12.92 * c, curve, greaterThanEqual(c, vec3(0.0031308)));
-}
-
 void main() {
     vec3 ray = vec3((gl_FragCoord.xy - v_view.xy) * v_view.zw, 1.0);
     float per_length = inversesqrt(dot(ray, ray));
     float across = dot(v_plane.xyz, ray);
     float cosine = abs(across) * per_length;
+#if STEEP
+    float z = v_plane.w / across;
+#else
     float z = cosine > GRAZING ? v_plane.w / across : 1.0 / gl_FragCoord.w;
+#endif
 #if LABELS
     out_z = z;
 #if !GROUND
@@ -222,7 +246,9 @@ void main() {
 #endif
 #endif
 
-#if COLOR
+#if COLOR && MATTE && !TEXTURED && !RASTER
+    out_color_region = vec4(v_plane_srgb, v_thing.x);
+#elif COLOR
     vec3 tint = vec3(1.0);
 #if TEXTURED
     vec4 texel = texture(albedo_map, v_uv);
@@ -270,4 +296,5 @@ def label_sources(variant: Variant) -> tuple[str, str]:
         f"#define {name.upper()} {int(v)}\n" for name, v in variant._asdict().items()
     )
     vertex, fragment = _VERTEX.replace("LIT_VERTEX", LIT_VERTEX), _FRAGMENT.replace("LIT_FRAGMENT", LIT_FRAGMENT)
-    return head + vertex, head + fragment
+    fragment = fragment.replace("GRAZING_COSINE", str(GRAZING))
+    return head + _ENCODE_SRGB + vertex, head + _ENCODE_SRGB + fragment

@@ -1,4 +1,4 @@
-"""What a thing covers of the pixel grid, inside the image and around it: pure functions."""
+"""What a thing covers of the pixel grid, inside the image and around it, and how steeply it is seen: pure functions."""
 
 import math
 from collections.abc import Iterator
@@ -13,6 +13,7 @@ from workers.geometry.bounds import bounds_of
 from workers.geometry.frames import transform
 from workers.geometry.jit import compiled
 from workers.render.raster.programs import NEAR_M
+from workers.render.raster.shaders import GRAZING
 
 TILE_PX = 1024
 """Side of a tile, pixels."""
@@ -73,8 +74,7 @@ def fills_image(shape: Shape, T_cam_shape: Pose, k: Intrinsics) -> bool:
     if shape.closed or not _is_rectangle(shape):
         return False
     low, high = bounds_of(shape.vertices)
-    x, y = np.array([-BORDER_PX, k.width + BORDER_PX]), np.array([-BORDER_PX, k.height + BORDER_PX])
-    rays = np.array([((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0) for u, v in product(x, y)]) @ T_cam_shape[:3, :3]
+    rays = _corner_rays(T_cam_shape, k)
     eye = -T_cam_shape[:3, 3] @ T_cam_shape[:3, :3]
     fall = float(low[2] - eye[2])
     if not (rays[:, 2] * fall > 0.0).all():
@@ -82,6 +82,29 @@ def fills_image(shape: Shape, T_cam_shape: Pose, k: Intrinsics) -> bool:
     away_m = fall / rays[:, 2]  # along the optical axis, as rays are of that length
     met = eye[:2] + away_m[:, None] * rays[:, :2]
     return bool((away_m > 2.0 * NEAR_M).all() and (met > low[:2]).all() and (met < high[:2]).all())
+
+
+def is_steep(shape: Shape, T_cam_shape: Pose, k: Intrinsics) -> bool:
+    """Whether a shape is one level plane of its frame, and the rays of all pixels meet it at a cosine above `GRAZING`.
+
+    The cosine, computed by a renderer in float32, is at least twice that. It is bounded by the least slope and the greatest
+    length of the rays through the image's corners, between which both lie.
+    """
+    low, high = bounds_of(shape.vertices)
+    if low[2] != high[2]:
+        return False
+    rays = _corner_rays(T_cam_shape, k)
+    slopes = rays[:, 2] if rays[0, 2] > 0.0 else -rays[:, 2]
+    return bool(slopes.min() > 2.0 * GRAZING * np.sqrt((rays * rays).sum(axis=1).max()))
+
+
+def _corner_rays(T_cam_shape: Pose, k: Intrinsics) -> Array:
+    """[4, 3]: rays through corners `BORDER_PX` beyond the image, 1 long along the optical axis, in the shape's frame."""
+    x, y = (-BORDER_PX, k.width + BORDER_PX), (-BORDER_PX, k.height + BORDER_PX)
+    rays: Array = (
+        np.array([((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0) for u, v in product(x, y)]) @ T_cam_shape[:3, :3]
+    )
+    return rays
 
 
 def _is_rectangle(shape: Shape) -> bool:

@@ -1,10 +1,13 @@
-"""The projection that reaches the GPU."""
+"""The projection and the lights that reach the GPU."""
 
 import numpy as np
+import pytest
 
+from schemas.base import frozen_array
+from schemas.scene.appearance import Appearance, Light
 from schemas.scene.camera import Intrinsics
 from workers.geometry.camera import project
-from workers.render.raster.programs import NEAR_M, clip_from_cam
+from workers.render.raster.programs import NEAR_M, clip_from_cam, light_slots, place_lights
 
 
 def test_clip_space_gives_the_cameras_image_coordinates():
@@ -20,3 +23,22 @@ def test_the_near_plane_cuts_and_nothing_is_cut_far_away():
     for z, inside in ((NEAR_M * 0.999, False), (NEAR_M * 1.001, True), (1.0, True), (1e6, True)):
         clip = clip_from_cam(k) @ [0.0, 0.0, z, 1.0]
         assert (-clip[3] <= clip[2] <= clip[3]) == inside, z
+
+
+def lit(count: int) -> Appearance:
+    light = Light(frozen_array([0.0, 0.6, 0.8]), (0.5, 0.4, 0.3))
+    return Appearance((0.1, 0.1, 0.1), (light,) * count, (0.0, 0.0, 0.0))
+
+
+def test_lights_fill_the_slots_of_the_program_and_the_rest_is_dark():
+    """The two lights of a scene of tier flat leave none dark, and tier raster has no programs for two."""
+    slots = {raster: [light_slots(lit(count), raster) for count in range(7)] for raster in (False, True)}
+    assert slots == {False: [1, 1, 2, 3, 6, 6, 6], True: [1, 1, 3, 3, 6, 6, 6]}
+    placed = place_lights(lit(2), np.eye(4), raster=True)
+    np.testing.assert_array_equal(placed.towards, np.float32([[0, 0.6, 0.8], [0, 0.6, 0.8], [0, 0, 0]]))
+    np.testing.assert_array_equal(placed.color, np.float32([[0.5, 0.4, 0.3], [0.5, 0.4, 0.3], [0, 0, 0]]))
+
+
+def test_seven_lights_are_too_many():
+    with pytest.raises(ValueError, match="7 lights"):
+        light_slots(lit(7), raster=False)

@@ -1,15 +1,20 @@
-"""The part of the pixel grid on which a thing is counted, and what covers all of the image."""
+"""The part of the pixel grid on which a thing is counted, what covers all of the image, and what is seen steeply."""
+
+from unittest import mock
 
 import numpy as np
 import trimesh
 
+import workers.render.raster.draw_calls
 from schemas.base import frozen_array
 from schemas.scene.camera import Intrinsics
 from schemas.scene.shape import Part, Shape
-from tests.workers.render.random_scenes import FLOOR_HALF_M, floor, shape_of
+from tests.workers.render.looks import FLAT, RASTER
+from tests.workers.render.random_scenes import APPEARANCE, FLOOR_HALF_M, camera, floor, random_things, shape_of
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import invert, translation
-from workers.render.raster.tiles import TILE_PX, fills_image, tiles, window
+from workers.render.raster.shaders import GRAZING
+from workers.render.raster.tiles import TILE_PX, fills_image, is_steep, tiles, window
 
 K = Intrinsics(width=100, height=80, fx=100.0, fy=100.0, cx=50.0, cy=40.0)
 
@@ -82,3 +87,48 @@ def test_only_a_rectangle_of_two_triangles_fills_an_image():
     for vertices, faces, fills in cases:
         shape = Shape((Part("p", frozen_array(vertices), np.array(faces, np.int32)),))
         assert fills_image(shape, above, K) == fills
+
+
+def cosines(T_world_cam: np.ndarray) -> np.ndarray:
+    """Of the angle between the level's normal and the ray of each of 41 x 41 points of the image, with its sign."""
+    x, y = np.meshgrid(np.linspace(0, K.width, 41), np.linspace(0, K.height, 41))
+    rays = np.stack([(x - K.cx) / K.fx, (y - K.cy) / K.fy, np.ones_like(x)], -1)
+    return (rays @ T_world_cam[:3, :3].T)[..., 2] / np.linalg.norm(rays, axis=-1)
+
+
+def test_a_level_that_is_seen_steeply_is_met_by_every_ray_above_the_grazing_angle():
+    """True for nearly all views that meet it so, but for those at the limit; never for one that does not somewhere."""
+    rng, agreed = np.random.default_rng(6), []
+    for turn in range(400):
+        inclination = (
+            rng.uniform(-1.5, 1.5) if turn % 2 else rng.uniform(0.36, 0.42)
+        )  # the highest rays are level there
+        T_world_cam = orbit_pose(rng.normal(0.0, 3.0, 3), inclination, rng.uniform(-3, 3), 3.0)
+        found = cosines(T_world_cam)
+        every = bool((found > GRAZING).all() or (found < -GRAZING).all())
+        steep = is_steep(floor().shape, invert(T_world_cam), K)
+        assert every or not steep
+        agreed.append((every, steep))
+    every, steep = np.array(agreed).T
+    assert 100 < steep.sum() < 350
+    assert steep[1::2].sum() >= 0.9 * every[1::2].sum()
+
+
+def test_only_what_lies_on_one_level_is_seen_steeply():
+    above = invert(orbit_pose(np.zeros(3), 1.0, 0.0, 1.0))
+    assert not is_steep(shape_of(trimesh.creation.box((9.0, 9.0, 1e-6))), above, K)
+    assert is_steep(floor().shape, above, K)
+
+
+def test_a_floor_that_is_seen_steeply_is_drawn_to_the_same_bytes(renderer):
+    rng = np.random.default_rng(7)
+    for look in (FLAT, RASTER):
+        for inclination in (0.7, 0.9, 1.4):
+            things, height = random_things(rng)
+            view = camera(T=orbit_pose(np.array([0.0, 0.0, height]), inclination, rng.uniform(-3, 3), 2.5))
+            assert is_steep(things[0].shape, invert(view.T_world_cam), view.intrinsics)
+            steep = renderer.draw(things, APPEARANCE, view, *look)
+            with mock.patch.object(workers.render.raster.draw_calls, "is_steep", return_value=False):
+                plain = renderer.draw(things, APPEARANCE, view, *look)
+            for kind in ("rgb", "depth_m", "region"):
+                assert getattr(steep, kind).tobytes() == getattr(plain, kind).tobytes(), kind
