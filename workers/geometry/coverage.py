@@ -124,8 +124,8 @@ def _cover(covered: NDArray[np.uint8], a: Corner, b: Corner, c: Corner) -> None:
         left, right = _cut(a, b, row, first, last)
         left, right = _cut(b, c, row, left, right)
         left, right = _cut(c, a, row, left, right)
-        for column in range(left, right + 1):
-            covered[row, column] = 1
+        if left <= right:
+            covered[row, left : right + 1] = 1  # in one go: as a loop, each index is tested for counting from the end
 
 
 @compiled

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import cv2
+
 from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from workers.assets.catalogue import Catalogue
@@ -24,6 +26,7 @@ class WorkerContext:
 
 
 def open_worker(job: Job, catalogue: Catalogue) -> WorkerContext:
-    """Prepare this process, its allocator and its renderer, for the job's scenes."""
+    """Prepare this process, its allocator, OpenCV and its renderer, for the job's scenes."""
     keep_freed_memory()
+    cv2.setNumThreads(1)  # there is a worker for each core: its threads would wait for those of other workers
     return WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))

@@ -1,9 +1,12 @@
-"""What a worker process holds: the digest of a job's settings."""
+"""What a worker process holds: the digest of a job's settings, and libraries that are held to one thread."""
 
+import cv2
 import pytest
 
 from schemas.job.identity import settings_digest
 from schemas.job.job import Job
+from tests.workers.render.random_scenes import built_in_assets
+from workers.pipeline.context import open_worker
 
 
 def digest(catalogue: str = "assets", **changes) -> str:
@@ -22,3 +25,13 @@ def test_what_does_not_change_a_scene_is_not_in_the_digest(changes):
 )
 def test_what_changes_a_scene_is_in_the_digest(changes):
     assert digest(**changes) != digest()
+
+
+def test_opencv_of_a_worker_has_one_thread():
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(3)
+    try:
+        open_worker(Job(name="t"), built_in_assets())
+        assert cv2.getNumThreads() == 1
+    finally:
+        cv2.setNumThreads(before)
