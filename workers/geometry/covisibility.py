@@ -75,16 +75,15 @@ def _compare(
     bounds: Bounds,
     units_per_m: float,
 ) -> tuple[Array, NDArray[np.uint8]]:
-    """eye: the target's position as the source's camera sees it; k: cx, cy, fx, fy of source and target."""
+    """eye: the target's position as the source's camera sees it; k: cx, cy, fx, fy of source and target.
+
+    All conditions must hold; those that take longest come last, as most pixels fail one before.
+    """
     (depth, region), (cx, cy, fx, fy), (mx, my, gx, gy) = source, k[0], k[1]
     height, width = target[0].shape
     differences, regions, count = np.empty(len(pixels)), np.empty(len(pixels), np.uint8), 0
     for n in range(len(pixels)):
         row, column = pixels[n] // depth.shape[1], pixels[n] % depth.shape[1]
-        if not facing_at(depth, units_per_m, region, row, column, k[0], eye) > bounds.facing:  # true where it is nan
-            continue
-        if not is_smooth(depth, region, row, column, bounds.smooth_m[0], units_per_m):
-            continue
         z = depth[row, column] / units_per_m
         x, y = (column + 0.5 - cx) / fx * z, (row + 0.5 - cy) / fy * z
         Z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
@@ -96,6 +95,10 @@ def _compare(
             continue
         seen_m, seen_region = sample_inverse_depth(target[0], target[1], u, v, units_per_m)
         if not (seen_m > 0.0 and seen_region == region[row, column] and seen_m + bounds.hidden_m > Z):
+            continue
+        if not is_smooth(depth, region, row, column, bounds.smooth_m[0], units_per_m):
+            continue
+        if not facing_at(depth, units_per_m, region, row, column, k[0], eye) > bounds.facing:  # true where it is nan
             continue
         if _is_smooth_around(target, u, v, bounds.smooth_m[1], units_per_m):
             differences[count], regions[count] = abs(Z - seen_m), region[row, column]
