@@ -74,14 +74,9 @@ def fills_image(shape: Shape, T_cam_shape: Pose, k: Intrinsics) -> bool:
     if shape.closed or not _is_rectangle(shape):
         return False
     low, high = bounds_of(shape.vertices)
-    rays = _corner_rays(T_cam_shape, k)
-    eye = -T_cam_shape[:3, 3] @ T_cam_shape[:3, :3]
-    fall = float(low[2] - eye[2])
-    if not (rays[:, 2] * fall > 0.0).all():
-        return False
-    away_m = fall / rays[:, 2]  # along the optical axis, as rays are of that length
-    met = eye[:2] + away_m[:, None] * rays[:, :2]
-    return bool((away_m > 2.0 * NEAR_M).all() and (met > low[:2]).all() and (met < high[:2]).all())
+    nearest_m, left, bottom, right, top, _ = _meet_level(T_cam_shape, _corners(k), low[2])
+    inside = left > low[0] and bottom > low[1] and right < high[0] and top < high[1]
+    return bool(nearest_m > 2.0 * NEAR_M and inside)
 
 
 def is_steep(shape: Shape, T_cam_shape: Pose, k: Intrinsics) -> bool:
@@ -91,20 +86,43 @@ def is_steep(shape: Shape, T_cam_shape: Pose, k: Intrinsics) -> bool:
     length of the rays through the image's corners, between which both lie.
     """
     low, high = bounds_of(shape.vertices)
-    if low[2] != high[2]:
-        return False
-    rays = _corner_rays(T_cam_shape, k)
-    slopes = rays[:, 2] if rays[0, 2] > 0.0 else -rays[:, 2]
-    return bool(slopes.min() > 2.0 * GRAZING * np.sqrt((rays * rays).sum(axis=1).max()))
+    return bool(low[2] == high[2] and _meet_level(T_cam_shape, _corners(k), low[2])[5] > 2.0 * GRAZING)
 
 
-def _corner_rays(T_cam_shape: Pose, k: Intrinsics) -> Array:
-    """[4, 3]: rays through corners `BORDER_PX` beyond the image, 1 long along the optical axis, in the shape's frame."""
-    x, y = (-BORDER_PX, k.width + BORDER_PX), (-BORDER_PX, k.height + BORDER_PX)
-    rays: Array = (
-        np.array([((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0) for u, v in product(x, y)]) @ T_cam_shape[:3, :3]
-    )
-    return rays
+def _corners(k: Intrinsics) -> tuple[float, float, float, float]:
+    """Left, top, right and bottom of the rays through corners `BORDER_PX` beyond the image, 1 long along the optical axis."""
+    left, right = (-BORDER_PX - k.cx) / k.fx, (k.width + BORDER_PX - k.cx) / k.fx
+    return left, (-BORDER_PX - k.cy) / k.fy, right, (k.height + BORDER_PX - k.cy) / k.fy
+
+
+@compiled
+def _meet_level(
+    T_cam_shape: Pose, corners: tuple[float, float, float, float], z: float
+) -> tuple[float, float, float, float, float, float]:
+    """Where the rays through four corners meet the level z of a shape's frame.
+
+    (least distance along the optical axis, least x and y, greatest x and y, metres; least cosine that a ray between them has
+    with the level's normal). The first is 0 where a ray meets nothing, the last where one runs the other way.
+    """
+    x = y = eye_z = 0.0  # the eye in the shape's frame
+    for i in range(3):
+        x -= T_cam_shape[i, 3] * T_cam_shape[i, 0]
+        y -= T_cam_shape[i, 3] * T_cam_shape[i, 1]
+        eye_z -= T_cam_shape[i, 3] * T_cam_shape[i, 2]
+    fall = z - eye_z
+    nearest, left, bottom, right, top = np.inf, np.inf, np.inf, -np.inf, -np.inf
+    low, high, length2 = np.inf, -np.inf, 0.0
+    for u in (corners[0], corners[2]):
+        for v in (corners[1], corners[3]):
+            ray_x = u * T_cam_shape[0, 0] + v * T_cam_shape[1, 0] + T_cam_shape[2, 0]
+            ray_y = u * T_cam_shape[0, 1] + v * T_cam_shape[1, 1] + T_cam_shape[2, 1]
+            ray_z = u * T_cam_shape[0, 2] + v * T_cam_shape[1, 2] + T_cam_shape[2, 2]
+            low, high, length2 = min(low, ray_z), max(high, ray_z), max(length2, u * u + v * v + 1.0)
+            away = fall / ray_z if ray_z * fall > 0.0 else 0.0
+            nearest = min(nearest, away)
+            left, right = min(left, x + away * ray_x), max(right, x + away * ray_x)
+            bottom, top = min(bottom, y + away * ray_y), max(top, y + away * ray_y)
+    return nearest, left, bottom, right, top, max(low, -high, 0.0) / np.sqrt(length2)
 
 
 def _is_rectangle(shape: Shape) -> bool:
