@@ -20,7 +20,7 @@ Index = NDArray[np.int64]
 
 
 @compiled
-def bounds_in(points: Array, features: Index, low: Array, high: Array) -> tuple[Index, Array, Array]:
+def bounds_in(points: Array, features: NDArray[np.integer], low: Array, high: Array) -> tuple[Index, Array, Array]:
     """(numbers [N], lower and upper bounds [N, 3]) of the features [F, K], corners by number, whose bounds overlap a box."""
     found, count = np.empty(len(features), np.int64), 0
     least, most = np.empty((len(features), 3)), np.empty((len(features), 3))

@@ -65,10 +65,9 @@ def is_closed(mesh: Mesh) -> bool:
 def crop(mesh: Mesh, low: Array, high: Array) -> Mesh:
     """The triangles that overlap a box, bounds [3] and [3], with all that may share a corner with one of them."""
     vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
-    faces = mesh.faces.astype(np.int64)
-    near, least, most = bounds_in(vertices, faces, low, high)
+    near, least, most = bounds_in(vertices, mesh.faces, low, high)
     if len(near):
-        near, _, _ = bounds_in(vertices, faces, least.min(axis=0), most.max(axis=0))
+        near, _, _ = bounds_in(vertices, mesh.faces, least.min(axis=0), most.max(axis=0))
     return Mesh(mesh.vertices, mesh.faces[near])
 
 
@@ -115,12 +114,19 @@ def _bent_edges(vertices: Array, faces: Index, normals: Array) -> tuple[Index, I
     edges = np.stack(np.divmod(keys[first], len(vertices)), axis=1)
     sides = which[np.stack([first, last], axis=1)]
     across = faces[sides // 3, (sides + 2) % 3]
-    cosine = (normals[sides[:, 0] // 3] * normals[sides[:, 1] // 3]).sum(axis=1)
-    a, b, p, q = (vertices[each] for each in (*edges.T, *across.T))
-    # Two faces folded onto one another are coplanar, and their edge is bent all the same
-    folded = (across[:, 0] != across[:, 1]) & ((np.cross(b - a, p - a) * np.cross(b - a, q - a)).sum(axis=1) > 0.0)
-    bent = (last != first + 1) | (np.abs(cosine) <= 1.0 - FLAT) | folded
+    cosine = _dots(normals[sides[:, 0] // 3], normals[sides[:, 1] // 3])
+    a = vertices[edges[:, 0]]
+    along, p, q = (vertices[each] - a for each in (edges[:, 1], *across.T))
+    # Two faces folded onto one another are coplanar, and their edge is bent all the same: p and q are on one side of it
+    same_side = _dots(p, q) * _dots(along, along) > _dots(along, p) * _dots(along, q)
+    bent = (last != first + 1) | (np.abs(cosine) <= 1.0 - FLAT) | ((across[:, 0] != across[:, 1]) & same_side)
     return edges[bent], across[bent]
+
+
+def _dots(one: Array, other: Array) -> Array:
+    """[N]: the scalar products of vectors [N, 3]."""
+    dots: Array = np.einsum("ij,ij->i", one, other)
+    return dots
 
 
 def faces_within(one: tuple[Array, Index], other: tuple[Array, Index], within_m: float) -> tuple[Index, Index]:
