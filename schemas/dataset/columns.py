@@ -73,9 +73,7 @@ _REST = {
     "residual_speed_mm_s": Meaning(
         "Drift of the farthest point in the simulation's last window, before correction.", "mm/s"
     ),
-    "recheck_move_mm": Meaning(
-        "Motion when it was let go again, of several until 0.2 mm; null where it was not.", "mm"
-    ),
+    "recheck_move_mm": Meaning("Motion when it was let go again, until 0.2 mm; null where it was not.", "mm"),
     "recheck_turn_deg": Meaning("Turn when it was let go again; null where it was not.", "deg"),
     "equilibrium_residual": Meaning("Share of its weight that the contact forces cannot balance.", "1"),
 }

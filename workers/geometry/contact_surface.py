@@ -216,7 +216,7 @@ def _patches(vertices: Array, faces: Index, normals: Array) -> tuple[NDArray[np.
     keys, which = _half_edges(faces, len(vertices))
     same = keys[1:] == keys[:-1]
     one, other = which[:-1][same] // 3, which[1:][same] // 3
-    cosine = np.einsum("ij,ij->i", normals[one], normals[other])
+    cosine = _dots(normals[one], normals[other])
     even = cosine > 1.0 - FLAT
     links = coo_array((np.ones(even.sum()), (one[even], other[even])), shape=(len(faces), len(faces)))
     patch = connected_components(links, directed=False)[1]
