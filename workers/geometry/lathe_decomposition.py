@@ -4,22 +4,7 @@ The section of a loft along one column of its rings is an outline that ends at t
 the axis, level with the rings, is cut into stacked bodies, each the hull of whole rings. The rest is cut into plane cells,
 and each cell, between two neighbouring columns, is a wedge: exact where columns lie in planes through the axis, because its
 facets are flat then.
-
-Of 20 of each category, 0.25 m along their diagonal: median / most parts, milliseconds on one busy core, micrometres that
-parts stand out of the surface at most, by points on them. No point of a surface is farther than 23 from all parts.
-
-    mug      414 / 495      69 / 143    34
-    bowl     746 / 959      173 / 428   79
-    jar      662 / 881      168 / 423   78
-    can      433 / 486      111 / 152   33
-    bottle   57 / 73        47 / 64     244
-    laptop   47 / 47        92 / 103    9
-    camera   96 / 125       27 / 52     0
-    box      3 / 5          4 / 10      0
-
-What exceeds 50 are soft squares that turn into circles, whose facets are twisted; a bottle's are not cut along them. A
-simulator's step of a body that stands on a foot ring takes three to nine times as long as with CoACD's parts, because each
-wedge of the ring touches the ground; on its side up to three times, of a bowl up to ten.
+docs/measured.md says how many parts there are, and how near they are to the surface.
 """
 
 import itertools

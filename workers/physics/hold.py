@@ -6,34 +6,35 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from schemas.base import Array, Pose
+from schemas.job.physics import Rest
 from workers.geometry.contact_surface import faces_within, skin_of
 from workers.geometry.frames import transform
 from workers.physics.bullet import SLOP_SHARE, GroundShape
-from workers.physics.fall import Outcome, StepSizes, fall
+from workers.physics.fall import FINEST, Outcome, StepSizes, fall
 from workers.physics.monitors import strays
 from workers.physics.placement import Placement, farthest_m
-from workers.physics.release import PACES_TOGETHER, Drop, Pace, settings_of
-from workers.physics.rest.rest import rest
+from workers.physics.release import Drop, Pace, settings_of
+from workers.physics.rest.contacts import contacts_within
+from workers.physics.rest.rest import LEVEL, rest
 from workers.physics.rigid_body import make_body
 from workers.physics.table_top import inside_margin, split_by_side
 
-HELD_FROM = 9
-"""Number of objects from which rest is held: of 24 piles of eight one moved by 0.11 mm when let go again, of twenty boxes a fifth
-by more. To hold a pile of eight takes as long as all else of its physics."""
+HELD = {"rest": Rest(speed_mm_s=0.1, window_s=0.02), "max_settle_s": 1.0}
+"""When what is let go stays: slower than 0.1 mm in a second, for as long as it takes to make up its margins a few times over."""
 
-HELD_M = 8e-5
-"""Motion in a rest window up to which objects stay; the bound of what is let go for a second is 0.1 mm."""
+HELD_M = 2e-5
+"""Motion up to which objects stay: skins make up their margins by some micrometres."""
 
-MOST_HOLDS = 6
-"""Times that objects are let go, each from where they came to rest the time before; of twenty boxes most need one, some three."""
+MOST_HOLDS = 5
+"""Times that objects are let go, each from where they came to rest the time before; of twenty boxes most need one, some three.
+Each time they may go twice as far as the time before."""
 
-FAR_M, FARTHEST_M = 2e-4, 3.2e-3
-"""Motion of a centre of mass at which they are stopped, at first and at most: only faces within twice that are there to meet."""
-
-LONGEST_S = 1.0
-"""How long they are let go at most. How far and how long doubles where something slipped, so that what slides slowly stops."""
+FAR_M = 2e-4
+"""Motion of a centre of mass at which they are stopped at first: only faces within twice that are there to meet."""
 
 THIN = 0.1
 """Margin of skins as a share of what bodies fall with: by one and a half times that Bullet pushes apart what touches, which would
@@ -50,32 +51,53 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> tuple[Pose,
     Forces that balance all weights do not exclude that friction lets go: of more contacts than equations there are many such
     forces, and bodies need not find them. What slips comes to exact rest anew, from where it went.
     """
-    if len(drop.starts) < HELD_FROM:
-        return tuple(poses)
-    far_m, seconds = FAR_M, drop.physics.rest.window_s
+    held, far_m = dataclasses.replace(drop, physics=drop.physics.model_copy(update=HELD)), FAR_M
     for _ in range(MOST_HOLDS):
-        window = drop.physics.rest.model_copy(update={"window_s": 2.0 * seconds})
-        changes = {"step_hz": PACES_TOGETHER[-1].rate * drop.physics.step_hz, "max_settle_s": seconds, "rest": window}
-        held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes))
-        went = let_go(held, placement, poses, far_m).poses
+        went = let_go(held, placement, poses, far_m, level=False)
         if farthest_m(drop.starts, poses, went) <= HELD_M:
             return tuple(poses)
         rested = rest(placement.things, went, placement.forms[-1].surface, placement.friction)
         if not rested.still:
             break
-        poses = rested.poses
-        far_m, seconds = min(FARTHEST_M, 2.0 * far_m), min(LONGEST_S, 2.0 * seconds)
+        poses, far_m = rested.poses, 2.0 * far_m
     return None
 
 
-def let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: float = FAR_M) -> Outcome:
-    """What objects at these `T_world_obj` do in steps of `physics.step_hz`, until one of them moved by `far_m`.
+def let_go(
+    drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: float = FAR_M, level: bool = True
+) -> tuple[Pose, ...]:
+    """The `T_world_obj` of objects, let go at these in the finest steps, once they rest, or one of them has moved by `far_m`.
+
+    What cannot meet is let go on its own: beside others Bullet's solver ends before it has found the forces of each. level:
+    also what has level contacts alone, which wedge nothing.
+    """
+    went = list(poses)
+    for group in _groups(placement, poses, 2.0 * far_m, level):
+        few = dataclasses.replace(drop, starts=tuple(drop.starts[k] for k in group))
+        outcome = _let_go(few, placement.of(group), [poses[k] for k in group], far_m)
+        for k, T in zip(group, outcome.poses, strict=True):
+            went[k] = T
+    return tuple(went)
+
+
+def _groups(placement: Placement, poses: Sequence[Pose], near_m: float, level: bool) -> list[list[int]]:
+    """The numbers of objects with others within `near_m` in between; only those where contacts are aslant, if not `level`."""
+    contacts, count = contacts_within(placement.surfaces, (*poses, np.eye(4)), near_m), len(poses)
+    paired, aslant = contacts.lower < count, np.linalg.norm(contacts.normals[:, :2], axis=1) > LEVEL
+    pairs = np.ones(paired.sum()), (contacts.upper[paired], contacts.lower[paired])
+    _, groups = connected_components(coo_array(pairs, shape=(count, count)), directed=False)
+    asked = np.unique(groups if level else groups[contacts.upper[aslant]])
+    return [np.flatnonzero(groups == each).tolist() for each in asked]
+
+
+def _let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: float) -> Outcome:
+    """The fall of objects that may meet.
 
     Their shapes are the skins of their meshes where they are near one another, in convex pieces: exact, and each with contacts of
     its own. Of two bodies that are one piece each Bullet keeps four contacts, chosen from some millimetres away, so that a
     box stands on three corners of four and on what it does not touch.
     """
-    physics, top, near_m = settings_of(drop, Pace()), drop.table.top, 2.0 * far_m
+    physics, top, near_m = settings_of(drop, Pace(rate=FINEST)), drop.table.top, 2.0 * far_m
     skins = _skins(placement, poses, near_m)
     whole = [make_body(start, parts) for start, parts in zip(drop.starts, skins, strict=True)]
     bodies = [dataclasses.replace(body, margin_m=THIN * body.margin_m) for body in whole]
@@ -91,7 +113,7 @@ def let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: float
 
 def _skins(placement: Placement, poses: Sequence[Pose], near_m: float) -> list[tuple[Array, ...]]:
     """The pieces [N, 3] of each object, in its own frame, that are within this of others or of the table."""
-    surfaces = [form.surface for form in placement.forms]
+    surfaces = placement.surfaces
     points = [transform(T, one.vertices) for T, one in zip((*poses, np.eye(4)), surfaces, strict=True)]
     near = [np.zeros(len(one.faces), dtype=np.bool_) for one in surfaces]
     for i, j in itertools.combinations(range(len(surfaces)), 2):

@@ -10,10 +10,10 @@ from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.region import REGION_TABLE
 from schemas.scene.scene import ContactForce
 from schemas.scene.shape import Mesh
-from workers.geometry.contact_surface import crop, is_closed
+from workers.geometry.contact_surface import Surface, crop, is_closed
 from workers.geometry.frames import DOWN, motion_between, transform
 from workers.physics.bullet import GRAVITY_M_S2
-from workers.physics.rest.contacts import Contacts, find_contacts, find_near_features
+from workers.physics.rest.contacts import Contacts, contacts_within
 from workers.physics.rest.rest import FALL_M, Thing
 from workers.physics.rest.step import Inertia, Motion, step
 from workers.physics.rest_pose import support_margin
@@ -41,6 +41,16 @@ class Placement:
     things: tuple[Thing, ...]
     forms: tuple[Form, ...]
     friction: float
+
+    @property
+    def surfaces(self) -> tuple[Surface, ...]:
+        """The features of the objects, and last of the table."""
+        return tuple(form.surface for form in self.forms)
+
+    def of(self, numbers: Sequence[int]) -> "Placement":
+        """Some of the objects, by their numbers, with the same table."""
+        starts, things, forms = (tuple(every[k] for k in numbers) for every in (self.starts, self.things, self.forms))
+        return Placement(starts, things, (*forms, self.forms[-1]), self.friction)
 
 
 @dataclass(frozen=True)
@@ -101,11 +111,8 @@ def placed_mesh(start: ObjectStart, T_world_obj: Pose) -> Mesh:
 
 def measure_supports(placement: Placement, poses: Sequence[Pose]) -> tuple[Support, ...]:
     """How every object rests at these `T_world_obj`, by contacts of at most `TOUCHING_M`."""
-    still = (*poses, np.eye(4))
-    gaps_m = find_gaps_m(placement.forms, still)
-    surfaces = [form.surface for form in placement.forms]
-    points = [transform(T, surface.vertices) for T, surface in zip(still, surfaces, strict=True)]
-    found = find_contacts(surfaces, points, find_near_features(surfaces, points, TOUCHING_M), TOUCHING_M, TOUCHING_M)
+    gaps_m = find_gaps_m(placement.forms, (*poses, np.eye(4)))
+    found = contacts_within(placement.surfaces, (*poses, np.eye(4)), TOUCHING_M)
     contacts = replace(found, gaps=np.zeros_like(found.gaps))
     inertias = [thing.inertia(T) for T, thing in zip(poses, placement.things, strict=True)]
     motion = step(inertias, contacts, placement.friction, FALL_M * DOWN, GRAVITY_M_S2)

@@ -14,7 +14,7 @@ from workers.geometry.convexity import mesh_of, solid_of, weld
 from workers.geometry.frames import transform
 from workers.geometry.hull import convex_hull, least_width_m
 from workers.geometry.manifold import hold_to_one_thread
-from workers.physics.rest.contacts import find_contacts, find_near_features
+from workers.physics.rest.contacts import contacts_within
 
 FARTHEST_M = 0.01
 """Farthest distance that is measured: CoACD's parts stand out of a surface by less."""
@@ -58,14 +58,12 @@ def find_gaps_m(forms: Sequence[Form], poses: Sequence[Pose]) -> list[float]:
     The distance is that of a corner from a face or of two edges that cross, and `FARTHEST_M` where nothing is nearer. The
     depth is `overlap_m` for two solids, else that of the deepest corner or edge.
     """
-    points = [transform(T, form.surface.vertices) for form, T in zip(forms, poses, strict=True)]
-    surfaces = [form.surface for form in forms]
     # A table need not be made a solid where no object is one, as the underside of one
     some = any(form.solid is not None for form in forms[:-1])
     solid = np.array([some and form.solid is not None for form in forms])
     gaps = [FARTHEST_M] * len(forms)
     for within_m in (NEAR_M, FARTHEST_M):
-        contacts = find_contacts(surfaces, points, find_near_features(surfaces, points, within_m), within_m, within_m)
+        contacts = contacts_within([form.surface for form in forms], poses, within_m)
         known = np.where(solid[contacts.upper] & solid[contacts.lower], np.maximum(contacts.gaps, 0.0), contacts.gaps)
         gaps = [min(FARTHEST_M, float(known[contacts.of(k)].min(initial=np.inf))) for k in range(len(forms))]
         if max(gaps) <= within_m:

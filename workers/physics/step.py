@@ -12,7 +12,6 @@ from schemas.scene.plan import ObjectStart, ScenePlan
 from schemas.scene.scene import Settled
 from workers.geometry.frames import motion_between
 from workers.physics.effects import called_for_with, rooms_m
-from workers.physics.fall import FINEST
 from workers.physics.hold import let_go
 from workers.physics.placement import forms_of, place
 from workers.physics.release import Drop
@@ -68,13 +67,13 @@ def release_again(
 ) -> tuple[Pose, ...]:
     """`T_world_obj` [4, 4] of every object this long after its release from where it rests, or once one moved by `hold.FAR_M`.
 
-    With the effects of the plan and in the finest steps, without correction. Nothing counts as resting before the end.
+    With the effects of the plan, without correction. Nothing counts as resting before the end.
     """
     rest = physics.rest.model_copy(update={"window_s": 2.0 * seconds})
-    fine = {"step_hz": FINEST * physics.step_hz, "max_settle_s": seconds, "rest": rest}
+    physics = physics.model_copy(update={"max_settle_s": seconds, "rest": rest})
     starts, poses = plan.objects, [each.T_world_obj for each in settled]
     placement = place(starts, poses, forms_of(starts), plan.table, physics.friction**2)
-    return let_go(Drop(starts, plan.table, physics.model_copy(update=fine), effects), placement, poses).poses
+    return let_go(Drop(starts, plan.table, physics, effects), placement, poses)
 
 
 def moved_by(start: ObjectStart, before: Pose, after: Pose) -> tuple[float, float]:

@@ -16,8 +16,8 @@ from tests.physics.settling import settle_group
 from tests.shapes import asset_of, box
 from workers.geometry.frames import motion_between, transform, translation
 from workers.physics import hold as module
-from workers.physics.fall import FINEST, Outcome
-from workers.physics.hold import FAR_M, HELD_FROM, HELD_M, MOST_HOLDS, hold, let_go
+from workers.physics.fall import Outcome
+from workers.physics.hold import FAR_M, HELD_M, MOST_HOLDS, hold, let_go
 from workers.physics.placement import Placement, forms_of, place
 from workers.physics.release import Drop
 from workers.physics.rest.rest import rest
@@ -28,15 +28,12 @@ PHYSICS = Job(name="t").physics
 PLAN = EffectPlan(("dynamics", "fine_step", "object_contacts"), {})
 
 
-def let_go_for(seconds: float, starts: Sequence[ObjectStart], table: Table, share: float = 1.0) -> float:
-    """Metres that the farthest point moves in this time, in steps that are so many times as short."""
+def let_go_for(seconds: float, starts: Sequence[ObjectStart], table: Table) -> float:
+    """Metres that the farthest point moves in this time."""
     rests = PHYSICS.rest.model_copy(update={"window_s": 2.0 * seconds})
-    physics = PHYSICS.model_copy(
-        update={"step_hz": round(share * PHYSICS.step_hz), "max_settle_s": seconds, "rest": rests}
-    )
-    drop, placement = released(starts, table, physics)
+    drop, placement = released(starts, table, PHYSICS.model_copy(update={"max_settle_s": seconds, "rest": rests}))
     poses = [one.T_world_obj for one in starts]
-    after = let_go(drop, placement, poses).poses
+    after = let_go(drop, placement, poses)
     return max(motion_between(one.hull.vertices, *T)[0] for one, *T in zip(starts, poses, after, strict=True))
 
 
@@ -53,10 +50,9 @@ def overhanging(by_m: float) -> tuple[tuple[ObjectStart, ...], Table]:
     return together(table, [put(cube(0.05), table, 0.0), plank]).starts, table
 
 
-@pytest.mark.parametrize("share", [1.0, FINEST])
-def test_a_plank_stays_with_its_centre_of_mass_a_millimetre_inside_an_edge_and_falls_with_it_outside(share):
-    assert let_go_for(0.5, *overhanging(-0.001), share) < HELD_M
-    assert let_go_for(0.5, *overhanging(0.001), share) > FAR_M
+def test_a_plank_stays_with_its_centre_of_mass_a_millimetre_inside_an_edge_and_falls_with_it_outside():
+    assert let_go_for(0.5, *overhanging(-0.001)) < HELD_M
+    assert let_go_for(0.5, *overhanging(0.001)) > FAR_M
 
 
 def leaning(degrees: float) -> tuple[tuple[ObjectStart, ...], Table]:
@@ -110,17 +106,42 @@ def test_what_friction_could_hold_but_does_not_is_balanced_and_falls_when_it_is_
     rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction)
     assert rested.still and np.abs(np.subtract(rested.poses, poses)).max() < 1e-6
     assert let_go_for(0.25, starts, table) > FAR_M
-    monkeypatch.setattr(module, "HELD_FROM", 2)
     assert hold(drop, placement, poses) is None
 
 
-def test_few_objects_are_not_let_go(monkeypatch):
-    starts, table = hanging()
+def beside(gap_m: float) -> tuple[tuple[ObjectStart, ...], Table]:
+    """A cube on another, and a third so far beside them."""
+    table = level()
+    upright = [
+        put(cube(0.05), table, 0.0),
+        put(cube(0.05), table, 0.05),
+        put(cube(0.05), table, 0.0, (0.05 + gap_m, 0.0)),
+    ]
+    return together(table, upright).starts, table
+
+
+@pytest.mark.parametrize(
+    ("gap_m", "all_of_them", "aslant"),
+    [(2.5 * FAR_M, [(0, 1), (2,)], []), (1.5 * FAR_M, [(0, 1, 2)], [(0, 1, 2)])],
+)
+def test_what_cannot_meet_is_let_go_on_its_own_and_what_stands_on_level_faces_alone_need_not_be_held(
+    gap_m, all_of_them, aslant, monkeypatch
+):
+    starts, table = beside(gap_m)
     drop, placement = released(starts, table)
-    poses = [one.T_world_obj for one in starts]
-    assert len(starts) < HELD_FROM
-    monkeypatch.setattr(module, "let_go", lambda *_: pytest.fail("let go"))
+    poses, seen = [one.T_world_obj for one in starts], []
+
+    def told(drop, placement, poses, far_m):
+        seen.append(tuple(starts.index(one) for one in drop.starts))
+        assert placement.starts == drop.starts and len(poses) == len(drop.starts)
+        return Outcome(tuple(poses), 0.0, 0.1, rested=True)
+
+    monkeypatch.setattr(module, "_let_go", told)
+    let_go(drop, placement, poses)
+    assert seen == all_of_them
+    seen.clear()
     assert hold(drop, placement, poses) == tuple(poses)
+    assert seen == aslant
 
 
 @pytest.mark.parametrize("slips", [0, 1, MOST_HOLDS - 1, MOST_HOLDS])
@@ -131,13 +152,13 @@ def test_what_slips_comes_to_rest_where_it_went_until_it_stays(slips, monkeypatc
     drop, placement = released(starts, table)
     left, seen = [slips], []
 
-    def slip(_drop, _placement, poses, _far_m):
+    def slip(_drop, _placement, poses, _far_m, level):
+        assert not level
         seen.append(poses[1][0, 3])
         left[0] -= 1
         by_m = 2.0 * HELD_M if left[0] >= 0 else 0.5 * HELD_M
-        return Outcome((poses[0], translation(by_m, 0.0, 0.0) @ poses[1]), 0.0, 0.1, rested=False)
+        return poses[0], translation(by_m, 0.0, 0.0) @ poses[1]
 
-    monkeypatch.setattr(module, "HELD_FROM", 2)
     monkeypatch.setattr(module, "let_go", slip)
     held = hold(drop, placement, [one.T_world_obj for one in starts])
     assert seen == pytest.approx([2.0 * HELD_M * k for k in range(min(slips + 1, MOST_HOLDS))], abs=1e-9)

@@ -1,19 +1,7 @@
 """Convex parts of a body that is not convex, by CoACD (Wei, Liu, Ling and Su 2022, doi 10.1145/3528223.3530103).
 
 Parts of built-in shapes follow from their making instead: see `workers.geometry.lathe_decomposition`.
-
-CoACD on built-in shapes, number 0 of each category, 0.25 m along their diagonal, by threshold: parts / their vertices / seconds
-on one busy core / millimetres that parts stand out at most. Half of the parts' surface is the shape's (except at 0.1).
-
-             0.1                        0.05                       0.02
-    mug      22 / 1,545 / 2.9 / 7.4     59 / 2,462 / 2.6 / 3.9     220 / 5,153 / 6.1 / 1.6
-    bowl     24 / 2,957 / 1.4 / 8.1     51 / 3,881 / 2.4 / 4.1     173 / 6,065 / 5.2 / 1.8
-    jar      41 / 2,436 / 3.3 / 7.7     116 / 4,344 / 6.8 / 3.8    441 / 10,125 / 13.7 / 1.8
-    bottle   2 / 852 / 0.4 / 1.3        2 / 852 / 0.4 / 1.3        10 / 1,241 / 0.8 / 1.2
-    laptop   2 / 153 / 0.3 / 3.1        3 / 178 / 0.3 / 1.4        3 / 178 / 0.3 / 1.4
-    camera   3 / 592 / 0.4 / 6.9        25 / 1,201 / 1.1 / 4.4     164 / 3,917 / 7.5 / 2.3
-
-With CoACD's own search depth the mug takes 142 s and has 47 parts.
+docs/measured.md says what its threshold costs.
 """
 
 import json

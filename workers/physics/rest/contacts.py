@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Array
+from schemas.base import Array, Pose
 from workers.geometry.contact_kernels import Index, bounds_in, corners_on_faces, edges_across_edges, find_near
 from workers.geometry.contact_surface import Surface
+from workers.geometry.frames import transform
 
 DEEPEST_M = 3e-3
 """Overlap from which bodies are moved apart, metres: coarse parts may be smaller than a quarter of a metre's shape by half of
@@ -84,6 +85,12 @@ def _boxes(surface: Surface, points: Array, low: Array, high: Array) -> tuple[_B
 def _pairs(here: _Boxes, there: _Boxes, within_m: float) -> Index:
     pairs = find_near(here[1], here[2], there[1], there[2], within_m)
     return np.stack([here[0][pairs[:, 0]], there[0][pairs[:, 1]]], axis=1)
+
+
+def contacts_within(surfaces: Sequence[Surface], poses: Sequence[Pose], within_m: float) -> Contacts:
+    """The contacts of surfaces at these poses [4, 4] with gaps and overlaps of at most `within_m`; the last is the ground."""
+    points = [transform(T, each.vertices) for T, each in zip(poses, surfaces, strict=True)]
+    return find_contacts(surfaces, points, find_near_features(surfaces, points, within_m), within_m, within_m)
 
 
 def find_contacts(
