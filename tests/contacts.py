@@ -7,7 +7,7 @@ from schemas.base import Array
 from schemas.scene.shape import MassProperties, Mesh
 from workers.geometry.contact_surface import is_closed, surface_of
 from workers.geometry.frames import pose, rotation_about, transform
-from workers.physics.rest.contacts import Contacts, find_contacts, find_near_features
+from workers.physics.rest.contacts import Contacts, contacts_within
 from workers.physics.rest.rest import Thing
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -31,8 +31,7 @@ def tipped(angle_rad: float) -> Array:
 def contacts_between(meshes: list[Mesh], within_m: float) -> Contacts:
     """Of meshes in world coordinates, the last of which is the ground."""
     surfaces = [surface_of(mesh, is_closed(mesh)) for mesh in meshes]
-    points = [surface.vertices for surface in surfaces]
-    return find_contacts(surfaces, points, find_near_features(surfaces, points, within_m), within_m, within_m)
+    return contacts_within(surfaces, [np.eye(4)] * len(surfaces), within_m)
 
 
 def thing_of(mesh: Mesh, mass_kg: float = 1.0) -> Thing:

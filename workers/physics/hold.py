@@ -10,6 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from schemas.base import Array, Pose
+from schemas.errors import SettleError
 from schemas.job.physics import Rest
 from workers.geometry.contact_surface import faces_within, skin_of
 from workers.geometry.frames import transform
@@ -45,11 +46,15 @@ SKIN_M = 1e-4
 skins that do nothing."""
 
 
-def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> tuple[Pose, ...] | None:
-    """The `T_world_obj` of objects that stay where they are when they are let go, from where they came to exact rest; else None.
+class UnsupportedError(SettleError):
+    """No balance was found, or none that holds."""
+
+
+def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> tuple[Pose, ...]:
+    """The `T_world_obj` of objects that stay where they are when they are let go, from where they came to exact rest.
 
     Forces that balance all weights do not exclude that friction lets go: of more contacts than equations there are many such
-    forces, and bodies need not find them. What slips comes to exact rest anew, from where it went.
+    forces, and bodies need not find them. What slips comes to exact rest anew, from where it went. Raises UnsupportedError.
     """
     held, far_m = dataclasses.replace(drop, physics=drop.physics.model_copy(update=HELD)), FAR_M
     for _ in range(MOST_HOLDS):
@@ -60,7 +65,11 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> tuple[Pose,
         if not rested.still:
             break
         poses, far_m = rested.poses, 2.0 * far_m
-    return None
+    raise UnsupportedError(
+        "unsupported",
+        f"something slips each time that all are let go again, {MOST_HOLDS} times: raise physics.friction, or have fewer "
+        "objects_per_scene",
+    )
 
 
 def let_go(

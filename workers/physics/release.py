@@ -67,7 +67,7 @@ DOUBTFUL_RISE, KNOWN_RISE = 0.4, 0.9
 """The same for a single object. From the first share a drop is repeated with a look after each step, which changes nothing of
 it; up to the second, known so, the pace was slow enough."""
 
-PACES_MANY = (Pace(rate=0.5, iterations=0.25, window=0.4, thin=0.25, coarse=True), Pace(coarse=True))
+PACES_MANY = (Pace(rate=0.5, iterations=0.25, window=0.1, thin=0.25, coarse=True), Pace(coarse=True))
 """Of many concave objects, the second where they do not come to exact rest after the first: all of the 36 of 48 piles of eight
 that stayed on the table did, in 1.5 s of processor each on average. Their bounces are more than a rise of energy."""
 

@@ -16,7 +16,7 @@ from workers.geometry.elevation import vertical_gap
 from workers.geometry.frames import transform, translation
 from workers.physics.effects import called_for_with
 from workers.physics.fall import Outcome
-from workers.physics.hold import MOST_HOLDS, hold
+from workers.physics.hold import UnsupportedError, hold
 from workers.physics.placement import (
     TOUCHING_M,
     Placement,
@@ -46,10 +46,6 @@ STAYED_M = 1e-3
 
 MOST_RELEASES = 3
 """Times that objects are released, each from where exact rest gave up the time before."""
-
-
-class UnsupportedError(SettleError):
-    """No balance was found, or none that holds."""
 
 
 class LeftRoomError(Exception):
@@ -147,7 +143,7 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace], flat
             return ending
         rested = rest(placement.things, outcome.poses, placement.forms[-1].surface, placement.friction)
         if rested.still:
-            return dataclasses.replace(ending, poses=_held(drop, placement, rested.poses))
+            return dataclasses.replace(ending, poses=hold(drop, placement, rested.poses))
         starts = (dataclasses.replace(one, T_world_obj=T) for one, T in zip(drop.starts, rested.poses, strict=True))
         drop = dataclasses.replace(drop, starts=tuple(starts))
     raise UnsupportedError(
@@ -155,17 +151,6 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace], flat
         f"{'it tips' if drop.single else 'something tips'} on without end: released {MOST_RELEASES} times, for {seconds:.1f} "
         "s in all, it never came into balance: lower physics.rest.speed_mm_s",
     )
-
-
-def _held(drop: Drop, placement: Placement, poses: tuple[Pose, ...]) -> tuple[Pose, ...]:
-    """Where objects stay that came to exact rest at `poses`. Raises UnsupportedError."""
-    if (held := hold(drop, placement, poses)) is None:
-        raise UnsupportedError(
-            "unsupported",
-            f"something slips each time that all are let go again, {MOST_HOLDS} times: raise physics.friction, or have fewer "
-            "objects_per_scene",
-        )
-    return held
 
 
 def _rest_as_placed(drop: Drop, forms: Sequence[Form]) -> _Ending | None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from tests.shapes import asset_of, box
 from workers.geometry.frames import motion_between, transform, translation
 from workers.physics import hold as module
 from workers.physics.fall import Outcome
-from workers.physics.hold import FAR_M, HELD_M, MOST_HOLDS, hold, let_go
+from workers.physics.hold import FAR_M, HELD_M, MOST_HOLDS, UnsupportedError, hold, let_go
 from workers.physics.placement import Placement, forms_of, place
 from workers.physics.release import Drop
 from workers.physics.rest.rest import rest
@@ -106,7 +107,8 @@ def test_what_friction_could_hold_but_does_not_is_balanced_and_falls_when_it_is_
     rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction)
     assert rested.still and np.abs(np.subtract(rested.poses, poses)).max() < 1e-6
     assert let_go_for(0.25, starts, table) > FAR_M
-    assert hold(drop, placement, poses) is None
+    with pytest.raises(UnsupportedError, match="slips each time"):
+        hold(drop, placement, poses)
 
 
 def beside(gap_m: float) -> tuple[tuple[ObjectStart, ...], Table]:
@@ -160,9 +162,7 @@ def test_what_slips_comes_to_rest_where_it_went_until_it_stays(slips, monkeypatc
         return poses[0], translation(by_m, 0.0, 0.0) @ poses[1]
 
     monkeypatch.setattr(module, "let_go", slip)
-    held = hold(drop, placement, [one.T_world_obj for one in starts])
+    with pytest.raises(UnsupportedError) if slips == MOST_HOLDS else nullcontext():
+        held = hold(drop, placement, [one.T_world_obj for one in starts])
+        assert held[1][0, 3] == pytest.approx(2.0 * HELD_M * slips, abs=1e-9)
     assert seen == pytest.approx([2.0 * HELD_M * k for k in range(min(slips + 1, MOST_HOLDS))], abs=1e-9)
-    if slips == MOST_HOLDS:
-        assert held is None
-    else:
-        assert held is not None and held[1][0, 3] == pytest.approx(2.0 * HELD_M * slips, abs=1e-9)

@@ -135,3 +135,12 @@ def test_a_steep_slope_holds_a_box_only_by_friction():
 
 def test_a_mesh_is_where_it_was_put():
     assert placed_mesh(CUBE, translation(1.0, 2.0, 3.0)).vertices.mean(axis=0) == pytest.approx([1.0, 2.0, 3.0])
+
+
+def test_some_of_the_objects_lie_on_the_same_table():
+    starts = [CUBE, HOOK, start_of(asset_of(box(0.05, 0.05, 0.05)), region=5)]
+    whole = place(starts, [translation(0.0, 0.0, TOP + 1.0)] * 3, forms_of(starts), TABLE, FRICTION)
+    few = whole.of([2, 0])
+    assert few.starts == (starts[2], CUBE) and few.things == (whole.things[2], whole.things[0])
+    assert few.forms == (whole.forms[2], whole.forms[0], whole.forms[3]) and few.friction == FRICTION
+    assert few.surfaces == tuple(form.surface for form in few.forms)

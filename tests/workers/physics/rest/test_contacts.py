@@ -6,8 +6,9 @@ import trimesh
 
 from schemas.scene.shape import Mesh
 from tests.contacts import UP, box, contacts_between, mesh_of, tipped
+from workers.geometry.contact_surface import surface_of
 from workers.geometry.frames import pose, rotation_about, uniform_rotation
-from workers.physics.rest.contacts import DEEPEST_M
+from workers.physics.rest.contacts import DEEPEST_M, contacts_within
 
 WITHIN_M = 5e-5
 GROUND = box((1.0, 1.0, 0.1), (0, 0, -0.05))
@@ -28,6 +29,14 @@ def test_a_box_on_a_level_touches_it_with_four_corners_as_far_off_as_it_is(gap_m
     assert found.normals == pytest.approx(np.tile(UP, (len(found.gaps), 1)), abs=1e-12)
     assert found.gaps == pytest.approx(gap_m, abs=1e-12)
     assert (found.upper == 0).all() and (found.lower == 1).all()
+
+
+def test_contacts_are_those_of_surfaces_at_their_poses():
+    cube = surface_of(box((0.1, 0.1, 0.1)), closed=True)
+    at = pose(rotation_about(UP, np.pi / 2), np.array([0.2, 0.0, 0.05 + 3e-5]))
+    found = contacts_within([cube, surface_of(GROUND, closed=True)], [at, np.eye(4)], WITHIN_M)
+    assert rows(found.points[:, :2]) == {(x, y) for x in (0.15, 0.25) for y in (-0.05, 0.05)}
+    assert found.gaps == pytest.approx(3e-5, abs=1e-12)
 
 
 @pytest.mark.parametrize("gap_m", [6e-5, -6e-5, 0.01])
