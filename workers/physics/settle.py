@@ -16,7 +16,7 @@ from workers.geometry.elevation import vertical_gap
 from workers.geometry.frames import transform, translation
 from workers.physics.effects import called_for_with
 from workers.physics.fall import Outcome
-from workers.physics.hold import UnsupportedError, hold
+from workers.physics.hold import hold
 from workers.physics.placement import (
     TOUCHING_M,
     Placement,
@@ -46,6 +46,10 @@ STAYED_M = 1e-3
 
 MOST_RELEASES = 3
 """Times that objects are released, each from where exact rest gave up the time before."""
+
+
+class UnsupportedError(SettleError):
+    """No balance was found, or none that holds."""
 
 
 class LeftRoomError(Exception):
@@ -123,7 +127,7 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace], flat
     """Release at these paces until at rest; None where a footprint left the flat top, so that the table's edges may matter.
 
     The simulation may end with objects that rolling friction or a shape's margin holds out of balance. They are followed
-    as they tip, and released again where that takes them far.
+    as they tip or slip, and released again where that takes them far.
     """
     seconds, placement = 0.0, None
     for _ in range(MOST_RELEASES):
@@ -141,15 +145,15 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace], flat
         ending = _Ending(drop, placement, outcome.poses, seconds, outcome.speed_m_s)
         if not exact:
             return ending
-        rested = rest(placement.things, outcome.poses, placement.forms[-1].surface, placement.friction)
+        rested = hold(drop, placement, outcome.poses)
         if rested.still:
-            return dataclasses.replace(ending, poses=hold(drop, placement, rested.poses))
+            return dataclasses.replace(ending, poses=rested.poses)
         starts = (dataclasses.replace(one, T_world_obj=T) for one, T in zip(drop.starts, rested.poses, strict=True))
         drop = dataclasses.replace(drop, starts=tuple(starts))
     raise UnsupportedError(
         "unsupported",
-        f"{'it tips' if drop.single else 'something tips'} on without end: released {MOST_RELEASES} times, for {seconds:.1f} "
-        "s in all, it never came into balance: lower physics.rest.speed_mm_s",
+        f"{'it tips or slips' if drop.single else 'something tips or slips'} on without end: released {MOST_RELEASES} times, "
+        f"for {seconds:.1f} s in all, it never came into balance: lower physics.rest.speed_mm_s, or raise physics.friction",
     )
 
 
