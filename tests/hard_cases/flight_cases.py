@@ -11,6 +11,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from schemas.base import Array
+from tests.gravity import set_gravity
 from tests.physics.room import MARGIN_M, G, advance, at, box_body, drop, physics
 from workers.geometry.frames import pose, rotation_about, rotation_from_quaternion
 from workers.physics.rigid_body import Body
@@ -46,7 +47,7 @@ def flown(flight: Flight) -> tuple[Array, Array]:
     stride = round(RATE_HZ * flight.seconds / SAMPLES)
     turned, spins = [np.eye(3)], [np.array(flight.spin)]
     with drop(flight.body, at(0.0, 3.0), 0.0, physics(step_hz=RATE_HZ), 1) as world:
-        world.set_gravity((0.0, 0.0, 0.0))
+        set_gravity(world, (0.0, 0.0, 0.0))
         world.set_velocity((0.0, 0.0, 0.0), flight.spin)
         for _ in range(SAMPLES):
             advance(world, stride)

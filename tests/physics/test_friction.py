@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from tests.gravity import set_gravity
 from tests.physics.room import MARGIN_M, PHYSICS, G, advance, at, box_body, drop, order, physics, slope
 
 MU = PHYSICS.friction**2
@@ -29,7 +30,7 @@ def speed_on_slope(rate_hz: int, angle_rad: float, heading_rad: float) -> float:
     settings = physics(step_hz=rate_hz)
     with drop(FLAT, at(0, 0.005 + MARGIN_M), 0.0, settings, 1) as world:
         advance(world, rate_hz)
-        world.set_gravity(slope(angle_rad, heading_rad))
+        set_gravity(world, slope(angle_rad, heading_rad))
         advance(world, rate_hz // 2)
         return math.hypot(*world.velocity()[0][:2])
 

@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from schemas.base import Array
+from tests.gravity import set_gravity
 from tests.physics.room import advance, at, box_body, drop, order, physics
 from workers.geometry.frames import rotation_from_quaternion
 
@@ -25,7 +26,7 @@ PUSHED = np.array([0.01, 1.0, 0.01]) * SPIN_RAD_S
 def simulated(rate_hz: int, seconds: float, spin: tuple[float, ...]) -> tuple[Array, Array]:
     """(R_world_body [3, 3], angular velocity [3] in the world), in the air without gravity."""
     with drop(BOX, at(0.0, 3.0), 0.0, physics(step_hz=rate_hz), 1) as world:
-        world.set_gravity((0.0, 0.0, 0.0))
+        set_gravity(world, (0.0, 0.0, 0.0))
         world.set_velocity((0.0, 0.0, 0.0), spin)
         advance(world, round(rate_hz * seconds))
         return rotation_from_quaternion(np.array(world.pose()[1])), np.array(world.velocity()[1])

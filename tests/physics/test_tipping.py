@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from schemas.job.physics import Physics
+from tests.gravity import set_gravity
 from tests.physics.room import G, advance, at, box_body, drop, lean, order, physics, slope
 from workers.physics.rigid_body import MARGIN_M
 
@@ -41,9 +42,9 @@ def tips(settings: Physics, nearly_rad: float, angle_rad: float) -> bool:
     """
     with drop(BOX, at(0, HEIGHT_M / 2 + MARGIN_M), 0.0, settings, 1) as world:
         advance(world, settings.step_hz // 4)
-        world.set_gravity(slope(nearly_rad))
+        set_gravity(world, slope(nearly_rad))
         advance(world, settings.step_hz // 2)
-        world.set_gravity(slope(angle_rad))
+        set_gravity(world, slope(angle_rad))
         for _ in range(2 * settings.step_hz):
             world.advance()
             if abs(lean(world)) > TIPPED_RAD:

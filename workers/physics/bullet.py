@@ -100,10 +100,6 @@ class World:
             self.bodies[body], -1, activationState=pybullet.ACTIVATION_STATE_SLEEP, physicsClientId=self.client
         )
 
-    def set_gravity(self, gravity: Sequence[float]) -> None:
-        """Set gravity, m/s^2, in this world alone."""
-        pybullet.setGravity(*gravity, physicsClientId=self.client)
-
     def set_restitution(self, restitution: float) -> None:
         """Set the restitution of ground and bodies; a contact's is the product of the two.
 

@@ -103,7 +103,7 @@ def _let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: floa
     points = np.concatenate([transform(T, one.hull.vertices) for one, T in zip(drop.starts, poses, strict=True)])
     low_m, inside_m = points[:, 2].min(), inside_margin(points[:, :2], top.outline).min()
     level = top.convex and low_m > top.height_m - near_m and inside_m > near_m
-    skins = _skins(placement, poses, near_m, top.height_m if level else None)
+    skins = _skins(placement, poses, near_m, top.height_m if level else -math.inf)
     whole = [make_body(start, parts) for start, parts in zip(drop.starts, skins, strict=True)]
     bodies = [dataclasses.replace(body, margin_m=THIN * body.margin_m) for body in whole]
     ground: GroundShape = split_by_side(drop.table.mesh)
@@ -114,14 +114,12 @@ def _let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: floa
     return fall(bodies, poses, ground, physics, StepSizes(physics.step_hz, math.inf), 0.0, stops, reach_m=SKIN_M)
 
 
-def _skins(
-    placement: Placement, poses: Sequence[Pose], near_m: float, level_m: float | None
-) -> list[tuple[Array, ...]]:
+def _skins(placement: Placement, poses: Sequence[Pose], near_m: float, level_m: float) -> list[tuple[Array, ...]]:
     """The pieces [N, 3] of each object, in its own frame, that are within this of others or of the table.
 
-    level_m: height of the half-space that the table is here; only corners of an object's hull can meet it.
+    level_m: height of the half-space that the table is here, which only corners of an object's hull can meet; -inf if it is none.
     """
-    surfaces = placement.surfaces[:-1] if level_m is not None else placement.surfaces
+    surfaces = placement.surfaces if math.isinf(level_m) else placement.surfaces[:-1]
     points = [transform(T, one.vertices) for T, one in zip((*poses, np.eye(4)), surfaces, strict=False)]
     near = [np.zeros(len(one.faces), dtype=np.bool_) for one in surfaces]
     for i, j in itertools.combinations(range(len(surfaces)), 2):
@@ -129,9 +127,7 @@ def _skins(
         near[i][here] = near[j][there] = True
     skins = []
     for start, T, one, each in zip(placement.starts, poses, surfaces, near, strict=False):
+        low = start.hull.vertices[transform(T, start.hull.vertices)[:, 2] <= level_m + near_m]
         skin = skin_of(one, np.flatnonzero(each), SKIN_M)
-        if level_m is not None:
-            low = start.hull.vertices[transform(T, start.hull.vertices)[:, 2] <= level_m + near_m]
-            skin += tuple(corner + SPIKE @ T[:3, :3] for corner in low)
-        skins.append(skin)
+        skins.append((*skin, *(corner + SPIKE @ T[:3, :3] for corner in low)))
     return skins

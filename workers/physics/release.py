@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.base import Array
 from schemas.job.physics import Physics
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart, Table
@@ -141,18 +140,12 @@ def _release(drop: Drop, flat: bool, pace: Pace, looked: int) -> Outcome:
         hover_m = bodies[0].margin_m * (1.0 - SLOP_SHARE)
         ground, stops = table.top.height_m - hover_m, {"edge": leaves_outline(table.top.outline, reach_m)}
     elif flat:
-        ground = _prism(table)
+        levels = (np.full((len(table.top.outline), 1), z) for z in (table.top.height_m, table.top.height_m - PRISM_M))
+        ground = np.concatenate([np.hstack([table.top.outline, level]) for level in levels])
     T_world_body = poses[0] @ bodies[0].T_obj_body
     if math.isfinite(drop.room_m):
         stops["room"] = strays(T_world_body[None, :2, 3], drop.room_m)
     return fall(bodies, poses, ground, physics, steps, free_m, stops, drop.many, standing)
-
-
-def _prism(table: Table) -> Array:
-    """[2 N, 3]: corners of the body below a convex flat top."""
-    outline, height_m = table.top.outline, table.top.height_m
-    levels = (np.full((len(outline), 1), z) for z in (height_m, height_m - PRISM_M))
-    return np.concatenate([np.hstack([outline, level]) for level in levels])
 
 
 def settings_of(drop: Drop, pace: Pace) -> Physics:

@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from schemas.job.job import Job
+from tests.gravity import set_gravity
 from tests.physics.room import at, ball_body, drop, physics
 from tests.shapes import box
 from workers.geometry.frames import pose, quaternion_from_rotation, rotation_about
@@ -106,7 +107,7 @@ def test_a_push_and_another_gravity_end_with_their_world():
     first = fall(body, T)
     with drop(body, T, 0.0, PHYSICS, STEPS) as world:
         world.set_velocity((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
-        world.set_gravity((0.0, 0.0, 0.0))
+        set_gravity(world, (0.0, 0.0, 0.0))
         assert world.velocity() == ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
         world.advance()
         assert world.pose()[0] == pytest.approx(np.array([1.0, 2.0, 3.0]) * STEPS / PHYSICS.step_hz + T[:3, 3])
@@ -133,7 +134,7 @@ def test_quaternions_agree_with_scipy(seed):
 def test_what_overlaps_is_moved_apart_and_gains_no_speed(step_hz):
     deep = 1e-4
     with drop(ball_body(0.05), at(0.0, 0.05 - deep), 0.0, physics(step_hz=step_hz), 1) as world:
-        world.set_gravity((0.0, 0.0, 0.0))
+        set_gravity(world, (0.0, 0.0, 0.0))
         world.advance()
         assert world.velocity()[0] == (0.0, 0.0, 0.0)
         raised = world.pose()[0][2] - (0.05 - deep)

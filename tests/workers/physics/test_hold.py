@@ -10,7 +10,7 @@ from schemas.job.job import Job
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart, Table
 from tests.hard_cases.bodies import built_in, cube
-from tests.hard_cases.drops import Y, level, table_of, turn
+from tests.hard_cases.drops import X, Y, level, table_of, turn
 from tests.hard_cases.groups import put, together
 from tests.physics.settling import settle_group
 from tests.shapes import asset_of, box
@@ -87,6 +87,18 @@ def test_a_small_cube_in_a_hollow_stays_where_exact_rest_puts_it():
     assert let_go_for(0.25, at, table) < 1e-4
     lifted = dataclasses.replace(at[1], T_world_obj=translation(0.0, 0.0, 3e-4) @ at[1].T_world_obj)
     assert let_go_for(0.25, [at[0], lifted], table) > 1e-4
+
+
+def test_a_cube_below_a_bowl_upside_down_is_not_met_by_what_closes_its_rim():
+    """The rim stands on level ground with its corners alone, and its outline has the cube inside."""
+    table = level()
+    bowl = put(built_in("bowl"), table, 0.0, R=turn(X, 180))
+    starts = together(table, [bowl, put(cube(0.01), table, 0.0)]).starts
+    settled = settle_group(starts, table, PHYSICS)
+    at = [dataclasses.replace(one, T_world_obj=rest.T_world_obj) for one, rest in zip(starts, settled, strict=True)]
+    assert let_go_for(0.1, at, table) < HELD_M
+    lifted = dataclasses.replace(at[0], T_world_obj=translation(0.0, 0.0, 1e-4) @ at[0].T_world_obj)
+    assert let_go_for(0.1, [lifted, at[1]], table) == pytest.approx(1e-4, abs=HELD_M)
 
 
 def hanging() -> tuple[tuple[ObjectStart, ...], Table]:
