@@ -10,7 +10,7 @@ from schemas.job.job import Job
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart, Table
 from tests.hard_cases.bodies import built_in, cube
-from tests.hard_cases.drops import X, Y, level, table_of, turn
+from tests.hard_cases.drops import Y, level, table_of, turn
 from tests.hard_cases.groups import put, together
 from tests.physics.settling import settle_group
 from tests.shapes import asset_of, box
@@ -89,16 +89,21 @@ def test_a_small_cube_in_a_hollow_stays_where_exact_rest_puts_it():
     assert let_go_for(0.25, [at[0], lifted], table) > 1e-4
 
 
-def test_a_cube_below_a_bowl_upside_down_is_not_met_by_what_closes_its_rim():
-    """The rim stands on level ground with its corners alone, and its outline has the cube inside."""
+def test_a_lid_on_level_ground_stands_on_the_corners_of_its_rim_and_what_is_within_it_meets_none_of_them():
     table = level()
-    bowl = put(built_in("bowl"), table, 0.0, R=turn(X, 180))
-    starts = together(table, [bowl, put(cube(0.01), table, 0.0)]).starts
-    settled = settle_group(starts, table, PHYSICS)
-    at = [dataclasses.replace(one, T_world_obj=rest.T_world_obj) for one, rest in zip(starts, settled, strict=True)]
-    assert let_go_for(0.1, at, table) < HELD_M
-    lifted = dataclasses.replace(at[0], T_world_obj=translation(0.0, 0.0, 1e-4) @ at[0].T_world_obj)
-    assert let_go_for(0.1, [lifted, at[1]], table) == pytest.approx(1e-4, abs=HELD_M)
+    walls = [
+        box(*sides, (*at, 0.015))
+        for sides, at in (((0.005, 0.1, 0.03), (0.05, 0.0)), ((0.1, 0.005, 0.03), (0.0, 0.05)))
+    ]
+    walls += [
+        box(*sides, (*at, 0.015))
+        for sides, at in (((0.005, 0.1, 0.03), (-0.05, 0.0)), ((0.1, 0.005, 0.03), (0.0, -0.05)))
+    ]
+    lid = put(asset_of(*walls, box(0.105, 0.105, 0.01, (0.0, 0.0, 0.035))), table, 0.0)
+    starts = together(table, [lid, put(asset_of(box(0.02, 0.02, 0.03 - FAR_M)), table, 0.0)]).starts
+    assert let_go_for(0.1, starts, table) < HELD_M
+    lifted = dataclasses.replace(starts[0], T_world_obj=translation(0.0, 0.0, 1e-4) @ starts[0].T_world_obj)
+    assert let_go_for(0.1, [lifted, starts[1]], table) == pytest.approx(1e-4, abs=HELD_M)
 
 
 def hanging() -> tuple[tuple[ObjectStart, ...], Table]:
