@@ -6,8 +6,6 @@ import pytest
 
 WAITING: dict[str, str] = {
     "pile of a hundred boxes": "no result in 40 s",
-    "stack of twenty-five cubes": "no result in 90 s: it sways at 5 to 60 mm/s for all of max_settle_s in the first pace, and "
-    "then falls once more, in steps four times as short",
 }
 """What ends otherwise than declared, and how."""
 

@@ -30,10 +30,6 @@ contact per step: a box that lands on an edge turns about the vertical by ten ti
 MOST_GROUND_VERTICES, MOST_GROUND_INDICES = 131_072, 524_288
 """PyBullet's limits on one collision mesh; beyond them it fails without a reason."""
 
-WARM_START = 1.0
-"""Share of a contact's impulse that the next step begins with, among several bodies: stacks keep their forces from step to
-step. At 0.85 a stack of eight sinks by millimetres. For a single body 0: what rolls over its corners would gain energy."""
-
 DECIMALS = 8
 """Decimals of a collision shape's vertices, metres. Bullet's hull drops vertices where more than three lie in one plane
 except for the last bits."""
@@ -118,13 +114,19 @@ class World:
 
 @contextmanager
 def open_world(
-    placed: Sequence[tuple[Body, Pose]], ground: GroundShape, physics: Physics, steps: int, reach_m: float = math.inf
+    placed: Sequence[tuple[Body, Pose]],
+    ground: GroundShape,
+    physics: Physics,
+    steps: int,
+    reach_m: float = math.inf,
+    kept: float = 1.0,
 ) -> Iterator[World]:
     """Open a world of a ground and of bodies at their `T_world_body`.
 
     `reach_m`: contact distance, if less than Bullet's own. Of two contacts of a vertex with triangles of a mesh
     Bullet keeps the one found last: beside an edge a corner sinks in while the next triangle is in reach. On level ground a
-    shorter reach would keep more rolling bodies from gaining energy, but bowls would spin for ever.
+    shorter reach would keep more rolling bodies from gaining energy, but bowls would spin for ever. `kept`: share of a contact's
+    impulse that the next step begins with, among several bodies; what rolls over its corners alone would gain energy.
 
     Runs are bit-identical with deterministicOverlappingPairs, whatever ran before, because everything is reset first: in
     maximal coordinates a ball that rolled on came elsewhere by a last bit after other worlds. One connection serves
@@ -138,7 +140,7 @@ def open_world(
         enableFileCaching=0,  # it would keep every object's file, 60 kB
         useSplitImpulse=1,
         splitImpulsePenetrationThreshold=0.0,
-        warmStartingFactor=WARM_START if len(placed) > 1 else 0.0,
+        warmStartingFactor=kept if len(placed) > 1 else 0.0,
         contactSlop=min(SLOP_M, SLOP_SHARE * min(body.margin_m for body, _ in placed)),
         contactBreakingThreshold=min(REACH_SHARE, reach_m / min(_size_m(body) for body, _ in placed)),
         physicsClientId=client,

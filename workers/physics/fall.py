@@ -54,12 +54,13 @@ BOUNCES_M_S = 0.1
 class StepSizes:
     """Adaptive time steps: `base_hz`, or more where a point would travel further than `max_travel_m` in one step.
 
-    looked: steps between two looks at the energy, a divisor of `SAMPLE_STEPS`. The motion is the same to the bit.
+    looked: steps between two looks at the energy, a divisor of `SAMPLE_STEPS`; changes no motion. kept: see `open_world`.
     """
 
     base_hz: float
     max_travel_m: float
     looked: int = SAMPLE_STEPS
+    kept: float = 1.0
 
     def rate_hz(self, speed_m_s: float) -> float:
         """Steps per second at the fastest point's speed: `base_hz` times a power of two."""
@@ -126,14 +127,13 @@ def fall(
     placed = [(one, lower @ T @ one.T_obj_body) for one, T in zip(bodies, poses, strict=True)]
     speed_m_s = math.sqrt(2.0 * GRAVITY_M_S2 * fallen_m)
     fallen_s = speed_m_s / GRAVITY_M_S2
+    end_s = physics.max_settle_s - fallen_s
     if isinstance(ground, Mesh | tuple):
         reach_m = min(reach_m, REACH_STEPS * max(steps.max_travel_m, speed_m_s / (FINEST * physics.step_hz)))
-    with open_world(placed, ground, physics, steps.looked, reach_m) as world:
+    with open_world(placed, ground, physics, steps.looked, reach_m, steps.kept) as world:
         for number in range(len(bodies)):
             world.set_velocity((0.0, 0.0, -speed_m_s), body=number)
-        outcome = _simulate(
-            world, bodies, physics, steps, physics.max_settle_s - fallen_s, stops or {}, sleeping, standing
-        )
+        outcome = _simulate(world, bodies, physics, steps, end_s, stops or {}, sleeping, standing)
     ended = tuple(T @ invert(one.T_obj_body) for T, one in zip(outcome.poses, bodies, strict=True))
     return dataclasses.replace(outcome, poses=ended, seconds=outcome.seconds + fallen_s)
 
