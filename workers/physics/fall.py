@@ -74,9 +74,8 @@ class StepSizes:
 class Outcome:
     """The end of a simulation, with `T_world_obj` [4, 4] of every object.
 
-    speed_m_s: of the fastest point; where all `rested`, the drift over the last window. seconds: of free fall and
-    simulation. stopped_by: the name of the stop condition that ended it. rise: how far the energy of all rose, as a share of its
-    bound.
+    speed_m_s: of the fastest point; where all `rested`, the drift over the last window. seconds: of free fall and simulation.
+    stopped_by: the name of the stop condition that ended it. rise: how far the energy of all rose, as a share of its bound.
     """
 
     poses: tuple[Pose, ...]
@@ -123,8 +122,7 @@ def fall(
     less than Bullet's own; on a mesh it follows from the steps.
     """
     fallen_m = min(max(0.0, free_m - SKIPPED_TO_M), GRAVITY_M_S2 * physics.max_settle_s**2 / 2)
-    lower = translation(0.0, 0.0, -fallen_m)
-    placed = [(one, lower @ T @ one.T_obj_body) for one, T in zip(bodies, poses, strict=True)]
+    placed = [(one, translation(0, 0, -fallen_m) @ T @ one.T_obj_body) for one, T in zip(bodies, poses, strict=True)]
     speed_m_s = math.sqrt(2.0 * GRAVITY_M_S2 * fallen_m)
     fallen_s = speed_m_s / GRAVITY_M_S2
     end_s = physics.max_settle_s - fallen_s

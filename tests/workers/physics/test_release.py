@@ -28,6 +28,7 @@ from workers.physics.release import (
     PACES_TOGETHER,
     Drop,
     release,
+    settings_of,
 )
 from workers.physics.table_top import place_table
 
@@ -106,6 +107,12 @@ def falls_of(drop: Drop, rises: list[float], monkeypatch) -> list[tuple[float, i
     monkeypatch.setattr("workers.physics.release.fall", risen)
     release(drop, True, drop.ways[0])
     return falls
+
+
+@pytest.mark.parametrize(("count", "times"), [(1, 1), (2, 1), (25, 1), (26, 2), (100, 4)])
+def test_the_solver_iterates_as_often_again_for_each_twenty_five_objects(count, times):
+    starts = ALONE.starts * count
+    assert settings_of(dataclasses.replace(ALONE, starts=starts), PACES_TOGETHER[0]).solver_iterations == times * 100
 
 
 def test_a_tall_stack_rests_where_not_all_of_an_impulse_is_kept_and_sways_where_it_is():
