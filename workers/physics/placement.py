@@ -49,8 +49,8 @@ class Placement:
 
     def of(self, numbers: Sequence[int]) -> "Placement":
         """Some of the objects, by their numbers, with the same table."""
-        starts, things, forms = (tuple(every[k] for k in numbers) for every in (self.starts, self.things, self.forms))
-        return Placement(starts, things, (*forms, self.forms[-1]), self.friction)
+        starts, things = tuple(self.starts[k] for k in numbers), tuple(self.things[k] for k in numbers)
+        return Placement(starts, things, tuple(self.forms[k] for k in (*numbers, -1)), self.friction)
 
 
 @dataclass(frozen=True)
