@@ -36,8 +36,8 @@ onto the mesh, of the many that roll to an edge; a stack on it gains energy, fou
 class Pace:
     """Steps per second, solver iterations, travel per step and rest window, as shares of what the settings say.
 
-    At a share of the window objects rest at as much more speed. thin: upper bound on the travel per step, as a share of the
-    thinnest object's width. coarse: convex parts are fewer, with fewer vertices, where exact rest follows. kept: see `StepSizes`.
+    At a share of the window objects rest at as much more speed and spin. thin: upper bound on the travel per step, as a share
+    of the thinnest object's width. coarse: fewer convex parts and vertices, where exact rest follows. kept: see `StepSizes`.
     """
 
     rate: float = 1.0
@@ -160,9 +160,9 @@ def settings_of(drop: Drop, pace: Pace) -> Physics:
     physics, rest = drop.physics, drop.physics.rest
     masses = [start.asset.mass.mass_kg for start in drop.starts]
     iterations = math.ceil(math.sqrt(max(masses) / min(masses))) * math.ceil(len(masses) / CROWD)
-    window = {"window_s": pace.window * rest.window_s, "speed_mm_s": rest.speed_mm_s / pace.window}
+    rates = {"speed_mm_s": rest.speed_mm_s / pace.window, "spin_rad_s": rest.spin_rad_s / pace.window}
     changes: dict[str, object] = {
-        "rest": rest.model_copy(update=window),
+        "rest": rest.model_copy(update=rates | {"window_s": pace.window * rest.window_s}),
         "step_hz": max(1, round(pace.rate * physics.step_hz)),
         "solver_iterations": max(1, round(pace.iterations * iterations * physics.solver_iterations)),
         "max_step_travel_mm": pace.travel * (1.0 if drop.single else GROUP_TRAVEL) * physics.max_step_travel_mm,
