@@ -27,6 +27,7 @@ from workers.physics.release import (
     PACES_MANY,
     PACES_TOGETHER,
     Drop,
+    Pace,
     release,
     settings_of,
 )
@@ -107,6 +108,13 @@ def falls_of(drop: Drop, rises: list[float], monkeypatch) -> list[tuple[float, i
     monkeypatch.setattr("workers.physics.release.fall", risen)
     release(drop, True, drop.ways[0])
     return falls
+
+
+def test_what_rests_at_a_share_of_the_window_may_drift_and_turn_as_far_in_it():
+    rest, shorter = PHYSICS.rest, settings_of(ALONE, Pace(window=0.1)).rest
+    assert shorter.window_s == pytest.approx(0.1 * rest.window_s)
+    assert shorter.window_s * shorter.speed_mm_s == pytest.approx(rest.window_s * rest.speed_mm_s)
+    assert shorter.window_s * shorter.spin_rad_s == pytest.approx(rest.window_s * rest.spin_rad_s)
 
 
 @pytest.mark.parametrize(("count", "times"), [(1, 1), (2, 1), (25, 1), (26, 2), (100, 4)])
