@@ -110,12 +110,13 @@ CHAOTIC = (
         first="minute",
     ),
     Chaotic("pile of twenty boxes", HARDLY_LESS, within(0.15), lambda seed: pile(20, seed), tier="slow", first="slow"),
-    # 10.5 l within walls 300 mm high, 27 l.
+    # 10.5 l within walls 600 mm high, 54 l. They fall from up to 2.5 m: MuJoCo keeps all of them inside in 19 of 20 seeds, and
+    # in 5 with walls of 300 mm, which the heap reaches.
     Chaotic(
         "pile of a hundred boxes",
         HARDLY_LESS,
         within(0.15),
-        lambda seed: pile(100, seed, 0.3),
+        lambda seed: pile(100, seed, 0.6),
         tier="slow",
         first="slow",
     ),
