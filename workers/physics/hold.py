@@ -14,6 +14,7 @@ from schemas.job.physics import Rest
 from workers.geometry.contact_surface import faces_within, skin_of
 from workers.geometry.frames import transform
 from workers.physics.bullet import SLOP_SHARE, GroundShape
+from workers.physics.effects import is_convex
 from workers.physics.fall import FINEST, Outcome, StepSizes, fall
 from workers.physics.monitors import strays
 from workers.physics.placement import Placement, farthest_m
@@ -117,17 +118,19 @@ def _let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: floa
 def _skins(placement: Placement, poses: Sequence[Pose], near_m: float, level_m: float) -> list[tuple[Array, ...]]:
     """The pieces [N, 3] of each object, in its own frame, that are within this of others or of the table.
 
-    level_m: height of the half-space that the table is here, which only corners of an object's hull can meet; -inf if it is none.
+    level_m: height of the half-space that the table is here, -inf if it is none. Only corners of an object's hull can meet it:
+    they stand for the foot of one that is not convex, a ring of a hundred faces.
     """
-    surfaces = placement.surfaces if math.isinf(level_m) else placement.surfaces[:-1]
-    points = [transform(T, one.vertices) for T, one in zip((*poses, np.eye(4)), surfaces, strict=False)]
+    surfaces, level = placement.surfaces, [math.isfinite(level_m) and not is_convex(one) for one in placement.starts]
+    points = [transform(T, one.vertices) for T, one in zip((*poses, np.eye(4)), surfaces, strict=True)]
     near = [np.zeros(len(one.faces), dtype=np.bool_) for one in surfaces]
     for i, j in itertools.combinations(range(len(surfaces)), 2):
-        here, there = faces_within((points[i], surfaces[i].faces), (points[j], surfaces[j].faces), near_m)
-        near[i][here] = near[j][there] = True
+        if j < len(poses) or not level[i]:
+            here, there = faces_within((points[i], surfaces[i].faces), (points[j], surfaces[j].faces), near_m)
+            near[i][here] = near[j][there] = True
     skins = []
-    for start, T, one, each in zip(placement.starts, poses, surfaces, near, strict=False):
-        low = start.hull.vertices[transform(T, start.hull.vertices)[:, 2] <= level_m + near_m]
-        skin = skin_of(one, np.flatnonzero(each), SKIN_M)
+    for number, (start, T) in enumerate(zip(placement.starts, poses, strict=True)):
+        low = start.hull.vertices[level[number] & (transform(T, start.hull.vertices)[:, 2] <= level_m + near_m)]
+        skin = skin_of(surfaces[number], np.flatnonzero(near[number]), SKIN_M)
         skins.append((*skin, *(corner + SPIKE @ T[:3, :3] for corner in low)))
     return skins
