@@ -24,11 +24,11 @@ from workers.physics.rest.rest import LEVEL, Rested, rest
 from workers.physics.rigid_body import make_body
 from workers.physics.table_top import inside_margin, split_by_side
 
-HELD = {"rest": Rest(speed_mm_s=0.1, window_s=0.02), "max_settle_s": 0.2}
-"""When what is let go stays: slower than 0.1 mm in a second, for as long as it takes to make up its margins a few times over."""
+HELD = {"rest": Rest(speed_mm_s=0.05, window_s=0.02), "max_settle_s": 0.2}
+"""When what is let go stays: slower than 0.05 mm in a second, for as long as it takes to make up its margins a few times over."""
 
-HELD_M = 2e-5
-"""Motion up to which objects stay, 0.1 mm in a second for all of that time: skins make up their margins by some micrometres."""
+HELD_M = 1.5e-5
+"""Motion up to which objects stay, of 0.075 mm/s for all of that time: skins make up their margins by up to 10 micrometres."""
 
 MOST_HOLDS = 3
 """Times that objects are let go before they fall anew, each from where they came to rest the time before, and twice as far."""
