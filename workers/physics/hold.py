@@ -24,12 +24,12 @@ from workers.physics.rest.rest import LEVEL, Rested, rest
 from workers.physics.rigid_body import make_body
 from workers.physics.table_top import inside_margin, split_by_side
 
-HELD = {"rest": Rest(speed_mm_s=0.05, window_s=0.05), "max_settle_s": 0.2}
-"""When what is let go stays: slower than 0.05 mm in a second. What slips has begun to within 0.05 s; after 0.02 s three of twenty
-boxes still stood that went by half a millimetre."""
+HELD = (9, Rest(speed_mm_s=0.05, window_s=0.05)), (math.inf, Rest(speed_mm_s=0.05, window_s=0.5))
+"""When what is let go stays, for fewer objects than this: slower than half of 0.1 mm/s. Slips in heaps take longer to begin: of
+twenty boxes three stood for 0.3 s before they went by half a millimetre."""
 
 HELD_M = 1.5e-5
-"""Motion up to which objects stay, of 0.075 mm/s for all of that time: skins make up their margins by up to 10 micrometres."""
+"""Motion up to which objects stay: skins make up their margins by up to 10 micrometres."""
 
 MOST_HOLDS = 3
 """Times that objects are let go before they fall anew, each from where they came to rest the time before, and twice as far."""
@@ -55,7 +55,9 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> Rested:
     Forces that balance all weights do not exclude that friction lets go: of more contacts than equations there are many such
     forces, and bodies need not find them. What slips comes to exact rest anew, from where it went.
     """
-    held, far_m = dataclasses.replace(drop, physics=drop.physics.model_copy(update=HELD)), FAR_M
+    still = next(each for fewer_than, each in HELD if len(drop.starts) < fewer_than)
+    changes = {"rest": still, "max_settle_s": 0.15 + still.window_s}
+    held, far_m = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes)), FAR_M
     for _ in range(MOST_HOLDS):
         rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction)
         if not rested.still:
