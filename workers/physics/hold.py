@@ -24,9 +24,9 @@ from workers.physics.rest.rest import LEVEL, Rested, rest
 from workers.physics.rigid_body import make_body
 from workers.physics.table_top import inside_margin, split_by_side
 
-HELD = (9, Rest(speed_mm_s=0.05, window_s=0.05)), (math.inf, Rest(speed_mm_s=0.05, window_s=0.5))
-"""When what is let go stays, for fewer objects than this: slower than half of 0.1 mm/s. Slips in heaps take longer to begin: of
-twenty boxes three stood for 0.3 s before they went by half a millimetre."""
+HELD = (16, Rest(speed_mm_s=0.05, window_s=0.05)), (math.inf, Rest(speed_mm_s=0.05, window_s=1.0))
+"""When what is let go stays, in groups of fewer objects than this: slower than half of 0.1 mm/s. Slips in heaps take longer to
+begin: of twenty boxes three stood for 0.6 s before they went by half a millimetre."""
 
 HELD_M = 1.5e-5
 """Motion up to which objects stay: skins make up their margins by up to 10 micrometres."""
@@ -38,8 +38,7 @@ FAR_M = 2e-4
 """Motion of a centre of mass at which they are stopped at first: only faces within twice that are there to meet."""
 
 THIN = 0.1
-"""Margin of skins as a share of what bodies fall with: by one and a half times that Bullet pushes apart what touches, which would
-lift the top of a stack of ten by 0.12 mm."""
+"""Margin of skins as a share of what bodies fall with, by which Bullet would lift the top of a stack of ten by 0.12 mm."""
 
 SKIN_M = 1e-4
 """Depth of skins, and contact distance, above both margins. Bullet's own distance, some millimetres, finds many contacts between
@@ -55,17 +54,17 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> Rested:
     Forces that balance all weights do not exclude that friction lets go: of more contacts than equations there are many such
     forces, and bodies need not find them. What slips comes to exact rest anew, from where it went.
     """
-    still = next(each for fewer_than, each in HELD if len(drop.starts) < fewer_than)
-    changes = {"rest": still, "max_settle_s": 0.15 + still.window_s}
-    held, far_m = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes)), FAR_M
-    for _ in range(MOST_HOLDS):
+    for far_m in (2.0**number * FAR_M for number in range(MOST_HOLDS)):
         rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction)
         if not rested.still:
             return rested
+        most = max(map(len, _groups(placement, rested.poses, 2.0 * far_m, False)), default=0)
+        still = next(each for fewer_than, each in HELD if most < fewer_than)
+        changes = {"rest": still, "max_settle_s": 0.15 + still.window_s}
+        held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes))
         poses = let_go(held, placement, rested.poses, far_m, level=False)
         if farthest_m(drop.starts, rested.poses, poses) <= HELD_M:
             return rested
-        far_m *= 2.0
     return Rested(tuple(poses), False, 0)
 
 
