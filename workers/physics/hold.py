@@ -24,7 +24,7 @@ from workers.physics.rest.rest import LEVEL, Rested, rest
 from workers.physics.rigid_body import make_body
 from workers.physics.table_top import inside_margin, split_by_side
 
-HELD = (16, Rest(speed_mm_s=0.05, window_s=0.05)), (math.inf, Rest(speed_mm_s=0.05, window_s=1.0))
+HELD = (9, Rest(speed_mm_s=0.05, window_s=0.05)), (math.inf, Rest(speed_mm_s=0.05, window_s=1.0))
 """When what is let go stays, in groups of fewer objects than this: slower than half of 0.1 mm/s. Slips in heaps take longer to
 begin: of twenty boxes three stood for 0.6 s before they went by half a millimetre."""
 
