@@ -91,14 +91,8 @@ def test_a_small_cube_in_a_hollow_stays_where_exact_rest_puts_it():
 
 def test_a_lid_on_level_ground_stands_on_the_corners_of_its_rim_and_what_is_within_it_meets_none_of_them():
     table = level()
-    walls = [
-        box(*sides, (*at, 0.015))
-        for sides, at in (((0.005, 0.1, 0.03), (0.05, 0.0)), ((0.1, 0.005, 0.03), (0.0, 0.05)))
-    ]
-    walls += [
-        box(*sides, (*at, 0.015))
-        for sides, at in (((0.005, 0.1, 0.03), (-0.05, 0.0)), ((0.1, 0.005, 0.03), (0.0, -0.05)))
-    ]
+    walls = [box(0.005, 0.1, 0.03, (x, 0.0, 0.015)) for x in (-0.05, 0.05)]
+    walls += [box(0.1, 0.005, 0.03, (0.0, y, 0.015)) for y in (-0.05, 0.05)]
     lid = put(asset_of(*walls, box(0.105, 0.105, 0.01, (0.0, 0.0, 0.035))), table, 0.0)
     starts = together(table, [lid, put(asset_of(box(0.02, 0.02, 0.03 - FAR_M)), table, 0.0)]).starts
     assert let_go_for(0.1, starts, table) < HELD_M
