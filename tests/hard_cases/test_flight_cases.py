@@ -17,9 +17,8 @@ from tests.hard_cases.flight_cases import (
     momenta,
     sleeping_rad_s,
 )
-from tests.hard_cases.waiting import marks_of
 
-ROWS = [pytest.param(one, id=one.name, marks=marks_of(one.name)) for one in FLIGHTS]
+ROWS = [pytest.param(one, id=one.name) for one in FLIGHTS]
 
 
 @pytest.mark.parametrize("flight", ROWS)

@@ -15,11 +15,8 @@ from schemas.scene.scene import Settled
 from tests.hard_cases.camera_cases import CAMERAS
 from tests.hard_cases.case import EITHER, FALL, SETTLE, UNDEFINED, Case, Made
 from tests.hard_cases.cases import CASES
-from tests.hard_cases.chaotic_cases import CHAOTIC
-from tests.hard_cases.flight_cases import FLIGHTS
 from tests.hard_cases.gate import verdicts, what_is_wrong
 from tests.hard_cases.spin import spinning
-from tests.hard_cases.waiting import WAITING, marks_of
 from tests.physics.settling import recheck_group, settle_group
 
 PHYSICS = Job(name="t").physics
@@ -102,7 +99,7 @@ def rows(cases: Sequence[Case], again: bool) -> list[Any]:
     found = []
     for case in cases:
         tiers = {case.tier, case.again} if again else {case.tier}
-        marks = [getattr(pytest.mark, name) for name in sorted(tiers - {""})] + marks_of(case.name)
+        marks = [getattr(pytest.mark, name) for name in sorted(tiers - {""})]
         found.append(pytest.param(case, id=case.name, marks=marks))
     return found
 
@@ -146,7 +143,3 @@ def test_whatever_may_settle_has_a_pose_that_it_must_have():
     assert [
         case.name for case in CASES if (case.measure is None) != (case.outcome == FALL or "refuse:" in case.outcome)
     ] == []
-
-
-def test_what_is_said_to_wait_is_in_the_table():
-    assert set(WAITING) <= {case.name for case in (*CASES, *CHAOTIC, *FLIGHTS)}

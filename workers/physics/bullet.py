@@ -31,8 +31,7 @@ MOST_GROUND_VERTICES, MOST_GROUND_INDICES = 131_072, 524_288
 """PyBullet's limits on one collision mesh; beyond them it fails without a reason."""
 
 DECIMALS = 8
-"""Decimals of a collision shape's vertices, metres. Bullet's hull drops vertices where more than three lie in one plane
-except for the last bits."""
+"""Decimals of a shape's vertices, metres: Bullet's hull drops some of four and more in one plane but for the last bits."""
 
 RESIDUAL_SHARE = 0.003
 """Change of velocity at which the solver stops to iterate, as a share of what gravity adds in a step. Bullet's default is a
@@ -92,9 +91,8 @@ class World:
 
         Bullet wakes it after `advance` where there are other bodies.
         """
-        pybullet.changeDynamics(
-            self.bodies[body], -1, activationState=pybullet.ACTIVATION_STATE_SLEEP, physicsClientId=self.client
-        )
+        asleep = pybullet.ACTIVATION_STATE_SLEEP
+        pybullet.changeDynamics(self.bodies[body], -1, activationState=asleep, physicsClientId=self.client)
 
     def set_restitution(self, restitution: float) -> None:
         """Set the restitution of ground and bodies; a contact's is the product of the two.
@@ -102,14 +100,9 @@ class World:
         Bullet solves contacts before they close and removes speed in portions too slow to bounce: with steps shorter than
         its contact distance over the speed nothing bounces. So contacts that bounce are solved only once bodies overlap.
         """
+        changes = {"restitution": restitution, "contactProcessingThreshold": 0.0 if restitution > 0.0 else NO_THRESHOLD}
         for thing in (*self.grounds, *self.bodies):
-            pybullet.changeDynamics(
-                thing,
-                -1,
-                restitution=restitution,
-                contactProcessingThreshold=0.0 if restitution > 0.0 else NO_THRESHOLD,
-                physicsClientId=self.client,
-            )
+            pybullet.changeDynamics(thing, -1, physicsClientId=self.client, **changes)
 
 
 @contextmanager
@@ -195,13 +188,9 @@ def _shape_of_mesh(client: int, mesh: Mesh) -> int:
             f"the table has {len(mesh.vertices)} vertices and {len(mesh.faces)} faces, and PyBullet takes "
             f"{MOST_GROUND_VERTICES} and {MOST_GROUND_INDICES // 3}: use a coarser table, or lower assets.limits",
         )
-    shape: int = pybullet.createCollisionShape(
-        pybullet.GEOM_MESH,
-        vertices=_BUFFERS.vertices(mesh.vertices),
-        indices=_BUFFERS.indices(mesh.faces.ravel()),
-        flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
-        physicsClientId=client,
-    )
+    flags = pybullet.GEOM_FORCE_CONCAVE_TRIMESH
+    triangles = {"vertices": _BUFFERS.vertices(mesh.vertices), "indices": _BUFFERS.indices(mesh.faces.ravel())}
+    shape: int = pybullet.createCollisionShape(pybullet.GEOM_MESH, flags=flags, physicsClientId=client, **triangles)
     return shape
 
 
@@ -251,8 +240,7 @@ def _shape_of(client: int, parts: Sequence[Array], turned: Mapping[str, list[flo
 
 def _set_surface(client: int, thing: int, physics: Physics, body: Body | None = None) -> None:
     """Set friction and margin of a body, or of the ground, and no damping."""
-    # A contact's arm is the sum over both of one's rolling friction times the other's friction. The bodies get the ground's
-    # share too, so that rolling friction can be left out for them.
+    # A contact's arm sums over both one's rolling friction times the other's friction: the bodies have the ground's share too
     share = 0.0 if body is None else 2.0
     pybullet.changeDynamics(
         thing,

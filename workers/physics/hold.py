@@ -18,7 +18,7 @@ from workers.physics.effects import is_convex
 from workers.physics.fall import FINEST, Outcome, StepSizes, fall
 from workers.physics.monitors import strays
 from workers.physics.placement import Placement, farthest_m
-from workers.physics.release import Drop, Pace, settings_of
+from workers.physics.release import CROWD, Drop, Pace, settings_of
 from workers.physics.rest.contacts import contacts_within
 from workers.physics.rest.rest import LEVEL, Rested, rest
 from workers.physics.rigid_body import make_body
@@ -41,8 +41,7 @@ THIN = 0.1
 """Margin of skins as a share of what bodies fall with, by which Bullet would lift the top of a stack of ten by 0.12 mm."""
 
 SKIN_M = 1e-4
-"""Depth of skins, and contact distance, above both margins. Bullet's own distance, some millimetres, finds many contacts between
-skins that do nothing."""
+"""Depth of skins, and contact distance, above both margins: Bullet's own, of millimetres, finds many that do nothing."""
 
 SPIKE = 2.0 * SKIN_M * np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.0], [-0.1, -0.1, 1.0]])
 """[4, 3] metres, world: the piece above a corner that meets level ground, of which nothing else does."""
@@ -52,32 +51,37 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> Rested:
     """Exact rest of objects from these `T_world_obj`, in which they stay when they are let go; or how far they came.
 
     Forces that balance all weights do not exclude that friction lets go: of more contacts than equations there are many such
-    forces, and bodies need not find them. What slips comes to exact rest anew, from where it went.
+    forces, and bodies need not find them. What slips comes to exact rest anew, from where it went. A crowd is not let go.
     """
     for far_m in (2.0**number * FAR_M for number in range(MOST_HOLDS)):
         rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction)
-        if not rested.still:
+        if not rested.still or len(poses) >= CROWD:
             return rested
-        most = max(map(len, _groups(placement, rested.poses, 2.0 * far_m, False)), default=0)
+        groups = _groups(placement, rested.poses, 2.0 * far_m, level=False)
+        most = max(map(len, groups), default=0)
         still = next(each for fewer_than, each in HELD if most < fewer_than)
         changes = {"rest": still, "max_settle_s": 0.15 + still.window_s}
         held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes))
-        poses = let_go(held, placement, rested.poses, far_m, level=False)
+        poses = let_go(held, placement, rested.poses, far_m, groups)
         if farthest_m(drop.starts, rested.poses, poses) <= HELD_M:
             return rested
     return Rested(tuple(poses), False, 0)
 
 
 def let_go(
-    drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: float = FAR_M, level: bool = True
+    drop: Drop,
+    placement: Placement,
+    poses: Sequence[Pose],
+    far_m: float = FAR_M,
+    groups: Sequence[list[int]] | None = None,
 ) -> tuple[Pose, ...]:
     """The `T_world_obj` of objects, let go at these in the finest steps, once they rest, or one of them has moved by `far_m`.
 
-    What cannot meet is let go on its own: beside others Bullet's solver ends before it has found the forces of each. level:
-    also what has level contacts alone, which wedge nothing.
+    What cannot meet is let go on its own: beside others Bullet's solver ends before it has found the forces of each. groups:
+    of those to let go; all, if not given.
     """
     went = list(poses)
-    for group in _groups(placement, poses, 2.0 * far_m, level):
+    for group in _groups(placement, poses, 2.0 * far_m, level=True) if groups is None else groups:
         few = dataclasses.replace(drop, starts=tuple(drop.starts[k] for k in group))
         outcome = _let_go(few, placement.of(group), [poses[k] for k in group], far_m)
         for k, T in zip(group, outcome.poses, strict=True):
@@ -86,7 +90,7 @@ def let_go(
 
 
 def _groups(placement: Placement, poses: Sequence[Pose], near_m: float, level: bool) -> list[list[int]]:
-    """The numbers of objects with others within `near_m` in between; only those where contacts are aslant, if not `level`."""
+    """The numbers of objects with others within `near_m` in between; without `level` only those with contacts aslant."""
     contacts, count = contacts_within(placement.surfaces, (*poses, np.eye(4)), near_m), len(poses)
     paired, aslant = contacts.lower < count, np.linalg.norm(contacts.normals[:, :2], axis=1) > LEVEL
     pairs = np.ones(paired.sum()), (contacts.upper[paired], contacts.lower[paired])

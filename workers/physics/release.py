@@ -17,8 +17,8 @@ from workers.physics.monitors import falls_below, leaves_outline, stays_standing
 from workers.physics.rigid_body import build_body, choose_collision_shape
 
 MANY, CROWD = 4, 25
-"""Number of objects from which they fall as coarser convex parts: the time grows with the pairs of parts near one another. And
-that for each of which the solver iterates as often again: of fifty boxes in a tray some slide on for 20 s otherwise."""
+"""Number of objects from which they fall as coarser convex parts, as time grows with the pairs of parts that are near. And that
+from which they fall in the finest steps at once, and are not let go again: a second of that takes a hundred two minutes."""
 
 GROUP_TRAVEL = 40.0
 """Several objects may travel so many times further in a step, 2 mm. Where they come to rest is chaotic: its distribution
@@ -34,16 +34,17 @@ onto the mesh, of the many that roll to an edge; a stack on it gains energy, fou
 
 @dataclass(frozen=True)
 class Pace:
-    """Steps per second, solver iterations, travel per step and rest window, as shares of what the settings say.
+    """Steps per second, solver iterations, travel per step, rest window and rest speed, as shares of what the settings say.
 
-    At a share of the window objects rest at as much more speed and spin. thin: upper bound on the travel per step, as a share
-    of the thinnest object's width. coarse: fewer convex parts and vertices, where exact rest follows. kept: see `StepSizes`.
+    thin: upper bound on the travel per step, as a share of the thinnest object's width. coarse: fewer convex parts and
+    vertices, where exact rest follows. kept: see `StepSizes`.
     """
 
     rate: float = 1.0
     iterations: float = 1.0
     travel: float = 1.0
     window: float = 1.0
+    speed: float = 1.0
     thin: float = THIN_SHARE
     coarse: bool = False
     kept: float = 1.0
@@ -57,10 +58,10 @@ PACES = (
 )
 """Of a single object, one after the other while its energy rises."""
 
-PACES_TOGETHER = (Pace(), Pace(rate=16.0, travel=0.25, kept=0.85))
-"""The same of several, where they are not many concave ones; the last once more where they do not come to exact rest. What the
-iterations leave undone adds up, as in a spring, where all of an impulse is kept: a stack of twenty-five cubes sways for ever, and
-rests in 0.3 s with 0.8 to 0.9 kept. In 960 steps a second a stack of eight sinks by millimetres then."""
+PACES_TOGETHER = (Pace(), Pace(rate=16.0, travel=0.25, speed=10.0, kept=0.85))
+"""The same of several, where they are not many concave ones; the last alone of a crowd, and once more where others do not come to
+exact rest. What iterations leave undone adds up, as in a spring, where all of an impulse is kept: a stack of twenty-five cubes
+sways for ever, and rests in 0.3 s with 0.8 to 0.9 kept. In 960 steps a second a stack of eight sinks by millimetres then."""
 
 MOST_RISE = 0.3
 """Rise of energy, as a share of its bound, up to which a pace was slow enough for several: the simulation looks every eight
@@ -70,9 +71,8 @@ DOUBTFUL_RISE, KNOWN_RISE = 0.4, 0.9
 """The same for a single object. From the first share a drop is repeated with a look after each step, which changes nothing of
 it; up to the second, known so, the pace was slow enough."""
 
-PACES_MANY = (Pace(rate=0.5, iterations=0.25, window=0.1, thin=0.25, coarse=True), Pace(coarse=True))
-"""Of many concave objects, the second where they do not come to exact rest after the first: all of the 36 of 48 piles of eight
-that stayed on the table did, in 1.5 s of processor each on average. Their bounces are more than a rise of energy."""
+PACES_MANY = (Pace(rate=0.5, iterations=0.25, window=0.1, speed=10.0, thin=0.25, coarse=True), Pace(coarse=True))
+"""Of many concave objects, the second where they do not come to exact rest. Their bounces are more than a rise of energy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +103,8 @@ class Drop:
         """The paces to fall at, and those to fall at once more where what comes to rest is refused."""
         if self.single:
             return (PACES,)
+        if len(self.starts) >= CROWD:
+            return (PACES_TOGETHER[-1:],)
         return (PACES_MANY[:1], PACES_MANY[1:]) if self.many else (PACES_TOGETHER, PACES_TOGETHER[-1:])
 
 
@@ -159,8 +161,8 @@ def settings_of(drop: Drop, pace: Pace) -> Physics:
     """
     physics, rest = drop.physics, drop.physics.rest
     masses = [start.asset.mass.mass_kg for start in drop.starts]
-    iterations = math.ceil(math.sqrt(max(masses) / min(masses))) * math.ceil(len(masses) / CROWD)
-    rates = {"speed_mm_s": rest.speed_mm_s / pace.window, "spin_rad_s": rest.spin_rad_s / pace.window}
+    iterations = math.ceil(math.sqrt(max(masses) / min(masses)))
+    rates = {"speed_mm_s": pace.speed * rest.speed_mm_s, "spin_rad_s": pace.speed * rest.spin_rad_s}
     changes: dict[str, object] = {
         "rest": rest.model_copy(update=rates | {"window_s": pace.window * rest.window_s}),
         "step_hz": max(1, round(pace.rate * physics.step_hz)),

@@ -50,9 +50,8 @@ def find_face(T_world_obj: Pose, hull: Hull, com: Array) -> Face | None:
 def snap_to_face(T_world_obj: Pose, hull: Hull, com: Array) -> Pose | None:
     """Turn the object about its centre of mass, by at most `SNAP_RAD`, onto the nearest steady face of its hull.
 
-    A simulator stops with the lowest vertices some tenths of a millimetre apart, because its collision shapes have
-    margins. At rest on a level plane the centre of mass is above a face of the hull. None where no steady face is near. The
-    caller sets the height.
+    A simulator stops with the lowest vertices some tenths of a millimetre apart, because its collision shapes have margins.
+    None where no steady face is near. The caller sets the height.
     """
     face = find_face(T_world_obj, hull, com)
     if face is None:

@@ -160,9 +160,7 @@ def _come_to_rest(drop: Drop, forms: Sequence[Form], paces: Sequence[Pace], flat
 def _rest_as_placed(drop: Drop, forms: Sequence[Form]) -> _Ending | None:
     """Objects that begin in touch and in balance, as a stack that was built; None where they have to fall."""
     poses = tuple(start.T_world_obj for start in drop.starts)
-    lowest_m = min(
-        float(transform(T, one.hull.vertices)[:, 2].min()) for T, one in zip(poses, drop.starts, strict=True)
-    )
+    lowest_m = min(transform(T, one.hull.vertices)[:, 2].min() for T, one in zip(poses, drop.starts, strict=True))
     if lowest_m > drop.table.top.height_m + PLACED_M:
         return None
     placement = _place(drop, poses, forms)

@@ -1,6 +1,7 @@
 """What the simulator is told of a scene: the size of steps, and the settings of the effects that the plan runs."""
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -17,8 +18,9 @@ from tests.physics.settling import recheck_group, settle_group
 from tests.shapes import asset_of, box, table
 from workers.geometry.frames import pose
 from workers.geometry.hull import convex_hull
-from workers.physics.fall import LOOK_STEPS, SAMPLE_STEPS, fall
+from workers.physics.fall import FINEST, LOOK_STEPS, SAMPLE_STEPS, fall
 from workers.physics.release import (
+    CROWD,
     DOUBTFUL_RISE,
     KNOWN_RISE,
     MANY,
@@ -110,24 +112,25 @@ def falls_of(drop: Drop, rises: list[float], monkeypatch) -> list[tuple[float, i
     return falls
 
 
-def test_what_rests_at_a_share_of_the_window_may_drift_and_turn_as_far_in_it():
-    rest, shorter = PHYSICS.rest, settings_of(ALONE, Pace(window=0.1)).rest
-    assert shorter.window_s == pytest.approx(0.1 * rest.window_s)
-    assert shorter.window_s * shorter.speed_mm_s == pytest.approx(rest.window_s * rest.speed_mm_s)
-    assert shorter.window_s * shorter.spin_rad_s == pytest.approx(rest.window_s * rest.spin_rad_s)
+def test_a_pace_has_its_share_of_the_rest_window_and_of_the_rest_speed():
+    rest, other = PHYSICS.rest, settings_of(ALONE, Pace(window=0.1, speed=10.0)).rest
+    assert other.window_s == pytest.approx(0.1 * rest.window_s)
+    assert (other.speed_mm_s, other.spin_rad_s) == pytest.approx((10.0 * rest.speed_mm_s, 10.0 * rest.spin_rad_s))
 
 
-@pytest.mark.parametrize(("count", "times"), [(1, 1), (2, 1), (25, 1), (26, 2), (100, 4)])
-def test_the_solver_iterates_as_often_again_for_each_twenty_five_objects(count, times):
-    starts = ALONE.starts * count
-    assert settings_of(dataclasses.replace(ALONE, starts=starts), PACES_TOGETHER[0]).solver_iterations == times * 100
+@pytest.mark.parametrize("count", [MANY, CROWD - 1, CROWD, 100])
+def test_a_crowd_falls_in_the_finest_steps_at_once_whatever_it_is_of(count):
+    for drop in (ALONE, many_mugs()):
+        paces = itertools.chain(*dataclasses.replace(drop, starts=ALONE.starts * count).ways)
+        assert all(pace.rate == FINEST for pace in paces) == (count >= CROWD)
 
 
 def test_a_tall_stack_rests_where_not_all_of_an_impulse_is_kept_and_sways_where_it_is():
     """Each of twenty-five cubes falls onto the one below, the highest by 12.5 mm, and slips by 0.1 mm at most."""
     group, physics = stack(*[cube(0.05)] * 25), PHYSICS.model_copy(update={"max_settle_s": 0.4})
     drop = Drop(group.starts, group.table, physics, EffectPlan(("dynamics", "fine_step", "object_contacts"), {}))
-    ends = [release(drop, True, (dataclasses.replace(PACES_TOGETHER[-1], kept=kept),)) for kept in (1.0, 0.85)]
+    paces = [dataclasses.replace(PACES_TOGETHER[-1], speed=1.0, kept=kept) for kept in (1.0, 0.85)]
+    ends = [release(drop, True, (pace,)) for pace in paces]
     assert [end.rested for end in ends] == [False, True] and PACES_TOGETHER[-1].kept == 0.85
     moved = [T[:2, 3] - start.T_world_obj[:2, 3] for T, start in zip(ends[1].poses, group.starts, strict=True)]
     assert np.linalg.norm(moved, axis=1).max() < 5e-4

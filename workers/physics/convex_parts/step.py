@@ -51,11 +51,9 @@ LIBRARIES = ("coacd", "manifold3d", "numpy", "scipy")
 NOT_INSTALLED = "the package `{}` is not installed, or cannot be loaded: set Verso up again with `./verso test`"
 
 LONGEST_S = 60
-"""Processor time for all pieces of a mesh: on some broken meshes CoACD never ends. The slowest that did end took half of it.
-
-Half of the default `run.scene_timeout_s`, so that a mesh without an end is a failure of that mesh, the same in every run.
-Where a job sets a shorter time, the worker is killed first, which is a failure of the machine, as for any slow scene.
-"""
+"""Processor time for all pieces of a mesh: on some broken meshes CoACD never ends. The slowest that did end took half of it. It
+is half of the default `run.scene_timeout_s`, so that a mesh without an end is a failure of that mesh, the same in every run:
+where a job sets a shorter time, the worker is killed first, which is a failure of the machine."""
 
 SCRAP = 1e-3
 """Thickness of a loose triangle, as a share of its distance from the middle of the mesh."""
@@ -103,9 +101,8 @@ def decompose(mesh: Mesh, digest: str, threshold: float = THRESHOLD, folder: Pat
 @cache
 def _version() -> str:
     """Digest of the code that parts depend on: this folder's and the geometry's files, and the versions of libraries."""
-    files = [
-        file for folder in (Path(__file__), Path(convexity.__file__)) for file in sorted(folder.parent.glob("*.py"))
-    ]
+    folders = Path(__file__).parent, Path(convexity.__file__).parent
+    files = [file for folder in folders for file in sorted(folder.glob("*.py"))]
     try:
         return key_of(*(file.read_bytes() for file in files), *(version(name) for name in LIBRARIES))
     except PackageNotFoundError as error:
@@ -198,10 +195,6 @@ def _fit(clouds: list[Array], vertices: Array, normals: Array) -> list[Array]:
         return []
     owner = np.concatenate([np.full(len(cloud), k) for k, cloud in enumerate(fitted)])
     points = np.concatenate(fitted)
-    lost: dict[int, list[Array]] = {}
-    for vertex in vertices:
-        away = ((points - vertex) ** 2).sum(axis=1)
-        nearest = int(np.argmin(away))
-        if away[nearest] > 0.0:
-            lost.setdefault(int(owner[nearest]), []).append(vertex)
-    return [np.concatenate([cloud, lost[k]]) if k in lost else cloud for k, cloud in enumerate(fitted)]
+    nearest = np.array([((points - vertex) ** 2).sum(axis=1).argmin() for vertex in vertices])
+    lost = (points[nearest] != vertices).any(axis=1)
+    return [np.concatenate([cloud, vertices[lost & (owner[nearest] == k)]]) for k, cloud in enumerate(fitted)]

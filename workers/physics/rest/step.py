@@ -3,8 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import clarabel
 import daqp
 import numpy as np
+from scipy.sparse import csc_array, eye_array
 
 from schemas.base import Array
 from workers.geometry.frames import cross_each
@@ -18,6 +20,9 @@ OPTIMAL, UNBOUNDED = 1, 1e30
 
 EXACT = 1e-10
 """Tolerance of the solver, in units in which 1 is the free fall of a step."""
+
+MANY = 25
+"""Bodies from which Clarabel is used. Of 8 DAQP takes a seventh of its time, of 20 half of it, of 100 ten times as much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +57,9 @@ def step(bodies: Sequence[Inertia], contacts: Contacts, friction: float, fall: A
     The motion nearest to free fall, measured by kinetic energy, with `n . d + gap >= friction |t . d|` for the relative
     motion d at every contact: the convex relaxation of Coulomb's law by Anitescu (2006, "Optimization-based simulation of
     nonsmooth rigid multibody dynamics"). A least-distance problem, solved by DAQP (Arnstrom et al. 2022, "A dual active-set
-    solver for embedded quadratic programming"). Its multipliers are the contact forces; where nothing moves they balance
-    the weights, which is static equilibrium. Raises JammedError.
+    solver for embedded quadratic programming") or Clarabel (Goulart and Chen 2024, "Clarabel: an interior-point solver for
+    conic programs with quadratic objectives"). Its multipliers are the contact forces; where nothing moves they balance the
+    weights, which is static equilibrium. Raises JammedError.
     """
     roots = [_inverse_root(body.tensor) for body in bodies]
     root_masses = np.sqrt([body.mass_kg for body in bodies])
@@ -66,7 +72,9 @@ def step(bodies: Sequence[Inertia], contacts: Contacts, friction: float, fall: A
     needed = -np.repeat(contacts.gaps / fall_m, CONE_EDGES) - matrix @ free.ravel()
     away, multipliers = _least_distance(matrix, needed)
     forces = gravity_m_s2 * (multipliers.reshape(-1, CONE_EDGES, 1) * edges).sum(axis=1)
-    return _motion((free + away.reshape(free.shape)) * fall_m, roots, root_masses, forces)
+    moved = (free + away.reshape(free.shape)) * fall_m
+    turns = np.stack([root @ each for root, each in zip(roots, moved[:, 3:], strict=True)])
+    return Motion(moved[:, :3] / root_masses[:, None], turns, forces)
 
 
 def _least_distance(matrix: Array, least: Array) -> tuple[Array, Array]:
@@ -74,6 +82,8 @@ def _least_distance(matrix: Array, least: Array) -> tuple[Array, Array]:
     count, size = matrix.shape
     if count == 0:
         return np.zeros(size), np.zeros(0)
+    if size >= MANY * 6:
+        return _interior(matrix, least)
     bounds = np.full(count, UNBOUNDED), least, np.zeros(count, dtype=np.int32)
     x, _, flag, found = daqp.solve(np.eye(size), np.zeros(size), matrix, *bounds, primal_tol=EXACT, dual_tol=EXACT)
     if flag != OPTIMAL:
@@ -81,10 +91,17 @@ def _least_distance(matrix: Array, least: Array) -> tuple[Array, Array]:
     return x, np.maximum(0.0, -found["lam"])
 
 
-def _motion(moved: Array, roots: Sequence[Array], root_masses: Array, forces: Array) -> Motion:
-    """The motion from that in units of root of kinetic energy [bodies, 6]."""
-    turns = np.stack([root @ each for root, each in zip(roots, moved[:, 3:], strict=True)])
-    return Motion(moved[:, :3] / root_masses[:, None], turns, forces)
+def _interior(matrix: Array, least: Array) -> tuple[Array, Array]:
+    """The same by an interior-point method, where each row has few numbers that are not zero."""
+    count, size = matrix.shape
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_feas = settings.tol_gap_abs = settings.tol_gap_rel = 10.0 * EXACT  # rounding allows no less
+    problem = eye_array(size, format="csc"), np.zeros(size), csc_array(-matrix), -least
+    found = clarabel.DefaultSolver(*problem, [clarabel.NonnegativeConeT(count)], settings).solve()
+    if found.status != clarabel.SolverStatus.Solved:
+        raise JammedError
+    return np.array(found.x), np.array(found.z)
 
 
 def _inverse_root(tensor: Array) -> Array:

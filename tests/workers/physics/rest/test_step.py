@@ -7,7 +7,8 @@ import trimesh
 from schemas.scene.shape import Mesh
 from tests.contacts import UP, box, contacts_between, mesh_of, thing_of, tipped
 from workers.geometry.frames import pose, rotation_about
-from workers.physics.rest.step import JammedError, Motion, step
+from workers.physics.rest import step as module
+from workers.physics.rest.step import MANY, JammedError, Motion, step
 
 WITHIN_M = 5e-5
 FALL_M = 1e-4
@@ -121,6 +122,36 @@ def test_what_no_motion_can_free_is_jammed():
     walls = [trimesh.creation.box((0.1, 1.0, 1.0)).apply_translation((x, 0, 0)) for x in (-0.1 + 2e-5, 0.1 - 2e-5)]
     with pytest.raises(JammedError):
         follow([box((0.1, 0.1, 0.1))], mesh_of(trimesh.util.concatenate(walls)))
+
+
+def heap(count: int, overlap_m: float = 0.0) -> tuple[list[Mesh], Mesh]:
+    """Boxes in columns of five that lean on one another, turned at random about the vertical, 20 micrometres apart."""
+    rng, bodies = np.random.default_rng(7), []
+    for number in range(count):
+        turn = rotation_about(UP, rng.uniform(0, 6))
+        at = 0.09 * (number // 5), *rng.uniform(-0.005, 0.005, 1), 0.025 + 0.05002 * (number % 5)
+        bodies.append(box((0.06, 0.06, 0.05), at, turn))
+    return bodies, box((9.0, 1.0, 0.1), (0, 0, -0.05 + overlap_m))
+
+
+@pytest.mark.parametrize("fall_m", [1e-4, 1e-2])
+def test_the_two_solvers_agree(fall_m, monkeypatch):
+    """DAQP and Clarabel share no code: an active set and an interior point."""
+    bodies, ground = heap(MANY)
+    both = []
+    for least in (MANY, MANY + 1):
+        monkeypatch.setattr(module, "MANY", least)
+        both.append(follow(bodies, ground, fall_m=fall_m))
+    assert both[0].moves == pytest.approx(both[1].moves, abs=1e-7 * fall_m)
+    assert both[0].turns == pytest.approx(both[1].turns, abs=1e-6 * fall_m)
+    assert np.abs(both[0].moves).max() > 0.1 * FALL_M and not np.array_equal(both[0].moves, both[1].moves)
+
+
+def test_many_bodies_may_be_jammed_too():
+    walls = [trimesh.creation.box((0.1, 9.0, 1.0)).apply_translation((x, 0, 0)) for x in (-0.1 + 2e-5, 0.1 - 2e-5)]
+    bodies = [box((0.1, 0.1, 0.1), (0, 0.2 * number, 0)) for number in range(MANY)]
+    with pytest.raises(JammedError):
+        follow(bodies, mesh_of(trimesh.util.concatenate(walls)))
 
 
 def test_what_falls_aslant_goes_the_way_of_the_fall():
