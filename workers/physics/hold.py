@@ -25,8 +25,8 @@ from workers.physics.rigid_body import make_body
 from workers.physics.table_top import inside_margin, split_by_side
 
 HELD = (9, Rest(speed_mm_s=0.05, window_s=0.05)), (math.inf, Rest(speed_mm_s=0.05, window_s=1.0))
-"""When what is let go stays, in groups of fewer objects than this: slower than half of 0.1 mm/s. Slips in heaps take longer to
-begin: of twenty boxes three stood for 0.6 s before they went by half a millimetre."""
+"""When what is let go stays, of fewer objects than this: slower than half of 0.1 mm/s. Slips in heaps take longer to begin: of
+twenty boxes three stood for 0.6 s before they went by half a millimetre, and two of a small group before they went by 0.4."""
 
 HELD_M = 1.5e-5
 """Motion up to which objects stay: skins make up their margins by up to 10 micrometres."""
@@ -58,8 +58,7 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> Rested:
         if not rested.still or len(poses) >= CROWD:
             return rested
         groups = _groups(placement, rested.poses, 2.0 * far_m, level=False)
-        most = max(map(len, groups), default=0)
-        still = next(each for fewer_than, each in HELD if most < fewer_than)
+        still = next(each for fewer_than, each in HELD if len(poses) < fewer_than)
         changes = {"rest": still, "max_settle_s": 0.15 + still.window_s}
         held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes))
         poses = let_go(held, placement, rested.poses, far_m, groups)
