@@ -26,7 +26,7 @@ from workers.physics.table_top import inside_margin, split_by_side
 
 HELD = (9, Rest(speed_mm_s=0.05, window_s=0.05)), (math.inf, Rest(speed_mm_s=0.05, window_s=1.0))
 """When what is let go stays, of fewer objects than this: slower than half of 0.1 mm/s. Slips in heaps take longer to begin: of
-twenty boxes three stood for 0.6 s before they went by half a millimetre, and two of a small group before they went by 0.4."""
+twenty boxes three stood for 0.6 s before they went by half a millimetre."""
 
 HELD_M = 1.5e-5
 """Motion up to which objects stay: skins make up their margins by up to 10 micrometres."""
@@ -57,7 +57,7 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> Rested:
         rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction)
         if not rested.still or len(poses) >= CROWD:
             return rested
-        groups = _groups(placement, rested.poses, 2.0 * far_m, level=False)
+        groups = _groups(placement, rested.poses, level=False)
         still = next(each for fewer_than, each in HELD if len(poses) < fewer_than)
         changes = {"rest": still, "max_settle_s": 0.15 + still.window_s}
         held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes))
@@ -80,7 +80,7 @@ def let_go(
     of those to let go; all, if not given.
     """
     went = list(poses)
-    for group in _groups(placement, poses, 2.0 * far_m, level=True) if groups is None else groups:
+    for group in _groups(placement, poses, level=True) if groups is None else groups:
         few = dataclasses.replace(drop, starts=tuple(drop.starts[k] for k in group))
         outcome = _let_go(few, placement.of(group), [poses[k] for k in group], far_m)
         for k, T in zip(group, outcome.poses, strict=True):
@@ -88,9 +88,12 @@ def let_go(
     return tuple(went)
 
 
-def _groups(placement: Placement, poses: Sequence[Pose], near_m: float, level: bool) -> list[list[int]]:
-    """The numbers of objects with others within `near_m` in between; without `level` only those with contacts aslant."""
-    contacts, count = contacts_within(placement.surfaces, (*poses, np.eye(4)), near_m), len(poses)
+def _groups(placement: Placement, poses: Sequence[Pose], level: bool) -> list[list[int]]:
+    """The numbers of objects that can meet before one has moved by `FAR_M`; without `level` only those with contacts aslant.
+
+    Larger groups for what may move farther would hide what slips, as the solver ends too early in them.
+    """
+    contacts, count = contacts_within(placement.surfaces, (*poses, np.eye(4)), 2.0 * FAR_M), len(poses)
     paired, aslant = contacts.lower < count, np.linalg.norm(contacts.normals[:, :2], axis=1) > LEVEL
     pairs = np.ones(paired.sum()), (contacts.upper[paired], contacts.lower[paired])
     _, groups = connected_components(coo_array(pairs, shape=(count, count)), directed=False)
