@@ -57,6 +57,7 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> Rested:
         rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction)
         if not rested.still or len(poses) >= CROWD:
             return rested
+        # No larger groups for what may move farther: the solver ends too early in them, and hides what slips
         groups = _groups(placement, rested.poses, level=False)
         still = next(each for fewer_than, each in HELD if len(poses) < fewer_than)
         changes = {"rest": still, "max_settle_s": 0.15 + still.window_s}
@@ -89,10 +90,7 @@ def let_go(
 
 
 def _groups(placement: Placement, poses: Sequence[Pose], level: bool) -> list[list[int]]:
-    """The numbers of objects that can meet before one has moved by `FAR_M`; without `level` only those with contacts aslant.
-
-    Larger groups for what may move farther would hide what slips, as the solver ends too early in them.
-    """
+    """The numbers of objects that can meet before one has moved by `FAR_M`; without `level` only those with contacts aslant."""
     contacts, count = contacts_within(placement.surfaces, (*poses, np.eye(4)), 2.0 * FAR_M), len(poses)
     paired, aslant = contacts.lower < count, np.linalg.norm(contacts.normals[:, :2], axis=1) > LEVEL
     pairs = np.ones(paired.sum()), (contacts.upper[paired], contacts.lower[paired])
