@@ -17,13 +17,15 @@ from tests.shapes import asset_of, box
 from workers.geometry.frames import motion_between, transform, translation
 from workers.physics import hold as module
 from workers.physics.fall import Outcome
-from workers.physics.hold import FAR_M, HELD_M, MOST_HOLDS, hold, let_go
+from workers.physics.hold import FAR_M, HELD, MOST_HOLDS, hold, let_go
 from workers.physics.placement import Placement, forms_of, place
 from workers.physics.release import Drop
 from workers.physics.rest.rest import Rested, rest
 
 PHYSICS = Job(name="t").physics
 """A friction of 0.7, so that a contact's is 0.49: the angle of friction is 26.1 degrees."""
+
+HELD_M = HELD[0][2]
 
 PLAN = EffectPlan(("dynamics", "fine_step", "object_contacts"), {})
 
