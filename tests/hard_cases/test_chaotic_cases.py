@@ -62,6 +62,7 @@ def rows(tiers: str) -> list[Any]:
     return found
 
 
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("case", rows("first"))
 def test_the_first_seeds_rest_through_the_gate(case):
     found = {seed: wrong_with(case, seed) for seed in range(FIRST)}
