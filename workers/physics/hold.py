@@ -51,15 +51,15 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> Rested:
     Forces that balance all weights do not exclude that friction lets go: of more contacts than equations there are many such
     forces, and bodies need not find them. What slips comes to exact rest anew, from where it went. A crowd is not let go.
     """
+    still, held_m = next((still, most_m) for fewer_than, still, most_m in HELD if len(poses) < fewer_than)
+    changes = {"rest": still, "max_settle_s": 0.15 + still.window_s}
+    held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes))
     for far_m in (2.0**number * FAR_M for number in range(MOST_HOLDS)):
         rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction)
         if not rested.still or len(poses) >= CROWD:
             return rested
         # No larger groups for what may move farther: the solver ends too early in them, and hides what slips
         groups = _groups(placement, rested.poses, level=False)
-        still, held_m = next((still, most_m) for fewer_than, still, most_m in HELD if len(poses) < fewer_than)
-        changes = {"rest": still, "max_settle_s": 0.15 + still.window_s}
-        held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes))
         poses = let_go(held, placement, rested.poses, far_m, groups)
         if farthest_m(drop.starts, rested.poses, poses) <= held_m:
             return rested
