@@ -33,7 +33,7 @@ class Run(Frozen):
     workers: Annotated[int, Field(ge=1, le=100_000)] | None = None
     """None: the cores that this container may use, or the cluster's."""
     shard_size: PositiveInt | None = None
-    """Scenes in a Ray task; rounded up to whole ranges. None: 64, and fewer where that would leave workers idle."""
+    """Scenes in a Ray task; rounded up to whole ranges. None: at most 64, and fewer towards the end."""
     range_size: RangeSize | None = None
     """Scenes in a commit; recorded at the first run. None: at most 16, and fewer where scenes are few or slow."""
     max_failure_share: Share = 0.01

@@ -17,6 +17,7 @@ from services.bench.others import Side, SideProcess, sides_of, start_side
 from services.bench.ratios import Lap
 from services.bench.stages import make_in_memory, open_workbench
 from workers.pipeline.make_scene import Scene
+from workers.store.file_system import sync_tree
 
 WARM_UP = 8
 """Scenes before the clock: they compile shaders, of which pyrender has one for each number of lights, and fill caches."""
@@ -80,6 +81,7 @@ def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
         size = job.run.range_size or ROUND
         for start in range(0, scenes, size):
             span = bench.next_span(min(size, scenes - start))
+            sync_tree(folder)  # what the other sides wrote: ours would wait for it, because its commits flush the file system
             laps["ours"].append(bench.run(span))
             # The input of the next side is made between the clocks.
             files = bench.files(span)

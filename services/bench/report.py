@@ -142,5 +142,5 @@ def _describe_scaling(scaling: dict[str, Any]) -> list[str]:
         f"  Ray gives {scaling['share_of_bare']:.1%} of what plain processes gain",
         f"  Ray's share of time    {format_spread(scaling['ray_share_one'], '.1%')} with one worker, "
         f"{format_spread(scaling['ray_share'], '.1%')} with {scaling['workers']}, their uneven end included; "
-        f"shards of {scaling['shard']}",
+        f"ranges of {scaling['range']}",
     ]

@@ -24,7 +24,7 @@ from services.bench.stages import run_process
 from services.run.coordinator import Coordinator, Limits
 from services.run.joining import terms_of_driver
 from services.run.pattern import Pattern
-from services.run.range_planner import MAX_SHARD, group_shards
+from services.run.range_planner import deal_shards, plan_ranges
 from services.run.ray_cluster import private_ray
 from services.run.slots import PREFETCH, Slots
 from services.run.tally import Tally
@@ -36,25 +36,26 @@ WARM_UP = 8
 
 
 def measure_scaling(
-    job: Job, job_folder: Path, folder: Path, workers: int, scenes: int, rounds: int = 3, shard: int = MAX_SHARD
+    job: Job, job_folder: Path, folder: Path, workers: int, scenes: int, rounds: int = 3
 ) -> dict[str, Any]:
     """One worker, all workers, one process, all processes, and again; always the same scenes, into new folders.
 
-    Everything is warm before: Ray's start, imports, the OpenGL context and its shaders are in no figure. `ray`: workers
-    through the coordinator; `bare`: plain processes, each on a core of its own. ray_share: the share of the slots' time
-    without a shard, the uneven end of the last shards included; ray_share_one: the same with one worker, which has no such
-    end. share_of_bare: Ray's speed-up over that of plain processes.
+    Ranges and shards are those of a run of that many scenes. Everything is warm before: Ray's start, imports, the OpenGL
+    context and its shaders are in no figure. `ray`: workers through the coordinator; `bare`: plain processes, each on a core
+    of its own. ray_share: the share of the slots' time without a shard, the uneven end of the last shards included;
+    ray_share_one: the same with one worker, which has no such end. share_of_bare: Ray's speed-up over that of plain processes.
     """
+    job = job.model_copy(update={"scenes": scenes})
     counts = (1, workers)
     ray: dict[int, list[tuple[Lap, float]]] = {count: [] for count in counts}
     bare: dict[int, list[Lap]] = {count: [] for count in counts}
     each = Span(start=job.first_scene, stop=job.first_scene + max(1, scenes // workers))
     drive = _RayDrive(job, open_catalogue(job.assets, job_folder, tuple(job.categories)), folder, workers)
     with private_ray(workers), plain_processes(job, job_folder, folder, workers) as processes:
-        drive.run("warm", workers, 4 * workers * job.range_size, job.range_size)
+        drive.run("warm", workers, 4 * workers * job.range_size)
         for number in range(rounds):
             for count in counts:
-                ray[count].append(drive.run(f"{number}-{count}", count, scenes, shard))
+                ray[count].append(drive.run(f"{number}-{count}", count, scenes))
             for count in counts:
                 laps = processes.run(f"{number}-{count}", count, each)
                 # They start together, and the lap lasts until the last one's end.
@@ -64,7 +65,7 @@ def measure_scaling(
     reference = gain_of(bare[1], bare[workers])
     return {
         "workers": workers,
-        "shard": shard,
+        "range": job.range_size,
         "ray": gain,
         "bare": reference,
         "ray_share": asdict(Spread.of([idle for _, idle in ray[workers]])),
@@ -130,19 +131,19 @@ class _RayDrive:
     folder: Path
     workers: int
 
-    def run(self, name: str, slots: int, count: int, shard_size: int) -> tuple[Lap, float]:
+    def run(self, name: str, slots: int, count: int) -> tuple[Lap, float]:
         """A lap of that many scenes, and the share of the slots' time without a shard."""
         out, size, first = self.folder / name, self.job.range_size, self.job.first_scene
+        spans = (Span(start=start, stop=stop) for start, stop in plan_ranges(first, first + count, size, []))
         store = LocalStore(out)
         store.prepare()
-        spans = [Span(start=s, stop=min(s + size, first + count)) for s in range(first, first + count, size)]
         tally = Tally(asked=count)
         # The other slot could start a waiting shard, so one worker gets one shard at a time.
         in_flight = PREFETCH * slots if slots == self.workers else slots
         limits = Limits(Slots(slots, in_flight), 1, count)
         pattern = Pattern(ShardOrder.of(str(out), self.job, "bench"), self.catalogue, terms_of_driver())
         begun = time.perf_counter()
-        Coordinator(store, pattern, limits, tally).run(group_shards(spans, shard_size))
+        Coordinator(store, pattern, limits, tally).run(deal_shards(spans, count, size, lambda: slots))
         seconds = time.perf_counter() - begun
         idle = idle_share(tally.shard_wall_s, slots, seconds)
         return Lap(tally.made, seconds, tally.shard_cpu_s, {}), idle

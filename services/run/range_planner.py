@@ -1,7 +1,7 @@
 """Planning of the ranges that are still to be made, such that ranges never overlap."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
@@ -104,24 +104,35 @@ def plan_retries(ledger: Ledger) -> list[Span]:
     return spans
 
 
-def choose_shard_size(scenes: int, slots: int, range_size: int) -> int:
-    """Scenes in a shard: enough that Ray costs little, few enough that every slot has at least two shards.
+def deal_shards(
+    spans: Iterable[Span], scenes: int, range_size: int, count_slots: Callable[[], int]
+) -> Iterator[tuple[Span, ...]]:
+    """Whole ranges in order, in shards that get smaller towards the end, so that all slots end at nearly the same time.
 
-    At most four ranges, so that slow scenes, which have short ranges, have short shards too.
+    A shard has half of an even share of the scenes that are left, and at most 64. At most four ranges, so that slow scenes,
+    which have short ranges, have short shards too. `scenes` are those of all spans. Made one at a time, on demand.
     """
-    return min(MAX_SHARD, MOST_RANGES * range_size, math.ceil(scenes / (2 * slots)))
+    most, left, waiting = min(MAX_SHARD, MOST_RANGES * range_size), scenes, iter(spans)
+    while shard := _take(waiting, min(most, math.ceil(left / (2 * count_slots())))):
+        left -= sum(span.count for span in shard)
+        yield shard
 
 
 def group_shards(spans: Iterable[Span], shard_size: int) -> Iterator[tuple[Span, ...]]:
     """Whole ranges in order, grouped until they hold at least `shard_size` scenes. Made one at a time, on demand."""
+    waiting = iter(spans)
+    while shard := _take(waiting, shard_size):
+        yield shard
+
+
+def _take(spans: Iterator[Span], least: int) -> tuple[Span, ...]:
+    """The next ranges, until they hold at least so many scenes, and at least one; none where none is left."""
     shard: list[Span] = []
     for span in spans:
         shard.append(span)
-        if sum(one.count for one in shard) >= shard_size:
-            yield tuple(shard)
-            shard = []
-    if shard:
-        yield tuple(shard)
+        if sum(one.count for one in shard) >= least:
+            break
+    return tuple(shard)
 
 
 def committed_ranges(ledger: Ledger) -> NDArray[np.int64]:

@@ -23,7 +23,7 @@ from services.run.metrics import Meter, serve
 from services.run.out_folder import explain_lost_folder
 from services.run.pattern import Pattern
 from services.run.progress import ProgressLine, event_log, log_event
-from services.run.range_planner import SpanPlan, choose_shard_size, group_shards, plan_spans
+from services.run.range_planner import SpanPlan, deal_shards, group_shards, plan_spans
 from services.run.ray_cluster import open_ray
 from services.run.slots import SharedSlots, Slots
 from services.run.tally import Tally
@@ -174,7 +174,10 @@ def _make(store: Store, pattern: Pattern, plan: SpanPlan, slots: Slots, keeper: 
     tally = Tally(asked=plan.scenes)
     log_event("started", job=job.name, scenes=tally.asked, slots=slots.running)
     limits = Limits(slots, job.run.max_attempts, int(job.run.max_failure_share * job.scenes))
-    shards = group_shards(plan, job.run.shard_size or choose_shard_size(tally.asked, slots.running, job.range_size))
+    if job.run.shard_size is not None:
+        shards = group_shards(plan, job.run.shard_size)
+    else:
+        shards = deal_shards(plan, plan.scenes, job.range_size, lambda: slots.now().running)
     with contextlib.closing(ProgressLine(tally.asked, job.name)) as line:
 
         def follow(now: Tally) -> None:

@@ -40,7 +40,7 @@ def test_ratios_are_of_slopes_and_the_text_tells_them():
     script = figures["others"]["script_plain"]
     assert script["ratio"] == pytest.approx({"median": 3.5, "least": 3.0, "most": 4.0})
     assert script["load_ms"] == pytest.approx(500.0)
-    scaling = {"workers": 2, "shard": 64, "ray": GAIN, "bare": GAIN, "ray_share": SHARE, "ray_share_one": SHARE}
+    scaling = {"workers": 2, "range": 8, "ray": GAIN, "bare": GAIN, "ray_share": SHARE, "ray_share_one": SHARE}
     rest = {"command": "verso bench", "file_system": "ext4", "other_systems": {"MuJoCo": "3.0", "Blender Cycles": "no"}}
     lines = describe({**figures, **rest, "memory": None, "scaling": {**scaling, "share_of_bare": 0.97}})
     assert "machine    2 of 4 cores (2 threads each), some, load 0.2" in lines

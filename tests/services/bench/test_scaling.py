@@ -33,7 +33,7 @@ def test_plain_processes_make_the_same_scenes_at_the_same_time(tmp_path):
 @pytest.mark.slow
 @pytest.mark.ray
 def test_scaling_tells_rays_part_from_the_machines(tmp_path):
-    told = measure_scaling(validate_job(SMALL, "test"), tmp_path, tmp_path, workers=2, scenes=8, rounds=1, shard=2)
+    told = measure_scaling(validate_job(SMALL, "test"), tmp_path, tmp_path, workers=2, scenes=8, rounds=1)
     assert told["ray"]["scenes"] == told["bare"]["scenes"] == 8
     assert 0 < told["ray_share_one"]["median"] < 1 and 0 < told["ray_share"]["median"] < 1
     assert all(0.2 < told[name]["inflation"]["median"] < 5 for name in ("ray", "bare"))

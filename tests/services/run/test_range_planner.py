@@ -10,8 +10,8 @@ from schemas.dataset.ledger import Ledger, join_rows, rows_of
 from schemas.errors import OutputError
 from schemas.job.job import Job
 from services.run.range_planner import (
-    choose_shard_size,
     committed_ranges,
+    deal_shards,
     group_shards,
     plan_ranges,
     plan_retries,
@@ -116,11 +116,12 @@ def test_the_lazy_plan_is_that_of_a_list_over_every_cell(data):
 
 def test_a_plan_of_a_thousand_million_scenes_is_made_on_demand():
     """The list took 12 GB."""
-    tracemalloc.start()
     job = Job.model_validate({"name": "large", "scenes": 10**9})
-    plan = plan_spans(job, Ledger(join_rows([rows_of([summary(16 * 40_000_000 - 16, stop=16 * 40_000_000)])])), False)
+    ledger = Ledger(join_rows([rows_of([summary(16 * 40_000_000 - 16, stop=16 * 40_000_000)])]))
+    tracemalloc.start()  # after the imports of a first job
+    plan = plan_spans(job, ledger, False)
     assert plan.scenes == 10**9 - 16
-    shards = group_shards(plan, choose_shard_size(plan.scenes, 2, 16))
+    shards = deal_shards(plan, plan.scenes, 16, lambda: 2)
     assert [span.start for span in next(shards)] == [0, 16, 32, 48]
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -160,8 +161,49 @@ def test_a_shard_is_whole_ranges_in_order(size, grouped):
     assert [span for shard in shards for span in shard] == spans
 
 
-def test_every_slot_has_two_shards_and_none_is_too_large():
-    assert choose_shard_size(24, 2, 16) == 6
-    assert choose_shard_size(1, 2, 16) == 1
-    assert choose_shard_size(10**6, 2, 16) == 64
-    assert choose_shard_size(10**6, 2, 1) == 4
+@pytest.mark.parametrize(
+    ("scenes", "slots", "size", "sizes"),
+    [
+        (256, 2, 16, [64, 48, 48, 32, 16, 16, 16, 16]),
+        (24, 2, 2, [6, 6, 4, 2, 2, 2, 2]),
+        (1, 2, 16, [1]),
+        (5, 4, 1, [1, 1, 1, 1, 1]),
+        (40, 1, 4, [16, 12, 8, 4]),
+    ],
+)
+def test_shards_get_smaller_towards_the_end(scenes, slots, size, sizes):
+    spans = [Span(start=start, stop=min(start + size, scenes)) for start in range(0, scenes, size)]
+    shards = list(deal_shards(spans, scenes, size, lambda: slots))
+    assert [sum(span.count for span in shard) for shard in shards] == sizes
+    assert [span for shard in shards for span in shard] == spans
+
+
+@pytest.mark.parametrize(("size", "first"), [(16, 64), (1, 4)])
+def test_no_shard_of_a_large_job_is_too_large(size, first):
+    spans = (Span(start=start, stop=start + size) for start in range(0, 10**6, size))
+    assert sum(span.count for span in next(deal_shards(spans, 10**6, size, lambda: 2))) == first
+
+
+def test_shards_follow_the_slots_of_the_moment():
+    slots, spans = iter([1, 8]), [Span(start=start, stop=start + 1) for start in range(32)]
+    shards = deal_shards(spans, 32, 8, lambda: next(slots))
+    assert [len(next(shards)), len(next(shards))] == [16, 1]
+
+
+@st.composite
+def _deals(draw):
+    scenes, size = draw(st.integers(1, 400)), draw(st.integers(1, 16))
+    seconds = draw(st.lists(st.floats(0.1, 0.2), min_size=scenes, max_size=scenes))
+    return scenes, size, draw(st.integers(1, 8)), seconds
+
+
+@given(_deals())
+def test_slots_end_within_the_time_of_two_ranges(deal):
+    """Each slot takes the next shard when it is free, as Ray does; scenes take from 0.1 to 0.2 s."""
+    scenes, size, slots, seconds = deal
+    spans = [Span(start=start, stop=min(start + size, scenes)) for start in range(0, scenes, size)]
+    free_at = [0.0] * slots
+    for shard in deal_shards(spans, scenes, size, lambda: slots):
+        first = free_at.index(min(free_at))
+        free_at[first] += sum(seconds[scene] for span in shard for scene in span.scene_ids)
+    assert max(free_at) - min(free_at) <= 2 * size * 0.2 + 1e-9
