@@ -81,7 +81,8 @@ def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
         size = job.run.range_size or ROUND
         for start in range(0, scenes, size):
             span = bench.next_span(min(size, scenes - start))
-            sync_tree(folder)  # what the other sides wrote: ours would wait for it, because its commits flush the file system
+            # What the other sides wrote: ours would wait for it, because its commits flush the file system.
+            sync_tree(folder)
             laps["ours"].append(bench.run(span))
             # The input of the next side is made between the clocks.
             files = bench.files(span)
