@@ -50,7 +50,7 @@ def surface_of(mesh: Mesh, closed: bool) -> Surface:
     solid = normals.any(axis=1)
     faces, normals = faces[solid], normals[solid]
     starts, members = _star(faces, len(vertices))
-    edges, across = _bent_edges(vertices, faces, normals)
+    edges, across = _bent_edges(vertices, faces, normals, *_half_edges(faces, len(vertices)))
     side = _sides(vertices, faces, normals, starts, members) if closed else np.zeros(len(faces), dtype=np.int64)
     return Surface(vertices, faces, side, numbers_in(edges, len(vertices)), edges, across, starts, members)
 
@@ -71,19 +71,42 @@ def crop(mesh: Mesh, low: Array, high: Array) -> Mesh:
     return Mesh(mesh.vertices, mesh.faces[near])
 
 
+@compiled
 def _star(faces: Index, count: int) -> tuple[Index, Index]:
     """(starts [count + 1], members): the neighbours of each vertex, one after the other, ascending."""
-    one, other = faces[:, [0, 1, 2, 1, 2, 0]], faces[:, [1, 2, 0, 0, 1, 2]]
-    keys = np.unique(one * count + other)
-    return np.searchsorted(keys, np.arange(count + 1) * count), keys % count
+    keys, starts, found = np.empty(6 * len(faces), np.int64), np.zeros(count + 1, np.int64), 0
+    for f in range(len(faces)):
+        for k in range(3):
+            one, other = faces[f, k], faces[f, (k + 1) % 3]
+            keys[6 * f + 2 * k], keys[6 * f + 2 * k + 1] = one * count + other, other * count + one
+    keys.sort()
+    members = np.empty(len(keys), np.int64)
+    for n in range(len(keys)):
+        if n == 0 or keys[n] != keys[n - 1]:
+            members[found] = keys[n] % count
+            found += 1
+            starts[keys[n] // count + 1] = found
+    for n in range(count):
+        starts[n + 1] = max(starts[n + 1], starts[n])
+    return starts, members[:found].copy()
 
 
 def _half_edges(faces: Index, count: int) -> tuple[Index, Index]:
     """(keys [3 F], ascending, the same for the sides of one edge; which [3 F] sides these are, three times their face and on)."""
-    one, other = faces, np.roll(faces, -1, axis=1)
-    keys = (np.minimum(one, other) * count + np.maximum(one, other)).ravel()
+    keys = _edge_keys(faces, count)
     which = np.argsort(keys, kind="stable")
     return keys[which], which
+
+
+@compiled
+def _edge_keys(faces: Index, count: int) -> Index:
+    """[3 F]: a number for the edge of each side of each face."""
+    keys = np.empty(3 * len(faces), np.int64)
+    for f in range(len(faces)):
+        for k in range(3):
+            one, other = faces[f, k], faces[f, (k + 1) % 3]
+            keys[3 * f + k] = min(one, other) * count + max(one, other)
+    return keys
 
 
 @compiled
@@ -107,20 +130,33 @@ def _sides(vertices: Array, faces: Index, normals: Array, starts: Index, members
     return side
 
 
-def _bent_edges(vertices: Array, faces: Index, normals: Array) -> tuple[Index, Index]:
-    """Edges [E, 2] that are not between two coplanar faces, and the vertices across them [E, 2]."""
-    keys, which = _half_edges(faces, len(vertices))
-    first, last = np.flatnonzero(np.diff(keys, prepend=-1)), np.flatnonzero(np.diff(keys, append=-1))
-    edges = np.stack(np.divmod(keys[first], len(vertices)), axis=1)
-    sides = which[np.stack([first, last], axis=1)]
-    across = faces[sides // 3, (sides + 2) % 3]
-    cosine = _dots(normals[sides[:, 0] // 3], normals[sides[:, 1] // 3])
-    a = vertices[edges[:, 0]]
-    along, p, q = (vertices[each] - a for each in (edges[:, 1], *across.T))
-    # Two faces folded onto one another are coplanar, and their edge is bent all the same: p and q are on one side of it
-    same_side = _dots(p, q) * _dots(along, along) > _dots(along, p) * _dots(along, q)
-    bent = (last != first + 1) | (np.abs(cosine) <= 1.0 - FLAT) | ((across[:, 0] != across[:, 1]) & same_side)
-    return edges[bent], across[bent]
+@compiled
+def _bent_edges(vertices: Array, faces: Index, normals: Array, keys: Index, which: Index) -> tuple[Index, Index]:
+    """Edges [E, 2] that are not between two coplanar faces, and the vertices across them [E, 2]; the rest: `_half_edges`."""
+    edges, across = np.empty((len(keys), 2), np.int64), np.empty((len(keys), 2), np.int64)
+    count = first = 0
+    for last in range(len(keys)):
+        if last + 1 < len(keys) and keys[last + 1] == keys[last]:
+            continue
+        one, other = which[first], which[last]
+        a, b = keys[last] // len(vertices), keys[last] % len(vertices)
+        p, q = faces[one // 3, (one + 2) % 3], faces[other // 3, (other + 2) % 3]
+        bent = last != first + 1 or abs(_dot(normals[one // 3], normals[other // 3])) <= 1.0 - FLAT
+        if not bent and p != q:
+            # Two faces folded onto one another are coplanar, and their edge is bent all the same: p and q are on one side
+            along, u, v = vertices[b] - vertices[a], vertices[p] - vertices[a], vertices[q] - vertices[a]
+            bent = _dot(u, v) * _dot(along, along) > _dot(along, u) * _dot(along, v)
+        if bent:
+            edges[count, 0], edges[count, 1], across[count, 0], across[count, 1] = a, b, p, q
+            count += 1
+        first = last + 1
+    return edges[:count].copy(), across[:count].copy()
+
+
+@compiled
+def _dot(one: Array, other: Array) -> float:
+    """The scalar product of two vectors [3], added in the order of `_dots`."""
+    return float((one[0] * other[0] + one[2] * other[2]) + one[1] * other[1])
 
 
 def _dots(one: Array, other: Array) -> Array:

@@ -32,14 +32,55 @@ def is_convex_surface(mesh: Mesh, solid: manifold3d.Manifold | None) -> bool:
 
 def weld(mesh: Mesh) -> Mesh:
     """The mesh with one vertex at each place, without loose vertices, repeated triangles and triangles of two corners."""
-    used = numbers_in(mesh.faces, len(mesh.vertices))
-    order, new = _ranked(mesh.vertices[used])
-    place = np.zeros(len(mesh.vertices), dtype=np.int32)
-    place[used[order]] = np.cumsum(new) - 1
-    faces = place[mesh.faces]
-    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
-    by_corners, first = _ranked(np.sort(faces, axis=1))
-    return Mesh(mesh.vertices[used[order[new]]], faces[np.sort(by_corners[first])])
+    vertices, used = mesh.vertices, _used_in(mesh.faces, len(mesh.vertices))
+    points = np.ascontiguousarray(vertices[used])
+    places, faces = _welded(points, np.lexsort(points.T[::-1]), used, mesh.faces, len(vertices))
+    corners = np.sort(faces, axis=1)
+    return Mesh(points[places], faces[_firsts(corners, np.lexsort(corners.T[::-1]))])
+
+
+@compiled
+def _used_in(faces: NDArray[np.integer], count: int) -> NDArray[np.int64]:
+    """[N] ascending: which of `count` vertices faces [F, 3] have."""
+    occurs = np.zeros(count, np.bool_)
+    for f in range(len(faces)):
+        for k in range(3):
+            occurs[faces[f, k]] = True
+    return np.flatnonzero(occurs)
+
+
+@compiled
+def _welded(
+    points: Array, order: NDArray[np.int64], used: NDArray[np.int64], faces: NDArray[np.integer], count: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """(the first point [V] at each place, faces [F, 3] of places), without triangles of two corners.
+
+    points [N, 3], with the numbers `used` [N] of `count` vertices that faces [F, 3] are into; order: the points' ascending order.
+    """
+    place, firsts, found = np.empty(count, np.int32), np.empty(len(points), np.int64), 0
+    for n in range(len(order)):
+        a, b = order[n], order[n - 1]
+        if n == 0 or points[a, 0] != points[b, 0] or points[a, 1] != points[b, 1] or points[a, 2] != points[b, 2]:
+            firsts[found] = a
+            found += 1
+        place[used[a]] = found - 1
+    kept, rows = np.empty((len(faces), 3), np.int32), 0
+    for f in range(len(faces)):
+        a, b, c = place[faces[f, 0]], place[faces[f, 1]], place[faces[f, 2]]
+        if a != b and b != c and c != a:
+            kept[rows, 0], kept[rows, 1], kept[rows, 2] = a, b, c
+            rows += 1
+    return firsts[:found].copy(), kept[:rows].copy()
+
+
+@compiled
+def _firsts(rows: NDArray[np.int32], order: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """[N]: whether no row before it is the same; order: the rows' ascending order, the same in order of their number."""
+    firsts = np.ones(len(rows), np.bool_)
+    for n in range(1, len(rows)):
+        a, b = order[n], order[n - 1]
+        firsts[a] = rows[a, 0] != rows[b, 0] or rows[a, 1] != rows[b, 1] or rows[a, 2] != rows[b, 2]
+    return firsts
 
 
 def unique_rows(rows: Array) -> Array:
