@@ -13,10 +13,8 @@ from schemas.scene.shape import Mesh
 from workers.geometry.contact_kernels import SLOPE, Index, bounds_in, find_near
 from workers.geometry.convexity import face_normals, numbers_in, weld
 from workers.geometry.jit import compiled
+from workers.geometry.mesh_edges import FLAT, bent_edges, half_edges, neighbours_of
 from workers.geometry.nearest import nearest_on_segments, nearest_on_triangle
-
-FLAT = 1e-9
-"""One minus the cosine between two faces, below which there is no edge between them."""
 
 WHOLE = 1e-6
 """Share of its area by which a patch of faces in one plane may miss its hull and still count as convex."""
@@ -29,7 +27,7 @@ class Surface:
     vertices [V, 3] metres; faces [F, 3]; side [F]: 1 where all about a face lies below its plane as it is wound, -1 where
     all lies above, 0 where neither or both, and on a surface that is not closed, which has no inside. corners [C]:
     vertices that are not within a plane; edges [E, 2] that bend or bound, across [E, 2]: the vertices beside them (twice the
-    same at one triangle); starts [V + 1] and members: the neighbours of each vertex.
+    same at one triangle); starts [V + 1] and members: the neighbours of each vertex. welded: the mesh with its faces of no area.
     """
 
     vertices: Array
@@ -40,6 +38,7 @@ class Surface:
     across: Index
     starts: Index
     members: Index
+    welded: Mesh
 
 
 def surface_of(mesh: Mesh, closed: bool) -> Surface:
@@ -49,16 +48,16 @@ def surface_of(mesh: Mesh, closed: bool) -> Surface:
     normals = face_normals(vertices, faces)
     solid = normals.any(axis=1)
     faces, normals = faces[solid], normals[solid]
-    starts, members = _star(faces, len(vertices))
-    edges, across = _bent_edges(vertices, faces, normals, *_half_edges(faces, len(vertices)))
+    starts, members = neighbours_of(faces, len(vertices))
+    edges, across = bent_edges(vertices, faces, normals, *half_edges(faces, len(vertices)))
     side = _sides(vertices, faces, normals, starts, members) if closed else np.zeros(len(faces), dtype=np.int64)
-    return Surface(vertices, faces, side, numbers_in(edges, len(vertices)), edges, across, starts, members)
+    return Surface(vertices, faces, side, numbers_in(edges, len(vertices)), edges, across, starts, members, mesh)
 
 
 def is_closed(mesh: Mesh) -> bool:
     """Whether every edge of a mesh has two faces or more, once its vertices at one place are one."""
     mesh = weld(mesh)
-    keys, _ = _half_edges(mesh.faces.astype(np.int64), len(mesh.vertices))
+    keys, _ = half_edges(mesh.faces.astype(np.int64), len(mesh.vertices))
     return bool((np.unique(keys, return_counts=True)[1] > 1).all())
 
 
@@ -69,44 +68,6 @@ def crop(mesh: Mesh, low: Array, high: Array) -> Mesh:
     if len(near):
         near, _, _ = bounds_in(vertices, mesh.faces, least.min(axis=0), most.max(axis=0))
     return Mesh(mesh.vertices, mesh.faces[near])
-
-
-@compiled
-def _star(faces: Index, count: int) -> tuple[Index, Index]:
-    """(starts [count + 1], members): the neighbours of each vertex, one after the other, ascending."""
-    keys, starts, found = np.empty(6 * len(faces), np.int64), np.zeros(count + 1, np.int64), 0
-    for f in range(len(faces)):
-        for k in range(3):
-            one, other = faces[f, k], faces[f, (k + 1) % 3]
-            keys[6 * f + 2 * k], keys[6 * f + 2 * k + 1] = one * count + other, other * count + one
-    keys.sort()
-    members = np.empty(len(keys), np.int64)
-    for n in range(len(keys)):
-        if n == 0 or keys[n] != keys[n - 1]:
-            members[found] = keys[n] % count
-            found += 1
-            starts[keys[n] // count + 1] = found
-    for n in range(count):
-        starts[n + 1] = max(starts[n + 1], starts[n])
-    return starts, members[:found].copy()
-
-
-def _half_edges(faces: Index, count: int) -> tuple[Index, Index]:
-    """(keys [3 F], ascending, the same for the sides of one edge; which [3 F] sides these are, three times their face and on)."""
-    keys = _edge_keys(faces, count)
-    which = np.argsort(keys, kind="stable")
-    return keys[which], which
-
-
-@compiled
-def _edge_keys(faces: Index, count: int) -> Index:
-    """[3 F]: a number for the edge of each side of each face."""
-    keys = np.empty(3 * len(faces), np.int64)
-    for f in range(len(faces)):
-        for k in range(3):
-            one, other = faces[f, k], faces[f, (k + 1) % 3]
-            keys[3 * f + k] = min(one, other) * count + max(one, other)
-    return keys
 
 
 @compiled
@@ -128,35 +89,6 @@ def _sides(vertices: Array, faces: Index, normals: Array, starts: Index, members
                 above = above and up >= -slack
         side[f] = np.int64(below) - np.int64(above)
     return side
-
-
-@compiled
-def _bent_edges(vertices: Array, faces: Index, normals: Array, keys: Index, which: Index) -> tuple[Index, Index]:
-    """Edges [E, 2] that are not between two coplanar faces, and the vertices across them [E, 2]; the rest: `_half_edges`."""
-    edges, across = np.empty((len(keys), 2), np.int64), np.empty((len(keys), 2), np.int64)
-    count = first = 0
-    for last in range(len(keys)):
-        if last + 1 < len(keys) and keys[last + 1] == keys[last]:
-            continue
-        one, other = which[first], which[last]
-        a, b = keys[last] // len(vertices), keys[last] % len(vertices)
-        p, q = faces[one // 3, (one + 2) % 3], faces[other // 3, (other + 2) % 3]
-        bent = last != first + 1 or abs(_dot(normals[one // 3], normals[other // 3])) <= 1.0 - FLAT
-        if not bent and p != q:
-            # Two faces folded onto one another are coplanar, and their edge is bent all the same: p and q are on one side
-            along, u, v = vertices[b] - vertices[a], vertices[p] - vertices[a], vertices[q] - vertices[a]
-            bent = _dot(u, v) * _dot(along, along) > _dot(along, u) * _dot(along, v)
-        if bent:
-            edges[count, 0], edges[count, 1], across[count, 0], across[count, 1] = a, b, p, q
-            count += 1
-        first = last + 1
-    return edges[:count].copy(), across[:count].copy()
-
-
-@compiled
-def _dot(one: Array, other: Array) -> float:
-    """The scalar product of two vectors [3], added in the order of `_dots`."""
-    return float((one[0] * other[0] + one[2] * other[2]) + one[1] * other[1])
 
 
 def _dots(one: Array, other: Array) -> Array:
@@ -249,7 +181,7 @@ def _patches(vertices: Array, faces: Index, normals: Array) -> tuple[NDArray[np.
     lean: tangent of half the sharpest angle between a face and a neighbour that is not of its patch, as if all edges were
     convex; at most 1.
     """
-    keys, which = _half_edges(faces, len(vertices))
+    keys, which = half_edges(faces, len(vertices))
     same = keys[1:] == keys[:-1]
     one, other = which[:-1][same] // 3, which[1:][same] // 3
     cosine = _dots(normals[one], normals[other])

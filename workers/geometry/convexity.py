@@ -182,6 +182,19 @@ def face_normals(vertices: Array, faces: NDArray[np.integer]) -> Array:
     return normals
 
 
+@compiled
+def face_areas(vertices: Array, faces: NDArray[np.integer]) -> Array:
+    """[F]: areas of faces [F, 3] with contiguous vertices [V, 3]."""
+    areas = np.empty(len(faces))
+    for face in range(len(faces)):
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+        vx, vy, vz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
+        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        areas[face] = np.sqrt(x * x + y * y + z * z) / 2.0
+    return areas
+
+
 def solid_of(mesh: Mesh) -> manifold3d.Manifold | None:
     """The solid that a welded mesh encloses, wound either way; None where the mesh is not closed, or not a manifold."""
     hold_to_one_thread()

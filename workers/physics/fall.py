@@ -14,6 +14,7 @@ from workers.geometry.frames import invert, translation
 from workers.geometry.hull import least_width_m
 from workers.physics.bullet import GRAVITY_M_S2, GroundShape, World, open_world
 from workers.physics.monitors import EnergyRecord, StandingCondition, StopCondition, Velocity
+from workers.physics.rest_pose import Face
 from workers.physics.rigid_body import Body, BodyPose, as_pose
 from workers.physics.table_top import support_height
 
@@ -76,6 +77,7 @@ class Outcome:
 
     speed_m_s: of the fastest point; where all `rested`, the drift over the last window. seconds: of free fall and simulation.
     stopped_by: the name of the stop condition that ended it. rise: how far the energy of all rose, as a share of its bound.
+    face: of its hull that an object stands on, where that ended it.
     """
 
     poses: tuple[Pose, ...]
@@ -84,6 +86,7 @@ class Outcome:
     rested: bool
     stopped_by: str | None = None
     rise: float = 0.0
+    face: Face | None = None
 
 
 def choose_steps(
@@ -192,12 +195,12 @@ def _simulate(
                 one.anchor, one.since = now, time
             elif sleeping and time - one.since >= rest.window_s:
                 world.let_sleep(number)
-        stands = False
+        face = None
         if standing is not None and asked < still[0].since <= time - STANDING_SHARE * rest.window_s:
-            asked, stands = time, standing(at[0], moving[0])
-        if stands or all(time - one.since >= rest.window_s for one in still):
+            asked, face = time, standing(at[0], moving[0])
+        if face is not None or all(time - one.since >= rest.window_s for one in still):
             drift_m_s = max(one.moved_m / (time - one.since) for one in still)
-            return Outcome(tuple(map(as_pose, at)), drift_m_s, time, True, rise=energy.rise())
+            return Outcome(tuple(map(as_pose, at)), drift_m_s, time, True, rise=energy.rise(), face=face)
         if time >= end_s:
             return Outcome(tuple(map(as_pose, at)), max(speeds), time, False, rise=energy.rise())
 

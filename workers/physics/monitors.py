@@ -9,7 +9,7 @@ from schemas.base import Array
 from schemas.scene.plan import ObjectStart
 from workers.geometry.frames import invert
 from workers.physics.bullet import GRAVITY_M_S2
-from workers.physics.rest_pose import find_face
+from workers.physics.rest_pose import Face, find_face
 from workers.physics.rigid_body import Body, BodyPose, as_pose
 from workers.physics.table_top import inside_margin
 
@@ -28,8 +28,8 @@ Velocity = tuple[Sequence[float], Sequence[float]]
 StopCondition = Callable[[int, BodyPose], bool]
 """Whether a body, by its number, at this pose ends the simulation."""
 
-StandingCondition = Callable[[BodyPose, Velocity], bool]
-"""Whether a body at this pose and velocity stays on the face below it."""
+StandingCondition = Callable[[BodyPose, Velocity], Face | None]
+"""The face below a body at this pose and velocity, if it stays on it."""
 
 
 class EnergyRecord:
@@ -111,15 +111,15 @@ def stays_standing(start: ObjectStart, body: Body, top_m: float, friction: float
     radii2 = [float(moment) / body.mass_kg for moment in body.moments]
     T_body_obj = invert(body.T_obj_body)
 
-    def stands(at: BodyPose, moving: Velocity) -> bool:
+    def stands(at: BodyPose, moving: Velocity) -> Face | None:
         energy_m = energy_height_m(radii2, at, moving)
         moving_m = energy_m - at[0][2]
         if moving_m > friction * SLIDE_M:
-            return False
+            return None
         face = find_face(as_pose(at) @ T_body_obj, start.hull, start.asset.mass.com)
         if face is None:
-            return False
+            return None
         over_m = max(0.0, energy_m - top_m - face.height_m)
-        return over_m + LIFT_M <= math.hypot(face.height_m, face.margin_m) - face.height_m
+        return face if over_m + LIFT_M <= math.hypot(face.height_m, face.margin_m) - face.height_m else None
 
     return stands

@@ -47,13 +47,13 @@ def find_face(T_world_obj: Pose, hull: Hull, com: Array) -> Face | None:
     return None
 
 
-def snap_to_face(T_world_obj: Pose, hull: Hull, com: Array) -> Pose | None:
+def snap_to_face(T_world_obj: Pose, hull: Hull, com: Array, known: Face | None = None) -> Pose | None:
     """Turn the object about its centre of mass, by at most `SNAP_RAD`, onto the nearest steady face of its hull.
 
     A simulator stops with the lowest vertices some tenths of a millimetre apart, because its collision shapes have margins.
-    None where no steady face is near. The caller sets the height.
+    None where no steady face is near. The caller sets the height. known: the face, if it is already found.
     """
-    face = find_face(T_world_obj, hull, com)
+    face = known or find_face(T_world_obj, hull, com)
     if face is None:
         return None
     return pose(face.turn, T_world_obj[:3, :3] @ com + T_world_obj[:3, 3] - face.turn @ com)
@@ -72,7 +72,7 @@ def support_margin(contacts_xy: Array, com_xy: Array) -> float:
     """
     if len(contacts_xy) == 0:
         return -np.inf
-    outline, at = shapely.convex_hull(shapely.multipoints(contacts_xy)), shapely.points(com_xy)
+    outline, at = shapely.convex_hull(shapely.linestrings([*contacts_xy, contacts_xy[0]])), shapely.points(com_xy)
     if outline.geom_type == "Polygon" and outline.contains(at):
         return float(outline.exterior.distance(at))
     return -float(outline.distance(at))

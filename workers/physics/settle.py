@@ -178,7 +178,8 @@ def _place(drop: Drop, poses: Sequence[Pose], forms: Sequence[Form]) -> Placemen
 def _stand(drop: Drop, outcome: Outcome, seconds: float) -> _Ending | None:
     """A single object turned onto the steady face of its hull that is below it, on the flat top; None where none is near."""
     (start,), table = drop.starts, drop.table
-    T = snap_to_face(outcome.poses[0], start.hull, start.asset.mass.com)
+    known = None if drop.physics.collision == "box" else outcome.face  # a box has other faces than the object's hull
+    T = snap_to_face(outcome.poses[0], start.hull, start.asset.mass.com, known)
     if T is None:
         return None
     T = translation(0.0, 0.0, -vertical_gap(placed_mesh(start, T), table.mesh)) @ T

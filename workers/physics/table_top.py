@@ -11,7 +11,7 @@ from schemas.errors import StartError
 from schemas.scene.plan import Table, TableTop
 from schemas.scene.shape import Asset, Mesh, Shape
 from workers.geometry.bounds import bounds_of
-from workers.geometry.convexity import face_normals, numbers_in, piece_of, triangle_corners
+from workers.geometry.convexity import face_areas, face_normals, numbers_in, piece_of
 from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import transform, translation
 from workers.geometry.jit import compiled
@@ -36,10 +36,9 @@ def find_table_top(shape: Shape) -> TableTop:
     level = faces[np.abs(face_normals(np.ascontiguousarray(vertices), faces)[:, 2]) > LEVEL]
     if not len(level):
         raise StartError("no_table_top", "the table's mesh has no level face within 2.6 degrees: leave this table out")
-    a, b, c = triangle_corners(Mesh(vertices, level))
-    key = np.round((a + b + c)[:, 2] / (3 * SAME_LEVEL_M)).astype(np.int64)
-    _, inverse = np.unique(key, return_inverse=True)
-    area = np.bincount(inverse, weights=np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
+    z = vertices[:, 2][level]
+    _, inverse = np.unique(np.round((z[:, 0] + z[:, 1] + z[:, 2]) / (3 * SAME_LEVEL_M)), return_inverse=True)
+    area = np.bincount(inverse, weights=face_areas(np.ascontiguousarray(vertices), level))
     top = int(np.flatnonzero(area >= TOP_SHARE * area.max()).max())
     points = vertices[numbers_in(level[inverse == top], len(vertices))]
     return _describe(points, float(area[top]), float(vertices[:, 2].max()))

@@ -51,7 +51,7 @@ def choose_assets(job: Job, catalogue: Catalogue, chance: SceneChance) -> tuple[
 def count_objects(job: Job, chance: SceneChance) -> int:
     """How many objects the scene has."""
     low, high = job.objects_per_scene
-    return int(chance.stream(Stream.COUNT).integers(low, high + 1))
+    return low if low == high else int(chance.stream(Stream.COUNT).integers(low, high + 1))
 
 
 def choose_category(job: Job, chance: SceneChance, number: int = 0) -> str:

@@ -7,7 +7,16 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from workers.geometry.convexity import components, concavity_m, face_planes, mesh_of, solid_of, triangle_corners, weld
+from workers.geometry.convexity import (
+    components,
+    concavity_m,
+    face_areas,
+    face_planes,
+    mesh_of,
+    solid_of,
+    triangle_corners,
+    weld,
+)
 
 
 def as_mesh(*bodies: trimesh.Trimesh) -> Mesh:
@@ -41,6 +50,12 @@ def test_the_corners_of_a_face_lie_in_its_plane_and_a_face_without_area_has_none
     for corner in triangle_corners(mesh):
         assert (normals[:-1] * corner).sum(axis=1) == pytest.approx(offsets[:-1], abs=1e-12)
     assert (*normals[-1], offsets[-1]) == (0.0, 0.0, 0.0, 0.0)
+
+
+def test_the_areas_of_a_box_are_half_of_its_sides_and_a_face_of_one_line_has_none():
+    mesh = as_mesh(box((1, 2, 3)))
+    lined = np.concatenate([mesh.faces, [[0, 1, 1]]])
+    assert sorted(face_areas(mesh.vertices, lined)) == pytest.approx([0.0] + 4 * [1.0] + 4 * [1.5] + 4 * [3.0])
 
 
 def weld_by_records(mesh: Mesh) -> Mesh:
