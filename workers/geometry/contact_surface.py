@@ -13,8 +13,10 @@ from schemas.scene.shape import Mesh
 from workers.geometry.contact_kernels import SLOPE, Index, bounds_in, find_near
 from workers.geometry.convexity import face_normals, numbers_in, weld
 from workers.geometry.jit import compiled
-from workers.geometry.mesh_edges import FLAT, bent_edges, half_edges, neighbours_of
 from workers.geometry.nearest import nearest_on_segments, nearest_on_triangle
+
+FLAT = 1e-9
+"""One minus the cosine between two faces, below which there is no edge between them."""
 
 WHOLE = 1e-6
 """Share of its area by which a patch of faces in one plane may miss its hull and still count as convex."""
@@ -48,8 +50,8 @@ def surface_of(mesh: Mesh, closed: bool) -> Surface:
     normals = face_normals(vertices, faces)
     solid = normals.any(axis=1)
     faces, normals = faces[solid], normals[solid]
-    starts, members = neighbours_of(faces, len(vertices))
-    edges, across = bent_edges(vertices, faces, normals, *half_edges(faces, len(vertices)))
+    starts, members = _star(faces, len(vertices))
+    edges, across = _bent_edges(vertices, faces, normals)
     side = _sides(vertices, faces, normals, starts, members) if closed else np.zeros(len(faces), dtype=np.int64)
     return Surface(vertices, faces, side, numbers_in(edges, len(vertices)), edges, across, starts, members, mesh)
 
@@ -57,7 +59,7 @@ def surface_of(mesh: Mesh, closed: bool) -> Surface:
 def is_closed(mesh: Mesh) -> bool:
     """Whether every edge of a mesh has two faces or more, once its vertices at one place are one."""
     mesh = weld(mesh)
-    keys, _ = half_edges(mesh.faces.astype(np.int64), len(mesh.vertices))
+    keys, _ = _half_edges(mesh.faces.astype(np.int64), len(mesh.vertices))
     return bool((np.unique(keys, return_counts=True)[1] > 1).all())
 
 
@@ -68,6 +70,21 @@ def crop(mesh: Mesh, low: Array, high: Array) -> Mesh:
     if len(near):
         near, _, _ = bounds_in(vertices, mesh.faces, least.min(axis=0), most.max(axis=0))
     return Mesh(mesh.vertices, mesh.faces[near])
+
+
+def _star(faces: Index, count: int) -> tuple[Index, Index]:
+    """(starts [count + 1], members): the neighbours of each vertex, one after the other, ascending."""
+    one, other = faces[:, [0, 1, 2, 1, 2, 0]], faces[:, [1, 2, 0, 0, 1, 2]]
+    keys = np.unique(one * count + other)
+    return np.searchsorted(keys, np.arange(count + 1) * count), keys % count
+
+
+def _half_edges(faces: Index, count: int) -> tuple[Index, Index]:
+    """(keys [3 F], ascending, the same for the sides of one edge; which [3 F] sides these are, three times their face and on)."""
+    one, other = faces, np.roll(faces, -1, axis=1)
+    keys = (np.minimum(one, other) * count + np.maximum(one, other)).ravel()
+    which = np.argsort(keys, kind="stable")
+    return keys[which], which
 
 
 @compiled
@@ -89,6 +106,22 @@ def _sides(vertices: Array, faces: Index, normals: Array, starts: Index, members
                 above = above and up >= -slack
         side[f] = np.int64(below) - np.int64(above)
     return side
+
+
+def _bent_edges(vertices: Array, faces: Index, normals: Array) -> tuple[Index, Index]:
+    """Edges [E, 2] that are not between two coplanar faces, and the vertices across them [E, 2]."""
+    keys, which = _half_edges(faces, len(vertices))
+    first, last = np.flatnonzero(np.diff(keys, prepend=-1)), np.flatnonzero(np.diff(keys, append=-1))
+    edges = np.stack(np.divmod(keys[first], len(vertices)), axis=1)
+    sides = which[np.stack([first, last], axis=1)]
+    across = faces[sides // 3, (sides + 2) % 3]
+    cosine = _dots(normals[sides[:, 0] // 3], normals[sides[:, 1] // 3])
+    a = vertices[edges[:, 0]]
+    along, p, q = (vertices[each] - a for each in (edges[:, 1], *across.T))
+    # Two faces folded onto one another are coplanar, and their edge is bent all the same: p and q are on one side of it
+    same_side = _dots(p, q) * _dots(along, along) > _dots(along, p) * _dots(along, q)
+    bent = (last != first + 1) | (np.abs(cosine) <= 1.0 - FLAT) | ((across[:, 0] != across[:, 1]) & same_side)
+    return edges[bent], across[bent]
 
 
 def _dots(one: Array, other: Array) -> Array:
@@ -181,7 +214,7 @@ def _patches(vertices: Array, faces: Index, normals: Array) -> tuple[NDArray[np.
     lean: tangent of half the sharpest angle between a face and a neighbour that is not of its patch, as if all edges were
     convex; at most 1.
     """
-    keys, which = half_edges(faces, len(vertices))
+    keys, which = _half_edges(faces, len(vertices))
     same = keys[1:] == keys[:-1]
     one, other = which[:-1][same] // 3, which[1:][same] // 3
     cosine = _dots(normals[one], normals[other])

@@ -1,12 +1,11 @@
 """Rigid bodies on a ground, simulated by PyBullet. The only module that imports PyBullet, so that it can be replaced."""
 
 import math
-import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache
 
 import numpy as np
 
@@ -227,23 +226,16 @@ def _shape_of(client: int, parts: Sequence[Array], turned: Mapping[str, list[flo
         vertices = _BUFFERS.vertices(parts[0])
         yield pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client, **turned)
         return
-    text = "".join(
-        f"o part{number}\n" + _layout_of(len(part)) % tuple(part.ravel().tolist()) for number, part in enumerate(parts)
-    )
-    descriptor, name = tempfile.mkstemp(prefix="verso-parts-", suffix=".obj")
-    try:
-        with open(descriptor, "wb") as file:
-            file.write(text.encode("ascii"))
-        yield pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=name, physicsClientId=client, **turned)
-    finally:
-        os.unlink(name)
-
-
-@lru_cache(1024)
-def _layout_of(count: int) -> str:
-    """The lines of a part with so many vertices, whose faces name them from the last one back, as OBJ allows."""
-    faces = (f"f {-count} {k - count} {k - count + 1}\n" for k in range(1, count - 1))
-    return "v %.9g %.9g %.9g\n" * count + "".join(faces)
+    lines, first = [], 1
+    for number, part in enumerate(parts):
+        lines.append(f"o part{number}\n")
+        lines.append("v %.9g %.9g %.9g\n" * len(part) % tuple(part.ravel().tolist()))
+        lines += [f"f {first} {first + k} {first + k + 1}\n" for k in range(1, len(part) - 1)]
+        first += len(part)
+    with tempfile.NamedTemporaryFile("w", encoding="ascii", prefix="verso-parts-", suffix=".obj") as file:
+        file.writelines(lines)
+        file.flush()
+        yield pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=file.name, physicsClientId=client, **turned)
 
 
 def _set_surface(client: int, thing: int, physics: Physics, body: Body | None = None) -> None:

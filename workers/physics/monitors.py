@@ -113,8 +113,7 @@ def stays_standing(start: ObjectStart, body: Body, top_m: float, friction: float
 
     def stands(at: BodyPose, moving: Velocity) -> Face | None:
         energy_m = energy_height_m(radii2, at, moving)
-        moving_m = energy_m - at[0][2]
-        if moving_m > friction * SLIDE_M:
+        if energy_m - at[0][2] > friction * SLIDE_M:
             return None
         face = find_face(as_pose(at) @ T_body_obj, start.hull, start.asset.mass.com)
         if face is None:

@@ -43,12 +43,7 @@ class Form:
     @cached_property
     def solid(self) -> manifold3d.Manifold | None:
         """The body that the mesh encloses; None where it encloses none, as a part of one."""
-        if self._whole is not self.mesh:
-            return solid_of(weld(self._whole))
-        welded, across = self.surface.welded, self.surface.across
-        # An edge with one face encloses nothing, as the underside of a body does not
-        is_open = len(welded.faces) == len(self.surface.faces) and (across[:, 0] == across[:, 1]).any()
-        return None if is_open else solid_of(welded)
+        return solid_of(self.surface.welded if self._whole is self.mesh else weld(self._whole))
 
     @cached_property
     def body(self) -> manifold3d.Manifold:

@@ -36,8 +36,7 @@ def find_table_top(shape: Shape) -> TableTop:
     level = faces[np.abs(face_normals(np.ascontiguousarray(vertices), faces)[:, 2]) > LEVEL]
     if not len(level):
         raise StartError("no_table_top", "the table's mesh has no level face within 2.6 degrees: leave this table out")
-    z = vertices[:, 2][level]
-    _, inverse = np.unique(np.round((z[:, 0] + z[:, 1] + z[:, 2]) / (3 * SAME_LEVEL_M)), return_inverse=True)
+    _, inverse = np.unique(np.round(vertices[:, 2][level].sum(axis=1) / (3 * SAME_LEVEL_M)), return_inverse=True)
     area = np.bincount(inverse, weights=face_areas(np.ascontiguousarray(vertices), level))
     top = int(np.flatnonzero(area >= TOP_SHARE * area.max()).max())
     points = vertices[numbers_in(level[inverse == top], len(vertices))]

@@ -10,7 +10,6 @@ from scipy.sparse import csc_array, eye_array
 
 from schemas.base import Array
 from workers.geometry.frames import cross_each
-from workers.geometry.jit import compiled
 from workers.physics.rest.contacts import Contacts
 
 CONE_EDGES = 16
@@ -129,23 +128,11 @@ def _pyramid(normals: Array, friction: float) -> Array:
 
     The first edge leans against gravity, so that a slope has all of its friction.
     """
+    up = np.array([0.0, 0.0, 1.0]) - normals[:, 2:] * normals
+    level = np.linalg.norm(up, axis=1) < 1e-3
+    up[level] = np.cross(normals[level], [0.0, 1.0, 0.0])
+    first = up / np.linalg.norm(up, axis=1, keepdims=True)
+    second = cross_each(normals, first[:, None])[:, 0]
     angle = 2.0 * np.pi * np.arange(CONE_EDGES) / CONE_EDGES
-    return _edges(np.ascontiguousarray(normals), friction, np.cos(angle), np.sin(angle))
-
-
-@compiled
-def _edges(normals: Array, friction: float, cosines: Array, sines: Array) -> Array:
-    edges = np.empty((len(normals), len(cosines), 3))
-    for n in range(len(normals)):
-        a, b, c = normals[n]
-        x, y, z = 0.0 - c * a, 0.0 - c * b, 1.0 - c * c
-        if np.sqrt(x * x + y * y + z * z) < 1e-3:
-            x, y, z = b * 0.0 - c, c * 0.0 - a * 0.0, a - b * 0.0
-        length = np.sqrt(x * x + y * y + z * z)
-        x, y, z = x / length, y / length, z / length
-        u, v, w = b * z - c * y, c * x - a * z, a * y - b * x
-        for k in range(len(cosines)):
-            edges[n, k, 0] = a + friction * (cosines[k] * x + sines[k] * u)
-            edges[n, k, 1] = b + friction * (cosines[k] * y + sines[k] * v)
-            edges[n, k, 2] = c + friction * (cosines[k] * z + sines[k] * w)
-    return edges
+    side = np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
+    return normals[:, None] + friction * side
