@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from schemas.base import Array
 from schemas.scene.shape import Mesh
 from workers.geometry.contact_kernels import SLOPE, Index, bounds_in, find_near
-from workers.geometry.convexity import face_normals, numbers_in, weld
+from workers.geometry.convexity import face_normals, has_rim, numbers_in, weld
 from workers.geometry.jit import compiled
 from workers.geometry.nearest import nearest_on_segments, nearest_on_triangle
 
@@ -59,8 +59,7 @@ def surface_of(mesh: Mesh, closed: bool) -> Surface:
 def is_closed(mesh: Mesh) -> bool:
     """Whether every edge of a mesh has two faces or more, once its vertices at one place are one."""
     mesh = weld(mesh)
-    keys, _ = _half_edges(mesh.faces.astype(np.int64), len(mesh.vertices))
-    return bool((np.unique(keys, return_counts=True)[1] > 1).all())
+    return not has_rim(mesh.faces, len(mesh.vertices))
 
 
 def crop(mesh: Mesh, low: Array, high: Array) -> Mesh:

@@ -195,8 +195,25 @@ def face_areas(vertices: Array, faces: NDArray[np.integer]) -> Array:
     return areas
 
 
+@compiled
+def has_rim(faces: NDArray[np.integer], count: int) -> bool:
+    """Whether some edge of faces [F, 3] into `count` vertices has one face alone."""
+    keys = np.empty(3 * len(faces), np.int64)
+    for f in range(len(faces)):
+        for k in range(3):
+            one, other = faces[f, k], faces[f, (k + 1) % 3]
+            keys[3 * f + k] = min(one, other) * np.int64(count) + max(one, other)
+    keys.sort()
+    alone = 0
+    for n in range(len(keys)):
+        alone += (n == 0 or keys[n] != keys[n - 1]) and (n + 1 == len(keys) or keys[n] != keys[n + 1])
+    return alone > 0
+
+
 def solid_of(mesh: Mesh) -> manifold3d.Manifold | None:
     """The solid that a welded mesh encloses, wound either way; None where the mesh is not closed, or not a manifold."""
+    if has_rim(mesh.faces, len(mesh.vertices)):
+        return None
     hold_to_one_thread()
     for faces in (mesh.faces, mesh.faces[:, ::-1]):
         solid = manifold3d.Manifold(

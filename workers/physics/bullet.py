@@ -14,6 +14,7 @@ from schemas.errors import SettleError
 from schemas.job.physics import Physics
 from schemas.scene.shape import Mesh
 from workers.geometry.frames import quaternion_from_rotation
+from workers.geometry.obj_text import obj_of
 from workers.physics.pybullet_flaws import BulletBuffers, silence_stderr
 from workers.physics.rest_pose import stands_on_face
 from workers.physics.rigid_body import Body, BodyPose
@@ -226,15 +227,8 @@ def _shape_of(client: int, parts: Sequence[Array], turned: Mapping[str, list[flo
         vertices = _BUFFERS.vertices(parts[0])
         yield pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client, **turned)
         return
-    lines, first = [], 1
-    for number, part in enumerate(parts):
-        lines.append(f"o part{number}\n")
-        lines.append("v %.9g %.9g %.9g\n" * len(part) % tuple(part.ravel().tolist()))
-        lines += [f"f {first} {first + k} {first + k + 1}\n" for k in range(1, len(part) - 1)]
-        first += len(part)
-    with tempfile.NamedTemporaryFile("w", encoding="ascii", prefix="verso-parts-", suffix=".obj") as file:
-        file.writelines(lines)
-        file.flush()
+    with tempfile.NamedTemporaryFile(prefix="verso-parts-", suffix=".obj", buffering=0) as file:
+        file.write(obj_of(parts))
         yield pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=file.name, physicsClientId=client, **turned)
 
 

@@ -12,6 +12,7 @@ from workers.geometry.convexity import (
     concavity_m,
     face_areas,
     face_planes,
+    has_rim,
     mesh_of,
     solid_of,
     triangle_corners,
@@ -109,3 +110,13 @@ def test_the_depth_of_a_dent_is_found_and_a_convex_body_has_none():
     vertices[top, 2] -= 0.1
     depth = concavity_m(Mesh(vertices, np.asarray(dented.faces, dtype=np.int32)))
     assert 0.05 < depth <= 0.1
+
+
+def test_a_mesh_has_a_rim_where_a_face_is_missing():
+    faces = np.asarray(trimesh.creation.box().faces)
+    assert not has_rim(faces, 8)
+    assert not has_rim(np.concatenate([faces, faces]), 8)
+    for missing in range(len(faces)):
+        assert has_rim(np.delete(faces, missing, axis=0), 8)
+    assert has_rim(np.array([[0, 1, 2]]), 3)
+    assert not has_rim(np.empty((0, 3), np.int64), 3)
