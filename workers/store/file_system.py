@@ -224,24 +224,6 @@ def _probe_once(root: Path) -> None:
                 os.unlink(path)
 
 
-def open_below(folder: str, path: str, buffering: int = -1, opener: Opener | None = None) -> IO[bytes]:
-    """A new file at `path` below `folder`, to be closed; folders in between are made as needed, `folder` itself never."""
-    target = f"{folder}/{path}"
-    try:
-        return open(target, "wb", buffering=buffering, opener=opener)
-    except FileNotFoundError:
-        for between in reversed(folders_above(path)):
-            with contextlib.suppress(FileExistsError):
-                os.mkdir(f"{folder}/{between}")
-        return open(target, "wb", buffering=buffering, opener=opener)
-
-
-def folders_above(path: str) -> list[str]:
-    """The folders on the way to a file, the nearest first."""
-    parts = path.split("/")
-    return ["/".join(parts[:end]) for end in range(len(parts) - 1, 0, -1)]
-
-
 def open_uncut(path: str, flags: int) -> int:
     """A descriptor as `open` asks for it, except that a file that is there keeps its bytes."""
     return os.open(path, flags & ~os.O_TRUNC, 0o666)

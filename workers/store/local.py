@@ -15,9 +15,7 @@ from workers.store.file_system import (
     Opener,
     OpenTree,
     explain_disk_errors,
-    folders_above,
     ignore_missing,
-    open_below,
     open_uncut,
     probe_folder,
     refuse_link_out,
@@ -93,8 +91,15 @@ class LocalStore(Store):
     @contextlib.contextmanager
     def stream_staged(self, staging: str, path: str, opener: Opener | None = None) -> Iterator[IO[bytes]]:
         """A file below the attempt's folder, whose subfolders are made as needed; `opener`: as of `open`."""
+        target = self._at(f"{staging}/{path}")
         with self._explained(f"{staging}/{path}"):
-            file = open_below(self._at(staging), path, opener=opener)
+            try:
+                file = open(target, "wb", opener=opener)  # noqa: SIM115 - closed below, on every path
+            except FileNotFoundError:
+                for folder in reversed(_folders_above(path)):  # never the attempt's own
+                    with contextlib.suppress(FileExistsError):
+                        os.mkdir(self._at(f"{staging}/{folder}"))
+                file = open(target, "wb", opener=opener)  # noqa: SIM115
             try:
                 yield file
                 if tree := self._open.get(staging):
@@ -104,18 +109,6 @@ class LocalStore(Store):
                     file.close()
                 raise
             file.close()
-
-    def write_staged(self, staging: str, path: str, data: bytes) -> None:
-        """As `stream_staged`, without its contexts and its buffer: a scene has two dozen files."""
-        try:
-            with open_below(self._at(staging), path, buffering=0) as file:
-                while data:  # a write may be cut short, and the next one then says why
-                    data = data[file.write(data) :]
-                if tree := self._open.get(staging):
-                    tree.flush_file(file)
-        except OSError:
-            with self._explained(f"{staging}/{path}"):
-                raise
 
     def write_note(self, staging: str, path: str, data: bytes) -> None:
         """In place: a file that is cut to nothing first is written to the disk as soon as it is closed."""
@@ -154,7 +147,7 @@ class LocalStore(Store):
     def sync_folders_of(self, keys: Iterable[str]) -> None:
         """Flushes the folders that hold `keys`, up to the output folder."""
         holders = {key.rpartition("/")[0] for key in keys}
-        folders = {".", *holders, *(folder for holder in holders for folder in folders_above(holder))} - {""}
+        folders = {".", *holders, *(folder for holder in holders for folder in _folders_above(holder))} - {""}
         with self._explained("the output folder"):
             sync_folders(self.root, folders)
 
@@ -298,3 +291,9 @@ class LocalStore(Store):
 
     def _explained(self, key: str) -> contextlib.AbstractContextManager[None]:
         return explain_disk_errors(f"{key} in {self.name} could not be written")
+
+
+def _folders_above(path: str) -> list[str]:
+    """The folders on the way to a file, the nearest first."""
+    parts = path.split("/")
+    return ["/".join(parts[:end]) for end in range(len(parts) - 1, 0, -1)]

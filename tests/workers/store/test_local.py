@@ -1,4 +1,3 @@
-import io
 import os
 import subprocess
 import sys
@@ -8,7 +7,6 @@ import pytest
 
 from schemas.dataset.layout import TEMPORARY
 from schemas.errors import OutputError
-from workers.store import local
 from workers.store.local import LocalStore, open_store
 from workers.store.objects import ObjectStore
 
@@ -120,17 +118,3 @@ def test_a_url_that_names_a_store_is_opened_with_its_prefix():
     assert isinstance(store, ObjectStore)
     assert store.name == "s3://bucket/a/dataset"
     assert store._bucket.prefix == "a/dataset"
-
-
-class CutShort(io.FileIO):
-    """A file that takes seven bytes at a time, as a system call may."""
-
-    def write(self, data):
-        return super().write(data[:7])
-
-
-def test_a_write_that_is_cut_short_goes_on(store, monkeypatch):
-    store.open_staging("_staging/0/a")
-    monkeypatch.setattr(local, "open_below", lambda folder, path, buffering: CutShort(f"{folder}/{path}", "w"))
-    store.write_staged("_staging/0/a", "one.png", bytes(range(100)))
-    assert store.read("_staging/0/a/one.png") == bytes(range(100))
