@@ -7,7 +7,7 @@ from workers.geometry.obj_text import obj_of
 TETRAHEDRON = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-def read(text: bytes) -> dict[str, tuple[list[list[float]], list[list[int]]]]:
+def read(text):
     """(vertices, faces) by object. A negative number of a face counts back from the last vertex before it."""
     objects, vertices = {}, []
     for line in text.decode("ascii").splitlines():
