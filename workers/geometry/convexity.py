@@ -32,21 +32,11 @@ def is_convex_surface(mesh: Mesh, solid: manifold3d.Manifold | None) -> bool:
 
 def weld(mesh: Mesh) -> Mesh:
     """The mesh with one vertex at each place, without loose vertices, repeated triangles and triangles of two corners."""
-    vertices, used = mesh.vertices, _used_in(mesh.faces, len(mesh.vertices))
-    points = np.ascontiguousarray(vertices[used])
-    places, faces = _welded(points, np.lexsort(points.T[::-1]), used, mesh.faces, len(vertices))
-    corners = np.sort(faces, axis=1)
-    return Mesh(points[places], faces[_firsts(corners, np.lexsort(corners.T[::-1]))])
-
-
-@compiled
-def _used_in(faces: NDArray[np.integer], count: int) -> NDArray[np.int64]:
-    """[N] ascending: which of `count` vertices faces [F, 3] have."""
-    occurs = np.zeros(count, np.bool_)
-    for f in range(len(faces)):
-        for k in range(3):
-            occurs[faces[f, k]] = True
-    return np.flatnonzero(occurs)
+    used = numbers_in(mesh.faces, len(mesh.vertices))
+    points = np.ascontiguousarray(mesh.vertices[used])
+    places, faces = _welded(points, np.lexsort(points.T[::-1]), used, mesh.faces, len(mesh.vertices))
+    by_corners, first = _ranked(np.sort(faces, axis=1))
+    return Mesh(points[places], faces[np.sort(by_corners[first])])
 
 
 @compiled
@@ -71,16 +61,6 @@ def _welded(
             kept[rows, 0], kept[rows, 1], kept[rows, 2] = a, b, c
             rows += 1
     return firsts[:found].copy(), kept[:rows].copy()
-
-
-@compiled
-def _firsts(rows: NDArray[np.int32], order: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """[N]: whether no row before it is the same; order: the rows' ascending order, the same in order of their number."""
-    firsts = np.ones(len(rows), np.bool_)
-    for n in range(1, len(rows)):
-        a, b = order[n], order[n - 1]
-        firsts[a] = rows[a, 0] != rows[b, 0] or rows[a, 1] != rows[b, 1] or rows[a, 2] != rows[b, 2]
-    return firsts
 
 
 def unique_rows(rows: Array) -> Array:

@@ -227,8 +227,9 @@ def _shape_of(client: int, parts: Sequence[Array], turned: Mapping[str, list[flo
         vertices = _BUFFERS.vertices(parts[0])
         yield pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client, **turned)
         return
-    with tempfile.NamedTemporaryFile(prefix="verso-parts-", suffix=".obj", buffering=0) as file:
+    with tempfile.NamedTemporaryFile(prefix="verso-parts-", suffix=".obj") as file:
         file.write(obj_of(parts))
+        file.flush()
         yield pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=file.name, physicsClientId=client, **turned)
 
 
