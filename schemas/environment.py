@@ -1,7 +1,7 @@
-"""The environment variables that make a process's bytes the same everywhere.
+"""The environment variables that make a process's bytes the same everywhere, and one for speed.
 
 numpy, OpenBLAS, Mesa and Python's hashing read them once, while they load. services/cli/environment.py restarts a command
-that has others, before anything heavy is imported. deploy/Dockerfile repeats the table as ENV lines for processes that
+that has others, before anything heavy is imported. deploy/Dockerfile repeats them as ENV lines for processes that
 are started without this project's commands (`ray start`); a test compares the two.
 """
 
@@ -35,6 +35,11 @@ STACK_ENVIRONMENT: Final[Mapping[str, str]] = MappingProxyType(
 # and AVX2 kernels. It does not check the variable, which must not be set on a processor without AVX2.
 WITH_AVX2: Final[Mapping[str, str]] = MappingProxyType({"OPENBLAS_CORETYPE": "Haswell"})
 
+# For speed alone, where the user has not set it. The heap lies in pages of 2 MiB where the kernel gives them to who asks (its
+# setting `madvise`, which most distributions have): images and Bullet's pools are megabytes, and a scene takes 3 % less time.
+# glibc before 2.35 ignores it.
+FOR_SPEED: Final[Mapping[str, str]] = MappingProxyType({"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"})
+
 # Set to 1, the environment stays as it is: for comparing stacks.
 KEEP: Final = "VERSO_KEEP_ENV"
 
@@ -45,10 +50,14 @@ def stack_environment(flags: frozenset[str]) -> dict[str, str]:
 
 
 def settings_to_change(environ: Mapping[str, str], flags: frozenset[str]) -> dict[str, str]:
-    """The variables in which `environ` differs from the stack's; none where the user asked to keep it."""
+    """The variables in which `environ` differs from the stack's, and those for speed that it lacks.
+
+    None where the user asked to keep it.
+    """
     if environ.get(KEEP) == "1":
         return {}
-    return {name: value for name, value in stack_environment(flags).items() if environ.get(name) != value}
+    missing = {name: value for name, value in FOR_SPEED.items() if name not in environ}
+    return missing | {name: value for name, value in stack_environment(flags).items() if environ.get(name) != value}
 
 
 def cache_folder(name: str) -> Path | None:

@@ -7,6 +7,7 @@ wrote beside its meshes; `out`: a folder; and the items of `asked` in its row) a
 
 import contextlib
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -16,6 +17,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import IO, Any
 
+from schemas.environment import FOR_SPEED
 from schemas.errors import MachineError
 from schemas.job.job import Job
 from services.bench.ratios import Lap
@@ -85,7 +87,10 @@ def installed(package: str) -> str | None:
 
 
 class SideProcess:
-    """A running script. It inherits our core and our environment, and never shares our OpenGL context."""
+    """A running script. It inherits our core and our environment, and never shares our OpenGL context.
+
+    Only what is set for our own speed (`FOR_SPEED`) it does not inherit: few people who write such scripts set it.
+    """
 
     def __init__(self, name: str, process: subprocess.Popen[str], errors: IO[str]) -> None:
         self._name, self._process, self._errors = name, process, errors
@@ -124,7 +129,9 @@ def start_side(name: str, command: Sequence[str] | None = None) -> Iterator[Side
     root = Path(__file__).resolve().parents[2]
     with tempfile.TemporaryFile("w+") as errors:
         try:
-            process = subprocess.Popen(command, cwd=root, stdin=pipe, stdout=pipe, stderr=errors, text=True)
+            process = subprocess.Popen(
+                command, cwd=root, env=_plain_environment(), stdin=pipe, stdout=pipe, stderr=errors, text=True
+            )
         except OSError as error:
             raise MachineError(f"{command[0]} cannot be run: {error}") from error
         try:
@@ -132,3 +139,9 @@ def start_side(name: str, command: Sequence[str] | None = None) -> Iterator[Side
         finally:
             process.kill()
             process.communicate()
+
+
+def _plain_environment() -> dict[str, str]:
+    """This process's environment without what is set for our own speed."""
+    inherited = os.environ  # noqa: TID251 - a child's environment is all of it
+    return {name: value for name, value in inherited.items() if FOR_SPEED.get(name) != value}

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from schemas.environment import STACK_ENVIRONMENT, WITH_AVX2
+from schemas.environment import FOR_SPEED, STACK_ENVIRONMENT, WITH_AVX2
 from schemas.errors import FingerprintError, MachineError, OutputError, VersoError
 from services.run.sight import Sight
 
@@ -27,7 +27,8 @@ class WorkerTerms:
 
 def worker_environment(environ: Mapping[str, str]) -> dict[str, str]:
     """The variables that a driver with this environment gives to the workers of a cluster."""
-    return {name: environ[name] for name in VARIABLES if name in environ}
+    own = {name: value for name, value in FOR_SPEED.items() if environ.get(name) == value}
+    return own | {name: environ[name] for name in VARIABLES if name in environ}
 
 
 def refusal_of(terms: WorkerTerms, node: Sight) -> VersoError | None:

@@ -1,22 +1,57 @@
 import ast
 import os
+import platform
 import re
 import subprocess
 import sys
 from pathlib import Path
 
-from schemas.environment import STACK_ENVIRONMENT, WITH_AVX2, settings_to_change
+import pytest
+
+from schemas.environment import FOR_SPEED, STACK_ENVIRONMENT, WITH_AVX2, settings_to_change
 
 ROOT = Path(__file__).resolve().parents[2]
+RIGHT = {**STACK_ENVIRONMENT, **FOR_SPEED}
+HUGE_PAGES = Path("/sys/kernel/mm/transparent_hugepage/enabled")
+FLAGS_OF_THE_HEAP = """
+kept = bytearray(100_000)
+heap = False
+for line in open("/proc/self/smaps"):
+    heap = line.rstrip().endswith("[heap]") if "-" in line.split()[0] else heap
+    if heap and line.startswith("VmFlags:"):
+        print(line)
+"""
 
 
 def test_nothing_changes_where_the_environment_is_right_already():
-    assert settings_to_change(STACK_ENVIRONMENT, frozenset()) == {}
-    assert settings_to_change({**STACK_ENVIRONMENT, "LP_NUM_THREADS": "4"}, frozenset()) == {"LP_NUM_THREADS": "0"}
+    assert settings_to_change(RIGHT, frozenset()) == {}
+    assert settings_to_change({**RIGHT, "LP_NUM_THREADS": "4"}, frozenset()) == {"LP_NUM_THREADS": "0"}
 
 
 def test_openblas_is_told_its_kernels_only_where_the_processor_has_them():
-    assert settings_to_change(STACK_ENVIRONMENT, frozenset({"avx2"})) == dict(WITH_AVX2)
+    assert settings_to_change(RIGHT, frozenset({"avx2"})) == dict(WITH_AVX2)
+
+
+def test_what_is_for_speed_alone_is_set_only_where_the_user_has_not():
+    assert settings_to_change(STACK_ENVIRONMENT, frozenset()) == dict(FOR_SPEED)
+    assert settings_to_change({**STACK_ENVIRONMENT, "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2"}, frozenset()) == {}
+
+
+def has_huge_pages_on_request() -> bool:
+    """Whether the kernel gives huge pages to who asks, and glibc knows how to ask."""
+    library, number = platform.libc_ver()
+    asks = library == "glibc" and tuple(map(int, number.split("."))) >= (2, 35)
+    return asks and HUGE_PAGES.exists() and "[madvise]" in HUGE_PAGES.read_text()
+
+
+@pytest.mark.skipif(not has_huge_pages_on_request(), reason="no huge pages on request")
+def test_the_heap_asks_for_huge_pages():
+    def flags_of_heap(environ: dict[str, str]) -> list[str]:
+        run = [sys.executable, "-c", FLAGS_OF_THE_HEAP]
+        return subprocess.run(run, env=environ, capture_output=True, text=True, check=True).stdout.split()
+
+    assert "hg" in flags_of_heap(RIGHT)
+    assert "hg" not in flags_of_heap(dict(STACK_ENVIRONMENT))
 
 
 def test_numpy_runs_without_avx512_and_does_not_complain():
@@ -37,4 +72,4 @@ def test_numpy_runs_without_avx512_and_does_not_complain():
 def test_the_image_sets_the_same_environment():
     lines = (ROOT / "deploy" / "Dockerfile").read_text().replace("\\\n", " ").splitlines()
     pairs = [pair for line in lines if line.startswith("ENV ") for pair in re.findall(r"(\w+)=(\S+)", line)]
-    assert {name: value for name, value in pairs if name in STACK_ENVIRONMENT} == dict(STACK_ENVIRONMENT)
+    assert {name: value for name, value in pairs if name in RIGHT} == RIGHT

@@ -1,7 +1,10 @@
 """Which other systems are compared, and what is said of one that dies."""
 
+import sys
+
 import pytest
 
+from schemas.environment import FOR_SPEED
 from schemas.errors import MachineError
 from services.bench import others
 from services.bench.others import start_side
@@ -21,6 +24,21 @@ def test_a_script_that_dies_says_why(tmp_path):
         pytest.raises(MachineError, match=r"baseline ended.*No such file"),
     ):
         script.ask({"scene": str(tmp_path / "nothing.json"), "out": str(tmp_path), "look": "plain"})
+
+
+def test_a_script_does_not_inherit_what_is_set_for_our_speed(monkeypatch):
+    monkeypatch.setenv("OTHER", "kept")
+    [(name, value)] = FOR_SPEED.items()
+    ask = f"import json, os; print(json.dumps([os.environ.get({name!r}), os.environ['OTHER']]))"
+
+    def seen_by_a_script() -> object:
+        with start_side("script", [sys.executable, "-c", ask]) as script:
+            return script.greeting
+
+    monkeypatch.setenv(name, value)
+    assert seen_by_a_script() == [None, "kept"]
+    monkeypatch.setenv(name, "glibc.cpu.hwcaps=-AVX2")
+    assert seen_by_a_script() == ["glibc.cpu.hwcaps=-AVX2", "kept"]
 
 
 def test_what_is_not_installed_is_said_to_be_so():

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from schemas.environment import STACK_ENVIRONMENT, WITH_AVX2, stack_environment
+from schemas.environment import FOR_SPEED, STACK_ENVIRONMENT, WITH_AVX2, stack_environment
 from schemas.errors import FingerprintError, MachineError, OutputError
 from services.run.sight import Sight
 from services.run.worker_terms import WorkerTerms, refusal_of, refusal_of_worker, worker_environment
@@ -24,6 +24,11 @@ def test_a_driver_gives_what_it_has_of_the_stacks_variables_and_no_other():
     assert worker_environment(mine) == {**ENVIRONMENT, "OMP_NUM_THREADS": "4"}
     assert worker_environment({}) == {}
     assert {*STACK_ENVIRONMENT, *WITH_AVX2} == set(worker_environment(mine))
+
+
+def test_a_driver_gives_its_own_setting_for_speed_but_not_a_users():
+    assert worker_environment(FOR_SPEED) == dict(FOR_SPEED)
+    assert worker_environment({"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2"}) == {}
 
 
 @pytest.mark.parametrize("name", sorted(ENVIRONMENT))
