@@ -38,7 +38,7 @@ def _no_loop(tool: str) -> bool:
     return os.geteuid() != 0 or shutil.which(tool) is None or _fails("losetup", "-f")
 
 
-def _no_huge_pages() -> bool:
+def no_huge_pages() -> bool:
     """Whether glibc is too old to ask for huge pages, or the kernel gives them to nobody, or to all."""
     library, number = platform.libc_ver()
     too_old = library != "glibc" or tuple(map(int, number.split("."))) < (2, 35)
@@ -66,7 +66,7 @@ CONDITIONS: Final[dict[str, Callable[[Machine], bool]]] = {
     "no webdataset": lambda machine: importlib.util.find_spec("webdataset") is None,
     "no datasets": lambda machine: importlib.util.find_spec("datasets") is None,
     "one core": lambda machine: len(os.sched_getaffinity(0)) < 2,
-    "no huge pages": lambda machine: _no_huge_pages(),
+    "no huge pages": lambda machine: no_huge_pages(),
     "no glibc": lambda machine: platform.libc_ver()[0] != "glibc",
 }
 """Whether a condition holds on this machine, asked of the machine and never of the tests."""

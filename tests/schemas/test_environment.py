@@ -1,6 +1,5 @@
 import ast
 import os
-import platform
 import re
 import subprocess
 import sys
@@ -9,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from schemas.environment import FOR_SPEED, STACK_ENVIRONMENT, WITH_AVX2, settings_to_change
+from services.cli.skips import no_huge_pages
 
 ROOT = Path(__file__).resolve().parents[2]
 RIGHT = {**STACK_ENVIRONMENT, **FOR_SPEED}
-HUGE_PAGES = Path("/sys/kernel/mm/transparent_hugepage/enabled")
 FLAGS_OF_THE_HEAP = """
 kept = bytearray(100_000)
 heap = False
@@ -37,14 +36,7 @@ def test_what_is_for_speed_alone_is_set_only_where_the_user_has_not():
     assert settings_to_change({**STACK_ENVIRONMENT, "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2"}, frozenset()) == {}
 
 
-def has_huge_pages_on_request() -> bool:
-    """Whether the kernel gives huge pages to who asks, and glibc knows how to ask."""
-    library, number = platform.libc_ver()
-    asks = library == "glibc" and tuple(map(int, number.split("."))) >= (2, 35)
-    return asks and HUGE_PAGES.exists() and "[madvise]" in HUGE_PAGES.read_text()
-
-
-@pytest.mark.skipif(not has_huge_pages_on_request(), reason="no huge pages on request")
+@pytest.mark.skipif(no_huge_pages(), reason="no huge pages on request")
 def test_the_heap_asks_for_huge_pages():
     def flags_of_heap(environ: dict[str, str]) -> list[str]:
         run = [sys.executable, "-c", FLAGS_OF_THE_HEAP]

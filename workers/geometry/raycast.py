@@ -5,7 +5,7 @@ from that triangle's plane, so that neither Embree's float32 nor the rasteriser 
 so ties between coplanar faces of two things are found and go to the lower region id. Both sides of every face count.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 
@@ -62,8 +62,7 @@ def cast_view(things: Sequence[Placed], camera: Camera) -> tuple[Array, NDArray[
         mesh = _in_camera(thing, camera)
         pixels = _pixels_in_reach(mesh.vertices, camera)
         caster = _Caster(mesh)
-        for first in range(0, len(pixels), RAYS_AT_ONCE):
-            some = pixels[first : first + RAYS_AT_ONCE]
+        for some in (pixels[block] for block in _blocks(len(pixels))):
             rays = unproject(*np.divmod(some, intrinsics.width), np.ones(len(some)), intrinsics)
             _keep_nearer(best, some, *caster.cast(NEAR_M * rays, rays), thing.region_id, offset=NEAR_M)
     depth = np.where(np.isinf(best.distance), 0.0, best.distance)
@@ -79,8 +78,9 @@ def first_hit(things: Sequence[Placed], origins: Array, directions: Array) -> Hi
     best = _no_hits(len(origins))
     everything = np.arange(len(origins))
     for thing in sorted(things, key=attrgetter("region_id")):
-        mesh = Mesh(transform(thing.T_world_shape, thing.shape.vertices), thing.shape.faces)
-        _keep_nearer(best, everything, *_Caster(mesh).cast(origins, directions), thing.region_id)
+        caster = _Caster(Mesh(transform(thing.T_world_shape, thing.shape.vertices), thing.shape.faces))
+        for some in _blocks(len(origins)):
+            _keep_nearer(best, everything[some], *caster.cast(origins[some], directions[some]), thing.region_id)
     return best
 
 
@@ -101,6 +101,11 @@ def edge_distance_px(things: Sequence[Placed], camera: Camera, pixels: NDArray, 
         )
         nearest[own] = np.minimum(nearest[own], distance)
     return nearest
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    """So many rays, `RAYS_AT_ONCE` at a time."""
+    return (slice(first, first + RAYS_AT_ONCE) for first in range(0, count, RAYS_AT_ONCE))
 
 
 def _in_camera(thing: Placed, camera: Camera) -> Mesh:

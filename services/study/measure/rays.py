@@ -14,7 +14,7 @@ from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.scene import Placed
 from workers.geometry.camera import project, project_bounds, unproject
 from workers.geometry.frames import invert, transform
-from workers.geometry.raycast import NEAR_M, RAYS_AT_ONCE, first_hit
+from workers.geometry.raycast import NEAR_M, first_hit
 
 Box = tuple[float, float, float, float]
 """(left, top, right, bottom)."""
@@ -182,15 +182,9 @@ def cast_at(things: Sequence[Placed], camera: Camera, u: Array, v: Array) -> tup
     """
     k, T_cam_world = camera.intrinsics, invert(camera.T_world_cam)
     there = [Placed(thing.region_id, thing.shape, T_cam_world @ thing.T_world_shape) for thing in things]
-    depth_m, region = np.zeros(len(u)), np.zeros(len(u), np.uint8)
-    for first in range(0, len(u), RAYS_AT_ONCE):
-        some = slice(first, first + RAYS_AT_ONCE)
-        x, y = (u[some] - k.cx) / k.fx, (v[some] - k.cy) / k.fy
-        rays = np.stack([x, y, np.ones(len(x))], axis=1)
-        hits = first_hit(there, NEAR_M * rays, rays)
-        depth_m[some] = np.where(np.isinf(hits.distance), 0.0, hits.distance + NEAR_M)
-        region[some] = hits.region
-    return depth_m, region
+    rays = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones(len(u))], axis=1)
+    hits = first_hit(there, NEAR_M * rays, rays)
+    return np.where(np.isinf(hits.distance), 0.0, hits.distance + NEAR_M), hits.region
 
 
 def sees(camera: Camera, things: Sequence[Placed], points: Array) -> NDArray[np.bool_]:
