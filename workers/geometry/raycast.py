@@ -19,9 +19,10 @@ from schemas.base import Array
 from schemas.scene.camera import Camera
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Mesh
-from workers.geometry.camera import project_bounds, unproject
+from workers.geometry.camera import project
 from workers.geometry.convexity import face_planes
 from workers.geometry.frames import invert, transform
+from workers.geometry.ray_kernels import keep_nearer, meet_planes, pixel_rays, pixels_between, row_spans
 
 NEAR_M = 0.05
 """Surfaces nearer than this, along the optical axis, are not seen: the near plane of the fast renderer."""
@@ -34,7 +35,10 @@ GRAZING = 1e-6
 """Cosine of incidence below which the plane does not fix the distance, and Embree's is used."""
 
 RAYS_AT_ONCE = 8_192
-"""Rays of one call: two megabytes of intermediate arrays, which a processor's cache holds."""
+"""Rays of one call: a megabyte of intermediate arrays, which a processor's cache holds."""
+
+FEW_PIXELS = 16
+"""Up to so many, passes over all edges for each pixel cost less than a search tree of the edges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,17 +60,17 @@ def cast_view(things: Sequence[Placed], camera: Camera) -> tuple[Array, NDArray[
     Returns depth_m [H, W] float64, z along the optical axis in metres, 0 where nothing is hit; region [H, W] uint8;
     incidence_cos [H, W] float32. Surfaces with z below `NEAR_M` are passed through.
     """
-    intrinsics = camera.intrinsics
-    best = _no_hits(intrinsics.height * intrinsics.width)
+    k = camera.intrinsics
+    best = _no_hits(k.height * k.width)
     for thing in sorted(things, key=attrgetter("region_id")):
         mesh = _in_camera(thing, camera)
-        pixels = _pixels_in_reach(mesh.vertices, camera)
+        pixels = _pixels_in_reach(mesh, camera)
         caster = _Caster(mesh)
         for some in (pixels[block] for block in _blocks(len(pixels))):
-            rays = unproject(*np.divmod(some, intrinsics.width), np.ones(len(some)), intrinsics)
-            _keep_nearer(best, some, *caster.cast(NEAR_M * rays, rays), thing.region_id, offset=NEAR_M)
-    depth = np.where(np.isinf(best.distance), 0.0, best.distance)
-    shape = (intrinsics.height, intrinsics.width)
+            rays = pixel_rays(some, k.width, (k.fx, k.fy, k.cx, k.cy), NEAR_M)
+            distance, cosine = caster.cast(*rays)
+            _keep_nearer(best, some, distance + NEAR_M, cosine, thing.region_id)
+    depth, shape = np.where(np.isinf(best.distance), 0.0, best.distance), (k.height, k.width)
     return depth.reshape(shape), best.region.reshape(shape), best.incidence_cos.reshape(shape)
 
 
@@ -91,11 +95,14 @@ def edge_distance_px(things: Sequence[Placed], camera: Camera, pixels: NDArray, 
     `outline_only`, only edges at which a mask can end count: those of a boundary, of a fold (more than two faces), and
     those between a front-facing and a back-facing triangle. Lines along which surfaces intersect one another are no edges.
     """
-    centres = shapely.points(np.asarray(pixels, dtype=np.float64)[:, ::-1] + 0.5)
+    points = np.asarray(pixels, dtype=np.float64)[:, ::-1] + 0.5
+    centres = shapely.points(points)
     nearest = np.full(len(centres), np.inf)
     for thing in things:
         mesh = _in_camera(thing, camera)
         edges = np.stack(_project_edges(mesh, _edges(mesh, outline_only), camera), axis=1)
+        if len(points) <= FEW_PIXELS:
+            edges = edges[_may_be_nearest(edges, points)]
         (own, _), distance = shapely.STRtree(shapely.linestrings(edges)).query_nearest(
             centres, return_distance=True, all_matches=False
         )
@@ -116,15 +123,18 @@ def _no_hits(count: int) -> Hits:
     return Hits(np.full(count, np.inf), np.zeros(count, np.uint8), np.zeros(count, np.float32))
 
 
-def _pixels_in_reach(vertices: Array, camera: Camera) -> NDArray[np.int64]:
-    """Flat indices of the pixels whose rays can meet a mesh: its projected bounding box, a pixel wider on each side."""
+def _pixels_in_reach(mesh: Mesh, camera: Camera) -> NDArray[np.int64]:
+    """Flat numbers of the pixels whose rays can meet a mesh in the camera's frame, ascending.
+
+    In each row those between the outermost projected edges, a pixel wider on each side; all where a corner is not beyond
+    the near plane, because it has no place in the image then.
+    """
     k = camera.intrinsics
-    if not len(vertices):
+    if not len(mesh.faces):
         return np.empty(0, np.int64)
-    u_min, v_min, u_max, v_max = project_bounds(vertices, k, NEAR_M)
-    left, right = np.clip([np.floor(u_min) - 1, np.ceil(u_max) + 1], 0, k.width).astype(np.int64)
-    top, bottom = np.clip([np.floor(v_min) - 1, np.ceil(v_max) + 1], 0, k.height).astype(np.int64)
-    return (np.arange(top, bottom)[:, None] * k.width + np.arange(left, right)).ravel()
+    if (mesh.vertices[:, 2] <= NEAR_M).any():
+        return np.arange(k.height * k.width)
+    return pixels_between(*row_spans(*project(mesh.vertices, k), mesh.faces, k.width, k.height), k.width)
 
 
 class _Caster:
@@ -137,35 +147,25 @@ class _Caster:
         self._scene = EmbreeScene(robust=True)
         faces = np.ascontiguousarray(mesh.faces, dtype=np.int32)
         self._geometry = TriangleMesh(self._scene, mesh.vertices.astype(np.float32), faces)
-        self._normals, self._offsets = face_planes(mesh)
+        self._planes = face_planes(mesh)
 
     def cast(self, origins: Array, directions: Array) -> tuple[Array, Array]:
         """(distance, incidence_cos), each [N] float64: distance inf and cosine 0 where the ray meets nothing."""
-        distance, cosine = np.full(len(origins), np.inf), np.zeros(len(origins))
         if self._empty or not len(origins):
-            return distance, cosine
-        found = self._scene.run(origins.astype(np.float32), directions.astype(np.float32), output=1)
-        hit = np.flatnonzero(found["primID"] >= 0)
-        face, o, d = found["primID"][hit], origins[hit], directions[hit]
-        n = self._normals[face]
-        towards = np.einsum("ij,ij->i", n, d)
-        cosine[hit] = np.abs(towards) / np.sqrt(np.einsum("ij,ij->i", d, d))
-        steep = cosine[hit] > GRAZING
-        exact = (self._offsets[face] - np.einsum("ij,ij->i", n, o)) / np.where(steep, towards, 1.0)
-        distance[hit] = np.where(steep, exact, found["tfar"][hit].astype(np.float64))
+            return np.full(len(origins), np.inf), np.zeros(len(origins))
+        rays = origins.astype(np.float32), directions.astype(np.float32)
+        face = self._scene.run(*rays)  # without distances: embreex takes long to hand them over
+        distance, cosine, grazing = meet_planes(face, self._planes, origins, directions, GRAZING)
+        if grazing:
+            these = np.flatnonzero(np.isnan(distance))
+            distance[these] = self._scene.run(rays[0][these], rays[1][these], query="DISTANCE")
         return distance, cosine
 
 
-def _keep_nearer(
-    best: Hits, rays: NDArray[np.int64], distance: Array, cosine: Array, region_id: int, *, offset: float = 0.0
-) -> None:
+def _keep_nearer(best: Hits, rays: NDArray[np.int64], distance: Array, cosine: Array, region_id: int) -> None:
     """Writes into `best` the hits that are nearer than its own by more than `COPLANAR_M` along the normal."""
-    distance = distance + offset
-    nearer = distance + COPLANAR_M / np.maximum(cosine, GRAZING) < best.distance[rays]
-    won = rays[nearer]
-    best.distance[won] = distance[nearer]
-    best.region[won] = region_id
-    best.incidence_cos[won] = cosine[nearer]
+    so_far = best.distance, best.region, best.incidence_cos
+    keep_nearer(so_far, rays, (distance, cosine), region_id, COPLANAR_M, GRAZING)
 
 
 def _edges(mesh: Mesh, outline_only: bool) -> NDArray[np.int64]:
@@ -198,3 +198,13 @@ def _project_edges(mesh: Mesh, edges: NDArray[np.int64], camera: Camera) -> tupl
         z = np.maximum(cut[:, 2], NEAR_M)
         ends.append(np.stack([k.fx * cut[:, 0] / z + k.cx, k.fy * cut[:, 1] / z + k.cy], axis=1))
     return ends[0], ends[1]
+
+
+def _may_be_nearest(edges: Array, points: Array) -> NDArray[np.bool_]:
+    """[E]: whether the box of an edge [E, 2, 2] is as near to one of the points [N, 2] as the nearest start of an edge."""
+    low, high, near = edges.min(axis=1), edges.max(axis=1), np.zeros(len(edges), dtype=np.bool_)
+    for point in points:
+        outside = np.maximum(np.maximum(low - point, point - high), 0.0)
+        to_start = np.hypot(*(edges[:, 0] - point).T).min(initial=np.inf)
+        near |= np.hypot(*outside.T) <= to_start + 1e-6  # what rounding may add
+    return near

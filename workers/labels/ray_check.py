@@ -15,6 +15,7 @@ from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.scene import PosedScene
 from schemas.scene.view import GBuffer, Pair
 from workers.geometry.camera import unproject
+from workers.geometry.jit import compiled
 from workers.geometry.raycast import cast_view, edge_distance_px, first_hit
 
 EDGE_PX = 1.0 / 64.0
@@ -24,6 +25,9 @@ PLANE_P999_MM = 0.01
 OBJECT_MEDIAN_MM = 0.01
 OBJECT_P99_MM = 0.05
 """Bounds on depth before quantisation, each a small part of a stored unit (0.2 mm)."""
+
+LEAST_BOUND_MM = min(PLANE_P999_MM, OBJECT_MEDIAN_MM, OBJECT_P99_MM)
+"""Errors up to this are within every bound."""
 
 ONE_SURFACE_MM = 0.02
 """Surfaces this near are both right: where two things touch or intersect, no edge marks the line between them."""
@@ -43,12 +47,14 @@ def check_against_rays(scene: PosedScene, camera: Camera, buffer: GBuffer, depth
     its depth to the bound.
     """
     depth, region, cosine = cast_view(scene.things, camera)
-    error_mm = np.abs(buffer.depth_m.astype(np.float64) - depth) * 1e3
-    rows, columns = np.nonzero((region != buffer.region) & (error_mm > ONE_SURFACE_MM))
-    if len(rows):
+    bounds = depth_range_m.low, depth_range_m.high, np.float32(STEEPEST_COS)
+    differ, compared, count, large = _compare((buffer.depth_m, buffer.region), (depth, region, cosine), bounds)
+    if len(differ):
+        rows, columns = np.divmod(differ, depth.shape[1])
         away = edge_distance_px(scene.things, camera, np.stack([rows, columns], axis=1))
         wrong = away > EDGE_PX
-        wrong[wrong] = ~_intersects(scene, camera, buffer, rows[wrong], columns[wrong])
+        if wrong.any():
+            wrong[wrong] = ~_intersects(scene, camera, buffer, rows[wrong], columns[wrong])
         worst = int(np.argmax(np.where(wrong, away, -1.0)))
         if wrong[worst]:
             at = rows[worst], columns[worst]
@@ -57,12 +63,46 @@ def check_against_rays(scene: PosedScene, camera: Camera, buffer: GBuffer, depth
                 f"pixel ({at[1]}, {at[0]}) is region {buffer.region[at]} in the mask and {region[at]} by ray, "
                 f"{away[worst]:.3f} px from the nearest edge",
             )
-    stored = (depth > depth_range_m.low) & (depth < depth_range_m.high)
-    same = (region == buffer.region) & (region > 0) & stored & (cosine > STEEPEST_COS)
-    for region_id in np.unique(region[same]):
-        pixels = np.argwhere(same & (region == region_id))
-        to_edge = partial(edge_distance_px, scene.things, camera)
-        _check_depth(int(region_id), error_mm[tuple(pixels.T)], pixels, to_edge)
+    to_edge = partial(edge_distance_px, scene.things, camera)
+    for region_id in np.flatnonzero(large).tolist():
+        # Fewer large errors than lie above the percentile leave it below its bound, and need no sorting.
+        if large[region_id] + 1 >= (count[region_id] - 1) * (1.0 - _bounds(region_id)[-1][0] / 100.0):
+            pixels = np.argwhere(compared == region_id)
+            rows, columns = pixels.T
+            error_mm = np.abs(buffer.depth_m[rows, columns].astype(np.float64) - depth[rows, columns]) * 1e3
+            _check_depth(region_id, error_mm, pixels, to_edge)
+
+
+@compiled
+def _compare(
+    drawn: tuple[NDArray[np.float32], NDArray[np.uint8]],
+    cast: tuple[Array, NDArray[np.uint8], NDArray[np.float32]],
+    bounds: tuple[float, float, np.float32],
+) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]:
+    """(flat numbers of pixels that differ, compared, count, large): a rendered view beside the cast one, in one pass.
+
+    drawn: depth and region [H, W]; cast: depth, region and cosine; bounds: depths that are stored, and `STEEPEST_COS`.
+    Pixels differ in region and by more than `ONE_SURFACE_MM`. compared [H, W]: the region where depth is to be compared,
+    else 0; count [256]: pixels of a region there; large [256]: those whose depth is off by more than `LEAST_BOUND_MM`.
+    """
+    (z_drawn, region_drawn), (z_cast, region_cast, cosine), (low, high, steepest) = drawn, cast, bounds
+    width = z_cast.shape[1]
+    differ, found = np.empty(z_cast.size, np.int64), 0
+    compared = np.zeros(z_cast.shape, np.uint8)
+    count, large = np.zeros(256, np.int64), np.zeros(256, np.int64)
+    for row in range(z_cast.shape[0]):
+        for column in range(width):
+            z, region = z_cast[row, column], region_cast[row, column]
+            error_mm = abs(np.float64(z_drawn[row, column]) - z) * 1e3
+            if region != region_drawn[row, column]:
+                if error_mm > ONE_SURFACE_MM:
+                    differ[found] = row * width + column
+                    found += 1
+            elif region > 0 and low < z < high and cosine[row, column] > steepest:
+                compared[row, column] = region
+                count[region] += 1
+                large[region] += error_mm > LEAST_BOUND_MM
+    return differ[:found].copy(), compared, count, large
 
 
 def _intersects(
@@ -89,12 +129,17 @@ def _intersects(
     return touching
 
 
+def _bounds(region_id: int) -> list[tuple[float, float]]:
+    """(percentile, bound in mm) of a region's errors of depth, ascending."""
+    is_object = region_id >= REGION_FIRST_OBJECT
+    return [(50.0, OBJECT_MEDIAN_MM), (99.0, OBJECT_P99_MM)] if is_object else [(99.9, PLANE_P999_MM)]
+
+
 def _check_depth(
     region_id: int, error_mm: Array, pixels: NDArray[np.int64], edge_px: Callable[[NDArray[np.int64]], Array]
 ) -> None:
     """Bound the errors [N] of a region's depths; `edge_px` measures the distances of pixels [M, 2] from projected edges."""
-    is_object = region_id >= REGION_FIRST_OBJECT
-    bounds = [(50.0, OBJECT_MEDIAN_MM), (99.0, OBJECT_P99_MM)] if is_object else [(99.9, PLANE_P999_MM)]
+    bounds = _bounds(region_id)
     large = error_mm > bounds[-1][1]
     if float(np.percentile(error_mm, bounds[-1][0])) > bounds[-1][1]:
         # In a small region one pixel at an edge of the thing itself, which may show either side, is more than 1 %.

@@ -127,6 +127,32 @@ def test_a_closed_mesh_lets_no_ray_through():
     assert (region[inside] == 3).all()
 
 
+def test_pixels_that_a_thing_cannot_reach_are_left_out_and_no_others():
+    """Through every pixel: things within the image, over its border, one edge-on, and one that the near plane cuts."""
+    ball, every = mesh(trimesh.creation.icosphere(2, 0.5)), rays(K).reshape(-1, 3)
+    slab = shape_of([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        places = [np.array([*rng.uniform(-1.5, 1.5, 2), z]) for z in (2.5, 4.0, 0.4)]
+        things = [Placed(3 + n, (ball, slab, ball)[n], pose(uniform_rotation(rng), at)) for n, at in enumerate(places)]
+        things.append(Placed(9, slab, pose(uniform_rotation(rng), np.array([0.0, 0.0, 1e3]))))
+        depth, region, cosine = cast_view(things, Camera(K, EYE))
+        hits = first_hit(things, NEAR_M * every, every)
+        np.testing.assert_array_equal(region.ravel(), hits.region)
+        np.testing.assert_array_equal(cosine.ravel(), hits.incidence_cos)
+        expected = np.where(hits.region > 0, hits.distance + NEAR_M, 0.0)
+        np.testing.assert_allclose(depth.ravel(), expected, rtol=1e-14)
+
+
+def test_a_ray_nearly_along_a_face_has_the_distance_in_float32():
+    """The face lies in x = 1e-9 (z - 1), and x = 4e-10 z on the ray, so that they meet at z = 5/3."""
+    face = Placed(3, shape_of([[0, -1, 1], [0, 1, 1], [1e-9, 0, 2]], [[0, 1, 2]]), EYE)
+    hits = first_hit([face, Placed(4, square(3.0), EYE)], np.zeros((1, 3)), np.array([[4e-10, 0.0, 1.0]]))
+    assert hits.region[0] == 3
+    assert 1e-9 < abs(hits.distance[0] / (5 / 3) - 1.0) < 1e-6
+    assert hits.incidence_cos[0] == pytest.approx(6e-10)
+
+
 def test_first_hit_measures_in_lengths_of_the_direction():
     things = [Placed(2, square(2.0), EYE), Placed(3, square(1.5, 0.2), EYE)]
     origins = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 3], [0, 0, 0]])
@@ -192,4 +218,6 @@ def test_the_distance_is_that_to_the_nearest_of_all_projected_edges():
     along, away = end - start, pixels[:, None, ::-1] + 0.5 - start
     share = np.clip((away * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)
     expected = np.linalg.norm(away - share[:, :, None] * along, axis=2).min(axis=1)
-    np.testing.assert_allclose(edge_distance_px([ball], Camera(K, EYE), pixels), expected, atol=1e-9)
+    for some in (slice(None), slice(0, 1), slice(200, 212)):  # many and few are searched in different ways
+        found = edge_distance_px([ball], Camera(K, EYE), pixels[some])
+        np.testing.assert_allclose(found, expected[some], atol=1e-9)

@@ -18,7 +18,7 @@ from tests.shapes import asset_of, box, shape_of, table
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.geometry.raycast import cast_view, edge_distance_px
-from workers.labels.ray_check import check_against_rays, check_pair
+from workers.labels.ray_check import STEEPEST_COS, check_against_rays, check_pair
 from workers.pipeline.make_scene import pose_scene
 from workers.plan.randomness import SceneChance
 from workers.plan.step import draw_scene
@@ -54,6 +54,26 @@ def test_depth_that_is_off_by_twenty_micrometres_is_found_in_every_region(scene,
     wrong = truth.depth_m + np.where(truth.region == region_id, np.float32(error_m), np.float32(0))
     with pytest.raises(LabelError, match=f"region {region_id}"):
         check_against_rays(scene, CAMERA, dataclasses.replace(truth, depth_m=wrong), STORED)
+
+
+@pytest.mark.parametrize(("region_id", "share", "error_mm"), [(1, 0.001, 0.02), (3, 0.01, 0.1), (3, 0.5, 0.02)])
+def test_depth_is_held_to_its_percentiles_to_the_pixel(scene, region_id, share, error_mm):
+    """Around the number of wrong pixels from which numpy's percentile exceeds the bound."""
+    depth, region, cosine = cast_view(scene.things, CAMERA)
+    compared = (region == region_id) & (depth < STORED.high) & (cosine > STEEPEST_COS)
+    pixels, verdicts = np.argwhere(compared), set()
+    pixels = pixels[np.argsort(-edge_distance_px(scene.things, CAMERA, pixels))]
+    for count in range(math.floor(share * len(pixels)) - 3, math.floor(share * len(pixels)) + 4):
+        wrong = depth.copy()
+        wrong[tuple(pixels[:count].T)] += error_mm / 1e3
+        buffer = GBuffer(np.zeros((120, 160, 3), np.uint8), wrong.astype(np.float32), region)
+        off = np.abs(buffer.depth_m.astype(np.float64) - depth)[compared] * 1e3
+        bounds = [(99.9, 0.01)] if region_id < 3 else [(50.0, 0.01), (99.0, 0.05)]
+        fails = any(np.percentile(off, percentile) > bound for percentile, bound in bounds)
+        with pytest.raises(LabelError, match=f"region {region_id}: ") if fails else contextlib.nullcontext():
+            check_against_rays(scene, CAMERA, buffer, STORED)
+        verdicts.add(fails)
+    assert verdicts == {True, False}
 
 
 def test_half_a_pixel_of_shift_is_found(scene, truth):
