@@ -10,6 +10,7 @@ from schemas.scene.camera import Camera, Intrinsics
 from workers.geometry.frames import invert
 from workers.geometry.jit import compiled
 from workers.geometry.normals import Depth
+from workers.geometry.sight import BLOCK, bound_view, columns_in_sight
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,45 +51,57 @@ def _splat(
 ) -> tuple[Array, NDArray[np.int32]]:
     """(depth, source index); k and m: cx, cy, fx, fy of source and target.
 
-    Each row of the source is carried over first, in a loop without branches that is vectorised, and drawn then.
+    Each row of the source is carried over first, as far as it may be in sight, in a loop without branches that is vectorised,
+    and drawn then.
     """
     (height, width), (cx, cy, fx, fy) = shape, m
     nearest, index = np.zeros(shape), np.full(shape, -1, np.int32)
     all_nearest, all_index = nearest.ravel(), index.ravel()
     (xx, xy, xz, x0), (yx, yy, yz, y0), (zx, zy, zz, z0) = _rows(T_target_source)
-    columns = depth.shape[1]
-    ray_x = (np.arange(columns) + 0.5 - k[0]) / k[2]
-    at_column, at_row, at_Z = np.empty(columns, np.int32), np.empty(columns, np.int32), np.empty(columns)
+    ray_x = (np.arange(depth.shape[1]) + 0.5 - k[0]) / k[2]
+    ray_y = (np.arange(depth.shape[0]) + 0.5 - k[1]) / k[3]
+    at_column, at_row, at_Z = np.empty(ray_x.shape, np.int32), np.empty(ray_x.shape, np.int32), np.empty(ray_x.shape)
     low, right, bottom = -float(reach), float(width + reach), float(height + reach)
+    sides = bound_view(T_target_source, m, reach, shape)
+    start = stop = 0
     for i in range(depth.shape[0]):
-        ray_y, source = (i + 0.5 - k[1]) / k[3], depth[i]
-        for j in range(columns):
+        if i % BLOCK[0] == 0:
+            rows = slice(i, i + BLOCK[0])
+            start, stop = columns_in_sight(depth[rows], units_per_m, ray_x, ray_y[rows], sides)
+        source, rays = depth[i, start:stop], ray_x[start:stop]
+        for j in range(len(source)):
             z = source[j] / units_per_m
-            x, y = ray_x[j] * z, ray_y * z
+            x, y = rays[j] * z, ray_y[i] * z
             Z = zx * x + zy * y + zz * z + z0
             u = fx * (xx * x + xy * y + xz * z + x0) / Z + cx
             v = fy * (yx * x + yy * y + yz * z + y0) / Z + cy
             seen = (source[j] > 0) & (Z > 0.0) & (u >= low) & (u < right) & (v >= low) & (v < bottom)
             at_column[j], at_row[j] = np.int32(np.floor(u) if seen else 0.0), np.int32(np.floor(v) if seen else 0.0)
             at_Z[j] = Z if seen else 0.0
-        for j in range(columns):
+        for j in range(len(source)):
             Z = at_Z[j]
             if Z == 0.0:
                 continue
-            if reach == 0:  # one pixel, without the work of four bounds
-                at = at_row[j] * width + at_column[j]
-                if all_index[at] < 0 or all_nearest[at] > Z:
-                    all_nearest[at] = Z
-                    all_index[at] = i * columns + j
+            pixel = i * depth.shape[1] + start + j
+            if reach > 0:
+                _draw_square((nearest, index), at_row[j], at_column[j], reach, Z, pixel)
                 continue
-            first, last = max(at_row[j] - reach, 0), min(at_row[j] + reach + 1, height)
-            left, end = max(at_column[j] - reach, 0), min(at_column[j] + reach + 1, width)
-            for row in range(first, last):
-                for column in range(left, end):
-                    if index[row, column] < 0 or nearest[row, column] > Z:
-                        nearest[row, column] = Z
-                        index[row, column] = i * columns + j
+            at = np.uint64(at_row[j] * width + at_column[j])  # a signed index is tested for counting from the end
+            if all_index[at] < 0 or all_nearest[at] > Z:
+                all_nearest[at], all_index[at] = Z, pixel
     return nearest, index
+
+
+@compiled
+def _draw_square(
+    target: tuple[Array, NDArray[np.int32]], at_row: int, at_column: int, reach: int, Z: float, pixel: int
+) -> None:
+    """Draws a point over the pixels of the target (depth, source index) up to `reach` from one, which may lie outside."""
+    nearest, index = target
+    for row in range(max(at_row - reach, 0), min(at_row + reach + 1, nearest.shape[0])):
+        for column in range(max(at_column - reach, 0), min(at_column + reach + 1, nearest.shape[1])):
+            if index[row, column] < 0 or nearest[row, column] > Z:
+                nearest[row, column], index[row, column] = Z, pixel
 
 
 @compiled
