@@ -11,10 +11,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from schemas.job.job import Job
+from schemas.scene.shape import Mesh
 from tests.gravity import set_gravity
 from tests.physics.room import at, ball_body, drop, physics
 from tests.shapes import box
-from workers.geometry.frames import pose, quaternion_from_rotation, rotation_about
+from workers.geometry.frames import pose, quaternion_from_rotation, rotation_about, uniform_rotation
+from workers.physics import bullet
 from workers.physics.bullet import GRAVITY_M_S2, open_world
 from workers.physics.rigid_body import Body
 
@@ -40,7 +42,7 @@ T = np.eye(4)
 T[2, 3] = 3.0
 sizes = []
 for world in range(513):
-    with open_world([(bodies[world // 2 % 2], T)], plate if world % 2 else 0.0, Job(name="t").physics, 8) as falling:
+    with open_world([(bodies[world // 4 % 2], T)], plate if world % 4 == 3 else 0.0, Job(name="t").physics, 8) as falling:
         falling.advance()
     sizes.append(anonymous_kb())
 print((sizes[512] - sizes[256]) / 256)
@@ -90,6 +92,60 @@ def test_what_was_simulated_before_leaves_no_trace_in_the_bits():
         if k % 3:
             fall(other, pose(rotation_about(np.array([1.0, 0, 0]), 0.1 * k), np.array([0, 0, 0.3])), k % 7)
     assert len(results) == 1
+
+
+def test_worlds_that_begin_without_a_reset_have_the_bits_of_those_that_begin_with_one(monkeypatch):
+    """Drops that turn, slide and roll on, some of several bodies or onto a mesh, in three orders."""
+    rng = np.random.default_rng(8)
+    shapes = [body_of(box(0.1, 0.08, 0.2)), body_of(box(0.02, 0.3, 0.1)), ball_body(0.03)]
+    plate = Mesh(np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    drops = []
+    for number in range(90):
+        count, ground = (2, 0.0) if number % 15 == 7 else (1, plate) if number % 15 == 11 else (1, 0.0)
+        spots = [np.array([0.05 * k, 0.0, 0.15 + 0.3 * k]) for k in range(count)]
+        placed = [(shapes[(number + k) % 3], pose(uniform_rotation(rng), spot)) for k, spot in enumerate(spots)]
+        drops.append((placed, ground, float(rng.uniform(200, 2000)), rng.normal(0.0, 0.3, 3)))
+
+    def ended(placed, ground, step_hz, push):
+        with open_world(placed, ground, PHYSICS, STEPS) as world:
+            world.set_rate(step_hz)
+            world.set_velocity(push)
+            for _ in range(50):
+                world.advance()
+            return [(world.pose(k), world.velocity(k)) for k in range(len(placed))]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bullet, "MOST_KEPT", 0)
+        expected = [ended(*one) for one in drops]
+    monkeypatch.setattr(bullet, "MOST_KEPT", 20)
+    for seed in range(3):
+        for number in np.random.default_rng(seed).permutation(len(drops)):
+            assert ended(*drops[number]) == expected[number]
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [((1913.6, 14, 39), (3729.7, 6)), ((3315.1, 3, 3), (3596.9, 6)), ((3899.2, 12, 26), (710.2, 5))],
+)
+def test_what_a_world_leaves_over_of_a_step_is_not_in_the_next(before, after, monkeypatch):
+    """Rates (1/s), steps at once and advances for which Bullet would take a step more or less in the second world."""
+    body, T = body_of(box(0.1, 0.08, 0.2)), pose(np.eye(3), np.array([0.0, 0.0, 0.3]))
+
+    def ended(step_hz, steps, advances):
+        with drop(body, T, 0.0, PHYSICS, steps) as world:
+            world.set_rate(step_hz)
+            for _ in range(advances):
+                world.advance()
+            return world.pose(), world.velocity()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bullet, "MOST_KEPT", 0)
+        ended(*before)
+        expected = ended(*after, 30)
+    bullet._connection().empty(plain=False)
+    monkeypatch.setattr(bullet, "MOST_KEPT", 1)
+    ended(*before)
+    assert ended(*after, 30) == expected
 
 
 def test_an_error_inside_a_world_does_not_harm_the_next():
