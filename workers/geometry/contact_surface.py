@@ -10,8 +10,10 @@ from scipy.spatial import ConvexHull
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
+from workers.geometry.bounds import bounds_of
 from workers.geometry.contact_kernels import SLOPE, Index, bounds_in, find_near
 from workers.geometry.convexity import face_normals, has_rim, numbers_in, weld
+from workers.geometry.frames import dot
 from workers.geometry.jit import compiled
 from workers.geometry.nearest import nearest_on_segments, nearest_on_triangle
 
@@ -50,9 +52,10 @@ def surface_of(mesh: Mesh, closed: bool) -> Surface:
     normals = face_normals(vertices, faces)
     solid = normals.any(axis=1)
     faces, normals = faces[solid], normals[solid]
-    starts, members = _star(faces, len(vertices))
-    edges, across = _bent_edges(vertices, faces, normals)
+    edges, across, bent = _edges(vertices, faces, normals, *_half_edges(faces, len(vertices)))
+    starts, members = _star(edges, len(vertices))
     side = _sides(vertices, faces, normals, starts, members) if closed else np.zeros(len(faces), dtype=np.int64)
+    edges, across = edges[bent], across[bent]
     return Surface(vertices, faces, side, numbers_in(edges, len(vertices)), edges, across, starts, members, mesh)
 
 
@@ -67,23 +70,28 @@ def crop(mesh: Mesh, low: Array, high: Array) -> Mesh:
     vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
     near, least, most = bounds_in(vertices, mesh.faces, low, high)
     if len(near):
-        near, _, _ = bounds_in(vertices, mesh.faces, least.min(axis=0), most.max(axis=0))
+        near, _, _ = bounds_in(vertices, mesh.faces, bounds_of(least)[0], bounds_of(most)[1])
     return Mesh(mesh.vertices, mesh.faces[near])
-
-
-def _star(faces: Index, count: int) -> tuple[Index, Index]:
-    """(starts [count + 1], members): the neighbours of each vertex, one after the other, ascending."""
-    one, other = faces[:, [0, 1, 2, 1, 2, 0]], faces[:, [1, 2, 0, 0, 1, 2]]
-    keys = np.unique(one * count + other)
-    return np.searchsorted(keys, np.arange(count + 1) * count), keys % count
 
 
 def _half_edges(faces: Index, count: int) -> tuple[Index, Index]:
     """(keys [3 F], ascending, the same for the sides of one edge; which [3 F] sides these are, three times their face and on)."""
-    one, other = faces, np.roll(faces, -1, axis=1)
+    one, other = faces, faces[:, [1, 2, 0]]
     keys = (np.minimum(one, other) * count + np.maximum(one, other)).ravel()
     which = np.argsort(keys, kind="stable")
     return keys[which], which
+
+
+@compiled
+def _star(edges: Index, count: int) -> tuple[Index, Index]:
+    """(starts [count + 1], members): the neighbours of each vertex, one after the other, ascending as edges [E, 2] are."""
+    starts = np.append(0, np.cumsum(np.bincount(edges.ravel(), minlength=count)))
+    members, free = np.empty(edges.size, np.int64), starts.copy()
+    for here, there in ((1, 0), (0, 1)):
+        for n in range(len(edges)):
+            members[free[edges[n, here]]] = edges[n, there]
+            free[edges[n, here]] += 1
+    return starts, members
 
 
 @compiled
@@ -107,26 +115,25 @@ def _sides(vertices: Array, faces: Index, normals: Array, starts: Index, members
     return side
 
 
-def _bent_edges(vertices: Array, faces: Index, normals: Array) -> tuple[Index, Index]:
-    """Edges [E, 2] that are not between two coplanar faces, and the vertices across them [E, 2]."""
-    keys, which = _half_edges(faces, len(vertices))
-    first, last = np.flatnonzero(np.diff(keys, prepend=-1)), np.flatnonzero(np.diff(keys, append=-1))
-    edges = np.stack(np.divmod(keys[first], len(vertices)), axis=1)
-    sides = which[np.stack([first, last], axis=1)]
-    across = faces[sides // 3, (sides + 2) % 3]
-    cosine = _dots(normals[sides[:, 0] // 3], normals[sides[:, 1] // 3])
-    a = vertices[edges[:, 0]]
-    along, p, q = (vertices[each] - a for each in (edges[:, 1], *across.T))
-    # Two faces folded onto one another are coplanar, and their edge is bent all the same: p and q are on one side of it
-    same_side = _dots(p, q) * _dots(along, along) > _dots(along, p) * _dots(along, q)
-    bent = (last != first + 1) | (np.abs(cosine) <= 1.0 - FLAT) | ((across[:, 0] != across[:, 1]) & same_side)
-    return edges[bent], across[bent]
-
-
-def _dots(one: Array, other: Array) -> Array:
-    """[N]: the scalar products of vectors [N, 3]."""
-    dots: Array = np.einsum("ij,ij->i", one, other)
-    return dots
+@compiled
+def _edges(vertices: Array, faces: Index, normals: Array, keys: Index, which: Index) -> tuple[Index, Index, Index]:
+    """The edges [E, 2] of half edges, the vertices across them [E, 2], and those [B] that are not between coplanar faces."""
+    edges, across, bent = np.empty((len(keys), 2), np.int64), np.empty((len(keys), 2), np.int64), np.empty_like(keys)
+    count = first = bends = 0
+    for last in range(len(keys)):
+        if last + 1 < len(keys) and keys[last + 1] == keys[last]:
+            continue
+        (f, m), (g, n), (i, j) = divmod(which[first], 3), divmod(which[last], 3), divmod(keys[last], len(vertices))
+        v, w = faces[f, (m + 2) % 3], faces[g, (n + 2) % 3]
+        edges[count], across[count], bent[bends] = (i, j), (v, w), count
+        even = last == first + 1 and abs(dot(normals[f], normals[g])) > 1.0 - FLAT
+        # Two faces folded onto one another are coplanar, and their edge is bent all the same: p and q are on one side of it
+        if even and v != w:
+            along, p, q = vertices[j] - vertices[i], vertices[v] - vertices[i], vertices[w] - vertices[i]
+            even = not dot(p, q) * dot(along, along) > dot(along, p) * dot(along, q)
+        bends += not even
+        count, first = count + 1, last + 1
+    return edges[:count], across[:count], bent[:bends]
 
 
 def faces_within(one: tuple[Array, Index], other: tuple[Array, Index], within_m: float) -> tuple[Index, Index]:
@@ -216,7 +223,7 @@ def _patches(vertices: Array, faces: Index, normals: Array) -> tuple[NDArray[np.
     keys, which = _half_edges(faces, len(vertices))
     same = keys[1:] == keys[:-1]
     one, other = which[:-1][same] // 3, which[1:][same] // 3
-    cosine = _dots(normals[one], normals[other])
+    cosine = np.einsum("ij,ij->i", normals[one], normals[other])
     even = cosine > 1.0 - FLAT
     links = coo_array((np.ones(even.sum()), (one[even], other[even])), shape=(len(faces), len(faces)))
     patch = connected_components(links, directed=False)[1]

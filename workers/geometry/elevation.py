@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
+from workers.geometry.bounds import bounds_of
 from workers.geometry.jit import compiled
 
 EDGE_SLACK = 1e-12
@@ -67,7 +68,7 @@ def vertical_gap(upper: Mesh, lower: Mesh, band_m: float = 0.02) -> float:
     `band_m` of its lowest point are tried. inf where nothing is above anything.
     """
     gap = _least_gap_below(upper.vertices, lower, band_m)
-    bottom, top = upper.vertices.min(axis=0), upper.vertices.max(axis=0)
+    bottom, top = bounds_of(upper.vertices)
     # The gap above a vertex of the lower mesh is at least its distance to the lowest point of the upper one.
     under = lower.vertices[bottom[2] - lower.vertices[:, 2] < gap]
     under = under[((under[:, :2] >= bottom[:2]) & (under[:, :2] <= top[:2])).all(axis=1)]

@@ -143,3 +143,9 @@ def cross_each(one: Array, many: Array) -> Array:
             x, y, z = many[n, k]
             products[n, k, 0], products[n, k, 1], products[n, k, 2] = b * z - c * y, c * x - a * z, a * y - b * x
     return products
+
+
+@compiled
+def dot(one: Array, other: Array) -> float:
+    """The scalar product of two vectors [3]; x and z are added first, as einsum adds three products."""
+    return (one[0] * other[0] + one[2] * other[2]) + one[1] * other[1]

@@ -13,6 +13,7 @@ from schemas.base import Array, Pose
 from schemas.errors import SettleError
 from schemas.job.physics import Physics
 from schemas.scene.shape import Mesh
+from workers.geometry.bounds import bounds_of
 from workers.geometry.frames import quaternion_from_rotation
 from workers.geometry.obj_text import obj_of
 from workers.physics.pybullet_flaws import BulletBuffers, silence_stderr
@@ -141,9 +142,7 @@ def open_world(
         physicsClientId=client,
     )
     pybullet.setGravity(0.0, 0.0, -GRAVITY_M_S2, physicsClientId=client)
-    grounds = tuple(_add_ground(client, each) for each in (ground if isinstance(ground, tuple) else (ground,)))
-    for number in grounds:
-        _set_surface(client, number, physics)
+    grounds = tuple(_add_ground(client, each, physics) for each in (ground if isinstance(ground, tuple) else (ground,)))
     things = []
     for body, T_world_body in placed:
         level = len(placed) == 1 and stands_on_face(np.concatenate(body.parts), -T_world_body[2, :3])
@@ -196,7 +195,7 @@ class _Connection:
 _connection = cache(_Connection)
 
 
-def _add_ground(client: int, ground: float | Mesh | Array) -> int:
+def _add_ground(client: int, ground: float | Mesh | Array, physics: Physics) -> int:
     place = {}
     if isinstance(ground, Mesh):
         shape = _shape_of_mesh(client, ground)
@@ -204,9 +203,9 @@ def _add_ground(client: int, ground: float | Mesh | Array) -> int:
         place = {"basePosition": [0, 0, ground - SLAB_HALF_M[2]]}
         shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=SLAB_HALF_M, physicsClientId=client)
     else:
-        vertices = _BUFFERS.vertices(ground)
-        shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client)
+        shape = _shape_of(client, [ground], {})
     thing: int = pybullet.createMultiBody(0, shape, useMaximalCoordinates=1, physicsClientId=client, **place)
+    _set_surface(client, thing, physics)
     return thing
 
 
@@ -219,8 +218,7 @@ def _shape_of_mesh(client: int, mesh: Mesh) -> int:
         )
     flags = pybullet.GEOM_FORCE_CONCAVE_TRIMESH
     triangles = {"vertices": _BUFFERS.vertices(mesh.vertices), "indices": _BUFFERS.indices(mesh.faces.ravel())}
-    shape: int = pybullet.createCollisionShape(pybullet.GEOM_MESH, flags=flags, physicsClientId=client, **triangles)
-    return shape
+    return int(pybullet.createCollisionShape(pybullet.GEOM_MESH, flags=flags, physicsClientId=client, **triangles))
 
 
 def _add_body(client: int, body: Body, R_world_body: Array | None) -> int:
@@ -234,31 +232,26 @@ def _add_body(client: int, body: Body, R_world_body: Array | None) -> int:
     turned = {}
     if R_world_body is not None:
         turned["collisionFrameOrientation"] = quaternion_from_rotation(R_world_body.T).tolist()
-    with _shape_of(client, parts, turned) as shape:
-        # The margin of a compound's parts can be set through a body in reduced coordinates alone, which shares the shape.
-        brief = pybullet.createMultiBody(body.mass_kg, shape, physicsClientId=client)
-        pybullet.changeDynamics(brief, -1, collisionMargin=body.margin_m, physicsClientId=client)
-        pybullet.removeBody(brief, physicsClientId=client)
-        thing: int = pybullet.createMultiBody(body.mass_kg, shape, useMaximalCoordinates=1, physicsClientId=client)
+    shape = _shape_of(client, parts, turned)
+    # The margin of a compound's parts can be set through a body in reduced coordinates alone, which shares the shape.
+    brief = pybullet.createMultiBody(body.mass_kg, shape, physicsClientId=client)
+    pybullet.changeDynamics(brief, -1, collisionMargin=body.margin_m, physicsClientId=client)
+    pybullet.removeBody(brief, physicsClientId=client)
+    thing: int = pybullet.createMultiBody(body.mass_kg, shape, useMaximalCoordinates=1, physicsClientId=client)
     moments = body.moments.tolist()
     pybullet.changeDynamics(thing, -1, mass=body.mass_kg, localInertiaDiagonal=moments, physicsClientId=client)
     return thing
 
 
-@contextmanager
-def _shape_of(client: int, parts: Sequence[Array], turned: Mapping[str, list[float]]) -> Iterator[int]:
-    """A collision shape of convex parts, for bodies that are made within the block.
-
-    PyBullet reads several parts from a file alone: the objects of an OBJ.
-    """
+def _shape_of(client: int, parts: Sequence[Array], turned: Mapping[str, list[float]]) -> int:
+    """A collision shape of convex parts. PyBullet reads several from a file alone: the objects of an OBJ."""
     if len(parts) == 1:
         vertices = _BUFFERS.vertices(parts[0])
-        yield pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client, **turned)
-        return
+        return int(pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client, **turned))
     with tempfile.NamedTemporaryFile(prefix="verso-parts-", suffix=".obj") as file:
         file.write(obj_of(parts))
         file.flush()
-        yield pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=file.name, physicsClientId=client, **turned)
+        return int(pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=file.name, physicsClientId=client, **turned))
 
 
 def _set_surface(client: int, thing: int, physics: Physics, body: Body | None = None) -> None:
@@ -281,6 +274,5 @@ def _set_surface(client: int, thing: int, physics: Physics, body: Body | None = 
 
 def _size_m(body: Body) -> float:
     """Bullet's measure of a body: half the diagonal of its box, plus the distance of its middle from the centre of mass."""
-    points = np.concatenate(body.parts)
-    low, high = points.min(axis=0) - body.margin_m, points.max(axis=0) + body.margin_m
+    low, high = bounds_of(np.concatenate(body.parts)) + [[-body.margin_m], [body.margin_m]]
     return float(np.linalg.norm(high - low) + np.linalg.norm(high + low)) / 2.0

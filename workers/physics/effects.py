@@ -43,8 +43,7 @@ def is_round(hull: Hull, com: Array) -> bool:
     At rest the centre of mass is lower over the plane than over all its neighbours, and on a round stretch hardly lower
     than over some of them.
     """
-    cells = np.rint(hull.normals / CELL).astype(np.int64)
-    normals = hull.normals[first_equal(cells) == np.arange(len(cells))]
+    normals = hull.normals[first_equal(np.rint(hull.normals / CELL).astype(np.int64)) == np.arange(len(hull.normals))]
     return _rests_on_round(hull.vertices, normals, com, math.cos(NEIGHBOUR_RAD), math.cos(SAME_PLANE_RAD))
 
 

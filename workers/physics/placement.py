@@ -10,6 +10,7 @@ from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.region import REGION_TABLE
 from schemas.scene.scene import ContactForce
 from schemas.scene.shape import Mesh
+from workers.geometry.bounds import bounds_of
 from workers.geometry.contact_surface import Surface, crop, is_closed
 from workers.geometry.frames import DOWN, motion_between, transform
 from workers.physics.bullet import GRAVITY_M_S2
@@ -92,7 +93,7 @@ def place(
 ) -> Placement:
     """The objects, as these forms, with the part of the table within `room_m` of these poses."""
     points = np.concatenate([transform(T, start.hull.vertices) for start, T in zip(starts, poses, strict=True)])
-    near = crop(table.mesh, points.min(axis=0) - room_m, points.max(axis=0) + room_m)
+    near = crop(table.mesh, *(bounds_of(points) + [[-room_m], [room_m]]))
     things = tuple(Thing(form.surface, start.asset.mass) for form, start in zip(forms, starts, strict=True))
     return Placement(tuple(starts), things, (*forms, Form(near, table.mesh, table.asset.shape.closed)), friction)
 

@@ -52,7 +52,7 @@ def _describe(points: Array, area_m2: float, highest_m: float) -> TableTop:
     # A face that leans within `LEVEL` is not flat: a level plane at its highest point would not stand for it.
     even = height - float(points[:, 2].min()) <= SAME_LEVEL_M
     convex = even and area_m2 >= FILLED_SHARE * hull.volume and highest_m <= height + SAME_LEVEL_M
-    middle = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
+    middle = bounds_of(points[:, :2]).sum(axis=0) / 2
     return TableTop(height, frozen_array(middle), frozen_array(points[hull.vertices, :2]), bool(convex))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
+from workers.geometry.bounds import bounds_of
 from workers.geometry.contact_kernels import Index, bounds_in, corners_on_faces, edges_across_edges, find_near
 from workers.geometry.contact_surface import Surface
 from workers.geometry.frames import transform
@@ -58,7 +59,7 @@ def find_near_features(surfaces: Sequence[Surface], points: Sequence[Array], wit
     points: the vertices [V, 3] of each surface, world.
     """
     found = []
-    bounds = [(each.min(axis=0, initial=np.inf), each.max(axis=0, initial=-np.inf)) for each in points]
+    bounds = [bounds_of(each) for each in points]
     for i, j in itertools.combinations(range(len(surfaces)), 2):
         low, high = np.maximum(bounds[i][0], bounds[j][0]) - within_m, np.minimum(bounds[i][1], bounds[j][1]) + within_m
         if (low > high).any():

@@ -114,12 +114,12 @@ def _inverse_root(tensor: Array) -> Array:
 def _rows(bodies: Sequence[Inertia], roots: Sequence[Array], contacts: Contacts, edges: Array) -> Array:
     """[contacts CONE_EDGES, 6 bodies]: how motion opens contacts along each edge, in units of root of kinetic energy."""
     rows = np.zeros((len(edges), CONE_EDGES, len(bodies), 6))
-    for who, sign in ((contacts.upper, 1.0), (contacts.lower, -1.0)):
-        for number, (body, root) in enumerate(zip(bodies, roots, strict=True)):
-            own = np.flatnonzero(who == number)
-            levers, along = contacts.points[own] - body.com, edges[own]
-            rows[own, :, number, :3] = sign * along / np.sqrt(body.mass_kg)
-            rows[own, :, number, 3:] = sign * cross_each(levers, along) @ root
+    for number, (body, root) in enumerate(zip(bodies, roots, strict=True)):
+        own = np.flatnonzero(contacts.of(number))
+        sign = np.where(contacts.upper[own] == number, 1.0, -1.0)[:, None, None]
+        levers, along = contacts.points[own] - body.com, edges[own]
+        rows[own, :, number, :3] = sign * along / np.sqrt(body.mass_kg)
+        rows[own, :, number, 3:] = sign * cross_each(levers, along) @ root
     return rows.reshape(-1, 6 * len(bodies))
 
 
@@ -130,7 +130,7 @@ def _pyramid(normals: Array, friction: float) -> Array:
     """
     up = np.array([0.0, 0.0, 1.0]) - normals[:, 2:] * normals
     level = np.linalg.norm(up, axis=1) < 1e-3
-    up[level] = np.cross(normals[level], [0.0, 1.0, 0.0])
+    up[level] = cross_each(normals[level], np.full((np.count_nonzero(level), 1, 3), [0.0, 1.0, 0.0]))[:, 0]
     first = up / np.linalg.norm(up, axis=1, keepdims=True)
     second = cross_each(normals, first[:, None])[:, 0]
     angle = 2.0 * np.pi * np.arange(CONE_EDGES) / CONE_EDGES
