@@ -15,7 +15,7 @@ from schemas.job.physics import Physics
 from schemas.scene.shape import Mesh
 from workers.geometry.bounds import bounds_of
 from workers.geometry.frames import quaternion_from_rotation
-from workers.geometry.obj_text import obj_of
+from workers.geometry.obj_text import DECIMALS, obj_of
 from workers.physics.pybullet_flaws import BulletBuffers, silence_stderr
 from workers.physics.rest_pose import stands_on_face
 from workers.physics.rigid_body import Body, BodyPose
@@ -31,9 +31,6 @@ contact per step: a box that lands on an edge turns about the vertical by ten ti
 
 MOST_GROUND_VERTICES, MOST_GROUND_INDICES = 131_072, 524_288
 """PyBullet's limits on one collision mesh; beyond them it fails without a reason."""
-
-DECIMALS = 8
-"""Decimals of a shape's vertices, metres: Bullet's hull drops some of four and more in one plane but for the last bits."""
 
 RESIDUAL_SHARE = 0.003
 """Change of velocity at which the solver stops to iterate, as a share of what gravity adds in a step. Bullet's default is a
@@ -228,6 +225,7 @@ def _add_body(client: int, body: Body, R_world_body: Array | None) -> int:
     the outermost vertices exact. In the world's axes these are the ones that the body stands on. But a shape with axes of its
     own is a compound to Bullet, and compounds are less stable on one another.
     """
+    # Of four vertices and more that lie in one plane but for the last bits, Bullet's hull drops some
     parts = [np.round(part if R_world_body is None else part @ R_world_body.T, DECIMALS) for part in body.parts]
     turned = {}
     if R_world_body is not None:
