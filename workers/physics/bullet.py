@@ -6,6 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
+from uuid import uuid4
 
 import numpy as np
 
@@ -243,13 +245,15 @@ def _add_body(client: int, body: Body, R_world_body: Array | None) -> int:
 
 def _shape_of(client: int, parts: Sequence[Array], turned: Mapping[str, list[float]]) -> int:
     """A collision shape of convex parts. PyBullet reads several from a file alone: the objects of an OBJ."""
+    given = {"physicsClientId": client, **turned}
     if len(parts) == 1:
-        vertices = _BUFFERS.vertices(parts[0])
-        return int(pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices, physicsClientId=client, **turned))
-    with tempfile.NamedTemporaryFile(prefix="verso-parts-", suffix=".obj") as file:
-        file.write(obj_of(parts))
-        file.flush()
-        return int(pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=file.name, physicsClientId=client, **turned))
+        return int(pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=_BUFFERS.vertices(parts[0]), **given))
+    path = Path(tempfile.gettempdir(), f"verso-parts-{uuid4().hex}.obj")  # `NamedTemporaryFile` takes twice as long
+    try:
+        path.write_bytes(obj_of(parts))
+        return int(pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path), **given))
+    finally:
+        path.unlink(missing_ok=True)
 
 
 def _set_surface(client: int, thing: int, physics: Physics, body: Body | None = None) -> None:

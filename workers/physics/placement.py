@@ -106,8 +106,7 @@ def farthest_m(starts: Sequence[ObjectStart], poses: Sequence[Pose], others: Seq
 
 def placed_mesh(start: ObjectStart, T_world_obj: Pose) -> Mesh:
     """The object's mesh in world coordinates."""
-    shape = start.asset.shape
-    return Mesh(transform(T_world_obj, shape.vertices), shape.faces)
+    return Mesh(transform(T_world_obj, start.asset.shape.vertices), start.asset.shape.faces)
 
 
 def measure_supports(placement: Placement, poses: Sequence[Pose]) -> tuple[Support, ...]:

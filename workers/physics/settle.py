@@ -204,8 +204,7 @@ def _is_low(drop: Drop, height_m: float) -> bool:
 
 
 def _com(start: ObjectStart, T: Pose) -> list[float]:
-    com: list[float] = transform(T, start.asset.mass.com[None])[0].tolist()
-    return com
+    return list(transform(T, start.asset.mass.com[None])[0].tolist())
 
 
 def _left_table(drop: Drop, start: ObjectStart, T: Pose, seconds: float) -> SettleError:
