@@ -276,5 +276,5 @@ def _set_surface(client: int, thing: int, physics: Physics, body: Body | None = 
 
 def _size_m(body: Body) -> float:
     """Bullet's measure of a body: half the diagonal of its box, plus the distance of its middle from the centre of mass."""
-    low, high = bounds_of(np.concatenate(body.parts)) + [[-body.margin_m], [body.margin_m]]
+    low, high = np.add(bounds_of(np.concatenate(body.parts)), [[-body.margin_m], [body.margin_m]])
     return float(np.linalg.norm(high - low) + np.linalg.norm(high + low)) / 2.0

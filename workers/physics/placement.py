@@ -93,7 +93,7 @@ def place(
 ) -> Placement:
     """The objects, as these forms, with the part of the table within `room_m` of these poses."""
     points = np.concatenate([transform(T, start.hull.vertices) for start, T in zip(starts, poses, strict=True)])
-    near = crop(table.mesh, *(bounds_of(points) + [[-room_m], [room_m]]))
+    near = crop(table.mesh, *np.add(bounds_of(points), [[-room_m], [room_m]]))
     things = tuple(Thing(form.surface, start.asset.mass) for form, start in zip(forms, starts, strict=True))
     return Placement(tuple(starts), things, (*forms, Form(near, table.mesh, table.asset.shape.closed)), friction)
 

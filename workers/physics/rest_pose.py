@@ -72,7 +72,7 @@ def support_margin(contacts_xy: Array, com_xy: Array) -> float:
     """
     if len(contacts_xy) == 0:
         return -np.inf
-    outline, at = shapely.convex_hull(shapely.linestrings(np.concatenate([contacts_xy, contacts_xy[:1]]))), shapely.points(com_xy)
+    outline, at = shapely.convex_hull(shapely.multipoints(contacts_xy)), shapely.points(com_xy)
     if outline.geom_type == "Polygon" and outline.contains(at):
         return float(outline.exterior.distance(at))
     return -float(outline.distance(at))

@@ -1,9 +1,12 @@
 """The simulator's room: the same bits whatever came before, and nothing kept of what was."""
 
 import dataclasses
+import errno
 import math
+import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +21,7 @@ from tests.shapes import box
 from workers.geometry.frames import pose, quaternion_from_rotation, rotation_about, uniform_rotation
 from workers.physics import bullet
 from workers.physics.bullet import GRAVITY_M_S2, open_world
-from workers.physics.rigid_body import Body
+from workers.physics.rigid_body import Body, octants
 
 ROOT = Path(__file__).resolve().parents[3]
 PHYSICS = Job(name="t").physics
@@ -195,3 +198,20 @@ def test_what_overlaps_is_moved_apart_and_gains_no_speed(step_hz):
         assert world.velocity()[0] == (0.0, 0.0, 0.0)
         raised = world.pose()[0][2] - (0.05 - deep)
         assert raised == pytest.approx(0.08 * (deep - 1e-5), rel=0.01)  # Bullet's share, and what it leaves
+
+
+def test_no_file_of_parts_stays_behind_also_where_the_disk_is_full(monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    body = body_of(box(0.1, 0.1, 0.1))
+    body = dataclasses.replace(body, parts=octants(body.parts[0], 0.01))
+    fall(body, at(0.0, 1.0))
+    assert list(tmp_path.iterdir()) == []
+
+    def write_half(path, data):
+        path.touch()
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", write_half)
+    with pytest.raises(OSError, match=r"No space left on device: .*verso-parts-"):
+        fall(body, at(0.0, 1.0))
+    assert list(tmp_path.iterdir()) == []
