@@ -10,6 +10,7 @@ from schemas.job.images import Images
 from schemas.scene.camera import Camera
 from schemas.scene.region import REGION_FIRST_OBJECT
 from workers.geometry.frames import UP, half_turn, pose, translation
+from workers.geometry.ranks import median, percentile
 from workers.geometry.stored_depth import dequantise_depth
 
 
@@ -51,5 +52,5 @@ def front_distance(depth_m: Array, object_pixels: NDArray[np.bool_] | np.bool_, 
     if mirror.pivot_depth == "nearest":
         return float(z.min())
     if mirror.pivot_depth == "median":
-        return float(np.median(z))
-    return float(np.percentile(z, mirror.percentile))
+        return median(z)
+    return percentile(z, mirror.percentile)

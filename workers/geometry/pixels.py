@@ -65,10 +65,9 @@ def measure_regions(region: NDArray[np.uint8]) -> list[Extent]:
     words = whole.view(np.uint64) if region.shape[1] % 8 == 0 else np.empty((len(region), 0), np.uint64)
     _measure_regions(whole, words, counts, boxes)
     extents = [Extent(0, (0, 0, 0, 0))] * 256
-    for found, pixels in enumerate(counts.tolist()):
-        if pixels:
-            x, y, right, bottom = boxes[found].tolist()
-            extents[found] = Extent(pixels, (x, y, right - x, bottom - y))
+    for found in np.flatnonzero(counts).tolist():
+        x, y, right, bottom = boxes[found].tolist()
+        extents[found] = Extent(int(counts[found]), (x, y, right - x, bottom - y))
     return extents
 
 
@@ -82,16 +81,18 @@ def _measure_regions(
     """
     height, width = region.shape
     for row in range(height):
-        first = 0
+        first, here, eights = 0, region[row], words[row]
         while first < width:
-            region_id = region[row, first]
+            region_id = here[first]
             stop = first + 1
             eight = np.uint64(region_id) * np.uint64(0x0101010101010101)
-            while stop < width and region[row, stop] == region_id:
-                if stop % 8 == 0 and stop // 8 < words.shape[1] and words[row, stop // 8] == eight:
-                    stop += 8
-                else:
-                    stop += 1
+            while stop < width and here[stop] == region_id:
+                stop += 1
+                if stop % 8 == 0 and len(eights):
+                    word = stop // 8
+                    while word < len(eights) and eights[word] == eight:
+                        word += 1
+                    stop = 8 * word
             counts[region_id] += stop - first
             boxes[region_id, 0] = min(boxes[region_id, 0], first)
             boxes[region_id, 1] = min(boxes[region_id, 1], row)
@@ -102,11 +103,17 @@ def _measure_regions(
 
 @compiled
 def count_filled(projected: NDArray[np.uint16], seen: NDArray[np.uint16], behind: float) -> tuple[int, int]:
-    """(pixels that are not 0 in `projected`, those of them that lie more than `behind` units behind `seen`)."""
+    """(pixels that are not 0 in `projected`, those of them that lie more than `behind` units behind `seen`).
+
+    A whole number of units is compared in two thirds of the time if `behind` is an int.
+    """
     filled = hidden = 0
     for row in range(projected.shape[0]):
-        for column in range(projected.shape[1]):
-            drawn, farthest = projected[row, column], seen[row, column] + behind
-            filled += drawn > 0
-            hidden += (drawn > 0) & (seen[row, column] > 0) & (drawn > farthest)
+        here, there = projected[row], seen[row]
+        row_filled = row_hidden = np.int32(0)  # of a row, in 32 bits: twice as many in a vector
+        for column in range(len(here)):
+            drawn, farthest = np.int32(here[column]), np.int32(there[column]) + behind
+            row_filled = np.int32(row_filled + np.int32(drawn > 0))
+            row_hidden = np.int32(row_hidden + np.int32((drawn > 0) & (there[column] > 0) & (drawn > farthest)))
+        filled, hidden = filled + int(row_filled), hidden + int(row_hidden)
     return filled, hidden

@@ -5,6 +5,7 @@ of the block is in its image.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from workers.geometry.jit import compiled
@@ -34,7 +35,9 @@ def bound_view(T: Pose, m: tuple[float, float, float, float], reach: int, shape:
 
 
 @compiled
-def columns_in_sight(depth: Depth, units_per_m: float, ray_x: Array, ray_y: Array, sides: Array) -> tuple[int, int]:
+def columns_in_sight(
+    depth: Depth, units_per_m: float, ray_x: NDArray[np.floating], ray_y: NDArray[np.floating], sides: Array
+) -> tuple[int, int]:
     """The first column, and one after the last, of the blocks in some rows of a depth image [H, W] that may be in a view.
 
     ray_x [W] and ray_y [H]: x and y of what a pixel sees, over z; sides: `bound_view` of the camera that looks.

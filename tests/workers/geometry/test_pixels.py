@@ -14,6 +14,9 @@ def test_every_region_is_counted_and_boxed(width):
     region[:, 40:] = 2
     region[20, 40:] = 3
     region[4:9, 3:30] = 255
+    region[30] = 4
+    region[31, 8:], region[31, :8] = 5, 4
+    region[32, :-1], region[32, -1] = 1, 0
     extents = measure_regions(region)
     assert len(extents) == 256
     for region_id, (pixels, (x, y, width, height)) in enumerate(extents):
@@ -55,6 +58,16 @@ def test_what_is_filled_and_what_lies_behind_is_counted():
     projected = np.array([[0, 10, 20, 65535, 30]], np.uint16)
     seen = np.array([[5, 0, 14, 65500, 30]], np.uint16)
     assert count_filled(projected, seen, 5.5) == (4, 2)
+
+
+@pytest.mark.parametrize("behind", [0, 50, 50.0, 50.5])
+def test_counts_are_those_of_the_definition_in_whole_units_and_in_parts_of_them(behind):
+    rng = np.random.default_rng(3)
+    projected, seen = rng.integers(0, 200, (2, 37, 53)).astype(np.uint16)
+    projected[5, 5:9], seen[5, 5:9] = (65535, 51, 50, 101), (65535, 1, 0, 50)
+    drawn, shown = projected.astype(float), seen.astype(float)
+    expected = (drawn > 0).sum(), ((drawn > 0) & (shown > 0) & (drawn > shown + behind)).sum()
+    assert count_filled(projected, seen, behind) == expected
 
 
 def test_samples_are_split_into_bytes_with_the_high_one_first():
