@@ -1,11 +1,16 @@
 """Compiled loops: where they are kept, and the order in which they add."""
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from workers.geometry.jit import compiled
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def test_a_loop_is_compiled_also_where_nothing_can_be_kept_on_disk():
@@ -24,3 +29,41 @@ def test_a_compiled_loop_adds_in_the_order_that_is_written():
 
     values = np.array([1e16, 1.0, -1e16] * 9)
     assert total(values) == sum(values.tolist())
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("def step(x):\n    return x + 1", "def step(x):\n    return x + 20"),
+        ("from far import step", "from farther import step"),
+        ("FACTOR = 3.0", "FACTOR = 50.0"),
+        ("TABLE = np.arange(3.0)", "TABLE = np.arange(3.0) + 7.0"),
+    ],
+)
+def test_what_a_kept_loop_uses_of_another_file_may_change(before, after, tmp_path):
+    """The file of the loop itself stays as it is."""
+    head = "import numpy as np\nfrom workers.geometry.jit import compiled\n"
+    near = "FACTOR = 3.0\nTABLE = np.arange(3.0)\n@compiled\ndef step(x):\n    return x + 1\n"
+    files = {
+        "far": f"{head}@compiled\ndef step(x):\n    return x - 4\n",
+        "farther": f"{head}@compiled\ndef step(x):\n    return x - 60\n",
+        "loops": f"{head}from near import FACTOR, TABLE, step\n@compiled\ndef run(x):\n    return FACTOR * step(x) + TABLE[1]\n",
+    }
+    if "far" in before:
+        near = f"FACTOR = 3.0\nTABLE = np.arange(3.0)\n{before}\n"
+    results = []
+    for text in (near, near, near.replace(before, after)):
+        for name, content in {**files, "near": head + text}.items():
+            path = tmp_path / f"{name}.py"
+            if not path.exists() or path.read_text() != content:
+                path.write_text(content)
+        program = (
+            "import loops; print(loops.run(2.0), sum(loops.run.stats.cache_hits.values()), loops.run.py_func(2.0))"
+        )
+        env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONPATH": f"{tmp_path}:{ROOT}"}
+        run = [sys.executable, "-c", program]
+        done = subprocess.run(run, capture_output=True, text=True, check=True, cwd=tmp_path, env=env)
+        results.append(tuple(map(float, done.stdout.split())))
+    assert [kept > 0 for _, kept, _ in results] == [False, True, False]
+    assert all(value == plain for value, _, plain in results)
+    assert results[0][0] != results[2][0]
