@@ -125,10 +125,10 @@ def open_world(
     shorter reach would keep more rolling bodies from gaining energy, but bowls would spin for ever. `kept`: share of a contact's
     impulse that the next step begins with, among several bodies; what rolls over its corners alone would gain energy.
 
-    Runs are bit-identical with deterministicOverlappingPairs, whatever ran before, because the world is emptied first. Blocks
-    do not nest.
+    Runs are bit-identical with deterministicOverlappingPairs, whatever ran before. One connection serves the process, because a
+    new one costs as much as a simulation. Blocks do not nest.
     """
-    client = _connection().empty(len(placed) == 1 and isinstance(ground, float))
+    client = _empty_world(plain=len(placed) == 1 and isinstance(ground, float))
     pybullet.setPhysicsEngineParameter(
         numSolverIterations=physics.solver_iterations,
         deterministicOverlappingPairs=1,
@@ -159,39 +159,32 @@ def open_world(
 _BUFFERS = BulletBuffers()
 
 
-class _Connection:
-    """A process's one connection, because a new one costs as much as a simulation, and its one world.
+@cache
+def _connect() -> tuple[int, list[int]]:
+    """A world without a renderer, which would read the file of every body's parts again, and [drops until its next reset]."""
+    client: int = pybullet.connect(pybullet.DIRECT)
+    pybullet.unloadPlugin(pybullet.loadPlugin("tinyRendererPlugin", physicsClientId=client), physicsClientId=client)
+    return client, [0]
 
-    It has no renderer, which would read the file of every body's parts again, to draw it.
+
+def _empty_world(plain: bool) -> int:
+    """The connection, with nothing in its world. plain: one body on level ground comes next.
+
+    A reset allots and fills megabytes, a sixth of the time of a default drop. It is done where there are several pairs of bodies,
+    or triangles, of which Bullet keeps orders and counters; one pair has none. What a step of time leaves over would change last
+    bits of what comes next: a step without substeps clears it.
     """
-
-    def __init__(self) -> None:
-        self._client: int = pybullet.connect(pybullet.DIRECT)
-        renderer = pybullet.loadPlugin("tinyRendererPlugin", physicsClientId=self._client)
-        pybullet.unloadPlugin(renderer, physicsClientId=self._client)
-        self._kept = 0
-
-    def empty(self, plain: bool) -> int:
-        """Empty the world, and return the connection's number. plain: one body on level ground comes next.
-
-        A reset allots and fills megabytes anew, a sixth of the time of a default drop. It is done where there are several pairs
-        of bodies, or triangles, of which Bullet keeps orders and counters; one pair has none. What a step of time leaves over
-        would change last bits of what comes next: a step without substeps clears it.
-        """
-        if plain and self._kept:
-            self._kept -= 1
-            for number in reversed(range(pybullet.getNumBodies(physicsClientId=self._client))):
-                body = pybullet.getBodyUniqueId(number, physicsClientId=self._client)
-                pybullet.removeBody(body, physicsClientId=self._client)
-            pybullet.setPhysicsEngineParameter(numSubSteps=0, physicsClientId=self._client)
-            pybullet.stepSimulation(physicsClientId=self._client)
-        else:
-            self._kept = MOST_KEPT if plain else 0
-            pybullet.resetSimulation(physicsClientId=self._client)
-        return self._client
-
-
-_connection = cache(_Connection)
+    client, left = _connect()
+    if plain and left[0]:
+        left[0] -= 1
+        for number in reversed(range(pybullet.getNumBodies(physicsClientId=client))):
+            pybullet.removeBody(pybullet.getBodyUniqueId(number, physicsClientId=client), physicsClientId=client)
+        pybullet.setPhysicsEngineParameter(numSubSteps=0, physicsClientId=client)
+        pybullet.stepSimulation(physicsClientId=client)
+    else:
+        left[0] = MOST_KEPT if plain else 0
+        pybullet.resetSimulation(physicsClientId=client)
+    return client
 
 
 def _add_ground(client: int, ground: float | Mesh | Array, physics: Physics) -> int:

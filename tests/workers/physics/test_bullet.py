@@ -145,7 +145,7 @@ def test_what_a_world_leaves_over_of_a_step_is_not_in_the_next(before, after, mo
         patch.setattr(bullet, "MOST_KEPT", 0)
         ended(*before)
         expected = ended(*after, 30)
-    bullet._connection().empty(plain=False)
+    bullet._empty_world(plain=False)
     monkeypatch.setattr(bullet, "MOST_KEPT", 1)
     ended(*before)
     assert ended(*after, 30) == expected
