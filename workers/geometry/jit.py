@@ -3,36 +3,62 @@
 Without `fastmath`, so that sums are added in the order that is written, on every machine.
 """
 
+import contextlib
+import os
 from collections.abc import Callable, Iterator
+from types import CodeType
 from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
+from numba.core.caching import FunctionCache
 
 Loop = TypeVar("Loop", bound=Callable[..., object])
 
 
 def compiled(loop: Loop) -> Loop:
     """The function compiled at its first call, and kept on disk for the next process where there is a place to write."""
-    try:
-        dispatcher: Any = numba.njit(cache=True, error_model="numpy")(loop)
-    except RuntimeError:  # neither the package's folder nor the user's cache is writable
-        return cast(Loop, numba.njit(error_model="numpy")(loop))
-    # numba looks for changes in the loop's own file alone, and what the loop uses of other files is compiled into it.
-    kept = dispatcher._cache._cache_file
-    kept._source_stamp = (kept._source_stamp, *_used_by(loop))
+    dispatcher: Any = numba.njit(error_model="numpy")(loop)
+    with contextlib.suppress(RuntimeError):  # where neither the package's folder nor the user's cache is writable
+        dispatcher._cache = _LoopCache(loop)
     return cast(Loop, dispatcher)
 
 
-def _used_by(loop: Callable[..., object]) -> Iterator[tuple[str, Any]]:
-    """Name and state of each global that a loop uses: the stamp of another loop, the value of a constant."""
-    names: dict[str, Any] = loop.__globals__
-    for name in loop.__code__.co_names:
-        value = names.get(name)
-        other = getattr(getattr(value, "_cache", None), "_cache_file", None)
-        if other is not None:
-            yield name, other._source_stamp
+class _LoopCache(FunctionCache):
+    """A loop on disk, as long as what it uses stays the same.
+
+    numba looks for changes in the loop's own file alone, and what the loop uses of other files is compiled into it.
+    """
+
+    def _load_overload(self, *arguments: object) -> object:
+        """Reads the loop, at its first call, when all that it uses is defined; saving comes after."""
+        used: dict[tuple[str, str], object] = {}
+        _find_used(self._py_func, used)
+        self._cache_file._source_stamp = used
+        return super()._load_overload(*arguments)
+
+
+def _find_used(loop: Callable[..., object], used: dict[tuple[str, str], object]) -> None:
+    """Adds the state of a loop and of all that it uses: of loops their file's time and size, of constants the value.
+
+    By module and name.
+    """
+    status = os.stat(loop.__code__.co_filename)
+    used[loop.__module__, loop.__qualname__] = status.st_mtime_ns, status.st_size
+    for name in _names_in(loop.__code__):
+        value, key = loop.__globals__.get(name), (loop.__module__, name)
+        other = getattr(value, "py_func", None)
+        if other is not None and (other.__module__, other.__qualname__) not in used:
+            _find_used(other, used)
         elif isinstance(value, np.ndarray):
-            yield name, (value.dtype.str, value.shape, value.tobytes())
+            used[key] = value.dtype.str, value.shape, value.tobytes()
         elif isinstance(value, bool | int | float | str | tuple | np.generic):
-            yield name, repr(value)
+            used[key] = repr(value)
+
+
+def _names_in(code: CodeType) -> Iterator[str]:
+    """The globals that a function and its comprehensions name."""
+    yield from code.co_names
+    for inner in code.co_consts:
+        if isinstance(inner, CodeType):
+            yield from _names_in(inner)

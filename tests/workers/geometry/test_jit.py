@@ -38,22 +38,27 @@ def test_a_compiled_loop_adds_in_the_order_that_is_written():
         ("from far import step", "from farther import step"),
         ("FACTOR = 3.0", "FACTOR = 50.0"),
         ("TABLE = np.arange(3.0)", "TABLE = np.arange(3.0) + 7.0"),
+        ("WEIGHTS = (1.0, 2.0)", "WEIGHTS = (1.0, 90.0)"),
     ],
 )
 def test_what_a_kept_loop_uses_of_another_file_may_change(before, after, tmp_path):
-    """The file of the loop itself stays as it is."""
+    """The file of the loop itself stays as it is; it calls a loop that is defined below it, and that uses the tables."""
     head = "import numpy as np\nfrom workers.geometry.jit import compiled\n"
-    near = "FACTOR = 3.0\nTABLE = np.arange(3.0)\n@compiled\ndef step(x):\n    return x + 1\n"
+    imports = "from near import FACTOR, step\nfrom tables import TABLE, WEIGHTS\n"
+    run = "@compiled\ndef run(x):\n    return FACTOR * step(x) + last(x)\n"
+    last = "@compiled\ndef last(x):\n    return TABLE[1] + sum([n * WEIGHTS[1] for n in range(3)])\n"
+    step = before if "far" in before else "@compiled\ndef step(x):\n    return x + 1"
     files = {
         "far": f"{head}@compiled\ndef step(x):\n    return x - 4\n",
         "farther": f"{head}@compiled\ndef step(x):\n    return x - 60\n",
-        "loops": f"{head}from near import FACTOR, TABLE, step\n@compiled\ndef run(x):\n    return FACTOR * step(x) + TABLE[1]\n",
+        "near": f"{head}FACTOR = 3.0\n{step}\n",
+        "tables": f"{head}TABLE = np.arange(3.0)\nWEIGHTS = (1.0, 2.0)\n",
+        "loops": head + imports + run + last,
     }
-    if "far" in before:
-        near = f"FACTOR = 3.0\nTABLE = np.arange(3.0)\n{before}\n"
+    changed = {**files, **{name: files[name].replace(before, after) for name in ("near", "tables")}}
     results = []
-    for text in (near, near, near.replace(before, after)):
-        for name, content in {**files, "near": head + text}.items():
+    for state in (files, files, changed):
+        for name, content in state.items():
             path = tmp_path / f"{name}.py"
             if not path.exists() or path.read_text() != content:
                 path.write_text(content)
@@ -61,8 +66,9 @@ def test_what_a_kept_loop_uses_of_another_file_may_change(before, after, tmp_pat
             "import loops; print(loops.run(2.0), sum(loops.run.stats.cache_hits.values()), loops.run.py_func(2.0))"
         )
         env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONPATH": f"{tmp_path}:{ROOT}"}
-        run = [sys.executable, "-c", program]
-        done = subprocess.run(run, capture_output=True, text=True, check=True, cwd=tmp_path, env=env)
+        done = subprocess.run(
+            [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path, env=env
+        )
         results.append(tuple(map(float, done.stdout.split())))
     assert [kept > 0 for _, kept, _ in results] == [False, True, False]
     assert all(value == plain for value, _, plain in results)
