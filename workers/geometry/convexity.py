@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import connected_components
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
-from workers.geometry.first_equal import first_equal
+from workers.geometry.first_equal import is_first
 from workers.geometry.frames import dot
 from workers.geometry.jit import compiled
 from workers.geometry.manifold import hold_to_one_thread
@@ -37,7 +37,7 @@ def weld(mesh: Mesh) -> Mesh:
     used = numbers_in(mesh.faces, len(mesh.vertices))
     points = np.ascontiguousarray(mesh.vertices[used])
     places, faces = _welded(points, np.lexsort(points.T[::-1]), used, mesh.faces, len(mesh.vertices))
-    return Mesh(points[places], faces[first_equal(np.sort(faces, axis=1).astype(np.int64)) == np.arange(len(faces))])
+    return Mesh(points[places], faces[is_first(np.sort(faces, axis=1).astype(np.int64))])
 
 
 @compiled

@@ -10,6 +10,11 @@ FRACTION_OF_2_64 = -0x61C8864680B583EB
 vol. 3, 6.4)."""
 
 
+def is_first(rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """[N]: whether no row before is equal to a row, of rows [N, 3]."""
+    return first_equal(rows) == np.arange(len(rows))
+
+
 @compiled
 def first_equal(rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """[N]: the first place of a row equal to each of the rows [N, 3]; a row's own where none before it is equal.

@@ -12,7 +12,7 @@ from schemas.base import Array, frozen_array
 from schemas.scene.shape import Hull, Shape
 from workers.geometry.bounds import bounds_of
 from workers.geometry.convexity import mesh_of
-from workers.geometry.first_equal import first_equal
+from workers.geometry.first_equal import is_first
 from workers.geometry.jit import compiled
 from workers.geometry.manifold import hold_to_one_thread
 
@@ -46,7 +46,7 @@ def convex_hull(vertices: Array) -> Hull:
         return _thin_hull(vertices)
     hold_to_one_thread()
     # Faces that are shaded apart repeat their corners, and a hull takes as long over a point that it has already.
-    distinct = first_equal(vertices.view(np.int64)) == np.arange(len(vertices))
+    distinct = is_first(vertices.view(np.int64))
     solid = manifold3d.Manifold.hull_points(vertices[distinct])
     step = COARSER * float(np.linalg.norm(np.ptp(bounds_of(vertices), axis=0)))
     while solid.num_vert() > MOST_VERTICES:

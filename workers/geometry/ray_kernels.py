@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
+from workers.geometry.frames import dot
 from workers.geometry.jit import compiled
 
 
@@ -73,7 +74,7 @@ def meet_planes(
     """(distance, cosine, n): where rays [N, 3] meet the planes of faces [N], and how many of them a plane does not fix.
 
     planes: normals [F, 3] and offsets [F]. Distances, in lengths of the direction, are inf for face -1, and nan where the
-    cosine of incidence is at most `grazing`. Of three products x's and z's are added first, as einsum adds them.
+    cosine of incidence is at most `grazing`.
     """
     normals, offsets = planes
     distance, cosine, open_ended = np.full(len(face), np.inf), np.zeros(len(face)), 0
@@ -81,13 +82,10 @@ def meet_planes(
         f = face[n]
         if f < 0:
             continue
-        nx, ny, nz = normals[f, 0], normals[f, 1], normals[f, 2]
-        dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
-        towards = (nx * dx + nz * dz) + ny * dy
-        cosine[n] = abs(towards) / math.sqrt((dx * dx + dz * dz) + dy * dy)
+        towards = dot(normals[f], directions[n])
+        cosine[n] = abs(towards) / math.sqrt(dot(directions[n], directions[n]))
         if cosine[n] > grazing:
-            before = (nx * origins[n, 0] + nz * origins[n, 2]) + ny * origins[n, 1]
-            distance[n] = (offsets[f] - before) / towards
+            distance[n] = (offsets[f] - dot(normals[f], origins[n])) / towards
         else:
             distance[n] = np.nan
             open_ended += 1

@@ -60,6 +60,5 @@ def carry_depth(source: View, target: Camera, images: Images, effects: EffectPla
 
 def projection_shares(projected: NDArray[np.uint16], mirror: NDArray[np.uint16], images: Images) -> tuple[float, float]:
     """Share of pixels that the projection fills, and of those the share that lies behind what the mirror camera sees."""
-    behind = HIDDEN_M * images.depth_units_per_m
-    filled, hidden = count_filled(projected, mirror, int(behind) if behind.is_integer() else behind)
+    filled, hidden = count_filled(projected, mirror, HIDDEN_M * images.depth_units_per_m)
     return filled / projected.size, hidden / max(1, filled)

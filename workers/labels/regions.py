@@ -5,8 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Pose
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.camera import Camera
 from schemas.scene.plan import ScenePlan
 from schemas.scene.region import REGION_TABLE
 from schemas.scene.scene import Placed, PosedScene
@@ -48,13 +47,10 @@ def label_things(
     extents = measure_regions(region)
     seen = [thing for thing in things if extents[thing.region_id].pixels]
     counts = dict(zip(map(id, seen), count_unoccluded(seen, camera), strict=True)) if seen else {}
-    T_cam_world = invert(camera.T_world_cam)
-    labels = []
-    for thing in things:
-        T_cam_obj, extent = T_cam_world @ thing.T_world_shape, extents[thing.region_id]
-        name, unoccluded = names[thing.region_id], counts.get(id(thing), 0)
-        labels.append(label_region(thing.region_id, name, T_cam_obj, camera.intrinsics, extent, unoccluded))
-    return tuple(labels)
+    return tuple(
+        label_region(thing, names[thing.region_id], camera, extents[thing.region_id], counts.get(id(thing), 0))
+        for thing in things
+    )
 
 
 def count_unoccluded(things: Sequence[Placed], camera: Camera, count_drawn: CountPixels) -> list[int]:
@@ -70,11 +66,10 @@ def count_unoccluded(things: Sequence[Placed], camera: Camera, count_drawn: Coun
     return [next(drawn) if count is None else count for count in counts]
 
 
-def label_region(
-    region_id: int, name: tuple[str, str], T_cam_obj: Pose, k: Intrinsics, extent: Extent, unoccluded: int
-) -> ObjectLabel:
+def label_region(thing: Placed, name: tuple[str, str], camera: Camera, extent: Extent, unoccluded: int) -> ObjectLabel:
     """The label of one thing in one view, `name` (category, instance id), which alone covers `unoccluded` pixels."""
-    u, v = image_coordinates(T_cam_obj, k)
+    T_cam_obj = invert(camera.T_world_cam) @ thing.T_world_shape
+    u, v = image_coordinates(T_cam_obj, camera.intrinsics)
     pixels = extent.pixels
     share = pixels / max(unoccluded, pixels, 1)
-    return ObjectLabel(region_id, *name, T_cam_obj, u, v, extent.bbox_xywh, pixels, share)
+    return ObjectLabel(thing.region_id, *name, T_cam_obj, u, v, extent.bbox_xywh, pixels, share)

@@ -11,7 +11,7 @@ from schemas.job.physics import Physics
 from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.shape import Hull
 from workers.geometry.convexity import fills_hull
-from workers.geometry.first_equal import first_equal
+from workers.geometry.first_equal import is_first
 from workers.geometry.frames import transform
 from workers.geometry.jit import compiled
 from workers.physics.table_top import inside_margin
@@ -43,7 +43,7 @@ def is_round(hull: Hull, com: Array) -> bool:
     At rest the centre of mass is lower over the plane than over all its neighbours, and on a round stretch hardly lower
     than over some of them.
     """
-    normals = hull.normals[first_equal(np.rint(hull.normals / CELL).astype(np.int64)) == np.arange(len(hull.normals))]
+    normals = hull.normals[is_first(np.rint(hull.normals / CELL).astype(np.int64))]
     return _rests_on_round(hull.vertices, normals, com, math.cos(NEIGHBOUR_RAD), math.cos(SAME_PLANE_RAD))
 
 

@@ -19,13 +19,14 @@ def count_as_200(things, camera):
 
 
 def test_a_label_counts_boxes_and_shares_its_own_pixels():
-    ahead = translation(0.001, 0.001, 2.0)
-    made = label_region(3, ("mug", "m"), ahead, K, Extent(50, (30, 10, 5, 10)), 100)
+    asset = asset_of(box(0.1, 0.1, 0.1))
+    thing = Placed(3, asset.shape, HERE.T_world_cam @ translation(0.001, 0.001, 2.0))
+    made = label_region(thing, ("mug", "m"), HERE, Extent(50, (30, 10, 5, 10)), 100)
     assert (made.region_id, made.category, made.instance_id) == (3, "mug", "m")
     assert (made.u, made.v) == (80, 60)
     assert made.bbox_xywh == (30, 10, 5, 10)
     assert (made.pixels, made.visible_fraction) == (50, 0.5)
-    unseen = label_region(3, ("mug", "m"), ahead, K, Extent(0, (0, 0, 0, 0)), 0)
+    unseen = label_region(thing, ("mug", "m"), HERE, Extent(0, (0, 0, 0, 0)), 0)
     assert (unseen.pixels, unseen.visible_fraction, unseen.bbox_xywh) == (0, 0.0, (0, 0, 0, 0))
 
 
