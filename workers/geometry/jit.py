@@ -4,7 +4,6 @@ Without `fastmath`, so that sums are added in the order that is written, on ever
 """
 
 import contextlib
-import os
 from collections.abc import Callable, Iterator
 from types import CodeType
 from typing import Any, TypeVar, cast
@@ -30,22 +29,24 @@ class _LoopCache(FunctionCache):
     numba looks for changes in the loop's own file alone, and what the loop uses of other files is compiled into it.
     """
 
+    def __init__(self, loop: Callable[..., object]) -> None:
+        super().__init__(loop)
+        self._own_stamp = self._cache_file._source_stamp
+
     def _load_overload(self, *arguments: object) -> object:
         """Reads the loop, at its first call, when all that it uses is defined; saving comes after."""
         used: dict[tuple[str, str], object] = {}
         _find_used(self._py_func, used)
-        self._cache_file._source_stamp = used
+        self._cache_file._source_stamp = self._own_stamp, used
         return super()._load_overload(*arguments)
 
 
 def _find_used(loop: Callable[..., object], used: dict[tuple[str, str], object]) -> None:
-    """Adds the state of a loop and of all that it uses: of loops their file's time and size, of constants the value.
-
-    By module and name.
-    """
-    status = os.stat(loop.__code__.co_filename)
-    used[loop.__module__, loop.__qualname__] = status.st_mtime_ns, status.st_size
-    for name in _names_in(loop.__code__):
+    """Adds a loop and all that it uses, by module and name: of loops what they compute, of constants the value."""
+    codes = list(_codes_in(loop.__code__))
+    constants = [[value for value in code.co_consts if not isinstance(value, CodeType)] for code in codes]
+    used[loop.__module__, loop.__qualname__] = [(code.co_code, code.co_names) for code in codes], repr(constants)
+    for name in (name for code in codes for name in code.co_names):
         value, key = loop.__globals__.get(name), (loop.__module__, name)
         other = getattr(value, "py_func", None)
         if other is not None and (other.__module__, other.__qualname__) not in used:
@@ -56,9 +57,9 @@ def _find_used(loop: Callable[..., object], used: dict[tuple[str, str], object])
             used[key] = repr(value)
 
 
-def _names_in(code: CodeType) -> Iterator[str]:
-    """The globals that a function and its comprehensions name."""
-    yield from code.co_names
+def _codes_in(code: CodeType) -> Iterator[CodeType]:
+    """The code of a function and of its comprehensions."""
+    yield code
     for inner in code.co_consts:
         if isinstance(inner, CodeType):
-            yield from _names_in(inner)
+            yield from _codes_in(inner)

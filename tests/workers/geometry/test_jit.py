@@ -35,6 +35,7 @@ def test_a_compiled_loop_adds_in_the_order_that_is_written():
     ("before", "after"),
     [
         ("def step(x):\n    return x + 1", "def step(x):\n    return x + 20"),
+        ("np.floor", "np.ceil"),
         ("from far import step", "from farther import step"),
         ("FACTOR = 3.0", "FACTOR = 50.0"),
         ("TABLE = np.arange(3.0)", "TABLE = np.arange(3.0) + 7.0"),
@@ -47,7 +48,7 @@ def test_what_a_kept_loop_uses_of_another_file_may_change(before, after, tmp_pat
     imports = "from near import FACTOR, step\nfrom tables import TABLE, WEIGHTS\n"
     run = "@compiled\ndef run(x):\n    return FACTOR * step(x) + last(x)\n"
     last = "@compiled\ndef last(x):\n    return TABLE[1] + sum([n * WEIGHTS[1] for n in range(3)])\n"
-    step = before if "far" in before else "@compiled\ndef step(x):\n    return x + 1"
+    step = before if "far" in before else "@compiled\ndef step(x):\n    return x + 1 + np.floor(0.5 * x + 0.1)"
     files = {
         "far": f"{head}@compiled\ndef step(x):\n    return x - 4\n",
         "farther": f"{head}@compiled\ndef step(x):\n    return x - 60\n",
