@@ -12,7 +12,7 @@ from services.bench.ratios import Lap
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import WorkerContext, open_worker
 from workers.pipeline.make_scene import Scene, make_scene
-from workers.pipeline.run_shard import run_span
+from workers.pipeline.run_shard import run_ranges
 from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.context import require_device
 from workers.store.commit import committed_files, read_record
@@ -34,14 +34,18 @@ class Workbench:
         self.next_scene = span.stop
         return span
 
-    def run(self, span: Span) -> Lap:
-        """Make and commit a range. Raises RunError where none of its scenes could be made."""
+    def run(self, *spans: Span) -> Lap:
+        """Make and commit ranges. Raises RunError where none of their scenes could be made."""
         watch = Stopwatch()
         wall, cpu = time.perf_counter(), time.process_time()
-        report = run_span(self.context, self.store, self.order, span, watch)
-        lap = Lap(report.made, time.perf_counter() - wall, time.process_time() - cpu, watch.seconds)
-        if not report.made:
-            raise RunError(f"none of the scenes {span.start} to {span.stop - 1} could be made: {report.failed}")
+        reports = run_ranges(self.context, self.store, self.order, spans, watch)
+        made = sum(report.made for report in reports)
+        lap = Lap(made, time.perf_counter() - wall, time.process_time() - cpu, watch.seconds)
+        if not made:
+            failed = {reason for report in reports for reason in report.failed}
+            raise RunError(
+                f"none of the scenes {spans[0].start} to {spans[-1].stop - 1} could be made: {', '.join(sorted(failed))}"
+            )
         return lap
 
     def files(self, span: Span) -> dict[str, bytes]:
@@ -78,8 +82,6 @@ def make_in_memory(context: WorkerContext, span: Span) -> list[Scene]:
 
 def run_process(job: Job, job_folder: Path, folder: Path, span: Span) -> Lap:
     """A plain process's part: make and commit a span into a new folder, range by range."""
-    bench, made = open_workbench(job, job_folder, folder), 0
-    wall, cpu = time.perf_counter(), time.process_time()
-    for start in range(span.start, span.stop, job.range_size):
-        made += bench.run(Span(start=start, stop=min(start + job.range_size, span.stop))).scenes
-    return Lap(made, time.perf_counter() - wall, time.process_time() - cpu, {})
+    bench = open_workbench(job, job_folder, folder)
+    starts = range(span.start, span.stop, job.range_size)
+    return bench.run(*(Span(start=start, stop=min(start + job.range_size, span.stop)) for start in starts))

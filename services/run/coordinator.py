@@ -5,7 +5,7 @@ import pickle
 import signal
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -223,12 +223,15 @@ class Coordinator:
             self._tally.add_commit(summary)
             left.pop(0)
         if left:
-            self._count_death(left[0], error, stalled)
+            self._count_death(left, error, stalled)
         self._again.extend((span,) for span in left)
 
-    def _count_death(self, span: Span, error: RayError, stalled: bool) -> None:
-        """Counts a death against the scene in progress. Raises RunError where workers die before they begin a scene."""
-        scene, timed_out = self._find_evidence(span)
+    def _count_death(self, left: Sequence[Span], error: RayError, stalled: bool) -> None:
+        """Counts a death against the scene in progress. Raises RunError where workers die before they begin a scene.
+
+        left: the ranges of its shard that are not committed.
+        """
+        span, scene, timed_out = self._find_evidence(left)
         reason: Reason = (
             "time" if timed_out or stalled else "memory" if isinstance(error, OutOfMemoryError) else "killed"
         )
@@ -237,21 +240,25 @@ class Coordinator:
         self._tally.lost[reason] += 1
         self._deaths.count(Death(span.start, scene, reason, message, isinstance(error, NodeDiedError)))
 
-    def _find_evidence(self, span: Span) -> tuple[int | None, bool]:
-        """The scene in progress when a worker of this run was lost, and whether its time was up; gives its attempt up.
+    def _find_evidence(self, left: Sequence[Span]) -> tuple[Span, int | None, bool]:
+        """The range and the scene in progress when a worker of this run was lost, and whether its time was up.
 
-        The worker may live, behind a network that failed or while it is paused. So its attempt is fenced and its record
-        looked for once more before its files go; one that has won meanwhile is published.
+        A worker has two attempts at most: one that it makes, and the one before, whose commit may be under way. Where no scene
+        was in progress, the first of the ranges is named. The worker may live, behind a network that failed or while it is
+        paused. So its attempts are given up: each is fenced and its record looked for once more before its files go; one that
+        has won meanwhile is published.
         """
-        for name in attempts_at(self._store, span.start):
-            if self._order.label not in name:
-                continue
-            scene = blamed_scene(self._store, span.start, name)
-            timed_out = bool(self._store.size(f"{staging_path(span.start, name)}/{TIMED_OUT}"))
-            sweep_attempt(self._store, span.start, name, given_up=True)
-            if scene is not None:
-                return scene, timed_out
-        return None, False
+        found: tuple[Span, int | None, bool] = left[0], None, False
+        for span in left:
+            for name in attempts_at(self._store, span.start):
+                if self._order.label not in name:
+                    continue
+                scene = blamed_scene(self._store, span.start, name)
+                timed_out = bool(self._store.size(f"{staging_path(span.start, name)}/{TIMED_OUT}"))
+                sweep_attempt(self._store, span.start, name, given_up=True)
+                if scene is not None and found[1] is None:
+                    found = span, scene, timed_out
+        return found
 
 
 def _keys(spans: tuple[Span, ...]) -> list[tuple[int, int]]:

@@ -27,7 +27,7 @@ from tests.disk_faults import unflushed
 from tests.made_up_scenes import attempt_at, small_scene, terms
 from tests.published_files import check_published
 from workers.assets.catalogue import Catalogue
-from workers.store.attempt import Attempt, begin_attempt
+from workers.store.attempt import Attempt, attempts_at, begin_attempt
 from workers.store.commit import publish, read_record
 from workers.store.committed_rows import list_commits
 from workers.store.local import LocalStore
@@ -105,10 +105,10 @@ def test_a_worker_that_lives_and_commits_while_it_is_given_up_keeps_its_files(
             if chance.random() < 0.1:  # let it end, to learn how long it takes
                 told = worker.stdout.readline()
                 commit_s = time.perf_counter() - begun
-                coordinator._find_evidence(Span(start=start, stop=start + 2))
+                coordinator._find_evidence([Span(start=start, stop=start + 2)])
             else:
                 time.sleep(chance.uniform(0.3, 1.1) * commit_s)
-                coordinator._find_evidence(Span(start=start, stop=start + 2))
+                coordinator._find_evidence([Span(start=start, stop=start + 2)])
                 told = worker.stdout.readline()
             record = read_record(store, start)
             assert told == "True\n" or record is None or not files_are_whole(store, record)
@@ -141,7 +141,7 @@ def test_on_a_store_a_worker_given_up_at_any_request_leaves_a_dataset_that_a_run
 
         def give_up(store=store):
             if gives_up == "the coordinator":
-                coordinator_of(store)._find_evidence(Span(start=0, stop=2))
+                coordinator_of(store)._find_evidence([Span(start=0, stop=2)])
             else:
                 sweep(store, fenced=None)
 
@@ -162,9 +162,21 @@ def test_on_a_store_a_worker_given_up_at_any_request_leaves_a_dataset_that_a_run
 def test_on_a_store_an_attempt_is_evidence_once(coordinator_of):
     store = fresh_bucket()
     begin_attempt(store, Span(start=0, stop=2), TAR, LABEL).begin_scene(1)
-    coordinator = coordinator_of(store)
-    assert coordinator._find_evidence(Span(start=0, stop=2)) == (1, False)
-    assert coordinator._find_evidence(Span(start=0, stop=2)) == (None, False)
+    coordinator, span = coordinator_of(store), Span(start=0, stop=2)
+    assert coordinator._find_evidence([span]) == (span, 1, False)
+    assert coordinator._find_evidence([span]) == (span, None, False)
+
+
+@pytest.mark.parametrize("kind", ["disk", "bucket"])
+def test_the_scene_in_progress_is_evidence_while_the_range_before_it_is_committed(kind, coordinator_of, tmp_path):
+    store = LocalStore(tmp_path) if kind == "disk" else fresh_bucket()
+    store.prepare()
+    whole_attempt(store).end_scenes()
+    begin_attempt(store, Span(start=2, stop=4), TAR, LABEL).begin_scene(3)
+    coordinator, left = coordinator_of(store), [Span(start=start, stop=start + 2) for start in (0, 2, 4)]
+    assert coordinator._find_evidence(left) == (left[1], 3, False)
+    assert not [name for start in (0, 2) for name in attempts_at(store, start)], "both attempts are given up"
+    assert coordinator._find_evidence(left) == (left[0], None, False)
 
 
 def test_an_attempt_that_won_before_it_was_given_up_is_published(tmp_path, coordinator_of, monkeypatch):
@@ -176,7 +188,7 @@ def test_an_attempt_that_won_before_it_was_given_up_is_published(tmp_path, coord
     with monkeypatch.context() as patch:
         patch.setattr("workers.store.attempt.publish", lambda *_: None)
         record = attempt.commit().record
-    coordinator_of(store)._find_evidence(Span(start=0, stop=2))
+    coordinator_of(store)._find_evidence([Span(start=0, stop=2)])
     check_published(store, record)
     publish(store, record)
 

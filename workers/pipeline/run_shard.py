@@ -1,4 +1,4 @@
-"""A shard: ranges of scenes made one after another in one process, each range committed as soon as it is whole."""
+"""A shard: ranges of scenes made one after another in one process, each committed while the next is made."""
 
 import faulthandler
 import os
@@ -6,14 +6,14 @@ import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from itertools import takewhile
 from typing import IO
 
-from schemas.dataset.commit import Span, summarize
+from schemas.dataset.commit import Span
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, staging_path
 from schemas.dataset.shard import Blame, ShardOrder, ShardReport, SpanReport
@@ -22,6 +22,7 @@ from schemas.job.render import Tier
 from schemas.scene.scene import SceneOutput
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.bugs import UnexpectedError, explain, keep_traceback, name_scene
+from workers.pipeline.committer import Committer, MadeRange
 from workers.pipeline.context import WorkerContext, open_worker
 from workers.pipeline.fingerprint import take_fingerprint
 from workers.pipeline.make_scene import make_scene
@@ -58,8 +59,7 @@ def run_shard(order: ShardOrder, catalogue: Catalogue, is_over: Callable[[], boo
     _join_stack(store, fingerprint, order)
     order = order.model_copy(update={"terms": order.terms.model_copy(update={"fingerprint": fingerprint.digest})})
     total = Stopwatch()
-    begun_spans = takewhile(lambda span: not is_over(), order.spans)
-    reports = tuple(run_span(context, store, order, span, total) for span in begun_spans)
+    reports = run_ranges(context, store, order, takewhile(lambda span: not is_over(), order.spans), total)
     return ShardReport(
         spans=reports,
         seconds=total.seconds,
@@ -71,8 +71,25 @@ def run_shard(order: ShardOrder, catalogue: Catalogue, is_over: Callable[[], boo
     )
 
 
-def run_span(context: WorkerContext, store: Store, order: ShardOrder, span: Span, total: Stopwatch) -> SpanReport:
-    """Make one range and commit it. A scene that ends in an error nobody expected is a row too, and is reported."""
+def run_ranges(
+    context: WorkerContext, store: Store, order: ShardOrder, spans: Iterable[Span], total: Stopwatch
+) -> tuple[SpanReport, ...]:
+    """Make these ranges and commit each while the next is made; `total` gets the time that is waited for commits.
+
+    A range that cannot be committed raises once the next is made, which then is not committed either.
+    """
+    with Committer(order.job_change) as committer:
+        for span in spans:
+            made = _make_range(context, store, order, span, total)
+            with total.stage("commit"):
+                committer.begin(made)
+        with total.stage("commit"):
+            committer.wait()
+    return tuple(committer.reports)
+
+
+def _make_range(context: WorkerContext, store: Store, order: ShardOrder, span: Span, total: Stopwatch) -> MadeRange:
+    """One range, written. A scene that ends in an error nobody expected is a row too, and is reported."""
     blamed = {blame.scene_id: blame for blame in order.blamed}
     attempt = begin_attempt(store, span, order.terms, order.label)
     failed: Counter[str] = Counter()
@@ -87,19 +104,8 @@ def run_span(context: WorkerContext, store: Store, order: ShardOrder, span: Span
                 output = failed_scene(scene_id, _category(context, scene_id), error)
                 attempt.add_scene(output)
             failed.update(f"{row['kind']}: {row['reason']}" for row in output.rows.get("failures", ()))
-    with total.stage("commit"):
-        result = attempt.commit(order.job_change)
-    return SpanReport(
-        start=span.start,
-        stop=span.stop,
-        retry=span.retry,
-        won=result.won,
-        conflict=result.conflict,
-        made=len(span.scene_ids) - failed.total(),
-        failed=dict(failed),
-        bugs=tuple(bugs),
-        commit=summarize(result.record),
-    )
+    attempt.end_scenes()
+    return MadeRange(attempt, failed, tuple(bugs))
 
 
 def _attempt_scene(

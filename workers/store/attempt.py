@@ -174,6 +174,13 @@ class Attempt:
         digest = scene_digest(output.rows)[:MARK]
         self._scenes.append(SceneMark(scene_id=output.scene_id, outcome=outcome, digest=digest, reason=reason))
 
+    def end_scenes(self) -> None:
+        """Notes that no scene is in progress any more. Raises ValueError where a scene of the range is missing."""
+        if missing := self.span.scene_ids[len(self._scenes) :]:
+            first = list(missing[:5])
+            raise ValueError(f"the range from {self.span.start} lacks scenes {first}: it cannot be committed")
+        self._note({})
+
     def commit(self, job_change: JobChange | None = None) -> CommitResult:
         """Decides the range and, where this attempt wins, publishes it; a loser's folder is removed.
 
@@ -181,10 +188,7 @@ class Attempt:
         Raises ValueError where a scene of the range is missing or a file is not its own, RunError where the attempt was
         swept although nobody has committed the range.
         """
-        if missing := self.span.scene_ids[len(self._scenes) :]:
-            first = list(missing[:5])
-            raise ValueError(f"the range from {self.span.start} lacks scenes {first}: it cannot be committed")
-        self._note({})
+        self.end_scenes()
         record = self._finish()
         own = self._own_files(record)
         if not self._put(record, job_change):

@@ -10,7 +10,17 @@ SHARD = (Span(start=0, stop=4), Span(start=4, stop=8))
 
 @pytest.mark.parametrize(
     ("in_progress", "made"),
-    [({}, 0), ({0: 0}, 0), ({0: 3}, 3), ({4: 4}, 4), ({4: 6}, 6), ({4: None}, 4), ({0: 99}, 0), ({8: 9}, 0)],
+    [
+        ({}, 0),
+        ({0: 0}, 0),
+        ({0: 3}, 3),
+        ({4: 4}, 4),
+        ({4: 6}, 6),
+        ({4: None}, 4),
+        ({0: None, 4: 6}, 6),
+        ({0: 99}, 0),
+        ({8: 9}, 0),
+    ],
 )
 def test_ranges_before_the_one_in_progress_and_scenes_before_the_one_in_progress_are_made(in_progress, made):
     assert count_under_way([SHARD], in_progress) == made

@@ -1,5 +1,8 @@
 """A shard of small scenes through the real path onto disk."""
 
+import itertools
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,11 +12,12 @@ from schemas.dataset.commit import CommitTerms, Span
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, commit_path, range_table_path
 from schemas.dataset.shard import Blame, ShardOrder, ShardReport
-from schemas.errors import FingerprintError
+from schemas.errors import FingerprintError, MachineError
 from services.job.read import validate_job
 from tests.effects.scenes import SMALL
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.run_shard import run_shard
+from workers.store.attempt import Attempt, blamed_scene, staged_attempts
 from workers.store.local import LocalStore
 from workers.store.manifest import decode_table
 
@@ -46,11 +50,102 @@ def test_every_range_of_a_shard_is_committed_and_reported_in_order(tmp_path):
 
 
 def test_a_worker_that_is_to_end_finishes_its_range_and_begins_no_other(tmp_path):
-    store = LocalStore(tmp_path)
-    report = run(tmp_path, stops=(2, 4, 6), is_over=lambda: store.size(commit_path(2)) is not None)
+    asked = itertools.count()
+    report = run(tmp_path, stops=(2, 4, 6), is_over=lambda: next(asked) == 2)
     assert [(span.start, span.won) for span in report.spans] == [(0, True), (2, True)]
     assert [path.name for path in (tmp_path / "_staging").glob("*/*")] == []
     assert run(tmp_path, stops=(8,), is_over=lambda: True).spans == ()
+
+
+def test_the_next_range_is_made_while_a_commit_waits_for_the_disk(tmp_path, monkeypatch):
+    begun = threading.Event()
+    begin_scene, make_durable = Attempt.begin_scene, LocalStore.make_durable
+
+    def note(attempt, scene_id):
+        begin_scene(attempt, scene_id)
+        if scene_id == 2:
+            begun.set()
+
+    def wait(store, staging):
+        assert begun.wait(60.0), "scene 2 is not begun while the range before it is committed"
+        make_durable(store, staging)
+
+    monkeypatch.setattr(Attempt, "begin_scene", note)
+    monkeypatch.setattr(LocalStore, "make_durable", wait)
+    assert [span.won for span in run(tmp_path, stops=(2, 4)).spans] == [True, True]
+
+
+def test_one_range_at_a_time_is_committed_in_order(tmp_path, monkeypatch):
+    commit, events = Attempt.commit, []
+
+    def watched(attempt, job_change):
+        events.append(attempt.span.start)
+        time.sleep(0.5)
+        result = commit(attempt, job_change)
+        events.append(attempt.span.start)
+        return result
+
+    monkeypatch.setattr(Attempt, "commit", watched)
+    run(tmp_path, stops=(2, 4, 6))
+    assert events == [0, 0, 2, 2, 4, 4]
+
+
+def test_a_range_that_cannot_be_committed_is_told_and_made_again_by_the_next_run(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(LocalStore, "make_durable", raises(MachineError("the disk is full")))
+        with pytest.raises(MachineError, match="the disk is full"):
+            run(tmp_path, stops=(2, 4, 6))
+    store = LocalStore(tmp_path)
+    assert [store.size(commit_path(start)) for start in (0, 2, 4)] == [None] * 3
+    assert [span.won for span in run(tmp_path, stops=(2, 4, 6)).spans] == [True] * 3
+
+
+def test_an_error_in_a_range_lets_the_commit_before_it_end(tmp_path, monkeypatch):
+    make_durable, failed = LocalStore.make_durable, threading.Event()
+
+    def fail(attempt, scene_id):
+        if scene_id == 2:
+            failed.set()
+            raise MachineError("the GPU is gone")
+
+    def wait(store, staging):
+        failed.wait(60.0)
+        make_durable(store, staging)
+
+    monkeypatch.setattr(Attempt, "begin_scene", fail)
+    monkeypatch.setattr(LocalStore, "make_durable", wait)
+    with pytest.raises(MachineError, match="the GPU is gone"):
+        run(tmp_path, stops=(2, 4))
+    store = LocalStore(tmp_path)
+    assert store.size(commit_path(0)) is not None
+    assert store.size(commit_path(2)) is None
+
+
+def test_a_range_that_waits_for_the_commit_before_it_has_no_scene_in_progress(tmp_path, monkeypatch):
+    make_durable, ended, noted = LocalStore.make_durable, threading.Event(), []
+    end_scenes = Attempt.end_scenes
+
+    def note(attempt):
+        end_scenes(attempt)
+        if attempt.span.start == 2:
+            ended.set()
+
+    def wait(store, staging):
+        assert ended.wait(60.0)
+        noted.extend(blamed_scene(store, start, name) for start, name in staged_attempts(store))
+        make_durable(store, staging)
+
+    monkeypatch.setattr(Attempt, "end_scenes", note)
+    monkeypatch.setattr(LocalStore, "make_durable", wait)
+    run(tmp_path, stops=(2, 4))
+    assert noted[:2] == [None, None]
+
+
+def raises(error: Exception) -> Callable[..., None]:
+    def fail(*_: object) -> None:
+        raise error
+
+    return fail
 
 
 def test_a_scene_that_killed_its_workers_is_a_row_and_is_not_tried_again(tmp_path):
