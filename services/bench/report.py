@@ -139,6 +139,7 @@ def _describe_scaling(scaling: dict[str, Any]) -> list[str]:
             f"{gain['one_scenes_per_s']:.2f} and {gain['all_scenes_per_s']:.2f}, {gain['scenes']} scenes"
             for name, gain in (("through Ray", scaling["ray"]), ("plain processes", scaling["bare"]))
         ),
+        f"  {'empty loops':22} {_times(scaling['loops'])}",
         f"  Ray gives {scaling['share_of_bare']:.1%} of what plain processes gain",
         f"  Ray's share of time    {format_spread(scaling['ray_share_one'], '.1%')} with one worker, "
         f"{format_spread(scaling['ray_share'], '.1%')} with {scaling['workers']}, their uneven end included; "

@@ -1,14 +1,15 @@
 """Scaling: several workers against one through the coordinator, and several plain processes against one.
 
 Two processes that share nothing but the machine seldom do twice the work of one: cores share caches, memory and clock,
-and are often two threads of one core. No scheduler can gain more than plain processes do.
+and are often two threads of one core. No scheduler can gain more than plain processes do, and these no more than empty loops,
+which use nothing but cores: two virtual cores may be worth less than two of the first.
 """
 
 import multiprocessing
 import os
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
@@ -20,7 +21,7 @@ from schemas.dataset.shard import ShardOrder
 from schemas.errors import RunError
 from schemas.job.job import Job
 from services.bench.ratios import Lap, Spread, by_clock, by_processor, idle_share, slope_ratio
-from services.bench.stages import run_process
+from services.bench.stages import count_for, run_process
 from services.run.coordinator import Coordinator, Limits
 from services.run.joining import terms_of_driver
 from services.run.pattern import Pattern
@@ -34,6 +35,9 @@ from workers.store.local import LocalStore
 WARM_UP = 8
 """Scenes that each plain process makes first."""
 
+LOOP_S = 2.0
+"""Time of an empty loop."""
+
 
 def measure_scaling(
     job: Job, job_folder: Path, folder: Path, workers: int, scenes: int, rounds: int = 3
@@ -42,13 +46,15 @@ def measure_scaling(
 
     Ranges and shards are those of a run of that many scenes. Everything is warm before: Ray's start, imports, the OpenGL
     context and its shaders are in no figure. `ray`: workers through the coordinator; `bare`: plain processes, each on a core
-    of its own. ray_share: the share of the slots' time without a shard, the uneven end of the last shards included;
-    ray_share_one: the same with one worker, which has no such end. share_of_bare: Ray's speed-up over that of plain processes.
+    of its own; `loops`: the speed-up of empty loops in these, the machine's own. ray_share: the share of the slots' time
+    without a shard, the uneven end of the last shards included; ray_share_one: the same with one worker, which has no such
+    end. share_of_bare: Ray's speed-up over that of plain processes.
     """
     job = job.model_copy(update={"scenes": scenes})
     counts = (1, workers)
     ray: dict[int, list[tuple[Lap, float]]] = {count: [] for count in counts}
     bare: dict[int, list[Lap]] = {count: [] for count in counts}
+    loops: dict[int, list[Lap]] = {count: [] for count in counts}
     each = Span(start=job.first_scene, stop=job.first_scene + max(1, scenes // workers))
     drive = _RayDrive(job, open_catalogue(job.assets, job_folder, tuple(job.categories)), folder, workers)
     with private_ray(workers), plain_processes(job, job_folder, folder, workers) as processes:
@@ -57,10 +63,9 @@ def measure_scaling(
             for count in counts:
                 ray[count].append(drive.run(f"{number}-{count}", count, scenes))
             for count in counts:
-                laps = processes.run(f"{number}-{count}", count, each)
-                # They start together, and the lap lasts until the last one's end.
-                wall_s = max(lap.wall_s for lap in laps)
-                bare[count].append(Lap(sum(lap.scenes for lap in laps), wall_s, sum(lap.cpu_s for lap in laps), {}))
+                bare[count].append(_together(processes.run(f"{number}-{count}", count, each)))
+            for count in counts:
+                loops[count].append(_together(processes.loop(count, LOOP_S)))
     gain = gain_of(*([lap for lap, _ in ray[count]] for count in counts))
     reference = gain_of(bare[1], bare[workers])
     return {
@@ -68,10 +73,16 @@ def measure_scaling(
         "range": job.range_size,
         "ray": gain,
         "bare": reference,
+        "loops": asdict(slope_ratio(loops[1], loops[workers])),
         "ray_share": asdict(Spread.of([idle for _, idle in ray[workers]])),
         "ray_share_one": asdict(Spread.of([idle for _, idle in ray[1]])),
         "share_of_bare": gain["speedup"]["median"] / reference["speedup"]["median"],
     }
+
+
+def _together(laps: Sequence[Lap]) -> Lap:
+    """The lap of processes that start together: it lasts until the last one's end."""
+    return Lap(sum(lap.scenes for lap in laps), max(lap.wall_s for lap in laps), sum(lap.cpu_s for lap in laps), {})
 
 
 def gain_of(one: Sequence[Lap], several: Sequence[Lap]) -> dict[str, Any]:
@@ -100,12 +111,20 @@ class Processes:
 
     def run(self, name: str, count: int, span: Span) -> list[Lap]:
         """The first `count` of them make these scenes at the same time, all of them the same scenes."""
-        laps = [
+        return self._laps(
             pool.submit(run_process, self.job, self.job_folder, self.folder / f"bare{number}" / name, span)
             for number, pool in enumerate(self.pools[:count])
-        ]
+        )
+
+    def loop(self, count: int, seconds: float) -> list[Lap]:
+        """The first `count` of them turn an empty loop at the same time."""
+        return self._laps(pool.submit(count_for, seconds) for pool in self.pools[:count])
+
+    def _laps(self, begun: Iterable[Future[Lap]]) -> list[Lap]:
+        """The laps of what was begun, all of it before one is waited for."""
+        under_way = list(begun)
         try:
-            return [lap.result() for lap in laps]
+            return [lap.result() for lap in under_way]
         except BrokenProcessPool as error:
             raise RunError("a plain process of the benchmark died; its last words stand above") from error
 

@@ -42,8 +42,9 @@ def test_ratios_are_of_slopes_and_the_text_tells_them():
     assert script["load_ms"] == pytest.approx(500.0)
     scaling = {"workers": 2, "range": 8, "ray": GAIN, "bare": GAIN, "ray_share": SHARE, "ray_share_one": SHARE}
     rest = {"command": "verso bench", "file_system": "ext4", "other_systems": {"MuJoCo": "3.0", "Blender Cycles": "no"}}
-    lines = describe({**figures, **rest, "memory": None, "scaling": {**scaling, "share_of_bare": 0.97}})
+    lines = describe({**figures, **rest, "memory": None, "scaling": {**scaling, "loops": SHARE, "share_of_bare": 0.97}})
     assert "machine    2 of 4 cores (2 threads each), some, load 0.2" in lines
     assert any(line.startswith("  the script, plain look 3.50 x [3.00 to 4.00]") for line in lines)
     assert "MuJoCo                   it died" in lines
     assert any("5.0% [4.0% to 6.1%] with one worker" in line for line in lines)
+    assert "  empty loops            0.05 x [0.04 to 0.06]" in lines

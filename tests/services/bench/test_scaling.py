@@ -23,11 +23,13 @@ def test_plain_processes_make_the_same_scenes_at_the_same_time(tmp_path):
     span = Span(start=0, stop=3)
     with plain_processes(validate_job(SMALL, "test"), tmp_path, tmp_path, 2) as processes:
         alone, both = processes.run("alone", 1, span), processes.run("both", 2, span)
+        loops = processes.loop(2, 0.2)
     assert [lap.scenes for lap in (*alone, *both)] == [3, 3, 3]
     assert all(lap.cpu_s > 0 for lap in both)
     for number, name in ((0, "alone"), (0, "both"), (1, "both")):
         commits = (tmp_path / f"bare{number}" / name / "manifest" / "_commits").glob("*.json")
         assert sorted(int(path.stem) for path in commits) == [0, 2]
+    assert all(lap.scenes > 0 and lap.cpu_s <= lap.wall_s < 1.0 for lap in loops)
 
 
 @pytest.mark.slow
@@ -37,3 +39,4 @@ def test_scaling_tells_rays_part_from_the_machines(tmp_path):
     assert told["ray"]["scenes"] == told["bare"]["scenes"] == 8
     assert 0 < told["ray_share_one"]["median"] < 1 and 0 < told["ray_share"]["median"] < 1
     assert all(0.2 < told[name]["inflation"]["median"] < 5 for name in ("ray", "bare"))
+    assert 0.5 < told["loops"]["median"] < 2.5
