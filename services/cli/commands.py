@@ -102,7 +102,7 @@ def status(options: argparse.Namespace) -> int:
         print(f"  rate: {now.scenes_per_s:.2f} scenes/s")
     lives = now.holder is not None and shows_life(store, now.holder)
     for one in now.running:
-        doing = "between scenes" if one.scene_id is None else f"scene {one.scene_id}"
+        doing = "no scene in progress" if one.scene_id is None else f"scene {one.scene_id}"
         print(f"  {'running' if lives else 'was running'}: range from {one.start}, {doing} ({one.attempt})")
     if now.holder is not None:
         gone = "" if lives else ", which is gone: start the run again, what is committed is kept"

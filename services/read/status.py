@@ -28,7 +28,7 @@ class Running:
     start: int
     attempt: str
     scene_id: int | None
-    """The scene in progress; None between scenes."""
+    """The scene in progress; None between scenes, and while the range is committed."""
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from tests.judge.judge import Thing, Verdict, judge
 from workers.geometry.frames import transform
 from workers.physics import settle
 from workers.physics.effects import called_for
+from workers.physics.fall import FINEST
 from workers.physics.step import recheck_scene, settle_scene
 
 PARTS = ("release", "rest")
@@ -90,7 +91,7 @@ def try_scene(scene_id: int, plan: ScenePlan, physics: Physics, asked: Asked) ->
     judge_s = time.process_time() - began
     moved: tuple[float | None, float | None] = (None, None)
     if asked.recheck:
-        again = recheck_scene(plan, rest, physics, effects).settled
+        again = recheck_scene(plan, rest, physics, effects, FINEST).settled
         moved = max(one.recheck_move_mm or 0.0 for one in again), max(one.recheck_turn_deg or 0.0 for one in again)
     held = hold_scene(plan, rest.settled, physics) if asked.mujoco else None
     return Outcome(

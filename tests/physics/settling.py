@@ -11,6 +11,7 @@ from schemas.scene.plan import ObjectStart, ScenePlan, Table
 from schemas.scene.scene import Settled
 from tests.shapes import asset_of, box, table
 from workers.physics.effects import called_for, called_for_with
+from workers.physics.fall import FINEST
 from workers.physics.step import RECHECK_S, moved_by, release_again, settle_scene
 from workers.plan.randomness import SceneChance
 from workers.plan.step import draw_scene
@@ -49,19 +50,21 @@ def settle_single(
 
 
 def recheck_group(
-    starts: Sequence[ObjectStart], settled: Sequence[Settled], on: Table, physics: Physics
+    starts: Sequence[ObjectStart], settled: Sequence[Settled], on: Table, physics: Physics, level_rate: float = FINEST
 ) -> list[tuple[float, float]]:
     """(mm that the farthest point moves, degrees that it turns) of every object, when all are released again.
 
-    For `RECHECK_S`, in the finest steps, on the ground that they came to rest on.
+    For `RECHECK_S`, on the ground that they came to rest on, in the finest steps or as `release_again` says.
     """
     effects = effects_of(starts, on, physics)
     if any(each.support == "mesh" for each in settled):
         effects = EffectPlan((*effects.ran, *called_for_with("table_mesh", starts, physics)), {})
-    after = release_again(scene_of(starts, on), settled, physics, effects, RECHECK_S)
+    after = release_again(scene_of(starts, on), settled, physics, effects, RECHECK_S, level_rate)
     return [moved_by(one, rest.T_world_obj, T) for one, rest, T in zip(starts, settled, after, strict=True)]
 
 
-def recheck(start: ObjectStart, settled: Settled, on: Table, physics: Physics) -> tuple[float, float]:
+def recheck(
+    start: ObjectStart, settled: Settled, on: Table, physics: Physics, level_rate: float = FINEST
+) -> tuple[float, float]:
     """The same of one object."""
-    return recheck_group((start,), (settled,), on, physics)[0]
+    return recheck_group((start,), (settled,), on, physics, level_rate)[0]

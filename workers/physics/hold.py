@@ -72,16 +72,17 @@ def let_go(
     poses: Sequence[Pose],
     far_m: float = FAR_M,
     groups: Sequence[list[int]] | None = None,
+    level_rate: float = FINEST,
 ) -> tuple[Pose, ...]:
     """The `T_world_obj` of objects, let go at these in the finest steps, once they rest, or one of them has moved by `far_m`.
 
     What cannot meet is let go on its own: beside others Bullet's solver ends before it has found the forces of each. groups:
-    of those to let go; all, if not given.
+    of those to let go; all, if not given. level_rate: steps a second, in the settings', of what meets level ground alone.
     """
     went = list(poses)
     for group in _groups(placement, poses, level=True) if groups is None else groups:
         few = dataclasses.replace(drop, starts=tuple(drop.starts[k] for k in group))
-        outcome = _let_go(few, placement.of(group), [poses[k] for k in group], far_m)
+        outcome = _let_go(few, placement.of(group), [poses[k] for k in group], far_m, level_rate)
         for k, T in zip(group, outcome.poses, strict=True):
             went[k] = T
     return tuple(went)
@@ -97,17 +98,18 @@ def _groups(placement: Placement, poses: Sequence[Pose], level: bool) -> list[li
     return [np.flatnonzero(groups == each).tolist() for each in asked]
 
 
-def _let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: float) -> Outcome:
+def _let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: float, level_rate: float) -> Outcome:
     """The fall of objects that may meet.
 
     Their shapes are the skins of their meshes where they are near one another, in convex pieces: exact, and each with contacts of
     its own. Of two bodies that are one piece each Bullet keeps four contacts, chosen from some millimetres away, so that a
     box stands on three corners of four and on what it does not touch.
     """
-    physics, top, near_m = settings_of(drop, Pace(rate=FINEST)), drop.table.top, 2.0 * far_m
+    top, near_m = drop.table.top, 2.0 * far_m
     points = np.concatenate([transform(T, one.hull.vertices) for one, T in zip(drop.starts, poses, strict=True)])
     low_m, inside_m = points[:, 2].min(), inside_margin(points[:, :2], top.outline).min()
     level = top.convex and low_m > top.height_m - near_m and inside_m > near_m
+    physics = settings_of(drop, Pace(rate=level_rate if level and drop.single else FINEST))
     skins = _skins(placement, poses, near_m, top.height_m if level else -math.inf)
     whole = [make_body(start, parts) for start, parts in zip(drop.starts, skins, strict=True)]
     bodies = [dataclasses.replace(body, margin_m=THIN * body.margin_m) for body in whole]

@@ -15,6 +15,7 @@ from schemas.scene.plan import ScenePlan
 from services.study.knobs import apply
 from services.study.model import Setting
 from workers.geometry.frames import motion_between, transform
+from workers.physics.fall import FINEST
 from workers.physics.step import Rest, moved_by, recheck_scene, settle_scene
 from workers.pipeline.context import WorkerContext
 from workers.plan.effects import Facts, plan_effects
@@ -112,7 +113,7 @@ def _apart_mm(plan: ScenePlan, one: Rest, other: Rest) -> float:
 
 
 def _release(job: Job, plan: ScenePlan, rest: Rest) -> dict[str, float]:
-    again = recheck_scene(plan, rest, *_physics(job, plan, RELEASED)).settled
+    again = recheck_scene(plan, rest, *_physics(job, plan, RELEASED), FINEST).settled
     return {
         "moved_mm": max(one.recheck_move_mm or 0.0 for one in again),
         "turned_deg": max(one.recheck_turn_deg or 0.0 for one in again),

@@ -144,7 +144,7 @@ def test_what_cannot_meet_is_let_go_on_its_own_and_what_stands_on_level_faces_al
     drop, placement = released(starts, table)
     poses, seen = [one.T_world_obj for one in starts], []
 
-    def told(drop, placement, poses, far_m):
+    def told(drop, placement, poses, far_m, level_rate):
         seen.append(tuple(starts.index(one) for one in drop.starts))
         assert placement.starts == drop.starts and len(poses) == len(drop.starts)
         return Outcome(tuple(poses), 0.0, 0.1, rested=True)

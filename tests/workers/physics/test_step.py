@@ -14,15 +14,15 @@ from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import Mesh
 from tests.physics.population import draw
-from tests.physics.settling import effects_of, recheck, settle_single
+from tests.physics.settling import effects_of, recheck, scene_of, settle_single
 from tests.shapes import asset_of, box, shape_of, table
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.elevation import vertical_gap
 from workers.geometry.frames import angle_between, pose, rotation_about, transform, translation
 from workers.geometry.hull import convex_hull
-from workers.physics.fall import fall
-from workers.physics.step import RECHECK_S, release_again
+from workers.physics.fall import FINEST, fall
+from workers.physics.step import RECHECK_RATE, RECHECK_S, Rest, recheck_scene, release_again
 from workers.physics.table_top import place_table
 from workers.plan.randomness import SceneChance
 from workers.plan.step import draw_scene, draw_start
@@ -116,17 +116,35 @@ def test_what_is_let_go_again_is_watched_to_the_end_however_still_it_stands(monk
     assert [each.seconds for each in watched] == pytest.approx([RECHECK_S, 0.5], abs=1e-3)
 
 
+def test_a_single_object_on_level_ground_alone_is_let_go_again_in_a_quarter_of_the_finest_steps(monkeypatch):
+    rates = []
+
+    def told(bodies, poses, ground, physics, steps, *rest, **more):
+        rates.append(steps.base_hz / PHYSICS.step_hz)
+        return fall(bodies, poses, ground, physics, steps, *rest, **more)
+
+    monkeypatch.setattr("workers.physics.hold.fall", told)
+    asset, at = asset_of(box(0.06, 0.06, 0.06)), [translation(x_m, 0.0, TOP + 0.03) for x_m in (0.0, 0.06, 0.699)]
+    starts = [start_of(asset, T) for T in at]
+    one = settle_single(start_of(asset, at[0]), TABLE, PHYSICS)
+    for numbers in ((0,), (2,), (0, 1)):
+        own, rests = [starts[n] for n in numbers], tuple(dataclasses.replace(one, T_world_obj=at[n]) for n in numbers)
+        recheck_scene(scene_of(own, TABLE), Rest(rests), PHYSICS, EffectPlan(("dynamics", "fine_step"), {}))
+    assert rates == [RECHECK_RATE, FINEST, FINEST], "on the top, at its edge, two that touch"
+
+
+@pytest.mark.parametrize("rate", [RECHECK_RATE, FINEST])
 @pytest.mark.parametrize(
     ("x_m", "up_m", "least_mm", "most_mm"),
     [(0.0, 0.0, 0.0, 1e-3), (0.0, 1.5e-4, 0.14, 0.16), (0.699, 0.0, 0.0, 1e-3), (0.701, 0.0, 0.2, 0.5)],
     ids=["on the table", "0.15 mm above it", "1 mm inside an overhang", "1 mm outside"],
 )
-def test_what_is_let_go_again_shows_whether_it_rested(x_m, up_m, least_mm, most_mm):
+def test_what_is_let_go_again_shows_whether_it_rested(x_m, up_m, least_mm, most_mm, rate):
     """A cube of 60 mm on a top that ends at 0.7 m; what tips is stopped once its centre of mass went 0.2 mm."""
     asset = asset_of(box(0.06, 0.06, 0.06))
     rest = settle_single(start_of(asset, translation(0.0, 0.0, TOP + 0.03)), TABLE, PHYSICS)
     T = translation(x_m, 0.0, TOP + 0.03 + up_m)
-    moved_mm, _ = recheck(start_of(asset, T), dataclasses.replace(rest, T_world_obj=T), TABLE, PHYSICS)
+    moved_mm, _ = recheck(start_of(asset, T), dataclasses.replace(rest, T_world_obj=T), TABLE, PHYSICS, rate)
     assert least_mm <= moved_mm <= most_mm
 
 
