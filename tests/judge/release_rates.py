@@ -21,6 +21,7 @@ from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.scene.plan import ScenePlan
 from services.job.read import validate_job
+from tests.judge.table import STILL_DEG, STILL_MM
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.geometry.frames import pose, rotation_about, transform, translation
 from workers.physics.fall import FINEST
@@ -28,9 +29,6 @@ from workers.physics.step import RECHECK_RATE, RECHECK_S, moved_by, release_agai
 from workers.plan.effects import Facts, plan_effects
 from workers.plan.randomness import SceneChance
 from workers.plan.step import plan_scene
-
-BOUND = 0.1
-"""Of the motion, millimetres, and of the turn, degrees."""
 
 TILTS_DEG = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 0.005, 0.02)
 LIFTS_MM = (0.005, 0.05, 0.09, 0.15)
@@ -47,7 +45,8 @@ class Compared:
     @property
     def refused(self) -> tuple[bool, bool]:
         """Whether the finest steps refuse it, and the quarter."""
-        return max(self.finest[:2]) > BOUND, max(self.quarter[:2]) > BOUND
+        finest, quarter = (mm > STILL_MM or deg > STILL_DEG for mm, deg, _ in (self.finest, self.quarter))
+        return finest, quarter
 
 
 def compare(job: Job, catalogue: Catalogue, scene_id: int) -> Iterator[Compared]:

@@ -141,6 +141,7 @@ class Attempt:
         self._rows: dict[str, list[pa.Table]] = {table: [] for table in TABLES}
         self._scenes: list[SceneMark] = []
         self._packing = Packing(store, self._staging, span, tar=terms.layout == "tar")
+        self._noted: Mapping[str, object] | None = None
 
     def begin_scene(self, scene_id: int) -> None:
         """Notes the scene in progress, which is blamed if the worker dies."""
@@ -260,8 +261,12 @@ class Attempt:
         return CommitResult(False, winner, compare_attempts(mine, self._files.values(), winner, theirs))
 
     def _note(self, current: Mapping[str, object]) -> None:
+        """Writes what is in progress, unless it is what was written last."""
+        if current == self._noted:
+            return
         with self._skip_if_swept():
             self._store.write_note(self._staging, CURRENT, json.dumps(current).encode().ljust(_NOTE_BYTES))
+        self._noted = current
 
     @contextlib.contextmanager
     def _skip_if_swept(self) -> Iterator[None]:

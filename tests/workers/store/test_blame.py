@@ -41,6 +41,14 @@ def test_a_worker_that_dies_while_it_commits_blames_no_scene(store, monkeypatch)
     assert blamed_scene(store, 0, attempt.name) is None
 
 
+def test_a_range_that_is_known_to_have_no_scene_in_progress_is_not_told_so_again(store, monkeypatch):
+    attempt = attempt_at(store, 0, 4)
+    attempt.end_scenes()
+    assert blamed_scene(store, 0, attempt.name) is None
+    monkeypatch.setattr(store, "write_note", None)  # called, it would raise
+    assert attempt.commit().won
+
+
 def test_a_shorter_note_replaces_a_longer_one_in_place(store):
     attempt = begin_attempt(store, Span(start=0, stop=MAX_SCENE), terms())
     note = store.root / f"{STAGING}/0000000000/{attempt.name}/_current"
