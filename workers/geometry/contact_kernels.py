@@ -40,23 +40,48 @@ def bounds_in(points: Array, features: NDArray[np.integer], low: Array, high: Ar
     return found[:count], least[:count], most[:count]
 
 
-@compiled
 def find_near(low: Array, high: Array, others_low: Array, others_high: Array, within: float) -> Index:
     """[N, 2]: the pairs of two lists of boxes, bounds [A, 3] and [B, 3], with at most `within` between them on each axis.
 
     Sorted by the first box. The second list is swept along the axis on which it extends farthest.
     """
-    pairs, count = np.empty((64, 2), np.int64), 0
     if len(low) == 0 or len(others_low) == 0:
-        return pairs[:0]
+        return np.empty((0, 2), np.int64)
+    axis, widest, starts = _longest_axis(others_low, others_high)
+    order = np.argsort(starts, kind="stable")  # numba's own takes seconds to compile
+    return _sweep(low, high, others_low, others_high, within, axis, widest, order, starts[order])
+
+
+@compiled
+def _longest_axis(low: Array, high: Array) -> tuple[int, float, Array]:
+    """(the axis on which boxes, bounds [B, 3], extend farthest; the widest box there; their lower bounds [B] there)."""
     axis, longest = 0, -1.0
     for k in range(3):
-        extent = others_high[:, k].max() - others_low[:, k].min()
-        if extent > longest:
-            axis, longest = k, extent
-    widest = (others_high[:, axis] - others_low[:, axis]).max()
-    order = np.argsort(others_low[:, axis], kind="mergesort")
-    sorted_low = others_low[order, axis]
+        least, most = low[0, k], high[0, k]
+        for n in range(1, len(low)):
+            least, most = min(least, low[n, k]), max(most, high[n, k])
+        if most - least > longest:
+            axis, longest = k, most - least
+    widest, starts = high[0, axis] - low[0, axis], np.empty(len(low))
+    for n in range(len(low)):
+        widest, starts[n] = max(widest, high[n, axis] - low[n, axis]), low[n, axis]
+    return axis, widest, starts
+
+
+@compiled
+def _sweep(
+    low: Array,
+    high: Array,
+    others_low: Array,
+    others_high: Array,
+    within: float,
+    axis: int,
+    widest: float,
+    order: Index,
+    sorted_low: Array,
+) -> Index:
+    """The pairs of `find_near`: along `axis` the second list, of boxes at most `widest` there, begins at `sorted_low` [B]."""
+    pairs, count = np.empty((64, 2), np.int64), 0
     for n in range(len(low)):
         first = np.searchsorted(sorted_low, low[n, axis] - within - widest)
         for m in range(first, len(order)):

@@ -85,8 +85,13 @@ def _half_edges(faces: Index, count: int) -> tuple[Index, Index]:
 @compiled
 def _star(edges: Index, count: int) -> tuple[Index, Index]:
     """(starts [count + 1], members): the neighbours of each vertex, one after the other, ascending as edges [E, 2] are."""
-    starts = np.append(0, np.cumsum(np.bincount(edges.ravel(), minlength=count)))
-    members, free = np.empty(edges.size, np.int64), starts.copy()
+    starts, free, members = np.zeros(count + 1, np.int64), np.empty(count, np.int64), np.empty(edges.size, np.int64)
+    for n in range(len(edges)):
+        starts[edges[n, 0] + 1] += 1
+        starts[edges[n, 1] + 1] += 1
+    for n in range(count):
+        free[n] = starts[n]
+        starts[n + 1] += starts[n]
     for here, there in ((1, 0), (0, 1)):
         for n in range(len(edges)):
             members[free[edges[n, here]]] = edges[n, there]
@@ -125,7 +130,8 @@ def _edges(vertices: Array, faces: Index, normals: Array, keys: Index, which: In
             continue
         (f, m), (g, n), (i, j) = divmod(which[first], 3), divmod(which[last], 3), divmod(keys[last], len(vertices))
         v, w = faces[f, (m + 2) % 3], faces[g, (n + 2) % 3]
-        edges[count], across[count], bent[bends] = (i, j), (v, w), count
+        edges[count, 0], edges[count, 1], across[count, 0], across[count, 1] = i, j, v, w
+        bent[bends] = count
         even = last == first + 1 and abs(dot(normals[f], normals[g])) > 1.0 - FLAT
         # Two faces folded onto one another are coplanar, and their edge is bent all the same: p and q are on one side of it
         if even and v != w:

@@ -83,7 +83,7 @@ def _deepest(line: Array) -> float:
         # Andrew's monotone chain (1979), of the side away from the axis
         while count > 1 and _left_of(line[n], hull[count - 2], hull[count - 1]) <= 0.0:
             count -= 1
-        hull[count] = line[n]
+        hull[count, 0], hull[count, 1] = line[n, 0], line[n, 1]
         count += 1
     deepest = 0.0
     for n in range(len(line)):

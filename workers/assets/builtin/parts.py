@@ -180,7 +180,8 @@ def _collect(
         for f in range(start, row):
             for k in range(3):
                 faces[f, k] = number[faces[f, k]]
-        number[least : most + 1] = 0
+        for key in range(least, most + 1):
+            number[key] = 0
         stops[s + 1, 0], stops[s + 1, 1] = row, count
     return faces, names[:count].copy(), stops
 

@@ -130,12 +130,12 @@ def _tops_first(
     vertices: NDArray[np.float32], faces: NDArray[np.int64], lowest_m: np.float32, plane_z: int
 ) -> tuple[NDArray[np.uint32], int]:
     """(faces [F, 3], those that face up and lie above `lowest_m` before the others; the number of them)."""
-    top = np.zeros(len(faces), np.bool_)
+    top, count = np.empty(len(faces), np.bool_), 0
     for face in range(len(faces)):
         top[face] = vertices[faces[face, 2], plane_z] > np.float32(0.0)
         for corner in range(3):
             top[face] &= vertices[faces[face, corner], 2] > lowest_m
-    count = int(np.count_nonzero(top))
+        count += top[face]
     ordered, first, other = np.empty((len(faces), 3), np.uint32), 0, count
     for face in range(len(faces)):
         row = first if top[face] else other
