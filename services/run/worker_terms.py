@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from schemas.environment import FOR_SPEED, STACK_ENVIRONMENT, WITH_AVX2
+from schemas.environment import FOR_SPEED, ON_X86_64_V3, STACK_ENVIRONMENT, X86_64_V3
 from schemas.errors import FingerprintError, MachineError, OutputError, VersoError
 from services.run.sight import Sight
 
-VARIABLES = (*STACK_ENVIRONMENT, *WITH_AVX2)
+VARIABLES = (*STACK_ENVIRONMENT, *ON_X86_64_V3)
 """The variables that a worker must have as the driver has them."""
 
 
@@ -42,11 +42,12 @@ def refusal_of_worker(terms: WorkerTerms, node: Sight) -> VersoError | None:
 
 
 def _processor(terms: WorkerTerms, node: Sight) -> VersoError | None:
-    if not WITH_AVX2.items() <= set(terms.environment) or "avx2" in node.flags:
+    missing = sorted(X86_64_V3 - node.flags)
+    if not missing or not ON_X86_64_V3.items() <= set(terms.environment):
         return None
     return MachineError(
-        f"the processor of {node.host} has no AVX2, and that of {terms.driver}, where the run was started, has: they do not "
-        f"make the same bytes. Take {node.host} out of the cluster, or use machines of one kind"
+        f"the processor of {node.host} is below x86-64-v3 (no {', '.join(missing)}), and that of {terms.driver}, where the run "
+        f"was started, is not: they do not make the same bytes. Take {node.host} out of the cluster, or use machines of one kind"
     )
 
 

@@ -108,12 +108,12 @@ def on_the_cluster(cluster: Cluster, job: Path, out: str) -> "subprocess.Complet
 
 def test_a_host_that_would_make_other_bytes_or_keep_them_is_refused_before_the_first_scene(cluster, job, tmp_path):
     cases = {
-        "no AVX2": "sed s/avx2//g /proc/cpuinfo > {0}; mount --bind {0} /proc/cpuinfo",
+        "(no avx2)": "sed s/avx2//g /proc/cpuinfo > {0}; mount --bind {0} /proc/cpuinfo",
         "install the same wheel or image": "sed '$a # changed' {1} > {0}; mount --bind {0} {1}",
         "does not share the output folder": "mount -t tmpfs none {2}",
     }
     code = ROOT / "schemas" / "plain_line.py"
-    places = {"no AVX2": "/proc/cpuinfo", "install the same wheel or image": code}
+    places = {"(no avx2)": "/proc/cpuinfo", "install the same wheel or image": code}
     for number, (told, change) in enumerate(cases.items()):
         hosts("run", "3", "sh", "-c", change.format(tmp_path / str(number), code, cluster.storage))
         try:

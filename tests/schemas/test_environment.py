@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas.environment import FOR_SPEED, STACK_ENVIRONMENT, WITH_AVX2, settings_to_change
+from schemas.environment import FOR_SPEED, ON_X86_64_V3, STACK_ENVIRONMENT, X86_64_V3, settings_to_change
 from services.cli.skips import no_huge_pages
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -27,8 +27,17 @@ def test_nothing_changes_where_the_environment_is_right_already():
     assert settings_to_change({**RIGHT, "LP_NUM_THREADS": "4"}, frozenset()) == {"LP_NUM_THREADS": "0"}
 
 
-def test_openblas_is_told_its_kernels_only_where_the_processor_has_them():
-    assert settings_to_change(RIGHT, frozenset({"avx2"})) == dict(WITH_AVX2)
+def test_kernels_and_code_for_a_processor_are_asked_for_only_where_it_has_all_that_they_use():
+    assert settings_to_change(RIGHT, X86_64_V3 | {"sse2"}) == dict(ON_X86_64_V3)
+    for flag in X86_64_V3:
+        assert settings_to_change(RIGHT, X86_64_V3 - {flag}) == {}
+
+
+def test_numba_compiles_for_the_level_and_not_for_the_processor():
+    asks = "from numba.core.registry import cpu_target as c; print(c.target_context.codegen().magic_tuple()[1:])"
+    environ = {**os.environ, **ON_X86_64_V3}
+    done = subprocess.run([sys.executable, "-c", asks], env=environ, capture_output=True, text=True, check=True)
+    assert ast.literal_eval(done.stdout) == ("x86-64-v3", "+avx2")
 
 
 def test_what_is_for_speed_alone_is_set_only_where_the_user_has_not():

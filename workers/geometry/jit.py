@@ -4,13 +4,15 @@ Without `fastmath`, so that sums are added in the order that is written, on ever
 """
 
 import contextlib
+import inspect
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import CodeType
 from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
-from numba.core.caching import FunctionCache
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 Loop = TypeVar("Loop", bound=Callable[..., object])
 
@@ -26,19 +28,28 @@ def compiled(loop: Loop) -> Loop:
 class _LoopCache(FunctionCache):
     """A loop on disk, as long as what it uses stays the same.
 
-    numba looks for changes in the loop's own file alone, and what the loop uses of other files is compiled into it.
+    numba looks for changes in the loop's own file alone, and what the loop uses of other files is compiled into it. A loop
+    that is not where this process keeps its loops may lie beside the loop's file, as the image has them, which is then read.
     """
 
     def __init__(self, loop: Callable[..., object]) -> None:
         super().__init__(loop)
         self._own_stamp = self._cache_file._source_stamp
+        beside = str(Path(inspect.getfile(loop)).resolve().parent / "__pycache__")
+        files = [self._cache_file, IndexDataCacheFile(beside, self._impl.filename_base, self._own_stamp)]
+        self._files = files[:1] if self._cache_path == beside else files
 
-    def _load_overload(self, *arguments: object) -> object:
-        """Reads the loop, at its first call, when all that it uses is defined; saving comes after."""
+    def _load_overload(self, signature: object, target_context: Any) -> object:
+        """Reads the loop, at its first call, when all that it uses is defined; saving comes after. None where it is not kept."""
         used: dict[tuple[str, str], object] = {}
         _find_used(self._py_func, used)
-        self._cache_file._source_stamp = self._own_stamp, used
-        return super()._load_overload(*arguments)
+        key = self._index_key(signature, target_context.codegen())
+        for file in self._files:
+            file._source_stamp = self._own_stamp, used
+            with contextlib.suppress(OSError):
+                if (kept := file.load(key)) is not None:
+                    return self._impl.rebuild(target_context, kept)
+        return None
 
 
 def _find_used(loop: Callable[..., object], used: dict[tuple[str, str], object]) -> None:

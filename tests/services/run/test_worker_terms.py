@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import pytest
 
-from schemas.environment import FOR_SPEED, STACK_ENVIRONMENT, WITH_AVX2, stack_environment
+from schemas.environment import FOR_SPEED, ON_X86_64_V3, STACK_ENVIRONMENT, X86_64_V3, stack_environment
 from schemas.errors import FingerprintError, MachineError, OutputError
 from services.run.sight import Sight
 from services.run.worker_terms import WorkerTerms, refusal_of, refusal_of_worker, worker_environment
 
-ENVIRONMENT = stack_environment(frozenset({"avx2"}))
+ENVIRONMENT = stack_environment(X86_64_V3)
 TERMS = WorkerTerms(tuple(ENVIRONMENT.items()), "c" * 64, "head", "/data/out", "/data/out/_lock.json", "token")
-GOOD = Sight("h2", frozenset({"avx2", "fma"}), ENVIRONMENT, "c" * 64)
+GOOD = Sight("h2", X86_64_V3 | {"sse2"}, ENVIRONMENT, "c" * 64)
 
 
 def test_a_worker_that_has_all_is_taken():
@@ -23,7 +23,7 @@ def test_a_driver_gives_what_it_has_of_the_stacks_variables_and_no_other():
     mine = {**ENVIRONMENT, "OMP_NUM_THREADS": "4", "AWS_SECRET_ACCESS_KEY": "secret"}
     assert worker_environment(mine) == {**ENVIRONMENT, "OMP_NUM_THREADS": "4"}
     assert worker_environment({}) == {}
-    assert {*STACK_ENVIRONMENT, *WITH_AVX2} == set(worker_environment(mine))
+    assert {*STACK_ENVIRONMENT, *ON_X86_64_V3} == set(worker_environment(mine))
 
 
 def test_a_driver_gives_its_own_setting_for_speed_but_not_a_users():
@@ -46,11 +46,11 @@ def test_before_a_worker_starts_its_node_is_not_asked_for_variables():
     assert refusal_of(TERMS, replace(GOOD, environment={})) is None
 
 
-def test_a_processor_without_avx2_is_refused_where_the_drivers_kernels_need_it():
-    old = replace(GOOD, flags=frozenset({"sse2"}))
+def test_a_processor_below_v3_is_refused_where_the_drivers_kernels_need_it():
+    old = replace(GOOD, flags=GOOD.flags - {"fma", "avx2"})
     for refusal in (refusal_of(TERMS, old), refusal_of_worker(TERMS, old)):
         assert isinstance(refusal, MachineError)
-        assert "h2 has no AVX2" in str(refusal) and "head" in str(refusal)
+        assert "h2 is below x86-64-v3 (no avx2, fma)" in str(refusal) and "head" in str(refusal)
     without = replace(TERMS, environment=tuple(stack_environment(frozenset()).items()))
     assert refusal_of(without, old) is None
 

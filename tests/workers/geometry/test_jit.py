@@ -74,3 +74,27 @@ def test_what_a_kept_loop_uses_of_another_file_may_change(before, after, tmp_pat
     assert [kept > 0 for _, kept, _ in results] == [False, True, False]
     assert all(value == plain for value, _, plain in results)
     assert results[0][0] != results[2][0]
+
+
+def test_a_loop_that_was_compiled_beside_its_file_is_read_where_this_process_keeps_its_own_elsewhere(tmp_path):
+    """As in the image, whose code nobody may write to."""
+    (tmp_path / "loops.py").write_text(
+        "from workers.geometry.jit import compiled\n@compiled\ndef run(x):\n    return x + 1\n"
+    )
+    program = "import loops; print(loops.run(2.0), sum(loops.run.stats.cache_hits.values()))"
+
+    def run(**settings: str) -> list[str]:
+        env = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+        env |= {"PYTHONPATH": f"{tmp_path}:{ROOT}", **settings}
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env=env)
+        return done.stdout.split()
+
+    elsewhere = tmp_path / "kept"
+    assert run() == ["3.0", "0"]
+    assert run(NUMBA_CACHE_DIR=str(elsewhere)) == ["3.0", "1"]
+    assert not list(elsewhere.rglob("*.nbc"))
+    beside = tmp_path / "__pycache__"
+    for file in beside.glob("*.nb[ci]"):
+        file.unlink()
+    assert run(NUMBA_CACHE_DIR=str(elsewhere)) == ["3.0", "0"]
+    assert list(elsewhere.rglob("*.nbc"))
