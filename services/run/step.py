@@ -22,7 +22,7 @@ from services.run.losses import find_lost
 from services.run.metrics import Meter, serve
 from services.run.out_folder import explain_lost_folder
 from services.run.pattern import Pattern
-from services.run.progress import ProgressLine, event_log, log_event
+from services.run.progress import ProgressLine, event_log, log_event, note_of_first_start
 from services.run.range_planner import SpanPlan, deal_shards, group_shards, plan_spans
 from services.run.ray_cluster import open_ray
 from services.run.slots import SharedSlots, Slots
@@ -97,7 +97,8 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
                     pattern = replace(pattern, order=with_own_stack(store, pattern.order))
                 there = f", {ledger.committed} are there" if ledger.committed else ""
                 print(
-                    f"{record.job.name}: {plan.scenes} scenes to make{there}; starting the workers",
+                    f"{record.job.name}: {plan.scenes} scenes to make{there}; starting the workers"
+                    f"{'' if request.address else note_of_first_start()}",
                     file=sys.stderr,
                     flush=True,
                 )

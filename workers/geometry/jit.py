@@ -4,15 +4,13 @@ Without `fastmath`, so that sums are added in the order that is written, on ever
 """
 
 import contextlib
-import inspect
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import CodeType
 from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
-from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.caching import FunctionCache, IndexDataCacheFile, InTreeCacheLocator
 
 Loop = TypeVar("Loop", bound=Callable[..., object])
 
@@ -35,7 +33,7 @@ class _LoopCache(FunctionCache):
     def __init__(self, loop: Callable[..., object]) -> None:
         super().__init__(loop)
         self._own_stamp = self._cache_file._source_stamp
-        beside = str(Path(inspect.getfile(loop)).resolve().parent / "__pycache__")
+        beside = InTreeCacheLocator(loop, loop.__code__.co_filename).get_cache_path()
         files = [self._cache_file, IndexDataCacheFile(beside, self._impl.filename_base, self._own_stamp)]
         self._files = files[:1] if self._cache_path == beside else files
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from schemas.dataset.layout import LOG_FOLDER
 from services.run import progress as module
-from services.run.progress import ProgressLine, event_log, log_event
+from services.run.progress import ProgressLine, event_log, log_event, note_of_first_start
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -61,3 +61,12 @@ def test_a_terminal_that_tells_no_width_has_a_bar_too(tmp_path):
     os.close(ours)
     assert "3/4" in said
     assert "failed=1" in said
+
+
+def test_the_start_is_told_to_take_longer_only_where_no_loop_was_compiled(tmp_path):
+    assert note_of_first_start(tmp_path) == " (a first start compiles for up to a minute)"
+    kept = tmp_path / "workers" / "geometry" / "__pycache__"
+    kept.mkdir(parents=True)
+    assert note_of_first_start(tmp_path) != ""
+    (kept / "frames._transform-58.py311.nbi").touch()
+    assert note_of_first_start(tmp_path) == ""
