@@ -12,7 +12,7 @@ from schemas.base import Array
 from schemas.scene.shape import Mesh
 from workers.geometry.bounds import bounds_of
 from workers.geometry.contact_kernels import SLOPE, Index, bounds_in, find_near
-from workers.geometry.convexity import face_normals, has_rim, numbers_in, weld
+from workers.geometry.convexity import edge_keys, face_normals, has_rim, numbers_in, weld
 from workers.geometry.frames import dot
 from workers.geometry.jit import compiled
 from workers.geometry.nearest import nearest_on_segments, nearest_on_triangle
@@ -76,8 +76,7 @@ def crop(mesh: Mesh, low: Array, high: Array) -> Mesh:
 
 def _half_edges(faces: Index, count: int) -> tuple[Index, Index]:
     """(keys [3 F], ascending, the same for the sides of one edge; which [3 F] sides these are, three times their face and on)."""
-    one, other = faces, faces[:, [1, 2, 0]]
-    keys = (np.minimum(one, other) * count + np.maximum(one, other)).ravel()
+    keys = edge_keys(faces, count)
     which = np.argsort(keys, kind="stable")
     return keys[which], which
 

@@ -165,14 +165,14 @@ def face_areas(vertices: Array, faces: NDArray[np.integer]) -> Array:
 
 def has_rim(faces: NDArray[np.integer], count: int) -> bool:
     """Whether some edge of faces [F, 3] into `count` vertices has one face alone."""
-    keys = np.sort(_edge_keys(faces, count))
+    keys = np.sort(edge_keys(faces, count))
     starts = np.ones(len(keys) + 1, np.bool_)  # of an edge, and the end
     starts[1:-1] = keys[1:] != keys[:-1]
     return bool((starts[:-1] & starts[1:]).any())
 
 
 @compiled
-def _edge_keys(faces: NDArray[np.integer], count: int) -> NDArray[np.int64]:
+def edge_keys(faces: NDArray[np.integer], count: int) -> NDArray[np.int64]:
     """[3 F]: a number for each edge of each face [F, 3], the same for two faces' common edge."""
     keys = np.empty(3 * len(faces), np.int64)
     for f in range(len(faces)):

@@ -34,8 +34,7 @@ class _LoopCache(FunctionCache):
         super().__init__(loop)
         self._own_stamp = self._cache_file._source_stamp
         beside = InTreeCacheLocator(loop, loop.__code__.co_filename).get_cache_path()
-        files = [self._cache_file, IndexDataCacheFile(beside, self._impl.filename_base, self._own_stamp)]
-        self._files = files[:1] if self._cache_path == beside else files
+        self._files = self._cache_file, IndexDataCacheFile(beside, self._impl.filename_base, self._own_stamp)
 
     def _load_overload(self, signature: object, target_context: Any) -> object:
         """Reads the loop, at its first call, when all that it uses is defined; saving comes after. None where it is not kept."""
