@@ -24,6 +24,9 @@ MATTE_ROUGHNESS = 0.8
 
 SAME_LEVEL_M = 1e-4
 
+UPRIGHT = 1.0 - 1e-6
+"""Least cosine with the vertical of normals that are shaded as upright."""
+
 _PLANE_Z = -2
 """The column with the z of a face's normal."""
 
@@ -40,10 +43,14 @@ class Batch:
     vertices: NDArray[np.float32]
     indices: NDArray[np.uint32]
     texture: NDArray[np.uint8] | None
+    planar: bool
+    """Whether no part has normals or colours of its own: each face has the normal of its plane and one material."""
     matte: bool
-    """Whether no part is metal or smoother than `MATTE_ROUGHNESS`, or has normals or colours of its own."""
+    """Whether it is planar, and no part is metal or smoother than `MATTE_ROUGHNESS`."""
     top_faces: int = 0
     """The first so many faces are horizontal, face up, and lie within `SAME_LEVEL_M` of the shape's highest point."""
+    planar_top: bool = False
+    """Whether these have the normals of their planes, and each has one colour."""
 
 
 def pack_shape(shape: Shape) -> tuple[Batch, ...]:
@@ -113,16 +120,12 @@ def _pack(parts: list[Part], highest_m: float) -> Batch:
         packed.append(vertices)
         indices.append(faces + start)
         start += len(vertices)
-    matte = all(
-        p.material.metallic == 0.0
-        and p.material.roughness >= MATTE_ROUGHNESS
-        and p.normals is None
-        and p.colors is None
-        for p in parts
-    )
+    planar = all(p.normals is None and p.colors is None for p in parts)
+    dull = all(p.material.metallic == 0.0 and p.material.roughness >= MATTE_ROUGHNESS for p in parts)
     vertices = np.concatenate(packed)
     corners, top_faces = _tops_first(vertices, np.concatenate(indices), np.float32(highest_m - SAME_LEVEL_M), _PLANE_Z)
-    return Batch(vertices, corners, texture_of(parts[0]), matte, top_faces)
+    planar_top = planar or _is_planar(vertices, corners[:top_faces], UPRIGHT)
+    return Batch(vertices, corners, texture_of(parts[0]), planar, planar and dull, top_faces, planar_top)
 
 
 @compiled
@@ -143,6 +146,22 @@ def _tops_first(
             ordered[row, corner] = faces[face, corner]
         first, other = first + top[face], other + (not top[face])
     return ordered, count
+
+
+@compiled
+def _is_planar(vertices: NDArray[np.float32], faces: NDArray[np.uint32], upright: float) -> bool:
+    """Whether horizontal faces [F, 3] have no normals but upright ones, and each has one colour."""
+    for face in range(len(faces)):
+        last = vertices[faces[face, 2]]
+        for corner in range(3):
+            vertex = vertices[faces[face, corner]]
+            x, y, z = vertex[3], vertex[4], vertex[5]
+            if x * x + y * y + z * z > 0.01 and z < upright * np.sqrt(x * x + y * y + z * z):
+                return False
+            for column in range(7, 10):
+                if vertex[column] != last[column]:
+                    return False
+    return True
 
 
 @compiled

@@ -40,6 +40,8 @@ class Uploaded:
     index_count: int
     top_count: int
     """The first so many indices belong to the shape's top (batches.py)."""
+    planar: bool
+    planar_top: bool
     matte: bool
     bytes: int
     positions: NDArray[np.float32]
@@ -154,4 +156,5 @@ def _upload(gl: ModuleType, batch: Batch, textures: TextureStore) -> Uploaded:
     # Copies, so that the other columns are not kept.
     faces = batch.indices if len(batch.indices) <= FEW_TRIANGLES else batch.indices[:0]
     positions = batch.vertices[: len(batch.vertices) if len(faces) else 0, :3].copy()
-    return Uploaded(vertex_array, buffers, texture, batch.indices.size, top_count, batch.matte, size, positions, faces)
+    looks = batch.planar, batch.planar_top, batch.matte
+    return Uploaded(vertex_array, buffers, texture, batch.indices.size, top_count, *looks, size, positions, faces)

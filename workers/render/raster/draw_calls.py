@@ -91,11 +91,13 @@ def sort_draws(
         for batch in shape.batches:
             textured = view.color and is_drawn(view.effects, "textures", batch.texture is not None)
             cutout = view.cut and textured and is_drawn(view.effects, "transparency", batch.holes)
-            for first, count, level in _ranges(batch, split, raster and ground, cover, eye):
-                # Each program takes megabytes; only a floor is large enough to gain from one for planes.
-                matte = view.color and batch.matte and ground and (level or not raster)
+            for first, count, top in _ranges(batch, split, cover, eye):
+                level = (split and top) or (raster and ground and not split)
+                # Each program takes megabytes; only floors and tops of tables are large enough to gain from their own.
+                planar = view.color and batch.few_triangles and (batch.planar_top if top else batch.planar)
+                matte = planar and batch.matte and ground and (level or not raster)
                 look = (view.color, textured, batch.few_triangles, matte, lights, raster)
-                variant = Variant(*look, ground, level, view.labels, cutout, steep)
+                variant = Variant(*look, ground, level, view.labels, cutout, planar, steep)
                 by_variant.setdefault(variant, []).append(Draw(thing, shape, batch, first, count))
     return by_variant
 
@@ -105,23 +107,21 @@ def is_beyond_near(shape: UploadedShape, T_cam_shape: Pose) -> bool:
     return bool((shape.corners @ T_cam_shape[2, :3] + T_cam_shape[2, 3] > NEAR_M).all())
 
 
-def _ranges(
-    batch: Uploaded, split: bool, level: bool, cover: Cover | None, eye: Array
-) -> Iterator[tuple[int, int, bool]]:
-    """(first index, count, whether all of them lie on a level) of what is drawn of a batch.
+def _ranges(batch: Uploaded, split: bool, cover: Cover | None, eye: Array) -> Iterator[tuple[int, int, bool]]:
+    """(first index, count, whether it is the top, apart from the rest) of what is drawn of a batch.
 
-    `split`: its top apart from the rest. With a cover, without what that hides from an eye [3] in its frame.
+    `split`: its top apart from the rest. With a cover also, and without what that hides from an eye [3] in its frame.
     """
     hides = cover is not None and len(batch.faces) > 0
     if not split and not hides:
-        yield 0, batch.index_count, level
+        yield 0, batch.index_count, False
         return
     if batch.top_count:
-        yield 0, batch.top_count, split or level
+        yield 0, batch.top_count, True
     if cover is not None and hides:
         lower = batch.faces[batch.top_count // 3 :]
         for first, count in seen_ranges(batch.positions, lower, cover, eye):
-            yield batch.top_count + 3 * first, 3 * count, level and not split
+            yield batch.top_count + 3 * first, 3 * count, False
     elif batch.top_count < batch.index_count:
         yield batch.top_count, batch.index_count - batch.top_count, False
 

@@ -22,7 +22,7 @@ out vec3 v_shadow;
 flat out vec2 v_slope;
 flat out vec2 v_aside;
 #endif
-#if FEW_TRIANGLES && !MATTE
+#if FEW_TRIANGLES && !PLANAR
 flat out vec3 v_up;
 flat out vec3 v_below;
 #endif
@@ -36,7 +36,7 @@ void pass_light() {
     v_slope = abs(n.z) > 1e-6 * length(n) ? clamp(-n.xy / n.z, -40.0, 40.0) : vec2(0.0);
     v_aside = ASIDE_M * (mat3(level_from_shape) * face_plane.xyz).xy;
 #endif
-#if FEW_TRIANGLES && !MATTE
+#if FEW_TRIANGLES && !PLANAR
     v_up = up;
     v_below = below;
 #endif
@@ -45,14 +45,10 @@ void pass_light() {
 
 LIT_FRAGMENT = """
 in vec3 v_level;
-#if MATTE
-flat in vec3 v_plane_open;
-flat in vec3 v_plane_key;
-flat in vec3 v_plane_mirror;
-#elif FEW_TRIANGLES
+#if FEW_TRIANGLES && !PLANAR
 flat in vec3 v_up;
 flat in vec3 v_below;
-#else
+#elif !PLANAR
 uniform vec3 up;
 uniform vec3 below;
 #define v_up up
@@ -95,26 +91,25 @@ vec3 tone_map(vec3 c) {
     return min(c, KNEE) + (1.0 - KNEE) * over / ((1.0 - KNEE) + over);
 }
 
-#if MATTE
-// A matte plane lies on the level of its map.
-vec3 shade_plane(vec3 tint) {
-    vec4 level = textureLod(level_map, v_level.xy, 0.0);
-    return tint * (level.r * v_plane_open + level.a * v_plane_key) + level.r * v_plane_mirror;
-}
-#else
-// Lambert, GGX's lobe as in the flat tier with Schlick's Fresnel, and a sky over a ground (hemispherical ambient).
-vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float roughness) {
+// What arrives of the sky and of the other lights, and of the key light; `facing`: the cosine of the latter's direction.
+vec2 arriving(float facing) {
 #if LEVEL
-    vec4 level = textureLod(level_map, v_level.xy, 0.0);
-    float open = level.r, lit = level.a;
+    return textureLod(level_map, v_level.xy, 0.0).ra;
 #else
     // A wall looks the map up in front of itself, where the map does not jump. Points high above the things there see more
     // of the sky.
     vec4 level = textureLod(level_map, v_level.xy + v_aside, 0.0);
     float open = mix(level.r, level.g, clamp(v_level.z / max(level.b, 0.004), 0.0, 1.0));
     open = v_level.z < -0.01 ? 1.0 : mix(open, 1.0, clamp(2.5 * (v_level.z - level.b), 0.0, 1.0));
-    float lit = key_share(level.a, dot(normal, v_light_towards[0]));
+    return vec2(open, key_share(level.a, facing));
 #endif
+}
+
+#if !PLANAR
+// Lambert, GGX's lobe as in the flat tier with Schlick's Fresnel, and a sky over a ground (hemispherical ambient).
+vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float roughness) {
+    vec2 arrives = arriving(dot(normal, v_light_towards[0]));
+    float open = arrives.x, lit = arrives.y;
     vec3 diffuse = albedo * (1.0 - metallic);
     vec3 mirror = mix(vec3(0.04), albedo, metallic);
     vec3 around = mix(v_below, v_ambient, 0.5 + 0.5 * dot(normal, v_up)) * open;

@@ -9,6 +9,7 @@ flat inputs where triangles are few, uniforms where they are many.
 from typing import NamedTuple
 
 from workers.render.raster.lit_shaders import LIT_FRAGMENT, LIT_VERTEX
+from workers.render.raster.plane_shaders import PLANE_FRAGMENT, PLANE_VERTEX
 
 GRAZING = 0.01
 """Cosine of incidence below which a face's plane does not determine z."""
@@ -25,7 +26,7 @@ class Variant(NamedTuple):
     textured: bool
     few_triangles: bool
     matte: bool
-    """A plane without highlights, whose light is therefore the same everywhere but for shadows: for the floor only."""
+    """Planar, and without highlights, whose light is therefore the same everywhere but for shadows: for the floor only."""
     lights: int
     raster: bool = False
     """Lit as in tier raster (lit_shaders.py)."""
@@ -37,6 +38,8 @@ class Variant(NamedTuple):
     """False: colour alone, tested by the rasteriser's depth, so that hidden fragments are not shaded."""
     cutout: bool = False
     """Its texture has holes. A variant of its own, because a program that may discard also shades hidden fragments."""
+    planar: bool = False
+    """Each face has the normal of its plane and one material, so that most of its light is found once: of few triangles."""
     steep: bool = False
     """One level plane, seen everywhere at an angle at which it determines z (`tiles.is_steep`): for `ground` only."""
 
@@ -62,15 +65,17 @@ layout(location = 4) in vec4 face_plane;
 
 uniform mat4 cam_from_shape;
 uniform mat4 clip_from_cam;
+#if !PLANAR
 out vec4 v_normal_metallic;
 out vec4 v_albedo_roughness;
+#endif
 out vec2 v_uv;
 flat out vec4 v_plane;
 #if GROUND || !LABELS
 uniform float nearer;
 #endif
 
-#if FEW_TRIANGLES || MATTE
+#if FEW_TRIANGLES
 uniform vec3 ambient;
 uniform vec3 light_towards[LIGHTS];
 uniform vec3 light_color[LIGHTS];
@@ -81,7 +86,7 @@ uniform vec4 view;
 uniform vec2 thing;
 flat out vec4 v_view;
 flat out vec2 v_thing;
-#if !MATTE
+#if !PLANAR
 flat out vec3 v_ambient;
 flat out vec3 v_light_towards[LIGHTS];
 flat out vec3 v_light_color[LIGHTS];
@@ -90,7 +95,7 @@ flat out vec3 v_light_color[LIGHTS];
 void pass_on() {
     v_view = view;
     v_thing = thing;
-#if !MATTE
+#if !PLANAR
     v_ambient = ambient;
     for (int i = 0; i < LIGHTS; ++i) {
         v_light_towards[i] = light_towards[i];
@@ -106,36 +111,8 @@ void pass_on() {}
 LIT_VERTEX
 #endif
 
-#if MATTE
-// Light from a plane towards the eye, per unit of a texel's: from the sky and all lights without shadows, and from the key
-// light with them; `v_plane_mirror` is the part that a texel does not tint. Where there are neither texels nor shadows, all
-// of the plane has one colour.
-#if TEXTURED || RASTER
-flat out vec3 v_plane_open;
-flat out vec3 v_plane_key;
-flat out vec3 v_plane_mirror;
-#else
-flat out vec3 v_plane_srgb;
-#endif
-
-void light_plane() {
-    vec3 normal = v_plane.w > 0.0 ? -v_plane.xyz : v_plane.xyz;    // towards the eye
-#if RASTER
-    vec3 around = mix(below, ambient, 0.5 + 0.5 * dot(normal, up));
-#else
-    vec3 around = ambient;
-#endif
-    vec3 mirror = 0.04 * around;
-    for (int i = RASTER; i < LIGHTS; ++i) around += light_color[i] * max(dot(normal, light_towards[i]), 0.0);
-    vec3 open = albedo_roughness.rgb * around;
-#if TEXTURED || RASTER
-    v_plane_open = open;
-    v_plane_key = albedo_roughness.rgb * light_color[0] * max(dot(normal, light_towards[0]), 0.0);
-    v_plane_mirror = mirror;
-#else
-    v_plane_srgb = encode_srgb(open + mirror);
-#endif
-}
+#if PLANAR
+PLANE_VERTEX
 #endif
 
 void main() {
@@ -147,11 +124,12 @@ void main() {
     vec3 shift = cam_from_shape[3].xyz;
     vec3 face_normal = turn * face_plane.xyz;
     v_plane = vec4(face_normal, face_plane.w + dot(face_normal, shift));
-#if MATTE
+#if PLANAR
     light_plane();
-#endif
+#else
     v_normal_metallic = vec4(turn * normal_metallic.xyz, normal_metallic.w);
     v_albedo_roughness = albedo_roughness;
+#endif
     v_uv = uv;
     gl_Position = clip_from_cam * vec4(turn * position + shift, 1.0);
 #if GROUND || !LABELS
@@ -165,15 +143,17 @@ const float NEAR_M = 0.05;         // of any length: it scales what the depth te
 const float HOLE = 0.5;          // texels more transparent than this are holes in colour, never in labels
 const float GRAZING = GRAZING_COSINE;
 
+#if !PLANAR
 in vec4 v_normal_metallic;
 in vec4 v_albedo_roughness;
+#endif
 in vec2 v_uv;
 flat in vec4 v_plane;
 
 #if FEW_TRIANGLES
 flat in vec4 v_view;               // cx, cy, 1 / fx, 1 / fy
 flat in vec2 v_thing;              // region id / 255, depth bias as a share of the distance
-#if !MATTE
+#if !PLANAR
 flat in vec3 v_ambient;
 flat in vec3 v_light_towards[LIGHTS];
 flat in vec3 v_light_color[LIGHTS];
@@ -200,18 +180,14 @@ layout(location = 1) out float out_z;
 
 #if RASTER
 LIT_FRAGMENT
-#else
+#endif
+
+#if PLANAR
+PLANE_FRAGMENT
+#elif !RASTER
 // Radiance towards the eye: Lambert, and GGX's lobe (Walter et al. 2007) with its masking term taken as 1. The lobe is
 // written by the angle between the mirrored ray and the light, 1 - cos = 2 sin^2 of the half vector's, which saves the
-// half vectors. On a matte surface it is under 0.03 of the light, and is left out.
-#if MATTE && TEXTURED
-flat in vec3 v_plane_open;
-flat in vec3 v_plane_mirror;
-
-vec3 shade_plane(vec3 tint) { return tint * v_plane_open + v_plane_mirror; }
-#elif MATTE
-flat in vec3 v_plane_srgb;
-#else
+// half vectors.
 vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float roughness) {
     vec3 diffuse = albedo * (1.0 - metallic);
     vec3 mirror = mix(vec3(0.04), albedo, metallic);
@@ -226,7 +202,6 @@ vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float rou
     }
     return sum;
 }
-#endif
 #endif
 
 void main() {
@@ -259,6 +234,8 @@ void main() {
 #endif
 #if MATTE
     vec3 light = shade_plane(tint);
+#elif PLANAR
+    vec3 light = shade_plane(tint, ray * per_length, cosine);
 #else
     vec3 face_normal = across > 0.0 ? -v_plane.xyz : v_plane.xyz;
     vec3 normal = v_normal_metallic.xyz;
@@ -295,6 +272,7 @@ def label_sources(variant: Variant) -> tuple[str, str]:
     head = "#version 410 core\n" + "".join(
         f"#define {name.upper()} {int(v)}\n" for name, v in variant._asdict().items()
     )
-    vertex, fragment = _VERTEX.replace("LIT_VERTEX", LIT_VERTEX), _FRAGMENT.replace("LIT_FRAGMENT", LIT_FRAGMENT)
+    vertex = _VERTEX.replace("LIT_VERTEX", LIT_VERTEX).replace("PLANE_VERTEX", PLANE_VERTEX)
+    fragment = _FRAGMENT.replace("LIT_FRAGMENT", LIT_FRAGMENT).replace("PLANE_FRAGMENT", PLANE_FRAGMENT)
     fragment = fragment.replace("GRAZING_COSINE", str(GRAZING))
     return head + _ENCODE_SRGB + vertex, head + _ENCODE_SRGB + fragment

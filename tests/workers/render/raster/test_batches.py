@@ -98,6 +98,27 @@ def test_a_batch_whose_normals_or_colours_vary_is_not_matte():
         assert not pack_shape(Shape((dull, varied)))[0].matte
 
 
+def test_the_top_is_planar_where_its_normals_are_upright_and_its_colours_one():
+    (plain,) = Shape((part_of(BODIES["box"]),)).parts
+    upright = np.tile([0.0, 0.0, 1.0], (len(plain.vertices), 1))
+    top = plain.vertices[:, 2] > 0.0
+    tilted, below = upright.copy(), upright.copy()
+    tilted[np.flatnonzero(top)[0]] = 0.01, 0.0, 1.0
+    below[~top] = 1.0, 0.0, 0.0
+    one, two = np.full((len(upright), 4), 200, np.uint8), np.full((len(upright), 4), 200, np.uint8)
+    two[np.flatnonzero(top)[0], 1] = 201
+    for change, planar in (
+        ({"normals": frozen_array(upright)}, True),
+        ({"normals": frozen_array(below)}, True),
+        ({"normals": frozen_array(tilted)}, False),
+        ({"colors": one}, True),
+        ({"colors": two}, False),
+    ):
+        (batch,) = pack_shape(Shape((replace(plain, **change),)))
+        assert (batch.planar, batch.planar_top) == (False, planar), change
+    assert pack_shape(Shape((plain,)))[0].planar_top
+
+
 def test_srgb_goes_there_and_back_and_has_its_known_values():
     steps = np.arange(256) / 255.0
     np.testing.assert_allclose(encode_srgb(decode_srgb(steps)), steps, atol=1e-12)
