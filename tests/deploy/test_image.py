@@ -13,11 +13,10 @@ MOST_COMPILED = 3
 """Loops of a hundred that a container may still compile for its first scenes: rare ones, which the build's scenes did not use."""
 
 COUNT_COMPILED = """
-from deploy import compile_loops
+from deploy.compile_loops import make_scenes
 from numba.core.event import install_recorder
-compile_loops.SCENES = {"tabletop.yaml": 8}
 with install_recorder("numba:compile") as recorder:
-    compile_loops.compile_loops()
+    make_scenes({"tabletop.yaml": 8})
 print(sum(event.is_start for _, event in recorder.buffer))
 """
 

@@ -54,7 +54,7 @@ def compare_covisible(
         (eye[0], eye[1], eye[2]),
         T_target_source,
         k,
-        bounds,
+        (bounds.facing, bounds.smooth_m, bounds.hidden_m),
         units_per_m,
     )
 
@@ -72,15 +72,16 @@ def _compare(
     eye: tuple[float, float, float],
     T: Pose,
     k: tuple[Pinhole, Pinhole],
-    bounds: Bounds,
+    bounds: tuple[float, tuple[float, float], float],
     units_per_m: float,
 ) -> tuple[Array, NDArray[np.uint8]]:
-    """eye: the target's position as the source's camera sees it; k: cx, cy, fx, fy of source and target.
+    """eye: the target's position as the source's camera sees it; k: cx, cy, fx, fy of source and target; bounds: as `Bounds`.
 
     All conditions must hold; those that take longest come last, as most pixels fail one before.
     """
     (depth, region), (cx, cy, fx, fy), (mx, my, gx, gy) = source, k[0], k[1]
     height, width = target[0].shape
+    facing, smooth_m, hidden_m = bounds
     differences, regions, count = np.empty(len(pixels)), np.empty(len(pixels), np.uint8), 0
     for n in range(len(pixels)):
         row, column = pixels[n] // depth.shape[1], pixels[n] % depth.shape[1]
@@ -94,13 +95,13 @@ def _compare(
         if not (0.0 <= u < width and 0.0 <= v < height):
             continue
         seen_m, seen_region = sample_inverse_depth(target[0], target[1], u, v, units_per_m)
-        if not (seen_m > 0.0 and seen_region == region[row, column] and seen_m + bounds.hidden_m > Z):
+        if not (seen_m > 0.0 and seen_region == region[row, column] and seen_m + hidden_m > Z):
             continue
-        if not is_smooth(depth, region, row, column, bounds.smooth_m[0], units_per_m):
+        if not is_smooth(depth, region, row, column, smooth_m[0], units_per_m):
             continue
-        if not facing_at(depth, units_per_m, region, row, column, k[0], eye) > bounds.facing:  # true where it is nan
+        if not facing_at(depth, units_per_m, region, row, column, k[0], eye) > facing:  # true where it is nan
             continue
-        if _is_smooth_around(target, u, v, bounds.smooth_m[1], units_per_m):
+        if _is_smooth_around(target, u, v, smooth_m[1], units_per_m):
             differences[count], regions[count] = abs(Z - seen_m), region[row, column]
             count += 1
     return differences[:count], regions[:count]

@@ -14,13 +14,23 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile, InTreeCacheLoc
 
 Loop = TypeVar("Loop", bound=Callable[..., object])
 
+_njit: Any = numba.njit
+"""Its types lack `no_cfunc_wrapper`. What C code would call by a pointer, which none does, is a tenth of compiling."""
+
 
 def compiled(loop: Loop) -> Loop:
     """The function compiled at its first call, and kept on disk for the next process where there is a place to write."""
-    dispatcher: Any = numba.njit(error_model="numpy")(loop)
+    dispatcher: Any = _njit(error_model="numpy", no_cfunc_wrapper=True)(loop)
     with contextlib.suppress(RuntimeError):  # where neither the package's folder nor the user's cache is writable
         dispatcher._cache = _LoopCache(loop)
     return cast(Loop, dispatcher)
+
+
+def used_by(loop: Callable[..., object]) -> dict[tuple[str, str], object]:
+    """A loop and all that it uses, by module and name: of loops what they compute, of constants the value."""
+    used: dict[tuple[str, str], object] = {}
+    _find_used(loop, used)
+    return used
 
 
 class _LoopCache(FunctionCache):
@@ -38,8 +48,7 @@ class _LoopCache(FunctionCache):
 
     def _load_overload(self, signature: object, target_context: Any) -> object:
         """Reads the loop, at its first call, when all that it uses is defined; saving comes after. None where it is not kept."""
-        used: dict[tuple[str, str], object] = {}
-        _find_used(self._py_func, used)
+        used = used_by(self._py_func)
         key = self._index_key(signature, target_context.codegen())
         for file in self._files:
             file._source_stamp = self._own_stamp, used
@@ -50,7 +59,7 @@ class _LoopCache(FunctionCache):
 
 
 def _find_used(loop: Callable[..., object], used: dict[tuple[str, str], object]) -> None:
-    """Adds a loop and all that it uses, by module and name: of loops what they compute, of constants the value."""
+    """Adds a loop and all that it uses to what was found before."""
     codes = list(_codes_in(loop.__code__))
     constants = [[value for value in code.co_consts if not isinstance(value, CodeType)] for code in codes]
     used[loop.__module__, loop.__qualname__] = [(code.co_code, code.co_names) for code in codes], repr(constants)

@@ -25,6 +25,7 @@ from workers.pipeline.bugs import UnexpectedError, explain, keep_traceback, name
 from workers.pipeline.committer import Committer, MadeRange
 from workers.pipeline.context import WorkerContext, open_worker
 from workers.pipeline.fingerprint import take_fingerprint
+from workers.pipeline.loops import compile_together
 from workers.pipeline.make_scene import make_scene
 from workers.pipeline.rows import failed_scene, record_scene, timing_row
 from workers.pipeline.stopwatch import Stopwatch
@@ -52,6 +53,7 @@ def run_shard(order: ShardOrder, catalogue: Catalogue, is_over: Callable[[], boo
     """
     begun, cpu = time.perf_counter(), time.process_time()
     require_tier(order.job.drawn)
+    compile_together()
     context = open_worker(order.job, catalogue)
     require_device(context.renderer.name, order.job.run.device)
     fingerprint = _fingerprint(order.job.drawn.tier)
