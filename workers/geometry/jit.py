@@ -33,6 +33,22 @@ def used_by(loop: Callable[..., object]) -> dict[tuple[str, str], object]:
     return used
 
 
+class _LoopFile(IndexDataCacheFile):
+    """The kept forms of one loop, each with what it was compiled from.
+
+    Of two processes that keep forms of one loop at the same moment, numba may file the one's code under the other's types.
+    """
+
+    def save(self, key: object, data: object) -> None:
+        """Keep the form that was compiled for a key."""
+        super().save(key, (self._source_stamp, key, data))
+
+    def load(self, key: object) -> object:
+        """The form that was compiled for the key, of the loop as it is now; None where it is not kept."""
+        kept: Any = super().load(key)
+        return kept[2] if kept is not None and kept[:2] == (self._source_stamp, key) else None
+
+
 class _LoopCache(FunctionCache):
     """A loop on disk, as long as what it uses stays the same.
 
@@ -44,7 +60,8 @@ class _LoopCache(FunctionCache):
         super().__init__(loop)
         self._own_stamp = self._cache_file._source_stamp
         beside = InTreeCacheLocator(loop, loop.__code__.co_filename).get_cache_path()
-        self._files = self._cache_file, IndexDataCacheFile(beside, self._impl.filename_base, self._own_stamp)
+        own, other = (_LoopFile(path, self._impl.filename_base, self._own_stamp) for path in (self._cache_path, beside))
+        self._cache_file, self._files = own, (own, other)
 
     def _load_overload(self, signature: object, target_context: Any) -> object:
         """Reads the loop, at its first call, when all that it uses is defined; saving comes after. None where it is not kept."""

@@ -1,7 +1,8 @@
 """The loops that scenes use, compiled before the first scene, each by one of the processes of a machine that start at once.
 
 Otherwise every process would compile every loop itself when it first uses it. What they share is a file beside the compiled
-loops: a byte for each entry of the list, locked by who compiles it, and `KEPT` once it is on the disk.
+loops: a byte for each entry of the list, `KEPT` once it is on the disk. Who compiles an entry locks the first one of the same
+loop, whose forms for other types lie in the same files.
 """
 
 import fcntl
@@ -44,8 +45,11 @@ def compile_together() -> int:
     except OSError:
         return 0
     try:
+        loops = [entry.split(" ", 2)[:2] for entry in entries]
         with _no_collector():
-            taken = sum(_take(shared, number, entry) for number, entry in enumerate(entries))
+            taken = sum(
+                _take(shared, number, loops.index(loops[number]), entry) for number, entry in enumerate(entries)
+            )
     finally:
         os.close(shared)
     for old in folders[0].glob("loops-*"):
@@ -89,13 +93,13 @@ def _no_collector() -> Iterator[None]:
             gc.collect()
 
 
-def _take(shared: int, number: int, entry: str) -> bool:
-    """Compile one entry unless it is kept, or another process is at it: whether this process took it.
+def _take(shared: int, number: int, first: int, entry: str) -> bool:
+    """Compile one entry unless it is kept, or another process is at its loop: whether this process took it.
 
     The lock of a process that dies goes with it, and the entry is not kept.
     """
     try:
-        fcntl.lockf(shared, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, number)
+        fcntl.lockf(shared, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, first)
     except (BlockingIOError, PermissionError):  # what POSIX lets a system say of a lock that another process holds
         return False
     try:
@@ -107,4 +111,4 @@ def _take(shared: int, number: int, entry: str) -> bool:
         os.pwrite(shared, KEPT, number)
         return True
     finally:
-        fcntl.lockf(shared, fcntl.LOCK_UN, 1, number)
+        fcntl.lockf(shared, fcntl.LOCK_UN, 1, first)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workers.geometry.jit import compiled
+from workers.geometry.jit import _LoopFile, compiled
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -98,3 +98,23 @@ def test_a_loop_that_was_compiled_beside_its_file_is_read_where_this_process_kee
         file.unlink()
     assert run(NUMBA_CACHE_DIR=str(elsewhere)) == ["3.0", "0"]
     assert list(elsewhere.rglob("*.nbc"))
+
+
+def test_two_processes_that_keep_a_loop_at_once_never_mix_up_its_types(tmp_path):
+    """One writes its index, the other its index and its code, and then the first its code: under numba's names the same file."""
+    one, two = (_LoopFile(str(tmp_path), "loop", "stamp") for _ in range(2))
+    write = one._save_data
+
+    def write_late(name: str, data: object) -> None:
+        two.save("of floats", "code for floats")
+        write(name, data)
+
+    one._save_data = write_late
+    two._load_index = dict  # as it was before the first wrote its own
+    one.save("of ints", "code for ints")
+    later = _LoopFile(str(tmp_path), "loop", "stamp")
+    assert {later.load("of floats"), later.load("of ints")} <= {None}, "both only have to be compiled again"
+    later.save("of floats", "code for floats")
+    later.save("of ints", "code for ints")
+    assert (later.load("of floats"), later.load("of ints")) == ("code for floats", "code for ints")
+    assert _LoopFile(str(tmp_path), "loop", "another stamp").load("of ints") is None
