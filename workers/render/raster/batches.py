@@ -24,7 +24,7 @@ MATTE_ROUGHNESS = 0.8
 
 SAME_LEVEL_M = 1e-4
 
-UPRIGHT = 1.0 - 1e-6
+SHADED_UPRIGHT = 1.0 - 1e-6
 """Least cosine with the vertical of normals that are shaded as upright."""
 
 _PLANE_Z = -2
@@ -124,7 +124,7 @@ def _pack(parts: list[Part], highest_m: float) -> Batch:
     dull = all(p.material.metallic == 0.0 and p.material.roughness >= MATTE_ROUGHNESS for p in parts)
     vertices = np.concatenate(packed)
     corners, top_faces = _tops_first(vertices, np.concatenate(indices), np.float32(highest_m - SAME_LEVEL_M), _PLANE_Z)
-    planar_top = planar or _is_planar(vertices, corners[:top_faces], UPRIGHT)
+    planar_top = planar or _is_planar(vertices, corners[:top_faces], SHADED_UPRIGHT)
     return Batch(vertices, corners, texture_of(parts[0]), planar, planar and dull, top_faces, planar_top)
 
 

@@ -6,8 +6,8 @@ that the cosine between a mirrored ray and a light is that between the ray and t
 
 PLANE_VERTEX = """
 // Light towards the eye, per unit of a texel's: from the sky and all lights without shadows, and from the key light with
-// them. On a matte plane `v_plane_mirror` is the part that a texel does not tint; where there are neither texels nor shadows,
-// all of it has one colour.
+// them. On a matte plane `v_plane_mirror` is the part that a texel does not tint, and GGX's lobe, under 0.03 of the light, is
+// left out; where there are neither texels nor shadows, all of it has one colour.
 #if MATTE && !TEXTURED && !RASTER
 flat out vec3 v_plane_srgb;
 #else
