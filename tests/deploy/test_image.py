@@ -13,10 +13,11 @@ MOST_COMPILED = 3
 """Loops of a hundred that a container may still compile for its first scenes: rare ones, which the build's scenes did not use."""
 
 COUNT_COMPILED = """
-from deploy.compile_loops import make_scenes
+from deploy.compile_loops import make_scenes, touch_bodies
 from numba.core.event import install_recorder
 with install_recorder("numba:compile") as recorder:
-    make_scenes({"tabletop.yaml": 8})
+    make_scenes({("tabletop.yaml", "raster"): 8, ("tabletop.yaml", "flat"): 1})
+    touch_bodies()
 print(sum(event.is_start for _, event in recorder.buffer))
 """
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.scene.camera import Intrinsics
 from workers.geometry.jit import compiled
 
 
@@ -42,6 +43,37 @@ def fourth_channel(rgba: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _high_bytes(words: NDArray[np.uint32], high: NDArray[np.uint8]) -> None:
     for n in range(len(words)):
         high[n] = np.uint8(words[n] >> np.uint32(24))
+
+
+def fill_plane_depth(
+    depth_m: NDArray[np.float32], region: NDArray[np.uint8], region_id: int, plane: NDArray[np.float32], k: Intrinsics
+) -> None:
+    """Writes z along the optical axis into `depth_m` [H, W] where `region` [H, W] is `region_id`, of one plane.
+
+    plane [4]: (n, n . p) in the optical frame. z = n . p / (n . ray), ray = ((x - cx) / fx, (y - cy) / fy, 1), in float32 and
+    in this order, as a fragment shader computes it.
+    """
+    view = np.array([k.cx, k.cy, 1.0 / k.fx, 1.0 / k.fy], np.float32)
+    _fill_plane_depth(depth_m, region, np.uint8(region_id), plane, view)
+
+
+@compiled
+def _fill_plane_depth(
+    depth_m: NDArray[np.float32],
+    region: NDArray[np.uint8],
+    region_id: np.uint8,
+    plane: NDArray[np.float32],
+    view: NDArray[np.float32],
+) -> None:
+    a, b, c, d = plane[0], plane[1], plane[2], plane[3]
+    half, ax = np.float32(0.5), np.empty(region.shape[1], np.float32)
+    for column in range(region.shape[1]):
+        ax[column] = a * ((np.float32(column) + half - view[0]) * view[2])
+    for row in range(region.shape[0]):
+        by = b * ((np.float32(row) + half - view[1]) * view[3])
+        for column in range(region.shape[1]):
+            z = d / (ax[column] + by + c)
+            depth_m[row, column] = z if region[row, column] == region_id else depth_m[row, column]
 
 
 @compiled

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from schemas.scene.camera import Intrinsics
 from workers.geometry.pixels import (
     Extent,
     count_filled,
+    fill_plane_depth,
     fourth_channel,
     gather_colours,
     measure_regions,
@@ -87,3 +89,19 @@ def test_counts_are_those_of_the_definition_in_whole_units_and_in_parts_of_them(
 def test_samples_are_split_into_bytes_with_the_high_one_first():
     pixels = np.array([[0x1234, 0x00FF, 0xFF00], [0, 0xFFFF, 0x0102]], np.uint16)
     assert split_samples(pixels).tolist() == [[0, 0x12, 0x34, 0, 0xFF, 0xFF, 0], [0, 0, 0, 0xFF, 0xFF, 1, 2]]
+
+
+def test_depth_of_a_plane_is_where_the_ray_of_each_of_its_pixels_meets_it():
+    rng, k = np.random.default_rng(11), Intrinsics(width=70, height=48, fx=60.5, fy=61.25, cx=34.5, cy=25.0)
+    x, y = np.meshgrid(np.arange(k.width) + 0.5, np.arange(k.height) + 0.5)
+    rays = np.stack([(x - k.cx) / k.fx, (y - k.cy) / k.fy, np.ones_like(x)], -1)
+    for _ in range(20):
+        normal = np.array([*rng.uniform(-0.4, 0.4, 2), 1.0])
+        plane = np.append(normal / np.linalg.norm(normal), rng.uniform(0.5, 3.0)).astype(np.float32)
+        region = rng.integers(0, 4, (k.height, k.width)).astype(np.uint8)
+        before = rng.uniform(0.5, 3.0, region.shape).astype(np.float32)
+        depth = before.copy()
+        fill_plane_depth(depth, region, 1, plane, k)
+        np.testing.assert_array_equal(depth[region != 1], before[region != 1])
+        met = float(plane[3]) / (rays @ plane[:3].astype(float))
+        np.testing.assert_allclose(depth[region == 1], met[region == 1], rtol=2e-6)

@@ -110,6 +110,16 @@ def texture_of(part: Part) -> NDArray[np.uint8] | None:
     return part.material.texture if part.uv is not None else None
 
 
+def is_matte(part: Part) -> bool:
+    """Whether each face of a part has the normal of its plane and the part's colour, and none has highlights."""
+    dull = part.material.metallic == 0.0 and part.material.roughness >= MATTE_ROUGHNESS
+    return dull and _is_faceted(part)
+
+
+def _is_faceted(part: Part) -> bool:
+    return part.normals is None and part.colors is None
+
+
 def _pack(parts: list[Part], highest_m: float) -> Batch:
     packed, indices, start = [], [], 0
     albedos = decode_srgb(np.array([part.material.base_color[:3] for part in parts]))
@@ -120,12 +130,11 @@ def _pack(parts: list[Part], highest_m: float) -> Batch:
         packed.append(vertices)
         indices.append(faces + start)
         start += len(vertices)
-    planar = all(p.normals is None and p.colors is None for p in parts)
-    dull = all(p.material.metallic == 0.0 and p.material.roughness >= MATTE_ROUGHNESS for p in parts)
+    planar = all(map(_is_faceted, parts))
     vertices = np.concatenate(packed)
     corners, top_faces = _tops_first(vertices, np.concatenate(indices), np.float32(highest_m - SAME_LEVEL_M), _PLANE_Z)
     planar_top = planar or _is_planar(vertices, corners[:top_faces], SHADED_UPRIGHT)
-    return Batch(vertices, corners, texture_of(parts[0]), planar, planar and dull, top_faces, planar_top)
+    return Batch(vertices, corners, texture_of(parts[0]), planar, all(map(is_matte, parts)), top_faces, planar_top)
 
 
 @compiled

@@ -8,7 +8,7 @@ from schemas.scene.camera import Intrinsics
 from workers.render.raster.buffers import UploadedShape
 from workers.render.raster.framebuffer import Framebuffer
 from workers.render.raster.lit_shaders import EMPTY_FRAGMENT
-from workers.render.raster.programs import Program
+from workers.render.raster.programs import Program, clip_from_cam
 from workers.render.raster.shaders import COUNT_VERTEX
 from workers.render.raster.tiles import TILE_PX
 
@@ -43,7 +43,7 @@ class PixelCounter:
         self._number += 1
         gl.glStencilFunc(gl.GL_NOTEQUAL, self._number, 0xFF)
         gl.glStencilOp(gl.GL_KEEP, gl.GL_REPLACE, gl.GL_REPLACE)
-        self.program.set_view(tile)
+        self.program.set_view(tile, clip_from_cam(tile))
         query = self._unused.pop() if self._unused else int(np.ravel(gl.glGenQueries(1))[0])
         gl.glBeginQuery(gl.GL_SAMPLES_PASSED, query)
         for batch in shape.batches:

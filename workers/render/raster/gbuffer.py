@@ -29,7 +29,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Pose
 from schemas.job.render import Render
 from schemas.scene.appearance import Appearance
 from schemas.scene.camera import Camera
@@ -38,25 +37,28 @@ from schemas.scene.region import REGION_FLOOR
 from schemas.scene.scene import Placed
 from schemas.scene.view import GBuffer
 from workers.geometry.frames import invert
-from workers.geometry.pixels import fourth_channel
+from workers.geometry.pixels import fill_plane_depth, fourth_channel
 from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_edges, smooth_edges
-from workers.render.raster.buffers import INDEX_BYTES, ShapeStore, UploadedShape
+from workers.render.raster.buffers import INDEX_BYTES, ShapeStore
 from workers.render.raster.context import open_context
 from workers.render.raster.counting import PixelCounter
-from workers.render.raster.draw_calls import Draw, RenderPass, is_beyond_near, is_drawn, rank_regions, sort_draws
+from workers.render.raster.draw_calls import (
+    DEPTH_BIAS,
+    FLOOR_BIAS,
+    Draw,
+    RenderPass,
+    hides_backs,
+    is_beyond_near,
+    is_drawn,
+    rank_regions,
+    sort_draws,
+)
 from workers.render.raster.framebuffer import ColourTarget, Framebuffer
+from workers.render.raster.ground import Ground, find_ground, level_plane, plain_srgb
 from workers.render.raster.light_maps import LightMaps
-from workers.render.raster.programs import Program, place_lights
+from workers.render.raster.programs import Program
 from workers.render.raster.shaders import Variant, label_sources
-from workers.render.raster.tiles import fills_image, tiles
-
-DEPTH_BIAS = 2e-6
-"""Share of its distance, along its normal, by which each rank of `rank_regions` moves a face back in the depth test: 5
-micrometres at 2.5 m. A quarter of it is the least that kept 400 pairs of coplanar squares apart."""
-
-FLOOR_BIAS = 1e-5
-"""Share of its distance by which the depth test takes the floor as nearer than it is. The floor is tested by the
-rasteriser's depth, exact to 3e-6 of the distance, so that its hidden pixels are not shaded; its stored depth is the plane's."""
+from workers.render.raster.tiles import tiles
 
 FLAT = Render(tier="flat")
 
@@ -120,9 +122,12 @@ class Renderer:
         view = RenderPass(appearance, k, invert(camera.T_world_cam), effects, color, _is_lit(render, effects))
         self._target.bind(k.width, k.height)
         self._gl.glEnable(self._gl.GL_DEPTH_TEST)
-        self._target.clear(appearance, filled=_floor_fills(things, view))
-        self._draw_things(things, view)
+        ground = find_ground(things, view, self._rank(things), self._shapes.fetch)
+        self._clear(appearance, ground)
+        self._draw_things(things, view, ground)
         rgb, depth_m, region = self._read(view)
+        if ground is not None:
+            fill_plane_depth(depth_m, region, REGION_FLOOR, ground.plane, view.k)
         if rgb is not None:
             self._refine(rgb, region, things, view, render.samples)
             rgb.setflags(write=False)
@@ -158,7 +163,7 @@ class Renderer:
             T_cam_shape = T_cam_world @ thing.T_world_shape
             self._counter.program.set_thing(T_cam_shape, 0, 0.0, 0.0)
             shape = self._shapes.fetch(thing.shape)
-            self._cull(shape, T_cam_shape)
+            self._cull(hides_backs(shape, is_beyond_near(shape, T_cam_shape)))
             views = tiles(thing.shape, T_cam_shape, camera.intrinsics)
             started.append([self._counter.start(shape, tile) for tile in views])
         self._gl.glDisable(self._gl.GL_CULL_FACE)
@@ -166,27 +171,41 @@ class Renderer:
         self._shapes.trim(max(1, self._scene_size))
         return counts
 
-    def _draw_things(self, things: Sequence[Placed], view: RenderPass) -> None:
-        """Draw into the bound framebuffer."""
-        ranks = self._rank(things)
-        lights = place_lights(view.appearance, view.T_cam_world, view.raster) if view.color else None
-        for variant, draws in sort_draws(things, self._shapes.fetch, view, self._light_maps.has_level_top).items():
+    def _clear(self, appearance: Appearance, ground: Ground | None) -> None:
+        """Clear the bound framebuffer of what the floor does not draw over."""
+        if ground is None:
+            self._target.clear(appearance)
+            return
+        self._target.clear_depth()
+        if ground.cleared is not None:
+            self._target.clear_color(ground.cleared)
+
+    def _draw_things(self, things: Sequence[Placed], view: RenderPass, ground: Ground | None = None) -> None:
+        """Draw into the bound framebuffer; of a floor that is known, what has to be drawn."""
+        ranks, fetch, has_level_top = self._rank(things), self._shapes.fetch, self._light_maps.has_level_top
+        for variant, draws in sort_draws(things, fetch, view, has_level_top, ground is None).items():
+            if variant.known_z and ground is not None and not self._target.limit_to(ground.window):
+                continue
             program = self._program(variant)
             program.use()
-            program.set_view(view.k)
-            if lights is not None:
-                program.set_light(lights)
+            program.set_view(view.k, view.clip_from_cam)
+            if view.color:
+                program.set_light(view.lights)
             if view.raster:
                 program.set_ambience(view.appearance, view.T_cam_world)
             for draw in draws:
                 if view.raster:
                     self._light_maps.bind(program, draw.thing)
                 bias = DEPTH_BIAS * ranks[draw.thing.region_id]
-                T_cam_shape = view.T_cam_world @ draw.thing.T_world_shape
+                if variant.plain:
+                    plane = level_plane(draw.thing.shape, draw.T_cam_shape)
+                    program.set_plain(plain_srgb(draw.thing.shape, view, plane))
                 nearer = FLOOR_BIAS if variant.ground else -10.0 * bias
-                program.set_thing(T_cam_shape, draw.thing.region_id, bias, nearer)
-                self._cull(draw.shape, T_cam_shape, through_holes=not view.labels)
+                program.set_thing(draw.T_cam_shape, draw.thing.region_id, bias, nearer)
+                self._cull(draw.culls)
                 self._draw(draw, variant.textured)
+            if variant.known_z:
+                self._target.limit_to(None)
         self._gl.glDisable(self._gl.GL_CULL_FACE)
 
     def _rank(self, things: Sequence[Placed]) -> dict[int, int]:
@@ -245,13 +264,9 @@ class Renderer:
             self._programs[variant] = Program(self._gl, *label_sources(variant))
         return self._programs[variant]
 
-    def _cull(self, shape: UploadedShape, T_cam_shape: Pose, through_holes: bool = False) -> None:
-        """Skip the back faces of closed bodies, unless the near plane cuts the body or its texture has holes."""
+    def _cull(self, culls: bool) -> None:
         gl = self._gl
-        cut = through_holes and any(batch.holes for batch in shape.batches)
-        (gl.glEnable if shape.closed and not cut and is_beyond_near(shape, T_cam_shape) else gl.glDisable)(
-            gl.GL_CULL_FACE
-        )
+        (gl.glEnable if culls else gl.glDisable)(gl.GL_CULL_FACE)
 
     def _draw(self, draw: Draw, textured: bool) -> None:
         gl = self._gl
@@ -273,12 +288,6 @@ class Renderer:
         # OpenCV splits channels 20 times faster than a numpy slice is copied, and faster than GL_RGB is read.
         rgb: NDArray | None = cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB) if view.color else None
         return rgb, depth, fourth_channel(rgba)
-
-
-def _floor_fills(things: Sequence[Placed], view: RenderPass) -> bool:
-    """Whether a floor is drawn that covers every pixel."""
-    floors = [thing for thing in things if thing.region_id == REGION_FLOOR] if view.effects.runs("floor") else []
-    return any(fills_image(thing.shape, view.T_cam_world @ thing.T_world_shape, view.k) for thing in floors)
 
 
 def _is_lit(render: Render, effects: EffectPlan) -> bool:

@@ -7,9 +7,12 @@ that the cosine between a mirrored ray and a light is that between the ray and t
 PLANE_VERTEX = """
 // Light towards the eye, per unit of a texel's: from the sky and all lights without shadows, and from the key light with
 // them. On a matte plane `v_plane_mirror` is the part that a texel does not tint, and GGX's lobe, under 0.03 of the light, is
-// left out; where there are neither texels nor shadows, all of it has one colour.
-#if MATTE && !TEXTURED && !RASTER
-flat out vec3 v_plane_srgb;
+// left out; where there are neither texels nor shadows, all of it has one colour, which ground.py finds.
+#if PLAIN
+uniform vec3 plain_srgb;
+flat out vec3 v_plain_srgb;
+
+void light_plane() { v_plain_srgb = plain_srgb; }
 #else
 flat out vec3 v_plane_open;
 #if RASTER
@@ -28,7 +31,6 @@ flat out vec3 v_below;
 flat out vec3 v_mirrored_up;
 #endif
 #endif
-#endif
 
 void light_plane() {
     vec3 normal = v_plane.w > 0.0 ? -v_plane.xyz : v_plane.xyz;    // towards the eye
@@ -39,11 +41,7 @@ void light_plane() {
 #endif
     vec3 diffuse = albedo_roughness.rgb * (1.0 - normal_metallic.w), mirror = 0.04 * around;
     for (int i = RASTER; i < LIGHTS; ++i) around += light_color[i] * max(dot(normal, light_towards[i]), 0.0);
-    vec3 open = diffuse * around;
-#if MATTE && !TEXTURED && !RASTER
-    v_plane_srgb = encode_srgb(open + mirror);
-#else
-    v_plane_open = open;
+    v_plane_open = diffuse * around;
 #if RASTER
     v_plane_key = diffuse * light_color[0] * max(dot(normal, light_towards[0]), 0.0);
 #endif
@@ -65,13 +63,13 @@ void light_plane() {
     v_mirrored_up = up - 2.0 * dot(normal, up) * normal;
 #endif
 #endif
-#endif
 }
+#endif
 """
 
 PLANE_FRAGMENT = """
-#if MATTE && !TEXTURED && !RASTER
-flat in vec3 v_plane_srgb;
+#if PLAIN
+flat in vec3 v_plain_srgb;
 #else
 flat in vec3 v_plane_open;
 #if RASTER

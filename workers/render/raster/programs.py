@@ -53,10 +53,9 @@ class Program:
         """Draw with this program from now on."""
         self._gl.glUseProgram(self._name)
 
-    def set_view(self, k: Intrinsics) -> None:
-        """Set the camera's intrinsics."""
-        matrix = clip_from_cam(k).astype(np.float32)
-        self._gl.glUniformMatrix4fv(self._location("clip_from_cam"), 1, True, matrix)
+    def set_view(self, k: Intrinsics, clip_from_cam: NDArray[np.floating]) -> None:
+        """Set the camera's intrinsics, also as the matrix that `clip_from_cam` makes of them."""
+        self._gl.glUniformMatrix4fv(self._location("clip_from_cam"), 1, True, clip_from_cam)
         self._gl.glUniform4f(self._location("view"), k.cx, k.cy, 1.0 / k.fx, 1.0 / k.fy)
 
     def set_light(self, lights: PlacedLights) -> None:
@@ -73,6 +72,10 @@ class Program:
         gl.glUniform3f(self._location("below"), *appearance.below)
         gl.glUniform1i(self._location("level_map"), LEVEL_UNIT)
         gl.glUniform1i(self._location("shadow_map"), SHADOW_UNIT)
+
+    def set_plain(self, srgb: NDArray[np.float32]) -> None:
+        """Set the colour [3] of what has one (ground.py)."""
+        self._gl.glUniform3f(self._location("plain_srgb"), *srgb.tolist())
 
     def set_maps(self, maps: MapPlacement) -> None:
         """Set a thing's pose in the light maps."""

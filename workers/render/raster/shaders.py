@@ -40,8 +40,13 @@ class Variant(NamedTuple):
     """Its texture has holes. A variant of its own, because a program that may discard also shades hidden fragments."""
     planar: bool = False
     """Each face has the normal of its plane and one material, so that most of its light is found once: of few triangles."""
-    steep: bool = False
-    """One level plane, seen everywhere at an angle at which it determines z (`tiles.is_steep`): for `ground` only."""
+    known_z: bool = False
+    """Its z is not drawn, as it is computed from its plane (ground.py): for `ground` only."""
+
+    @property
+    def plain(self) -> bool:
+        """Whether all of it has one colour, found before it is drawn."""
+        return self.color and self.matte and not self.textured and not self.raster
 
 
 _ENCODE_SRGB = """
@@ -209,20 +214,16 @@ void main() {
     float per_length = inversesqrt(dot(ray, ray));
     float across = dot(v_plane.xyz, ray);
     float cosine = abs(across) * per_length;
-#if STEEP
-    float z = v_plane.w / across;
-#else
+#if LABELS && !KNOWN_Z
     float z = cosine > GRAZING ? v_plane.w / across : 1.0 / gl_FragCoord.w;
-#endif
-#if LABELS
     out_z = z;
 #if !GROUND
     gl_FragDepth = NEAR_M / (z * (1.0 + v_thing.y / max(cosine, GRAZING)));
 #endif
 #endif
 
-#if COLOR && MATTE && !TEXTURED && !RASTER
-    out_color_region = vec4(v_plane_srgb, v_thing.x);
+#if PLAIN
+    out_color_region = vec4(v_plain_srgb, v_thing.x);
 #elif COLOR
     vec3 tint = vec3(1.0);
 #if TEXTURED
@@ -269,9 +270,8 @@ void main() {
 
 def label_sources(variant: Variant) -> tuple[str, str]:
     """(vertex, fragment) shader of a variant."""
-    head = "#version 410 core\n" + "".join(
-        f"#define {name.upper()} {int(v)}\n" for name, v in variant._asdict().items()
-    )
+    choices = {**variant._asdict(), "plain": variant.plain}
+    head = "#version 410 core\n" + "".join(f"#define {name.upper()} {int(v)}\n" for name, v in choices.items())
     vertex = _VERTEX.replace("LIT_VERTEX", LIT_VERTEX).replace("PLANE_VERTEX", PLANE_VERTEX)
     fragment = _FRAGMENT.replace("LIT_FRAGMENT", LIT_FRAGMENT).replace("PLANE_FRAGMENT", PLANE_FRAGMENT)
     fragment = fragment.replace("GRAZING_COSINE", str(GRAZING))

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from functools import lru_cache
 from itertools import product
 
 import numpy as np
@@ -125,6 +126,7 @@ def _meet_level(
     return nearest, left, bottom, right, top, max(low, -high, 0.0) / np.sqrt(length2)
 
 
+@lru_cache(maxsize=1)  # the views of one scene ask about one floor
 def _is_rectangle(shape: Shape) -> bool:
     """Whether a shape is a rectangle along x and y at one z: four corners, and two triangles on either side of a diagonal."""
     if len(shape.vertices) != 4 or len(shape.faces) != 2:

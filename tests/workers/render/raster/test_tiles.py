@@ -1,16 +1,12 @@
 """The part of the pixel grid on which a thing is counted, what covers all of the image, and what is seen steeply."""
 
-from unittest import mock
-
 import numpy as np
 import trimesh
 
-import workers.render.raster.draw_calls
 from schemas.base import frozen_array
 from schemas.scene.camera import Intrinsics
 from schemas.scene.shape import Part, Shape
-from tests.workers.render.looks import FLAT, RASTER
-from tests.workers.render.random_scenes import APPEARANCE, FLOOR_HALF_M, camera, floor, random_things, shape_of
+from tests.workers.render.random_scenes import FLOOR_HALF_M, floor, shape_of
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import invert, translation
 from workers.render.raster.shaders import GRAZING
@@ -118,17 +114,3 @@ def test_only_what_lies_on_one_level_is_seen_steeply():
     above = invert(orbit_pose(np.zeros(3), 1.0, 0.0, 1.0))
     assert not is_steep(shape_of(trimesh.creation.box((9.0, 9.0, 1e-6))), above, K)
     assert is_steep(floor().shape, above, K)
-
-
-def test_a_floor_that_is_seen_steeply_is_drawn_to_the_same_bytes(renderer):
-    rng = np.random.default_rng(7)
-    for look in (FLAT, RASTER):
-        for inclination in (0.7, 0.9, 1.4):
-            things, height = random_things(rng)
-            view = camera(T=orbit_pose(np.array([0.0, 0.0, height]), inclination, rng.uniform(-3, 3), 2.5))
-            assert is_steep(things[0].shape, invert(view.T_world_cam), view.intrinsics)
-            steep = renderer.draw(things, APPEARANCE, view, *look)
-            with mock.patch.object(workers.render.raster.draw_calls, "is_steep", return_value=False):
-                plain = renderer.draw(things, APPEARANCE, view, *look)
-            for kind in ("rgb", "depth_m", "region"):
-                assert getattr(steep, kind).tobytes() == getattr(plain, kind).tobytes(), kind
