@@ -62,8 +62,8 @@ def test_every_python_in_the_image_has_the_kernels_of_its_processor_and_writes_n
 @pytest.mark.skipif(not processor_flags() >= X86_64_V3, reason="the processor is below x86-64-v3")
 def test_the_first_scenes_of_a_container_find_their_loops_compiled(image):
     run = ("run", "--rm", "--read-only", "--tmpfs", "/tmp:mode=1777", "--entrypoint", "python", image, "-c")
-    made, compiled = must(docker(*run, COUNT_COMPILED)).strip().splitlines()[-2:]
-    assert made == "tabletop.yaml: 8 of 8 scenes made"
+    *made, compiled = must(docker(*run, COUNT_COMPILED)).strip().splitlines()[-3:]
+    assert made == [f"tabletop.yaml: {count} of {count} scenes made" for count in (8, 1)]
     assert int(compiled) <= MOST_COMPILED
     without = must(docker(*run, "from numba import config; config.CPU_NAME = 'nocona'\n" + COUNT_COMPILED))
     assert int(without.strip().splitlines()[-1]) > 50
