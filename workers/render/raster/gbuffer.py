@@ -198,7 +198,9 @@ class Renderer:
                 if view.raster:
                     self._light_maps.bind(program, draw.thing)
                 bias = DEPTH_BIAS * ranks[draw.thing.region_id]
-                if variant.plain:
+                if variant.plain and ground is not None and ground.cleared is not None:
+                    program.set_plain(ground.cleared[:3])
+                elif variant.plain:
                     plane = level_plane(draw.thing.shape, draw.T_cam_shape)
                     program.set_plain(plain_srgb(draw.thing.shape, view, plane))
                 nearer = FLOOR_BIAS if variant.ground else -10.0 * bias

@@ -5,7 +5,6 @@ the floor is drawn with one output less. Where it also has one colour, the frame
 drawn only where something comes so near to it that the depth test has to decide.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -16,16 +15,19 @@ from schemas.base import Array, Pose
 from schemas.scene.region import REGION_FLOOR
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Shape
+from workers.geometry.frames import transform
 from workers.geometry.jit import compiled
 from workers.geometry.srgb import decode_srgb
 from workers.render.raster.buffers import UploadedShape
 from workers.render.raster.draw_calls import DEPTH_BIAS, FLOOR_BIAS, RenderPass, is_plain
-from workers.render.raster.programs import NEAR_M
 from workers.render.raster.shaders import GRAZING
-from workers.render.raster.tiles import BORDER_PX, fills_image, is_steep
+from workers.render.raster.tiles import fills_image, is_steep, window
 
 ROUNDING = 1e-5
 """Share of a distance by which the depths that the rasteriser compares may be off; they are exact to 3e-6."""
+
+BORDER_PX = 1
+"""Pixels around that are drawn too: a rasteriser moves edges by at most 1/256 of one."""
 
 Float32 = NDArray[np.float32]
 
@@ -123,57 +125,43 @@ def near_window(
     low_m = 2.0 * share * -level_m
     if low_m <= 0.0:
         return whole
-    lens, bounds = (k.fx, k.fy, k.cx, k.cy), np.array([np.inf, np.inf, -np.inf, -np.inf])
+    low = [np.empty((0, 3))]
     for thing in others:
         T_cam_shape = view.T_cam_world @ thing.T_world_shape
         height = up @ T_cam_shape[:3]
         height[3] -= level_m
-        is_low = (fetch(thing.shape).corners @ height[:3]).min() + height[3] < low_m
-        if is_low and not _reach(thing.shape.vertices, thing.shape.faces, height, T_cam_shape, lens, low_m, bounds):
-            return whole
-    if bounds[0] > bounds[2]:
+        if (fetch(thing.shape).corners @ height[:3]).min() + height[3] < low_m:
+            low.append(transform(T_cam_shape, _low_points(thing.shape.vertices, thing.shape.faces, height, low_m)))
+    points = np.concatenate(low)
+    if not len(points):
         return 0, 0, 0, 0
-    left, top = (max(math.floor(edge - BORDER_PX), 0) for edge in bounds[:2])
-    right, bottom = (math.ceil(edge + BORDER_PX) for edge in bounds[2:])
-    return left, top, min(right, k.width), min(bottom, k.height)
+    left, top, right, bottom = window(points, k)
+    return (
+        max(left - BORDER_PX, 0),
+        max(top - BORDER_PX, 0),
+        min(right + BORDER_PX, k.width),
+        min(bottom + BORDER_PX, k.height),
+    )
 
 
 @compiled
-def _reach(
-    vertices: Array,
-    faces: NDArray[np.int32],
-    up: Array,
-    T_cam_shape: Pose,
-    lens: tuple[float, float, float, float],
-    low_m: float,
-    bounds: Array,
-) -> bool:
-    """Widens bounds (left, top, right, bottom), pixels, by all of a mesh that is lower than `low_m`.
+def _low_points(vertices: Array, faces: NDArray[np.int32], up: Array, low_m: float) -> Array:
+    """[N, 3]: the corners of what a mesh has below `low_m`, in its frame.
 
-    up [4]: (a, b, c, d) with the height a x + b y + c z + d, metres. False where some of it is not beyond the near plane.
+    up [4]: (a, b, c, d) with the height a x + b y + c z + d, metres.
     """
     height = np.empty(len(vertices))
     for n in range(len(vertices)):
         height[n] = up[0] * vertices[n, 0] + up[1] * vertices[n, 1] + up[2] * vertices[n, 2] + up[3]
+    points, count = np.empty((6 * len(faces), 3)), 0
     for face in range(len(faces)):
         for corner in range(3):
             i, j = faces[face, corner], faces[face, (corner + 1) % 3]
-            for end in range(2):
-                here, there = height[i] < low_m, height[j] < low_m
-                if (end == 0 and not here) or (end == 1 and here == there):
-                    continue
-                # The corner itself, and where the edge leaves what is low.
-                share = 0.0 if end == 0 else (low_m - height[i]) / (height[j] - height[i])
-                x = y = z = 0.0
-                for k in range(3):
-                    value = vertices[i, k] + share * (vertices[j, k] - vertices[i, k])
-                    x += T_cam_shape[0, k] * value
-                    y += T_cam_shape[1, k] * value
-                    z += T_cam_shape[2, k] * value
-                z += T_cam_shape[2, 3]
-                if z <= NEAR_M:
-                    return False
-                u, v = lens[0] * (x + T_cam_shape[0, 3]) / z + lens[2], lens[1] * (y + T_cam_shape[1, 3]) / z + lens[3]
-                bounds[0], bounds[1] = min(bounds[0], u), min(bounds[1], v)
-                bounds[2], bounds[3] = max(bounds[2], u), max(bounds[3], v)
-    return True
+            if height[i] < low_m:
+                points[count] = vertices[i]
+                count += 1
+            if (height[i] < low_m) != (height[j] < low_m):  # the edge leaves what is low
+                share = (low_m - height[i]) / (height[j] - height[i])
+                points[count] = vertices[i] + share * (vertices[j] - vertices[i])
+                count += 1
+    return points[:count].copy()
