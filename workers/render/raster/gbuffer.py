@@ -41,7 +41,7 @@ from workers.geometry.frames import invert
 from workers.geometry.pixels import fill_plane_depth, fourth_channel
 from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_edges, smooth_edges
 from workers.render.raster.buffers import INDEX_BYTES, ShapeStore
-from workers.render.raster.context import open_context
+from workers.render.raster.context import is_software, open_context
 from workers.render.raster.counting import PixelCounter
 from workers.render.raster.draw_calls import (
     DEPTH_BIAS,
@@ -264,7 +264,7 @@ class Renderer:
 
     def _program(self, variant: Variant) -> Program:
         if variant not in self._programs:
-            self._programs[variant] = Program(self._gl, *label_sources(variant))
+            self._programs[variant] = Program(self._gl, *label_sources(variant, not is_software(self.name)))
         return self._programs[variant]
 
     def _cull(self, culls: bool) -> None:

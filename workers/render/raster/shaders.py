@@ -268,10 +268,11 @@ void main() {
 """
 
 
-def label_sources(variant: Variant) -> tuple[str, str]:
-    """(vertex, fragment) shader of a variant."""
+def label_sources(variant: Variant, hardware: bool) -> tuple[str, str]:
+    """(vertex, fragment) shader of a variant; `hardware`: for a GPU, which may fuse a product with a sum."""
     choices = {**variant._asdict(), "plain": variant.plain}
     head = "#version 410 core\n" + "".join(f"#define {name.upper()} {int(v)}\n" for name, v in choices.items())
+    head += f"#define UNFUSED {'precise' if hardware else ''}\n"
     vertex = _VERTEX.replace("LIT_VERTEX", LIT_VERTEX).replace("PLANE_VERTEX", PLANE_VERTEX)
     fragment = _FRAGMENT.replace("LIT_FRAGMENT", LIT_FRAGMENT).replace("PLANE_FRAGMENT", PLANE_FRAGMENT)
     fragment = fragment.replace("GRAZING_COSINE", str(GRAZING))

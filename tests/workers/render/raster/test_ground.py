@@ -30,8 +30,12 @@ from tests.workers.render.random_scenes import (
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import invert, pose, transform, translation, uniform_rotation
 from workers.geometry.srgb import decode_srgb, encode_srgb
+from workers.render.raster.context import is_software
 from workers.render.raster.draw_calls import RenderPass
 from workers.render.raster.ground import Ground, find_ground, near_window
+
+GPU_DIVISION = 2.0**-21
+"""Relative error of z that a GPU draws: GLSL allows a division 2.5 units in the last place, and fused sums another one or two."""
 
 LOOKS = {"flat": FLAT, "labels alone": without(FLAT, "rgb"), "raster": RASTER}
 
@@ -76,6 +80,9 @@ def test_a_known_floor_is_seen_to_the_same_bytes(renderer, look):
                 drawn = renderer.draw(things, APPEARANCE, view, *look)
             for kind in ("rgb", "depth_m", "region"):
                 a, b = getattr(seen, kind), getattr(drawn, kind)
+                if kind == "depth_m" and not is_software(renderer.name):
+                    np.testing.assert_allclose(a, b, rtol=GPU_DIVISION)
+                    continue
                 assert (a is None and b is None) or a.tobytes() == b.tobytes(), (seed, kind)
             met += bool((seen.region == things[-1].region_id).any())
             assert view is not views[2] or (seen.region == 1).mean() > 0.9
