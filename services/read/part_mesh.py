@@ -9,7 +9,7 @@ from trimesh.visual.material import PBRMaterial
 
 from schemas.base import Array
 from schemas.scene.shape import Part
-from workers.assets.external.materials import linear_from_srgb
+from workers.geometry.srgb import decode_srgb
 
 
 def mesh_of_part(part: Part) -> trimesh.Trimesh:
@@ -32,4 +32,4 @@ def _visual(part: Part) -> TextureVisuals | ColorVisuals:
 
 def linear_bytes(srgb: Array) -> NDArray[np.uint8]:
     """[..., 4] colours and vertex colours as glTF has them: linear, where textures and ours are sRGB; alpha as it is."""
-    return np.rint(255.0 * np.concatenate([linear_from_srgb(srgb[..., :3]), srgb[..., 3:]], axis=-1)).astype(np.uint8)
+    return np.rint(255.0 * np.concatenate([decode_srgb(srgb[..., :3]), srgb[..., 3:]], axis=-1)).astype(np.uint8)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from schemas.scene.shape import Asset, Part
-from workers.assets.external.materials import linear_from_srgb
 from workers.geometry.bounds import bounds_of
+from workers.geometry.srgb import decode_srgb
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
@@ -77,7 +77,7 @@ def asset_glb(asset: Asset, encode_opaque: EncodeImage = encode_with_pillow) -> 
     `encode_opaque` makes the PNGs of images without alpha.
     """
     writer = _Writer(encode_opaque)
-    colors = linear_from_srgb(np.array([part.material.base_color[:3] for part in asset.shape.parts])).tolist()
+    colors = decode_srgb(np.array([part.material.base_color[:3] for part in asset.shape.parts])).tolist()
     materials = [
         _material(writer, part, rgb, asset.watertight) for part, rgb in zip(asset.shape.parts, colors, strict=True)
     ]
@@ -143,7 +143,7 @@ def _primitive(writer: _Writer, part: Part, material: int) -> dict[str, Any]:
         attributes["TEXCOORD_0"] = writer.add_accessor(flipped, "VEC2", _FLOAT)
     if part.colors is not None:
         color = part.colors / 255.0
-        color[:, :3] = linear_from_srgb(color[:, :3])
+        color[:, :3] = decode_srgb(color[:, :3])
         shorts = np.round(65535.0 * color).astype("<u2")
         attributes["COLOR_0"] = writer.add_accessor(shorts, "VEC4", _USHORT, normalized=True)
     small = len(part.vertices) <= 65535

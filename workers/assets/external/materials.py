@@ -13,6 +13,7 @@ from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
 from schemas.base import Array
 from schemas.scene.shape import Material
 from workers.assets.external.caps import describe_error
+from workers.geometry.srgb import encode_srgb
 
 MIN_TINT = 0.02
 """Darkest base colour that multiplies a texture; below it the colour is an exporter's leftover and is ignored."""
@@ -31,16 +32,6 @@ class MeshVisual:
     uv: Array | None = None
     colors: NDArray[np.uint8] | None = None
     face_colors: NDArray[np.uint8] | None = None
-
-
-def srgb_from_linear(linear: Array) -> Array:
-    """sRGB in [0, 1] from linear values in [0, 1] (IEC 61966-2-1)."""
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(np.maximum(linear, 1e-12), 1 / 2.4) - 0.055)
-
-
-def linear_from_srgb(srgb: Array) -> Array:
-    """Linear values in [0, 1] from sRGB in [0, 1] (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, np.power((srgb + 0.055) / 1.055, 2.4))
 
 
 def read_visual(mesh: trimesh.Trimesh, linear: bool) -> tuple[MeshVisual, tuple[str, ...]]:
@@ -62,7 +53,7 @@ def read_visual(mesh: trimesh.Trimesh, linear: bool) -> tuple[MeshVisual, tuple[
 def _colors(values: NDArray, linear: bool) -> NDArray[np.uint8]:
     rgba = np.asarray(values, dtype=np.uint8).copy()
     if linear:
-        rgba[:, :3] = np.round(255.0 * srgb_from_linear(rgba[:, :3] / 255.0)).astype(np.uint8)
+        rgba[:, :3] = np.round(255.0 * encode_srgb(rgba[:, :3] / 255.0)).astype(np.uint8)
     return rgba
 
 
@@ -77,7 +68,7 @@ def _attribute_colors(values: NDArray | None, count: int, linear: bool) -> NDArr
         return None
     share = np.clip(share, 0.0, 1.0)
     if linear:
-        share[:, :3] = srgb_from_linear(share[:, :3])
+        share[:, :3] = encode_srgb(share[:, :3])
     return np.round(255.0 * share).astype(np.uint8)
 
 
@@ -88,7 +79,7 @@ def _material(source: object, textured: bool) -> tuple[Material, tuple[str, ...]
     if isinstance(source, PBRMaterial):
         texture = _texture(source.baseColorTexture, notes) if textured else None
         factor = np.ones(4) if source.baseColorFactor is None else np.asarray(source.baseColorFactor) / 255.0
-        color = np.append(srgb_from_linear(factor[:3]), factor[3])
+        color = np.append(encode_srgb(factor[:3]), factor[3])
         metallic = 1.0 if source.metallicFactor is None else float(source.metallicFactor)
         roughness = 1.0 if source.roughnessFactor is None else float(source.roughnessFactor)
     elif isinstance(source, SimpleMaterial):
