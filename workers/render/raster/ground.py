@@ -20,7 +20,7 @@ from workers.geometry.jit import compiled
 from workers.geometry.srgb import decode_srgb
 from workers.render.raster.buffers import UploadedShape
 from workers.render.raster.draw_calls import DEPTH_BIAS, FLOOR_BIAS, RenderPass, is_plain
-from workers.render.raster.shaders import GRAZING
+from workers.render.raster.shaders import GRAZING, SRGB_CURVE
 from workers.render.raster.tiles import fills_image, is_steep, window
 
 ROUNDING = 1e-5
@@ -91,7 +91,7 @@ def plain_srgb(shape: Shape, view: RenderPass, plane: Float32) -> Float32:
 
 @compiled
 def _plain_srgb(normal: Float32, albedo: Float32, ambient: Float32, towards: Float32, color: Float32) -> Float32:
-    """The colour of a level by its normal [3], and lights [N, 3], encoded by the curve of shaders.py."""
+    """The colour of a level by its normal [3], and lights [N, 3], encoded as shaders do."""
     srgb = np.empty(3, np.float32)
     for channel in range(3):
         around = ambient[channel]
@@ -101,7 +101,7 @@ def _plain_srgb(normal: Float32, albedo: Float32, ambient: Float32, towards: Flo
         light = albedo[channel] * around + np.float32(0.04) * ambient[channel]
         c = min(max(light, np.float32(0.0)), np.float32(1.0))
         root = np.sqrt(c)
-        curve = 0.83375144 * root + 0.29810974 * np.sqrt(root) - 0.05531654 * c - 0.07690398
+        curve = SRGB_CURVE[0] * root + SRGB_CURVE[1] * np.sqrt(root) - SRGB_CURVE[2] * c - SRGB_CURVE[3]
         srgb[channel] = np.rint(255.0 * (curve if c >= 0.0031308 else 12.92 * c)) / 255.0
     return srgb
 

@@ -49,16 +49,21 @@ class Variant(NamedTuple):
         return self.color and self.matte and not self.textured and not self.raster
 
 
-_ENCODE_SRGB = """
-// The curve is within 0.1 of a step of 8 bits of 1.055 c^(1 / 2.4) - 0.055, and square roots cost a third of powers.
-vec3 encode_srgb(vec3 c) {
+SRGB_CURVE = (0.83375144, 0.29810974, 0.05531654, 0.07690398)
+"""sRGB of linear light c as a c^(1/2) + b c^(1/4) - d c - e, from 0.0031308 on; below, sRGB is 12.92 c.
+
+Within 0.1 of a step of 8 bits of 1.055 c^(1 / 2.4) - 0.055, and square roots cost a third of powers.
+"""
+
+_ENCODE_SRGB = f"""
+vec3 encode_srgb(vec3 c) {{
 #if !RASTER                        // whose tone curve ends at 1
     c = clamp(c, 0.0, 1.0);
 #endif
     vec3 root = sqrt(c);
-    vec3 curve = 0.83375144 * root + 0.29810974 * sqrt(root) - 0.05531654 * c - 0.07690398;
+    vec3 curve = {SRGB_CURVE[0]} * root + {SRGB_CURVE[1]} * sqrt(root) - {SRGB_CURVE[2]} * c - {SRGB_CURVE[3]};
     return mix(12.92 * c, curve, greaterThanEqual(c, vec3(0.0031308)));
-}
+}}
 """
 
 _VERTEX = """
