@@ -12,6 +12,7 @@ makes it from a table's height.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -59,7 +60,7 @@ class Box:
     T_view_world: Pose
     bounds: Array
 
-    @property
+    @cached_property
     def unit_from_world(self) -> Pose:
         """[4, 4]: world to (u, v, depth), each in [0, 1] within the box."""
         size = self.bounds[1] - self.bounds[0]
