@@ -118,7 +118,9 @@ def sort_draws(
                 level = (split and top) or (raster and ground and not split)
                 # Each program takes megabytes; only floors and tops of tables are large enough to gain from their own.
                 planar = view.color and batch.few_triangles and (batch.planar_top if top else batch.planar)
-                matte = ground and planar and batch.matte and (level if raster else textured or is_plain(thing.shape, view))
+                matte = ground and planar and batch.matte
+                if matte:
+                    matte = level if raster else textured or is_plain(thing.shape, view)
                 look = (view.color, textured, batch.few_triangles, matte, lights, raster)
                 variant = Variant(*look, ground, level, view.labels, cutout, planar, ground and not ground_z)
                 by_variant.setdefault(variant, []).append(Draw(thing, T_cam_shape, batch, culls, first, count))

@@ -125,11 +125,13 @@ class LightMaps:
         level = self._baked.floor if thing.region_id == REGION_FLOOR else self._baked.stand
         level_from_shape = np.zeros((4, 4)) if level is None else level.unit_from_world @ thing.T_world_shape
         # Without shadows all lies before the map, where light arrives.
-        shadow_from_shape, normal, softness = np.diag([0.0, 0.0, 0.0, 1.0]), np.zeros((3, 3)), (0.0, 1.0, 0.0)
+        shadow_from_shape, softness = np.diag([0.0, 0.0, 0.0, 1.0]), (0.0, 1.0, 0.0)
+        linear_inverse: NDArray = np.zeros((3, 3))
         if light is not None:
-            shadow_from_shape = light.unit_from_world @ thing.T_world_shape
-            normal, softness = np.linalg.inv(shadow_from_shape[:3, :3]).T, baking.shadow_filter(light)
-        on_level, on_shadow, normal = (m.astype(np.float32) for m in (level_from_shape, shadow_from_shape, normal))
+            shadow_from_shape, softness = light.unit_from_world @ thing.T_world_shape, baking.shadow_filter(light)
+            linear_inverse = np.linalg.inv(shadow_from_shape[:3, :3])
+        matrices = (level_from_shape, shadow_from_shape, linear_inverse.T)
+        on_level, on_shadow, normal = (matrix.astype(np.float32) for matrix in matrices)
         return MapPlacement(on_level, on_shadow, normal, softness)
 
     def _cast(self, things: Sequence[Placed], clip_from_world: Pose) -> NDArray[np.float32]:
