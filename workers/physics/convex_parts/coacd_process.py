@@ -2,7 +2,7 @@
 
 A script, started by `workers.physics.convex_parts.step` and imported for `MISSING` alone. Reads `request.npz` in the given
 folder (vertices [V, 3] float64, faces [F, 3] int32, options as JSON) and writes `parts.npz` there: vertices [N, 3] float64 of
-all parts in turn, counts [P]. Exit code 3: the package is missing. The second argument is its limit of processor time,
+all parts in turn, counts [P]. Exit code 3: the package is missing, or its library. The second argument is its limit of processor time,
 whole seconds, at which SIGXCPU ends it; the third is that of its memory, MiB, at which CoACD gives up.
 """
 
@@ -32,11 +32,12 @@ def main(folder: Path, cpu_s: int, memory_mb: int) -> int:
     os.sched_setaffinity(0, {min(allowed)})  # a worker has one core; OpenMP counts them on loading
     try:
         import coacd  # type: ignore[import-untyped]
-    except ImportError:
+
+        coacd.set_log_level("off")
+    except (ImportError, NameError):  # the latter where the package is there and the library in it is not
         return MISSING
     finally:
         os.sched_setaffinity(0, allowed)
-    coacd.set_log_level("off")
     with np.load(folder / "request.npz") as request:
         mesh = coacd.Mesh(request["vertices"], request["faces"])
         options = json.loads(str(request["options"]))

@@ -36,3 +36,12 @@ def test_an_l_is_cut_into_parts_within_its_bounds(tmp_path):
         assert np.allclose(
             [parts["vertices"].min(axis=0), parts["vertices"].max(axis=0)], [[0, 0, 0], [2, 2, 1]], atol=0.02
         )
+
+
+def test_a_package_without_its_library_is_missing_and_no_mesh_that_cannot_be_cut(tmp_path, monkeypatch):
+    """coacd 1.0.14 without its library is imported, and fails at its first call."""
+    (tmp_path / "coacd.py").write_text("def set_log_level(level):\n    _lib.CoACD_setLogLevel(level)\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    command = [sys.executable, "-P", coacd_process.__file__, str(tmp_path), "60", "4096"]
+    done = subprocess.run(command, capture_output=True)
+    assert done.returncode == coacd_process.MISSING, done.stderr
