@@ -64,7 +64,7 @@ def lint(project: Path, imports: dict[str, str]) -> subprocess.CompletedProcess[
         ("workers/geometry/hull.py", "workers.physics.thing", "geometry knows none"),
         ("workers/plan/step.py", "workers.pipeline.thing", "stages do not know one another"),
         ("workers/geometry/hull.py", "subprocess", "geometry is pure"),
-        ("services/merge/step.py", "services.run.thing", "services: commands"),
+        ("services/merge/merge.py", "services.run.thing", "services: commands"),
         ("services/read/query.py", "services.dataset.thing", "services: commands"),
         ("services/read/independent/derive.py", "workers.geometry.thing", "the independent derivation"),
         ("services/read/independent/derive.py", "schemas.dataset.thing", "the independent derivation"),

@@ -17,9 +17,9 @@ from schemas.dataset.commit import COMMIT_VERSION, CommitRecord, FileEntry, Scen
 from schemas.dataset.layout import COMMITS, RANGES, commit_path, image_path, range_table_path, tar_path
 from schemas.dataset.tables import TABLES
 from tests.made_up_scenes import failed_scene, made_scene, terms
+from workers.store.commit import encode_record
 from workers.store.local import LocalStore
 from workers.store.manifest import sorted_rows, table_of_rows
-from workers.store.record import encode_record
 
 PAIRS = 5
 CATEGORY = "mug"

@@ -1,16 +1,17 @@
-"""The states that a disk may be left in by a crash: at every step of a program, with every kind of legal loss.
+"""What a disk may hold after a loss of power: a program's steps are recorded, and every state they allow is made up."""
 
-A program's steps on the disk are recorded once. Played back up to any of them, they tell what was flushed: by an fsync
-of a file its bytes, by an fsync of a folder the names in it, by a syncfs everything. Whatever was not may be lost or
-torn, with three limits that every file system with a journal keeps: a renamed file is never lost under both names, a
-renamed folder never has two names, and the changes of one name apply in order.
-"""
-
+import builtins
+import os
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import pytest
+
+from workers.store import file_system, local
 
 Step = tuple[Any, ...]
 
@@ -241,3 +242,85 @@ def write_tree(left: dict[str, bytes | None], root: Path) -> None:
             (root / name).mkdir()
         else:
             (root / name).write_bytes(data)
+
+
+@contextmanager
+def recorded(root: Path, by_syncfs: bool = True) -> Iterator[list[Step]]:
+    """The steps that a program takes below `root` in this context. Nothing is flushed really."""
+    steps: list[Step] = []
+    inside = os.path.realpath(root)
+
+    def key(path: Any, folder: int | None = None) -> str | None:
+        """The path below `root`, None elsewhere."""
+        above = os.readlink(f"/proc/self/fd/{folder}") if folder is not None else os.getcwd()
+        whole = os.path.join(above, os.fspath(path))
+        return os.path.relpath(whole, inside) if whole.startswith(inside + "/") else None
+
+    def seen(path: str) -> bytes | None:
+        whole = os.path.join(inside, path)
+        return Path(whole).read_bytes() if os.path.isfile(whole) else None
+
+    def two(name: str, real: Callable) -> Callable:
+        def call(source: Any, target: Any, **more: Any) -> None:
+            old, new = key(source), key(target)
+            data = seen(old) if old is not None else None
+            real(source, target, **more)
+            if old is not None:
+                steps.append((name, old, new, data))
+
+        return call
+
+    def one(name: str, real: Callable) -> Callable:
+        def call(path: Any, *more: Any, dir_fd: int | None = None) -> None:
+            real(path, *more, dir_fd=dir_fd)
+            if (found := key(path, dir_fd)) is not None:
+                steps.append((name, found))
+
+        return call
+
+    def fsync(descriptor: int) -> None:
+        place = os.readlink(f"/proc/self/fd/{descriptor}")
+        if place == inside:
+            steps.append(("fsync", "", None))
+        elif (found := key(place)) is not None and os.path.exists(place):
+            steps.append(("fsync", found, seen(found)))
+
+    def opened(path: Any, mode: str = "r", **more: Any) -> Any:
+        file = builtins.open(path, mode, **more)  # noqa: SIM115 - the caller's to close
+        if mode not in ("wb", "xb") or (found := key(path)) is None:
+            return file
+        steps.append(("create", id(file), found))
+        return _Written(file, lambda half: steps.append(("write", id(file), half)))
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name, call in (("link", two("link", os.link)), ("replace", two("rename", os.replace))):
+            patch.setattr(os, name, call)
+        patch.setattr(os, "rename", two("rename", os.rename))
+        patch.setattr(os, "mkdir", one("mkdir", os.mkdir))
+        patch.setattr(os, "unlink", one("remove", os.unlink))
+        patch.setattr(os, "rmdir", one("remove", os.rmdir))
+        patch.setattr(os, "fsync", fsync)
+        patch.setattr(local, "open", opened, raising=False)
+        patch.setattr(file_system, "_syncfs", lambda descriptor: steps.append(("syncfs",)))
+        patch.setattr(file_system, "_trusts_syncfs", lambda folder: by_syncfs)
+        yield steps
+
+
+class _Written:
+    """A file whose writes are told."""
+
+    def __init__(self, file: Any, tell: Callable[[bytes], object]) -> None:
+        self._file, self._tell = file, tell
+        self.close, self.flush, self.fileno = file.close, file.flush, file.fileno
+
+    def write(self, data: bytes) -> int:
+        half = len(data) // 2
+        self._tell(bytes(data[:half]))
+        self._tell(bytes(data[half:]))
+        return self._file.write(data)
+
+    def __enter__(self) -> "_Written":
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._file.close()

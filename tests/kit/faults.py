@@ -1,19 +1,26 @@
-"""Counting what a program does to the disk, and ending or disturbing it at any one of those steps.
-
-A kill is an exception that nothing catches, and every later step raises it again: clean-up code cannot touch the disk
-either, as after a real kill. A loss of power also empties every file whose bytes were not flushed since they were
-written.
-"""
+"""Faults on purpose: a disk that fails or loses power, requests to a bucket that are cut, and a lock that another takes."""
 
 import builtins
+import contextlib
 import os
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
+import obstore
 import pytest
+from obstore.exceptions import GenericError
 
-from workers.store import file_system, local
+from schemas.dataset.commit import CommitRecord, FileEntry
+from schemas.dataset.layout import is_shape
+from schemas.errors import CorruptError
+from services.run import lock as module
+from services.run.lock import Beat, Lock, hold_lock
+from workers.store import file_system, local, objects
+from workers.store.commit import committed_files
+from workers.store.store import Store
 
 _STEPS = ("link", "replace", "rename", "mkdir", "unlink", "rmdir", "fsync")
 
@@ -139,3 +146,103 @@ def _sync_all(watched: Disk, descriptor: int) -> bool:
     for parent, _, names in os.walk(os.readlink(f"/proc/self/fd/{descriptor}")):
         watched.synced |= {os.stat(os.path.join(parent, name)).st_ino for name in names}
     return True
+
+
+CHANGES = ("put", "copy", "delete")
+REQUESTS = (*CHANGES, "get", "head", "list", "list_with_delimiter")
+
+Fault = Literal["killed before", "killed after", "answer lost"]
+
+
+class Requests:
+    """`obstore`, with its requests counted; number `at` meets the fault, or `then` runs just before it."""
+
+    def __init__(self, names: tuple[str, ...], at: int, fault: Fault, then: Callable[[], object] | None) -> None:
+        self.count = 0
+        self.decision = -1
+        """The number of the latest conditional put."""
+        self.names = names
+        self.at = at
+        self._fault = fault
+        self._then = then
+        self._busy = False
+        self._counting = threading.Lock()
+
+    def __getattr__(self, name: str):
+        real = getattr(obstore, name)
+        return self._watched(real) if name in self.names else real
+
+    def _watched(self, real: Callable) -> Callable:
+        def call(*arguments, **named):
+            if self._busy:
+                return real(*arguments, **named)
+            with self._counting:
+                mine = self.count
+                self.count += 1
+                if named.get("mode") == "create":
+                    self.decision = mine
+            if mine == self.at and self._then is not None:
+                self._run_then()
+            elif self._then is None and -1 < self.at <= mine and self._fault != "answer lost":
+                if mine == self.at and self._fault == "killed after":
+                    real(*arguments, **named)
+                raise Killed
+            elif mine == self.at and self._then is None:
+                real(*arguments, **named)
+                raise GenericError("the answer was lost")
+            return real(*arguments, **named)
+
+        return call
+
+    def _run_then(self) -> None:
+        assert self._then is not None
+        self._busy = True
+        try:
+            self._then()
+        finally:
+            self._busy = False
+
+
+@contextmanager
+def requests(
+    at: int = -1,
+    fault: Fault = "killed before",
+    then: Callable[[], object] | None = None,
+    names: tuple[str, ...] = CHANGES,
+) -> Iterator[Requests]:
+    """Counts the requests with these names in this context; number `at` meets the fault, or `then` runs before it."""
+    watched = Requests(names, at, fault, then)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(objects, "obstore", watched)
+        yield watched
+
+
+FAST = Beat(period_s=0.02, patience=15)
+STILL = Beat(period_s=0.02 * 3600, patience=1)
+"""A heartbeat that does not come while a test lasts."""
+
+
+@contextlib.contextmanager
+def taken_over(store: Store) -> Iterator[Lock]:
+    """Another machine finds the holder silent and takes the lock over; yields its lock."""
+    with contextlib.ExitStack() as stack:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(module, "_machine", lambda: "another")
+            patch.setattr(module.socket, "gethostname", lambda: "far")
+            theirs = stack.enter_context(hold_lock(store, FAST))
+        yield theirs
+
+
+def check_published(store: Store, record: CommitRecord) -> tuple[FileEntry, ...]:
+    """Every file of the record.
+
+    Raises CorruptError naming one that is not in its final place with its size. A shape that a mix of stacks shares
+    keeps the size of whichever was first.
+    """
+    files = committed_files(store, record)
+    for entry in files:
+        final = store.size(entry.path)
+        exact = record.terms.fingerprint_mode == "strict" or not is_shape(entry.path)
+        if final is None or (exact and final != entry.bytes):
+            raise CorruptError(f"{entry.path} has {final} bytes in its final place, and its commit says {entry.bytes}")
+    return files
