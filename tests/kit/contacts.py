@@ -8,7 +8,7 @@ from schemas.scene.shape import MassProperties, Mesh
 from workers.geometry.frames import pose, rotation_about, transform
 from workers.physics.contact_surface import is_closed, surface_of
 from workers.physics.contacts import Contacts, contacts_within
-from workers.physics.rest import Thing
+from workers.physics.exact_rest import Thing
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -16,11 +16,10 @@ from schemas.scene.shape import Mesh
 from workers.geometry.frames import DOWN, motion_between, transform
 from workers.geometry.hull import convex_hull, least_width_m
 from workers.geometry.mesh import bounds_of, hold_to_one_thread, mesh_of, solid_of, weld
-from workers.physics import rest as step
 from workers.physics.bullet import GRAVITY_M_S2
 from workers.physics.contact_surface import Surface, crop, is_closed, surface_of
 from workers.physics.contacts import Contacts, contacts_within
-from workers.physics.rest import FALL_M, Inertia, Motion, Thing
+from workers.physics.exact_rest import FALL_M, Inertia, Motion, Thing, step
 from workers.physics.support import support_margin
 
 FARTHEST_M = 0.01

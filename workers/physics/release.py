@@ -19,11 +19,11 @@ from schemas.job.physics import Physics, Rest
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart, Table
 from workers.geometry.frames import transform
-from workers.physics import rest
 from workers.physics.bullet import SLOP_SHARE, GroundShape
 from workers.physics.contact_surface import faces_within, skin_of
 from workers.physics.contacts import contacts_within
 from workers.physics.effects import is_convex
+from workers.physics.exact_rest import LEVEL, Rested, rest
 from workers.physics.fall import (
     FINEST,
     LOOK_STEPS,
@@ -40,7 +40,6 @@ from workers.physics.fall import (
     strays,
 )
 from workers.physics.placement import Placement, farthest_m
-from workers.physics.rest import LEVEL, Rested
 from workers.physics.rigid_body import build_body, choose_collision_shape, make_body
 from workers.physics.support import inside_margin, split_by_side
 

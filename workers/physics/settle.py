@@ -18,8 +18,8 @@ from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart, ScenePlan
 from schemas.scene.scene import Settled, SupportedBy
 from workers.geometry.frames import motion_between, transform, translation
-from workers.physics import rest
 from workers.physics.effects import called_for_with, rooms_m
+from workers.physics.exact_rest import rest
 from workers.physics.fall import FINEST, Outcome
 from workers.physics.placement import (
     TOUCHING_M,

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from tests import shapes
+from tests.kit import shapes
 from tests.kit.contacts import box, mesh_of
 from workers.physics.contact_surface import Surface, crop, faces_within, is_closed, skin_of, surface_of
 

@@ -16,11 +16,10 @@ from tests.kit.shapes import asset_of, box
 from tests.physics.settling import settle_group
 from workers.geometry.frames import motion_between, transform, translation
 from workers.physics import release as module
-from workers.physics import rest
+from workers.physics.exact_rest import Rested, rest
 from workers.physics.fall import Outcome
 from workers.physics.placement import Placement, forms_of, place
 from workers.physics.release import FAR_M, HELD, MOST_HOLDS, Drop, hold, let_go
-from workers.physics.rest import Rested
 
 PHYSICS = Job(name="t").physics
 """A friction of 0.7, so that a contact's is 0.49: the angle of friction is 26.1 degrees."""

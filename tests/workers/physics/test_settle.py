@@ -17,7 +17,7 @@ from workers.geometry.frames import pose, rotation_about, translation
 from workers.geometry.hull import convex_hull
 from workers.physics import settle
 from workers.physics.effects import called_for
-from workers.physics.rest import Rested
+from workers.physics.exact_rest import Rested
 from workers.physics.settle import LEFT_ROOM, LEFT_TOP, Rest, settle_scene
 from workers.physics.support import place_table
 
