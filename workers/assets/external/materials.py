@@ -13,7 +13,7 @@ from trimesh.visual.material import MultiMaterial, PBRMaterial, SimpleMaterial
 from schemas.base import Array
 from schemas.scene.shape import Material
 from workers.assets.external.caps import describe_error
-from workers.geometry.srgb import encode_srgb
+from workers.geometry.colour import encode_srgb
 
 MIN_TINT = 0.02
 """Darkest base colour that multiplies a texture; below it the colour is an exporter's leftover and is ignored."""

@@ -1,14 +1,26 @@
-"""Compiled loops over pairs of features of two meshes: which are near, and how far apart they are along their normal."""
+"""Signed contacts between the true meshes of bodies and their ground, found anew as bodies move. Pure."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Array
+from schemas.base import Array, Pose
+from workers.geometry.distance import nearest_on_triangle
+from workers.geometry.frames import transform
 from workers.geometry.jit import compiled
-from workers.geometry.nearest import nearest_on_triangle
+from workers.geometry.mesh import bounds_of
+from workers.physics.contact_surface import SLOPE, Index, Surface, bounds_in, find_near
 
-SLOPE = 0.02
-"""Slope, about a degree, up to which a surface that falls below the plane of contact may still lie on it."""
+DEEPEST_M = 3e-3
+"""Overlap from which bodies are moved apart, metres: coarse parts may be smaller than a quarter of a metre's shape by half of
+that, and the walls of mugs are as thick."""
+
+DEEP_M = 1e-3
+"""Overlap from which only a corner below a single face is believed: seams of bodies that abut have edges below one another."""
+
 
 PARALLEL = 1e-3
 """Sine of the angle between edges below which they count as parallel: their ends lie on faces then."""
@@ -16,88 +28,121 @@ PARALLEL = 1e-3
 BORDER_M = 1e-7
 """Distance from a face up to which a corner above its border is above it."""
 
-Index = NDArray[np.int64]
 
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Contacts of body `upper` [N] with body `lower` [N], in world coordinates; the last body is the ground.
 
-@compiled
-def bounds_in(points: Array, features: NDArray[np.integer], low: Array, high: Array) -> tuple[Index, Array, Array]:
-    """(numbers [N], lower and upper bounds [N, 3]) of the features [F, K], corners by number, whose bounds overlap a box."""
-    found, count = np.empty(len(features), np.int64), 0
-    least, most = np.empty((len(features), 3)), np.empty((len(features), 3))
-    for f in range(len(features)):
-        near = True
-        for k in range(3):
-            down = up = points[features[f, 0], k]
-            for m in range(1, features.shape[1]):
-                down, up = min(down, points[features[f, m], k]), max(up, points[features[f, m], k])
-            near = near and down <= high[k] and up >= low[k]
-            if not near:
-                break
-            least[count, k], most[count, k] = down, up
-        if near:
-            found[count] = f
-            count += 1
-    return found[:count], least[:count], most[:count]
-
-
-def find_near(low: Array, high: Array, others_low: Array, others_high: Array, within: float) -> Index:
-    """[N, 2]: the pairs of two lists of boxes, bounds [A, 3] and [B, 3], with at most `within` between them on each axis.
-
-    Sorted by the first box. The second list is swept along the axis on which it extends farthest.
+    points [N, 3] metres; normals [N, 3], unit, from lower to upper; gaps [N] metres, negative where the two overlap.
     """
-    if len(low) == 0 or len(others_low) == 0:
-        return np.empty((0, 2), np.int64)
-    axis, widest, starts = _longest_axis(others_low, others_high)
-    order = np.argsort(starts, kind="stable")  # numba's own takes seconds to compile
-    return _sweep(low, high, others_low, others_high, within, axis, widest, order, starts[order])
+
+    upper: Index
+    lower: Index
+    points: Array
+    normals: Array
+    gaps: Array
+
+    def of(self, body: int) -> NDArray[np.bool_]:
+        """[N]: which contacts a body has."""
+        return (self.upper == body) | (self.lower == body)
 
 
-@compiled
-def _longest_axis(low: Array, high: Array) -> tuple[int, float, Array]:
-    """(the axis on which boxes, bounds [B, 3], extend farthest; the widest box there; their lower bounds [B] there)."""
-    axis, longest = 0, -1.0
-    for k in range(3):
-        least, most = low[0, k], high[0, k]
-        for n in range(1, len(low)):
-            least, most = min(least, low[n, k]), max(most, high[n, k])
-        if most - least > longest:
-            axis, longest = k, most - least
-    widest, starts = high[0, axis] - low[0, axis], np.empty(len(low))
-    for n in range(len(low)):
-        widest, starts[n] = max(widest, high[n, axis] - low[n, axis]), low[n, axis]
-    return axis, widest, starts
+@dataclass(frozen=True, eq=False)
+class Near:
+    """The features of two surfaces, `upper` and `lower`, that are near one another, by their numbers."""
+
+    upper: int
+    lower: int
+    corners: Index
+    """[P, 2]: corner of upper, face of lower."""
+    faces: Index
+    """[P, 2]: corner of lower, face of upper."""
+    edges: Index
+    """[P, 2]: edge of upper, edge of lower."""
 
 
-@compiled
-def _sweep(
-    low: Array,
-    high: Array,
-    others_low: Array,
-    others_high: Array,
-    within: float,
-    axis: int,
-    widest: float,
-    order: Index,
-    sorted_low: Array,
-) -> Index:
-    """The pairs of `find_near`: along `axis` the second list, of boxes at most `widest` there, begins at `sorted_low` [B]."""
-    pairs, count = np.empty((64, 2), np.int64), 0
-    for n in range(len(low)):
-        first = np.searchsorted(sorted_low, low[n, axis] - within - widest)
-        for m in range(first, len(order)):
-            if sorted_low[m] > high[n, axis] + within:
-                break
-            f = order[m]
-            near = True
-            for k in range(3):
-                near = near and others_low[f, k] - within <= high[n, k] and low[n, k] <= others_high[f, k] + within
-            if not near:
-                continue
-            if count == len(pairs):
-                pairs = np.concatenate((pairs, pairs))
-            pairs[count, 0], pairs[count, 1] = n, f
-            count += 1
-    return pairs[:count]
+def find_near_features(surfaces: Sequence[Surface], points: Sequence[Array], within_m: float) -> list[Near]:
+    """The pairs of features with at most `within_m` between their boxes; the last surface is the ground.
+
+    points: the vertices [V, 3] of each surface, world.
+    """
+    found = []
+    bounds = [bounds_of(each) for each in points]
+    for i, j in itertools.combinations(range(len(surfaces)), 2):
+        low, high = np.maximum(bounds[i][0], bounds[j][0]) - within_m, np.minimum(bounds[i][1], bounds[j][1]) + within_m
+        if (low > high).any():
+            continue
+        here, there = (_boxes(surfaces[k], points[k], low, high) for k in (i, j))
+        pairs = ((here[0], there[1]), (there[0], here[1]), (here[2], there[2]))
+        found.append(Near(i, j, *(_pairs(*each, within_m) for each in pairs)))
+    return found
+
+
+_Boxes = tuple[Index, Array, Array]
+
+
+def _boxes(surface: Surface, points: Array, low: Array, high: Array) -> tuple[_Boxes, _Boxes, _Boxes]:
+    """(numbers, bounds) of the corners, faces and edges of a surface whose boxes overlap a box."""
+    corners, least, most = bounds_in(points, surface.corners[:, None], low, high)
+    return (
+        (surface.corners[corners], least, most),
+        bounds_in(points, surface.faces, low, high),
+        bounds_in(points, surface.edges, low, high),
+    )
+
+
+def _pairs(here: _Boxes, there: _Boxes, within_m: float) -> Index:
+    pairs = find_near(here[1], here[2], there[1], there[2], within_m)
+    return np.stack([here[0][pairs[:, 0]], there[0][pairs[:, 1]]], axis=1)
+
+
+def contacts_within(surfaces: Sequence[Surface], poses: Sequence[Pose], within_m: float) -> Contacts:
+    """The contacts of surfaces at these poses [4, 4] with gaps and overlaps of at most `within_m`; the last is the ground."""
+    points = [transform(T, each.vertices) for T, each in zip(poses, surfaces, strict=True)]
+    return find_contacts(surfaces, points, find_near_features(surfaces, points, within_m), within_m, within_m)
+
+
+def find_contacts(
+    surfaces: Sequence[Surface], points: Sequence[Array], near: Sequence[Near], within_m: float, deepest_m: float
+) -> Contacts:
+    """The contacts with gaps from -`deepest_m` to `within_m` among features that are near."""
+    rows, upper, lower = [np.empty((0, 7))], [], []
+    for pair in near:
+        for found in _between(surfaces, points, pair, (within_m, deepest_m)):
+            rows.append(found)
+            upper += [pair.upper] * len(found)
+            lower += [pair.lower] * len(found)
+    every = np.concatenate(rows)
+    above, below = (np.array(numbers, dtype=np.int64) for numbers in (upper, lower))
+    return Contacts(above, below, every[:, :3], every[:, 3:6], every[:, 6])
+
+
+def _between(
+    surfaces: Sequence[Surface], points: Sequence[Array], pair: Near, reach: tuple[float, float]
+) -> tuple[Array, ...]:
+    """Point, normal and gap [N, 7] of the contacts of two surfaces: corners on faces, faces on corners, edges."""
+    a, b = surfaces[pair.upper], surfaces[pair.lower]
+    p, q = points[pair.upper], points[pair.lower]
+    on_lower = corners_on_faces(pair.corners, p, a.starts, a.members, q, b.faces, b.side, *reach)
+    on_upper = corners_on_faces(pair.faces, q, b.starts, b.members, p, a.faces, a.side, *reach)
+    crossed = edges_across_edges(pair.edges, p, a.edges, a.across, q, b.edges, b.across, *reach)
+    turned = _shallowest(*on_upper)
+    turned[:, 3:6] *= -1.0
+    return _shallowest(*on_lower), turned, crossed[crossed[:, 6] >= -DEEP_M]
+
+
+def _shallowest(rows: Array, which: Index) -> Array:
+    """The contacts without those by which a corner would leave the other body the longer way.
+
+    A corner that is on one face, or above it, is not deep below another.
+    """
+    inside, deep = rows[:, 6] < 0.0, rows[:, 6] < -DEEP_M
+    if not inside.any():
+        return rows
+    best, best_inside = (np.full(int(which[:, 0].max()) + 1, -np.inf) for _ in range(2))
+    np.maximum.at(best, which[:, 0], rows[:, 6])
+    np.maximum.at(best_inside, which[inside, 0], rows[inside, 6])
+    return rows[(~inside | (rows[:, 6] >= best_inside[which[:, 0]])) & (~deep | (rows[:, 6] >= best[which[:, 0]]))]
 
 
 @compiled

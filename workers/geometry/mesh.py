@@ -1,4 +1,7 @@
-"""Welding of meshes, their connected pieces, their depth below the hull, and conversion from and to manifold3d."""
+"""Meshes: bounds, equal rows, welding, connected pieces, planes of faces, convexity, and conversion from and to manifold3d."""
+
+import functools
+import os
 
 import manifold3d
 import numpy as np
@@ -8,11 +11,80 @@ from scipy.sparse.csgraph import connected_components
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
-from workers.geometry.first_equal import is_first
+from workers.geometry.distance import nearest_on_mesh
 from workers.geometry.frames import dot
 from workers.geometry.jit import compiled
-from workers.geometry.manifold import hold_to_one_thread
-from workers.geometry.nearest import nearest_on_mesh
+
+
+def bounds_of(points: Array) -> Array:
+    """[2, D] float64: lower and upper corner of the axis-aligned bounding box of points [N, D], N > 0.
+
+    numpy's minimum along the first axis takes ten times as long. Points must not hold nan.
+    """
+    return _bounds_of(np.ascontiguousarray(points))
+
+
+@compiled
+def _bounds_of(points: Array) -> Array:
+    bounds = np.empty((2, points.shape[1]))
+    bounds[0], bounds[1] = np.inf, -np.inf
+    for n in range(len(points)):
+        for axis in range(points.shape[1]):
+            bounds[0, axis] = min(bounds[0, axis], points[n, axis])
+            bounds[1, axis] = max(bounds[1, axis], points[n, axis])
+    return bounds
+
+
+FRACTION_OF_2_64 = -0x61C8864680B583EB
+"""2^64 over the golden ratio, as a signed number: its multiples are spread evenly (Knuth, The Art of Computer Programming
+vol. 3, 6.4)."""
+
+
+def is_first(rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """[N]: whether no row before is equal to a row, of rows [N, 3]."""
+    return first_equal(rows) == np.arange(len(rows))
+
+
+@compiled
+def first_equal(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """[N]: the first place of a row equal to each of the rows [N, 3]; a row's own where none before it is equal.
+
+    By a hash table: `np.unique` takes forty times as long. Coordinates are given by their bits (`array.view`), among which
+    0.0 and -0.0 differ.
+    """
+    size, shift = 4, 62
+    while size < 2 * len(rows):
+        size, shift = 2 * size, shift - 1
+    slots, first = np.full(size, -1), np.empty(len(rows), np.int64)
+    for n in range(len(rows)):
+        x, y, z = rows[n, 0], rows[n, 1], rows[n, 2]
+        slot = ((x ^ (y >> 21) ^ (y << 43) ^ (z >> 42) ^ (z << 22)) * FRACTION_OF_2_64 >> shift) & (size - 1)
+        while slots[slot] >= 0:
+            known = slots[slot]
+            if rows[known, 0] == x and rows[known, 1] == y and rows[known, 2] == z:
+                break
+            slot = (slot + 1) & (size - 1)
+        if slots[slot] < 0:
+            slots[slot] = n
+        first[n] = slots[slot]
+    return first
+
+
+@functools.cache
+def hold_to_one_thread() -> None:
+    """Limits manifold3d's thread pool to one core; to be called before manifold3d is used.
+
+    The pool counts the cores that the calling thread may use at the first boolean, and never again: so the first boolean
+    is made while only one core is allowed.
+    """
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    try:
+        cube = manifold3d.Manifold.cube()
+        (cube + cube.translate((0.5, 0.3, 0.2))).num_tri()
+    finally:
+        os.sched_setaffinity(0, allowed)
+
 
 CONVEX_SHARE = 0.9999
 """Share of its hull's volume from which a body is convex."""

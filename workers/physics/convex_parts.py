@@ -1,34 +1,121 @@
 """Convex parts of a body that is not convex, by CoACD (Wei, Liu, Ling and Su 2022, doi 10.1145/3528223.3530103).
 
-Parts of built-in shapes follow from their making instead: see `workers.geometry.lathe_decomposition`.
-docs/measured.md says what its threshold costs.
+Parts of built-in shapes follow from their making instead: see `workers.geometry.lathe_decomposition`. Parts are kept in memory
+and in files, which may be deleted. docs/measured.md says what CoACD's threshold costs.
 """
 
+import hashlib
+import io
 import json
 import math
+import os
 import resource
 import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import NamedTuple
 
 import manifold3d
 import numpy as np
 import shapely
+from cachetools import LRUCache
 from scipy.spatial import QhullError
 
 from schemas.base import Array, frozen_array
+from schemas.environment import cache_folder
 from schemas.errors import MachineError, MeshError
 from schemas.scene.shape import Asset, Mesh
-from workers.geometry import convexity
-from workers.geometry.convexity import components, is_convex_surface, mesh_of, solid_of, weld
+from workers.geometry import mesh as convexity
 from workers.geometry.hull import convex_hull
 from workers.geometry.lathe_decomposition import TOLERANCE, decompose_lofts
-from workers.physics.convex_parts.coacd_process import MISSING
-from workers.physics.convex_parts.parts_cache import USUAL_FOLDER, Parts, PartsCache, key_of
+from workers.geometry.mesh import components, is_convex_surface, mesh_of, solid_of, weld
+from workers.physics.coacd_process import MISSING
+
+CAPACITY_BYTES = 64 * 1024 * 1024
+"""Memory per process: a thousand mugs."""
+
+
+class Parts(NamedTuple):
+    """Vertices [N, 3] float64, metres, of each convex part of a body, and how they were made.
+
+    convex: every piece of the body is; coacd: by CoACD; pieces: CoACD failed, and they are the hulls of the pieces; lofts:
+    from the making of a built-in shape; none: there are none, because CoACD took too long.
+    """
+
+    clouds: tuple[Array, ...]
+    method: str
+
+
+USUAL_FOLDER = cache_folder("parts")
+
+
+def key_of(*inputs: str | bytes) -> str:
+    """SHA-256 of everything that an answer depends on."""
+    whole = hashlib.sha256()
+    for one in inputs:
+        data = one.encode() if isinstance(one, str) else one
+        whole.update(len(data).to_bytes(8, "little") + data)
+    return whole.hexdigest()
+
+
+class PartsCache:
+    """The parts used last that fit `capacity_bytes` together, and files of all parts if a folder is given.
+
+    A file begins with the SHA-256 of its content, by which a torn one is found and made again, and is renamed into place. A
+    folder that cannot be written is ignored.
+    """
+
+    def __init__(self, capacity_bytes: int = CAPACITY_BYTES) -> None:
+        self._kept: LRUCache[str, Parts] = LRUCache(capacity_bytes, lambda parts: sum(c.nbytes for c in parts.clouds))
+
+    def get(self, key: str, folder: Path | None, make: Callable[[], Parts]) -> Parts:
+        """The parts of this key: from memory, from the folder, or made. An exception of `make` leaves no trace."""
+        if (parts := self._kept.get(key)) is not None:
+            return parts
+        parts = None if folder is None else _read(folder / key)
+        if parts is None:
+            parts = make()
+            if folder is not None:
+                with suppress(OSError):
+                    _write(folder, key, parts)
+        with suppress(ValueError):  # larger than all that is kept
+            self._kept[key] = parts
+        return parts
+
+
+def _read(path: Path) -> Parts | None:
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return None
+    size = hashlib.sha256().digest_size
+    if hashlib.sha256(data[size:]).digest() != data[:size]:
+        return None
+    with np.load(io.BytesIO(data[size:])) as stored:
+        counts = stored["counts"]
+        clouds = np.split(stored["vertices"], np.cumsum(counts)[:-1]) if len(counts) else []
+        return Parts(tuple(frozen_array(cloud) for cloud in clouds), str(stored["method"]))
+
+
+def _write(folder: Path, key: str, parts: Parts) -> None:
+    content, counts = io.BytesIO(), [len(cloud) for cloud in parts.clouds]
+    np.savez(content, method=parts.method, vertices=np.concatenate([np.empty((0, 3)), *parts.clouds]), counts=counts)
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=folder, prefix=f".{key}.", delete=False) as file:
+        try:
+            file.write(hashlib.sha256(content.getvalue()).digest() + content.getvalue())
+            file.flush()
+            os.replace(file.name, folder / key)
+        except OSError:
+            Path(file.name).unlink(missing_ok=True)
+            raise
+
 
 THRESHOLD = 0.05
 """CoACD's concavity at which it stops, in units in which the mesh is 2 across. 0.02 halves the error and triples the parts."""

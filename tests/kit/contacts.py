@@ -5,10 +5,10 @@ import trimesh
 
 from schemas.base import Array
 from schemas.scene.shape import MassProperties, Mesh
-from workers.geometry.contact_surface import is_closed, surface_of
 from workers.geometry.frames import pose, rotation_about, transform
-from workers.physics.rest.contacts import Contacts, contacts_within
-from workers.physics.rest.rest import Thing
+from workers.physics.contact_surface import is_closed, surface_of
+from workers.physics.contacts import Contacts, contacts_within
+from workers.physics.exact_rest import Thing
 
 UP = np.array([0.0, 0.0, 1.0])
 

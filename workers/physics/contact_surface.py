@@ -1,4 +1,4 @@
-"""What of a mesh may touch another: its corners, edges and faces, each with what is about it, and its outermost layer. Pure."""
+"""What of a mesh may touch another: its corners, edges and faces, each with its neighbours, and its outermost layer. Pure."""
 
 from dataclasses import dataclass
 
@@ -10,12 +10,98 @@ from scipy.spatial import ConvexHull
 
 from schemas.base import Array
 from schemas.scene.shape import Mesh
-from workers.geometry.bounds import bounds_of
-from workers.geometry.contact_kernels import SLOPE, Index, bounds_in, find_near
-from workers.geometry.convexity import edge_keys, face_normals, has_rim, numbers_in, weld
+from workers.geometry.distance import nearest_on_segments, nearest_on_triangle
 from workers.geometry.frames import dot
 from workers.geometry.jit import compiled
-from workers.geometry.nearest import nearest_on_segments, nearest_on_triangle
+from workers.geometry.mesh import bounds_of, edge_keys, face_normals, has_rim, numbers_in, weld
+
+SLOPE = 0.02
+"""Slope, about a degree, up to which a surface that falls below the plane of contact may still lie on it."""
+
+
+Index = NDArray[np.int64]
+
+
+@compiled
+def bounds_in(points: Array, features: NDArray[np.integer], low: Array, high: Array) -> tuple[Index, Array, Array]:
+    """(numbers [N], lower and upper bounds [N, 3]) of the features [F, K], corners by number, whose bounds overlap a box."""
+    found, count = np.empty(len(features), np.int64), 0
+    least, most = np.empty((len(features), 3)), np.empty((len(features), 3))
+    for f in range(len(features)):
+        near = True
+        for k in range(3):
+            down = up = points[features[f, 0], k]
+            for m in range(1, features.shape[1]):
+                down, up = min(down, points[features[f, m], k]), max(up, points[features[f, m], k])
+            near = near and down <= high[k] and up >= low[k]
+            if not near:
+                break
+            least[count, k], most[count, k] = down, up
+        if near:
+            found[count] = f
+            count += 1
+    return found[:count], least[:count], most[:count]
+
+
+def find_near(low: Array, high: Array, others_low: Array, others_high: Array, within: float) -> Index:
+    """[N, 2]: the pairs of two lists of boxes, bounds [A, 3] and [B, 3], with at most `within` between them on each axis.
+
+    Sorted by the first box. The second list is swept along the axis on which it extends farthest.
+    """
+    if len(low) == 0 or len(others_low) == 0:
+        return np.empty((0, 2), np.int64)
+    axis, widest, starts = _longest_axis(others_low, others_high)
+    order = np.argsort(starts, kind="stable")  # numba's own takes seconds to compile
+    return _sweep(low, high, others_low, others_high, within, axis, widest, order, starts[order])
+
+
+@compiled
+def _longest_axis(low: Array, high: Array) -> tuple[int, float, Array]:
+    """(the axis on which boxes, bounds [B, 3], extend farthest; the widest box there; their lower bounds [B] there)."""
+    axis, longest = 0, -1.0
+    for k in range(3):
+        least, most = low[0, k], high[0, k]
+        for n in range(1, len(low)):
+            least, most = min(least, low[n, k]), max(most, high[n, k])
+        if most - least > longest:
+            axis, longest = k, most - least
+    widest, starts = high[0, axis] - low[0, axis], np.empty(len(low))
+    for n in range(len(low)):
+        widest, starts[n] = max(widest, high[n, axis] - low[n, axis]), low[n, axis]
+    return axis, widest, starts
+
+
+@compiled
+def _sweep(
+    low: Array,
+    high: Array,
+    others_low: Array,
+    others_high: Array,
+    within: float,
+    axis: int,
+    widest: float,
+    order: Index,
+    sorted_low: Array,
+) -> Index:
+    """The pairs of `find_near`: along `axis` the second list, of boxes at most `widest` there, begins at `sorted_low` [B]."""
+    pairs, count = np.empty((64, 2), np.int64), 0
+    for n in range(len(low)):
+        first = np.searchsorted(sorted_low, low[n, axis] - within - widest)
+        for m in range(first, len(order)):
+            if sorted_low[m] > high[n, axis] + within:
+                break
+            f = order[m]
+            near = True
+            for k in range(3):
+                near = near and others_low[f, k] - within <= high[n, k] and low[n, k] <= others_high[f, k] + within
+            if not near:
+                continue
+            if count == len(pairs):
+                pairs = np.concatenate((pairs, pairs))
+            pairs[count, 0], pairs[count, 1] = n, f
+            count += 1
+    return pairs[:count]
+
 
 FLAT = 1e-9
 """One minus the cosine between two faces, below which there is no edge between them."""

@@ -1,4 +1,4 @@
-"""sRGB and linear light (IEC 61966-2-1): as numbers from 0 to 1, and as 8-bit codes."""
+"""Colour: sRGB and linear light (IEC 61966-2-1), as numbers from 0 to 1 and as 8-bit codes; holes in textures."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,3 +39,12 @@ def decode_codes(rgb: NDArray[np.uint8]) -> Array:
 def encode_codes(light: Array) -> NDArray[np.uint8]:
     """8-bit sRGB to the nearest; below black is black, above white is white."""
     return np.searchsorted(LIMITS, light).astype(np.uint8)
+
+
+HOLE_ALPHA = 128
+"""Texels of a smaller alpha, of 255, are holes in colour."""
+
+
+def has_holes(texture: NDArray[np.uint8] | None) -> bool:
+    """Whether a texture [h, w, 3 or 4] has holes."""
+    return texture is not None and texture.shape[2] == 4 and bool((texture[..., 3] < HOLE_ALPHA).any())

@@ -1,6 +1,6 @@
 """CoACD in a process of its own: its exceptions end the process, and its memory must not affect the next mesh.
 
-A script, started by `workers.physics.convex_parts.step` and imported for `MISSING` alone. Reads `request.npz` in the given
+A script, started by `workers.physics.convex_parts` and imported for `MISSING` alone. Reads `request.npz` in the given
 folder (vertices [V, 3] float64, faces [F, 3] int32, options as JSON) and writes `parts.npz` there: vertices [N, 3] float64 of
 all parts in turn, counts [P]. Exit code 3: the package is missing, or its library. The second argument is its limit of processor
 time, whole seconds, at which SIGXCPU ends it; the third is that of its memory, MiB, at which CoACD gives up.

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from schemas.job.job import Job
-from tests.energy_minimum import is_energy_minimum
+from tests.kit.energy_minimum import is_energy_minimum
 from tests.physics.population import draw
 from tests.physics.settling import settle_single
 from workers.assets.catalogue import open_catalogue
