@@ -21,8 +21,8 @@ from numba.core.dispatcher import Dispatcher
 import workers
 from services.job.read import load_job
 from workers.assets.catalogue import open_catalogue
-from workers.geometry.contact_surface import faces_within
 from workers.geometry.jit import used_by
+from workers.physics.contact_surface import faces_within
 from workers.pipeline.context import open_worker
 from workers.pipeline.loops import LIST, compile_together
 from workers.pipeline.run_shard import run_scene

@@ -9,7 +9,7 @@ from schemas.job.job import Job
 from services.job.read import validate_job
 from services.job.record import encode_job, record_job
 from services.merge.dataset_card import write_card
-from services.merge.step import merge
+from services.merge.merge import merge
 from services.read.verify import verify
 from services.run.range_planner import plan_spans
 from workers.pipeline.captures.listing import open_sources

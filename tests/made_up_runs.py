@@ -8,13 +8,13 @@ from pathlib import Path
 from schemas.dataset.commit import CommitTerms
 from schemas.dataset.layout import STAGING
 from schemas.scene.scene import SceneOutput
-from services.merge.step import MergeResult, merge
+from services.merge.merge import MergeResult, merge
 from services.run.lock import Lock
 from services.run.range_planner import committed_ranges, plan_ranges, plan_retries
 from tests.made_up_scenes import attempt_at, small_scene, terms
-from workers.store.committed_rows import list_commits
+from workers.store.attempt import sweep
+from workers.store.ledger import list_commits
 from workers.store.store import Store
-from workers.store.sweep import sweep
 
 FIRST, STOP, RANGE = 4, 7, 2
 

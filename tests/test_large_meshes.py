@@ -10,7 +10,7 @@ import trimesh
 from schemas.job.job import Job
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.shape import Part, Shape
-from tests.shapes import asset_of
+from tests.kit.shapes import asset_of
 from workers.assets.builtin.solid import circle, lathe
 from workers.assets.catalogue import open_catalogue
 from workers.assets.glb import asset_glb

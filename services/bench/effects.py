@@ -19,7 +19,7 @@ from services.bench.ratios import Spread, format_spread
 from services.bench.report import describe_head
 from workers.assets.catalogue import open_catalogue
 from workers.physics.effects import called_for
-from workers.physics.step import settle_scene
+from workers.physics.settle import settle_scene
 from workers.pipeline.context import open_worker
 from workers.plan.effects import PHYSICS_EFFECTS, Facts, plan_effects
 from workers.plan.randomness import SceneChance

@@ -10,7 +10,7 @@ from schemas.scene.scene import Placed
 from schemas.scene.shape import Mesh, Shape
 from schemas.scene.view import Pair
 from workers.assets.glb import asset_glb
-from workers.geometry.srgb import SRGB_STEPS, decode_srgb, encode_srgb
+from workers.geometry.colour import SRGB_STEPS, decode_srgb, encode_srgb
 from workers.pipeline.image_files import image_boxes, object_labels
 from workers.pipeline.make_scene import Scene
 from workers.store.images import encode_png

@@ -28,14 +28,12 @@ from services.bench.ratios import Lap, Spread, by_processor, format_spread, slop
 from services.bench.report import describe_head
 from services.bench.stages import make_in_memory
 from workers.assets.catalogue import open_catalogue
+from workers.geometry.colour import decode_srgb
 from workers.geometry.frames import transform
-from workers.geometry.srgb import decode_srgb
 from workers.pipeline.context import open_worker
 from workers.pipeline.make_scene import Scene
 from workers.plan.effects import Facts, plan_effects
-from workers.render.pathtraced.lights import GLOW, SKY_PX, sky_directions, sky_picture
-from workers.render.pathtraced.materials import tint_of
-from workers.render.pathtraced.tracer import Tracer, encode_light
+from workers.render.pathtraced import GLOW, SKY_PX, Tracer, encode_light, sky_directions, sky_picture, tint_of
 from workers.render.raster.baking import LAMP_RAD
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.tiers import require_tier

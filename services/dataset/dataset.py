@@ -26,10 +26,10 @@ from services.dataset.pair import Pair, read_pair
 from services.dataset.pair_table import PAIR_TABLES, choose_pairs, pair_table
 from services.dataset.stored_files import RangeFiles, StoredFiles
 from services.job.record import require_job
-from services.merge.step import read_success
+from services.merge.merge import read_success
 from services.read.dataset_reader import find_records
 from services.read.stored_tables import StoredTables
-from workers.store.committed_rows import iter_committed, range_rows
+from workers.store.ledger import iter_committed, range_rows
 from workers.store.local import open_store
 from workers.store.store import Store
 

@@ -18,7 +18,7 @@ from schemas.scene.region import REGION_FIRST_OBJECT
 from services.export.folder import ExportFolder
 from services.export.source import ExportPair, ExportScene
 from services.export.writer import Added, LeftOut
-from services.merge.poses import escaped
+from services.merge.tables import escaped
 from workers.store.images import decode_png, encode_png
 
 UNITS_PER_M = 5000.0

@@ -18,7 +18,7 @@ from schemas.scene.region import REGION_FIRST_OBJECT
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, read_image, read_stored
 from services.read.stored_paths import patch_paths, view_paths
 from workers.store.commit import read_committed, split_code
-from workers.store.committed_rows import read_range
+from workers.store.ledger import read_range
 from workers.store.store import Store
 
 _STRICTNESS = ("train", "val", "test")

@@ -20,7 +20,7 @@ from services.export.request import SHARDED, ExportRequest
 from services.export.source import iter_ranges, scenes_of
 from services.export.writer import Added
 from services.job.record import JobRecord, require_job
-from services.merge.step import read_success
+from services.merge.merge import read_success
 from workers.store.commit import list_codes
 
 LEFT_OUT: Final = "left_out.csv"

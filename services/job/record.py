@@ -13,7 +13,7 @@ from schemas.errors import CorruptError, JobError, OutputError
 from schemas.job.identity import compare_jobs, job_digest
 from schemas.job.job import Job
 from services.job.read import parse_yaml, validate_job
-from workers.store.seal import is_sealed, seal
+from workers.store.commit import is_sealed, seal
 from workers.store.store import Store
 
 OWN = {MANIFEST, STAGING, LOCK_FILE, LOG_FOLDER}

@@ -8,9 +8,9 @@ from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE, stor
 from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Captures
 from services.job.record import JobRecord
-from services.merge.step import MergeResult
+from services.merge.merge import MergeResult
 from workers.assets.catalogue import Catalogue
-from workers.store.seal import is_sealed, seal
+from workers.store.commit import is_sealed, seal
 from workers.store.store import Store
 
 ARTICLE = (

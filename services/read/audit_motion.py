@@ -14,7 +14,7 @@ from schemas.scene.view import View
 from workers.geometry.camera import project
 from workers.geometry.frames import invert, motion_between, transform
 from workers.geometry.raycast import NEAR_M, edge_distance_px
-from workers.physics.step import release_again
+from workers.physics.settle import release_again
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene
 from workers.plan.effects import Facts, names_of_kind, plan_effects

@@ -9,7 +9,7 @@ from trimesh.visual.material import PBRMaterial
 
 from schemas.base import Array
 from schemas.scene.shape import Part
-from workers.geometry.srgb import decode_srgb
+from workers.geometry.colour import decode_srgb
 
 
 def mesh_of_part(part: Part) -> trimesh.Trimesh:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from schemas.errors import MachineError
-from services.merge.scratch import open_scratch
+from services.merge.shared import open_scratch
 
 _TABLE = "CREATE TABLE paths (path BLOB PRIMARY KEY, sha256 TEXT) WITHOUT ROWID"
 

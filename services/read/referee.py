@@ -20,7 +20,7 @@ from schemas.job.physics import Physics
 from schemas.scene.plan import ObjectStart, ScenePlan
 from schemas.scene.scene import Settled
 from workers.geometry.frames import invert, motion_between, transform
-from workers.physics.convex_parts.step import parts_of
+from workers.physics.convex_parts import parts_of
 from workers.physics.effects import is_convex
 from workers.physics.rigid_body import body_frame
 

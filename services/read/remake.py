@@ -20,10 +20,10 @@ from workers.pipeline.run_shard import run_scene
 from workers.pipeline.stopwatch import Stopwatch
 from workers.store.attempt import begin_attempt
 from workers.store.commit import read_committed
+from workers.store.file_system import temporary_folder
 from workers.store.local import LocalStore
 from workers.store.manifest import decode_table, encode_table, sorted_rows, table_of_rows
 from workers.store.store import Store
-from workers.store.temporary_folder import temporary_folder
 
 
 class Maker:

@@ -5,7 +5,7 @@ from typing import Any
 
 from schemas.dataset.layout import pose_of_image
 from schemas.dataset.tables import TABLES
-from services.merge.merging import Merging
+from services.merge.merge import Merging
 from services.merge.reading import RANGES_PER_BLOCK, ROWS_PER_BLOCK, Block
 from services.read.verify_range import ReadRange
 from workers.store.manifest import join_rows

@@ -12,7 +12,7 @@ from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, RANGES, commit_pa
 from schemas.errors import CorruptError, VersoError
 from services.job.record import encode_job, record_job
 from services.merge.dataset_card import write_card
-from services.merge.step import merge
+from services.merge.merge import merge
 from services.read.remake import Maker
 from services.read.verdict import COPY, Verdict
 from services.read.verify import verify

@@ -8,7 +8,7 @@ import pyarrow.compute as pc
 from schemas.dataset.layout import COMMITS, STAGING, commit_path
 from schemas.dataset.ledger import Ledger
 from schemas.errors import OutputError
-from services.merge.step import read_success
+from services.merge.merge import read_success
 from services.run.lock import Holder, read_holder
 from services.run.losses import find_lost
 from workers.store.attempt import blamed_scene, retry_of_attempt, staged_attempts

@@ -16,10 +16,10 @@ from schemas.dataset.layout import COMMITS, MANIFEST, STAGING, SUCCESS_FILE, ran
 from schemas.dataset.tables import CAPTURE_SCHEMAS, SCHEMAS, TABLES, schema_of
 from schemas.errors import CorruptError, OutputError
 from services.job.record import read_job
-from services.merge.step import read_success
+from services.merge.merge import read_success
 from services.read.store_files import file_system_of
 from workers.store.commit import commit_names, read_record
-from workers.store.committed_rows import range_rows
+from workers.store.ledger import range_rows
 from workers.store.manifest import join_rows
 from workers.store.store import Store
 

@@ -39,9 +39,9 @@ from services.read.verify_range import RangeCheck, read_records
 from services.read.verify_span import Spans, commit_groups
 from workers.pipeline.allocator import keep_freed_memory
 from workers.store.commit import commits_digest
+from workers.store.file_system import temporary_folder
 from workers.store.ledger import read_kept_rows
 from workers.store.store import Store
-from workers.store.temporary_folder import temporary_folder
 
 TOP_FILES = (JOB_FILE, README_FILE, SUCCESS_FILE, FINGERPRINT_FILE, LEDGER_FILE, CAM_POSES, CAMERAS, OBJECTS)
 """Files with one place each; whether they are whole is checked by name."""

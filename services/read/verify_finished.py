@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from schemas.dataset.layout import README_FILE, SUCCESS_FILE
 from services.merge.dataset_card import is_card_sealed
-from services.merge.step import encode_success
+from services.merge.merge import encode_success
 from services.read.verdict import Verdict, describe_os_error, printable
 from workers.store.store import Store
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from schemas.dataset.codec import Row
 from schemas.errors import CorruptError
 from services.job.record import require_job
-from services.merge.step import read_success
+from services.merge.merge import read_success
 from services.read.dataset_reader import choose_scenes, file_reader, find_scene
 from services.read.independent.derive import StoredPair
 from services.read.independent.forces import check_forces

@@ -20,7 +20,7 @@ from services.read.path_index import PathIndex
 from services.read.verdict import COPY, Verdict, describe_os_error
 from workers.pipeline.check_stored import check_stored_pair, check_stored_scene
 from workers.store.commit import committed_files, read_committed, read_record
-from workers.store.committed_rows import range_rows
+from workers.store.ledger import range_rows
 from workers.store.store import Store
 from workers.store.tars import check_labels
 

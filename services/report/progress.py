@@ -14,7 +14,7 @@ from services.report.histogram import Histogram
 from services.report.sample import DEPTH_M, ShownScene, show_scene
 from services.run.lock import shows_life
 from workers.store.commit import list_codes, split_code
-from workers.store.committed_rows import read_range
+from workers.store.ledger import read_range
 from workers.store.store import Store
 
 Phase = Literal["empty", "making", "stopped", "finished", "unreadable"]

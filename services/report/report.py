@@ -6,7 +6,7 @@ from pathlib import Path
 from schemas.errors import OutputError
 from schemas.job.job import Job
 from services.job.record import JobRecord, require_job
-from services.merge.step import read_success
+from services.merge.merge import read_success
 from services.report.beside import Side, beside_html
 from services.report.clouds import Space, pack_space, read_space
 from services.report.collect import Figures, collect

@@ -12,10 +12,10 @@ import pyarrow.parquet as pq
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import MANIFEST
 from schemas.dataset.tables import CAPTURE_SCHEMAS
-from services.merge.step import read_success
+from services.merge.merge import read_success
 from services.read.stored_tables import category_of, read_merged
 from workers.store.commit import list_codes, split_code
-from workers.store.committed_rows import range_rows, read_range
+from workers.store.ledger import range_rows, read_range
 from workers.store.store import Store
 
 MOST_RANGES = 256

@@ -27,10 +27,9 @@ from services.run.stalls import Stall
 from services.run.tally import Tally
 from services.run.under_way import count_under_way
 from services.run.watchdog import Watchdog, end_worker_here, find_own_workers, scenes_in_progress
-from workers.store.attempt import TIMED_OUT, attempts_at, blamed_scene, host_part, retry_of_attempt
+from workers.store.attempt import TIMED_OUT, attempts_at, blamed_scene, host_part, retry_of_attempt, sweep_attempt
 from workers.store.ledger import read_summary
 from workers.store.store import Store
-from workers.store.sweep import sweep_attempt
 
 POLL_S = 0.5
 """Time of one wait for reports: Ctrl-C is seen at least this often."""

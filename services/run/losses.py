@@ -6,7 +6,7 @@ import numpy as np
 
 from schemas.dataset.layout import commit_path
 from schemas.dataset.ledger import Ledger
-from services.merge.step import read_success
+from services.merge.merge import read_success
 from workers.store.commit import commits_digest
 from workers.store.ledger import list_commits
 from workers.store.store import Store

@@ -14,7 +14,7 @@ from schemas.errors import FingerprintError
 from schemas.job.job import Job
 from services.job.record import JobRecord, adopt, encode_job, record_job, refuse_foreign
 from services.merge.dataset_card import describe_doubts, describe_left_out, write_card
-from services.merge.step import MergeResult, merge
+from services.merge.merge import MergeResult, merge
 from services.run.coordinator import Coordinator, Limits
 from services.run.joining import join_cluster, terms_of_driver, with_own_stack
 from services.run.lock import hold_lock
@@ -30,10 +30,10 @@ from services.run.tally import Tally
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.captures.listing import open_sources
 from workers.render.tiers import require_tier
+from workers.store.attempt import sweep
 from workers.store.ledger import LedgerKeeper, list_commits
 from workers.store.local import open_store
 from workers.store.store import Store
-from workers.store.sweep import sweep
 
 
 @dataclass(frozen=True)

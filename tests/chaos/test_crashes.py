@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from schemas.errors import VersoError
-from tests.crash_states import Disk, losses, write_tree
-from tests.disk_recorder import recorded
+from tests.kit.crash_states import Disk, losses, recorded, write_tree
 from tests.made_up_runs import FIRST, RANGE, STOP, broken_promises, contents, leftovers, make_dataset, settings_of
 from tests.made_up_scenes import attempt_at, failed_scene, small_scene
 from workers.store import attempt as attempt_module

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from schemas.errors import VersoError
-from tests.disk_faults import unflushed
+from tests.kit.faults import unflushed
 from tests.made_up_runs import broken_promises, contents, leftovers, make_dataset
 from workers.store.local import LocalStore
 

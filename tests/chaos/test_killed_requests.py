@@ -12,8 +12,7 @@ from obstore.store import MemoryStore
 
 from schemas.dataset.layout import staging_path
 from schemas.errors import VersoError
-from tests.bucket_faults import Fault, requests
-from tests.disk_faults import Killed, unflushed
+from tests.kit.faults import Fault, Killed, requests, unflushed
 from tests.made_up_runs import FIRST, RANGE, STOP, make_dataset, settings_of
 from tests.made_up_scenes import attempt_at, failed_scene, small_scene
 from workers.store import attempt as attempt_module

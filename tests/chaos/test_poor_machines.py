@@ -25,7 +25,7 @@ MAY_READ_IT = {
     "services/run/tally.py": "when a run began, for the time that is left",
     "workers/store/local.py": "when a file was written, for the rate",
     "workers/store/objects.py": "when an object was put, for the rate",
-    "workers/store/temporary_folder.py": "how long ago an unlocked folder was made, which a set clock only leaves longer",
+    "workers/store/file_system.py": "how long ago an unlocked folder was made, which a set clock only leaves longer",
 }
 """No work is lost or done twice by these, so a clock may be set while a run goes on."""
 

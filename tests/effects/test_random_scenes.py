@@ -18,7 +18,7 @@ from tests.effects.random_physics import needed, random_physics
 from tests.effects.scenes import Setting, facts_of, make, with_holes, without_textures
 from workers.cameras.placement import place_aligned_camera, place_mirror_camera
 from workers.geometry.raycast import cast_view
-from workers.physics.step import settle_scene
+from workers.physics.settle import settle_scene
 from workers.plan.effects import EFFECTS, Facts, names_of_kind, plan_effects
 
 pytestmark = pytest.mark.minute

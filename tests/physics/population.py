@@ -24,8 +24,8 @@ from tests.physics.energy import watched, worst_of
 from tests.physics.room import G
 from tests.physics.settling import recheck, settle_single
 from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import transform
+from workers.physics.support import sample_elevation
 from workers.plan.randomness import SceneChance
 from workers.plan.step import choose_category, plan_scene
 

@@ -9,10 +9,10 @@ from schemas.job.physics import Physics
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart, ScenePlan, Table
 from schemas.scene.scene import Settled
-from tests.shapes import asset_of, box, table
+from tests.kit.shapes import asset_of, box, table
 from workers.physics.effects import called_for, called_for_with
 from workers.physics.fall import FINEST
-from workers.physics.step import RECHECK_S, moved_by, release_again, settle_scene
+from workers.physics.settle import RECHECK_S, moved_by, release_again, settle_scene
 from workers.plan.randomness import SceneChance
 from workers.plan.step import draw_scene
 

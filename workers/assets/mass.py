@@ -7,7 +7,9 @@ from schemas.base import Array, frozen_array
 from schemas.scene.shape import MassProperties, Shape
 from workers.assets.external.mesh import is_solid
 from workers.geometry.bounds import bounds_of
+from workers.assets.external.topology import is_solid
 from workers.geometry.jit import compiled
+from workers.geometry.mesh import bounds_of
 
 
 def mass_properties(shape: Shape, density_kg_m3: float, shell_kg_m2: float) -> MassProperties:

@@ -10,8 +10,8 @@ from schemas.job.images import Images
 from schemas.scene.camera import Camera
 from schemas.scene.region import REGION_FIRST_OBJECT
 from workers.geometry.frames import UP, half_turn, pose, translation
+from workers.geometry.pixels import dequantise_depth
 from workers.geometry.ranks import median, percentile
-from workers.geometry.stored_depth import dequantise_depth
 
 
 def place_aligned_camera(camera: Camera, depth_camera: DepthCamera) -> Camera:

@@ -9,8 +9,8 @@ from schemas.base import Array, Pose
 from schemas.errors import CaptureError
 from schemas.scene.shape import Mesh
 from workers.capture.evaluate import sample_surface
+from workers.geometry.distance import distance_to_mesh
 from workers.geometry.frames import invert, pose, rotation_about, transform
-from workers.geometry.surface_distance import distance_to_mesh
 
 TURNS = 24
 """Starts: the mesh stands as it is, z up, turned about the vertical by so many angles."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from workers.geometry.srgb import SRGB_STEPS
+from workers.geometry.colour import SRGB_STEPS
 
 SAMPLES = 24
 """Profiles across one edge."""

@@ -14,9 +14,9 @@ from schemas.scene.shape import Mesh
 from workers.capture.posed_view import PosedView
 from workers.capture.visibility import facing_cosine, placed
 from workers.geometry.camera import project
+from workers.geometry.distance import distance_to_mesh
 from workers.geometry.frames import angle_between, invert, transform
 from workers.geometry.raycast import cast_view
-from workers.geometry.surface_distance import distance_to_mesh
 
 SAMPLES = 40_000
 """Points of the true surface: their share within a distance is known to a quarter of a percent."""

@@ -13,9 +13,9 @@ from schemas.scene.camera import Camera
 from workers.capture.depth_fit import FittedDepth
 from workers.capture.posed_view import PosedView
 from workers.capture.tsdf import sample_inverse
+from workers.geometry.colour import SRGB_STEPS, encode_codes
 from workers.geometry.frames import invert
 from workers.geometry.jit import compiled
-from workers.geometry.srgb import SRGB_STEPS, encode_codes
 
 UNSEEN = 128
 """The code of each channel where no view sees anything."""

@@ -10,11 +10,8 @@ from scipy.spatial import ConvexHull
 
 from schemas.base import Array, frozen_array
 from schemas.scene.shape import Hull, Shape
-from workers.geometry.bounds import bounds_of
-from workers.geometry.convexity import mesh_of
-from workers.geometry.first_equal import is_first
 from workers.geometry.jit import compiled
-from workers.geometry.manifold import hold_to_one_thread
+from workers.geometry.mesh import bounds_of, hold_to_one_thread, is_first, mesh_of
 
 THIN = 1e-4
 """Ratio of a cloud's least to its largest spread below which Qhull is used: manifold3d's hull leaves out points that stand

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from schemas.job.images import Images
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.view import Agreement, View
-from workers.geometry.covisibility import Bounds, Seen, compare_covisible
+from workers.geometry.projection import Bounds, Seen, compare_covisible
 from workers.geometry.ranks import median
 from workers.labels.projected_view import HIDDEN_M
 

@@ -9,10 +9,8 @@ from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.effects import EffectPlan
 from schemas.scene.view import View
 from workers.geometry.distortion import distort
-from workers.geometry.normals import facing_cosine
-from workers.geometry.pixels import count_filled, gather_colours
+from workers.geometry.pixels import count_filled, facing_cosine, gather_colours, quantise_depth
 from workers.geometry.projection import Projected, forward_project, in_frame
-from workers.geometry.stored_depth import quantise_depth
 
 HIDDEN_M = 0.01
 """A projected point this far behind what the mirror camera sees is hidden."""

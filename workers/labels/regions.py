@@ -11,9 +11,9 @@ from schemas.scene.region import REGION_TABLE
 from schemas.scene.scene import Placed, PosedScene
 from schemas.scene.view import ObjectLabel
 from workers.geometry.camera import image_coordinates
-from workers.geometry.coverage import count_covered
 from workers.geometry.frames import invert
 from workers.geometry.pixels import Extent, measure_regions
+from workers.geometry.zbuffer import count_covered
 
 CountPixels = Callable[[Sequence[Placed], Camera], list[int]]
 """Counts, for each thing, the pixels of that thing alone, also outside the frame."""

@@ -1,26 +1,158 @@
-"""Rigid bodies on a ground, simulated by PyBullet. The only module that imports PyBullet, so that it can be replaced."""
+"""Rigid bodies on a ground, simulated by PyBullet. The only module that imports PyBullet, so that it can be replaced.
+
+Here too is what works around its flaws: it leaks the shapes that it is given, it prints when it is imported, and it takes
+convex parts only as the text of an OBJ file.
+"""
 
 import math
+import os
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, field
+from functools import cache, lru_cache
 from pathlib import Path
 from uuid import uuid4
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.errors import SettleError
 from schemas.job.physics import Physics
 from schemas.scene.shape import Mesh
-from workers.geometry.bounds import bounds_of
 from workers.geometry.frames import quaternion_from_rotation
-from workers.geometry.obj_text import DECIMALS, obj_of
-from workers.physics.pybullet_flaws import BulletBuffers, silence_stderr
-from workers.physics.rest_pose import stands_on_face
+from workers.geometry.jit import compiled
+from workers.geometry.mesh import bounds_of
 from workers.physics.rigid_body import Body, BodyPose
+from workers.physics.support import stands_on_face
+
+STDERR = 2
+
+
+@dataclass(frozen=True)
+class BulletBuffers:
+    """Python objects with new contents for every call.
+
+    PyBullet 3.2.7 takes a reference to each list of vertices or indices and to each item, and never releases it (190
+    bytes a vertex).
+    """
+
+    points: list[list[float]] = field(default_factory=list)
+    integers: list[int] = field(default_factory=list)
+    vertex_list: list[list[float]] = field(default_factory=list)
+    index_list: list[int] = field(default_factory=list)
+
+    def vertices(self, points: Array) -> list[list[float]]:
+        """[N, 3] as lists, valid until the next call."""
+        self.points.extend([0.0, 0.0, 0.0] for _ in range(len(points) - len(self.points)))
+        for mine, point in zip(self.points, points.tolist(), strict=False):
+            mine[:] = point
+        self.vertex_list[:] = self.points[: len(points)]
+        return self.vertex_list
+
+    def indices(self, values: NDArray[np.integer]) -> list[int]:
+        """[N] non-negative integers as a list, valid until the next call."""
+        self.integers.extend(range(len(self.integers), int(values.max()) + 1))
+        self.index_list[:] = [self.integers[value] for value in values.tolist()]
+        return self.index_list
+
+
+@contextmanager
+def silence_stderr() -> Iterator[None]:
+    """Discard what C code prints to standard error; an exception is reported after the block, as usual.
+
+    PyBullet prints its build time on import, at the head of every command's messages.
+    """
+    sys.stderr.flush()
+    with open(os.devnull, "wb") as devnull:
+        kept = os.dup(STDERR)
+        os.dup2(devnull.fileno(), STDERR)
+    try:
+        yield
+    finally:
+        os.dup2(kept, STDERR)
+        os.close(kept)
+
+
+DECIMALS = 8
+"""Decimals that coordinates are rounded to, metres."""
+
+MOST_LETTERS = 16
+"""Letters that a coordinate takes at most, with the space before it."""
+
+
+def obj_of(parts: Sequence[Array]) -> bytes:
+    """An object `part0`, `part1` ... for each part [N, 3], of which a reader wants the vertices: its faces are a fan over all.
+
+    Coordinates are rounded to `DECIMALS` already. They have nine significant digits, those that float32 keeps: `%.9g`.
+    """
+    texts = (b"o part%d\n" % n + _vertices_of(part) + _fan_over(len(part)) for n, part in enumerate(parts))
+    return b"".join(texts)
+
+
+def _vertices_of(part: Array) -> bytes:
+    """A line `v x y z` for each of the points [N, 3]."""
+    letters = np.empty(len(part) * (3 * MOST_LETTERS + 2), np.uint8)
+    length = _write_vertices(np.ascontiguousarray(part), letters)
+    if length < 0:
+        return ("v %.9g %.9g %.9g\n" * len(part) % tuple(part.ravel().tolist())).encode("ascii")
+    return letters[:length].tobytes()
+
+
+@lru_cache(1024)
+def _fan_over(count: int) -> bytes:
+    """The faces over so many vertices, counted from the last vertex back, as OBJ allows, in any part alike."""
+    return b"".join(b"f %d %d %d\n" % (-count, k - count, k - count + 1) for k in range(1, count - 1))
+
+
+@compiled
+def _write_vertices(points: Array, text: NDArray[np.uint8]) -> int:
+    """Writes the lines of points [N, 3] into `text`, ASCII, and returns their length; -1 for points 10 metres away.
+
+    Python's own formatting takes five times as long.
+    """
+    at = 0
+    for point in points:
+        text[at] = ord("v")
+        at += 1
+        for value in point:
+            if not abs(value) < 10.0:
+                return -1
+            text[at] = ord(" ")
+            at = _write_number(value, text, at + 1)
+        text[at] = ord("\n")
+        at += 1
+    return at
+
+
+@compiled
+def _write_number(value: float, text: NDArray[np.uint8], at: int) -> int:
+    """Writes a number as `%.9g` has it to `text` from `at` on, and returns where it ends."""
+    digits = np.int64(np.rint(abs(value) * 10.0**DECIMALS))
+    if np.signbit(value):
+        text[at] = ord("-")
+        at += 1
+    before, power = DECIMALS, 0  # the digits after the point, and the exponent
+    if 0 < digits < 10 ** (DECIMALS - 4):  # below a ten-thousandth: one digit, the point, the others, an exponent
+        before = int(digits >= 10) + int(digits >= 100) + int(digits >= 1000)
+        power = DECIMALS - before
+    scale = 10**before
+    text[at] = ord("0") + digits // scale
+    at, digits = at + 1, digits % scale
+    if digits > 0:
+        text[at] = ord(".")
+        at += 1
+    while digits > 0:
+        scale //= 10
+        text[at] = ord("0") + digits // scale
+        at, digits = at + 1, digits % scale
+    if power > 0:
+        text[at], text[at + 1], text[at + 2], text[at + 3] = ord("e"), ord("-"), ord("0"), ord("0") + power
+        at += 4
+    return at
+
 
 with silence_stderr():
     import pybullet

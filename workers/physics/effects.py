@@ -10,11 +10,10 @@ from schemas.base import Array
 from schemas.job.physics import Physics
 from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.shape import Hull
-from workers.geometry.convexity import fills_hull
-from workers.geometry.first_equal import is_first
 from workers.geometry.frames import transform
 from workers.geometry.jit import compiled
-from workers.physics.table_top import inside_margin
+from workers.geometry.mesh import fills_hull, is_first
+from workers.physics.support import inside_margin
 
 NEIGHBOUR_RAD = math.radians(30.0)
 """Greatest angle between normals of a hull that belong to one stretch of its surface."""

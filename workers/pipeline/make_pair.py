@@ -10,7 +10,7 @@ from schemas.scene.plan import ScenePlan
 from schemas.scene.scene import PosedScene
 from schemas.scene.view import Pair, View
 from workers.cameras.placement import object_distance, place_aligned_camera, place_mirror_camera
-from workers.geometry.stored_depth import quantise_depth
+from workers.geometry.pixels import quantise_depth
 from workers.labels.agreement import compare_views
 from workers.labels.projected_view import derive_projected, projection_shares
 from workers.labels.ray_check import check_against_rays
@@ -18,7 +18,7 @@ from workers.labels.regions import count_unoccluded, label_regions
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.stopwatch import Stopwatch
 from workers.plan.randomness import SceneChance, Stream
-from workers.render.step import draw_view
+from workers.render.tiers import draw_view
 from workers.sensor.step import SensorChance, sense_view
 
 

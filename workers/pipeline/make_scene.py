@@ -12,7 +12,7 @@ from schemas.scene.region import REGION_FLOOR, REGION_TABLE
 from schemas.scene.scene import Placed, PosedScene, Settled
 from schemas.scene.view import Pair
 from workers.labels.ray_check import check_pair
-from workers.physics.step import recheck_scene, settle_scene
+from workers.physics.settle import recheck_scene, settle_scene
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_pair import SettledScene, make_pair
 from workers.pipeline.stopwatch import Stopwatch

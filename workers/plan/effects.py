@@ -23,7 +23,7 @@ from schemas.scene.plan import ScenePlan
 from schemas.scene.shape import Part
 from workers.cameras.placement import place_aligned_camera, place_mirror_camera
 from workers.geometry.camera import is_outside_views
-from workers.geometry.texels import has_holes
+from workers.geometry.colour import has_holes
 from workers.physics.effects import PREDICATES
 from workers.plan.randomness import SceneChance, Stream
 

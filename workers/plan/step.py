@@ -16,11 +16,9 @@ from schemas.scene.shape import Asset, Hull, Mesh
 from workers.assets.appearance import draw_appearance
 from workers.assets.catalogue import Catalogue, InstanceRef, choose_object, choose_table, load_asset
 from workers.geometry.camera import orbit_pose
-from workers.geometry.elevation import sample_elevation
 from workers.geometry.frames import UP, pose, rotation_about, transform, translation, uniform_rotation
 from workers.geometry.hull import hull_of
-from workers.physics.rest_pose import support_margin
-from workers.physics.table_top import place_table, support_height
+from workers.physics.support import place_table, sample_elevation, support_height, support_margin
 from workers.plan.arrange import has_room, rise_above
 from workers.plan.randomness import SceneChance, Stream
 

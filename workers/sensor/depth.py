@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.job.sensor import DepthNoise
 from schemas.scene.camera import Camera
-from workers.geometry.normals import facing_cosine
+from workers.geometry.pixels import facing_cosine
 
 
 def sense_depth(

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from schemas.base import Array, frozen_array
 from schemas.job.sensor import Distortion, Exposure, RgbNoise, SensorEffects
 from schemas.scene.camera import Intrinsics
+from workers.geometry.colour import decode_codes, encode_codes
 from workers.geometry.distortion import undistort
-from workers.geometry.srgb import decode_codes, encode_codes
 
 
 def sense_rgb(

@@ -8,7 +8,7 @@ from schemas.job.images import Images
 from schemas.job.sensor import SensorEffects
 from schemas.scene.effects import EffectPlan
 from schemas.scene.view import View
-from workers.geometry.stored_depth import dequantise_depth, quantise_depth
+from workers.geometry.pixels import dequantise_depth, quantise_depth
 from workers.sensor.depth import sense_depth
 from workers.sensor.rgb import sense_rgb
 

@@ -1,11 +1,15 @@
-"""What the store asks of a local file system: its type, flushing to the disk, a probe, and errors explained."""
+"""Calls to a local file system: its type, flushing to the disk, a probe, temporary files and folders, errors explained."""
 
 import contextlib
 import ctypes
 import errno
+import fcntl
 import os
 import pwd
 import re
+import shutil
+import tempfile
+import time
 import uuid
 import weakref
 from collections.abc import Callable, Iterable, Iterator
@@ -275,3 +279,38 @@ def explain_disk_errors(what: str) -> Iterator[None]:
         if error.errno in _REMEDIES:
             raise MachineError(f"{what}: {remedy_of(error)}") from error
         raise
+
+
+_LOCK = ".in-use"
+_YOUNG_S = 3600.0
+"""A folder without its lock file is left alone so long: its process may be just about to make it."""
+
+
+@contextlib.contextmanager
+def temporary_folder(name: str) -> Iterator[Path]:
+    """An empty folder. Its owner holds a lock on a file in it, which the kernel gives back when the process ends."""
+    remove_abandoned(name)
+    with tempfile.TemporaryDirectory(prefix=f"verso-{name}-") as folder, open(Path(folder, _LOCK), "wb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        inner = Path(folder, "files")
+        inner.mkdir()
+        yield inner
+
+
+def remove_abandoned(name: str) -> None:
+    """Removes the folders of this name whose process is gone."""
+    for folder in Path(tempfile.gettempdir()).glob(f"verso-{name}-*"):
+        with contextlib.suppress(OSError):
+            if _is_abandoned(folder):
+                shutil.rmtree(folder)
+
+
+def _is_abandoned(folder: Path) -> bool:
+    try:
+        with open(folder / _LOCK, "rb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+    except BlockingIOError:
+        return False
+    except FileNotFoundError:
+        return time.time() - folder.stat().st_mtime > _YOUNG_S

@@ -20,8 +20,8 @@ from obstore.store import from_url
 
 from schemas.dataset.layout import PROBE_PREFIX, TEMPORARY
 from schemas.errors import MachineError, OutputError, RunError
+from workers.store.file_system import remove_abandoned, temporary_folder
 from workers.store.store import Entry, Store, Version
-from workers.store.temporary_folder import remove_abandoned, temporary_folder
 
 if TYPE_CHECKING:
     from obstore import PutMode, PutResult

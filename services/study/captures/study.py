@@ -15,7 +15,7 @@ from services.study.measure.timing import timed_rows
 from services.study.model import Plan, Row
 from workers.pipeline.captures.make_capture import simulate_one
 from workers.pipeline.context import WorkerContext
-from workers.store.temporary_folder import temporary_folder
+from workers.store.file_system import temporary_folder
 
 LEAST_CAPTURES = 2
 """Fewer tell nothing of how errors spread."""

@@ -21,8 +21,7 @@ from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene
 from workers.plan.effects import Facts, plan_effects
 from workers.plan.randomness import SceneChance, Stream
-from workers.render.step import draw_view
-from workers.render.tiers import require_tier
+from workers.render.tiers import draw_view, require_tier
 
 WIDTH, HEIGHT = 640, 480
 """The size of the image that colours are compared at, whatever the size of the image under test. Only a crop is traced."""

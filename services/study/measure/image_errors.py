@@ -15,7 +15,7 @@ from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
 from schemas.scene.view import Pair, View
 from services.study.measure.rays import Patch, Pixels, Seen
 from services.study.measure.truth import Truth
-from workers.geometry.stored_depth import dequantise_depth
+from workers.geometry.pixels import dequantise_depth
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene
 

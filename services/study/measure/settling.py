@@ -16,7 +16,7 @@ from services.study.knobs import apply
 from services.study.model import Setting
 from workers.geometry.frames import motion_between, transform
 from workers.physics.fall import FINEST
-from workers.physics.step import Rest, moved_by, recheck_scene, settle_scene
+from workers.physics.settle import Rest, moved_by, recheck_scene, settle_scene
 from workers.pipeline.context import WorkerContext
 from workers.plan.effects import Facts, plan_effects
 from workers.plan.randomness import SceneChance

@@ -13,7 +13,7 @@ from schemas.errors import SceneError
 from services.bench.ratios import Spread
 from services.study.measure.settling import context_for
 from services.study.model import Row, Setting
-from workers.physics.step import settle_scene
+from workers.physics.settle import settle_scene
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.run_shard import run_scene
 from workers.pipeline.stopwatch import Stopwatch

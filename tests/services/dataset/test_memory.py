@@ -14,7 +14,7 @@ from services.dataset.dataset import Dataset
 from services.job.read import validate_job
 from services.job.record import encode_job, record_job
 from tests.datasets import SMALL
-from tests.many_ranges import ManyRanges
+from tests.kit.many_ranges import ManyRanges
 
 def stream(root, ranges):
     store = ManyRanges(root, ranges)

@@ -13,11 +13,12 @@ from obstore.store import MemoryStore
 
 from schemas.dataset.layout import SUCCESS_FILE
 from schemas.errors import RunError
-from services.merge import install, reading
-from services.merge.step import merge, read_success
-from tests.disk_faults import disk
+from services.merge import merge as install
+from services.merge import reading
+from services.merge.merge import merge, read_success
+from tests.kit.faults import disk
+from tests.kit.s3_server import Bucket, s3_server
 from tests.made_up_scenes import attempt_at, failed_scene, small_scene, terms
-from tests.s3_server import Bucket, s3_server
 from workers.store import objects
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore

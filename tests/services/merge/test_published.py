@@ -4,8 +4,7 @@ import pytest
 from obstore.store import MemoryStore
 
 from schemas.errors import CorruptError
-from services.merge.published import PublishedFiles
-from services.merge.reading import read_blocks
+from services.merge.reading import PublishedFiles, read_blocks
 from tests.made_up_scenes import attempt_at, made_scene, terms
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore

@@ -6,7 +6,7 @@ import pytest
 
 from schemas.dataset.layout import STAGING
 from schemas.errors import CommitConflict, CorruptError, RunError
-from services.merge.step import merge, read_success
+from services.merge.merge import merge, read_success
 from tests.made_up_datasets import FIRST, STOP, dataset_at
 from tests.made_up_scenes import attempt_at, made_scene, terms, with_shapes
 from workers.store.local import LocalStore

@@ -9,7 +9,7 @@ from schemas.errors import CorruptError, InputError
 from schemas.queue import MARK_FILE, event_path, request_path
 from services.queue.store import Queue, make_queue, open_queue
 from tests.fake_drivers import ids, queue_of, request_of
-from tests.s3_server import Bucket, s3_server
+from tests.kit.s3_server import Bucket, s3_server
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 

@@ -11,10 +11,10 @@ from schemas.queue import submission_id
 from services.queue.decide import Driver
 from services.queue.store import Queue, make_queue
 from services.queue.supervise import build_entrypoint, hold_queue
-from tests.disk_faults import unflushed
 from tests.fake_drivers import ids
+from tests.kit.faults import unflushed
+from tests.kit.s3_server import Bucket, s3_server
 from tests.queue_world import AT_ONCE, DIES, Killed, World
-from tests.s3_server import Bucket, s3_server
 from workers.store.objects import ObjectStore
 
 __all__ = ["unflushed"]

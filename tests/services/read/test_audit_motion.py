@@ -9,7 +9,7 @@ from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed, PosedScene
 from schemas.scene.view import View
 from services.read.audit_motion import compare_masks, move_between, shift_px
-from tests.shapes import box, shape_of
+from tests.kit.shapes import box, shape_of
 from tests.workers.render.random_scenes import APPEARANCE, floor
 from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.render.raster.gbuffer import shared_renderer

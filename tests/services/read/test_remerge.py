@@ -5,7 +5,7 @@ import hashlib
 
 import pytest
 
-from services.merge.step import read_success
+from services.merge.merge import read_success
 from services.read import remerge
 from services.read.path_index import PathIndex
 from services.read.remerge import Remerge

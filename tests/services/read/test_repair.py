@@ -9,7 +9,7 @@ import pytest
 from schemas.scene.scene import encoded_file
 from services.cli.main import main
 from services.job.record import require_job
-from services.merge.step import read_success
+from services.merge.merge import read_success
 from services.read import remake
 from services.read.repair import Repair, repair
 from tests.damage import files_by_kind, kind_of

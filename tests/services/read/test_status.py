@@ -8,7 +8,7 @@ from schemas.errors import OutputError
 from schemas.job.job import Job
 from services.cli.main import main
 from services.job.record import encode_job, record_job
-from services.merge.step import merge
+from services.merge.merge import merge
 from services.read.status import read_status
 from services.run.lock import hold_lock
 from tests.made_up_scenes import attempt_at, failed_scene, scene

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests import many_ranges
+from tests.kit import many_ranges
 
 VERIFY = """
 import json, sys

@@ -9,7 +9,7 @@ from services.read.verify_job import read_stored_job
 from services.read.verify_range import RangeCheck, read_records
 from tests.datasets import faults_of, make_dataset
 from workers.store.local import LocalStore
-from workers.store.pose_labels import encode_label
+from workers.store.tars import encode_label
 
 
 def test_a_range_is_counted_and_its_rows_are_kept(tiny, tmp_path):

@@ -3,7 +3,7 @@ import json
 import pytest
 
 from schemas.dataset.layout import LEDGER_FILE, SUCCESS_FILE, commit_path
-from services.merge.step import merge
+from services.merge.merge import merge
 from services.run import losses
 from services.run.losses import find_lost
 from tests.made_up_datasets import FIRST, STOP, dataset_at

@@ -11,7 +11,7 @@ from schemas.dataset.layout import LOCK_FILE
 from schemas.errors import RunError
 from services.run import lock as module
 from services.run.lock import hold_lock, read_holder
-from tests.lost_locks import FAST, STILL, taken_over
+from tests.kit.faults import FAST, STILL, taken_over
 from workers.store.local import LocalStore
 
 

@@ -10,7 +10,7 @@ from prometheus_client.parser import text_string_to_metric_families
 import services.run.step
 from schemas.errors import MachineError
 from schemas.job.job import Job
-from services.merge.step import merge
+from services.merge.merge import merge
 from services.run.metrics import Counts, Meter, serve
 from services.run.ray_cluster import private_ray
 from services.run.step import RunRequest, run_job

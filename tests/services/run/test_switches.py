@@ -12,7 +12,7 @@ from services.bench.command import refuse_unmatched
 from services.job.read import validate_job
 from services.job.record import require_job
 from services.merge.dataset_card import describe_dataset
-from services.merge.step import MergeResult, read_success
+from services.merge.merge import MergeResult, read_success
 from services.read.contact_sheet import draw_sheet
 from services.read.query import query
 from services.read.replay import open_context, replay_scene

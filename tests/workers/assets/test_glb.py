@@ -12,7 +12,7 @@ from schemas.base import frozen_array
 from schemas.job.assets import MeshLimits, ProceduralSource
 from schemas.job.category import CATEGORIES
 from schemas.scene.shape import Material, Part, Shape
-from tests.shapes import asset_of
+from tests.kit.shapes import asset_of
 from tests.workers.assets.oracles import welded, write
 from workers.assets.builtin.make import make_asset
 from workers.assets.external.mesh import is_solid, load_shape

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 
 from workers.capture.edges import refine_corners
-from workers.geometry.srgb import encode_srgb
+from workers.geometry.colour import encode_srgb
 
 
 def square(corners, blur_px, exposure):

@@ -7,7 +7,7 @@ import trimesh
 from schemas.base import frozen_array
 from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.shape import Mesh
-from tests.shapes import shape_of
+from tests.kit.shapes import shape_of
 from workers.capture.raster import draw_depth
 from workers.geometry.camera import look_at
 from workers.geometry.raycast import Placed, cast_view

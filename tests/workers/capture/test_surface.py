@@ -10,7 +10,7 @@ from workers.capture.depth_fit import fit_depth
 from workers.capture.posed_view import PosedView
 from workers.capture.surface import UNSEEN, Sight, color_points, exposure_gains, measure_offsets, observe, sample_light
 from workers.geometry.camera import look_at
-from workers.geometry.srgb import decode_codes
+from workers.geometry.colour import decode_codes
 
 K = kinect(0.25)
 NOTHING = Thing(sphere=None, boxes=[])

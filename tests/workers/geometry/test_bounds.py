@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workers.geometry.bounds import bounds_of
+from workers.geometry.mesh import bounds_of
 
 
 @pytest.mark.parametrize("count", [1, 2, 1000])

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from workers.geometry.contact_kernels import bounds_in, corners_on_faces, edges_across_edges, find_near
+from workers.physics.contact_surface import bounds_in, find_near
+from workers.physics.contacts import corners_on_faces, edges_across_edges
 
 PAIR = np.array([[0, 0]])
 FACE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -7,9 +7,9 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from tests import shapes
-from tests.contacts import box, mesh_of
-from workers.geometry.contact_surface import Surface, crop, faces_within, is_closed, skin_of, surface_of
+from tests.kit import shapes
+from tests.kit.contacts import box, mesh_of
+from workers.physics.contact_surface import Surface, crop, faces_within, is_closed, skin_of, surface_of
 
 DEEP_M = 1e-3
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from workers.geometry.convex_partition import partition_outlines
+from workers.geometry.lathe_decomposition import partition_outlines
 
 L_SHAPE = np.array([(0, 0), (3, 0), (3, 1), (1, 1), (1, 3), (0, 3)], dtype=np.float64)
 STAR = np.array([(np.cos(k * np.pi / 7) * r, np.sin(k * np.pi / 7) * r) for k, r in enumerate([2.0, 0.7] * 7)])

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from workers.geometry.convexity import (
+from workers.geometry.mesh import (
     components,
     concavity_m,
     face_areas,

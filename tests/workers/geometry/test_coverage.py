@@ -9,9 +9,9 @@ import trimesh
 from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Part, Shape
-from workers.geometry.coverage import LARGEST_PX, NEAREST_M, count_covered
 from workers.geometry.frames import pose, translation, uniform_rotation
 from workers.geometry.raycast import cast_view
+from workers.geometry.zbuffer import LARGEST_PX, NEAREST_M, count_covered
 
 K = Intrinsics(width=160, height=120, fx=128.0, fy=128.0, cx=80.0, cy=60.0)
 ONE_PIXEL_M = 1.0 / 128.0

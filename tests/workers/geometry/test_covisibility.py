@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.workers.labels.planes import HERE, IMAGES, THERE, plane_view
-from workers.geometry.covisibility import Bounds, Seen, compare_covisible
+from workers.geometry.projection import Bounds, Seen, compare_covisible
 
 BOUNDS = Bounds(facing=0.1, smooth_m=(0.002, 0.001), hidden_m=0.01)
 UNITS = IMAGES.depth_units_per_m

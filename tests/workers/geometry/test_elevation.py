@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from workers.geometry.elevation import sample_elevation, vertical_gap
+from workers.physics.support import sample_elevation, vertical_gap
 
 
 def mesh(m: trimesh.Trimesh) -> Mesh:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workers.geometry.first_equal import first_equal
+from workers.geometry.mesh import first_equal
 
 
 def by_sorting(rows):

@@ -12,11 +12,11 @@ from schemas.scene.shape import Loft, Mesh
 from workers.assets.builtin.make import make_asset
 from workers.assets.builtin.solid import circle, difference, lathe, union
 from workers.assets.builtin.sweeps import prism
-from workers.geometry.convexity import solid_of, weld
+from workers.geometry.distance import nearest_on_mesh
 from workers.geometry.lathe_decomposition import COARSE, decompose_lofts
-from workers.geometry.nearest import nearest_on_mesh
-from workers.physics.convex_parts import step as decompose
-from workers.physics.convex_parts.step import parts_of
+from workers.geometry.mesh import solid_of, weld
+from workers.physics import convex_parts as decompose
+from workers.physics.convex_parts import parts_of
 
 AIM_M = 5e-5
 """Largest distance that parts of a shape 0.25 m along its diagonal may stand out, or leave uncovered."""

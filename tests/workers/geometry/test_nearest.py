@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from workers.geometry.nearest import nearest_on_mesh, nearest_on_segments
+from workers.geometry.distance import nearest_on_mesh, nearest_on_segments
 
 
 def test_the_nearest_point_is_the_one_that_trimesh_finds():

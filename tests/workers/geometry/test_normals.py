@@ -7,7 +7,7 @@ from schemas.scene.camera import Camera, Intrinsics
 from tests.workers.labels.planes import HERE, plane_view
 from tests.workers.labels.planes import K as PLANE_K
 from workers.geometry.camera import unproject
-from workers.geometry.normals import facing_cosine, is_smooth
+from workers.geometry.pixels import facing_cosine, is_smooth
 
 K = Intrinsics(width=12, height=10, fx=20.0, fy=21.0, cx=6.0, cy=5.0)
 CAMERA = Camera(K, np.eye(4))

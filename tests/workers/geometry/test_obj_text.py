@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workers.geometry.obj_text import DECIMALS, obj_of
+from workers.physics.bullet import DECIMALS, obj_of
 
 TETRAHEDRON = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 

@@ -5,7 +5,7 @@ import shapely
 
 from schemas.scene.camera import Intrinsics
 from workers.geometry.camera import unproject
-from workers.geometry.ray_kernels import keep_nearer, meet_planes, pixel_rays, pixels_between, row_spans
+from workers.geometry.raycast import keep_nearer, meet_planes, pixel_rays, pixels_between, row_spans
 
 K = Intrinsics(width=160, height=120, fx=130.0, fy=140.0, cx=77.3, cy=62.1)
 

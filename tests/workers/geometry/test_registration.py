@@ -21,7 +21,7 @@ from tests.workers.geometry.made_up_kinect import (
 )
 from workers.geometry.frames import pose, rotation_about
 from workers.geometry.rational_lens import project_points
-from workers.geometry.registration import register_depth
+from workers.geometry.zbuffer import register_depth
 
 SMALL_COLOR = smaller(COLOR, 0.25)
 SMALL = dataclasses.replace(CAMERA, intrinsics=smaller(DEPTH, 0.25))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from workers.geometry.frames import pose, uniform_rotation
-from workers.geometry.sight import BLOCK, bound_view, columns_in_sight
+from workers.geometry.projection import BLOCK, bound_view, columns_in_sight
 
 HEIGHT, WIDTH, FOCAL_PX = BLOCK[0], 5 * BLOCK[1] + 7, 90.0
 RAY_X, RAY_Y = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL_PX, (np.arange(HEIGHT) + 0.5 - HEIGHT / 2) / FOCAL_PX

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workers.geometry.srgb import SRGB_STEPS, decode_codes, decode_srgb, encode_codes, encode_srgb
+from workers.geometry.colour import SRGB_STEPS, decode_codes, decode_srgb, encode_codes, encode_srgb
 
 
 def test_known_values():

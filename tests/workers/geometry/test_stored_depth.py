@@ -3,7 +3,7 @@
 import numpy as np
 
 from schemas.job.images import Images
-from workers.geometry.stored_depth import dequantise_depth, quantise_depth
+from workers.geometry.pixels import dequantise_depth, quantise_depth
 
 IMAGES = Images()
 

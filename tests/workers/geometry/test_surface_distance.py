@@ -5,8 +5,7 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from workers.geometry.nearest import nearest_on_mesh
-from workers.geometry.surface_distance import distance_to_mesh
+from workers.geometry.distance import distance_to_mesh, nearest_on_mesh
 
 
 @pytest.mark.parametrize("seed", range(3))

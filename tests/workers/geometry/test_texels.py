@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workers.geometry.texels import has_holes
+from workers.geometry.colour import has_holes
 
 
 @pytest.mark.parametrize(("alpha", "holes"), [(255, False), (128, False), (127, True), (0, True)])

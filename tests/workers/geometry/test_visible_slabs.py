@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from workers.geometry.visible_slabs import is_covered, ring_points, stack_slabs, trace_visible_border
+from workers.geometry.lathe_decomposition import is_covered, ring_points, stack_slabs, trace_visible_border
 
 CONE = np.array([(0.0, 0.0), (2.0, 0.0), (0.0, 4.0)])
 CUP = np.array([(0.0, 0.0), (3.0, 0.0), (3.0, 5.0), (2.0, 5.0), (2.0, 1.0), (0.0, 1.0)])

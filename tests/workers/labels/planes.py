@@ -7,7 +7,7 @@ from schemas.scene.camera import Camera, Intrinsics, Role
 from schemas.scene.view import View
 from workers.cameras.placement import mirror_pose
 from workers.geometry.camera import orbit_pose, unproject
-from workers.geometry.stored_depth import quantise_depth
+from workers.geometry.pixels import quantise_depth
 
 K = Intrinsics(width=160, height=120, fx=131.0, fy=131.0, cx=80.0, cy=60.0)
 IMAGES = Images()

@@ -13,8 +13,8 @@ from schemas.job.job import Job
 from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed, PosedScene
 from schemas.scene.view import Agreement, GBuffer
+from tests.kit.shapes import asset_of, box, shape_of, table
 from tests.physics.settling import settle_single
-from tests.shapes import asset_of, box, shape_of, table
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.geometry.raycast import cast_view, edge_distance_px

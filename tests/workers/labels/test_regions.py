@@ -5,7 +5,7 @@ import pytest
 
 from schemas.job.job import Job
 from schemas.scene.scene import Placed, PosedScene
-from tests.shapes import asset_of, box, table
+from tests.kit.shapes import asset_of, box, table
 from tests.workers.labels.planes import HERE, K
 from workers.geometry.frames import translation
 from workers.geometry.pixels import Extent

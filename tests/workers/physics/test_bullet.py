@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from schemas.job.job import Job
 from schemas.scene.shape import Mesh
-from tests.gravity import set_gravity
+from tests.kit.gravity import set_gravity
+from tests.kit.shapes import box
 from tests.physics.room import at, ball_body, drop, physics
-from tests.shapes import box
 from workers.geometry.frames import pose, quaternion_from_rotation, rotation_about, uniform_rotation
 from workers.physics import bullet
 from workers.physics.bullet import GRAVITY_M_S2, open_world

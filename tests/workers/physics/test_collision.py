@@ -9,12 +9,12 @@ import trimesh
 from schemas.job.job import Job
 from schemas.job.physics import Collision, Physics
 from schemas.scene.plan import ObjectStart
+from tests.kit.shapes import asset_of, box, table
 from tests.physics.settling import settle_single
-from tests.shapes import asset_of, box, table
 from workers.geometry.frames import angle_between, pose, rotation_about
 from workers.geometry.hull import convex_hull
 from workers.physics.effects import PREDICATES, called_for
-from workers.physics.table_top import place_table
+from workers.physics.support import place_table
 
 PHYSICS = Job(name="t").physics
 TABLE = place_table(table())

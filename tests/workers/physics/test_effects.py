@@ -11,7 +11,7 @@ from schemas.job.assets import ProceduralSource
 from schemas.job.job import Job
 from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import Asset
-from tests.shapes import asset_of, box, shape_of, table
+from tests.kit.shapes import asset_of, box, shape_of, table
 from workers.assets.builtin.make import make_asset
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.geometry.hull import convex_hull
@@ -25,7 +25,7 @@ from workers.physics.effects import (
     rooms_m,
     starts_over_top,
 )
-from workers.physics.table_top import place_table
+from workers.physics.support import place_table
 from workers.plan.effects import PHYSICS_EFFECTS
 
 PHYSICS = Job(name="t").physics

@@ -9,7 +9,7 @@ from schemas.job.job import Job
 from schemas.job.physics import Physics
 from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import Mesh
-from tests.shapes import asset_of, box
+from tests.kit.shapes import asset_of, box
 from workers.geometry.frames import (
     pose,
     quaternion_from_rotation,

@@ -12,15 +12,14 @@ from schemas.scene.plan import ObjectStart, Table
 from tests.hard_cases.bodies import built_in, cube
 from tests.hard_cases.drops import Y, level, table_of, turn
 from tests.hard_cases.groups import put, together
+from tests.kit.shapes import asset_of, box
 from tests.physics.settling import settle_group
-from tests.shapes import asset_of, box
 from workers.geometry.frames import motion_between, transform, translation
-from workers.physics import hold as module
+from workers.physics import release as module
+from workers.physics.exact_rest import Rested, rest
 from workers.physics.fall import Outcome
-from workers.physics.hold import FAR_M, HELD, MOST_HOLDS, hold, let_go
 from workers.physics.placement import Placement, forms_of, place
-from workers.physics.release import Drop
-from workers.physics.rest.rest import Rested, rest
+from workers.physics.release import FAR_M, HELD, MOST_HOLDS, Drop, hold, let_go
 
 PHYSICS = Job(name="t").physics
 """A friction of 0.7, so that a contact's is 0.49: the angle of friction is 26.1 degrees."""

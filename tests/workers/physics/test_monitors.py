@@ -10,11 +10,11 @@ from schemas.job.job import Job
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart
 from tests.hard_cases.drops import X, turn
-from tests.shapes import asset_of, box, table
+from tests.kit.shapes import asset_of, box, table
 from workers.geometry.frames import pose, quaternion_from_rotation, uniform_rotation
 from workers.geometry.hull import convex_hull
 from workers.physics.bullet import GRAVITY_M_S2
-from workers.physics.monitors import (
+from workers.physics.fall import (
     LIFT_M,
     SHARE,
     SLIDE_M,
@@ -26,7 +26,7 @@ from workers.physics.monitors import (
 )
 from workers.physics.release import PACES, Drop, release
 from workers.physics.rigid_body import Body, body_frame, make_body
-from workers.physics.table_top import place_table
+from workers.physics.support import place_table
 
 TOP_M, FRICTION = 0.7, 0.49
 STILL = (0.0, 0.0, 0.0)

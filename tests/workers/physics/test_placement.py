@@ -9,10 +9,11 @@ import pytest
 from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.region import REGION_TABLE
 from schemas.scene.shape import Asset
-from tests.shapes import asset_of, box, shape_of, table
+from tests.kit.shapes import asset_of, box, shape_of, table
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.geometry.hull import convex_hull
 from workers.physics.placement import (
+    FARTHEST_M,
     Support,
     forms_of,
     measure_supports,
@@ -20,8 +21,7 @@ from workers.physics.placement import (
     place_on_top,
     placed_mesh,
 )
-from workers.physics.separation import FARTHEST_M
-from workers.physics.table_top import place_table
+from workers.physics.support import place_table
 
 Y = np.array([0.0, 1.0, 0.0])
 FRICTION = 0.5

@@ -5,7 +5,7 @@ import os
 import numpy as np
 import pytest
 
-from workers.physics.pybullet_flaws import STDERR, BulletBuffers, silence_stderr
+from workers.physics.bullet import STDERR, BulletBuffers, silence_stderr
 
 
 def test_longer_and_shorter_lists_have_their_own_contents_in_the_same_objects():

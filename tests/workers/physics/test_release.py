@@ -14,8 +14,8 @@ from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import built_in, cube, rod
 from tests.hard_cases.drops import X, turn
 from tests.hard_cases.groups import put, stack, together, tray
+from tests.kit.shapes import asset_of, box, table
 from tests.physics.settling import recheck_group, settle_group
-from tests.shapes import asset_of, box, table
 from workers.geometry.frames import pose
 from workers.geometry.hull import convex_hull
 from workers.physics.fall import FINEST, LOOK_STEPS, SAMPLE_STEPS, fall
@@ -33,7 +33,7 @@ from workers.physics.release import (
     release,
     settings_of,
 )
-from workers.physics.table_top import place_table
+from workers.physics.support import place_table
 
 PHYSICS = Job(name="t").physics
 TABLE = place_table(table())

@@ -7,10 +7,10 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from tests.shapes import box
+from tests.kit.shapes import box
 from workers.geometry.frames import DOWN, angle_between, pose, rotation_about, transform
 from workers.geometry.hull import convex_hull
-from workers.physics.rest_pose import snap_to_face, stands_on_face, support_margin
+from workers.physics.support import snap_to_face, stands_on_face, support_margin
 
 X = np.array([1.0, 0.0, 0.0])
 CUBE = convex_hull(np.asarray(box(0.1, 0.1, 0.1).vertices))

@@ -8,7 +8,7 @@ from schemas.job.job import Job
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import Asset
-from tests.shapes import asset_of, box
+from tests.kit.shapes import asset_of, box
 from workers.geometry.frames import pose, rotation_about, transform, uniform_rotation
 from workers.geometry.hull import convex_hull, depth_m
 from workers.physics import rigid_body

@@ -8,10 +8,10 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from tests.contacts import mesh_of
-from tests.shapes import box
+from tests.kit.contacts import mesh_of
+from tests.kit.shapes import box
 from workers.geometry.frames import pose, rotation_about, translation, uniform_rotation
-from workers.physics.separation import FARTHEST_M, Form, find_gaps_m, find_overlaps_m
+from workers.physics.placement import FARTHEST_M, Form, find_gaps_m, find_overlaps_m
 
 CUBE = Form(mesh_of(box(0.1, 0.1, 0.1)))
 GROUND = Form(mesh_of(box(2.0, 2.0, 0.1, (0, 0, -0.05))))

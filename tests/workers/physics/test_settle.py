@@ -11,15 +11,15 @@ from schemas.job.job import Job
 from schemas.scene.plan import ObjectStart
 from schemas.scene.scene import Settled
 from schemas.scene.shape import Asset
+from tests.kit.shapes import asset_of, box, table
 from tests.physics.settling import effects_of, scene_of, settle_group, settle_single
-from tests.shapes import asset_of, box, table
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.geometry.hull import convex_hull
 from workers.physics import settle
 from workers.physics.effects import called_for
-from workers.physics.rest.rest import Rested
-from workers.physics.step import LEFT_ROOM, LEFT_TOP, Rest, settle_scene
-from workers.physics.table_top import place_table
+from workers.physics.exact_rest import Rested
+from workers.physics.settle import LEFT_ROOM, LEFT_TOP, Rest, settle_scene
+from workers.physics.support import place_table
 
 PHYSICS = Job(name="t").physics
 TABLE = place_table(table())

@@ -13,17 +13,16 @@ from schemas.job.job import Job
 from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import Mesh
+from tests.kit.shapes import asset_of, box, shape_of, table
 from tests.physics.population import draw
 from tests.physics.settling import effects_of, recheck, scene_of, settle_single
-from tests.shapes import asset_of, box, shape_of, table
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
-from workers.geometry.elevation import vertical_gap
 from workers.geometry.frames import angle_between, pose, rotation_about, transform, translation
 from workers.geometry.hull import convex_hull
 from workers.physics.fall import FINEST, fall
-from workers.physics.step import RECHECK_RATE, RECHECK_S, Rest, recheck_scene, release_again
-from workers.physics.table_top import place_table
+from workers.physics.settle import RECHECK_RATE, RECHECK_S, Rest, recheck_scene, release_again
+from workers.physics.support import place_table, vertical_gap
 from workers.plan.randomness import SceneChance
 from workers.plan.step import draw_scene, draw_start
 
@@ -108,7 +107,7 @@ def test_what_is_let_go_again_is_watched_to_the_end_however_still_it_stands(monk
         watched.append(fall(*arguments, **more))
         return watched[-1]
 
-    monkeypatch.setattr("workers.physics.hold.fall", told)
+    monkeypatch.setattr("workers.physics.release.fall", told)
     recheck(start, rest, TABLE, PHYSICS)
     plan = draw_scene(Job(name="t"), SceneChance(0, 0), table(), start.asset)
     plan = dataclasses.replace(plan, objects=(start,), table=TABLE)
@@ -123,7 +122,7 @@ def test_a_single_object_on_level_ground_alone_is_let_go_again_in_a_quarter_of_t
         rates.append(steps.base_hz / PHYSICS.step_hz)
         return fall(bodies, poses, ground, physics, steps, *rest, **more)
 
-    monkeypatch.setattr("workers.physics.hold.fall", told)
+    monkeypatch.setattr("workers.physics.release.fall", told)
     asset, at = asset_of(box(0.06, 0.06, 0.06)), [translation(x_m, 0.0, TOP + 0.03) for x_m in (0.0, 0.06, 0.699)]
     starts = [start_of(asset, T) for T in at]
     one = settle_single(start_of(asset, at[0]), TABLE, PHYSICS)

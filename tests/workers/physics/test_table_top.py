@@ -6,8 +6,8 @@ import trimesh
 
 from schemas.errors import StartError
 from schemas.scene.shape import Mesh
-from tests.shapes import asset_of, box, shape_of, table
-from workers.physics.table_top import find_table_top, inside_margin, place_table, split_by_side, support_height
+from tests.kit.shapes import asset_of, box, shape_of, table
+from workers.physics.support import find_table_top, inside_margin, place_table, split_by_side, support_height
 
 
 def test_the_top_is_the_top_and_not_a_shelf_or_a_rim():

@@ -35,11 +35,10 @@ def _pause(x):
 """
 NAMES = "abcdefgh"
 ELSEWHERE = {
-    "workers.geometry.nearest": {"_nearest"},
-    "workers.geometry.normals": {"_facing_cosine"},
+    "workers.geometry.distance": {"_nearest", "_box_distance2", "_search"},
+    "workers.geometry.pixels": {"_facing_cosine"},
     "workers.geometry.rational_lens": {"_distort", "_pixel_rays", "_project_points"},
-    "workers.geometry.registration": {"_draw", "_draw_triangle", "_lift"},
-    "workers.geometry.surface_distance": {"_box_distance2", "_search"},
+    "workers.geometry.zbuffer": {"_draw", "_draw_triangle", "_lift"},
     "workers.labels.board_regions": {"_meets_rectangle"},
 }
 """Loops that only captures, models of sensors and some sources of assets use."""

@@ -12,7 +12,7 @@ from schemas.errors import StartError
 from schemas.job.job import Job
 from schemas.scene.plan import ObjectStart, ScenePlan
 from schemas.scene.shape import Asset
-from tests.shapes import asset_of, box, table
+from tests.kit.shapes import asset_of, box, table
 from workers.geometry.frames import transform
 from workers.plan.arrange import APART_M, columns_apart
 from workers.plan.randomness import SceneChance

@@ -12,8 +12,8 @@ from schemas.scene.effects import EffectPlan
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Material, Part, Shape
 from tests.workers.render.random_scenes import EYE, floor
+from workers.geometry.colour import decode_srgb
 from workers.geometry.frames import invert
-from workers.geometry.srgb import decode_srgb
 
 Look = tuple[Render, EffectPlan]
 

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-import workers.render.step
+import workers.render.tiers
 from tests.effects.scenes import Setting, facts_of, with_holes
 from tests.workers.render.looks import FLAT, FOUR, RASTER, paths, without
 from tests.workers.render.pathtraced.scenes import traced
 from tests.workers.render.random_scenes import APPEARANCE, camera, orbit_and_mirror, random_things, small
 from workers.plan.effects import EFFECTS, plan_effects
 from workers.render.raster.gbuffer import FLAT_EFFECTS
-from workers.render.step import draw_view
+from workers.render.tiers import draw_view
 
 
 @traced
@@ -28,7 +28,7 @@ def test_labels_are_the_same_to_the_byte_in_all_tiers(renderer):
 
 
 def test_without_rgb_nothing_is_traced(renderer, monkeypatch):
-    monkeypatch.setattr(workers.render.step, "shared_tracer", lambda: pytest.fail("a path was traced"))
+    monkeypatch.setattr(workers.render.tiers, "shared_tracer", lambda: pytest.fail("a path was traced"))
     rng = np.random.default_rng(900)
     things, height = random_things(rng)
     view = camera(small(64, 48), orbit_and_mirror(rng, height)[0].T_world_cam)

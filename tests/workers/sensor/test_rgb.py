@@ -8,8 +8,8 @@ import pytest
 
 from schemas.job.sensor import Distortion, Exposure, RgbNoise, SensorEffects
 from schemas.scene.camera import Intrinsics
-from workers.geometry.srgb import decode_codes as decode
-from workers.geometry.srgb import encode_codes as encode
+from workers.geometry.colour import decode_codes as decode
+from workers.geometry.colour import encode_codes as encode
 from workers.sensor.rgb import add_noise, distort, expose, sense_rgb
 
 K = Intrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=80.0, cy=60.0)

@@ -18,7 +18,7 @@ from services.run.ray_cluster import private_ray
 from services.run.slots import Slots
 from services.run.step import RunRequest, run_job
 from tests.services.run.test_step import SMALL
-from workers.geometry.srgb import decode_codes
+from workers.geometry.colour import decode_codes
 from workers.sensor.step import SensorChance, planned_effects, sense_view
 from workers.store.local import LocalStore
 

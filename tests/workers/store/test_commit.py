@@ -8,8 +8,8 @@ import pytest
 from schemas.dataset.commit import FileEntry
 from schemas.dataset.layout import RANGES, STAGING, commit_path, range_table_path
 from schemas.errors import CommitConflict, CorruptError
+from tests.kit.faults import check_published
 from tests.made_up_scenes import attempt_at, made_scene, terms, with_shapes
-from tests.published_files import check_published
 from workers.store.commit import (
     commit_names,
     commits_digest,
@@ -18,8 +18,7 @@ from workers.store.commit import (
     read_committed,
     read_record,
 )
-from workers.store.committed_rows import read_range_table
-from workers.store.ledger import read_summary
+from workers.store.ledger import read_range_table, read_summary
 from workers.store.local import LocalStore
 from workers.store.manifest import encode_table, table_of_rows
 

@@ -4,7 +4,7 @@ from schemas.dataset.layout import STAGING, range_table_path
 from schemas.dataset.tables import TABLES
 from schemas.errors import CorruptError, RunError
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene
-from workers.store.committed_rows import iter_ranges, range_rows
+from workers.store.ledger import iter_ranges, range_rows
 from workers.store.local import LocalStore
 
 pytestmark = pytest.mark.usefixtures("unflushed")

@@ -6,9 +6,9 @@ import pytest
 from schemas.dataset.layout import TEMPORARY
 from schemas.errors import MachineError, OutputError
 from workers.store import file_system
+from workers.store.attempt import sweep
 from workers.store.file_system import explain_disk_errors, file_system_of, refuse_link_out
 from workers.store.local import LocalStore
-from workers.store.sweep import sweep
 
 
 @pytest.fixture

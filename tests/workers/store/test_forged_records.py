@@ -8,12 +8,12 @@ import pytest
 
 from schemas.dataset.layout import STAGING, SUCCESS_FILE, commit_path
 from schemas.errors import CorruptError, OutputError, RunError
-from services.merge.step import merge, read_success
+from services.merge.merge import merge, read_success
 from tests.made_up_datasets import FIRST, STOP, dataset_at
 from tests.made_up_scenes import attempt_at
+from workers.store.attempt import sweep
+from workers.store.commit import seal_record
 from workers.store.local import LocalStore
-from workers.store.record import seal_record
-from workers.store.sweep import sweep
 
 pytestmark = pytest.mark.usefixtures("unflushed")
 

@@ -9,9 +9,8 @@ from schemas.dataset.ledger import LEDGER_SCHEMA, join_rows, rows_of
 from schemas.errors import CorruptError, MachineError
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, terms
 from workers.store import ledger as module
-from workers.store.commit import committed_files, read_record
+from workers.store.commit import committed_files, read_record, seal_record
 from workers.store.ledger import LedgerKeeper, list_commits, read_kept_rows, read_summary, save_rows
-from workers.store.record import seal_record
 
 pytestmark = pytest.mark.usefixtures("unflushed")
 

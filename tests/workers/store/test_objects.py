@@ -8,21 +8,20 @@ from obstore.store import LocalStore as FolderStore
 from schemas.dataset.commit import Span
 from schemas.dataset.layout import STAGING
 from schemas.errors import MachineError, OutputError, RunError
-from services.merge.step import merge, read_success
+from services.merge.merge import merge, read_success
 from services.read.query import query
 from services.read.status import read_status
 from services.run.lock import Beat, hold_lock, read_holder
 from services.run.range_planner import committed_ranges, plan_ranges
+from tests.kit.faults import check_published
+from tests.kit.s3_server import Bucket, s3_server
 from tests.made_up_scenes import attempt_at, made_scene, scene, terms
-from tests.published_files import check_published
-from tests.s3_server import Bucket, s3_server
 from tests.stored_images import iter_records, read_images
-from workers.store.attempt import attempts_at, begin_attempt, blamed_scene
+from workers.store.attempt import attempts_at, begin_attempt, blamed_scene, sweep
 from workers.store.commit import publish, read_record
-from workers.store.committed_rows import list_commits
+from workers.store.ledger import list_commits
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
-from workers.store.sweep import sweep
 
 pytestmark = pytest.mark.usefixtures("unflushed")
 

@@ -4,17 +4,19 @@ import pytest
 
 from schemas.dataset.layout import commit_path
 from schemas.errors import CorruptError, OutputError
+from tests.kit.faults import check_published
 from tests.made_up_scenes import attempt_at, made_scene
-from tests.published_files import check_published
 from tests.stored_images import iter_records
 from workers.store.commit import (
     committed_files,
     compare_attempts,
+    decode_record,
+    encode_record,
     publish,
     read_record,
+    seal_record,
 )
 from workers.store.ledger import read_summary
-from workers.store.record import decode_record, encode_record, seal_record
 
 pytestmark = pytest.mark.usefixtures("unflushed")
 

@@ -2,9 +2,9 @@ import pytest
 
 from schemas.dataset.layout import STAGING
 from schemas.errors import CorruptError
+from tests.kit.faults import check_published
 from tests.made_up_scenes import attempt_at
-from tests.published_files import check_published
-from workers.store.sweep import sweep
+from workers.store.attempt import sweep
 
 pytestmark = pytest.mark.usefixtures("unflushed")
 

@@ -12,8 +12,7 @@ from tests.made_up_scenes import attempt_at, made_scene, scene, terms
 from tests.stored_images import read_images
 from workers.store.local import LocalStore
 from workers.store.manifest import table_of_rows
-from workers.store.pose_labels import LABEL_TABLES
-from workers.store.tars import check_labels, member_of, path_of, read_labels, read_tar
+from workers.store.tars import LABEL_TABLES, check_labels, member_of, path_of, read_labels, read_tar
 
 pytestmark = pytest.mark.usefixtures("unflushed")
 

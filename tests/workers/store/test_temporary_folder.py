@@ -4,11 +4,11 @@ import subprocess
 import sys
 import tempfile
 
-from workers.store.temporary_folder import remove_abandoned, temporary_folder
+from workers.store.file_system import remove_abandoned, temporary_folder
 
 HOLD = """
 import sys, time
-from workers.store.temporary_folder import temporary_folder
+from workers.store.file_system import temporary_folder
 with temporary_folder("test") as folder:
     (folder / "rows").write_bytes(b"12")
     print(folder, flush=True)

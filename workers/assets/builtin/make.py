@@ -20,8 +20,8 @@ from workers.assets.builtin.laptop import make_laptop
 from workers.assets.builtin.parts import Model, cut_into_parts
 from workers.assets.builtin.table import make_table
 from workers.assets.mass import solid_mass
-from workers.geometry.bounds import bounds_of
 from workers.geometry.frames import pose
+from workers.geometry.mesh import bounds_of
 
 LICENCE = "CC0-1.0"
 GENERATORS: dict[str, tuple[int, Callable[[np.random.Generator], Model]]] = {

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.scene.shape import Material, Part, Shape
 from workers.assets.builtin.solid import TRIG_DIGITS, Indices, Solid, renumber
-from workers.geometry.bounds import bounds_of
 from workers.geometry.jit import compiled
+from workers.geometry.mesh import bounds_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,10 +17,8 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import Loft
-from workers.geometry.convexity import numbers_in
-from workers.geometry.first_equal import first_equal
 from workers.geometry.jit import compiled
-from workers.geometry.manifold import hold_to_one_thread
+from workers.geometry.mesh import first_equal, hold_to_one_thread, numbers_in
 
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.camera import Intrinsics
+from workers.geometry.colour import SRGB_STEPS
 from workers.geometry.jit import compiled
-from workers.geometry.srgb import SRGB_STEPS
 
 SAMPLES = 9
 """Images that are averaged into one photograph."""

@@ -19,7 +19,7 @@ from schemas.scene.scene import Placed
 from schemas.scene.shape import Asset
 from schemas.scene.view import ObjectLabel, Pair, View
 from workers.cameras.placement import object_distance, place_mirror_camera
-from workers.geometry.stored_depth import quantise_depth
+from workers.geometry.pixels import quantise_depth
 from workers.labels.board_regions import capture_regions
 from workers.labels.projected_view import derive_projected, projection_shares
 from workers.labels.regions import CountPixels, label_things

@@ -12,7 +12,7 @@ from schemas.scene.camera import Camera
 from workers.capture.simulate.effects import ASKED
 from workers.capture.simulate.lens import opencv_lens
 from workers.capture.simulate.path import plan_path
-from workers.geometry.srgb import encode_codes
+from workers.geometry.colour import encode_codes
 from workers.pipeline.captures.photograph import Studio, draw_labels, take_light
 from workers.plan.randomness import Stream
 from workers.store.capture_folder import CaptureFile, write_description, write_pose, write_view

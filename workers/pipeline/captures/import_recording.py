@@ -15,7 +15,7 @@ from workers.capture.recording.choose import FrameMeasure, choose_frames, measur
 from workers.capture.recording.images import DEPTH_FORMAT, decode_color, decode_depth, decode_gray, is_whole
 from workers.capture.recording.pairs import Losses, count_losses, pair_frames
 from workers.capture.recording.tracks import Recording, TrackFrame, open_recording, read_frames
-from workers.geometry.registration import register_depth
+from workers.geometry.zbuffer import register_depth
 from workers.store.capture_folder import CaptureFile, write_description, write_view
 
 RECORDING_FILE = "recording.json"

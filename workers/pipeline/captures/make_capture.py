@@ -23,7 +23,7 @@ from workers.plan.randomness import SceneChance
 from workers.store.capture_folder import open_folder
 from workers.store.capture_inputs import digest_inputs
 from workers.store.capture_truth import read_receipt, read_truth
-from workers.store.temporary_folder import temporary_folder
+from workers.store.file_system import temporary_folder
 
 SOURCE, SIMULATED = "capture", "simulated_capture"
 """`scenes.source` and `assets.source` of captures; those of scenes are the source of the shape."""

@@ -24,12 +24,12 @@ from workers.capture.simulate.noise import STEP_M, kinect_noise
 from workers.capture.simulate.place import true_board
 from workers.capture.simulate.rig import Rig, assumed_device, make_rig, scale_intrinsics
 from workers.capture.simulate.sampling import CENTRE, Sample, add_light, light_table, make_samples, shift_camera
+from workers.geometry.colour import encode_codes
 from workers.geometry.frames import translation
-from workers.geometry.registration import register_depth
-from workers.geometry.srgb import encode_codes
+from workers.geometry.zbuffer import register_depth
 from workers.plan.randomness import SceneChance, Stream
 from workers.render.raster.gbuffer import shared_renderer
-from workers.render.step import draw_view
+from workers.render.tiers import draw_view
 from workers.sensor.depth import sense_depth
 from workers.sensor.rgb import add_noise, expose
 

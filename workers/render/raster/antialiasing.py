@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.scene.region import REGION_FLOOR
+from workers.geometry.colour import SRGB_STEPS, encode_srgb
 from workers.geometry.jit import compiled
-from workers.geometry.srgb import SRGB_STEPS, encode_srgb
 
 CONTRAST = 24
 """An edge pixel differs from one of its neighbours by more than this, in steps of 8 bits."""

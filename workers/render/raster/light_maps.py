@@ -17,8 +17,8 @@ from schemas.scene.scene import Placed
 from workers.render.raster import baking
 from workers.render.raster.baking import SHADOW_PX, Box
 from workers.render.raster.buffers import ShapeStore
+from workers.render.raster.draw_calls import LEVEL_UNIT, SHADOW_UNIT, MapPlacement, Program
 from workers.render.raster.lit_shaders import CAST_VERTEX, EMPTY_FRAGMENT
-from workers.render.raster.programs import LEVEL_UNIT, SHADOW_UNIT, MapPlacement, Program
 
 UPRIGHT = 1.0 - 1e-9
 """Least cosine between two directions that count as equal."""

@@ -11,7 +11,7 @@ import workers.geometry.camera
 import workers.geometry.pixels
 import workers.geometry.projection
 import workers.labels.patches
-import workers.render.step
+import workers.render.tiers
 from schemas.scene.camera import Camera, Intrinsics
 from services.read.verify_independent import verify_independently
 from tests.datasets import faults_of, make_dataset
@@ -73,7 +73,7 @@ def opencv_on_the_wrong_side(_: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def half_a_pixel_in_rendering(plant: Plant, _: Any) -> None:
-    original = workers.render.step.draw_view
+    original = workers.render.tiers.draw_view
     plant(
         original,
         lambda renderer, things, look, camera, *rest: original(

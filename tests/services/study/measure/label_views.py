@@ -14,7 +14,7 @@ from services.job.read import validate_job
 from services.study.measure.image_errors import measure_images
 from services.study.measure.truth import Truth
 from tests.effects.scenes import SMALL, context_of, merged
-from tests.shapes import box, shape_of
+from tests.kit.shapes import box, shape_of
 from workers.geometry.camera import look_at
 from workers.pipeline.make_scene import make_scene
 from workers.pipeline.stopwatch import Stopwatch

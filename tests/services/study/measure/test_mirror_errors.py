@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from schemas.scene.view import Agreement
+from tests.kit.shapes import box
 from tests.services.study.measure.label_views import (
     TOP_Z,
     block,
@@ -16,7 +17,6 @@ from tests.services.study.measure.label_views import (
     thing,
     view,
 )
-from tests.shapes import box
 from workers.cameras.placement import mirror_pose
 from workers.geometry.camera import look_at
 

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import trimesh
 
-from workers.physics.convex_parts import coacd_process
+from workers.physics import coacd_process
 
 OPTIONS = {
     "threshold": 0.05,

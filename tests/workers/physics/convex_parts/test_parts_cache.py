@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from tests.workers.physics.convex_parts.test_step import angle_iron
-from workers.physics.convex_parts import step as module
-from workers.physics.convex_parts.parts_cache import Parts, PartsCache, key_of
-from workers.physics.convex_parts.step import decompose
+from workers.physics import convex_parts as module
+from workers.physics.convex_parts import Parts, PartsCache, decompose, key_of
 
 
 def digest_of(parts):

@@ -15,11 +15,10 @@ from schemas.job.assets import ProceduralSource
 from schemas.job.run import Run
 from schemas.scene.shape import Mesh
 from workers.assets.builtin.make import make_asset
-from workers.geometry.convexity import components, concavity_m, weld
 from workers.geometry.hull import convex_hull
-from workers.physics.convex_parts import step as module
-from workers.physics.convex_parts.parts_cache import PartsCache
-from workers.physics.convex_parts.step import decompose
+from workers.geometry.mesh import components, concavity_m, weld
+from workers.physics import convex_parts as module
+from workers.physics.convex_parts import PartsCache, decompose
 
 ROOT = Path(__file__).resolve().parents[4]
 
@@ -236,7 +235,7 @@ import numpy as np
 from schemas.scene.shape import Mesh
 from schemas.job.assets import ProceduralSource
 from workers.assets.builtin.make import make_asset
-from workers.physics.convex_parts.step import decompose
+from workers.physics.convex_parts import decompose
 for category in sys.argv[2:]:
     mesh = make_asset(category, ProceduralSource(source="procedural"), 1, 600.0).shape.mesh
     parts = decompose(mesh, category, 0.2, None)

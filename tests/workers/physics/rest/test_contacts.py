@@ -5,10 +5,10 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from tests.contacts import UP, box, contacts_between, mesh_of, tipped
-from workers.geometry.contact_surface import surface_of
+from tests.kit.contacts import UP, box, contacts_between, mesh_of, tipped
 from workers.geometry.frames import pose, rotation_about, uniform_rotation
-from workers.physics.rest.contacts import DEEPEST_M, contacts_within
+from workers.physics.contact_surface import surface_of
+from workers.physics.contacts import DEEPEST_M, contacts_within
 
 WITHIN_M = 5e-5
 GROUND = box((1.0, 1.0, 0.1), (0, 0, -0.05))

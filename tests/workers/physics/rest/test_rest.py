@@ -7,10 +7,10 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from tests.contacts import UP, box, contacts_between, mesh_of, thing_of, tipped
-from workers.geometry.contact_surface import surface_of
+from tests.kit.contacts import UP, box, contacts_between, mesh_of, thing_of, tipped
 from workers.geometry.frames import pose, rotation_about, transform, translation, uniform_rotation
-from workers.physics.rest.rest import Rested, rest
+from workers.physics.contact_surface import surface_of
+from workers.physics.exact_rest import Rested, rest
 
 FRICTION = 0.49
 GROUND = box((1.0, 1.0, 0.1), (0, 0, -0.05))

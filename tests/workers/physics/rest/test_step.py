@@ -5,10 +5,10 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from tests.contacts import UP, box, contacts_between, mesh_of, thing_of, tipped
+from tests.kit.contacts import UP, box, contacts_between, mesh_of, thing_of, tipped
 from workers.geometry.frames import pose, rotation_about
-from workers.physics.rest import step as module
-from workers.physics.rest.step import MANY, JammedError, Motion, step
+from workers.physics import exact_rest as module
+from workers.physics.exact_rest import MANY, JammedError, Motion, step
 
 WITHIN_M = 5e-5
 FALL_M = 1e-4

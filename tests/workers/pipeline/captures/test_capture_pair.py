@@ -7,8 +7,8 @@ from schemas.job.assets import Assets
 from tests.captures import captures_job, exact_capture
 from workers.assets.captured import CaptureNames, board_asset, reconstructed_asset
 from workers.geometry.camera import project
-from workers.geometry.covisibility import Bounds, Seen, compare_covisible
 from workers.geometry.frames import invert, transform
+from workers.geometry.projection import Bounds, Seen, compare_covisible
 from workers.pipeline.captures.capture_pair import CapturedObject, CapturedPair, make_capture_pair
 from workers.pipeline.captures.make_capture import image_effects
 from workers.render.raster.gbuffer import shared_renderer

@@ -10,8 +10,8 @@ from tests.workers.pipeline.captures.edge_corners import corner_errors, grey, pr
 from tests.workers.pipeline.captures.made_captures import made, take_one
 from workers.capture.board.layout import marker_corners
 from workers.capture.simulate.noise import AXIAL_M, AXIAL_PER_M, OFFSET_M, OFFSET_SHARE
+from workers.geometry.colour import decode_codes
 from workers.geometry.frames import invert, transform
-from workers.geometry.srgb import decode_codes
 from workers.store.capture_folder import read_view
 
 NEAR = {"views": 1, "image_scale": 0.5, "distance_m": [0.4, 0.45]}

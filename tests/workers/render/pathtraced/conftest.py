@@ -2,7 +2,7 @@
 
 import pytest
 
-from workers.render.pathtraced.tracer import Tracer
+from workers.render.pathtraced import Tracer
 
 
 @pytest.fixture(scope="session")

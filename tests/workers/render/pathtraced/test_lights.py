@@ -16,7 +16,7 @@ from tests.workers.render.random_scenes import (
     small,
 )
 from workers.geometry.camera import orbit_pose
-from workers.render.pathtraced.lights import lamp_directions, sky_directions, sky_picture
+from workers.render.pathtraced import lamp_directions, sky_directions, sky_picture
 
 
 @traced

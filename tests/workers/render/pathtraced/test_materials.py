@@ -19,8 +19,7 @@ from tests.workers.render.random_scenes import (
     small,
 )
 from workers.geometry.camera import orbit_pose
-from workers.render.pathtraced.materials import tint_of
-from workers.render.pathtraced.tracer import encode_light
+from workers.render.pathtraced import encode_light, tint_of
 
 GLASS = Material((0.7, 0.8, 0.8, 1.0), roughness=0.1, transmission=1.0)
 RED = Material((0.9, 0.05, 0.05, 1.0), roughness=1.0)

@@ -29,12 +29,7 @@ from tests.workers.render.random_scenes import (
 )
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import invert, pose, rotation_about, translation
-from workers.render.pathtraced.tracer import (
-    clamp_fireflies,
-    encode_light,
-    round_up_samples,
-    square_pixels,
-)
+from workers.render.pathtraced import clamp_fireflies, encode_light, round_up_samples, square_pixels
 
 
 def cast(tracer, things, appearance, view):
@@ -113,7 +108,7 @@ RUN = """
 import hashlib, numpy as np
 from tests.workers.render.random_scenes import APPEARANCE, camera, orbit_and_mirror, random_things, small
 from tests.workers.render.looks import paths
-from workers.render.pathtraced.tracer import Tracer, encode_light
+from workers.render.pathtraced import Tracer, encode_light
 rng = np.random.default_rng(5)
 things, height = random_things(rng)
 view = camera(small(96, 72), orbit_and_mirror(rng, height)[1].T_world_cam)

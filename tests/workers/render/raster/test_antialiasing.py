@@ -10,8 +10,8 @@ from schemas.scene.scene import Placed
 from schemas.scene.shape import Material
 from tests.workers.render.looks import BLACK, FLAT, FOUR, RASTER, without
 from tests.workers.render.random_scenes import APPEARANCE, camera, orbit_and_mirror, procedural_things, quad, small
+from workers.geometry.colour import encode_srgb
 from workers.geometry.frames import translation
-from workers.geometry.srgb import encode_srgb
 from workers.render.raster.antialiasing import blend_samples, find_edges
 from workers.render.raster.gbuffer import Renderer
 

@@ -9,7 +9,7 @@ import trimesh
 from schemas.base import frozen_array
 from schemas.scene.shape import Material, Part, Shape
 from tests.workers.render.random_scenes import part_of
-from workers.geometry.srgb import decode_srgb, encode_srgb
+from workers.geometry.colour import decode_srgb, encode_srgb
 from workers.render.raster.batches import own_vertices, pack_shape
 
 BODIES = {

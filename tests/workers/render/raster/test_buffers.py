@@ -3,7 +3,7 @@
 import pytest
 import trimesh
 
-from tests.shapes import shape_of
+from tests.kit.shapes import shape_of
 from workers.render.raster.buffers import ShapeStore
 
 

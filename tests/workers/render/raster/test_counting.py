@@ -17,9 +17,9 @@ from tests.workers.render.random_scenes import (
     small,
 )
 from workers.geometry.camera import orbit_pose
-from workers.geometry.coverage import count_covered
 from workers.geometry.frames import pose, translation, uniform_rotation
 from workers.geometry.raycast import cast_view
+from workers.geometry.zbuffer import count_covered
 
 
 def test_an_unoccluded_thing_in_the_frame_counts_as_many_pixels_as_its_region(renderer):

@@ -11,7 +11,7 @@ from tests.workers.render.random_scenes import APPEARANCE, camera, floor, small,
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import translation
 from workers.render.raster import draw_calls
-from workers.render.raster.covers import MERGED, Cover, find_cover, seen_ranges
+from workers.render.raster.batches import MERGED, Cover, find_cover, seen_ranges
 
 SQUARE = [[-1, -1], [1, -1], [1, 1], [-1, 1]]
 RING = [[0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]]

@@ -6,9 +6,9 @@ import importlib
 import numpy as np
 import pytest
 
-from workers.render.raster import direct_calls
-from workers.render.raster.direct_calls import ARRAYS, GENERATORS, SIGNATURES
-from workers.render.raster.programs import Program
+from workers.render.raster import context as direct_calls
+from workers.render.raster.context import ARRAYS, GENERATORS, SIGNATURES
+from workers.render.raster.draw_calls import Program
 
 VERTEX = "#version 410 core\nuniform mat4 m; void main() { gl_Position = m * vec4(1.0); }"
 FRAGMENT = "#version 410 core\nout vec4 o; void main() { o = vec4(1.0); }"

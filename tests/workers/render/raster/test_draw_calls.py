@@ -10,7 +10,7 @@ import trimesh
 import workers.render.raster.gbuffer
 from schemas.scene.camera import Camera
 from schemas.scene.scene import Placed
-from tests.shapes import shape_of
+from tests.kit.shapes import shape_of
 from tests.workers.render.looks import FLAT, FOUR, RASTER, Look, forcing, without
 from tests.workers.render.random_scenes import APPEARANCE, VGA, orbit_and_mirror, procedural_things, random_things
 from workers.geometry.camera import orbit_pose

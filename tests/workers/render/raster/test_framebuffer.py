@@ -9,8 +9,8 @@ from schemas.scene.scene import Placed
 from schemas.scene.shape import Material, Part, Shape
 from tests.workers.render.looks import BLACK, FOUR, RASTER
 from tests.workers.render.random_scenes import EYE, camera, facing, quad, small
-from workers.geometry.srgb import encode_srgb
-from workers.render.raster.framebuffer import Framebuffer
+from workers.geometry.colour import encode_srgb
+from workers.render.raster.context import Framebuffer
 
 
 @pytest.mark.parametrize("sizes", [[(8, 6)], [(8, 6), (40, 3), (8, 6)]], ids=["one", "resized"])

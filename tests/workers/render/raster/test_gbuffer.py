@@ -25,10 +25,10 @@ from tests.workers.render.random_scenes import (
 )
 from workers.geometry import raycast
 from workers.geometry.camera import orbit_pose
+from workers.geometry.colour import encode_srgb
 from workers.geometry.frames import pose, translation, uniform_rotation
 from workers.geometry.raycast import cast_view
-from workers.geometry.srgb import encode_srgb
-from workers.render.raster import programs
+from workers.render.raster import draw_calls as programs
 
 PLANE_MM = 0.001
 """float32 depth of a plane some metres away: a few units in the last place."""

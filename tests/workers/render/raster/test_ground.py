@@ -28,8 +28,8 @@ from tests.workers.render.random_scenes import (
     stand,
 )
 from workers.geometry.camera import orbit_pose
+from workers.geometry.colour import decode_srgb, encode_srgb
 from workers.geometry.frames import invert, pose, transform, translation, uniform_rotation
-from workers.geometry.srgb import decode_srgb, encode_srgb
 from workers.render.raster.context import is_software
 from workers.render.raster.draw_calls import RenderPass
 from workers.render.raster.ground import Ground, find_ground, near_window

@@ -10,8 +10,8 @@ from schemas.scene.scene import Placed
 from tests.workers.render.looks import BLACK, DOWN, RASTER, brightness, pixel_of, white_floor
 from tests.workers.render.random_scenes import camera, floor, shape_of, small
 from workers.geometry.camera import orbit_pose
+from workers.geometry.colour import decode_srgb
 from workers.geometry.frames import translation
-from workers.geometry.srgb import decode_srgb
 
 
 def test_a_white_plane_under_one_light_is_as_bright_as_lambert_says(renderer):

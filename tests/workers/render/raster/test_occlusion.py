@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from workers.render.raster.occlusion import column_extents, sky_visibility
+from workers.render.raster.baking import column_extents, sky_visibility
 
 
 def test_nothing_hides_nothing():

@@ -7,7 +7,7 @@ from schemas.base import frozen_array
 from schemas.scene.appearance import Appearance, Light
 from schemas.scene.camera import Intrinsics
 from workers.geometry.camera import project
-from workers.render.raster.programs import NEAR_M, clip_from_cam, light_slots, place_lights
+from workers.render.raster.draw_calls import NEAR_M, clip_from_cam, light_slots, place_lights
 
 
 def test_clip_space_gives_the_cameras_image_coordinates():

@@ -19,8 +19,8 @@ from tests.workers.render.random_scenes import (
     small,
 )
 from workers.geometry.camera import orbit_pose
+from workers.geometry.colour import decode_srgb, encode_srgb
 from workers.geometry.frames import translation
-from workers.geometry.srgb import decode_srgb, encode_srgb
 
 PLANE_MM = 0.001
 """float32 depth of a plane some metres away: a few units in the last place."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from workers.render.raster.textures import MAX_TEXTURE_PX, TextureStore, mip_levels
+from workers.render.raster.buffers import MAX_TEXTURE_PX, TextureStore, mip_levels
 
 
 def roots_of(image: np.ndarray) -> np.ndarray:

@@ -9,8 +9,8 @@ from schemas.scene.shape import Part, Shape
 from tests.workers.render.random_scenes import FLOOR_HALF_M, floor, shape_of
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import invert, translation
+from workers.render.raster.ground import TILE_PX, fills_image, is_steep, tiles, window
 from workers.render.raster.shaders import GRAZING
-from workers.render.raster.tiles import TILE_PX, fills_image, is_steep, tiles, window
 
 K = Intrinsics(width=100, height=80, fx=100.0, fy=100.0, cx=50.0, cy=40.0)
 
