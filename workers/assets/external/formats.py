@@ -21,8 +21,6 @@ from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Material
 from workers.assets.external.caps import FolderResolver, check_counts, declared_counts, describe_error
 from workers.assets.external.gltf import check_glb, named_by_gltf, pack_gltf
-from workers.geometry.srgb import encode_srgb
-from workers.assets.external.caps import describe_error
 from workers.geometry.colour import encode_srgb
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb", ".gltf")
