@@ -23,10 +23,9 @@ from services.job.read import load_job
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.jit import used_by
 from workers.physics.contact_surface import faces_within
-from workers.pipeline.context import open_worker
 from workers.pipeline.loops import LIST, compile_together
-from workers.pipeline.run_shard import run_scene
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch, open_worker
+from workers.shard.run_shard import run_scene
 
 JOBS = Path(__file__).parent / "jobs"
 

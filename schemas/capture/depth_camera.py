@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from schemas.base import Array, Pose
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.capture.estimate import Estimates, Reconstruction, SynthesizedView
 from schemas.job.captures import Board
-from schemas.scene.camera import Camera
+from schemas.scene.view import Camera
 
 
 @dataclass(frozen=True, eq=False)

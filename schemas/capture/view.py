@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
-from schemas.job.sensor import Distortion
-from schemas.scene.camera import Intrinsics
+from schemas.job.views import Distortion
+from schemas.scene.view import Intrinsics
 
 
 @dataclass(frozen=True, eq=False)

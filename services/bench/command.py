@@ -10,7 +10,7 @@ from typing import Any
 
 from schemas.errors import InputError
 from schemas.job.job import Job
-from schemas.job.start import ONE_OBJECT
+from schemas.job.physics import ONE_OBJECT
 from services.bench import effects, report, traced
 from services.bench.extra import require_extra
 from services.bench.measure import bench_folder, measure

@@ -11,8 +11,8 @@ from schemas.scene.shape import Mesh, Shape
 from schemas.scene.view import Pair
 from workers.assets.glb import asset_glb
 from workers.geometry.colour import SRGB_STEPS, decode_srgb, encode_srgb
-from workers.pipeline.image_files import image_boxes, object_labels
-from workers.pipeline.make_scene import Scene
+from workers.scene.make_scene import Scene
+from workers.scene.rows import image_boxes, object_labels
 from workers.store.images import encode_png
 
 URDF = """<robot name="{name}"><link name="base">

@@ -8,15 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from schemas.errors import MachineError, OutputError
-from schemas.job.job import Job
-from schemas.job.range_size import MOST
+from schemas.job.job import MOST, Job
 from services.bench.handover import hand_over
 from services.bench.lower_bound import choose_encoders, images_of, run_lower_bound
 from services.bench.machine import describe_machine, pinned, process_age_s
 from services.bench.others import Side, SideProcess, sides_of, start_side
 from services.bench.ratios import Lap
 from services.bench.stages import make_in_memory, open_workbench
-from workers.pipeline.make_scene import Scene
+from workers.scene.make_scene import Scene
 from workers.store.file_system import sync_tree
 
 WARM_UP = 8

@@ -10,12 +10,11 @@ from schemas.errors import RunError, SceneError
 from schemas.job.job import Job
 from services.bench.ratios import Lap
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.context import WorkerContext, open_worker
 from workers.pipeline.loops import compile_together
-from workers.pipeline.make_scene import Scene, make_scene
-from workers.pipeline.run_shard import run_ranges
-from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.context import require_device
+from workers.scene.context import Stopwatch, WorkerContext, open_worker
+from workers.scene.make_scene import Scene, make_scene
+from workers.shard.run_shard import run_ranges
 from workers.store.commit import committed_files, read_record
 from workers.store.local import LocalStore
 

@@ -18,10 +18,10 @@ from schemas.base import Array
 from schemas.dataset.commit import Span
 from schemas.errors import MachineError
 from schemas.job.job import Job
-from schemas.job.render import Render
-from schemas.scene.camera import Camera
+from schemas.job.views import Render
 from schemas.scene.scene import PosedScene
 from schemas.scene.shape import Part
+from schemas.scene.view import Camera
 from services.bench.machine import describe_machine, pinned
 from services.bench.others import SideProcess, start_side
 from services.bench.ratios import Lap, Spread, by_processor, format_spread, slope_ratio
@@ -30,13 +30,13 @@ from services.bench.stages import make_in_memory
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.colour import decode_srgb
 from workers.geometry.frames import transform
-from workers.pipeline.context import open_worker
-from workers.pipeline.make_scene import Scene
-from workers.plan.effects import Facts, plan_effects
 from workers.render.pathtraced import GLOW, SKY_PX, Tracer, encode_light, sky_directions, sky_picture, tint_of
 from workers.render.raster.baking import LAMP_RAD
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.tiers import require_tier
+from workers.scene.context import open_worker
+from workers.scene.effects import Facts, plan_effects
+from workers.scene.make_scene import Scene
 
 SAMPLES = (16, 1)
 

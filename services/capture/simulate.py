@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from schemas.errors import OutputError
-from schemas.job.render import Render
+from schemas.job.views import Render
 from services.capture.settings import capture_job
 
 
@@ -27,8 +27,8 @@ def simulate(options: argparse.Namespace) -> int:
     from workers.assets.catalogue import open_catalogue
     from workers.capture.simulate.effects import ASKED, plan_effects
     from workers.pipeline.captures.simulate import load_object, simulate_capture
-    from workers.plan.randomness import SceneChance
     from workers.render.tiers import require_tier
+    from workers.scene.plan import SceneChance
 
     settings, chance = job.captures.simulate, SceneChance(job.seed, job.first_scene)
     require_tier(Render(tier=settings.tier))

@@ -6,7 +6,7 @@ import unicodedata
 from pathlib import Path
 from typing import Final, NoReturn
 
-from schemas.plain_line import plain_line
+from schemas.errors import plain_line
 from services.job.packed import MOST_CHARACTERS, is_packed
 
 JOB_ID: Final = r"j[0-9a-f]{8}"

@@ -200,7 +200,7 @@ COMMANDS: dict[str, Command] = {
                 help="size of a file of webdataset and huggingface, 10^6 bytes (default: 256)",
             ),
         ),
-        "services.export.command:main",
+        "services.export.export:main",
     ),
     "capture": Command(
         "real photographs of an object on a marker board: print a board, simulate, import, process, make views, score",

@@ -19,9 +19,8 @@ import pyarrow.dataset as ds
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.tables import CAPTURE_SCHEMAS, SCHEMAS, TABLES
-from schemas.errors import InputError
+from schemas.errors import InputError, did_you_mean
 from schemas.job.job import Job
-from schemas.nearest import did_you_mean
 from services.dataset.pair import Pair, read_pair
 from services.dataset.pair_table import PAIR_TABLES, choose_pairs, pair_table
 from services.dataset.stored_files import RangeFiles, StoredFiles

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from schemas.errors import InputError
-from schemas.scene.camera import ROLES
+from schemas.scene.view import ROLES
 
 PAIR_TABLES = ("scenes", "views", "assets")
 """The tables that a choice of pairs reads."""

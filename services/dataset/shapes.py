@@ -10,13 +10,12 @@ import trimesh
 
 from schemas.dataset.layout import asset_path
 from schemas.errors import CorruptError, InputError, MachineError
-from schemas.job.category import TABLE
-from schemas.scene.region import REGION_TABLE
-from schemas.scene.shape import Asset
+from schemas.job.assets import TABLE
+from schemas.scene.shape import REGION_TABLE, Asset
 from services.job.record import JobRecord
 from services.read.part_mesh import mesh_of_part
 from workers.assets.catalogue import Catalogue
-from workers.plan.randomness import SceneChance
+from workers.scene.plan import SceneChance
 
 ReadShape = Callable[[str], bytes]
 """Returns the bytes of a stored shape by its path. Raises FileNotFoundError."""
@@ -54,7 +53,7 @@ class Shapes:
         """The shape of a source whose licence keeps it out of the dataset."""
         if self._record.job.captures is not None:
             raise CorruptError(f"{path} is missing: restore it from a copy")
-        from workers.plan.step import plan_scene  # loads the physics
+        from workers.scene.plan import plan_scene  # loads the physics
 
         plan = plan_scene(self._record.job, self._sources(path), SceneChance(self._record.job.seed, scene_id))
         assets: dict[int, Asset] = {start.region_id: start.asset for start in plan.objects}

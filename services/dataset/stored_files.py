@@ -9,7 +9,7 @@ from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import tar_path
 from schemas.errors import CorruptError
-from schemas.job.images import Patch
+from schemas.job.views import Patch
 from services.dataset.shapes import Shapes
 from services.job.record import JobRecord
 from workers.store.commit import read_committed

@@ -3,8 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from schemas.nearest import did_you_mean
-from schemas.plain_line import plain_line
+from schemas.errors import did_you_mean, plain_line
 from services.job.reference import allowed_keys
 
 _KEYS, _NUMBER, _WHOLE, _TEXT = (

@@ -6,10 +6,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from schemas.errors import JobError
+from schemas.errors import JobError, plain_line
 from schemas.job.job import Job
 from schemas.job.keys import set_key
-from schemas.plain_line import plain_line
 from services.job.bounded_yaml import MOST_LEVELS, parse_yaml
 from services.job.faults import describe_fault
 from services.job.packed import is_packed, pack, unpack

@@ -3,8 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from schemas.errors import InUseError, RunError, VersoError
-from schemas.plain_line import plain_line
+from schemas.errors import InUseError, RunError, VersoError, plain_line
 from schemas.queue import JobRequest
 from services.queue.store import Queue
 

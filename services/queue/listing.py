@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from schemas.durations import describe_seconds
-from schemas.errors import VersoError
+from schemas.errors import VersoError, describe_seconds
 from services.queue.decide import turn, waiting_for_folder
 from services.queue.fold import JobView
 from services.queue.store import Queue

@@ -7,8 +7,7 @@ from typing import Any, Final, Protocol
 from ray.exceptions import AuthenticationError
 from ray.job_submission import JobSubmissionClient
 
-from schemas.errors import MachineError
-from schemas.plain_line import plain_line
+from schemas.errors import MachineError, plain_line
 from services.queue.decide import Driver
 
 ANSWER_S: Final = 30.0

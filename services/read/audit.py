@@ -9,8 +9,8 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
-from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, is_shape
+from schemas.dataset.shard import Fingerprint
 from schemas.errors import InputError, SceneError
 from schemas.scene.scene import SceneOutput
 from services.job.record import require_job
@@ -18,12 +18,11 @@ from services.read.audit_motion import Motion, measure_motion
 from services.read.dataset_reader import StoredRange, choose_scenes, find_scene
 from services.read.referee import Held, describe_held, hold_scene, is_installed
 from services.read.replay import compare_files, compare_rows, open_context
-from workers.pipeline.context import WorkerContext
-from workers.pipeline.fingerprint import take_fingerprint
-from workers.pipeline.make_scene import Scene, make_scene
-from workers.pipeline.rows import record_scene
-from workers.pipeline.stopwatch import Stopwatch
-from workers.plan.effects import EFFECTS
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.effects import EFFECTS
+from workers.scene.make_scene import Scene, make_scene
+from workers.scene.rows import record_scene
+from workers.shard.fingerprint import take_fingerprint
 from workers.store.commit import committed_files
 from workers.store.store import Store
 

@@ -7,18 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.base import Pose
-from schemas.scene.camera import Camera
 from schemas.scene.scene import Placed, PosedScene
 from schemas.scene.shape import Shape
-from schemas.scene.view import View
+from schemas.scene.view import Camera, View
 from workers.geometry.camera import project
 from workers.geometry.frames import invert, motion_between, transform
 from workers.geometry.raycast import NEAR_M, edge_distance_px
 from workers.physics.settle import release_again
-from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import Scene
-from workers.plan.effects import Facts, names_of_kind, plan_effects
 from workers.render.raster.gbuffer import Renderer
+from workers.scene.context import WorkerContext
+from workers.scene.effects import Facts, names_of_kind, plan_effects
+from workers.scene.make_scene import Scene
 
 RELEASE_S = 1.0
 

@@ -10,7 +10,7 @@ from schemas.base import Pose
 from schemas.dataset.codec import Row, read_world_poses
 from schemas.dataset.layout import asset_path
 from schemas.errors import CorruptError
-from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
 from services.read.dataset_reader import StoredRange
 from workers.assets.external.formats import read_visual
 from workers.store.store import Store

@@ -15,9 +15,8 @@ from schemas.scene.scene import SceneOutput
 from services.job.record import JobRecord
 from services.read.replay import open_context
 from services.read.stored_tables import read_merged
-from workers.pipeline.context import WorkerContext
-from workers.pipeline.run_shard import run_scene
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.shard.run_shard import run_scene
 from workers.store.attempt import begin_attempt
 from workers.store.commit import read_committed
 from workers.store.file_system import temporary_folder

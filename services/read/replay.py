@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, is_shape
+from schemas.dataset.shard import Fingerprint
 from schemas.dataset.tables import DETERMINISTIC_TABLES
 from schemas.errors import CorruptError, MachineError
 from schemas.job.identity import job_digest
@@ -14,10 +14,9 @@ from schemas.scene.scene import SceneOutput
 from services.job.record import JobRecord, require_job
 from services.read.dataset_reader import StoredRange, file_reader, find_scene
 from workers.pipeline.captures.listing import open_sources
-from workers.pipeline.context import WorkerContext, open_worker
-from workers.pipeline.fingerprint import take_fingerprint
-from workers.pipeline.run_shard import run_scene
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch, WorkerContext, open_worker
+from workers.shard.fingerprint import take_fingerprint
+from workers.shard.run_shard import run_scene
 from workers.store.images import decode_png
 from workers.store.manifest import table_of_rows
 from workers.store.store import Store

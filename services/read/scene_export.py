@@ -9,15 +9,14 @@ from trimesh.visual import ColorVisuals
 from schemas.dataset.codec import Row, read_world_poses
 from schemas.errors import InputError, OutputError
 from schemas.job.job import Job
-from schemas.scene.region import REGION_FLOOR, REGION_TABLE
+from schemas.scene.shape import REGION_FLOOR, REGION_TABLE
 from services.job.record import require_job
 from services.read.capture_export import captured_geometry
 from services.read.dataset_reader import StoredRange, find_scene
 from services.read.part_mesh import linear_bytes, mesh_of_part
 from services.read.replay import open_context
 from workers.assets.catalogue import Catalogue
-from workers.plan.randomness import SceneChance
-from workers.plan.step import plan_scene
+from workers.scene.plan import SceneChance, plan_scene
 from workers.store.store import Store
 
 

@@ -37,7 +37,7 @@ from services.read.verify_finished import (
 from services.read.verify_job import StoredJob, Terms, check_fingerprint, check_terms, read_stored_job
 from services.read.verify_range import RangeCheck, read_records
 from services.read.verify_span import Spans, commit_groups
-from workers.pipeline.allocator import keep_freed_memory
+from workers.scene.context import keep_freed_memory
 from workers.store.commit import commits_digest
 from workers.store.file_system import temporary_folder
 from workers.store.ledger import read_kept_rows

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from pydantic import ValidationError
 
 from schemas.dataset.commit import CommitRecord
-from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE, commit_path
+from schemas.dataset.shard import Fingerprint
 from schemas.errors import CorruptError
 from schemas.job.identity import job_digest
 from services.job.record import JobRecord, decode_job, is_job_sealed, is_job_unsealed

@@ -18,7 +18,7 @@ from services.job.record import JobRecord
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, read_image
 from services.read.path_index import PathIndex
 from services.read.verdict import COPY, Verdict, describe_os_error
-from workers.pipeline.check_stored import check_stored_pair, check_stored_scene
+from workers.scene.check_stored import check_stored_pair, check_stored_scene
 from workers.store.commit import committed_files, read_committed, read_record
 from workers.store.ledger import range_rows
 from workers.store.store import Store

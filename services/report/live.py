@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from html import escape
 
-from schemas.durations import describe_seconds
+from schemas.errors import describe_seconds
 from services.report.gallery import Address, strip_html
 from services.report.progress import Phase, Progress
 from services.report.sample import ShownScene

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from schemas.scene.region import REGION_FIRST_OBJECT, REGION_FLOOR
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
 
 MOST_WIDTH = 480
 """Wider images are shrunk to this for the page, pixels."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.dataset.codec import Row
-from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.shape import REGION_FIRST_OBJECT
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, find_scene
 from services.report.histogram import Histogram
 from services.report.images import PairImages, metres_of, read_pair

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from functools import partial
 from html import escape
 
-from schemas.durations import describe_seconds
+from schemas.errors import describe_seconds
 from schemas.job.job import Job
 from services.report.charts import Chart, amount, chart_html, length_of_decade
 from services.report.collect import Cost, Failure, Figures

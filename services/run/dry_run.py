@@ -3,9 +3,8 @@
 import os
 import time
 
-from schemas.dataset.ledger import Ledger
-from schemas.durations import describe_seconds
-from schemas.errors import OutputError
+from schemas.dataset.commit import Ledger
+from schemas.errors import OutputError, describe_seconds
 from schemas.job.job import Job
 from services.job.record import adopt, refuse_foreign
 from services.merge.dataset_card import describe_doubts, describe_sources
@@ -14,10 +13,9 @@ from services.run.lock import read_holder, shows_life
 from services.run.range_planner import MAX_SHARD, plan_spans
 from services.run.step import RunRequest, open_catalogue, record_of
 from workers.assets.catalogue import Catalogue
-from workers.pipeline.context import open_worker
-from workers.pipeline.run_shard import run_scene
-from workers.pipeline.stopwatch import Stopwatch
 from workers.render.tiers import require_tier
+from workers.scene.context import Stopwatch, open_worker
+from workers.shard.run_shard import run_scene
 from workers.store.ledger import list_commits
 from workers.store.local import open_store
 from workers.store.store import Store

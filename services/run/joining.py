@@ -10,7 +10,7 @@ from services.run.lock import Lock
 from services.run.node_probe import check_nodes
 from services.run.pattern import Pattern
 from services.run.worker_terms import WorkerTerms, worker_environment
-from workers.pipeline.code import code_digest
+from workers.shard.code import code_digest
 from workers.store.store import Store
 
 
@@ -28,9 +28,9 @@ def with_own_stack(store: Store, order: ShardOrder) -> ShardOrder:
     """
     if order.terms.fingerprint_mode != "strict" or order.terms.fingerprint:
         return order
-    from workers.pipeline.fingerprint import take_fingerprint  # loads GL
     from workers.render.raster.context import is_software
     from workers.render.raster.gbuffer import shared_renderer
+    from workers.shard.fingerprint import take_fingerprint  # loads GL
 
     renderer = shared_renderer()
     if order.job.run.device == "gpu" and is_software(renderer.name):

@@ -4,8 +4,8 @@ from collections import Counter
 
 import numpy as np
 
+from schemas.dataset.commit import Ledger
 from schemas.dataset.layout import commit_path
-from schemas.dataset.ledger import Ledger
 from services.merge.merge import read_success
 from workers.store.commit import commits_digest
 from workers.store.ledger import list_commits

@@ -10,8 +10,7 @@ import numpy as np
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from schemas.dataset.commit import Span
-from schemas.dataset.ledger import Ledger
+from schemas.dataset.commit import Ledger, Span
 from schemas.errors import OutputError
 from schemas.job.job import Job
 

@@ -85,7 +85,7 @@ def _why_not_writable(folder: str) -> str:
 def _read_code() -> tuple[str, str]:
     """(the digest of the project's code, "") or ("", why it cannot be imported)."""
     try:
-        from workers.pipeline.code import code_digest
+        from workers.shard.code import code_digest
     except ImportError as error:
         return "", str(error)
     return code_digest(), ""

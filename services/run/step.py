@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from schemas.dataset.commit import Ledger
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
-from schemas.dataset.ledger import Ledger
 from schemas.dataset.shard import JobChange, ShardOrder
 from schemas.errors import FingerprintError
 from schemas.job.job import Job

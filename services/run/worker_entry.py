@@ -29,7 +29,7 @@ def enter_shard(terms: WorkerTerms, order: bytes, catalogue: bytes) -> "ShardRep
     if is_draining():
         time.sleep(DRAINED_PAUSE_S)
     check_worker(terms)
-    from workers.pipeline.run_shard import run_shard
+    from workers.shard.run_shard import run_shard
 
     return run_shard(pickle.loads(order), pickle.loads(catalogue), is_draining)
 

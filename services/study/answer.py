@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from schemas.durations import describe_seconds
+from schemas.errors import describe_seconds
 from services.study.choose import (
     AS_CHEAP,
     TargetError,

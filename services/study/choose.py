@@ -5,8 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from decimal import ROUND_CEILING, Context
 
-from schemas.errors import InputError, RunError
-from schemas.nearest import did_you_mean
+from schemas.errors import InputError, RunError, did_you_mean
 from services.study.errors import ERRORS
 from services.study.model import Figure, Row
 from services.study.words import amount, listed, times, unit

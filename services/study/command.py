@@ -28,10 +28,10 @@ from services.study.report.page import write_page
 from services.study.report.tables import write_tables
 from services.study.study import header_of, run_study, study_of
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.code import code_digest
-from workers.pipeline.context import open_worker
 from workers.render.raster.context import require_device
 from workers.render.tiers import require_tier
+from workers.scene.context import open_worker
+from workers.shard.code import code_digest
 
 LEAST_SCENES = 4
 """Fewer tell nothing of a 95th percentile."""

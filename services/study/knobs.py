@@ -9,11 +9,9 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import to_jsonable_python
 
-from schemas.errors import InputError
-from schemas.job.job import Job
+from schemas.errors import InputError, did_you_mean
+from schemas.job.job import PRESETS, Job
 from schemas.job.keys import set_key
-from schemas.job.preset import PRESETS
-from schemas.nearest import did_you_mean
 from services.job.faults import describe_fault
 from services.study.captures.knobs import capture_knobs
 from services.study.model import Changes, Group, Knob, Setting, Value

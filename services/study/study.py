@@ -24,7 +24,7 @@ from services.study.model import Plan, Row, Setting, Study
 from services.study.pairs import promising
 from services.study.rounds import Round, Unit
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.context import WorkerContext, open_worker
+from workers.scene.context import WorkerContext, open_worker
 
 LAPS_OF_CLOSE_CALLS = 3
 """Factor on the rounds of timing for settings whose time decides the choice."""

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from schemas.base import Array, Pose
 from schemas.capture.estimate import Reconstruction, SynthesizedView
 from schemas.errors import CaptureError
-from schemas.scene.camera import Camera
 from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera
 from workers.capture.posed_view import PosedView
 from workers.capture.visibility import facing_cosine, placed
 from workers.geometry.camera import project

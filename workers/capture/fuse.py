@@ -10,8 +10,8 @@ from schemas.base import Array
 from schemas.capture.estimate import Reconstruction
 from schemas.errors import CaptureError
 from schemas.job.captures import Fusion
-from schemas.scene.camera import Camera
 from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera
 from workers.capture.depth_fit import fit_depth
 from workers.capture.mesh import cut_below, extract_surface, keep_vertices, large_parts, vertex_normals
 from workers.capture.object_region import ObjectRegion

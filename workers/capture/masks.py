@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.scene.camera import Camera
 from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera
 from workers.capture.object_region import Ground
 from workers.capture.raster import draw_depth
 

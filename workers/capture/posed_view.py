@@ -10,7 +10,7 @@ from schemas.base import Pose, frozen_array
 from schemas.capture.estimate import DepthCorrection
 from schemas.capture.view import CaptureCamera, CapturedView
 from schemas.errors import CaptureError
-from schemas.scene.camera import Camera
+from schemas.scene.view import Camera
 from workers.capture.poses.rays import opencv_matrix
 from workers.geometry.jit import compiled
 

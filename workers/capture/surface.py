@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from schemas.base import Array
-from schemas.scene.camera import Camera
+from schemas.scene.view import Camera
 from workers.capture.depth_fit import FittedDepth
 from workers.capture.posed_view import PosedView
 from workers.capture.tsdf import sample_inverse

@@ -9,7 +9,7 @@ from schemas.base import Array
 from schemas.capture.estimate import SynthesizedView
 from schemas.errors import CaptureError
 from schemas.job.captures import Synthesis
-from schemas.scene.camera import Camera
+from schemas.scene.view import Camera
 from workers.capture.fill import fill_holes
 from workers.capture.warp import Layer, Source, warp
 from workers.geometry.jit import compiled

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.scene.camera import Camera
+from schemas.scene.view import Camera
 from workers.capture.depth_fit import FittedDepth
 from workers.geometry.frames import invert
 from workers.geometry.jit import compiled

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.capture.depth_camera import DepthCamera
-from schemas.scene.camera import Intrinsics
 from schemas.scene.shape import Shape
+from schemas.scene.view import Intrinsics
 from workers.geometry.jit import compiled
 from workers.geometry.rational_lens import pixel_rays, project_points
 

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.job.captures import Board
-from schemas.scene.camera import Camera
-from schemas.scene.region import REGION_FIRST_OBJECT, REGION_NOTHING, REGION_TABLE
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_NOTHING, REGION_TABLE
+from schemas.scene.view import Camera
 from workers.geometry.jit import compiled
 
 

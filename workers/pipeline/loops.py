@@ -20,7 +20,7 @@ from numba.core import config
 from numba.core.caching import FunctionCache, InTreeCacheLocator
 from numba.core.sigutils import normalize_signature
 
-from workers.pipeline.code import code_digest
+from workers.shard.code import code_digest
 
 LIST = Path(__file__).with_name("loops.txt")
 """A line for each loop and types of its arguments; a loop comes after those that it calls. deploy/compile_loops.py writes it."""

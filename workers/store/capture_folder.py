@@ -24,7 +24,7 @@ from schemas.base import Array, Frozen, Pose, Positive, PositiveInt, Text
 from schemas.capture.view import CaptureCamera, CapturedView
 from schemas.errors import CaptureError
 from schemas.job.captures import Board, BoardFrame
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from workers.store.images import encode_mask, encode_png
 
 CAMERA_FILE, BOARD_FILE, CAPTURE_FILE, TRUTH = "camera.json", "board.json", "capture.json", "truth"

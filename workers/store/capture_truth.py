@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from schemas.base import frozen_array
 from schemas.capture.view import CaptureTruth
 from schemas.errors import CaptureError
-from schemas.job.sensor import Distortion
+from schemas.job.views import Distortion
 from workers.store.capture_folder import TRUTH
 from workers.store.images import encode_mask
 

@@ -15,7 +15,7 @@ from workers.geometry.spread import spread_evenly
 from workers.pipeline.captures.make_capture import require_captures
 from workers.pipeline.captures.process_capture import process_capture
 from workers.pipeline.captures.processor_clock import ProcessorClock
-from workers.pipeline.context import WorkerContext
+from workers.scene.context import WorkerContext
 from workers.store.capture_folder import CaptureFolder, open_folder
 
 BYTES_OF_POINT = 3 * 4 + 3 * 4 + 3

@@ -14,7 +14,7 @@ from services.study.measure.statistics import image_figures
 from services.study.measure.timing import timed_rows
 from services.study.model import Plan, Row
 from workers.pipeline.captures.make_capture import simulate_one
-from workers.pipeline.context import WorkerContext
+from workers.scene.context import WorkerContext
 from workers.store.file_system import temporary_folder
 
 LEAST_CAPTURES = 2

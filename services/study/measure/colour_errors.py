@@ -9,19 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import InputError
-from schemas.job.render import Render
-from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.plan import ScenePlan
-from schemas.scene.region import REGION_FLOOR
-from schemas.scene.scene import Placed
+from schemas.job.views import Render
+from schemas.scene.scene import Placed, ScenePlan
+from schemas.scene.shape import REGION_FLOOR
+from schemas.scene.view import Camera, Intrinsics
 from services.study.measure.flip import flip_between
 from services.study.measure.rays import Box, cast_patch
 from workers.assets.appearance import draw_appearance
-from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import Scene
-from workers.plan.effects import Facts, plan_effects
-from workers.plan.randomness import SceneChance, Stream
 from workers.render.tiers import draw_view, require_tier
+from workers.scene.context import WorkerContext
+from workers.scene.effects import Facts, plan_effects
+from workers.scene.make_scene import Scene
+from workers.scene.plan import SceneChance, Stream
 
 WIDTH, HEIGHT = 640, 480
 """The size of the image that colours are compared at, whatever the size of the image under test. Only a crop is traced."""

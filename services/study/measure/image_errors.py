@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.job.images import Images
-from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
+from schemas.job.views import Images
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
 from schemas.scene.view import Pair, View
 from services.study.measure.rays import Patch, Pixels, Seen
 from services.study.measure.truth import Truth
 from workers.geometry.pixels import dequantise_depth
-from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import Scene
+from workers.scene.context import WorkerContext
+from workers.scene.make_scene import Scene
 
 PERCENTILE = 99.0
 """Percentile of pixels: leaves out the few where a ray grazes an edge."""
@@ -42,7 +42,7 @@ def measure_images(context: WorkerContext, scene: Scene, truth: Truth) -> dict[s
       `mirror_pose` sets the mirror camera T_z_m away from the point d_z ahead of the input camera, and turns it by the input
       pose alone. So the camera is off by exactly this, along the input camera's optical axis, and is not turned.
     - agreement_mm: the stored input depth projected into the mirror view against the stored mirror depth, the median
-      (workers/labels/agreement.py), the largest of all pairs; it needs no rays.
+      (workers/scene/labels.py), the largest of all pairs; it needs no rays.
     - unfilled_share: of the mirror view's object pixels by ray whose point the input camera sees too, the share that the
       projected depth leaves empty.
     - hidden_share: of the projected depth's filled pixels, of objects and all else, evenly over the image: the share that

@@ -17,9 +17,8 @@ from services.study.measure.image_errors import measure_images
 from services.study.measure.settling import context_for
 from services.study.measure.truth import truth_of
 from services.study.model import Setting
-from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import Scene, make_scene
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.make_scene import Scene, make_scene
 
 CONVERGED_PATHS = 256
 """Two truths with other seeds differ by 0.012 to 0.02 in FLIP, a tenth of what tiers do."""

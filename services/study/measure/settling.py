@@ -10,17 +10,15 @@ import numpy as np
 from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.job.physics import Physics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ScenePlan
+from schemas.scene.scene import EffectPlan, ScenePlan
 from services.study.knobs import apply
 from services.study.model import Setting
 from workers.geometry.frames import motion_between, transform
 from workers.physics.fall import FINEST
 from workers.physics.settle import Rest, moved_by, recheck_scene, settle_scene
-from workers.pipeline.context import WorkerContext
-from workers.plan.effects import Facts, plan_effects
-from workers.plan.randomness import SceneChance
-from workers.plan.step import plan_scene
+from workers.scene.context import WorkerContext
+from workers.scene.effects import Facts, plan_effects
+from workers.scene.plan import SceneChance, plan_scene
 
 AGREE_MM = 0.05
 """Two references agree where their poses are nearer than this; only then is there a true pose."""

@@ -14,12 +14,10 @@ from services.bench.ratios import Spread
 from services.study.measure.settling import context_for
 from services.study.model import Row, Setting
 from workers.physics.settle import settle_scene
-from workers.pipeline.context import WorkerContext
-from workers.pipeline.run_shard import run_scene
-from workers.pipeline.stopwatch import Stopwatch
-from workers.plan.effects import Facts, plan_effects
-from workers.plan.randomness import SceneChance
-from workers.plan.step import plan_scene
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.effects import Facts, plan_effects
+from workers.scene.plan import SceneChance, plan_scene
+from workers.shard.run_shard import run_scene
 
 WARM_SCENES = 4
 

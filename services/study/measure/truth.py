@@ -7,10 +7,10 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from schemas.scene.camera import Camera
 from schemas.scene.scene import Placed
+from schemas.scene.view import Camera
 from services.study.measure.rays import Patch, Pixels, cast_patch, cast_pixels, seen_by_other
-from workers.pipeline.make_scene import Scene
+from workers.scene.make_scene import Scene
 
 KEPT = 12
 """Casts kept of a scene, some 0.3 MB each: the last ones used. Every setting uses the input camera's; the mirror camera moves

@@ -7,7 +7,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from schemas.durations import describe_seconds
+from schemas.errors import describe_seconds
 from services.study.answer import answer
 from services.study.choose import Targets, as_cheap, front, own_row
 from services.study.errors import ERRORS

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from schemas.errors import MachineError
-from schemas.job.render import Render
+from schemas.job.views import Render
 from schemas.scene.scene import PosedScene
 from services.bench.ratios import Lap
 from services.bench.traced import describe, hand_over, start_cycles, summarise

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from services.run.sight import Sight, look_at_folder, processor_flags, see, start_environment
-from workers.pipeline.code import code_digest
+from workers.shard.code import code_digest
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from schemas.job.identity import settings_digest
-from schemas.job.job import Job
-from schemas.job.preset import PRESETS
+from schemas.job.job import PRESETS, Job
 from services.study.choose import error_of, own_row
 from services.study.errors import ERRORS
 from services.study.knobs import apply

@@ -7,8 +7,8 @@ import trimesh
 from schemas.base import frozen_array
 from schemas.capture.estimate import Reconstruction, SynthesizedView
 from schemas.errors import CaptureError
-from schemas.scene.camera import Camera
 from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera
 from tests.workers.capture.analytic_capture import kinect
 from workers.capture.evaluate import (
     compare_poses,

@@ -7,7 +7,7 @@ import pytest
 from schemas.capture.estimate import DepthCorrection
 from schemas.capture.view import CaptureCamera, CapturedView
 from schemas.errors import CaptureError
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from workers.capture.posed_view import correct_depth, distort_mask, pose_view
 from workers.capture.poses.rays import opencv_matrix
 

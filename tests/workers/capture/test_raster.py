@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera, Intrinsics
 from tests.kit.shapes import shape_of
 from workers.capture.raster import draw_depth
 from workers.geometry.camera import look_at

@@ -6,7 +6,7 @@ import pytest
 
 from schemas.capture.view import CaptureCamera
 from schemas.job.captures import Board, Estimation
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from tests.conftest import SHARED_DATA
 from workers.capture.board.frames import frame_in_board
 from workers.capture.board.layout import marker_corners, open_dictionary

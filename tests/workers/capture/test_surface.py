@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from schemas.base import frozen_array
-from schemas.scene.camera import Camera
+from schemas.scene.view import Camera
 from tests.workers.capture.analytic_capture import Thing, cast, kinect
 from workers.capture.depth_fit import fit_depth
 from workers.capture.posed_view import PosedView

@@ -6,7 +6,7 @@ import pytest
 from schemas.base import frozen_array
 from schemas.errors import CaptureError
 from schemas.job.captures import Synthesis
-from schemas.scene.camera import Camera
+from schemas.scene.view import Camera
 from tests.workers.capture.analytic_capture import Thing, capture, cast, kinect, poses
 from workers.capture.depth_fit import fit_depth
 from workers.capture.synthesize import merge_layers, rank_views, synthesize_view

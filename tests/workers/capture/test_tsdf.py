@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from schemas.base import frozen_array
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.view import Camera, Intrinsics
 from workers.capture.depth_fit import fit_depth
 from workers.capture.tsdf import BACK_VOXELS, FRONT_VOXELS, empty_volume, integrate, sample_inverse
 from workers.geometry.camera import look_at

@@ -4,8 +4,8 @@ import numpy as np
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera, Intrinsics
 from workers.capture.visibility import UNSEEN, facing_cosine, visible_points
 from workers.geometry.camera import look_at
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from workers.geometry.camera import (
     image_coordinates,
     inclination,

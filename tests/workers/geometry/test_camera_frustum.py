@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.camera import is_outside_views, orbit_pose, project
 from workers.geometry.frames import invert, transform, uniform_rotation
 

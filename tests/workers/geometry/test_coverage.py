@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Part, Shape
+from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.frames import pose, translation, uniform_rotation
 from workers.geometry.raycast import cast_view
 from workers.geometry.zbuffer import LARGEST_PX, NEAREST_M, count_covered

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.view import Camera, Intrinsics
 from tests.workers.labels.planes import HERE, plane_view
 from tests.workers.labels.planes import K as PLANE_K
 from workers.geometry.camera import unproject

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from workers.geometry.pixels import (
     Extent,
     count_filled,

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from schemas.scene.camera import Camera, Intrinsics
-from workers.cameras.placement import mirror_pose
+from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.camera import orbit_pose, unproject
 from workers.geometry.frames import invert
 from workers.geometry.projection import forward_project, sample_inverse_depth
+from workers.scene.pairs import mirror_pose
 
 K = Intrinsics(width=40, height=30, fx=33.0, fy=33.0, cx=20.0, cy=15.0)
 HERE = Camera(K, orbit_pose(np.zeros(3), 0.8, 0.3, 2.5))

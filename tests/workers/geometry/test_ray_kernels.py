@@ -3,7 +3,7 @@
 import numpy as np
 import shapely
 
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from workers.geometry.camera import unproject
 from workers.geometry.raycast import keep_nearer, meet_planes, pixel_rays, pixels_between, row_spans
 

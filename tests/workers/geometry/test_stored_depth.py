@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from schemas.job.images import Images
+from schemas.job.views import Images
 from workers.geometry.pixels import dequantise_depth, quantise_depth
 
 IMAGES = Images()

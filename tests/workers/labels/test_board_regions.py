@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from schemas.job.captures import Board
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.view import Camera, Intrinsics
 from tests.captures import rolled_pose
 from workers.geometry.camera import look_at
 from workers.geometry.frames import invert

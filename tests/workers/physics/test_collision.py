@@ -8,7 +8,7 @@ import trimesh
 
 from schemas.job.job import Job
 from schemas.job.physics import Collision, Physics
-from schemas.scene.plan import ObjectStart
+from schemas.scene.scene import ObjectStart
 from tests.kit.shapes import asset_of, box, table
 from tests.physics.settling import settle_single
 from workers.geometry.frames import angle_between, pose, rotation_about

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from schemas.job.job import Job
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart
+from schemas.scene.scene import EffectPlan, ObjectStart
 from tests.hard_cases.drops import X, turn
 from tests.kit.shapes import asset_of, box, table
 from workers.geometry.frames import pose, quaternion_from_rotation, uniform_rotation

@@ -6,9 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from schemas.scene.plan import ObjectStart, Table
-from schemas.scene.region import REGION_TABLE
-from schemas.scene.shape import Asset
+from schemas.scene.scene import ObjectStart, Table
+from schemas.scene.shape import REGION_TABLE, Asset
 from tests.kit.shapes import asset_of, box, shape_of, table
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.geometry.hull import convex_hull

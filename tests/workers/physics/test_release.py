@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from schemas.job.job import Job
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart
+from schemas.scene.scene import EffectPlan, ObjectStart
 from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import built_in, cube, rod
 from tests.hard_cases.drops import X, turn

@@ -8,8 +8,7 @@ import trimesh
 
 from schemas.errors import SettleError
 from schemas.job.job import Job
-from schemas.scene.plan import ObjectStart
-from schemas.scene.scene import Settled
+from schemas.scene.scene import ObjectStart, Settled
 from schemas.scene.shape import Asset
 from tests.kit.shapes import asset_of, box, table
 from tests.physics.settling import effects_of, scene_of, settle_group, settle_single

@@ -10,8 +10,7 @@ import trimesh
 from schemas.errors import SettleError
 from schemas.job.assets import ProceduralSource
 from schemas.job.job import Job
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart
+from schemas.scene.scene import EffectPlan, ObjectStart
 from schemas.scene.shape import Mesh
 from tests.kit.shapes import asset_of, box, shape_of, table
 from tests.physics.population import draw
@@ -23,8 +22,7 @@ from workers.geometry.hull import convex_hull
 from workers.physics.fall import FINEST, fall
 from workers.physics.settle import RECHECK_RATE, RECHECK_S, Rest, recheck_scene, release_again
 from workers.physics.support import place_table, vertical_gap
-from workers.plan.randomness import SceneChance
-from workers.plan.step import draw_scene, draw_start
+from workers.scene.plan import SceneChance, draw_scene, draw_start
 
 PHYSICS = Job(name="t").physics
 TABLE = place_table(table())

@@ -8,9 +8,9 @@ from tests.effects.scenes import Setting, facts_of, with_holes
 from tests.workers.render.looks import FLAT, FOUR, RASTER, paths, without
 from tests.workers.render.pathtraced.scenes import traced
 from tests.workers.render.random_scenes import APPEARANCE, camera, orbit_and_mirror, random_things, small
-from workers.plan.effects import EFFECTS, plan_effects
 from workers.render.raster.gbuffer import FLAT_EFFECTS
 from workers.render.tiers import draw_view
+from workers.scene.effects import EFFECTS, plan_effects
 
 
 @traced

@@ -6,11 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.job.images import Images
-from schemas.job.sensor import SensorEffects
-from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.view import View
+from schemas.job.views import Images, SensorEffects
+from schemas.scene.scene import EffectPlan
+from schemas.scene.view import Camera, Intrinsics, View
 from services.job.read import validate_job
 from services.read.query import query
 from services.read.verify import verify
@@ -19,7 +17,7 @@ from services.run.slots import Slots
 from services.run.step import RunRequest, run_job
 from tests.services.run.test_step import SMALL
 from workers.geometry.colour import decode_codes
-from workers.sensor.step import SensorChance, planned_effects, sense_view
+from workers.scene.sensor import SensorChance, planned_effects, sense_view
 from workers.store.local import LocalStore
 
 EVERY = {

@@ -7,7 +7,7 @@ import pytest
 from schemas.capture.view import CaptureCamera, CapturedView
 from schemas.errors import CaptureError
 from schemas.job.captures import Board
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from workers.geometry.frames import pose, rotation_about
 from workers.store.capture_folder import (
     CaptureFile,

@@ -8,7 +8,7 @@ import pytest
 
 from schemas.capture.view import CaptureTruth
 from schemas.errors import CaptureError
-from schemas.job.sensor import Distortion
+from schemas.job.views import Distortion
 from workers.geometry.frames import pose, uniform_rotation
 from workers.store.capture_truth import TrueObject, read_truth, write_true_mask, write_truth
 

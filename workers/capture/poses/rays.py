@@ -5,7 +5,7 @@ import numpy as np
 
 from schemas.base import Array, Pose
 from schemas.capture.view import CaptureCamera
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from workers.geometry.frames import invert
 
 ROUND_TRIP_PX = 0.05

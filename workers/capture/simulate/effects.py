@@ -1,11 +1,11 @@
 """Which effects a simulated capture runs: one table of effects, and the plan that follows from its settings. Pure.
 
-The plan is of the same kind as that of scenes (schemas/scene/effects.py). Effects of the rendering are no-ops where a
+The plan is of the same kind as that of scenes (schemas/scene/scene.py). Effects of the rendering are no-ops where a
 capture does not call for them; every other one is asked for by name in `captures.simulate`.
 """
 
 from schemas.job.captures import Simulate
-from schemas.scene.effects import EffectPlan
+from schemas.scene.scene import EffectPlan
 
 ASKED = (
     "hidden_markers",

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, frozen_array
 from schemas.errors import CaptureError
-from schemas.job.sensor import Distortion
-from schemas.scene.camera import Intrinsics
+from schemas.job.views import Distortion
+from schemas.scene.view import Intrinsics
 from workers.geometry.distortion import undistort
 from workers.geometry.jit import compiled
 

@@ -6,11 +6,11 @@ whole range of the mode NFOV unbinned, 0.5 to 3.86 m. Tolgyessy et al. 2021 (Sen
 and what is behind it. Kurillo et al. 2022 (Sensors 22(7):2469) see the random error grow with the distance.
 
 **Assumed.** The numbers below are no fit of a published table. They are a device of the usual kind at arm's length, far inside
-those bounds; what scenes have (schemas/job/sensor.py) is the upper bound.
+those bounds; what scenes have (schemas/job/views.py) is the upper bound.
 """
 
 from schemas.job.captures import KinectDepthNoise
-from schemas.job.sensor import DepthNoise
+from schemas.job.views import DepthNoise
 
 AXIAL_M, AXIAL_PER_M = 0.0008, 0.0005
 """sigma(z) = 0.8 mm + 0.5 mm z^2 (z in metres), over the cosine of incidence: 1.1 mm at 0.8 m and 1.3 mm at 1 m."""

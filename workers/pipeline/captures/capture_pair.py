@@ -12,17 +12,13 @@ from schemas.capture.processed import PosedImages
 from schemas.dataset.layout import file_pose_id, input_pose_id
 from schemas.job.captures import Board
 from schemas.job.job import Job
-from schemas.scene.camera import Camera, Role
-from schemas.scene.effects import EffectPlan
-from schemas.scene.region import REGION_FIRST_OBJECT, REGION_NOTHING, REGION_TABLE
-from schemas.scene.scene import Placed
-from schemas.scene.shape import Asset
-from schemas.scene.view import ObjectLabel, Pair, View
-from workers.cameras.placement import object_distance, place_mirror_camera
+from schemas.scene.scene import EffectPlan, Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_NOTHING, REGION_TABLE, Asset
+from schemas.scene.view import Camera, ObjectLabel, Pair, Role, View
 from workers.geometry.pixels import quantise_depth
 from workers.labels.board_regions import capture_regions
-from workers.labels.projected_view import derive_projected, projection_shares
-from workers.labels.regions import CountPixels, label_things
+from workers.scene.labels import CountPixels, derive_projected, label_things, projection_shares
+from workers.scene.pairs import object_distance, place_mirror_camera
 
 Synthesize = Callable[[Camera], SynthesizedView]
 

@@ -7,7 +7,7 @@ from schemas.job.captures import Captures
 from workers.pipeline.captures.corrections import Given, correct_manually
 from workers.pipeline.captures.estimate import estimate_poses
 from workers.pipeline.captures.reconstruct import Merged, reconstruct
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch
 
 
 def estimate_surface(given: Given, captures: Captures, watch: Stopwatch) -> tuple[Estimates, Merged]:

@@ -8,13 +8,13 @@ import numpy as np
 from schemas.base import Array, Pose
 from schemas.capture.view import CaptureCamera, CapturedView
 from schemas.job.captures import Board
-from schemas.scene.camera import Camera
+from schemas.scene.view import Camera
 from workers.capture.simulate.effects import ASKED
 from workers.capture.simulate.lens import opencv_lens
 from workers.capture.simulate.path import plan_path
 from workers.geometry.colour import encode_codes
 from workers.pipeline.captures.photograph import Studio, draw_labels, take_light
-from workers.plan.randomness import Stream
+from workers.scene.plan import Stream
 from workers.store.capture_folder import CaptureFile, write_description, write_pose, write_view
 
 VIEWS = 3

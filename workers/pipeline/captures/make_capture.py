@@ -9,17 +9,15 @@ from schemas.capture.processed import ProcessedCapture
 from schemas.errors import CaptureError, ViewError
 from schemas.job.captures import Captures
 from schemas.job.job import Job
-from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import SceneOutput
+from schemas.scene.scene import EffectPlan, SceneOutput
 from workers.assets.captured import CaptureNames, board_asset, reconstructed_asset
 from workers.geometry.spread import spread_evenly
 from workers.pipeline.captures.capture_pair import CapturedObject, CapturedPair, make_capture_pair
 from workers.pipeline.captures.process_capture import process_capture
 from workers.pipeline.captures.rows import LeftOut, Origin, record_capture
 from workers.pipeline.captures.simulate import load_object, simulate_capture
-from workers.pipeline.context import WorkerContext
-from workers.pipeline.stopwatch import Stopwatch
-from workers.plan.randomness import SceneChance
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.plan import SceneChance
 from workers.store.capture_folder import open_folder
 from workers.store.capture_inputs import digest_inputs
 from workers.store.capture_truth import read_receipt, read_truth

@@ -8,13 +8,10 @@ from numpy.typing import NDArray
 from schemas.base import Array, Pose, frozen_array
 from schemas.capture.view import CapturedView
 from schemas.job.captures import Board, Simulate
-from schemas.job.render import Render
-from schemas.scene.appearance import Appearance
-from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.region import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
-from schemas.scene.scene import Placed
-from schemas.scene.shape import Part, Shape
+from schemas.job.views import Render
+from schemas.scene.scene import EffectPlan, Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE, Appearance, Part, Shape
+from schemas.scene.view import Camera, Intrinsics
 from workers.assets.appearance import draw_appearance
 from workers.capture.simulate.board_body import THICKNESS_M, board_body
 from workers.capture.simulate.cover import cover_markers
@@ -27,11 +24,10 @@ from workers.capture.simulate.sampling import CENTRE, Sample, add_light, light_t
 from workers.geometry.colour import encode_codes
 from workers.geometry.frames import translation
 from workers.geometry.zbuffer import register_depth
-from workers.plan.randomness import SceneChance, Stream
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.tiers import draw_view
-from workers.sensor.depth import sense_depth
-from workers.sensor.rgb import add_noise, expose
+from workers.scene.plan import SceneChance, Stream
+from workers.scene.sensor import add_noise, expose, sense_depth
 
 DEPTH_UNITS_PER_M = 1000.0
 

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 from schemas.capture.estimate import Estimates, ViewEstimate
 from schemas.capture.view import CaptureCamera
 from schemas.dataset.codec import Row, camera_columns
-from schemas.scene.camera import Camera
+from schemas.scene.view import Camera
 
 _f64, _i64, _str = pa.float64(), pa.int64(), pa.string()
 _matrix = pa.list_(pa.field("item", _f64, nullable=False), 16)

@@ -7,8 +7,8 @@ from typing import Any
 
 from schemas.capture.estimate import CaptureEstimate, Estimates
 from schemas.job.captures import Captures
-from schemas.scene.camera import Camera
 from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera
 from workers.capture.masks import silhouette
 from workers.capture.posed_view import distort_mask
 from workers.pipeline.captures.corrections import Given, corrections_of, given_files

@@ -10,7 +10,7 @@ from workers.pipeline.captures.estimate_surface import estimate_surface
 from workers.pipeline.captures.reconstruct import Merged
 from workers.pipeline.captures.score import read_whole_truth, score_capture
 from workers.pipeline.captures.views import CaptureViews
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch
 from workers.store.capture_folder import CaptureFolder
 
 

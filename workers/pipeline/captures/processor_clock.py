@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from workers.capture.masks import down_to_board
 from workers.capture.object_region import ObjectRegion, find_object
 from workers.capture.posed_view import PosedView, pose_view
 from workers.pipeline.captures.corrections import Given
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch
 from workers.store.capture_folder import read_view
 
 

@@ -10,15 +10,13 @@ from schemas.capture.processed import ProcessedCapture, ViewScore
 from schemas.dataset.codec import Row, matrix_column
 from schemas.dataset.layout import asset_path
 from schemas.dataset.tables import NOT_OF_CAPTURES
-from schemas.scene.camera import Role
 from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
+from schemas.scene.view import Role
 from workers.assets.catalogue import split_of
 from workers.assets.glb import asset_glb
 from workers.pipeline.captures.capture_pair import CapturedObject, CapturedPair
-from workers.pipeline.context import WorkerContext
-from workers.pipeline.image_files import encode_view
-from workers.pipeline.rows import asset_row, object_rows, view_row
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.rows import asset_row, encode_view, object_rows, view_row
 from workers.store.images import encode_png
 
 SCORES = ("pose_mm", "pose_deg", "cloud_median_mm", "cloud_p95_mm", "completeness", "depth_median_mm")

@@ -13,8 +13,8 @@ from schemas.base import Array, Pose
 from schemas.capture.estimate import CaptureEstimate, Reconstruction
 from schemas.capture.processed import CaptureScore, ViewScore
 from schemas.errors import CaptureError, ViewError
-from schemas.scene.camera import Camera
 from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera
 from workers.capture.evaluate import (
     COMPLETE_M,
     MeasuredSurface,

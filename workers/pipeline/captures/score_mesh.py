@@ -1,7 +1,7 @@
 """A processed capture against a mesh that the user gives, in a frame of its own."""
 
-from schemas.scene.camera import Camera
 from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera
 from workers.capture.align import Alignment, align_mesh
 from workers.capture.evaluate import SurfaceErrors
 from workers.geometry.frames import transform

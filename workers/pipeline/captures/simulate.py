@@ -7,10 +7,8 @@ from schemas.capture.view import CaptureCamera, CaptureTruth
 from schemas.errors import CaptureError
 from schemas.job.captures import Board, Simulate
 from schemas.job.job import Job
-from schemas.scene.effects import EffectPlan
-from schemas.scene.region import REGION_FIRST_OBJECT
-from schemas.scene.scene import Placed
-from schemas.scene.shape import Asset
+from schemas.scene.scene import EffectPlan, Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT, Asset
 from workers.assets.catalogue import Catalogue, load_asset
 from workers.assets.glb import asset_glb
 from workers.capture.simulate.effects import plan_effects, planned_settings
@@ -19,8 +17,7 @@ from workers.capture.simulate.path import plan_path
 from workers.capture.simulate.place import place_object
 from workers.pipeline.captures.held_out import write_held_out
 from workers.pipeline.captures.photograph import DEPTH_UNITS_PER_M, Studio, build_studio, photograph
-from workers.plan.randomness import SceneChance, Stream
-from workers.plan.step import choose_assets
+from workers.scene.plan import SceneChance, Stream, choose_assets
 from workers.store.capture_folder import TRUTH, CaptureFile, write_description, write_view
 from workers.store.capture_truth import HELD_OUT, TrueObject, write_true_mask, write_truth
 

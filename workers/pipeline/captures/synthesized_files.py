@@ -7,7 +7,7 @@ from typing import Any
 from schemas.base import Pose, frozen_array
 from schemas.capture.estimate import SynthesizedView
 from schemas.errors import CaptureError, OutputError, ViewError
-from schemas.scene.camera import Camera
+from schemas.scene.view import Camera
 from workers.geometry.pixels import round_depth
 from workers.pipeline.captures.stored_result import StoredResult
 from workers.store.capture_folder import write_pose

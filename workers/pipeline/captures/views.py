@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.capture.estimate import CaptureEstimate, SynthesizedView
 from schemas.capture.processed import PosedImages
-from schemas.job.cameras import Mirror
 from schemas.job.captures import Captures
-from schemas.scene.camera import Camera
+from schemas.job.views import Mirror
 from schemas.scene.shape import Mesh
-from workers.cameras.placement import front_distance, place_mirror_camera
+from schemas.scene.view import Camera
 from workers.capture.depth_fit import fit_depth
 from workers.capture.masks import silhouette
 from workers.capture.posed_view import PosedView
@@ -21,6 +20,7 @@ from workers.capture.synthesize import choose_sources, synthesize_view
 from workers.capture.warp import Source, move_depth, prepare_source
 from workers.pipeline.captures.corrections import Given
 from workers.pipeline.captures.reconstruct import read_posed
+from workers.scene.pairs import front_distance, place_mirror_camera
 from workers.store.capture_folder import CaptureFolder
 
 KEPT = 12

@@ -10,7 +10,7 @@ from services.study.captures.measure import errors_of, fewer_views, measure_capt
 from services.study.model import Setting
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.captures.make_capture import simulate_one
-from workers.pipeline.context import open_worker
+from workers.scene.context import open_worker
 from workers.store.capture_folder import open_folder
 
 pytestmark = pytest.mark.minute

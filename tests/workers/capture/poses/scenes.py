@@ -8,7 +8,7 @@ import numpy as np
 from schemas.base import Pose
 from schemas.capture.view import CaptureCamera
 from schemas.job.captures import Board, Estimation
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from tests.workers.capture.photographs import KINECT
 from workers.capture.board.layout import marker_corners
 from workers.capture.poses.evidence import Evidence

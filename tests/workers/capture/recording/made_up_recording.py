@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from schemas.job.captures import Board
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from tests.workers.capture.recording.matroska import Track, write_recording
 from tests.workers.geometry.made_up_kinect import (
     COLOR_LENS,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from schemas.errors import CaptureError
-from schemas.job.sensor import Distortion
+from schemas.job.views import Distortion
 from workers.capture.simulate.lens import add_bent_light, nearest_pixels, opencv_lens, pinhole_lookup
 from workers.capture.simulate.rig import make_rig
 

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 
 from schemas.errors import MachineError, MeshError
 from schemas.job.assets import ProceduralSource
-from schemas.job.run import Run
+from schemas.job.job import Run
 from schemas.scene.shape import Mesh
 from workers.assets.builtin.make import make_asset
 from workers.geometry.hull import convex_hull

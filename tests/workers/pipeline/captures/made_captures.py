@@ -8,8 +8,8 @@ from pathlib import Path
 from schemas.capture.view import CaptureCamera, CaptureTruth
 from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Board, Simulate
-from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.scene import Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT
 from workers.assets.builtin.make import make_asset
 from workers.capture.simulate.effects import plan_effects
 from workers.capture.simulate.lens import opencv_lens
@@ -17,7 +17,7 @@ from workers.capture.simulate.path import plan_path
 from workers.capture.simulate.place import place_object
 from workers.pipeline.captures.photograph import build_studio, photograph
 from workers.pipeline.captures.simulate import simulate_capture
-from workers.plan.randomness import SceneChance, Stream
+from workers.scene.plan import SceneChance, Stream
 from workers.store.capture_folder import CaptureFolder, open_folder
 
 KEPT = tempfile.TemporaryDirectory(prefix="verso-captures-")

@@ -11,7 +11,7 @@ from schemas.job.captures import Board, Captures, Estimation, KinectDepthNoise, 
 from workers.assets.builtin.make import make_asset
 from workers.pipeline.captures.process import ProcessedFolder, process_folder
 from workers.pipeline.captures.simulate import simulate_capture
-from workers.plan.randomness import SceneChance
+from workers.scene.plan import SceneChance
 from workers.store.capture_folder import open_folder
 from workers.store.capture_truth import read_truth
 

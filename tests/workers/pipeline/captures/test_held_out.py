@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.scene.camera import Camera
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Part, Shape
+from schemas.scene.view import Camera
 from tests.workers.pipeline.captures.edge_corners import corner_errors
 from tests.workers.pipeline.captures.made_captures import made
 from workers.geometry.raycast import cast_view

@@ -11,8 +11,7 @@ from tests.captures import captures_job, exact_capture, use_exact_captures, writ
 from workers.pipeline.captures import make_capture
 from workers.pipeline.captures.listing import open_sources
 from workers.pipeline.captures.make_capture import image_effects, run_capture
-from workers.pipeline.context import open_worker
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch, open_worker
 from workers.store.images import decode_png
 from workers.store.manifest import check_files, table_of_rows
 

@@ -9,7 +9,7 @@ import pytest
 from schemas.capture.estimate import CaptureEstimate, Estimates, ViewEstimate
 from schemas.capture.view import CaptureCamera
 from schemas.dataset.tables import SCHEMAS
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from workers.geometry.frames import translation
 from workers.pipeline.captures.pose_table import SCHEMA, pose_table
 

@@ -12,8 +12,8 @@ from workers.assets.builtin.make import make_asset
 from workers.geometry.frames import translation
 from workers.pipeline.captures.process_capture import is_corrected, process_capture
 from workers.pipeline.captures.simulate import simulate_capture
-from workers.pipeline.stopwatch import Stopwatch
-from workers.plan.randomness import SceneChance
+from workers.scene.context import Stopwatch
+from workers.scene.plan import SceneChance
 from workers.store.capture_folder import open_folder, write_pose
 from workers.store.capture_truth import read_truth
 

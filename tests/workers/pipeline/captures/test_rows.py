@@ -12,8 +12,7 @@ from workers.assets.catalogue import split_of
 from workers.pipeline.captures.listing import open_sources
 from workers.pipeline.captures.make_capture import make_pairs, place_capture
 from workers.pipeline.captures.rows import LeftOut, Origin, record_capture
-from workers.pipeline.context import WorkerContext, open_worker
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch, WorkerContext, open_worker
 
 JOB = captures_job()
 

@@ -14,7 +14,7 @@ from tests.workers.pipeline.captures.made_captures import asset_of, made
 from workers.assets.catalogue import open_catalogue
 from workers.capture.simulate.effects import ASKED
 from workers.pipeline.captures.simulate import load_object, simulate_capture
-from workers.plan.randomness import SceneChance
+from workers.scene.plan import SceneChance
 from workers.store.capture_folder import read_view
 from workers.store.capture_truth import read_truth
 

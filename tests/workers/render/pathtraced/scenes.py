@@ -5,8 +5,7 @@ import importlib.util
 import pytest
 
 from schemas.base import frozen_array
-from schemas.scene.appearance import Light
-from schemas.scene.shape import Material, Part, Shape
+from schemas.scene.shape import Light, Material, Part, Shape
 
 MITSUBA = importlib.util.find_spec("mitsuba") is not None
 traced = pytest.mark.skipif(not MITSUBA, reason="Mitsuba is not installed: the path-traced tier goes untested")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from schemas.base import frozen_array
-from schemas.scene.appearance import Appearance, Light
 from schemas.scene.scene import Placed
+from schemas.scene.shape import Appearance, Light
 from tests.workers.render.looks import BLACK, paths
 from tests.workers.render.pathtraced.scenes import matte, traced, with_material
 from tests.workers.render.random_scenes import (

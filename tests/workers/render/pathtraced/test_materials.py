@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from schemas.base import frozen_array
-from schemas.scene.appearance import Appearance, Light
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Material, Part, Shape
+from schemas.scene.shape import Appearance, Light, Material, Part, Shape
 from tests.workers.render.looks import BLACK, FLAT, paths, without
 from tests.workers.render.pathtraced.scenes import DOWN, matte, traced, with_material
 from tests.workers.render.random_scenes import (

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.scene.appearance import Appearance
-from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.scene import Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT, Appearance
 from tests.workers.render.looks import BLACK, paths, without
 from tests.workers.render.pathtraced.scenes import DOWN, matte, traced, with_material
 from tests.workers.render.random_scenes import (

@@ -5,9 +5,8 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from schemas.scene.appearance import Appearance
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Material
+from schemas.scene.shape import Appearance, Material
 from tests.workers.render.looks import BLACK, FLAT, FOUR, RASTER, without
 from tests.workers.render.random_scenes import APPEARANCE, camera, orbit_and_mirror, procedural_things, quad, small
 from workers.geometry.colour import encode_srgb

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.scene.camera import Camera
 from schemas.scene.scene import Placed
+from schemas.scene.view import Camera
 from tests.workers.render.random_scenes import (
     APPEARANCE,
     VGA,

@@ -8,16 +8,16 @@ import pytest
 import trimesh
 
 import workers.render.raster.gbuffer
-from schemas.scene.camera import Camera
 from schemas.scene.scene import Placed
+from schemas.scene.view import Camera
 from tests.kit.shapes import shape_of
 from tests.workers.render.looks import FLAT, FOUR, RASTER, Look, forcing, without
 from tests.workers.render.random_scenes import APPEARANCE, VGA, orbit_and_mirror, procedural_things, random_things
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import translation
-from workers.plan.effects import names_of_kind
 from workers.render.raster.draw_calls import rank_regions, sort_draws
 from workers.render.raster.light_maps import LightMaps
+from workers.scene.effects import names_of_kind
 
 DRAWN = ("floor", "light_maps", "table", "textures", "transparency")
 """The no-ops that the renderer knows of."""

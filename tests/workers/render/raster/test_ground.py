@@ -8,9 +8,8 @@ import trimesh
 
 import workers.render.raster.gbuffer
 from schemas.base import frozen_array
-from schemas.scene.appearance import Appearance
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Material, Part, Shape
+from schemas.scene.shape import Appearance, Material, Part, Shape
 from tests.workers.render.looks import FLAT, RASTER, without
 from tests.workers.render.random_scenes import (
     APPEARANCE,

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.scene.appearance import Appearance, Light
 from schemas.scene.scene import Placed
+from schemas.scene.shape import Appearance, Light
 from tests.workers.render.looks import BLACK, DOWN, RASTER, brightness, pixel_of, white_floor
 from tests.workers.render.random_scenes import camera, floor, shape_of, small
 from workers.geometry.camera import orbit_pose

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from schemas.base import frozen_array
-from schemas.scene.appearance import Appearance, Light
-from schemas.scene.camera import Intrinsics
+from schemas.scene.shape import Appearance, Light
+from schemas.scene.view import Intrinsics
 from workers.geometry.camera import project
 from workers.render.raster.draw_calls import NEAR_M, clip_from_cam, light_slots, place_lights
 

@@ -5,9 +5,8 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.scene.appearance import Appearance, Light
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Material, Part, Shape
+from schemas.scene.shape import Appearance, Light, Material, Part, Shape
 from tests.workers.render.looks import FLAT, RASTER
 from tests.workers.render.random_scenes import (
     EYE,

@@ -4,8 +4,8 @@ import numpy as np
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.scene.camera import Intrinsics
 from schemas.scene.shape import Part, Shape
+from schemas.scene.view import Intrinsics
 from tests.workers.render.random_scenes import FLOOR_HALF_M, floor, shape_of
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import invert, translation

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Range
 from schemas.errors import LabelError
-from schemas.job.run import Check
-from schemas.scene.camera import Camera
-from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.job.job import Check
 from schemas.scene.scene import PosedScene
-from schemas.scene.view import GBuffer, Pair
+from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.view import Camera, GBuffer, Pair
 from workers.geometry.camera import unproject
 from workers.geometry.jit import compiled
 from workers.geometry.raycast import cast_view, edge_distance_px, first_hit

@@ -1,7 +1,11 @@
 """`verso export`: a dataset in another layout, scene by scene in constant memory, gone on with after a kill."""
 
+import argparse
 import csv
 import io
+import json
+import sys
+import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
@@ -13,15 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import OutputError
-from services.export.choice import Chooser
 from services.export.folder import ExportFolder
-from services.export.formats import open_writer
-from services.export.request import SHARDED, ExportRequest
+from services.export.formats import SHARDED, Added, Choice, Chooser, ExportRequest, open_writer
 from services.export.source import iter_ranges, scenes_of
-from services.export.writer import Added
-from services.job.record import JobRecord, require_job
+from services.job.record import JobRecord, require_dataset, require_job
 from services.merge.merge import read_success
+from services.read.damage import explain_damage
+from services.run.progress import ProgressLine
 from workers.store.commit import list_codes
+from workers.store.local import open_store
 
 LEFT_OUT: Final = "left_out.csv"
 VERSION: Final = 1
@@ -167,3 +171,50 @@ def _refuse_inside(request: ExportRequest) -> None:
     root = request.store.root
     if root is not None and request.target.resolve().is_relative_to(Path(root).resolve()):
         raise OutputError(f"{request.target} lies in the dataset {request.store.name}: choose a DIR beside it")
+
+
+# TODO(merge) `verso export`: writes a dataset in another layout, and says what was left out.
+
+
+def main(options: argparse.Namespace) -> int:
+    """Export what the options ask for; returns 0, or 1 where no pair could be exported."""
+    if "://" in options.dir:
+        raise OutputError(f"{options.dir} is not a folder: export into one on this machine, and copy it there")
+    store = require_dataset(open_store(options.out))
+    first, last = options.scenes or (None, None)
+    choice = Choice(categories=tuple(options.category), first_scene=first, last_scene=last, where=options.where)
+    request = ExportRequest(store, Path(options.dir), options.format, choice, options.shard_mb)
+    begun = time.monotonic()
+    with explain_damage(store), closing(ProgressLine(0, "export")) as line:
+
+        def report(done: int, asked: int) -> None:
+            line.expect(asked)
+            line.show(done)
+
+        result = export(request, report)
+    _tell(options, result, time.monotonic() - begun)
+    return 0 if result.manifest["pairs"] else 1
+
+
+def _tell(options: argparse.Namespace, result: ExportResult, seconds: float) -> None:
+    """Prints what the export holds and what it leaves out."""
+    manifest = result.manifest
+    now = f" ({result.pairs_now} now, in {seconds:.1f} s)" if result.pairs_now else " (nothing was left to do)"
+    print(f"{options.dir}: {options.format}, {manifest['pairs']} pairs of {manifest['scenes']} scenes{now}")
+    for reason, count in manifest["left_out"].items():
+        print(f"  left out: {count} pairs, {reason}")
+    if manifest["pairs_left_out"]:
+        print(f"  {Path(options.dir) / LEFT_OUT} names each of them")
+    for line in manifest.get("not_exported", ()):
+        print(f"  not exported: {line}")
+    if not manifest["pairs"]:
+        told = "no scene was chosen" if not manifest["pairs_left_out"] else "every pair was left out"
+        print(f"verso: {options.dir} holds no pair: {told}", file=sys.stderr)
+    if options.json:
+        answer: dict[str, Any] = {
+            "ok": manifest["pairs"] > 0,
+            "dir": options.dir,
+            "pairs_now": result.pairs_now,
+            **manifest,
+        }
+        print(json.dumps(answer))

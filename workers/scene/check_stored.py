@@ -8,18 +8,15 @@ from numpy.typing import ArrayLike, NDArray
 from schemas.dataset.codec import Row, columns_of_bodies, read_camera, read_label, read_world_poses
 from schemas.dataset.layout import file_pose_id, image_path, stored_images
 from schemas.job.job import Job
-from schemas.scene.camera import Role
-from schemas.scene.effects import EffectPlan
-from schemas.scene.region import REGION_FIRST_OBJECT
-from schemas.scene.view import View
-from workers.cameras.placement import object_distance, place_aligned_camera, place_mirror_camera
+from schemas.scene.scene import EffectPlan
+from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.view import Role, View
 from workers.geometry.camera import image_coordinates
 from workers.geometry.frames import invert
 from workers.geometry.pixels import measure_regions
-from workers.labels.agreement import compare_views
-from workers.labels.patches import patch_object_fraction
-from workers.labels.projected_view import derive_projected, projection_shares
-from workers.pipeline.image_files import image_boxes, view_pixels
+from workers.scene.labels import compare_views, derive_projected, patch_object_fraction, projection_shares
+from workers.scene.pairs import object_distance, place_aligned_camera, place_mirror_camera
+from workers.scene.rows import image_boxes, view_pixels
 
 ROUNDING = 1e-12
 """Largest difference of poses and distances that are computed again from the same doubles."""

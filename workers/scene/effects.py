@@ -1,6 +1,6 @@
 """What a scene calls for: one table of effects, one entry an effect, and the plan that follows from it. Pure.
 
-The plan is made from the scene as it is drawn, before anything moves; the kinds are explained in schemas/scene/effects.py.
+The plan is made from the scene as it is drawn, before anything moves; the kinds are explained in schemas/scene/scene.py.
 To add an effect: add an entry with its kind, predicate and stage, let the step that it belongs to ask the plan, and
 give it its two scenes (tests/effects/cases.py) and its proof (tests/effects/proofs.py).
 """
@@ -13,19 +13,16 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.dataset.layout import SWITCHES, PixelKind, is_stored
-from schemas.job.job import Job
-from schemas.job.render import Tier
-from schemas.job.run import Check
-from schemas.job.sensor import SensorEffects
-from schemas.scene.camera import Camera, Role
-from schemas.scene.effects import EffectKind, EffectPlan
-from schemas.scene.plan import ScenePlan
+from schemas.job.job import Check, Job
+from schemas.job.views import SensorEffects, Tier
+from schemas.scene.scene import EffectKind, EffectPlan, ScenePlan
 from schemas.scene.shape import Part
-from workers.cameras.placement import place_aligned_camera, place_mirror_camera
+from schemas.scene.view import Camera, Role
 from workers.geometry.camera import is_outside_views
 from workers.geometry.colour import has_holes
 from workers.physics.effects import PREDICATES
-from workers.plan.randomness import SceneChance, Stream
+from workers.scene.pairs import place_aligned_camera, place_mirror_camera
+from workers.scene.plan import SceneChance, Stream
 
 
 @dataclass(frozen=True, eq=False)

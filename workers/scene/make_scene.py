@@ -6,19 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.base import frozen_array
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ScenePlan
-from schemas.scene.region import REGION_FLOOR, REGION_TABLE
-from schemas.scene.scene import Placed, PosedScene, Settled
+from schemas.scene.scene import EffectPlan, Placed, PosedScene, ScenePlan, Settled
+from schemas.scene.shape import REGION_FLOOR, REGION_TABLE
 from schemas.scene.view import Pair
-from workers.labels.ray_check import check_pair
 from workers.physics.settle import recheck_scene, settle_scene
-from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_pair import SettledScene, make_pair
-from workers.pipeline.stopwatch import Stopwatch
-from workers.plan.effects import Facts, is_raycast_scene, plan_effects
-from workers.plan.randomness import SceneChance
-from workers.plan.step import plan_scene
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.effects import Facts, is_raycast_scene, plan_effects
+from workers.scene.pairs import SettledScene, make_pair
+from workers.scene.plan import SceneChance, plan_scene
+from workers.scene.ray_check import check_pair
 
 
 @dataclass(frozen=True, eq=False)

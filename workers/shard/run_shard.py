@@ -1,42 +1,151 @@
-"""A shard: ranges of scenes made one after another in one process, each committed while the next is made."""
+"""What is told of a scene in which something was raised that is no refusal: a bug, or memory that ran out."""
 
+import contextlib
 import faulthandler
 import os
 import socket
 import sys
 import time
+import traceback
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import takewhile
+from pathlib import PurePath
+from types import TracebackType
 from typing import IO
 
-from schemas.dataset.commit import Span
-from schemas.dataset.fingerprint import Fingerprint
-from schemas.dataset.layout import FINGERPRINT_FILE, staging_path
-from schemas.dataset.shard import Blame, ShardOrder, ShardReport, SpanReport
+from schemas.dataset.commit import Span, summarize
+from schemas.dataset.layout import FINGERPRINT_FILE, LOG_FOLDER, staging_path
+from schemas.dataset.shard import Blame, Fingerprint, JobChange, ShardOrder, ShardReport, SpanReport
 from schemas.errors import FingerprintError, SceneError, VersoError
-from schemas.job.render import Tier
+from schemas.job.views import Tier
 from schemas.scene.scene import SceneOutput
 from workers.assets.catalogue import Catalogue
-from workers.pipeline.bugs import UnexpectedError, explain, keep_traceback, name_scene
-from workers.pipeline.committer import Committer, MadeRange
-from workers.pipeline.context import WorkerContext, open_worker
-from workers.pipeline.fingerprint import take_fingerprint
 from workers.pipeline.loops import compile_together
-from workers.pipeline.make_scene import make_scene
-from workers.pipeline.rows import failed_scene, record_scene, timing_row
-from workers.pipeline.stopwatch import Stopwatch
-from workers.plan.randomness import SceneChance
-from workers.plan.step import choose_category
 from workers.render.raster.context import require_device
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.tiers import require_tier
+from workers.scene.context import Stopwatch, WorkerContext, open_worker
+from workers.scene.make_scene import make_scene
+from workers.scene.plan import SceneChance, choose_assets, choose_category
+from workers.scene.rows import failed_scene, record_scene, timing_row
+from workers.shard.fingerprint import take_fingerprint
 from workers.store.attempt import TIMED_OUT, Attempt, begin_attempt
 from workers.store.local import open_store
 from workers.store.store import Store
+
+
+class UnexpectedError(SceneError):
+    """A scene that stopped at an error nobody expected. The others go on, and `--retry-failed` makes it again."""
+
+    stage = "worker"
+    kind = "environmental"
+
+
+def explain(error: Exception) -> UnexpectedError:
+    """The row of a scene that ended in this error."""
+    if isinstance(error, MemoryError):
+        told = "a worker had too little memory for this scene: use fewer workers, then run with --retry-failed"
+        return UnexpectedError("memory", f"{told} ({describe(error)})")
+    return UnexpectedError("bug", f"{describe(error)}: report this, then run with --retry-failed")
+
+
+def describe(error: BaseException) -> str:
+    """One line: the kind of error, its first line, and where in the code it was raised."""
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f" at {PurePath(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
+    said = next(iter(str(error).splitlines()), "")[:200]
+    return f"{type(error).__name__}{f': {said}' if said else ''}{where}"
+
+
+def name_scene(context: WorkerContext, scene_id: int) -> str:
+    """The scene with its category and the instances in it, as far as they can be drawn, or the capture and its folder."""
+    drawn = ""
+    if context.job.captures is not None:
+        folders = context.job.captures.folders
+        return f"capture {scene_id}{f' ({folders[scene_id]})' if scene_id < len(folders) else ''}"
+    with contextlib.suppress(Exception):  # what failed may be the draw itself
+        objects, table = choose_assets(context.job, context.catalogue, SceneChance(context.job.seed, scene_id))
+        each = ", ".join(f"{ref.category} {ref.instance_id}" for ref in objects)
+        drawn = f" ({each}, on table {table.instance_id})"
+    return f"scene {scene_id}{drawn}"
+
+
+def keep_traceback(store: Store, scene_id: int, error: BaseException) -> str:
+    """Writes the traceback beside the logs; where it is, for the end of a sentence."""
+    key = f"{LOG_FOLDER}/scene-{scene_id}.txt"
+    try:
+        store.write_whole(key, "".join(traceback.format_exception(error)).encode(), durable=False)
+    except Exception:  # a log must not end the scene's range
+        return ""
+    return f"; the traceback is in {store.name}/{key}"
+
+
+# TODO(merge) Ranges that are committed while the next one is made.
+#
+# A commit computes little and waits long: for a disk to flush, or for an object store to take and copy archives. So it runs in a
+# thread of its own. One range at a time is committed, in order, and nothing else of a worker runs in two threads.
+
+
+@dataclass(frozen=True, eq=False)
+class MadeRange:
+    """A range whose scenes are all written: its failures by `kind: reason`, and scenes that ended in an unexpected error."""
+
+    attempt: Attempt
+    failed: Mapping[str, int]
+    bugs: tuple[str, ...]
+
+    def commit(self, job_change: JobChange | None) -> SpanReport:
+        """Commit it. Raises as `Attempt.commit`."""
+        result, span = self.attempt.commit(job_change), self.attempt.span
+        return SpanReport(
+            start=span.start,
+            stop=span.stop,
+            retry=span.retry,
+            won=result.won,
+            conflict=result.conflict,
+            made=len(span.scene_ids) - sum(self.failed.values()),
+            failed=dict(self.failed),
+            bugs=self.bugs,
+            commit=summarize(result.record),
+        )
+
+
+class Committer:
+    """Commits one range while the next is made. A context: at its end no commit is under way, also where its block raises."""
+
+    def __init__(self, job_change: JobChange | None) -> None:
+        self._job_change = job_change
+        self._thread = ThreadPoolExecutor(1, "commit")
+        self._under_way: Future[SpanReport] | None = None
+        self.reports: list[SpanReport] = []
+        """Of the ranges whose commits were waited for, in order."""
+
+    def begin(self, made: MadeRange) -> None:
+        """Begin to commit a range, after the commit before it. Raises what that one raised; then this one is not begun."""
+        self.wait()
+        self._under_way = self._thread.submit(made.commit, self._job_change)
+
+    def wait(self) -> None:
+        """Wait for the commit that is under way. Raises what it raised."""
+        if self._under_way is not None:
+            ended, self._under_way = self._under_way, None
+            self.reports.append(ended.result())
+
+    def __enter__(self) -> "Committer":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._thread.shutdown()
+
+
+# TODO(merge) A shard: ranges of scenes made one after another in one process, each committed while the next is made.
 
 
 class BlamedScene(SceneError):

@@ -1,26 +1,110 @@
-"""The draw of a scene: assets, starts, cameras and look, all before anything moves."""
+"""Named streams of random numbers: one for each step of a scene, append-only, so that adding a camera moves no object."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import StartError
-from schemas.job.cameras import Cameras
 from schemas.job.job import Job
-from schemas.job.start import Start
-from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.plan import ObjectStart, ScenePlan, Table
-from schemas.scene.region import REGION_FIRST_OBJECT
-from schemas.scene.shape import Asset, Hull, Mesh
+from schemas.job.physics import Start
+from schemas.job.views import Cameras
+from schemas.scene.scene import ObjectStart, ScenePlan, Table
+from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Hull, Mesh
+from schemas.scene.view import Camera, Intrinsics
 from workers.assets.appearance import draw_appearance
 from workers.assets.catalogue import Catalogue, InstanceRef, choose_object, choose_table, load_asset
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, transform, translation, uniform_rotation
 from workers.geometry.hull import hull_of
 from workers.physics.support import place_table, sample_elevation, support_height, support_margin
-from workers.plan.arrange import has_room, rise_above
-from workers.plan.randomness import SceneChance, Stream
+
+
+class Stream(IntEnum):
+    """Every use of chance in a scene. A new one gets the next number; a number is never used for anything else."""
+
+    CATEGORY = 0
+    OBJECT = 1
+    TABLE = 2
+    START = 3
+    REDRAW = 4
+    CAMERA = 5
+    APPEARANCE = 6
+    RAYCAST_CHECK = 7
+    SENSOR_DEPTH = 8
+    SENSOR_RGB = 9
+    SENSOR_EXPOSURE = 10
+    PATHS = 11
+    COUNT = 12
+    HIDDEN_MARKERS = 13
+    MOTION = 14
+    HELD_OUT = 15
+
+
+@dataclass(frozen=True)
+class SceneChance:
+    """The random numbers of one scene: a function of the dataset's seed and the scene's id alone."""
+
+    seed: int
+    scene_id: int
+
+    def stream(self, name: Stream, *within: int) -> np.random.Generator:
+        """The generator of one step.
+
+        `within` names a part of a step that must not depend on how many parts there are: (pair, role) for a view's noise.
+        """
+        key = (self.scene_id, int(name), *within)
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
+
+    def object_stream(self, name: Stream, number: int) -> np.random.Generator:
+        """The generator of one step for an object by its number: the first object's is that of a scene with only one."""
+        return self.stream(name, *([number] if number else []))
+
+
+# TODO(merge) How several objects begin without touching: each on a place of its own, or one above another. Pure.
+
+
+APART_M = 0.001
+"""Columns nearer to each other than this count as touching."""
+
+_ANGLES = math.pi * np.arange(90) / 90
+AXES = frozen_array(np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1))
+"""[90, 2] the horizontal axes that are tried for a separating plane. None is further than 1 degree from the best one, so
+that two footprints of 0.2 m that are more than 4 mm apart are found to be so."""
+
+
+def points_of(start: ObjectStart) -> Array:
+    """[N, 3] world: the corners of an object's hull where it begins."""
+    return transform(start.T_world_obj, start.hull.vertices)
+
+
+def columns_apart(points: Array, others: Array) -> bool:
+    """Whether a vertical plane separates two clouds [N, 3] by at least `APART_M` of air.
+
+    Two bodies that fall straight down then do not meet. The theorem of the separating axis, applied to `AXES` alone:
+    clouds that almost touch may count as touching.
+    """
+    mine, theirs = points[:, :2] @ AXES.T, others[:, :2] @ AXES.T
+    gap = np.maximum(theirs.min(axis=0) - mine.max(axis=0), mine.min(axis=0) - theirs.max(axis=0))
+    return bool(gap.max() >= APART_M)
+
+
+def has_room(points: Array, earlier: Sequence[ObjectStart]) -> bool:
+    """Whether a cloud [N, 3] stands in no earlier object's column."""
+    return all(columns_apart(points, points_of(other)) for other in earlier)
+
+
+def rise_above(points: Array, earlier: Sequence[ObjectStart]) -> float:
+    """Metres by which a cloud [N, 3] must be lifted for its lowest point to be level with the top of all earlier objects."""
+    top = max(float(points_of(other)[:, 2].max()) for other in earlier)
+    return max(0.0, top - float(points[:, 2].min()))
+
+
+# TODO(merge) The draw of a scene: assets, starts, cameras and look, all before anything moves.
+
 
 RECESS_M = 0.05
 """Table this far below its top still counts as table under an object: a tray's bottom does, a lower shelf does not."""

@@ -9,17 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.dataset.fingerprint import Fingerprint
+from schemas.dataset.shard import Fingerprint
 from schemas.job.identity import settings_digest
 from schemas.job.job import Job
-from schemas.job.render import Tier
+from schemas.job.views import Tier
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.code import code_digest
-from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import make_scene
-from workers.pipeline.rows import record_scene
-from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.gbuffer import Renderer
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.make_scene import make_scene
+from workers.scene.rows import record_scene
+from workers.shard.code import code_digest
 
 CANARY = Job(name="canary", seed=7, scenes=1)
 """Changed with the schema version only: a new canary makes every stored fingerprint foreign."""
