@@ -68,7 +68,7 @@ def lint(project: Path, imports: dict[str, str]) -> subprocess.CompletedProcess[
         ("services/read/query.py", "services.dataset.thing", "services: commands"),
         ("services/read/independent/derive.py", "workers.geometry.thing", "the independent derivation"),
         ("services/read/independent/derive.py", "schemas.dataset.thing", "the independent derivation"),
-        ("services/read/independent/step.py", "services.read.verify", "the independent derivation"),
+        ("services/read/independent/poses.py", "services.read.verify", "the independent derivation"),
         ("schemas/scene/scene.py", "trimesh", "schemas load nothing heavy"),
         ("workers/shard/run_shard.py", "ray", "workers never import Ray"),
         ("services/cli/main.py", "ray", "Ray is known"),

@@ -10,8 +10,8 @@ from services.cli.commands import answer_json
 
 def report(options: argparse.Namespace) -> int:
     """`verso report`."""
-    from services.read.damage import explain_damage
-    from services.report.report import write_report
+    from services.look.report import write_report
+    from services.read.verdict import explain_damage
     from workers.store.local import open_store
 
     began = time.monotonic()
@@ -29,8 +29,8 @@ def report(options: argparse.Namespace) -> int:
 
 def serve(options: argparse.Namespace) -> int:
     """`verso serve`."""
-    from services.report.follow import Follower
-    from services.report.server import choose_place, ended_by_signal, serving
+    from services.look.live import Follower
+    from services.look.server import choose_place, ended_by_signal, serving
     from workers.store.local import open_store
 
     place = choose_place(options.host, options.port, options.token)

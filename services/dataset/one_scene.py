@@ -12,8 +12,8 @@ from schemas.errors import CorruptError, SceneError
 from schemas.job.job import Job
 from schemas.job.views import Patch
 from schemas.scene.scene import SceneOutput
+from services.dataset.dataset import PAIR_TABLES, pair_table
 from services.dataset.pair import Pair, read_pair
-from services.dataset.pair_table import PAIR_TABLES, pair_table
 from services.dataset.shapes import Shapes
 from services.job.read import load_job, validate_job
 from services.job.record import JobRecord, record_job

@@ -17,7 +17,7 @@ from schemas.errors import InputError
 from schemas.job.views import Patch
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import ROLES, Camera, ObjectLabel, Role
-from services.read.stored_paths import patch_paths, view_paths
+from services.read.stored_tables import patch_paths, view_paths
 from workers.scene.labels import crop_box
 from workers.store.images import decode_png
 

@@ -22,7 +22,7 @@ from services.export.formats import SHARDED, Added, Choice, Chooser, ExportReque
 from services.export.source import iter_ranges, scenes_of
 from services.job.record import JobRecord, require_dataset, require_job
 from services.merge.merge import read_success
-from services.read.damage import explain_damage
+from services.read.verdict import explain_damage
 from services.run.progress import ProgressLine
 from workers.store.commit import list_codes
 from workers.store.local import open_store

@@ -18,7 +18,7 @@ from services.export.folder import ExportFolder
 from services.export.formats import Added, LeftOut
 from services.export.source import ExportScene, unchanged_sources
 from services.job.record import JobRecord
-from services.read.scene_export import captured_scene, planned_scene
+from services.read.scene_geometry import captured_scene, planned_scene
 from workers.assets.catalogue import Catalogue
 from workers.store.store import Store
 

@@ -18,7 +18,7 @@ from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Role
 from services.job.record import JobRecord
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, read_image, read_stored
-from services.read.stored_paths import patch_paths, view_paths
+from services.read.stored_tables import patch_paths, view_paths
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.captures.listing import open_sources
 from workers.store.commit import read_committed, split_code

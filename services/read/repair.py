@@ -13,13 +13,11 @@ from schemas.errors import CorruptError, VersoError
 from services.job.record import encode_job, record_job
 from services.merge.dataset_card import write_card
 from services.merge.merge import merge
-from services.read.remake import Maker
+from services.read.replay import Maker
 from services.read.verdict import COPY, Verdict
-from services.read.verify import verify
-from services.read.verify_finished import read_stored_success
-from services.read.verify_job import StoredJob, Terms, check_fingerprint, encode_fingerprint, read_stored_job
-from services.read.verify_range import read_records
-from services.read.verify_span import commit_groups
+from services.read.verify import StoredJob, Terms, check_fingerprint, encode_fingerprint, read_stored_job, verify
+from services.read.verify_files import read_stored_success
+from services.read.verify_range import commit_groups, read_records
 from services.run.lock import hold_lock
 from workers.pipeline.captures.listing import open_sources
 from workers.render.raster.gbuffer import shared_renderer

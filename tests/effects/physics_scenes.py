@@ -6,7 +6,7 @@ from functools import cache
 
 from schemas.base import Pose
 from schemas.scene.scene import EffectPlan, ScenePlan, Settled
-from services.read.audit_motion import MOST_DEG, MOST_MM
+from services.read.audit import MOST_DEG, MOST_MM
 from tests.effects.scenes import Setting, facts_of
 from tests.hard_cases.drops import Drop
 from workers.physics.fall import Outcome, StepSizes, fall, falls_below

@@ -15,9 +15,8 @@ import workers.scene.pairs
 from schemas.dataset.layout import FINGERPRINT_FILE
 from services.cli.main import main
 from services.job.read import validate_job
-from services.read import audit_motion
-from services.read.audit import Audit, audit, describe_audit
-from services.read.audit_motion import Motion
+from services.read import audit as audit_motion
+from services.read.audit import Audit, Motion, audit, describe_audit
 from services.read.referee import Held
 from tests.datasets import run_here
 from tests.effects.scenes import SMALL, merged

@@ -13,7 +13,7 @@ import workers.render.tiers
 import workers.scene.labels
 import workers.scene.pairs
 from schemas.scene.view import Camera, Intrinsics
-from services.read.verify_independent import verify_independently
+from services.read.audit import verify_independently
 from tests.datasets import faults_of, make_dataset
 from workers.geometry.frames import pose, rotation_about, translation
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import workers.scene.pairs
-from services.read.verify_independent import verify_independently
+from services.read.audit import verify_independently
 from tests.captures import CAMERA, captures_job, exact_capture, use_exact_captures
 from tests.datasets import faults_of, run_here
 from workers.geometry.frames import pose, rotation_about, translation

@@ -1,23 +1,79 @@
-"""`verso scene`: the posed geometry of one stored scene as a GLB file."""
+"""A part of a shape as a mesh of trimesh's, with its material."""
 
+import io
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import trimesh
-from trimesh.visual import ColorVisuals
+from numpy.typing import NDArray
+from PIL import Image
+from trimesh.visual import ColorVisuals, TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
+from schemas.base import Array, Pose
 from schemas.dataset.codec import Row, read_world_poses
-from schemas.errors import InputError, OutputError
+from schemas.dataset.layout import asset_path
+from schemas.errors import CorruptError, InputError, OutputError
 from schemas.job.job import Job
-from schemas.scene.shape import REGION_FLOOR, REGION_TABLE
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE, Part
 from services.job.record import require_job
-from services.read.capture_export import captured_geometry
 from services.read.dataset_reader import StoredRange, find_scene
-from services.read.part_mesh import linear_bytes, mesh_of_part
 from services.read.replay import open_context
 from workers.assets.catalogue import Catalogue
+from workers.assets.external.formats import read_visual
+from workers.geometry.colour import decode_srgb
 from workers.scene.plan import SceneChance, plan_scene
 from workers.store.store import Store
+
+
+def mesh_of_part(part: Part) -> trimesh.Trimesh:
+    """The part in the shape's frame, metres. Its material is as glTF has it: colours linear, textures sRGB."""
+    return trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=_visual(part), process=False)
+
+
+def _visual(part: Part) -> TextureVisuals | ColorVisuals:
+    material = part.material
+    if part.colors is not None and material.texture is None:
+        return ColorVisuals(vertex_colors=linear_bytes(part.colors / 255.0))
+    pbr = PBRMaterial(
+        baseColorFactor=linear_bytes(np.array(material.base_color)),
+        metallicFactor=material.metallic,
+        roughnessFactor=material.roughness,
+        baseColorTexture=None if material.texture is None else Image.fromarray(material.texture),
+    )
+    return TextureVisuals(uv=part.uv, material=pbr)
+
+
+def linear_bytes(srgb: Array) -> NDArray[np.uint8]:
+    """[..., 4] colours and vertex colours as glTF has them: linear, where textures and ours are sRGB; alpha as it is."""
+    return np.rint(255.0 * np.concatenate([decode_srgb(srgb[..., :3]), srgb[..., 3:]], axis=-1)).astype(np.uint8)
+
+
+# TODO(merge) The posed geometry of a stored capture: its board, and the mesh that was reconstructed from it.
+
+
+def captured_geometry(store: Store, stored: StoredRange, row: Row) -> Iterator[tuple[str, trimesh.Trimesh, Pose]]:
+    """(name, mesh, T_world_mesh) of board and object. Raises CorruptError where the stored shape cannot be read."""
+    T_world = read_world_poses(row)
+    board = next(asset for asset in stored.rows["assets"] if asset["instance_id"] == row["table_id"])
+    x, y, _ = (0.5 * size for size in board["extents_m"])
+    rectangle = trimesh.Trimesh([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
+    yield f"board {row['table_id']}", rectangle, T_world[REGION_TABLE]
+    path = asset_path(row["category"], row["instance_id"])
+    try:
+        scene = trimesh.load_scene(io.BytesIO(store.read(path)), file_type="glb", process=False)
+    except Exception as error:  # trimesh raises errors of many kinds for a damaged file
+        raise CorruptError(
+            f"{path} cannot be read: {error}; `verso replay {store.name} --repair` makes it again"
+        ) from error
+    for mesh in scene.geometry.values():
+        visual, _ = read_visual(mesh, linear=True)
+        mesh.visual = ColorVisuals(mesh, vertex_colors=visual.colors)
+        yield f"{row['category']} {row['instance_id']}", mesh, T_world[REGION_FIRST_OBJECT]
+
+
+# TODO(merge) `verso scene`: the posed geometry of one stored scene as a GLB file.
 
 
 def export_scene(store: Store, scene_id: int, target: Path) -> int:

@@ -16,9 +16,9 @@ from schemas.base import Array
 from schemas.dataset.codec import Row, read_camera, read_world_poses
 from schemas.errors import VersoError
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
+from services.look.pictures import PairImages, metres_of, read_pair
 from services.read.dataset_reader import file_reader, find_scene
-from services.read.scene_export import export_scene
-from services.report.images import PairImages, metres_of, read_pair
+from services.read.scene_geometry import export_scene
 from workers.geometry.camera import unproject
 from workers.store.store import Store
 
