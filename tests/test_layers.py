@@ -73,7 +73,7 @@ def lint(project: Path, imports: dict[str, str]) -> subprocess.CompletedProcess[
         ("workers/shard/run_shard.py", "ray", "workers never import Ray"),
         ("services/cli/main.py", "ray", "Ray is known"),
         ("workers/scene/ray_check.py", "pybullet", "PyBullet is imported in one file"),
-        ("services/bench/stages.py", "pybullet", "PyBullet is imported in one file"),
+        ("services/bench/measure.py", "pybullet", "PyBullet is imported in one file"),
         ("workers/store/images.py", "OpenGL.GL", "OpenGL stays in its room"),
         ("services/read/report.py", "pyrender", "OpenGL stays in its room"),
         ("workers/render/tiers.py", "mitsuba", "Mitsuba stays in one file"),

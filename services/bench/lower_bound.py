@@ -14,7 +14,7 @@ import fpng
 import numpy as np
 from numpy.typing import NDArray
 
-from services.bench.ratios import Lap
+from services.bench.figures import Lap
 from workers.render.raster.gbuffer import FLAT, Renderer
 from workers.scene.make_scene import Scene
 from workers.store.file_system import sync_path, sync_tree

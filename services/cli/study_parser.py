@@ -1,6 +1,5 @@
 """The commands that measure: how long scenes take, and what accuracy costs."""
 
-import sys
 from pathlib import Path
 
 from services.cli.arguments import read_counts, read_path
@@ -24,13 +23,6 @@ STUDY_COMMANDS: dict[str, Command] = {
             number("--workers", "also compare N workers with one, beside N plain processes"),
             number("--scaling-scenes", "how many scenes that comparison makes", 512),
             SET,
-            option(
-                "--pathtraced",
-                nargs="?",
-                const=sys.executable,
-                metavar="PYTHON",
-                help="time the path-traced tier instead, beside Blender's Cycles where PYTHON (default: this one) has bpy",
-            ),
             option(
                 "--nodes",
                 type=read_counts,

@@ -8,8 +8,8 @@ import pytest
 from schemas.base import frozen_array
 from schemas.scene.view import Camera, Intrinsics
 from services.job.read import validate_job
-from services.study.measure import colour_errors
-from services.study.measure.colour_errors import (
+from services.study.measure import colour as colour_errors
+from services.study.measure.colour import (
     ColourTruth,
     Crop,
     colour_truth_missing,

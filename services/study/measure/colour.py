@@ -1,4 +1,9 @@
-"""Errors of colour: FLIP of the input view against a converged path-traced image."""
+"""FLIP (Andersson et al. 2020) by flip-evaluator: the visible difference on flipping between two images, 0 to 1.
+
+The observer is the authors' default: 0.7 m before a screen 0.7 m and 3840 pixels wide, 67 of the image's pixels in a degree.
+The package calls `sys.exit` on wrong arguments and misreads integers, so it only gets float32 in [0, 1]. Its map is the same
+on one thread (`OMP_NUM_THREADS`) and on several; its mean, summed in float32, is not, so it is not used.
+"""
 
 import importlib.util
 from collections.abc import Sequence
@@ -13,7 +18,6 @@ from schemas.job.views import Render
 from schemas.scene.scene import Placed, ScenePlan
 from schemas.scene.shape import REGION_FLOOR
 from schemas.scene.view import Camera, Intrinsics
-from services.study.measure.flip import flip_between
 from services.study.measure.rays import Box, cast_patch
 from workers.assets.appearance import draw_appearance
 from workers.render.tiers import draw_view, require_tier
@@ -21,6 +25,22 @@ from workers.scene.context import WorkerContext
 from workers.scene.effects import Facts, plan_effects
 from workers.scene.make_scene import Scene
 from workers.scene.plan import SceneChance, Stream
+
+
+def flip_between(reference: NDArray[np.uint8], rgb: NDArray[np.uint8]) -> float:
+    """The mean of FLIP's map, from 0 for equal images to 1. Both are [H, W, 3] uint8 sRGB of one size. Raises ValueError."""
+    import flip_evaluator  # of the extra `study`
+
+    for image in (reference, rgb):
+        if image.shape != reference.shape or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise ValueError(f"FLIP compares [H, W, 3] uint8 of one size, not {image.shape} {image.dtype}")
+    a, b = (np.ascontiguousarray(image, np.float32) / np.float32(255) for image in (reference, rgb))
+    seen, _, _ = flip_evaluator.evaluate(a, b, "LDR", applyMagma=False, computeMeanError=False)
+    return float(np.asarray(seen, np.float64).mean())
+
+
+# TODO(merge) Errors of colour: FLIP of the input view against a converged path-traced image.
+
 
 WIDTH, HEIGHT = 640, 480
 """The size of the image that colours are compared at, whatever the size of the image under test. Only a crop is traced."""

@@ -1,6 +1,7 @@
 """One capture processed with every setting: processor time, bytes, and errors against its truth."""
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,15 +9,20 @@ from typing import Any
 import numpy as np
 
 from schemas.capture.processed import CaptureScore, ProcessedCapture
-from schemas.errors import CaptureError
+from schemas.errors import CaptureError, InputError
+from services.bench.figures import pinned
+from services.run.progress import ProgressLine
 from services.study.measure.settling import context_for
-from services.study.model import Setting
+from services.study.measure.timing import image_figures, timed_rows
+from services.study.model import Plan, Row, Setting
+from services.study.study import Journal
 from workers.geometry.spread import spread_evenly
-from workers.pipeline.captures.make_capture import require_captures
+from workers.pipeline.captures.make_capture import require_captures, simulate_one
 from workers.pipeline.captures.process_capture import process_capture
 from workers.pipeline.captures.processor_clock import ProcessorClock
 from workers.scene.context import WorkerContext
 from workers.store.capture_folder import CaptureFolder, open_folder
+from workers.store.file_system import temporary_folder
 
 BYTES_OF_POINT = 3 * 4 + 3 * 4 + 3
 BYTES_OF_VERTEX = 3 * 4 + 3
@@ -79,3 +85,69 @@ def _bytes(done: ProcessedCapture) -> int:
     surface = done.surface
     points, vertices, faces = len(surface.points), len(surface.vertices), len(surface.faces)
     return points * BYTES_OF_POINT + vertices * BYTES_OF_VERTEX + faces * BYTES_OF_FACE
+
+
+# TODO(merge) The study of a job of simulated captures: what views, estimates, iterations and voxels cost, and what they give.
+
+
+LEAST_CAPTURES = 2
+"""Fewer tell nothing of how errors spread."""
+
+
+def check_captures(plan: Plan) -> None:
+    """Raises InputError where a job's captures cannot be studied."""
+    captures = plan.job.captures
+    if captures is None or captures.source != "simulate":
+        raise InputError(
+            "captures.source is folders: a study needs truth, which simulated captures alone have; use captures.source: simulate"
+        )
+    if plan.sizes.scenes < LEAST_CAPTURES:
+        raise InputError(f"{plan.sizes.scenes} capture cannot tell how errors spread: ask for {LEAST_CAPTURES} or more")
+
+
+def run_capture_study(plan: Plan, journal: Journal, context: WorkerContext, progress: ProgressLine) -> tuple[Row, ...]:
+    """Measure what is not in the journal yet, and make the table; its first row is the job itself.
+
+    A capture is simulated once, and processed with every setting in an order of its own, lap by lap, on one core.
+    """
+    first, sizes = plan.job.first_scene, plan.sizes
+    units = {
+        f"captures/{scene}/{lap}": (scene, lap)
+        for scene, lap in itertools.product(range(first, first + sizes.scenes), range(sizes.laps))
+    }
+    missing: dict[int, list[str]] = {}
+    for name, (scene, _) in units.items():
+        if name not in journal:
+            missing.setdefault(scene, []).append(name)
+    progress.expect(len(units))
+    with pinned():
+        for number, (scene, names) in enumerate(missing.items()):
+            with temporary_folder("study") as scratch:
+                path = scratch / "capture"
+                simulate_one(context, scene, path)
+                if number == 0:
+                    warm_up(context, plan.settings[0], path)
+                for name in names:
+                    journal.add(name, measure_capture(context, plan.settings, path, units[name]))
+                    progress.show(sum(unit in journal for unit in units))
+    laps: list[dict[int, dict[str, Any]]] = [{} for _ in range(sizes.laps)]
+    for name, (scene, lap) in units.items():
+        laps[lap][scene] = journal[name]
+    return rows_of(plan, laps)
+
+
+def rows_of(plan: Plan, laps: Sequence[Mapping[int, dict[str, Any]]]) -> tuple[Row, ...]:
+    """The table, from the answers by lap and capture; settings that no capture could be processed with are left out."""
+    answers, rows = list(laps[0].values()), []
+    for row, _ in timed_rows(plan.settings, laps):
+        name = row.setting.name
+        failed = [str(one["failed"][name]) for one in answers if name in one["failed"]]
+        rows.append(
+            replace(
+                row,
+                errors=image_figures([one["errors"][name] for one in answers if name in one["errors"]]),
+                failed_share=len(failed) / len(answers),
+                notes=tuple(dict.fromkeys(failed)),
+            )
+        )
+    return tuple(rows)
