@@ -10,16 +10,21 @@ import numpy as np
 import pytest
 
 from schemas.base import frozen_array
-from schemas.capture.estimate import (
+from schemas.capture import (
+    CaptureCamera,
+    CapturedView,
     CaptureEstimate,
+    CaptureScore,
+    CaptureTruth,
     DepthCorrection,
     Estimates,
+    PosedImages,
+    ProcessedCapture,
     Reconstruction,
     SynthesizedView,
     ViewEstimate,
+    ViewScore,
 )
-from schemas.capture.processed import CaptureScore, PosedImages, ProcessedCapture, ViewScore
-from schemas.capture.view import CaptureCamera, CapturedView, CaptureTruth
 from schemas.job.assets import Assets, ProceduralSource
 from schemas.job.captures import Board, Captures, Simulate
 from schemas.job.job import Job
@@ -32,14 +37,13 @@ from tests.datasets import overlaid
 from workers.assets.appearance import draw_appearance
 from workers.assets.builtin.make import make_asset
 from workers.assets.captured import board_asset
+from workers.capture import make_capture
+from workers.capture.folder import CaptureFile, CaptureFolder, TrueObject, write_description, write_truth, write_view
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import pose, rotation_about, translation
-from workers.pipeline.captures import make_capture
 from workers.render.raster.gbuffer import shared_renderer
 from workers.scene.context import Stopwatch
 from workers.scene.plan import SceneChance
-from workers.store.capture_folder import CaptureFile, CaptureFolder, write_description, write_view
-from workers.store.capture_truth import TrueObject, write_truth
 
 SMALL_CAPTURES: dict[str, Any] = {
     "name": "captures",

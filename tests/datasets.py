@@ -12,7 +12,7 @@ from services.merge.dataset_card import write_card
 from services.merge.merge import merge
 from services.read.verify import verify
 from services.run.range_planner import plan_spans
-from workers.pipeline.captures.listing import open_sources
+from workers.capture.results import open_sources
 from workers.scene.context import Stopwatch, open_worker
 from workers.shard.fingerprint import take_fingerprint
 from workers.shard.run_shard import run_scene

@@ -29,7 +29,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
             BOARD,
             number("--dpi", "resolution of a PNG, dots an inch (default: 300)", 300),
         ),
-        "services.capture.board:board",
+        "services.capture:board",
     ),
     "simulate": Command(
         "make a virtual capture with known truth",
@@ -41,7 +41,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
             option("--category", default="mug", metavar="NAME", help="what is captured (default: mug)"),
             SET,
         ),
-        "services.capture.simulate:simulate",
+        "services.capture:simulate",
     ),
     "import": Command(
         "make a capture from an Azure Kinect recording, without its SDK",
@@ -54,7 +54,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
             option("--name", metavar="NAME", help="of the object (default: the name of DIR)"),
             option("--category", default="object", metavar="NAME", help=f"{CATEGORY_HELP} (default: object)"),
         ),
-        "services.capture.import_recording:import_recording",
+        "services.capture:import_recording",
     ),
     "process": Command(
         "estimate the camera poses of a capture, and merge its views into a cloud and a mesh",
@@ -68,7 +68,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
             ),
             SET,
         ),
-        "services.capture.process:process",
+        "services.capture:process",
     ),
     "synthesize": Command(
         "make RGB, depth and mask of a processed capture from other poses",
@@ -77,7 +77,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
             FOLDER,
             option("--out", type=read_path, metavar="DIR", help="where the views go (default: DIR/views)"),
         ),
-        "services.capture.synthesize:synthesize",
+        "services.capture:synthesize",
         one_of=(
             option("--pose", type=read_path, metavar="FILE", help="T_board_cam, 4 lines of 4 numbers"),
             option("--mirror", action="store_true", help="the mirror view of every captured view"),
@@ -87,7 +87,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
         "score a processed capture against its truth or a given mesh",
         "data/mug --json",
         (FOLDER, option("--mesh", type=read_path, metavar="FILE", help="the object's mesh, metres, in its own frame")),
-        "services.capture.evaluate:evaluate",
+        "services.capture:evaluate",
     ),
 }
 """In the order of `verso capture --help`."""

@@ -17,7 +17,7 @@ from services.dataset.pair import Pair, read_pair
 from services.dataset.shapes import Shapes
 from services.job.read import load_job, validate_job
 from services.job.record import JobRecord, record_job
-from workers.pipeline.captures.listing import open_sources
+from workers.capture.results import open_sources
 from workers.scene.context import Stopwatch, open_worker
 from workers.shard.run_shard import run_scene
 from workers.store.manifest import table_of_rows

@@ -68,7 +68,7 @@ class Shapes:
         return _join([mesh_of_part(part) for part in asset.shape.parts])
 
     def _sources(self, path: str) -> Catalogue:
-        from workers.pipeline.captures.listing import open_sources
+        from workers.capture.results import open_sources
 
         if self._catalogue is None:
             told = f"{path} is not in the dataset (its licence is not free, or assets.copy_assets is off)"

@@ -20,7 +20,7 @@ from services.job.record import JobRecord
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, read_image, read_stored
 from services.read.stored_tables import patch_paths, view_paths
 from workers.assets.catalogue import Catalogue
-from workers.pipeline.captures.listing import open_sources
+from workers.capture.results import open_sources
 from workers.store.commit import read_committed, split_code
 from workers.store.ledger import read_range
 from workers.store.store import Store

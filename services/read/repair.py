@@ -19,7 +19,7 @@ from services.read.verify import StoredJob, Terms, check_fingerprint, encode_fin
 from services.read.verify_files import read_stored_success
 from services.read.verify_range import commit_groups, read_records
 from services.run.lock import hold_lock
-from workers.pipeline.captures.listing import open_sources
+from workers.capture.results import open_sources
 from workers.render.raster.gbuffer import shared_renderer
 from workers.shard.fingerprint import take_fingerprint
 from workers.store.attempt import reopen

@@ -28,7 +28,7 @@ from schemas.scene.scene import SceneOutput
 from services.job.record import JobRecord, require_job
 from services.read.dataset_reader import StoredRange, file_reader, find_scene
 from services.read.stored_tables import read_merged
-from workers.pipeline.captures.listing import open_sources
+from workers.capture.results import open_sources
 from workers.scene.context import Stopwatch, WorkerContext, open_worker
 from workers.shard.fingerprint import take_fingerprint
 from workers.shard.run_shard import run_scene

@@ -28,7 +28,7 @@ from services.run.ray_cluster import open_ray
 from services.run.slots import SharedSlots, Slots
 from services.run.tally import Tally
 from workers.assets.catalogue import Catalogue
-from workers.pipeline.captures.listing import open_sources
+from workers.capture.results import open_sources
 from workers.render.tiers import require_tier
 from workers.store.attempt import sweep
 from workers.store.ledger import LedgerKeeper, list_commits

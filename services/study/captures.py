@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from schemas.capture.processed import CaptureScore, ProcessedCapture
+from schemas.capture import CaptureScore, ProcessedCapture
 from schemas.errors import CaptureError, InputError
 from services.bench.figures import pinned
 from services.run.progress import ProgressLine
@@ -16,12 +16,11 @@ from services.study.measure.settling import context_for
 from services.study.measure.timing import image_figures, timed_rows
 from services.study.model import Plan, Row, Setting
 from services.study.study import Journal
+from workers.capture.estimate import ProcessorClock
+from workers.capture.folder import CaptureFolder, open_folder
+from workers.capture.make_capture import process_capture, require_captures, simulate_one
 from workers.geometry.spread import spread_evenly
-from workers.pipeline.captures.make_capture import require_captures, simulate_one
-from workers.pipeline.captures.process_capture import process_capture
-from workers.pipeline.captures.processor_clock import ProcessorClock
 from workers.scene.context import WorkerContext
-from workers.store.capture_folder import CaptureFolder, open_folder
 from workers.store.file_system import temporary_folder
 
 BYTES_OF_POINT = 3 * 4 + 3 * 4 + 3

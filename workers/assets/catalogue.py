@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from cachetools import LRUCache
 
-from schemas.capture.listing import CaptureListing
+from schemas.capture import CaptureListing
 from schemas.errors import AssetSourceError
 from schemas.job.assets import (
     CATEGORIES,

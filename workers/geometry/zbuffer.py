@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
-from schemas.capture.depth_camera import DepthCamera
+from schemas.capture import DepthCamera
 from schemas.scene.shape import Shape
 from schemas.scene.view import Intrinsics
 from workers.geometry.jit import compiled

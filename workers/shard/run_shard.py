@@ -265,7 +265,7 @@ def run_scene(context: WorkerContext, scene_id: int, total: Stopwatch) -> SceneO
 def _make_output(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> SceneOutput:
     if context.job.captures is None:
         return record_scene(context, make_scene(context, scene_id, stopwatch), stopwatch)
-    from workers.pipeline.captures.make_capture import run_capture  # loads what scenes have no use for
+    from workers.capture.make_capture import run_capture  # loads what scenes have no use for
 
     return run_capture(context, scene_id, stopwatch)
 

@@ -21,7 +21,8 @@ from services.read.scene_geometry import captured_geometry, export_scene
 from services.read.status import read_status
 from tests.captures import captures_job, use_exact_captures, write_folder
 from tests.datasets import faults_of, run_here
-from workers.pipeline.captures import capture_pair, make_capture
+from workers.capture import make_capture
+from workers.capture import rows as capture_pair
 from workers.store.local import LocalStore
 
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from schemas.base import frozen_array
-from schemas.capture.depth_camera import DepthCamera
+from schemas.capture import DepthCamera
 from schemas.scene.view import Intrinsics
 from workers.geometry.frames import pose, rotation_about
 

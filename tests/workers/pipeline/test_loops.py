@@ -39,7 +39,7 @@ ELSEWHERE = {
     "workers.geometry.pixels": {"_facing_cosine"},
     "workers.geometry.rational_lens": {"_distort", "_pixel_rays", "_project_points"},
     "workers.geometry.zbuffer": {"_draw", "_draw_triangle", "_lift"},
-    "workers.labels.board_regions": {"_meets_rectangle"},
+    "workers.capture.rows": {"_meets_rectangle"},
 }
 """Loops that only captures, models of sensors and some sources of assets use."""
 COMPILE = """

@@ -7,8 +7,8 @@ import workers.scene.pairs
 from services.read.audit import verify_independently
 from tests.captures import CAMERA, captures_job, exact_capture, use_exact_captures
 from tests.datasets import faults_of, run_here
+from workers.capture import make_capture
 from workers.geometry.frames import pose, rotation_about, translation
-from workers.pipeline.captures import make_capture
 
 
 @pytest.fixture(autouse=True)

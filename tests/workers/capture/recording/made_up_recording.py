@@ -21,7 +21,7 @@ from tests.workers.geometry.made_up_kinect import (
     opencv_rays,
     sphere_depth,
 )
-from workers.capture.board.picture import draw_board
+from workers.capture.board.sheets import draw_board
 from workers.geometry.camera import look_at
 
 COLOR = Intrinsics(width=1280, height=720, fx=608.2, fy=607.9, cx=641.3, cy=365.9)

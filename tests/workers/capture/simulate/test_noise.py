@@ -5,8 +5,8 @@ import pytest
 
 from schemas.job.captures import KinectDepthNoise
 from schemas.scene.view import Camera
-from workers.capture.simulate.noise import kinect_noise
-from workers.capture.simulate.rig import make_rig
+from workers.capture.simulate.camera import kinect_noise
+from workers.capture.simulate.photograph import make_rig
 from workers.scene.sensor import sense_depth
 
 

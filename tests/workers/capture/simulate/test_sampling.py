@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from schemas.scene.view import Intrinsics
-from workers.capture.simulate.sampling import SAMPLES, add_light, light_table, make_samples, shift_camera
+from workers.capture.simulate.camera import SAMPLES, add_light, light_table, make_samples, shift_camera
 from workers.geometry.colour import decode_srgb
 
 
