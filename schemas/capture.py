@@ -1,4 +1,11 @@
-"""The depth camera of an RGB-D sensor, with its place in the colour camera's frame."""
+"""What the steps of a capture hand to one another: cameras, views, detections, estimates, results.
+
+- The depth camera of an RGB-D sensor, with its place in the colour camera's frame.
+- A capture: its camera, the images of one view, and the markers that were found in it.
+- A folder of a capture as a job found it: where it lies, and the digest of what is in it.
+- Estimated camera poses of a capture, with their uncertainty and residuals.
+- A processed capture: all that its dataset is made of, and what it was scored with.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -25,9 +32,6 @@ class DepthCamera:
     intrinsics: Intrinsics
     lens: Array
     T_color_depth: Pose
-
-
-# TODO(merge) A capture: its camera, the images of one view, and the markers that were found in it.
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,18 +98,12 @@ class CaptureTruth:
     lens: Distortion | None
 
 
-# TODO(merge) A folder of a capture as a job found it: where it lies, and the digest of what is in it.
-
-
 @dataclass(frozen=True)
 class CaptureListing:
     """folder: absolute; sha256: hex, of the names and the bytes of every input file."""
 
     folder: Path
     sha256: str
-
-
-# TODO(merge) Estimated camera poses of a capture, with their uncertainty and residuals.
 
 
 ViewStatus = Literal["used", "flagged", "refused"]
@@ -227,9 +225,6 @@ class SynthesizedView:
     measured: np.ndarray
     measured_share: float
     sources: tuple[int, ...]
-
-
-# TODO(merge) A processed capture: all that its dataset is made of, and what it was scored with.
 
 
 @dataclass(frozen=True, eq=False)

@@ -137,9 +137,6 @@ class CaptureError(SceneError):
     stage = "capture"
 
 
-# TODO(merge) Somebody's text on one line of a message: cut, and without characters that a terminal obeys.
-
-
 def plain_line(text: str, most: int = 80) -> str:
     """`text` with at most `most` characters of it, and an escape in place of what is not printable."""
     cut = text if len(text) <= most else f"{text[: most - 3]}..."
@@ -150,16 +147,10 @@ def _printable(character: str) -> str:
     return character if character.isprintable() else character.encode("unicode_escape").decode()
 
 
-# TODO(merge) The nearest of known words to one that is not known, for messages.
-
-
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """A question with the nearest of the known words and a space behind it; empty where none is near."""
     near = difflib.get_close_matches(word, known, n=1)
     return f"did you mean '{near[0]}'? " if near else ""
-
-
-# TODO(merge) A duration in words, the same in every message, table and page.
 
 
 _SPANS = ((60.0, 1.0, "s"), (5400.0, 60.0, "min"), (48 * 3600.0, 3600.0, "h"), (float("inf"), 86400.0, "d"))

@@ -1,4 +1,7 @@
-"""The settings of `verso capture` commands: a job of one capture, with the keys that --set changes."""
+"""The commands `verso capture ...`.
+
+- The settings of `verso capture` commands: a job of one capture, with the keys that --set changes.
+"""
 
 import argparse
 import dataclasses
@@ -47,9 +50,6 @@ def capture_settings(changes: Sequence[str] = (), keys: Mapping[str, Any] | None
     return captures
 
 
-# TODO(merge) `verso capture board`: the marker board as a file to print.
-
-
 def board(options: argparse.Namespace) -> int:
     """Writes options.file (.pdf or .png); reads `board`, `tiles` (None or "a4"), `dpi` and `json`. Returns 0."""
     from workers.capture.board.sheets import board_pdf, board_png, tiled_pdf
@@ -78,9 +78,6 @@ def board(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"ok": True, "file": str(path), "board": spec.model_dump(mode="json")}))
     return 0
-
-
-# TODO(merge) `verso capture simulate`: a virtual capture with known truth, in the folder that a real one has.
 
 
 def simulate(options: argparse.Namespace) -> int:
@@ -117,9 +114,6 @@ def simulate(options: argparse.Namespace) -> int:
         answer |= {"instance_id": asset.instance_id, "seed": job.seed, "effects": ran, "seconds": seconds}
         print(json.dumps(answer))
     return 0
-
-
-# TODO(merge) `verso capture import`: an Azure Kinect recording as a capture folder.
 
 
 def import_recording(options: argparse.Namespace) -> int:
@@ -171,9 +165,6 @@ def _make_empty(out: Path) -> Path:
     except OSError as error:
         raise OutputError(f"{out} cannot be made: {error.strerror}") from error
     return out
-
-
-# TODO(merge) `verso capture process`: poses, masks, cloud and mesh of a capture, written into its folder.
 
 
 def process(options: argparse.Namespace) -> int:
@@ -230,9 +221,6 @@ def _describe_process(estimate: CaptureEstimate) -> str:
     return ", ".join(words)
 
 
-# TODO(merge) `verso capture synthesize`: RGB, depth and mask of a processed capture from other poses.
-
-
 def synthesize(options: argparse.Namespace) -> int:
     """Writes views of options.folder to options.out: from the pose in the file `pose`, or with `mirror` one for each view.
 
@@ -259,9 +247,6 @@ def synthesize(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"ok": True, "out": str(out), "views": made}))
     return 0
-
-
-# TODO(merge) `verso capture evaluate`: the errors of a processed capture against its truth or a given mesh.
 
 
 def evaluate(options: argparse.Namespace) -> int:

@@ -1,4 +1,8 @@
-"""A commit: the record that a range of scenes is done, and the terms that all commits of a dataset share."""
+"""Commits: the record that a range of scenes is done, and the ledger of all records.
+
+- A commit: the record that a range of scenes is done, and the terms that all commits of a dataset share.
+- The ledger: what planning and status need of every commit, in columns, about 40 bytes for each.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -193,9 +197,6 @@ def summarize(record: CommitRecord) -> CommitSummary:
         fingerprint=terms.fingerprint,
         job_digest=terms.job_digest,
     )
-
-
-# TODO(merge) The ledger: what planning and status need of every commit, in columns, about 40 bytes for each.
 
 
 _failure = pa.struct(

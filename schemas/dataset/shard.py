@@ -1,4 +1,8 @@
-"""The fingerprint of a stack of software and hardware: versions, and the bytes that it makes."""
+"""Messages that cross Ray (orders and reports of shards, never an image), and the fingerprint of a stack.
+
+- The fingerprint of a stack of software and hardware: versions, and the bytes that it makes.
+- Messages that cross Ray: the order to make a shard, and the report of it. Never an image.
+"""
 
 import hashlib
 from typing import Literal
@@ -50,9 +54,6 @@ class Fingerprint(Frozen):
         pairs = [(key, mine[key], theirs[key]) for key in mine]
         pairs += [(name, a.get(name, "absent"), b.get(name, "absent")) for name in sorted({*a, *b})]
         return [f"{name}: {ours}, {other}" for name, ours, other in pairs if ours != other]
-
-
-# TODO(merge) Messages that cross Ray: the order to make a shard, and the report of it. Never an image.
 
 
 Reason = Literal["killed", "time", "memory"]

@@ -1,4 +1,9 @@
-"""Patterns of file names, as `Path.glob` reads them, for paths that are already known."""
+"""The `assets` branch of a job, the names of categories, and patterns of file names.
+
+- Patterns of file names, as `Path.glob` reads them, for paths that are already known.
+- Names of categories: what a user may call them, and which ones the sources of a job offer.
+- The `assets` branch of a job: where objects and tables come from.
+"""
 
 import itertools
 import math
@@ -26,9 +31,6 @@ def matches(path: str, pattern: str) -> bool:
         else:
             reached = {place + 1 for place in reached if place < len(folders) and fnmatchcase(folders[place], part)}
     return len(folders) in reached
-
-
-# TODO(merge) Names of categories: what a user may call them, and which ones the sources of a job offer.
 
 
 CATEGORIES = ("bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box")
@@ -115,9 +117,6 @@ def describe_unknown(names: Iterable[str], offered: Sequence[str]) -> str:
                 "files offers what its category_map names"
             )
     return ""
-
-
-# TODO(merge) The `assets` branch of a job: where objects and tables come from.
 
 
 UpAxis = Literal["x", "y", "z"]

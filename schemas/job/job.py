@@ -1,4 +1,11 @@
-"""The `check`, `output` and `run` branches of a job: what is checked, how files are laid out, how the work is driven."""
+"""The job file: one tree of frozen models, parsed once.
+
+- The `check`, `output` and `run` branches of a job: what is checked, how files are laid out, how the work is driven.
+- The number of scenes in a range, where the job does not give it.
+- Presets: defaults for several keys at once, chosen from the measurement in docs/tradeoff.
+
+Every key but `name` has a default, and an unknown key is an error.
+"""
 
 import copy
 import math
@@ -65,9 +72,6 @@ class Run(Frozen):
     """`strict` refuses workers whose stack makes other bytes; `record` allows them and stores which made what."""
 
 
-# TODO(merge) The number of scenes in a range, where the job does not give it.
-
-
 MOST = 16
 """Of quick scenes: a few seconds of work, of which a commit takes about a hundredth."""
 
@@ -93,9 +97,6 @@ def choose_range_size(scenes: int, most_objects: int, pairs: int, start: Start, 
     return max(1, min(MOST, int(RANGE_S / scene_s), math.ceil(scenes / FEWEST_RANGES)))
 
 
-# TODO(merge) Presets: defaults for several keys at once, chosen from the measurement in docs/tradeoff.
-
-
 PresetName = Literal["fast", "balanced", "exact"]
 
 PRESETS: dict[PresetName, dict[str, Any]] = {
@@ -118,11 +119,6 @@ def with_preset(tree: Mapping[str, Any]) -> dict[str, Any]:
         with suppress(ValueError):
             set_key(filled, path, value, keep=True)
     return filled
-
-
-# TODO(merge) The job file: one tree of frozen models, parsed once. A step gets its own branch and no other.
-#
-# Every key but `name` has a default, and an unknown key is an error.
 
 
 MOST_SCENE_IDS = 10**10

@@ -1,4 +1,8 @@
-"""The `start` branch of a job: how objects begin, and how many there are."""
+"""The `start` and `physics` branches of a job: how objects begin, and how they come to rest.
+
+- The `start` branch of a job: how objects begin, and how many there are.
+- The `physics` branch of a job.
+"""
 
 from typing import Annotated, Literal
 
@@ -45,9 +49,6 @@ class Start(Frozen):
     """Height of the lowest point above the table, or above what is below it in a pile, at the start of a drop."""
     max_redraws: NonNegativeInt = 20
     """Largest number of redraws of a position with no table under the centre of mass or no room beside other objects."""
-
-
-# TODO(merge) The `physics` branch of a job.
 
 
 Collision = Literal["planned", "box", "hull", "parts"]

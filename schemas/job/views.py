@@ -1,4 +1,10 @@
-"""The `cameras` branch of a job: where cameras stand and what their intrinsics are."""
+"""The branches of a job that shape its images: `cameras`, `images`, `render` and `sensor`.
+
+- The `cameras` branch of a job: where cameras stand and what their intrinsics are.
+- The `images` branch of a job: encodings, patches, and the projection of the input cloud.
+- The `render` branch of a job: how RGB is made.
+- The `sensor` branch of a job: effects of a real sensor on images, each off by default.
+"""
 
 import math
 from typing import Annotated, Literal
@@ -77,9 +83,6 @@ class Cameras(Frozen):
     """The camera on the other side."""
 
 
-# TODO(merge) The `images` branch of a job: encodings, patches, and the projection of the input cloud.
-
-
 class Patch(Frozen):
     """Size of the crop about each object, pixels [A]."""
 
@@ -135,9 +138,6 @@ class Images(Frozen):
         return self
 
 
-# TODO(merge) The `render` branch of a job: how RGB is made.
-
-
 Tier = Literal["flat", "raster", "pathtraced"]
 
 
@@ -158,9 +158,6 @@ class Render(Frozen):
     sides, and are rounded up where they do not: 16 is 4 x 4, 13 becomes 15."""
     path_bounces: Annotated[int, Field(ge=1, le=64)] = 8
     """Largest number of scatterings and glass crossings of a path, for tier pathtraced."""
-
-
-# TODO(merge) The `sensor` branch of a job: effects of a real sensor on images, each off by default.
 
 
 class DepthNoise(Frozen):

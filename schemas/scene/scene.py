@@ -1,4 +1,9 @@
-"""Which effects a scene runs: what the plan decides, and what every step asks."""
+"""A scene from its plan to its output: effects, plan, settled objects, posed geometry.
+
+- Which effects a scene runs: what the plan decides, and what every step asks.
+- The plan of a scene: all that is random, drawn before anything moves.
+- A scene from rest to output: settled objects, posed geometry, and all that is written of it.
+"""
 
 import hashlib
 from collections.abc import Mapping
@@ -37,9 +42,6 @@ class EffectPlan:
             skipped={**self.skipped, **{name: "withdrawn" for name in self.ran if name in names}},
             forced=self.forced.difference(names),
         )
-
-
-# TODO(merge) The plan of a scene: all that is random, drawn before anything moves.
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +96,6 @@ class ScenePlan:
     input_cameras: tuple[Camera, ...]
     """One for each pair, RGB camera."""
     appearance: Appearance
-
-
-# TODO(merge) A scene from rest to output: settled objects, posed geometry, and all that is written of it.
 
 
 SupportedBy = Literal["flat_top", "mesh", "placed"]

@@ -1,4 +1,9 @@
-"""Region ids: the pixel values of segment images; objects count from REGION_FIRST_OBJECT."""
+"""What is in a scene: region ids, shapes with materials and mass, lights and background. Arrays are read-only.
+
+- Region ids: the pixel values of segment images; objects count from REGION_FIRST_OBJECT.
+- Shapes: meshes, parts with materials, mass, and assets. Arrays are read-only.
+- Lights and background of a scene: what only RGB depends on.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,9 +17,6 @@ REGION_NOTHING = 0
 REGION_FLOOR = 1
 REGION_TABLE = 2
 REGION_FIRST_OBJECT = 3
-
-
-# TODO(merge) Shapes: meshes, parts with materials, mass, and assets. Arrays are read-only.
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,9 +204,6 @@ class Asset:
         """[3] float64: size of the bounding box along the object axes."""
         lower, upper = self.shape.bounds
         return upper - lower
-
-
-# TODO(merge) Lights and background of a scene: what only RGB depends on.
 
 
 @dataclass(frozen=True, eq=False)

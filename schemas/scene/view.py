@@ -1,4 +1,8 @@
-"""A camera: intrinsics and a pose in the optical frame (x right, y down, z forward)."""
+"""Cameras and views of a scene: raw buffers, stored views with their labels, pairs of views.
+
+- A camera: intrinsics and a pose in the optical frame (x right, y down, z forward).
+- Views of a scene: raw buffers, stored views with their labels, and pairs of views.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -53,9 +57,6 @@ class Camera:
     def position(self) -> Array:
         """[3] float64, world, metres."""
         return self.T_world_cam[:3, 3]
-
-
-# TODO(merge) Views of a scene: raw buffers, stored views with their labels, and pairs of views.
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,12 @@
-"""Memory and pace of one worker over many scenes, in a process of its own."""
+"""Memory and pace of one worker over many scenes, and several workers against one.
+
+- Memory and pace of one worker over many scenes, in a process of its own.
+- Scaling: several workers against one through the coordinator, and several plain processes against one.
+
+Two processes that share nothing but the machine seldom do twice the work of one: cores share caches, memory and clock,
+and are often two threads of one core. No scheduler can gain more than plain processes do, and these no more than empty
+loops, which use nothing but cores: two virtual cores may be worth less than two of the first.
+"""
 
 import multiprocessing
 import os
@@ -87,13 +95,6 @@ def summarise(samples: list[Sample], peak_mb: float) -> dict[str, float]:
         "last_ms": median(paces[-window:]) * 1e3,
         "last_to_first": 1.0 + growth(paces, window),
     }
-
-
-# TODO(merge) Scaling: several workers against one through the coordinator, and several plain processes against one.
-#
-# Two processes that share nothing but the machine seldom do twice the work of one: cores share caches, memory and clock,
-# and are often two threads of one core. No scheduler can gain more than plain processes do, and these no more than empty loops,
-# which use nothing but cores: two virtual cores may be worth less than two of the first.
 
 
 WARM_UP = 8

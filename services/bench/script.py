@@ -1,8 +1,8 @@
 """The script that we compare with (baseline.py): its looks, a scene as files for it, and its process.
 
-The script says `{"ready": true}`, then reads one line of JSON for each scene (`scene`: the `scene.json` that `hand_over` wrote beside
-its meshes; `out`: a folder; `look`) and answers with one line: `wall_s`, `cpu_s`, `stages_s` by stage, and `load_s`, the seconds of
-reading files before its clock.
+The script says `{"ready": true}`, then reads one line of JSON for each scene (`scene`: the `scene.json` that `hand_over` wrote
+beside its meshes; `out`: a folder; `look`) and answers with one line: `wall_s`, `cpu_s`, `stages_s` by stage, and `load_s`,
+the seconds of reading files before its clock.
 """
 
 import contextlib

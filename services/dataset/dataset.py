@@ -1,4 +1,11 @@
-"""Pairs of a range as one Arrow table, so that one expression chooses among scenes, views and assets. Pure."""
+"""A dataset opened in Python: its tables as pyarrow datasets, and its pairs one after the other.
+
+- Pairs of a range as one Arrow table, so that one expression chooses among scenes, views and assets. Pure.
+
+from services.dataset.dataset import open_dataset
+
+for pair in open_dataset("data/tabletop").pairs(pc.field("category") == "mug"): depth_m = pair.mirror.depth_m()
+"""
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -70,14 +77,6 @@ def _structs(table: pa.Table, key: str, values: pa.ChunkedArray | np.ndarray) ->
     """A struct of the first row with each of the values, null where there is none."""
     wanted = pa.chunked_array([pa.array(values)]) if isinstance(values, np.ndarray) else values
     return table.to_struct_array().take(pc.index_in(wanted, table[key]))
-
-
-# TODO(merge) A dataset opened in Python: its tables as pyarrow datasets, and its pairs one after the other.
-#
-# from services.dataset.dataset import open_dataset
-#
-# for pair in open_dataset("data/tabletop").pairs(pc.field("category") == "mug"):
-# depth_m = pair.mirror.depth_m()
 
 
 KEPT_RANGES = 8

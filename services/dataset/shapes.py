@@ -1,4 +1,8 @@
-"""Shapes of a dataset's objects as meshes in the object frame: from the stored GLB, or from the job's sources."""
+"""Shapes and files of a dataset's pairs.
+
+- Shapes of a dataset's objects as meshes in the object frame: from the stored GLB, or from the job's sources.
+- Files of a dataset's pairs, from single files or from tars; the tars that are read are kept, bounded by their bytes.
+"""
 
 import io
 from collections.abc import Callable, Mapping, Sequence
@@ -94,9 +98,6 @@ def _join(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     joined = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
     assert isinstance(joined, trimesh.Trimesh)
     return joined
-
-
-# TODO(merge) Files of a dataset's pairs, from single files or from tars; the tars that are read are kept, bounded by their bytes.
 
 
 TAR_BYTES = 256 << 20

@@ -1,7 +1,10 @@
 """Format `bop`: the scenewise layout of the BOP benchmark (6-D object pose), one BOP scene for each scene of the dataset.
 
-Images of a scene are the input, aligned and mirror views of its pairs. Poses are model to camera in millimetres, K has pixel
-centres on integers, as OpenCV has them. A scene's folder appears whole.
+- One scene of a BOP export: its images, masks, and the three files that describe them.
+- The object models of a BOP export: numbered as they first appear, one PLY file each, in a constant amount of memory.
+
+Images of a scene are the input, aligned and mirror views of its pairs. Poses are model to camera in millimetres, K has
+pixel centres on integers, as OpenCV has them. A scene's folder appears whole.
 """
 
 import csv
@@ -96,9 +99,6 @@ class Bop:
             "pixels": "cam_K has pixel centres on integers, as OpenCV has them",
             "depth": "millimetres are the stored value times depth_scale, z along the optical axis",
         }
-
-
-# TODO(merge) One scene of a BOP export: its images, masks, and the three files that describe them.
 
 
 ROLES: Final[tuple[Role, ...]] = ("input", "aligned", "mirror")
@@ -237,9 +237,6 @@ def _info(thing: "_Thing", depth: NDArray) -> Row:
         "px_count_visib": seen,
         "visib_fract": seen / whole.pixels if whole.pixels else 0.0,
     }
-
-
-# TODO(merge) The object models of a BOP export: numbered as they first appear, one PLY file each, in a constant amount of memory.
 
 
 _INFO, _NAMES = "models/models_info.json", "objects.csv"

@@ -173,9 +173,6 @@ def _refuse_inside(request: ExportRequest) -> None:
         raise OutputError(f"{request.target} lies in the dataset {request.store.name}: choose a DIR beside it")
 
 
-# TODO(merge) `verso export`: writes a dataset in another layout, and says what was left out.
-
-
 def main(options: argparse.Namespace) -> int:
     """Export what the options ask for; returns 0, or 1 where no pair could be exported."""
     if "://" in options.dir:

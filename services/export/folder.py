@@ -1,7 +1,9 @@
 """The folder that an export writes: claimed, filled whole file by whole file, and gone on with after a kill.
 
-While it is being made, `_export/` in it holds what was asked, how far it came, and files that are not finished. `export.json`,
-written last, says what is there and what was left out. A file has its final name only when it is whole.
+- Files that many pairs share: one open for each split, all ended together, so that a killed export goes on at an end.
+
+While it is being made, `_export/` in it holds what was asked, how far it came, and files that are not finished.
+`export.json`, written last, says what is there and what was left out. A file has its final name only when it is whole.
 """
 
 import contextlib
@@ -175,9 +177,6 @@ def _read_tree(path: Path) -> Tree | None:
     if not isinstance(tree, dict):
         raise CorruptError(f"{path} is damaged: remove the folder {path.parent.parent}, and export again")
     return tree
-
-
-# TODO(merge) Files that many pairs share: one open for each split, all ended together, so that a killed export goes on at an end.
 
 
 class Shard(Protocol):

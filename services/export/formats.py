@@ -1,4 +1,10 @@
-"""Which scenes of a dataset are exported: by id, by category, and by an SQL condition."""
+"""What an export is: its request and choice of scenes, what every format has, and the table of formats.
+
+- Which scenes of a dataset are exported: by id, by category, and by an SQL condition.
+- What an export is asked for: a dataset, a place, a format by name, and a choice of scenes.
+- What every format is: a writer that takes scenes in order and says which pairs it leaves out, and why.
+- The formats of `verso export`, by name; each is loaded when it is asked for.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -89,9 +95,6 @@ class Chooser:
         return {scene_id for (scene_id,) in found}
 
 
-# TODO(merge) What an export is asked for: a dataset, a place, a format by name, and a choice of scenes.
-
-
 FormatName = Literal["mirror-recon", "bop", "webdataset", "huggingface", "gltf"]
 FORMATS: tuple[FormatName, ...] = get_args(FormatName)
 SHARDED: tuple[FormatName, ...] = ("webdataset", "huggingface")
@@ -108,9 +111,6 @@ class ExportRequest:
     choice: Choice = EVERYTHING
     shard_mb: int = 256
     """Size that ends a shard, of formats that have shards; 10^6 bytes."""
-
-
-# TODO(merge) What every format is: a writer that takes scenes in order and says which pairs it leaves out, and why.
 
 
 @dataclass(frozen=True)
@@ -149,9 +149,6 @@ class Writer(Protocol):
 
     def close(self) -> None:
         """Lets go of what is open; what is not in the last state may be lost."""
-
-
-# TODO(merge) The formats of `verso export`, by name; each is loaded when it is asked for.
 
 
 def open_writer(

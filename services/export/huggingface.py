@@ -1,7 +1,9 @@
 """Format `huggingface`: Parquet files with embedded images that `datasets.load_dataset(DIR)` reads, and a dataset card.
 
-A row is a pair. Its columns come from the manifest's schemas: what a view has is a struct `<role>_view`, its images are the
-columns `<role>_rgb`, `<role>_depth` and `<role>_region`, PNG files as they are stored.
+- What Hugging Face wants beside the columns: the features in the metadata of a Parquet schema, and the dataset card.
+
+A row is a pair. Its columns come from the manifest's schemas: what a view has is a struct `<role>_view`, its images are
+the columns `<role>_rgb`, `<role>_depth` and `<role>_region`, PNG files as they are stored.
 """
 
 import json
@@ -141,9 +143,6 @@ class _Parquet:
     def close(self) -> None:
         self._flush()
         self._writer.close()
-
-
-# TODO(merge) What Hugging Face wants beside the columns: the features in the metadata of a Parquet schema, and the dataset card.
 
 
 _CC0 = "CC0-1.0"

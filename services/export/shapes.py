@@ -1,4 +1,9 @@
-"""Shapes of a dataset's instances with a colour for each vertex: from the stored GLB files, or else from the job's sources."""
+"""Shapes of a dataset's instances with a colour for each vertex, and whole silhouettes of objects in views.
+
+- Shapes of a dataset's instances with a colour for each vertex: from the stored GLB files, or else from the job's
+  sources.
+- The whole silhouette of an object in a view: what is seen of it, what others hide, and what lies outside the image.
+"""
 
 import io
 from collections import OrderedDict
@@ -120,9 +125,6 @@ def _sample(texture: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:
     column = np.floor(np.mod(uv[:, 0], 1.0) * width).astype(np.int64).clip(0, width - 1)
     row = np.floor((1.0 - np.mod(uv[:, 1], 1.0)) * height).astype(np.int64).clip(0, height - 1)
     return texture[row, column, :3]
-
-
-# TODO(merge) The whole silhouette of an object in a view: what is seen of it, what others hide, and what lies outside the image.
 
 
 _FARTHEST = 3

@@ -1,4 +1,8 @@
-"""The sources of shapes of a stored job, as far as they are still what they were."""
+"""What an export reads: the scenes and pairs of a dataset that were chosen, and the sources of their shapes.
+
+- The sources of shapes of a stored job, as far as they are still what they were.
+- What an export reads: the scenes and pairs of a dataset that were chosen, in order, from one range at a time.
+"""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -33,9 +37,6 @@ def unchanged_sources(record: JobRecord) -> Catalogue | None:
     except (VersoError, OSError):
         return None
     return catalogue if catalogue.digest == record.catalogue else None
-
-
-# TODO(merge) What an export reads: the scenes and pairs of a dataset that were chosen, in order, from one range at a time.
 
 
 _STRICTNESS = ("train", "val", "test")

@@ -1,4 +1,8 @@
-"""Counts of a figure over equal steps, added up batch by batch. Pure."""
+"""Histograms: counts over equal steps, added up batch by batch, and HTML figures of them with SVG bars. Pure.
+
+- Counts of a figure over equal steps, added up batch by batch. Pure.
+- Histograms as HTML figures with SVG bars, which take their colours from the page's style. Pure.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -93,9 +97,6 @@ def window_of(histograms: Sequence[Histogram], bars: int) -> Window:
     width = max(1, -(-(high - low) // bars))
     first = low // width * width
     return Window(first, width, -(-(high - first) // width))
-
-
-# TODO(merge) Histograms as HTML figures with SVG bars, which take their colours from the page's style. Pure.
 
 
 BARS = 40

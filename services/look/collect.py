@@ -1,4 +1,9 @@
-"""Columns of the manifest tables in batches, finished or being made: rows of a large dataset are never all in memory."""
+"""The figures of a dataset from batches of its tables: rows of a large dataset are never all in memory.
+
+- Columns of the manifest tables in batches, finished or being made: rows of a large dataset are never all in memory.
+- The figures of a dataset from batches of its tables: counts, histograms, effects and their cost. Pure but for
+  reading.
+"""
 
 import math
 from collections import Counter
@@ -105,9 +110,6 @@ def _with_columns(rows: pa.Table, table: str, columns: Sequence[str]) -> pa.Tabl
         if name not in rows.column_names:
             rows = rows.append_column(name, pa.nulls(rows.num_rows, schema.field(name).type))
     return rows.select(list(columns))
-
-
-# TODO(merge) The figures of a dataset from batches of its tables: counts, histograms, effects and their cost. Pure but for reading.
 
 
 @dataclass

@@ -1,4 +1,9 @@
-"""How far a dataset is: an empty folder, one being made, one that stands still, one that is finished."""
+"""The live page: how far a dataset is, what the page shows of it, and a thread that follows it.
+
+- How far a dataset is: an empty folder, one being made, one that stands still, one that is finished.
+- The live part of the page: state, progress, failures so far, and the latest pictures. Pure: progress to HTML.
+- Follows a dataset for the live page: a thread that looks every few seconds and keeps the newest answers ready.
+"""
 
 import threading
 import time
@@ -113,9 +118,6 @@ def latest_scenes(store: Store, count: int = LATEST) -> list[ShownScene]:
     return shown
 
 
-# TODO(merge) The live part of the page: state, progress, failures so far, and the latest pictures. Pure: progress to HTML.
-
-
 STATES: dict[Phase, str] = {
     "empty": "Waiting for a job",
     "making": "Making scenes",
@@ -169,9 +171,6 @@ def _latest(progress: Progress, latest: Sequence[ShownScene], address: Address) 
     if not latest or progress.phase == "unreadable":
         return ""
     return f'<div class="latest">{"".join(strip_html(scene, address) for scene in latest)}</div>'
-
-
-# TODO(merge) Follows a dataset for the live page: a thread that looks every few seconds and keeps the newest answers ready.
 
 
 LOOK_S = 2.0

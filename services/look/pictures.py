@@ -1,4 +1,9 @@
-"""Pictures of stored images for a page: colour, depth in viridis, regions, the projection over the mirror view. Pure."""
+"""Scenes chosen evenly from each category, and pictures of their stored images.
+
+- Pictures of stored images for a page: colour, depth in viridis, regions, the projection over the mirror view. Pure.
+- The full images of a stored pair, read by role and kind of pixels.
+- Scenes chosen evenly from each category, with their pictures. Reads stored rows and images.
+"""
 
 import base64
 import hashlib
@@ -121,9 +126,6 @@ def _palette() -> list[int]:
     return [int(value) for value in np.concatenate([np.array(FIXED_REGIONS), objects]).ravel()]
 
 
-# TODO(merge) The full images of a stored pair, read by role and kind of pixels.
-
-
 PairImages: TypeAlias = Mapping[tuple[str, str], NDArray]
 """Images by role (input, mirror, projected) and kind of pixels (rgb, depth, region), as far as they are stored."""
 
@@ -142,9 +144,6 @@ def metres_of(depth: NDArray, view: Row) -> NDArray:
     """[H, W] float64, metres; 0 where there is no depth."""
     metres: NDArray = depth / view["depth_units_per_m"]
     return metres
-
-
-# TODO(merge) Scenes chosen evenly from each category, with their pictures. Reads stored rows and images.
 
 
 DEPTH_M = (0.0, 9.6)

@@ -1,4 +1,8 @@
-"""The whole page from its sections, style and scripts: one file that fetches nothing, or the page of a server."""
+"""`verso report`: a dataset as one HTML page that needs nothing beside it; and the pages of the server.
+
+- The whole page from its sections, style and scripts: one file that fetches nothing, or the page of a server.
+- What the live page shows at a moment: as a page, and as answers to a page that asks for what is new. Pure.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -108,9 +112,6 @@ def fill_page(page: Page, around: Around) -> str:
     )
 
 
-# TODO(merge) What the live page shows at a moment: as a page, and as answers to a page that asks for what is new. Pure.
-
-
 _LIVE = (
     '<div id="live-now" aria-live="polite">{}</div>'
     '<p class="empty" id="live-gone" hidden>The server does not answer; this page asks again.</p>'
@@ -152,9 +153,6 @@ def live_page(view: View) -> str:
     scripts = "".join(f'<script src="/{name}"></script>\n' for name in (*SCRIPTS, "live.js"))
     data = f' data-version="{view.version}" data-shape="{escape(view.shape)}"'
     return fill_page(page, Around("", '<link rel="stylesheet" href="/page.css">', "/icon.svg", scripts, data))
-
-
-# TODO(merge) `verso report`: a dataset as one HTML page that needs nothing beside it: no file, no network.
 
 
 SCENES = 24

@@ -1,4 +1,9 @@
-"""Two datasets side by side, captures beside scenes above all: their figures, and a scene of each category. Pure."""
+"""The sections of the page. Pure: figures and pictures to HTML.
+
+- Two datasets side by side, captures beside scenes above all: their figures, and a scene of each category. Pure.
+- The sections of the page that are pictures: sheets by category, the slider, the 3-D view. Pure: pictures to HTML.
+- The sections of the page that are figures: overview, histograms, effects, failures, captures. Pure: figures to HTML.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -69,9 +74,6 @@ _ROWS: dict[str, Callable[[Side], str]] = {
     "visibility, mirror": lambda side: _median(side[1].visibility, "mirror", "%", 100.0),
     "inclination, input": lambda side: _median(side[1].inclination, "input", "°"),
 }
-
-
-# TODO(merge) The sections of the page that are pictures: sheets by category, the slider, the 3-D view. Pure: pictures to HTML.
 
 
 CELLS = ("input rgb", "input depth", "input mask", "mirror rgb", "mirror depth", "mirror mask", "over")
@@ -208,9 +210,6 @@ def strip_html(scene: ShownScene, address: Address) -> str:
     )
     name = f"{escape(scene.category)} <span>scene {scene.scene_id}</span>"
     return f"<figure><div>{images}</div><figcaption>{name}</figcaption></figure>"
-
-
-# TODO(merge) The sections of the page that are figures: overview, histograms, effects, failures, captures. Pure: figures to HTML.
 
 
 def overview_html(figures: Figures, job: Job, failed: int) -> str:

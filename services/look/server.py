@@ -1,4 +1,7 @@
-"""Who may read the live page: names of the server, its token, its headers. Pure."""
+"""`verso serve`: the live page over HTTP, read-only, and who may read it. The one file that opens a port for it.
+
+- Who may read the live page: names of the server, its token, its headers. Pure.
+"""
 
 import contextlib
 import hashlib
@@ -127,9 +130,6 @@ def _cookies(header: str, name: str) -> list[str]:
     except CookieError:
         return []
     return [cookie[name].value] if name in cookie else []
-
-
-# TODO(merge) `verso serve`: the live page over HTTP, read-only. Edge: the one file that opens a port for it.
 
 
 MOST_REQUESTS = 64

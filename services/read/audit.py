@@ -1,4 +1,12 @@
-"""Motion of a settled scene that is released again with every effect of physics on, and the mask pixels that it changes."""
+"""`verso verify --independent N` and `--audit N`: labels derived a second time, and what was skipped proven not to matter.
+
+- Motion of a settled scene that is released again with every effect of physics on, and the mask pixels that it
+  changes.
+
+Exact no-ops: the scene is made again with them forced, and every byte must equal what is stored. Approximations: the
+scene at rest is released again with every effect of physics on (audit_motion.py). Where MuJoCo is installed, it holds
+every scene as a referee (referee.py): its figures are told, and have no bound.
+"""
 
 import dataclasses
 import math
@@ -122,9 +130,6 @@ def shift_px(before: Placed, after: Placed, camera: Camera) -> float:
     return float(np.hypot(u1 - u0, v1 - v0).max(initial=0.0))
 
 
-# TODO(merge) `verso verify --independent N`: labels of some scenes derived a second time, by code that shares nothing with the first.
-
-
 @dataclass
 class IndependentVerdict:
     """Counts of what was derived, what has no second derivation for this job, and the faults, a sentence each."""
@@ -173,13 +178,6 @@ def describe_independent(found: IndependentVerdict) -> Iterator[str]:
         f"{len(found.faults) or 'nothing'} off"
     )
     yield from (f"  {line}" for line in found.underived)
-
-
-# TODO(merge) `verso verify --audit N`: proves on N scenes that the effects which their plans left out did not matter.
-#
-# Exact no-ops: the scene is made again with them forced, and every byte must equal what is stored.
-# Approximations: the scene at rest is released again with every effect of physics on (audit_motion.py). Where MuJoCo is installed,
-# it holds every scene as a referee (referee.py): its figures are told, and have no bound.
 
 
 RECEIPT = frozenset({"effects", "skipped"})

@@ -1,4 +1,7 @@
-"""`verso query`: SQL over the manifests of a dataset, finished or being made. Reads nothing else and writes nothing."""
+"""`verso query`: SQL over the manifests of a dataset, finished or being made. Reads nothing else and writes nothing.
+
+- Query results as a table for people, or as CSV, JSON or Parquet for programs, written as they come.
+"""
 
 import csv
 import io
@@ -111,9 +114,6 @@ def _register(connection: duckdb.DuckDBPyConnection, store: Store) -> None:
         union = " UNION ALL ".join(f"SELECT {columns} FROM _{table}_{number}" for number in range(len(parts)))
         once = "DISTINCT ON (instance_id)" if table == "assets" else ""
         connection.execute(f"CREATE VIEW {table} AS SELECT {once} {columns} FROM ({union})")
-
-
-# TODO(merge) Query results as a table for people, or as CSV, JSON or Parquet for programs, written as they come.
 
 
 Format = Literal["table", "csv", "parquet", "json"]

@@ -1,4 +1,7 @@
-"""`verso replay`: makes one scene again from its job and compares it with what is stored."""
+"""`verso replay`: makes scenes again from their job, and compares or puts back what is stored.
+
+- Files of a committed range made again from the job, and kept only where their SHA-256 is what the commit says.
+"""
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -132,9 +135,6 @@ def compare_rows(stored: StoredRange, output: SceneOutput, ignored: frozenset[st
             columns = sorted({name for a, b in pairs for name in a if repr(a[name]) != repr(b.get(name))})
             differences.append(f"rows of {table}: {', '.join(columns) or f'{len(before)} stored, {len(now)} made now'}")
     return differences
-
-
-# TODO(merge) Files of a committed range made again from the job, and kept only where their SHA-256 is what the commit says.
 
 
 class Maker:

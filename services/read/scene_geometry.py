@@ -1,4 +1,8 @@
-"""A part of a shape as a mesh of trimesh's, with its material."""
+"""The posed geometry of one stored scene or capture.
+
+- A part of a shape as a mesh of trimesh's, with its material.
+- The posed geometry of a stored capture: its board, and the mesh that was reconstructed from it.
+"""
 
 import io
 from collections.abc import Iterator
@@ -50,9 +54,6 @@ def linear_bytes(srgb: Array) -> NDArray[np.uint8]:
     return np.rint(255.0 * np.concatenate([decode_srgb(srgb[..., :3]), srgb[..., 3:]], axis=-1)).astype(np.uint8)
 
 
-# TODO(merge) The posed geometry of a stored capture: its board, and the mesh that was reconstructed from it.
-
-
 def captured_geometry(store: Store, stored: StoredRange, row: Row) -> Iterator[tuple[str, trimesh.Trimesh, Pose]]:
     """(name, mesh, T_world_mesh) of board and object. Raises CorruptError where the stored shape cannot be read."""
     T_world = read_world_poses(row)
@@ -71,9 +72,6 @@ def captured_geometry(store: Store, stored: StoredRange, row: Row) -> Iterator[t
         visual, _ = read_visual(mesh, linear=True)
         mesh.visual = ColorVisuals(mesh, vertex_colors=visual.colors)
         yield f"{row['category']} {row['instance_id']}", mesh, T_world[REGION_FIRST_OBJECT]
-
-
-# TODO(merge) `verso scene`: the posed geometry of one stored scene as a GLB file.
 
 
 def export_scene(store: Store, scene_id: int, target: Path) -> int:

@@ -1,4 +1,8 @@
-"""The paths of a view's images that are stored, by its row of `views`. Pure."""
+"""The tables of a dataset as pyarrow datasets: finished or being made, in a folder or a bucket.
+
+- The paths of a view's images that are stored, by its row of `views`. Pure.
+- The files of a dataset as a file system of pyarrow's, so that a bucket is scanned as a folder is, a file at a time.
+"""
 
 import contextlib
 import urllib.parse
@@ -55,9 +59,6 @@ def _stored(row: Mapping[str, Any], named: Mapping[PixelKind, str]) -> Mapping[P
     return MappingProxyType({kind: path for kind, path in named.items() if path in listed})
 
 
-# TODO(merge) The files of a dataset as a file system of pyarrow's, so that a bucket is scanned as a folder is, a file at a time.
-
-
 def file_system_of(store: Store) -> fs.FileSystem:
     """Reads files by their keys: straight from a disk, from a bucket each as a whole when it is scanned."""
     if store.root is not None:
@@ -99,9 +100,6 @@ class _StoreFiles(fs.FileSystemHandler):
 
     get_file_info_selector = create_dir = delete_dir = delete_dir_contents = delete_root_dir_contents = _refuse
     delete_file = move = copy_file = open_output_stream = open_append_stream = _refuse
-
-
-# TODO(merge) The tables of a dataset as pyarrow datasets: finished or being made, in a folder or a bucket.
 
 
 Rows: TypeAlias = ds.Dataset | pa.Table

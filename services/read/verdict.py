@@ -1,4 +1,9 @@
-"""The result of `verso verify`: counts of what was read, and faults, each a line with the file and what to do."""
+"""The result of `verso verify`, errors of damaged files in one line, and every path that commits name.
+
+- The result of `verso verify`: counts of what was read, and faults, each a line with the file and what to do.
+- Errors of files that are damaged, missing or of the wrong kind, told in one line by every command that reads.
+- Every path that a dataset's commits name, in an SQLite file: a constant amount of memory for any number of them.
+"""
 
 import contextlib
 import os
@@ -76,9 +81,6 @@ def describe_os_error(error: OSError) -> str:
     return f"cannot be read ({error.strerror or error})"
 
 
-# TODO(merge) Errors of files that are damaged, missing or of the wrong kind, told in one line by every command that reads.
-
-
 @contextlib.contextmanager
 def explain_damage(store: Store) -> Iterator[None]:
     """Raises CorruptError with one line where the block meets a file that cannot be read as what it should be."""
@@ -94,9 +96,6 @@ def explain_damage(store: Store) -> Iterator[None]:
     else:
         return
     raise CorruptError(f"{printable(told)}; `verso verify {store.name}` lists every damaged file")
-
-
-# TODO(merge) Every path that a dataset's commits name, in an SQLite file: a constant amount of memory for any number of them.
 
 
 _TABLE = "CREATE TABLE paths (path BLOB PRIMARY KEY, sha256 TEXT) WITHOUT ROWID"

@@ -1,4 +1,10 @@
-"""The merge of ranges that `verify` has read, made again in a temporary folder: what `_SUCCESS` and its files must be."""
+"""`verso verify`: proves that a folder is exactly its dataset: every scene asked, every file and label, no more.
+
+- The merge of ranges that `verify` has read, made again in a temporary folder: what `_SUCCESS` and its files must be.
+- What a dataset says of itself, against its commits: job.yaml and the fingerprint of its stack.
+
+Ranges are read one by one, and what they share is kept in a temporary folder: memory does not grow with the dataset.
+"""
 
 import contextlib
 import errno
@@ -84,9 +90,6 @@ class Remerge:
             for table in TABLES
         }
         self._merging.add(Block([one.records for one in waiting], files, rows))
-
-
-# TODO(merge) What a dataset says of itself, against its commits: job.yaml and the fingerprint of its stack.
 
 
 MOST_TOLD = 100
@@ -202,11 +205,6 @@ def _is_in_card(store: Store, stored: Fingerprint) -> bool:
         return stored.digest.encode() in store.read(README_FILE)
     except OSError:
         return False
-
-
-# TODO(merge) `verso verify`: proves that a folder is exactly its dataset: every scene asked, every file and label, and nothing else.
-#
-# Ranges are read one by one, and what they share is kept in a temporary folder: memory does not grow with the dataset.
 
 
 TOP_FILES = (JOB_FILE, README_FILE, SUCCESS_FILE, FINGERPRINT_FILE, LEDGER_FILE, CAM_POSES, CAMERAS, OBJECTS)

@@ -1,4 +1,9 @@
-"""Everything in an output folder that is no part of its dataset: files, folders, links."""
+"""A whole folder against its commits: merged files, `_SUCCESS`, DATASET.md, and everything that is no part of the dataset.
+
+- Everything in an output folder that is no part of its dataset: files, folders, links.
+- A finished dataset against its commits: they are merged again, and `_SUCCESS`, the merged files and DATASET.md
+  compared.
+"""
 
 import hashlib
 import json
@@ -148,9 +153,6 @@ def _walk(root: Path, folder: str) -> Iterator[tuple[Kind, str]]:
                     yield "folder", key
                 else:
                     yield "file" if entry.is_file() else "special", key
-
-
-# TODO(merge) A finished dataset against its commits: they are merged again, and `_SUCCESS`, the merged files and DATASET.md compared.
 
 
 _ROWS = 4_096

@@ -1,4 +1,9 @@
-"""The scenes that a dataset must hold, against those that are committed: gaps, overlaps, and commits that cannot be read."""
+"""Committed ranges read back: which there must be, and of each its record, tables, files and labels.
+
+- The scenes that a dataset must hold, against those that are committed: gaps, overlaps, and commits that cannot be
+  read.
+- One committed range read back: its records, its tables, every file against its SHA-256, and every label.
+"""
 
 import contextlib
 import hashlib
@@ -113,9 +118,6 @@ class Spans:
         for begin, end in zip(starts, [*starts[1:], stop], strict=True):
             told = f"{commit_path(begin)}: is missing: scenes {begin} to {end - 1} are not committed"
             self._verdict.tell(told, f"{run} to make them")
-
-
-# TODO(merge) One committed range read back: its records, its tables, every file against its SHA-256, and every label.
 
 
 @dataclass

@@ -1,4 +1,7 @@
-"""One capture processed with every setting: processor time, bytes, and errors against its truth."""
+"""The study of a job of simulated captures: what views, estimates, iterations and voxels cost, and what they give.
+
+- One capture processed with every setting: processor time, bytes, and errors against its truth.
+"""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -84,9 +87,6 @@ def _bytes(done: ProcessedCapture) -> int:
     surface = done.surface
     points, vertices, faces = len(surface.points), len(surface.vertices), len(surface.faces)
     return points * BYTES_OF_POINT + vertices * BYTES_OF_VERTEX + faces * BYTES_OF_FACE
-
-
-# TODO(merge) The study of a job of simulated captures: what views, estimates, iterations and voxels cost, and what they give.
 
 
 LEAST_CAPTURES = 2

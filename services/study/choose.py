@@ -1,4 +1,4 @@
-"""Chooses the cheapest setting that meets the targets, and the front of settings worth their time. Pure."""
+"""The cheapest setting that meets the targets, the front of settings worth their time, and the answer in words. Pure."""
 
 import dataclasses
 import math
@@ -237,9 +237,6 @@ def parse_targets(text: str) -> dict[str, float]:
             example = ", a share such as 0.001 for 0.1 %" if unit(name) == "%" else ""
             raise InputError(f"--target {name}={value}: must be a number from 0 up{example}")
     return targets
-
-
-# TODO(merge) The answer of a study in one sentence. Pure.
 
 
 DEFAULT_TARGETS: Targets = {

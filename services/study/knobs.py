@@ -1,4 +1,8 @@
-"""The knobs of captures that the study turns. Pure."""
+"""The knobs that a study turns, of scenes and of captures, and the settings made of them. Pure.
+
+- The knobs of captures that the study turns. Pure.
+- The knobs that the study turns, and the settings made of them. Pure.
+"""
 
 import copy
 import itertools
@@ -37,9 +41,6 @@ def capture_knobs(captures: Captures) -> tuple[Knob, ...]:
 
 def _values(key: str, values: Iterable[float]) -> list[Value]:
     return [Value(f"{value:g}", {key: value}) for value in values]
-
-
-# TODO(merge) The knobs that the study turns, and the settings made of them. Pure.
 
 
 SPIN_PER_SPEED = 0.01

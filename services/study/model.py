@@ -1,4 +1,8 @@
-"""The models of a study of accuracy against time: knobs, settings, its plan, and rows of its table."""
+"""The models of a study of accuracy against time, and the errors that it measures.
+
+- The models of a study of accuracy against time: knobs, settings, its plan, and rows of its table.
+- The errors that the study measures, each with the truth it is held against, which is never the setting under test.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -145,9 +149,6 @@ class Plan:
     presets: tuple[Setting, ...]
     targets: Mapping[str, float] | None
     sizes: Sizes = field(default_factory=Sizes)
-
-
-# TODO(merge) The errors that the study measures, each with the truth it is held against, which is never the setting under test.
 
 
 _RAYS = "a ray caster in float64 at the same pixel centres"

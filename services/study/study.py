@@ -1,4 +1,10 @@
-"""The journal of a study: a file of answers, with which the same command goes on where it stopped."""
+"""The whole study: its journal, every knob by itself, then promising combinations, and the table of both.
+
+- The journal of a study: a file of answers, with which the same command goes on where it stopped.
+- Chooses the combinations of settings to measure, once each knob has been measured by itself. Pure.
+- A round of the study: settings that are measured side by side, the units of work, and the resulting table.
+- The whole study: every knob by itself, then promising combinations, and the table of both.
+"""
 
 import hashlib
 import itertools
@@ -79,9 +85,6 @@ class Journal(dict[str, Any], AbstractContextManager):
         self._file.close()
 
 
-# TODO(merge) Chooses the combinations of settings to measure, once each knob has been measured by itself. Pure.
-
-
 SAVES = 0.98
 """A value is cheaper where it takes at most this share of the job's own time."""
 
@@ -146,9 +149,6 @@ def _least_share(row: Row, own: Row) -> float | None:
     if any(value > max(negligible, WORSE * mine) for value, mine, negligible in pairs):
         return None
     return min((value / mine for value, mine, negligible in pairs if mine > negligible), default=1.0)
-
-
-# TODO(merge) A round of the study: settings that are measured side by side, the units of work, and the resulting table.
 
 
 @dataclass(frozen=True)
@@ -238,9 +238,6 @@ class Round:
             found |= image_figures([one[name] for one in answers[kind] if name in one])
         order = [error for error in ERRORS if error != "failed_share"]
         return {error: found[error] for error in (*order, "failed_share") if error in found}
-
-
-# TODO(merge) The whole study: every knob by itself, then promising combinations, and the table of both.
 
 
 LAPS_OF_CLOSE_CALLS = 3

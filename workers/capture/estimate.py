@@ -1,4 +1,8 @@
-"""Processor time by stage: what a busy machine does not change."""
+"""The poses of a capture: images are read one view at a time, and what is found in them goes to the three estimates.
+
+- Processor time by stage: what a busy machine does not change.
+- Poses and surface of a capture: the same steps whether results are written into its folder or not.
+"""
 
 import dataclasses
 import time
@@ -36,9 +40,6 @@ class ProcessorClock(Stopwatch):
             for clock, name in entries:
                 if name is not None:
                     clock[name] = clock.get(name, 0.0) + elapsed
-
-
-# TODO(merge) The poses of a capture: images are read one view at a time, and what is found in them goes to the three estimates.
 
 
 FEW_MARKERS = 4
@@ -129,9 +130,6 @@ def _no_pose(estimate: CaptureEstimate, folder: CaptureFolder) -> str:
     few = max(view.markers for view in estimate.views) < FEW_MARKERS
     seen = _other_markers(folder) if few else ""
     return f"{what}; {seen}" if seen else what
-
-
-# TODO(merge) Poses and surface of a capture: the same steps whether results are written into its folder or not.
 
 
 def estimate_surface(given: Given, captures: Captures, watch: Stopwatch) -> tuple[Estimates, Merged]:

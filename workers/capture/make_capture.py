@@ -1,4 +1,7 @@
-"""A capture from its folder to poses, surface and views from elsewhere, without writing anything into the folder."""
+"""One capture from its id to what is written: the list of steps.
+
+- A capture from its folder to poses, surface and views from elsewhere, without writing anything into the folder.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -61,9 +64,6 @@ def score_against_truth(
 def is_corrected(depth: DepthCorrection) -> bool:
     """Whether an estimate changes what was measured."""
     return depth.offset_m != 0.0 or depth.scale != 1.0 or not np.array_equal(depth.T_cam_depth, np.eye(4))
-
-
-# TODO(merge) One capture from its id to what is written: the list of steps.
 
 
 SOURCE, SIMULATED = "capture", "simulated_capture"

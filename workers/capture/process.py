@@ -1,4 +1,7 @@
-"""poses.parquet: every view in every estimate, with its residuals before and after. Pure."""
+"""A capture's folder from photographs to poses, masks, cloud and mesh, written beside them: the list of steps.
+
+- poses.parquet: every view in every estimate, with its residuals before and after. Pure.
+"""
 
 import io
 from collections.abc import Mapping
@@ -96,9 +99,6 @@ def _sigmas(view: ViewEstimate) -> tuple[float | None, float | None]:
         float(np.linalg.eigvalsh(block).max()) for block in (view.covariance[:3, :3], view.covariance[3:, 3:])
     )
     return 1e3 * float(np.sqrt(max(place, 0.0))), float(np.degrees(np.sqrt(max(turn, 0.0))))
-
-
-# TODO(merge) A capture's folder from photographs to poses, masks, cloud and mesh, written beside them: the list of steps.
 
 
 @dataclass(frozen=True, eq=False)

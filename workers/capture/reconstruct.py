@@ -1,4 +1,7 @@
-"""Manual corrections of a capture's poses: what the user wrote into the folder wins over every estimate."""
+"""The surface of a capture's object from its folder and the estimated poses, and the user's own corrections of poses.
+
+- Manual corrections of a capture's poses: what the user wrote into the folder wins over every estimate.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -97,9 +100,6 @@ def corrections_of(given: Given, estimates: Estimates) -> dict[int, tuple[Pose, 
         for view in estimates.estimate.views
         if view.T_board_cam is not None
     }
-
-
-# TODO(merge) The surface of a capture's object from its folder and the estimated poses.
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,8 @@
-"""What processing writes into a capture's folder, and how a file of ours is told from one of the user's.
+"""What a capture's folder holds: its inputs and their digest, what processing writes, and which files are the user's.
+
+- What processing writes into a capture's folder, and how a file of ours is told from one of the user's.
+- The input files of a capture's folder, and their digest: what a dataset that is made of it depends on.
+- The sources of a job: the catalogue of its shapes, and the folders of its captures.
 
     process.json       settings, poses used, depth correction, notes, seconds, and the SHA-256 of every file below
     board_00000.txt  correction_00000.txt  mask_00000.png      where the user gave none
@@ -168,9 +172,6 @@ def _digest_of(file: Path) -> str | None:
         return None
 
 
-# TODO(merge) The input files of a capture's folder, and their digest: what a dataset that is made of it depends on.
-
-
 _IMAGE = re.compile(r"(?:rgb|depth|mask)_[0-9]{5,9}\.png|(?:board|correction)_[0-9]{5,9}\.txt")
 
 
@@ -212,9 +213,6 @@ def _dictionary(path: Path) -> Iterator[Path]:
         return
     if found and (file := path / found[1].decode(errors="replace")).is_file() and not _is_input(file.name):
         yield file
-
-
-# TODO(merge) The sources of a job: the catalogue of its shapes, and the folders of its captures.
 
 
 def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue:

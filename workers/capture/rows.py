@@ -1,4 +1,9 @@
-"""Regions of a capture's view: the object by its mask, and the board by the rays that meet it. Pure."""
+"""The output of a capture: pairs of views with their regions, encoded files, and rows in the tables that scenes have.
+
+- Regions of a capture's view: the object by its mask, and the board by the rays that meet it. Pure.
+- One pair of a capture: a captured view as it is stored, and its view from the other side.
+- The output of a capture: encoded files, and its rows in the tables that scenes have. Pure.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -65,9 +70,6 @@ def _meets_rectangle(
             y = T[1, 3] + z * (T[1, 0] * ray_x + T[1, 1] * ray_y + T[1, 2])
             meets[row, column] = abs(x) <= half_x and abs(y) <= half_y
     return meets
-
-
-# TODO(merge) One pair of a capture: a captured view as it is stored, and its view from the other side.
 
 
 Synthesize = Callable[[Camera], SynthesizedView]
@@ -151,9 +153,6 @@ def _labels(
         for placed, asset in zip(thing.things, assets, strict=True)
     }
     return label_things(thing.things, names, camera, region, count)
-
-
-# TODO(merge) The output of a capture: encoded files, and its rows in the tables that scenes have. Pure.
 
 
 SCORES = ("pose_mm", "pose_deg", "cloud_median_mm", "cloud_p95_mm", "completeness", "depth_median_mm")

@@ -1,4 +1,7 @@
-"""A processed capture against truth: that of its simulation, or a mesh that the user gives."""
+"""A processed capture against truth: that of its simulation, or a mesh that the user gives.
+
+- A processed capture against a mesh that the user gives, in a frame of its own.
+"""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -147,9 +150,6 @@ def score_held_out(views: CaptureViews, truth: Truth, known: Sequence[int], most
         except (CaptureError, ViewError):  # the view sees nothing of the object, or nothing beside it does
             continue
     return found
-
-
-# TODO(merge) A processed capture against a mesh that the user gives, in a frame of its own.
 
 
 def score_against_mesh(result: StoredResult, mesh: Mesh) -> tuple[SurfaceErrors, Alignment]:

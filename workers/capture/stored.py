@@ -1,4 +1,9 @@
-"""A processed capture read back from its folder."""
+"""The stored result of a processed capture, and the files of views that are made from it.
+
+- A processed capture read back from its folder.
+- Files of synthesised views: pictures with the names that a capture's have, their poses, and views.json with the
+  shares.
+"""
 
 import json
 from dataclasses import dataclass
@@ -79,9 +84,6 @@ def _final_pose(path: Path, number: int) -> Pose | None:
     board = read_pose(path / f"board_{number:05d}.txt")
     correction = read_pose(path / f"correction_{number:05d}.txt")
     return None if board is None or correction is None else frozen_array(np.asarray(correction @ board))
-
-
-# TODO(merge) Files of synthesised views: pictures with the names that a capture's have, their poses, and views.json with the shares.
 
 
 FARTHEST_UNITS = 65_535.0

@@ -1,4 +1,8 @@
-"""The context of a worker process: the job, its assets, the renderer."""
+"""The context of a worker process: the job, its assets, the renderer, and where the time goes.
+
+- The C library's allocator, set to keep the memory that freed arrays give back.
+- Where the time of a scene goes.
+"""
 
 import contextlib
 import ctypes
@@ -36,9 +40,6 @@ def open_worker(job: Job, catalogue: Catalogue) -> WorkerContext:
     return WorkerContext(job, catalogue, shared_renderer(), settings_digest(job, catalogue.digest))
 
 
-# TODO(merge) The C library's allocator, set to keep the memory that freed arrays give back.
-
-
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 """Names of mallopt(3)."""
 
@@ -59,9 +60,6 @@ def keep_freed_memory() -> None:
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(M_MMAP_THRESHOLD, OWN_PAGES_BYTES)
         mallopt(M_TRIM_THRESHOLD, KEPT_BYTES)
-
-
-# TODO(merge) Where the time of a scene goes.
 
 
 @dataclass(frozen=True)

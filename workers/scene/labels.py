@@ -1,4 +1,10 @@
-"""The label of each region of a rendered view, from its mask and the poses. Pure."""
+"""Labels of rendered views: regions, the projected view, the agreement of two views, patches. Pure.
+
+- The label of each region of a rendered view, from its mask and the poses. Pure.
+- The projected view: the stored input cloud as the mirror camera sees it. Pure.
+- The agreement of two views: input depth carried into the mirror view against mirror depth. Pure.
+- Patches: the crop of an image about each object. Pure.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -77,9 +83,6 @@ def label_region(thing: Placed, name: tuple[str, str], camera: Camera, extent: E
     return ObjectLabel(thing.region_id, *name, T_cam_obj, u, v, extent.bbox_xywh, pixels, share)
 
 
-# TODO(merge) The projected view: the stored input cloud as the mirror camera sees it. Pure.
-
-
 HIDDEN_M = 0.01
 """A projected point this far behind what the mirror camera sees is hidden."""
 
@@ -130,9 +133,6 @@ def projection_shares(projected: NDArray[np.uint16], mirror: NDArray[np.uint16],
     return filled / projected.size, hidden / max(1, filled)
 
 
-# TODO(merge) The agreement of two views: input depth carried into the mirror view against mirror depth. Pure.
-
-
 FEWEST_POINTS = 50
 """An agreement of fewer co-visible pixels is not given."""
 
@@ -178,9 +178,6 @@ def _sample_pixels(region: NDArray[np.uint8]) -> NDArray[np.int64]:
     chosen = region >= REGION_FIRST_OBJECT
     chosen[::SCENE_STRIDE, ::SCENE_STRIDE] = True
     return np.flatnonzero(chosen)
-
-
-# TODO(merge) Patches: the crop of an image about each object. Pure.
 
 
 def crop_box(label: ObjectLabel, camera: Camera, patch: Patch) -> tuple[slice, slice] | None:

@@ -1,4 +1,9 @@
-"""Poses of the cameras that follow from an input camera, and d_z: the depth of the pivot that the mirror camera turns about."""
+"""One pair of a settled scene: cameras that follow from the input camera, views as they are stored, and how they agree.
+
+- Poses of the cameras that follow from an input camera, and d_z: the depth of the pivot that the mirror camera turns
+  about.
+- One pair of a settled scene: its views as they are stored, and how they agree.
+"""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -64,9 +69,6 @@ def front_distance(depth_m: Array, object_pixels: NDArray[np.bool_] | np.bool_, 
     if mirror.pivot_depth == "median":
         return median(z)
     return percentile(z, mirror.percentile)
-
-
-# TODO(merge) One pair of a settled scene: its views as they are stored, and how they agree.
 
 
 @dataclass(frozen=True, eq=False)

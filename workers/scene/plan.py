@@ -1,4 +1,8 @@
-"""Named streams of random numbers: one for each step of a scene, append-only, so that adding a camera moves no object."""
+"""The draw of a scene: assets, starts, cameras and look, all before anything moves.
+
+- Named streams of random numbers: one for each step of a scene, append-only, so that adding a camera moves no object.
+- How several objects begin without touching: each on a place of its own, or one above another. Pure.
+"""
 
 import math
 from collections.abc import Sequence
@@ -64,9 +68,6 @@ class SceneChance:
         return self.stream(name, *([number] if number else []))
 
 
-# TODO(merge) How several objects begin without touching: each on a place of its own, or one above another. Pure.
-
-
 APART_M = 0.001
 """Columns nearer to each other than this count as touching."""
 
@@ -101,9 +102,6 @@ def rise_above(points: Array, earlier: Sequence[ObjectStart]) -> float:
     """Metres by which a cloud [N, 3] must be lifted for its lowest point to be level with the top of all earlier objects."""
     top = max(float(points_of(other)[:, 2].max()) for other in earlier)
     return max(0.0, top - float(points[:, 2].min()))
-
-
-# TODO(merge) The draw of a scene: assets, starts, cameras and look, all before anything moves.
 
 
 RECESS_M = 0.05

@@ -1,4 +1,8 @@
-"""The images that a view leaves, their names, and their bytes. Pure."""
+"""The output of a scene: encoded images, and its rows in each manifest table. Pure.
+
+- The images that a view leaves, their names, and their bytes. Pure.
+- The output of a scene: encoded files, and its rows in each manifest table. Pure.
+"""
 
 from collections.abc import Iterator, Sequence
 from weakref import WeakKeyDictionary
@@ -64,9 +68,6 @@ def object_labels(view: View, pair: Pair) -> list[ObjectLabel]:
     labelled = pair.mirror if view.role == "projected" else view
     assert labelled is not None
     return [label for label in labelled.labels if label.region_id >= REGION_FIRST_OBJECT]
-
-
-# TODO(merge) The output of a scene: encoded files, and its rows in each manifest table. Pure.
 
 
 ASSET_COLUMNS = ("instance_id", "category", "source", "licence", "path", "sha256", "volume_m3", "watertight", "scale")

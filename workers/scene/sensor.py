@@ -1,7 +1,15 @@
-"""Noise of a time-of-flight depth camera. Pure: the same generator state gives the same image.
+"""Effects of real sensors on depth and colour. Pure: the same generator state gives the same image.
 
-Its steps in order: a pixel at an edge may measure a neighbour, or both surfaces at once; the measurement has a systematic and
-a random error; some pixels have no depth. `schemas/job/views.py` names the sources of the preset's numbers.
+- Noise of a time-of-flight depth camera. Pure: the same generator state gives the same image.
+- Lens distortion, exposure, shot noise and read noise of an RGB camera, in linear light. Pure.
+- Sensing of one view: what the sensors store of exact images. Masks and labels stay exact.
+
+Its steps in order: a pixel at an edge may measure a neighbour, or both surfaces at once; the measurement has a
+systematic and a random error; some pixels have no depth. `schemas/job/views.py` names the sources of the preset's
+numbers.
+
+8-bit sRGB is decoded by table and encoded by comparison with the 255 limits between codes, so that no machine's power
+function decides a rounding.
 """
 
 import math
@@ -103,12 +111,6 @@ def shift_lookup(depth_m: Array, shift_px: Array, reach_px: int) -> Array:
     return np.where(seen > 0.0, seen, depth_m)
 
 
-# TODO(merge) Lens distortion, exposure, shot noise and read noise of an RGB camera, in linear light. Pure.
-#
-# 8-bit sRGB is decoded by table and encoded by comparison with the 255 limits between codes, so that no machine's power
-# function decides a rounding.
-
-
 def sense_rgb(
     rgb: NDArray[np.uint8],
     intrinsics: Intrinsics,
@@ -167,9 +169,6 @@ def add_noise(light: Array, noise: RgbNoise, rng: np.random.Generator) -> Array:
     """
     variance = light / noise.full_well_e + (noise.read_noise_e / noise.full_well_e) ** 2
     return light + np.sqrt(variance) * rng.standard_normal(light.shape)
-
-
-# TODO(merge) Sensing of one view: what the sensors store of exact images. Masks and labels stay exact.
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,12 @@
-"""What is told of a scene in which something was raised that is no refusal: a bug, or memory that ran out."""
+"""A shard: ranges of scenes made one after another in one process, each committed while the next is made.
+
+- What is told of a scene in which something was raised that is no refusal: a bug, or memory that ran out.
+- Ranges that are committed while the next one is made.
+
+A commit computes little and waits long: for a disk to flush, or for an object store to take and copy archives. So it
+runs in a thread of its own. One range at a time is committed, in order, and nothing else of a worker runs in two
+threads.
+"""
 
 import contextlib
 import faulthandler
@@ -85,12 +93,6 @@ def keep_traceback(store: Store, scene_id: int, error: BaseException) -> str:
     return f"; the traceback is in {store.name}/{key}"
 
 
-# TODO(merge) Ranges that are committed while the next one is made.
-#
-# A commit computes little and waits long: for a disk to flush, or for an object store to take and copy archives. So it runs in a
-# thread of its own. One range at a time is committed, in order, and nothing else of a worker runs in two threads.
-
-
 @dataclass(frozen=True, eq=False)
 class MadeRange:
     """A range whose scenes are all written: its failures by `kind: reason`, and scenes that ended in an unexpected error."""
@@ -143,9 +145,6 @@ class Committer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._thread.shutdown()
-
-
-# TODO(merge) A shard: ranges of scenes made one after another in one process, each committed while the next is made.
 
 
 class BlamedScene(SceneError):

@@ -1,7 +1,10 @@
-"""Cameras, labels and projection of one stored pair by the definitions of Staszak and Belter 2024.
+"""Cameras, labels, projection and forces of stored scenes by the definitions of Staszak and Belter 2024.
 
-Matrices are [4, 4] float64, `T_a_b` takes frame b to frame a, metres; camera frames are optical (x right, y down, z forward).
-A pixel (column, row) has its centre at (column + 0.5, row + 0.5).
+- Cameras, labels and projection of one stored pair by the definitions of Staszak and Belter 2024.
+- Static equilibrium of a stored scene, from its contact forces alone: weights, levers, friction and reaction.
+
+Matrices are [4, 4] float64, `T_a_b` takes frame b to frame a, metres; camera frames are optical (x right, y down, z
+forward). A pixel (column, row) has its centre at (column + 0.5, row + 0.5).
 """
 
 import hashlib
@@ -248,9 +251,6 @@ def unproject(view: Row, depth: NDArray) -> tuple[Array, NDArray[np.int64]]:
     z = depth[rows, columns] / view["depth_units_per_m"]
     x, y = (columns + 0.5 - view["cx"]) / view["fx"] * z, (rows + 0.5 - view["cy"]) / view["fy"] * z
     return np.stack([x, y, z, np.ones_like(z)]), rows * view["width"] + columns
-
-
-# TODO(merge) Static equilibrium of a stored scene, from its contact forces alone: weights, levers, friction and reaction.
 
 
 GRAVITY_M_S2 = 9.81

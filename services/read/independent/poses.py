@@ -1,6 +1,11 @@
-"""Where the cameras of one stored pair stand, by the definitions of Staszak and Belter 2024.
+"""`verso verify --independent N`: labels derived a second time, from the definitions of Staszak and Belter 2024.
+
+- Where the cameras of one stored pair stand, by the definitions of Staszak and Belter 2024.
 
 Matrices and conventions are those of derive.py.
+
+`verso verify` derives them by the producer's own functions, which finds damage and never a wrong formula. This package
+imports nothing else of the project: rows come as dictionaries, files as bytes.
 """
 
 import math
@@ -97,12 +102,6 @@ def _derive_rolled_mirror(T_in: Array, d_z: float, T_z: float) -> Array:
 
 def _transform(R: Array, t: Sequence[float]) -> Array:
     return np.vstack([np.column_stack([R, t]), [0.0, 0.0, 0.0, 1.0]])
-
-
-# TODO(merge) `verso verify --independent N`: labels derived a second time, from the definitions of Staszak and Belter 2024.
-#
-# `verso verify` derives them by the producer's own functions, which finds damage and never a wrong formula. This package
-# imports nothing else of the project: rows come as dictionaries, files as bytes.
 
 
 _ELEMENTS = [f"T{i}{j}" for i in range(4) for j in range(4)]

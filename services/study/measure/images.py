@@ -1,4 +1,12 @@
-"""The ray casts of one scene's geometry, kept from setting to setting while its poses stay."""
+"""Errors of the images of a scene with each setting, against rays. Pure.
+
+- The ray casts of one scene's geometry, kept from setting to setting while its poses stay.
+- Errors of a made scene's depth, masks, mirror pose and projection against rays. Pure.
+- Measures the images of a scene with each setting, against rays and against very many paths.
+
+The rays are cast from the scene's own cameras at its own poses: through pixels' centres or, for errors that depend on
+the size of pixels, through places that do not depend on it. Views of all pairs count together.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
@@ -90,12 +98,6 @@ def _same(mine: Placed, other: Placed) -> bool:
         np.array_equal(mine.shape.vertices, other.shape.vertices)
         and np.array_equal(mine.shape.faces, other.shape.faces)
     )
-
-
-# TODO(merge) Errors of a made scene's depth, masks, mirror pose and projection against rays. Pure.
-#
-# The rays are cast from the scene's own cameras at its own poses: through pixels' centres or, for errors that depend on the
-# size of pixels, through places that do not depend on it. Views of all pairs count together.
 
 
 PERCENTILE = 99.0
@@ -214,9 +216,6 @@ def _mean(name: str, flags: Iterable[NDArray[np.bool_]]) -> dict[str, float]:
     """The share of true flags by its name, or none for no flags."""
     values = np.concatenate([np.empty(0, bool), *flags])
     return {name: float(values.mean())} if len(values) else {}
-
-
-# TODO(merge) Measures the images of a scene with each setting, against rays and against very many paths.
 
 
 CONVERGED_PATHS = 256

@@ -1,4 +1,8 @@
-"""A setting's errors with their confidence intervals, from the figures of scenes. Pure."""
+"""Processor time of a scene with each setting, and a setting's errors with their confidence intervals.
+
+- A setting's errors with their confidence intervals, from the figures of scenes. Pure.
+- Processor time of a scene with each setting, in turn within a round, on one core.
+"""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -91,9 +95,6 @@ def image_figures(scenes: Sequence[Mapping[str, float]]) -> dict[str, Figure]:
     """A setting's errors of images, from one mapping a scene, in the order of `ERRORS`."""
     names = [name for name in ERRORS if any(name in scene for scene in scenes)]
     return {name: figure_over_scenes([scene[name] for scene in scenes if name in scene]) for name in names}
-
-
-# TODO(merge) Processor time of a scene with each setting, in turn within a round, on one core.
 
 
 WARM_SCENES = 4

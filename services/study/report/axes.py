@@ -1,4 +1,8 @@
-"""Style, palette and logarithmic axes of all plots."""
+"""Style, palette, axes and labels of all plots.
+
+- Style, palette and logarithmic axes of all plots.
+- Labels beside the points of a plot, placed where they hide nothing.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -161,9 +165,6 @@ def draw_row(axes: Axes, row: Row, error: str, color: str, own_ms: float | None 
     for span in spans:
         axes.plot(*span, color=color, lw=0.8, alpha=0.55, zorder=2.5)
     axes.plot([x], [y], ls="", color=color, clip_on=False, **mark)
-
-
-# TODO(merge) Labels beside the points of a plot, placed where they hide nothing.
 
 
 SPACE_X, SPACE_Y = 5.0, 1.0

@@ -1,4 +1,8 @@
-"""The files of a study: two Parquet tables, and the whole study as JSON."""
+"""The files of a study: Parquet tables, the whole study as JSON, and one HTML page.
+
+- The files of a study: two Parquet tables, and the whole study as JSON.
+- A study as one HTML page that needs nothing beside it: no file, no script, no network.
+"""
 
 import base64
 import json
@@ -95,9 +99,6 @@ def _replace(file: Path, write: Callable[[Path], Any]) -> Path:
     write(partial)
     os.replace(partial, file)
     return file
-
-
-# TODO(merge) A study as one HTML page that needs nothing beside it: no file, no script, no network.
 
 
 TEMPLATE = Path(__file__).with_name("page.html")

@@ -1,4 +1,8 @@
-"""One panel: an error over processor time, a point for each setting that was measured."""
+"""The plots of a study: what accuracy costs in time, and each knob by itself.
+
+- One panel: an error over processor time, a point for each setting that was measured.
+- All plots of a study: what accuracy costs in time, and each knob by itself.
+"""
 
 import math
 from collections import Counter
@@ -202,9 +206,6 @@ def _labels(rows: Sequence[Row], panel: Panel, best: Sequence[Row], looks: Looks
         rank = 0.0 if must else (1.0 if row in best else 2.0) + order * 1e-3
         labels.append(Label(cut(text), place_of(row, panel.error), color, rank, must))
     return labels
-
-
-# TODO(merge) All plots of a study: what accuracy costs in time, and each knob by itself.
 
 
 TRADEOFF_FILE = "tradeoff.png"

@@ -1,10 +1,14 @@
-"""Corners of a printed square where lines through its four edges meet, to a few hundredths of a pixel.
+"""Detection of a board's markers in a photograph, with corners refined along their edges.
 
-An edge is found on short profiles across it, at the centroid of the gradient of light, which blur moves less than it moves
-the corner itself. Measured on pictures drawn in linear light and stored in sRGB: 0.04 px (rms an axis); OpenCV's refinements
-leave 0.36 (AprilTag), 0.44 (cornerSubPix) and 0.85 (contour) there. On the one real photograph at hand it fits the nominal
-board worse than the contours do (median 1.01 px against 0.44 to a free homography), and best of all (0.23 against 0.28) once
-the side of the printed marker is free: 41.5 mm in place of 40, which AprilTag's corners say as well.
+- Corners of a printed square where lines through its four edges meet, to a few hundredths of a pixel.
+- Detection of a board's markers in a photograph, by OpenCV's ArucoDetector, with corners refined along their edges.
+
+An edge is found on short profiles across it, at the centroid of the gradient of light, which blur moves less than it
+moves the corner itself. Measured on pictures drawn in linear light and stored in sRGB: 0.04 px (rms an axis); OpenCV's
+refinements leave 0.36 (AprilTag), 0.44 (cornerSubPix) and 0.85 (contour) there. On the one real photograph at hand it
+fits the nominal board worse than the contours do (median 1.01 px against 0.44 to a free homography), and best of all
+(0.23 against 0.28) once the side of the printed marker is free: 41.5 mm in place of 40, which AprilTag's corners say as
+well.
 """
 
 import cv2
@@ -105,9 +109,6 @@ def _intersections(lines: Array) -> Array:
     det = a * e - b * d
     det = np.where(np.abs(det) < 1e-6, np.nan, det)
     return np.stack([(c * e - b * f) / det, (a * f - c * d) / det], axis=2)
-
-
-# TODO(merge) Detection of a board's markers in a photograph, by OpenCV's ArucoDetector, with corners refined along their edges.
 
 
 MIN_PERIMETER = 0.01

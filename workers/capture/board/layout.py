@@ -1,4 +1,10 @@
-"""Frames that others give board poses in, and how they lie in ours: origin at the grid's centre, y up the print, z out."""
+"""The marker board: its frame and those of others, the corners of its markers, and what is printed beside them.
+
+- Frames that others give board poses in, and how they lie in ours: origin at the grid's centre, y up the print, z
+  out.
+- Where the corners of every marker lie on the board, and OpenCV's dictionary of its markers.
+- What is printed on the sheet of a marker board: black rectangles, an arrow and text, at nominal size.
+"""
 
 import math
 from dataclasses import dataclass
@@ -39,9 +45,6 @@ def correction_in_board(correction: Pose, board: Board, frame: BoardFrame) -> Po
     """The correction of poses in our frame that does what `correction` does to poses in the other."""
     T = frame_in_board(board, frame)
     return T @ correction @ invert(T)
-
-
-# TODO(merge) Where the corners of every marker lie on the board, and OpenCV's dictionary of its markers.
 
 
 PREDEFINED = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
@@ -94,9 +97,6 @@ def _read_dictionary(name: str, folder: Path | None) -> "cv2.aruco.Dictionary":
             "dictionary", f"{path.name} is no dictionary in OpenCV's format (nmarkers, markersize, marker_0)"
         )
     return dictionary
-
-
-# TODO(merge) What is printed on the sheet of a marker board: black rectangles, an arrow and text, at nominal size.
 
 
 MARGIN_M = 0.02

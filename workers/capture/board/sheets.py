@@ -1,4 +1,8 @@
-"""The marker board as pixels: its markers alone, and the whole sheet as a PNG that knows its resolution."""
+"""The marker board as a file to print: pixels, PNG, PDF, A4 pages.
+
+- The marker board as pixels: its markers alone, and the whole sheet as a PNG that knows its resolution.
+- The marker board as PDF: one sheet of the board's size, or A4 pages that are glued together.
+"""
 
 import io
 import math
@@ -97,9 +101,6 @@ def _write(picture: NDArray[np.uint8], words: Words, at: tuple[float, float], px
     column, row = round(at[0] + drop[0]), round(at[1] + drop[1])
     part = picture[max(row, 0) : row + pixels.shape[0], max(column, 0) : column + pixels.shape[1]]
     np.minimum(part, pixels[max(-row, 0) :, max(-column, 0) :][: part.shape[0], : part.shape[1]], out=part)
-
-
-# TODO(merge) The marker board as PDF: one sheet of the board's size, or A4 pages that are glued together.
 
 
 POINTS_PER_M = 72 / 0.0254

@@ -1,4 +1,10 @@
-"""The estimate `markers` of a whole capture."""
+"""The estimates `markers` and `joint` of a whole capture, and what they found out about it.
+
+- The estimate `markers` of a whole capture.
+- What a joint estimate found out about a capture and its user must know, in words.
+- Whether the object moved on the board in the middle of a capture, by what views before and after see of it.
+- The estimate `joint` of a whole capture.
+"""
 
 import dataclasses
 import math
@@ -38,9 +44,6 @@ def judged(found: MarkerPose, corner_px: float) -> Judged:
         faults.append("ambiguous: a pose of another tilt fits the markers as well (planar target)")
     covariance = np.asarray(corner_px**2 * np.linalg.pinv(found.fit.information, hermitian=True), np.float64)
     return Judged(found.fit.T_board_cam, covariance, tuple(faults))
-
-
-# TODO(merge) What a joint estimate found out about a capture and its user must know, in words.
 
 
 SCALES_DIFFER = 0.01
@@ -93,9 +96,6 @@ def _weights(term: BoardTerm | ObjectTerm, view: NDArray[np.int64], growth: Arra
     together = np.bincount(view, 1.0 / (term.sigma_m**2 * term.inflation))
     patch, whole = np.median(term.sigma_m / growth), np.median(1.0 / np.sqrt(together[together > 0]))
     return f"sigma of a patch {1000 * patch:.2f} mm at 1 m, of all patches of a view together {1000 * whole:.2f} mm"
-
-
-# TODO(merge) Whether the object moved on the board in the middle of a capture, by what views before and after see of it.
 
 
 REACH_M = 0.05
@@ -183,9 +183,6 @@ def _shift(normal: Array, distance_m: Array) -> tuple[Array, float]:
 
 def _cost(distance_m: Array) -> float:
     return float(np.log1p((distance_m / ROBUST_M) ** 2).sum())
-
-
-# TODO(merge) The estimate `joint` of a whole capture.
 
 
 OFF_BOARD_MM = 10.0

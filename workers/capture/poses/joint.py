@@ -1,4 +1,15 @@
-"""Pairs of patches of the object, seen in two views, that lie on one piece of its surface."""
+"""The joint estimate: all views, corners and depth in one problem.
+
+- Pairs of patches of the object, seen in two views, that lie on one piece of its surface.
+- How noisy a capture's depth is, by its own residuals: the sigma of a patch, and how much alike the patches of a view
+  err.
+- Levenberg-Marquardt over the poses of all views and the shared parameters, by dense normal equations.
+- The joint problem of a capture: corners, the board's depth and the object's, each weighed by its measured noise.
+
+Errors of depth are alike over an image (the lens, the distance, the shutter). Hundreds of patches that err together
+know no more than a few; so the variance of a term is inflated by what the misfit of whole views says over that of
+independent patches.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -78,12 +89,6 @@ def _smoothed(normals: Array, neighbour: NDArray[np.intp], chosen: NDArray[np.bo
     return np.where(length > 0.5, total / np.maximum(length, 1e-9), normals)
 
 
-# TODO(merge) How noisy a capture's depth is, by its own residuals: the sigma of a patch, and how much alike the patches of a view err.
-#
-# Errors of depth are alike over an image (the lens, the distance, the shutter). Hundreds of patches that err together know no
-# more than a few; so the variance of a term is inflated by what the misfit of whole views says over that of independent patches.
-
-
 MAD = 1.4826
 FLOOR_M = 2e-4
 """No patch is taken to be better than this at 1 m: stored depth has a step of 1 mm, and its errors are not all seen."""
@@ -135,9 +140,6 @@ def row_inflation(factor: float, sigma_m: Array, *views: NDArray[np.int64]) -> A
     """[N]: inflation of each row of sigma_m [N], at least `factor`, so that no view's rows come to less than VIEW_FLOOR_M."""
     count = np.max([np.bincount(view)[view] for view in views], axis=0)
     return np.maximum(factor, count * (VIEW_FLOOR_M / sigma_m) ** 2)
-
-
-# TODO(merge) Levenberg-Marquardt over the poses of all views and the shared parameters, by dense normal equations.
 
 
 SETTLED = 1e-7
@@ -229,9 +231,6 @@ def _linearise(problem: Problem, poses: Array, shared: Shared) -> tuple[Array, A
     held = np.concatenate([np.repeat(problem.fixed, POSE), ~free])
     matrix[held], matrix[:, held], gradient[held] = 0.0, 0.0, 0.0
     return matrix, gradient, sum(r.cost for r in rows) + float(((deviation / sigma)[free] ** 2).sum())
-
-
-# TODO(merge) The joint problem of a capture: corners, the board's depth and the object's, each weighed by its measured noise.
 
 
 ROUNDS = 4

@@ -1,4 +1,8 @@
-"""Small rigid motions: the exponential map, its logarithm, and matrices of cross products.
+"""Poses from markers alone: rigid motions, reprojection, and one view by itself.
+
+- Small rigid motions: the exponential map, its logarithm, and matrices of cross products.
+- Corners of markers against their images: residuals with exact derivatives, and a robust fit of one view's pose.
+- The estimate `markers`: each view's pose from the corners of its markers alone.
 
 A pose is changed from the right, in camera axes: T_board_cam <- T_board_cam exp(motion), motion = (metres, radians).
 """
@@ -43,9 +47,6 @@ def moved(T: Pose, motion: Array) -> Pose:
     R = T[:3, :3] @ exponential(motion[3:])
     U, _, V = np.linalg.svd(R)
     return pose(U @ V, T[:3, 3] + T[:3, :3] @ motion[:3])
-
-
-# TODO(merge) Corners of markers against their images: residuals with exact derivatives, and a robust fit of one view's pose.
 
 
 CAUCHY = 3.0
@@ -135,9 +136,6 @@ def _normal_equations(residuals: Array, jacobian: Array, scale: float) -> tuple[
     weights = 1.0 / (1.0 + (residuals**2).sum(axis=1) / scale**2)
     weighted = jacobian * weights[:, None, None]
     return np.einsum("kij,kil->jl", weighted, jacobian), np.einsum("kij,ki->j", weighted, residuals)
-
-
-# TODO(merge) The estimate `markers`: each view's pose from the corners of its markers alone.
 
 
 FLOOR_PX = 0.02

@@ -1,4 +1,8 @@
-"""Pixels to rays and board points to pixels, through the lens, by OpenCV's own model."""
+"""What one view observes: rays through pixels, corners and depth samples.
+
+- Pixels to rays and board points to pixels, through the lens, by OpenCV's own model.
+- What the estimates know of one view: its corners as rays, where they lie on the board, and samples of its depth.
+"""
 
 from dataclasses import dataclass, field
 
@@ -55,9 +59,6 @@ def _distorted(points_cam: Array, camera: CaptureCamera) -> Array:
     found, _ = cv2.projectPoints(points_cam.reshape(-1, 1, 3), zero, zero, matrix, camera.lens)
     pixels: Array = found.reshape(-1, 2).astype(np.float64) + 0.5
     return pixels
-
-
-# TODO(merge) What the estimates know of one view: its corners as rays, where they lie on the board, and samples of its depth.
 
 
 @dataclass(frozen=True, eq=False)

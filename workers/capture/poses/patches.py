@@ -1,7 +1,11 @@
-"""Small planar pieces of a depth image: on the markers of the board, and around their corners.
+"""Samples of one view's depth: planar pieces on the board, around its markers' corners, and on what stands on it.
 
-A piece of plane has an inverse depth that is affine in the ray (x, y): 1 / z = a x + b y + c, with the plane's normal along
-(a, b, c). So one robust linear fit gives the piece's middle, its normal and its noise.
+- Small planar pieces of a depth image: on the markers of the board, and around their corners.
+- Pieces of the surface of what stands on the board, found by depth alone: no mask is needed.
+- What one view's images come to: its corners, its pose from markers, and samples of its depth.
+
+A piece of plane has an inverse depth that is affine in the ray (x, y): 1 / z = a x + b y + c, with the plane's normal
+along (a, b, c). So one robust linear fit gives the piece's middle, its normal and its noise.
 """
 
 import dataclasses
@@ -126,9 +130,6 @@ def depth_at(depth: NDArray[np.uint16], pixels: Array, units_per_m: float) -> Ar
     return np.where(few, 0.0, median / units_per_m)
 
 
-# TODO(merge) Pieces of the surface of what stands on the board, found by depth alone: no mask is needed.
-
-
 SIDE_RAD = 0.012
 """Width of a patch, seen from the camera: 10 mm at 0.8 m."""
 ACROSS = 5
@@ -204,9 +205,6 @@ def _over_board(found: Patches, T_board_cam: Pose, board: Board) -> NDArray[np.b
     half = 0.5 * board.scale * np.array([board.width_m, board.height_m])
     inside: NDArray[np.bool_] = np.abs(transform(T_board_cam, found.ray_z)[:, :2]) < half
     return inside[:, 0] & inside[:, 1]
-
-
-# TODO(merge) What one view's images come to: its corners, its pose from markers, and samples of its depth.
 
 
 def observe_view(

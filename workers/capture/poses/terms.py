@@ -1,4 +1,13 @@
-"""What all views of a capture share: how depth is wrong, and how large the print is; with what is known of it beforehand."""
+"""The terms of the joint problem: shared parameters, rows of residuals and their derivatives.
+
+- What all views of a capture share: how depth is wrong, and how large the print is; with what is known of it
+  beforehand.
+- Rows of a sparse least-squares problem over the poses of V views and the parameters that they share.
+- The terms of the joint estimate as rows of residuals over sigma: corners, the board's depth, the object's depth.
+
+Each term is fixed data; its rows depend on the poses [V, 4, 4] (T_board_cam) and on the shared parameters. The sigma of
+depth grows with its scale: otherwise a smaller scale, which makes noise smaller, would always fit better.
+"""
 
 import math
 from collections.abc import Sequence
@@ -102,9 +111,6 @@ def identified(sigma: Array, prior: Array) -> tuple[str, ...]:
     return tuple(name for name, after, before in zip(NAMES, sigma, prior, strict=True) if after < IDENTIFIED * before)
 
 
-# TODO(merge) Rows of a sparse least-squares problem over the poses of V views and the parameters that they share.
-
-
 POSE = 6
 SHARED = len(NAMES)
 
@@ -177,12 +183,6 @@ def _add_pairs(rows: Rows, blocks: Array) -> None:
     for a, b, block in zip(first, second, sums, strict=True):
         blocks[a, :, b] += block
         blocks[b, :, a] += block.T
-
-
-# TODO(merge) The terms of the joint estimate as rows of residuals over sigma: corners, the board's depth, the object's depth.
-#
-# Each term is fixed data; its rows depend on the poses [V, 4, 4] (T_board_cam) and on the shared parameters. The sigma of
-# depth grows with its scale: otherwise a smaller scale, which makes noise smaller, would always fit better.
 
 
 ROBUST = 3.0

@@ -1,4 +1,8 @@
-"""What the three estimates of a capture are made from."""
+"""Which views fit an estimate, by which evidence.
+
+- What the three estimates of a capture are made from.
+- What becomes of a view's pose: used, flagged or refused, with reasons that name the number measured.
+"""
 
 import math
 from dataclasses import dataclass
@@ -41,9 +45,6 @@ class Evidence:
     def spec(self) -> Estimation:
         """How poses are estimated."""
         return self.setup.spec
-
-
-# TODO(merge) What becomes of a view's pose: used, flagged or refused, with reasons that name the number measured.
 
 
 MAX_SIGMA_M = 0.005

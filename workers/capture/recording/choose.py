@@ -1,4 +1,8 @@
-"""Which depth frame belongs to which colour frame, and how many frames a recording has lost."""
+"""Choice of a recording's frames: pairs of colour and depth, sharp, and spread over all that the camera has seen.
+
+- Which depth frame belongs to which colour frame, and how many frames a recording has lost.
+- Choice of a recording's frames: sharp ones, and spread over all that the camera has seen.
+"""
 
 from dataclasses import dataclass
 
@@ -76,9 +80,6 @@ def describe_losses(losses: Losses) -> list[str]:
     if losses.without_depth:
         told.append(f"{losses.without_depth} colour frames have no depth")
     return told
-
-
-# TODO(merge) Choice of a recording's frames: sharp ones, and spread over all that the camera has seen.
 
 
 LOOK = (32, 18)

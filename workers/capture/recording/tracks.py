@@ -1,6 +1,13 @@
-"""How long a Matroska file says that it is, read from its first bytes: what a cut file has lost follows from it.
+"""The tracks of an Azure Kinect recording, read by PyAV, and how much of it is there.
+
+- How long a Matroska file says that it is, read from its first bytes: what a cut file has lost follows from it.
+- The images of a recording, from the bytes of their frames.
 
 Elements and their coding: RFC 8794 (EBML) and RFC 9559 (Matroska).
+
+The layout is that of Microsoft's description ("Azure Kinect record file format") and its SDK: tracks named COLOR and
+DEPTH or marked by the tags K4A_COLOR_TRACK and K4A_DEPTH_TRACK, time stamps in microseconds of the device's clock,
+depth as 16-bit big-endian millimetres (b16g), the factory calibration as an attachment.
 """
 
 import struct
@@ -75,9 +82,6 @@ def _elements(data: bytes, at: int, most: int = 10_000) -> list[tuple[int, int, 
     return found
 
 
-# TODO(merge) The images of a recording, from the bytes of their frames.
-
-
 FORMATS = ("MJPG", "NV12", "YUY2", "BGRA")
 """Of colour frames, by their four-character code."""
 
@@ -128,13 +132,6 @@ def decode_gray(data: bytes, fourcc: str, size: tuple[int, int]) -> NDArray[np.u
 
 def _pixels(data: bytes, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     return np.frombuffer(data, np.uint8).reshape(shape)
-
-
-# TODO(merge) The tracks of an Azure Kinect recording, read by PyAV.
-#
-# The layout is that of Microsoft's description ("Azure Kinect record file format") and its SDK: tracks named COLOR and DEPTH or
-# marked by the tags K4A_COLOR_TRACK and K4A_DEPTH_TRACK, time stamps in microseconds of the device's clock, depth as 16-bit
-# big-endian millimetres (b16g), the factory calibration as an attachment.
 
 
 AS_RECORDED = "take the file as k4arecorder or the SDK wrote it"

@@ -1,4 +1,19 @@
-"""How a photograph is averaged: points over a pixel's area and moments of the exposure, and sums in linear light."""
+"""Effects of a real camera on a simulated photograph: exposure, motion, noise, hidden markers, lens.
+
+- How a photograph is averaged: points over a pixel's area and moments of the exposure, and sums in linear light.
+- The camera's movement while the shutter is open.
+- The preset of the depth camera's noise: what a typical Azure Kinect at 0.5 to 1.5 m adds to exact depth.
+- Slips of paper that lie on the print and hide markers in part.
+- The lens of the simulated colour camera: a wider pinhole picture, and the lookup that bends it.
+
+**Published.** Microsoft bounds the random error by 17 mm and the systematic error by 11 mm + 0.1 % of the distance over
+the whole range of the mode NFOV unbinned, 0.5 to 3.86 m. Tolgyessy et al. 2021 (Sensors 21(2):413) confirm both bounds
+up to 3.5 m, find the noise lowest near the middle of the image and at short range, and describe pixels that fly between
+a surface and what is behind it. Kurillo et al. 2022 (Sensors 22(7):2469) see the random error grow with the distance.
+
+**Assumed.** The numbers below are no fit of a published table. They are a device of the usual kind at arm's length, far
+inside those bounds; what scenes have (schemas/job/views.py) is the upper bound.
+"""
 
 import math
 from dataclasses import dataclass
@@ -72,9 +87,6 @@ def add_light(total: Array, rgb: NDArray[np.uint8], light_of: Array) -> None:
                 total[row, column, channel] += light_of[rgb[row, column, channel]]
 
 
-# TODO(merge) The camera's movement while the shutter is open.
-
-
 @dataclass(frozen=True, eq=False)
 class Motion:
     """Even motion in the camera's own axes: `way` [3] metres and a rotation by `turn_rad` about `axis` [3] in one exposure."""
@@ -97,17 +109,6 @@ def draw_motion(blur: MotionBlur, rng: np.random.Generator) -> Motion:
 def pose_at(T_world_cam: Pose, motion: Motion, moment: float) -> Pose:
     """[4, 4]: the camera's pose at a moment, -0.5 to 0.5, of the exposure; T_world_cam is that of its middle."""
     return T_world_cam @ pose(rotation_about(motion.axis, moment * motion.turn_rad), moment * motion.way)
-
-
-# TODO(merge) The preset of the depth camera's noise: what a typical Azure Kinect at 0.5 to 1.5 m adds to exact depth.
-#
-# **Published.** Microsoft bounds the random error by 17 mm and the systematic error by 11 mm + 0.1 % of the distance over the
-# whole range of the mode NFOV unbinned, 0.5 to 3.86 m. Tolgyessy et al. 2021 (Sensors 21(2):413) confirm both bounds up to
-# 3.5 m, find the noise lowest near the middle of the image and at short range, and describe pixels that fly between a surface
-# and what is behind it. Kurillo et al. 2022 (Sensors 22(7):2469) see the random error grow with the distance.
-#
-# **Assumed.** The numbers below are no fit of a published table. They are a device of the usual kind at arm's length, far inside
-# those bounds; what scenes have (schemas/job/views.py) is the upper bound.
 
 
 AXIAL_M, AXIAL_PER_M = 0.0008, 0.0005
@@ -137,9 +138,6 @@ def kinect_noise(spec: KinectDepthNoise) -> DepthNoise:
             "offset_share": OFFSET_SHARE,
         }
     )
-
-
-# TODO(merge) Slips of paper that lie on the print and hide markers in part.
 
 
 HEIGHT_M = 0.0003
@@ -175,9 +173,6 @@ def _slip(corners: Array, rng: np.random.Generator) -> Array:
     turn = rng.uniform(0.0, math.pi)
     u, v = np.array([math.cos(turn), math.sin(turn)]), np.array([-math.sin(turn), math.cos(turn)])
     return np.stack([middle + a * half[0] * u + b * half[1] * v for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
-
-
-# TODO(merge) The lens of the simulated colour camera: a wider pinhole picture, and the lookup that bends it.
 
 
 MARGIN_PX = 2

@@ -1,4 +1,10 @@
-"""Where the object of a simulated capture stands, and the board as it was really printed."""
+"""One photograph of a virtual capture: object and board as geometry, the Azure Kinect's two cameras, its images.
+
+- Where the object of a simulated capture stands, and the board as it was really printed.
+- The printed board as geometry: every cell of every marker is a face, so that its edges are exact at any resolution.
+- The simulated Azure Kinect: its colour camera and, beside it, its depth camera.
+- One photograph of a virtual capture: both cameras' images as the device stores them.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -64,9 +70,6 @@ def true_board(board: Board, simulate: Simulate) -> Board:
     """The board as large as it was printed: nominal sizes times `print_scale`, whatever a ruler is said to show."""
     scale = 1.0 if simulate.print_scale is None else simulate.print_scale
     return board.model_copy(update={"measured_ruler_m": scale * board.ruler_m})
-
-
-# TODO(merge) The printed board as geometry: every cell of every marker is a face, so that its edges are exact at any resolution.
 
 
 THICKNESS_M = 0.005
@@ -155,9 +158,6 @@ def _triangles(quads: NDArray[np.int32]) -> NDArray[np.int32]:
     return frozen_array(np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), np.int32)
 
 
-# TODO(merge) The simulated Azure Kinect: its colour camera and, beside it, its depth camera.
-
-
 COLOR = Intrinsics(width=1920, height=1080, fx=912.37, fy=912.25, cx=961.44 + 0.5, cy=548.29 + 0.5)
 """The article's camera. Its principal point (961.44, 548.29) counts from the first pixel's centre."""
 
@@ -208,9 +208,6 @@ def assumed_device(device: DepthCamera, error: RegistrationError | None) -> Dept
     turn = rotation_about(np.array([0.0, 1.0, 0.0]), math.radians(error.turn_deg))
     T_error = pose(turn, np.array(error.shift_m))
     return replace(device, T_color_depth=frozen_array(T_error @ device.T_color_depth))
-
-
-# TODO(merge) One photograph of a virtual capture: both cameras' images as the device stores them.
 
 
 DEPTH_UNITS_PER_M = 1000.0

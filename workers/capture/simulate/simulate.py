@@ -1,4 +1,9 @@
-"""Which effects a simulated capture runs: one table of effects, and the plan that follows from its settings. Pure.
+"""A virtual capture from its settings to its folder: effects, camera path, photographs, held-out views.
+
+- Which effects a simulated capture runs: one table of effects, and the plan that follows from its settings. Pure.
+- The path of a hand-held camera around an object, as poses at the moments of its photographs.
+- Views of a simulated capture that were not photographed: what synthesised views are compared with.
+- One virtual capture from its settings to its folder: the list of steps.
 
 The plan is of the same kind as that of scenes (schemas/scene/scene.py). Effects of the rendering are no-ops where a
 capture does not call for them; every other one is asked for by name in `captures.simulate`.
@@ -69,9 +74,6 @@ def plan_effects(simulate: Simulate) -> EffectPlan:
 def planned_settings(simulate: Simulate, plan: EffectPlan) -> Simulate:
     """The settings of those effects that the plan runs: every other one is off."""
     return simulate.model_copy(update=dict.fromkeys(name for name in ASKED if not plan.runs(name)))
-
-
-# TODO(merge) The path of a hand-held camera around an object, as poses at the moments of its photographs.
 
 
 VIEWS_PER_TURN = 14
@@ -146,9 +148,6 @@ def _rolled(T: Array, roll_rad: float) -> Array:
     return T @ pose(rotation_about(OPTICAL_AXIS, roll_rad), np.zeros(3))
 
 
-# TODO(merge) Views of a simulated capture that were not photographed: what synthesised views are compared with.
-
-
 VIEWS = 3
 
 DEPTH_UNITS_PER_M = 10_000.0
@@ -184,9 +183,6 @@ def take_exact(studio: Studio, number: int, T_board_cam: Pose) -> CapturedView:
     depth = np.rint(np.clip(depth_m * DEPTH_UNITS_PER_M, 0.0, 65_535.0)).astype(np.uint16)
     depth[depth == 65_535] = 0
     return CapturedView(number, encode_codes(take_light(studio, number, T_world_cam)), depth, mask)
-
-
-# TODO(merge) One virtual capture from its settings to its folder: the list of steps.
 
 
 def load_object(job: Job, catalogue: Catalogue, chance: SceneChance) -> Asset:

@@ -1,4 +1,8 @@
-"""Errors of a processed capture against truth: poses, merged surface, synthesised views."""
+"""Errors of a cloud and of views against a true surface, and the alignment of frames before that.
+
+- Errors of a processed capture against truth: poses, merged surface, synthesised views.
+- Alignment of a given mesh to a merged surface: iterated closest points from many starts.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -169,9 +173,6 @@ def compare_view(
         beyond=float((view.mask & ~mask).sum() / max(int(view.mask.sum()), 1)),
         measured_share=view.measured_share,
     )
-
-
-# TODO(merge) Alignment of a given mesh to a merged surface: iterated closest points from many starts.
 
 
 TURNS = 24

@@ -1,4 +1,8 @@
-"""What every view says about the points of a merged surface: where it really is, how many see it, and its colour."""
+"""The surface of a capture's object: depth of all views merged, confirmed, and moved to where views face it.
+
+- What every view says about the points of a merged surface: where it really is, how many see it, and its colour.
+- One surface from the depth of all views: merged, confirmed, moved to where the views see it, and coloured.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -204,9 +208,6 @@ def _sample_light(
             upper = steps[rgb[row, column, c]] * (1.0 - s) + steps[rgb[row, column + 1, c]] * s
             lower = steps[rgb[row + 1, column, c]] * (1.0 - s) + steps[rgb[row + 1, column + 1, c]] * s
             light[i, c] = upper * (1.0 - t) + lower * t
-
-
-# TODO(merge) One surface from the depth of all views: merged, confirmed, moved to where the views see it, and coloured.
 
 
 MARGIN_PX = 12

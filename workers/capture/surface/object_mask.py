@@ -1,4 +1,13 @@
-"""A small rasteriser in float64: depth of triangles at pixel centres, by a z-buffer."""
+"""Where the object is: its footprint and height on the board, and its mask in each view.
+
+- A small rasteriser in float64: depth of triangles at pixel centres, by a z-buffer.
+- Where the object stands on the board: its footprint and height, from the depth of all views together.
+- Masks of the object: the silhouette of the merged surface, down to the board.
+
+Heights above the board are collected in the cells of a grid, and a cell's height is their median: a hundred noisy
+pixels of many views fix it to some tenths of a millimetre, so that an object of 4 mm is found where no single view
+shows it.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -54,12 +63,6 @@ def _draw(u: Array, v: Array, q: Array, faces: NDArray[np.int32], depth: Array) 
                 z = 1.0 / (q[a] * (1.0 - wb - wc) + q[b] * wb + q[c] * wc)
                 if depth[row, column] == 0.0 or z < depth[row, column]:
                     depth[row, column] = z
-
-
-# TODO(merge) Where the object stands on the board: its footprint and height, from the depth of all views together.
-#
-# Heights above the board are collected in the cells of a grid, and a cell's height is their median: a hundred noisy pixels of
-# many views fix it to some tenths of a millimetre, so that an object of 4 mm is found where no single view shows it.
 
 
 CELL_M = 0.004
@@ -268,9 +271,6 @@ def _region(
     high = np.array([corner[0] + (i.max() + 1) * CELL_M, corner[1] + (j.max() + 1) * CELL_M, plane[2] + top + 0.01])
     spread, clearance = spread_and_clearance
     return ObjectRegion(plane, clearance, low, high, spread, grown, corner, notes)
-
-
-# TODO(merge) Masks of the object: the silhouette of the merged surface, down to the board.
 
 
 RIM_M = 0.0005

@@ -1,4 +1,8 @@
-"""A view with its pose and without its lens: what merging and synthesis start from."""
+"""A view with its pose, and which points of a surface it sees.
+
+- A view with its pose and without its lens: what merging and synthesis start from.
+- Which points of a mesh the cameras can see past the mesh itself, by rays.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -92,9 +96,6 @@ def distort_mask(mask: NDArray[np.bool_], camera: CaptureCamera) -> NDArray[np.b
 
 def _nearest(image: NDArray, columns: NDArray[np.float32], rows: NDArray[np.float32]) -> NDArray:
     return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
-
-
-# TODO(merge) Which points of a mesh the cameras can see past the mesh itself, by rays.
 
 
 CLEAR_M = 1e-5

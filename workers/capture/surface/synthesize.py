@@ -1,4 +1,9 @@
-"""Small holes of a synthesised view, filled from their rim."""
+"""A view from any pose, made of captured ones: ranked, warped, merged, holes filled.
+
+- Small holes of a synthesised view, filled from their rim.
+- Views from poses that were not captured: the nearest views, merged and drawn from there (Staszak and Belter 2024,
+  step 4).
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -85,9 +90,6 @@ def _fill_rim(
             for c in range(3):
                 rgb[row, column, c] = np.uint8(found[n, 2 + c] + 0.5)
     return left
-
-
-# TODO(merge) Views from poses that were not captured: the nearest views, merged and drawn from there (Staszak and Belter 2024, step 4).
 
 
 AGREE_M = 0.006

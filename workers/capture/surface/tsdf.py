@@ -1,7 +1,14 @@
-"""Planes fitted to the neighbourhood of each depth pixel: less noise, the angle of incidence, and no flying pixels.
+"""Truncated signed distances from depth images, the error of depth that they correct, and meshes from them.
+
+- Planes fitted to the neighbourhood of each depth pixel: less noise, the angle of incidence, and no flying pixels.
+- A truncated signed distance field: the mean, weighted by inverse variance, of every view's distance to its surface.
+- Triangle meshes of a merged surface: extraction, cutting, loose parts, normals.
 
 On a plane 1/z is linear in the image, so the fit is exact there. Registered depth is coarser than the colour image that
 it fills, so the neighbourhood is sampled with a stride that grows with the focal length.
+
+Curless and Levoy 1996, with the distance along the surface's normal in place of the distance along the ray, because the
+latter grows with the angle of incidence.
 """
 
 import math
@@ -153,12 +160,6 @@ def _facing(plane: Array, stride: int, k: tuple[float, float, float, float], ray
     return float(plane[0] / np.sqrt(A * A + B * B + C * C))
 
 
-# TODO(merge) A truncated signed distance field: the mean, weighted by inverse variance, of every view's distance to its surface.
-#
-# Curless and Levoy 1996, with the distance along the surface's normal in place of the distance along the ray, because the
-# latter grows with the angle of incidence.
-
-
 FRONT_VOXELS = 3.0
 """Distances in front of the surface are cut off here: above the noise of a view after its fit, which is about 1 mm."""
 
@@ -280,9 +281,6 @@ def _integrate(
                     near[i, j, n] += 1
                 distance_m[i, j, n] = (distance_m[i, j, n] * weight[i, j, n] + s * w) / total
                 weight[i, j, n] = total
-
-
-# TODO(merge) Triangle meshes of a merged surface: extraction, cutting, loose parts, normals.
 
 
 EMPTY = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
