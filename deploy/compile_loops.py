@@ -19,7 +19,7 @@ from numba.core.caching import NullCache
 from numba.core.dispatcher import Dispatcher
 
 import workers
-from services.job.read import load_job
+from services.job.job_file import load_job
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.jit import used_by
 from workers.physics.contact_surface import faces_within

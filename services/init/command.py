@@ -25,7 +25,7 @@ from services.init.shown import Shown, show_items
 from services.init.table import draw_left_out, draw_table
 from services.init.walk import walk_folder
 from services.job.bounded_yaml import parse_yaml
-from services.job.read import MOST_BYTES, MOST_KEYS, validate_job
+from services.job.job_file import MOST_BYTES, MOST_KEYS, validate_job
 from services.run.progress import ProgressLine
 from workers.assets.catalogue import Catalogue, InstanceRef, open_catalogue
 from workers.render.raster.gbuffer import shared_renderer

@@ -16,17 +16,12 @@ from services.job.record import JobRecord, adopt, encode_job, record_job, refuse
 from services.merge.dataset_card import describe_doubts, describe_left_out, write_card
 from services.merge.merge import MergeResult, merge
 from services.run.coordinator import Coordinator, Limits
-from services.run.joining import join_cluster, terms_of_driver, with_own_stack
-from services.run.lock import hold_lock
-from services.run.losses import find_lost
-from services.run.metrics import Meter, serve
-from services.run.out_folder import explain_lost_folder
-from services.run.pattern import Pattern
+from services.run.joining import Pattern, join_cluster, terms_of_driver, with_own_stack
+from services.run.lock import explain_lost_folder, hold_lock
+from services.run.metrics import Meter, Tally, serve
 from services.run.progress import ProgressLine, event_log, log_event, note_of_first_start
-from services.run.range_planner import SpanPlan, deal_shards, group_shards, plan_spans
-from services.run.ray_cluster import open_ray
-from services.run.slots import SharedSlots, Slots
-from services.run.tally import Tally
+from services.run.range_planner import SpanPlan, deal_shards, find_lost, group_shards, plan_spans
+from services.run.ray_cluster import SharedSlots, Slots, open_ray
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.captures.listing import open_sources
 from workers.render.tiers import require_tier
