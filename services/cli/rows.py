@@ -33,7 +33,14 @@ JSON = option("--json", action="store_true", help="print one JSON object as the 
 JOB = option("job", type=read_job, metavar="JOB.yaml")
 OUT = option("out", type=read_place, metavar="OUT")
 SCENE = option("scene", type=read_index, metavar="SCENE")
-SET = option("--set", action="append", default=[], metavar="KEY=VALUE", dest="changes", help="change a key of the job")
+SET = option(
+    "--set",
+    action="append",
+    default=[],
+    metavar="KEY=VALUE",
+    dest="changes",
+    help="change a key of the job, for example physics.step_hz=480 (docs/job.md)",
+)
 
 FOLDER: Final = option("folder", type=read_path, metavar="DIR", help="folder of the capture")
 BOARD: Final = option(
