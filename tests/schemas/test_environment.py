@@ -6,9 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from services.cli.skips import no_huge_pages
 
 from schemas.environment import FOR_SPEED, ON_X86_64_V3, STACK_ENVIRONMENT, X86_64_V3, settings_to_change
-from services.cli.skips import no_huge_pages
 
 ROOT = Path(__file__).resolve().parents[2]
 RIGHT = {**STACK_ENVIRONMENT, **FOR_SPEED}
