@@ -12,7 +12,7 @@ import pytest
 from hypothesis import settings
 
 from schemas.environment import settings_to_change
-from services.run.sight import processor_flags
+from services.run.worker_entry import processor_flags
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -4,7 +4,7 @@ import os
 import sys
 
 from schemas.environment import settings_to_change
-from services.run.sight import processor_flags
+from services.run.worker_entry import processor_flags
 
 
 def enter_stack_environment() -> None:

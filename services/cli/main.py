@@ -8,7 +8,8 @@ from functools import partial
 
 from schemas.errors import VersoError
 from services.cli.environment import enter_stack_environment
-from services.cli.parser import KEPT, build_parser
+from services.cli.parser import build_parser
+from services.cli.rows import KEPT
 from services.run.supervisor import supervise
 
 

@@ -17,7 +17,7 @@ from typing import Final
 from xml.etree import ElementTree
 
 from services.cli.skips import Machine, Skip, read_expected, stale, unexpected
-from services.run.cores import usable_cores
+from services.run.machine import usable_cores
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 

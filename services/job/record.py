@@ -12,7 +12,7 @@ from schemas.dataset.layout import JOB_FILE, LOCK_FILE, LOG_FOLDER, MANIFEST, ST
 from schemas.errors import CorruptError, JobError, OutputError
 from schemas.job.identity import compare_jobs, job_digest
 from schemas.job.job import Job
-from services.job.read import parse_yaml, validate_job
+from services.job.job_file import parse_yaml, validate_job
 from workers.store.commit import is_sealed, seal
 from workers.store.store import Store
 

@@ -9,10 +9,10 @@ from schemas.errors import OutputError
 from schemas.job.job import Job
 from services.job.record import adopt, refuse_foreign
 from services.merge.dataset_card import describe_doubts, describe_sources
-from services.run.cores import usable_cores
 from services.run.lock import read_holder, shows_life
+from services.run.machine import usable_cores
 from services.run.range_planner import MAX_SHARD, plan_spans
-from services.run.step import RunRequest, open_catalogue, record_of
+from services.run.run_job import RunRequest, open_catalogue, record_of
 from workers.assets.catalogue import Catalogue
 from workers.pipeline.context import open_worker
 from workers.pipeline.run_shard import run_scene

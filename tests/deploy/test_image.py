@@ -3,8 +3,8 @@
 import pytest
 
 from schemas.environment import X86_64_V3
-from services.run.sight import processor_flags
-from tests.containers import copy_checkout, docker, must
+from services.run.worker_entry import processor_flags
+from tests.kit.containers import copy_checkout, docker, must
 
 PYTHON_IMAGE = "python:3.11-slim-bookworm"
 DEBIAN_IMAGE = "debian:bookworm-slim"

@@ -11,7 +11,7 @@ from schemas.job.job import Job
 from services.job.record import encode_job
 from services.run import dry_run
 from services.run.dry_run import describe_plan, measure_scene
-from services.run.step import RunRequest, open_catalogue, record_of
+from services.run.run_job import RunRequest, open_catalogue, record_of
 
 SMALL = {"cameras": {"sensor": {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0}}}
 

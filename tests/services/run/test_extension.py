@@ -11,9 +11,9 @@ from schemas.dataset.commit import Span
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, SUCCESS_FILE
 from schemas.dataset.shard import ShardOrder
 from schemas.errors import FingerprintError, MachineError
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.job.record import record_job, require_job
-from services.run.step import RunRequest, order_pattern, run_job
+from services.run.run_job import RunRequest, order_pattern, run_job
 from tests.datasets import SMALL, make_dataset
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline import run_shard as module
