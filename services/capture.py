@@ -21,7 +21,7 @@ from schemas.job.captures import Board, Captures
 from schemas.job.job import Job
 from schemas.job.keys import set_key
 from schemas.job.views import Render
-from services.job.read import change_key, validate_job
+from services.job.job_file import change_key, validate_job
 
 if TYPE_CHECKING:
     from workers.capture.folder import CaptureFile

@@ -32,7 +32,7 @@ from schemas.job.views import Render
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE, Asset
 from schemas.scene.view import Camera, Intrinsics
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from tests.datasets import overlaid
 from workers.assets.appearance import draw_appearance
 from workers.assets.builtin.make import make_asset

@@ -15,7 +15,7 @@ from schemas.job.physics import ONE_OBJECT
 from services.bench import effects, report
 from services.bench.measure import bench_folder, measure
 from services.bench.scaling import measure_memory
-from services.job.read import change_key, load_job, validate_job
+from services.job.job_file import change_key, load_job, validate_job
 from workers.store.file_system import file_system_of
 
 PACKAGES = {"flip_evaluator": "flip-evaluator", "isal": "isal", "matplotlib": "matplotlib"}

@@ -15,7 +15,7 @@ from services.bench.figures import Lap, describe_machine, pinned, process_age_s
 from services.bench.lower_bound import choose_encoders, images_of, run_lower_bound
 from services.bench.script import Look, hand_over, looks_of, start_script
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.loops import compile_together
+from workers.geometry.jit import compile_planned
 from workers.render.raster.context import require_device
 from workers.scene.context import Stopwatch, WorkerContext, open_worker
 from workers.scene.make_scene import Scene, make_scene
@@ -71,7 +71,7 @@ def open_workbench(job: Job, job_folder: Path, out: Path) -> Workbench:
     catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
     store = LocalStore(out)
     store.prepare()
-    compile_together()
+    compile_planned()
     context = open_worker(job, catalogue)
     require_device(context.renderer.name, job.run.device)
     return Workbench(context, store, ShardOrder.of(str(out), job, "bench"), job.first_scene)

@@ -32,7 +32,7 @@ from schemas.dataset.shard import Fingerprint
 from schemas.dataset.tables import TABLES
 from schemas.errors import CommitConflict, CorruptError, MachineError
 from schemas.job.identity import job_digest
-from services.job.record import JobRecord, decode_job, is_job_sealed, is_job_unsealed
+from services.job.record import JobRecord, decode_job, is_job_sealed
 from services.merge.merge import Merging
 from services.merge.reading import RANGES_PER_BLOCK, ROWS_PER_BLOCK, Block
 from services.read.verdict import COPY, PathIndex, Verdict, describe_os_error
@@ -123,7 +123,7 @@ def read_stored_job(store: Store, verdict: Verdict) -> StoredJob:
         told = str(error).removeprefix(JOB_FILE).lstrip(": ").removesuffix(COPY).rstrip(";: ")
         verdict.tell(f"{JOB_FILE}: {told}", COPY, "job")
         return StoredJob()
-    found = StoredJob(record, is_job_sealed(data), is_job_sealed(data) or is_job_unsealed(data))
+    found = StoredJob(record, is_job_sealed(data), is_job_sealed(data))
     if not found.whole:
         verdict.tell(f"{JOB_FILE}: was altered after a run wrote it: its seal does not match", verdict.repair, "job")
     elif record.digest != found.digest:

@@ -17,7 +17,7 @@ from schemas.errors import InputError, did_you_mean
 from schemas.job.captures import ESTIMATES, Captures
 from schemas.job.job import PRESETS, Job
 from schemas.job.keys import set_key
-from services.job.faults import describe_fault
+from services.job.job_file import describe_fault
 from services.study.model import Changes, Group, Knob, Setting, Value
 
 VIEWS = (4, 6, 10, 20, 40)

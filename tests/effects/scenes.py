@@ -14,7 +14,7 @@ from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.scene.scene import ScenePlan
 from schemas.scene.shape import Part, Shape
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.render.raster.gbuffer import shared_renderer
 from workers.scene.context import Stopwatch, WorkerContext

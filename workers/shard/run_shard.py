@@ -26,6 +26,7 @@ from pathlib import PurePath
 from types import TracebackType
 from typing import IO
 
+import workers.assets.builtin.make  # noqa: F401  so that its loops are compiled with the others
 from schemas.dataset.commit import Span, summarize
 from schemas.dataset.layout import FINGERPRINT_FILE, LOG_FOLDER, staging_path
 from schemas.dataset.shard import Blame, Fingerprint, JobChange, ShardOrder, ShardReport, SpanReport
@@ -33,7 +34,7 @@ from schemas.errors import FingerprintError, SceneError, VersoError
 from schemas.job.views import Tier
 from schemas.scene.scene import SceneOutput
 from workers.assets.catalogue import Catalogue
-from workers.pipeline.loops import compile_together
+from workers.geometry.jit import compile_planned
 from workers.render.raster.context import require_device
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.tiers import require_tier
@@ -161,7 +162,7 @@ def run_shard(order: ShardOrder, catalogue: Catalogue, is_over: Callable[[], boo
     """
     begun, cpu = time.perf_counter(), time.process_time()
     require_tier(order.job.drawn)
-    compile_together()
+    compile_planned()
     context = open_worker(order.job, catalogue)
     require_device(context.renderer.name, order.job.run.device)
     fingerprint = _fingerprint(order.job.drawn.tier)

@@ -14,7 +14,7 @@ import workers.scene.effects
 import workers.scene.pairs
 from schemas.dataset.layout import FINGERPRINT_FILE
 from services.cli.main import main
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.read import audit as audit_motion
 from services.read.audit import Audit, Motion, audit, describe_audit
 from services.read.referee import Held

@@ -10,10 +10,10 @@ import pytest
 
 from schemas.dataset.layout import FINGERPRINT_FILE
 from schemas.dataset.shard import Fingerprint, ShardOrder
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.run.joining import terms_of_driver, with_own_stack
-from services.run.sight import processor_flags
-from tests.bare_cluster import BareCluster, bare_cluster
+from services.run.worker_entry import processor_flags
+from tests.kit.ray_head import BareCluster, bare_cluster
 from workers.render.raster.gbuffer import shared_renderer
 from workers.shard.code import code_digest
 from workers.shard.fingerprint import take_fingerprint

@@ -12,7 +12,7 @@ from schemas.dataset.commit import CommitTerms, Span
 from schemas.dataset.layout import FINGERPRINT_FILE, commit_path, range_table_path
 from schemas.dataset.shard import Blame, Fingerprint, ShardOrder, ShardReport
 from schemas.errors import FingerprintError, MachineError
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from tests.effects.scenes import SMALL
 from workers.assets.catalogue import open_catalogue
 from workers.shard.run_shard import run_shard
