@@ -22,10 +22,10 @@ SCENES = 320
 
 MERGE = """
 import json, resource, sys, time
-from services.merge import reading, scratch, tables
+from services.merge import reading, shared, tables
 from services.merge.merge import merge
 from workers.store.local import LocalStore
-tables.ROWS_PER_GROUP, reading.ROWS_PER_BLOCK, scratch.CACHE_KIB = json.loads(sys.argv[5])
+tables.ROWS_PER_GROUP, reading.ROWS_PER_BLOCK, shared.CACHE_KIB = json.loads(sys.argv[5])
 warm, root, scenes = LocalStore(sys.argv[1]), LocalStore(sys.argv[2]), int(sys.argv[3])
 merge(warm, 0, int(sys.argv[4]))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
