@@ -31,7 +31,7 @@ from schemas.scene.scene import Placed
 from schemas.scene.shape import Asset
 from services.job.read import validate_job
 from tests.datasets import overlaid
-from workers.assets.appearance.draw import draw_appearance
+from workers.assets.appearance import draw_appearance
 from workers.assets.builtin.make import make_asset
 from workers.assets.captured import board_asset
 from workers.geometry.camera import orbit_pose

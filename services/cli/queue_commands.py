@@ -175,7 +175,7 @@ def _absolute(place: str) -> str:
 
 def _refuse_relative_folders(job: "Job", file: Path) -> None:
     """Raises JobError for a folder of assets or captures that only this host, or this user, can find."""
-    from workers.assets.external.folder import PYBULLET_DATA
+    from workers.assets.external.listing import PYBULLET_DATA
 
     for key, folder in folders_of(job).items():
         if folder not in ("", PYBULLET_DATA) and not folder.startswith("/") and "://" not in folder:

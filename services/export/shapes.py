@@ -17,9 +17,8 @@ from schemas.scene.shape import Material, Part, Shape
 from services.export.source import ExportScene
 from services.export.sources import unchanged_sources
 from services.job.record import JobRecord
-from workers.assets.catalogue import Catalogue
-from workers.assets.external.materials import read_visual
-from workers.assets.step import load_asset
+from workers.assets.catalogue import Catalogue, load_asset
+from workers.assets.external.formats import read_visual
 from workers.plan.randomness import SceneChance
 from workers.plan.step import choose_assets
 from workers.store.store import Store

@@ -66,7 +66,7 @@ def folders_of(job: Job) -> dict[str, str]:
 
 def _check_absolute(job: Job, name: str) -> None:
     """Raises JobError for a folder that is meant from the job file's own, which a packed job has not."""
-    from workers.assets.external.folder import PYBULLET_DATA
+    from workers.assets.external.listing import PYBULLET_DATA
 
     for key, folder in folders_of(job).items():
         if folder not in ("", PYBULLET_DATA) and not folder.startswith(("/", "~")):

@@ -12,7 +12,7 @@ from schemas.dataset.layout import asset_path
 from schemas.errors import CorruptError
 from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
 from services.read.dataset_reader import StoredRange
-from workers.assets.external.materials import read_visual
+from workers.assets.external.formats import read_visual
 from workers.store.store import Store
 
 

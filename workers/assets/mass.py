@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, frozen_array
 from schemas.scene.shape import MassProperties, Shape
-from workers.assets.external.topology import is_solid
+from workers.assets.external.mesh import is_solid
 from workers.geometry.jit import compiled
 from workers.geometry.mesh import bounds_of
 

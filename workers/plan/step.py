@@ -13,9 +13,8 @@ from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.plan import ObjectStart, ScenePlan, Table
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.shape import Asset, Hull, Mesh
-from workers.assets.appearance.draw import draw_appearance
-from workers.assets.catalogue import Catalogue, InstanceRef
-from workers.assets.step import choose_object, choose_table, load_asset
+from workers.assets.appearance import draw_appearance
+from workers.assets.catalogue import Catalogue, InstanceRef, choose_object, choose_table, load_asset
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, transform, translation, uniform_rotation
 from workers.geometry.hull import hull_of

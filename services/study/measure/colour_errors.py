@@ -16,7 +16,7 @@ from schemas.scene.region import REGION_FLOOR
 from schemas.scene.scene import Placed
 from services.study.measure.flip import flip_between
 from services.study.measure.rays import Box, cast_patch
-from workers.assets.appearance.draw import draw_appearance
+from workers.assets.appearance import draw_appearance
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene
 from workers.plan.effects import Facts, plan_effects

@@ -13,8 +13,7 @@ from schemas.scene.appearance import Appearance, Light
 from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Material, Part, Shape
-from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.assets.step import choose_object, choose_table, load_asset
+from workers.assets.catalogue import Catalogue, choose_object, choose_table, load_asset, open_catalogue
 from workers.cameras.placement import mirror_pose
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, transform, uniform_rotation

@@ -15,7 +15,7 @@ from schemas.scene.effects import EffectPlan
 from schemas.scene.region import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Part, Shape
-from workers.assets.appearance.draw import draw_appearance
+from workers.assets.appearance import draw_appearance
 from workers.capture.simulate.board_body import THICKNESS_M, board_body
 from workers.capture.simulate.cover import cover_markers
 from workers.capture.simulate.lens import add_bent_light, nearest_pixels, opencv_lens, pinhole_lookup

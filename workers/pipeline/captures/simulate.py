@@ -11,9 +11,8 @@ from schemas.scene.effects import EffectPlan
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Asset
-from workers.assets.catalogue import Catalogue
+from workers.assets.catalogue import Catalogue, load_asset
 from workers.assets.glb import asset_glb
-from workers.assets.step import load_asset
 from workers.capture.simulate.effects import plan_effects, planned_settings
 from workers.capture.simulate.lens import opencv_lens
 from workers.capture.simulate.path import plan_path

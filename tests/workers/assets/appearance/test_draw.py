@@ -8,7 +8,7 @@ import pytest
 from schemas.job.job import Job
 from schemas.job.render import Render
 from tests.kit.shapes import asset_of, box, table
-from workers.assets.appearance.draw import draw_appearance
+from workers.assets.appearance import draw_appearance
 from workers.plan.effects import Facts, plan_effects, write_receipt
 from workers.plan.randomness import SceneChance, Stream
 from workers.plan.step import draw_scene

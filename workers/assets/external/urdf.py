@@ -14,7 +14,7 @@ from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Material, Part, Shape
 from workers.assets.external.caps import LONGEST_NAME, Budget, check_counts, check_nodes, find_inside
-from workers.assets.external.materials import DEFAULT
+from workers.assets.external.formats import DEFAULT
 from workers.assets.external.mesh import LoadedMesh, check_coordinates, load_shape, transform_shape
 from workers.geometry.frames import pose
 
