@@ -253,7 +253,7 @@ def scene(options: argparse.Namespace) -> int:
 def _dataset(out: str) -> "Store":
     """The store of an output folder. Raises OutputError where it is none."""
     from services.job.record import require_dataset
-    from workers.store.local import open_store
+    from workers.store.store import open_store
 
     return require_dataset(open_store(out))
 
@@ -261,7 +261,7 @@ def _dataset(out: str) -> "Store":
 def _committed(out: str) -> "Store":
     """The store of an output folder, also of one that lost its job.yaml. Raises OutputError where it is none."""
     from schemas.dataset.layout import COMMITS
-    from workers.store.local import open_store
+    from workers.store.store import open_store
 
     store = open_store(out)
     return store if next(iter(store.files(COMMITS)), None) is not None else _dataset(out)

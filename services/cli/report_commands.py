@@ -12,7 +12,7 @@ def report(options: argparse.Namespace) -> int:
     """`verso report`."""
     from services.read.damage import explain_damage
     from services.report.report import write_report
-    from workers.store.local import open_store
+    from workers.store.store import open_store
 
     began = time.monotonic()
     store = open_store(options.out)
@@ -31,7 +31,7 @@ def serve(options: argparse.Namespace) -> int:
     """`verso serve`."""
     from services.report.follow import Follower
     from services.report.server import choose_place, ended_by_signal, serving
-    from workers.store.local import open_store
+    from workers.store.store import open_store
 
     place = choose_place(options.host, options.port, options.token)
     follower = Follower(open_store(options.out), options.scenes)

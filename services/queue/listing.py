@@ -11,7 +11,7 @@ from services.queue.decide import turn, waiting_for_folder
 from services.queue.fold import JobView
 from services.queue.store import Queue
 from workers.store.ledger import list_commits
-from workers.store.local import open_store
+from workers.store.store import open_store
 
 MOST_LOOKS: Final = 20
 """Output folders that are looked into for one listing: those of the latest jobs."""

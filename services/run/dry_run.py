@@ -19,8 +19,7 @@ from workers.pipeline.run_shard import run_scene
 from workers.pipeline.stopwatch import Stopwatch
 from workers.render.tiers import require_tier
 from workers.store.ledger import list_commits
-from workers.store.local import open_store
-from workers.store.store import Store
+from workers.store.store import Store, open_store
 
 TIMED_SCENES = 3
 LONGEST_S = 10.0

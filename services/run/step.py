@@ -32,8 +32,7 @@ from workers.pipeline.captures.listing import open_sources
 from workers.render.tiers import require_tier
 from workers.store.attempt import sweep
 from workers.store.ledger import LedgerKeeper, list_commits
-from workers.store.local import open_store
-from workers.store.store import Store
+from workers.store.store import Store, open_store
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
                     made_now = _make(store, pattern, plan, own, keeper, meter)
         meter.enter("merging")
         if store.size(JOB_FILE) is None or store.read(JOB_FILE) != encode_job(record):
-            store.write_whole(JOB_FILE, encode_job(record))
+            store.put(JOB_FILE, encode_job(record))
         merged = merge(store, record.job.first_scene, record.job.stop_scene, lock.require_held)
         write_card(store, record, catalogue, merged)
         log_event("finished", job=record.job.name, digest=merged.digest)
@@ -146,7 +145,7 @@ def order_pattern(store: Store, out: str, record: JobRecord, ledger: Ledger) -> 
     text = encode_job(record)
     change = None
     if store.size(JOB_FILE) is None:
-        store.write_whole(JOB_FILE, text)
+        store.put(JOB_FILE, text)
     elif (before := store.read(JOB_FILE)) != text:
         change = JobChange(before=before.decode(), after=text.decode())
     if not ledger.rows.num_rows and not ledger.lost:

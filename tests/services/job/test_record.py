@@ -24,13 +24,13 @@ def record(catalogue: str = "c", **keys) -> JobRecord:
 def test_a_record_reads_back_as_it_was_written(store):
     assert read_job(store) is None
     written = record(scenes=5, categories=["mug"])
-    store.write_whole(JOB_FILE, encode_job(written))
+    store.put(JOB_FILE, encode_job(written))
     assert require_job(store) == written
     assert written.folder == str(Path("jobs").resolve())
 
 
 def test_more_scenes_go_on_with_the_first_range_size_and_another_job_is_refused_by_key(store):
-    store.write_whole(JOB_FILE, encode_job(record(scenes=5, run={"range_size": 4})))
+    store.put(JOB_FILE, encode_job(record(scenes=5, run={"range_size": 4})))
     adopted = adopt(store, record(scenes=9, run={"range_size": 64, "workers": 2}))
     assert (adopted.job.scenes, adopted.job.run.range_size, adopted.job.run.workers) == (9, 4, 2)
     with pytest.raises(OutputError, match="seed: 0 there, 3 here"):
@@ -51,7 +51,7 @@ def test_a_folder_that_is_no_dataset_is_refused(store, tmp_path):
 
 @pytest.mark.parametrize("text", ["- a list", "job: [", "digest: x"])
 def test_a_damaged_record_is_told(store, text):
-    store.write_whole(JOB_FILE, text.encode())
+    store.put(JOB_FILE, text.encode())
     with pytest.raises(CorruptError, match="is not a job that `verso run` wrote"):
         require_job(store)
 
@@ -59,7 +59,7 @@ def test_a_damaged_record_is_told(store, text):
 @pytest.mark.parametrize("folder", ["../elsewhere", "", 5, None, ["/a"], "/a\nverso: all is well", "/a\0b"])
 def test_a_folder_that_is_no_absolute_path_is_refused(store, folder):
     tree = yaml.safe_load(encode_job(record()))
-    store.write_whole(JOB_FILE, yaml.safe_dump(tree | {"folder": folder}).encode())
+    store.put(JOB_FILE, yaml.safe_dump(tree | {"folder": folder}).encode())
     with pytest.raises(CorruptError, match="is not a job that `verso run` wrote"):
         require_job(store)
 
@@ -68,7 +68,7 @@ def test_captures_whose_files_changed_are_named_by_their_folders(store):
     captures = {"source": "folders", "folders": ["shots/mug", "shots/box"]}
     job = Job.model_validate({"name": "a", "captures": captures})
     before = record_job(job, "c", Path("jobs"), ("1" * 64, "2" * 64))
-    store.write_whole(JOB_FILE, encode_job(before))
+    store.put(JOB_FILE, encode_job(before))
     assert require_job(store) == before
     assert adopt(store, before).inputs == before.inputs
     with pytest.raises(OutputError, match="captures in shots/box ") as caught:
