@@ -29,7 +29,7 @@ from schemas.scene.effects import EffectPlan
 from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Asset
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from tests.datasets import overlaid
 from workers.assets.appearance import draw_appearance
 from workers.assets.builtin.make import make_asset

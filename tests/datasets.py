@@ -6,7 +6,7 @@ from typing import Any
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
 from schemas.dataset.shard import ShardOrder
 from schemas.job.job import Job
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.job.record import encode_job, record_job
 from services.merge.dataset_card import write_card
 from services.merge.merge import merge

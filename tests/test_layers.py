@@ -80,7 +80,7 @@ def lint(project: Path, imports: dict[str, str]) -> subprocess.CompletedProcess[
         ("workers/capture/fuse.py", "skimage.measure", "each known to one file"),
         ("services/capture/board.py", "reportlab.pdfgen", "each known to one file"),
         ("schemas/capture/thing.py", "schemas.dataset.thing", "schemas: what is stored"),
-        ("services/run/step.py", "prometheus_client", "Prometheus is known to one file"),
+        ("services/run/run_job.py", "prometheus_client", "Prometheus is known to one file"),
     ],
 )
 def test_a_forbidden_import_is_found(tmp_path, file, module, rule):

@@ -27,7 +27,7 @@ from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.scene.scene import PosedScene
 from schemas.scene.view import Pair
-from services.job.read import load_job
+from services.job.job_file import load_job
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import make_scene

@@ -16,7 +16,7 @@ from services.bench.extra import require_extra
 from services.bench.measure import bench_folder, measure
 from services.bench.memory import measure_memory
 from services.bench.others import other_systems
-from services.job.read import change_key, load_job, validate_job
+from services.job.job_file import change_key, load_job, validate_job
 from workers.store.file_system import file_system_of
 
 

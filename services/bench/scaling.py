@@ -23,12 +23,10 @@ from schemas.job.job import Job
 from services.bench.ratios import Lap, Spread, by_clock, by_processor, idle_share, slope_ratio
 from services.bench.stages import count_for, run_process
 from services.run.coordinator import Coordinator, Limits
-from services.run.joining import terms_of_driver
-from services.run.pattern import Pattern
+from services.run.joining import Pattern, terms_of_driver
+from services.run.metrics import Tally
 from services.run.range_planner import deal_shards, plan_ranges
-from services.run.ray_cluster import private_ray
-from services.run.slots import PREFETCH, Slots
-from services.run.tally import Tally
+from services.run.ray_cluster import PREFETCH, Slots, private_ray
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.store.local import LocalStore
 

@@ -10,8 +10,8 @@ from schemas.errors import RunError, SceneError
 from schemas.job.job import Job
 from services.bench.ratios import Lap
 from workers.assets.catalogue import open_catalogue
+from workers.geometry.jit import compile_planned
 from workers.pipeline.context import WorkerContext, open_worker
-from workers.pipeline.loops import compile_together
 from workers.pipeline.make_scene import Scene, make_scene
 from workers.pipeline.run_shard import run_ranges
 from workers.pipeline.stopwatch import Stopwatch
@@ -66,7 +66,7 @@ def open_workbench(job: Job, job_folder: Path, out: Path) -> Workbench:
     catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
     store = LocalStore(out)
     store.prepare()
-    compile_together()
+    compile_planned()
     context = open_worker(job, catalogue)
     require_device(context.renderer.name, job.run.device)
     return Workbench(context, store, ShardOrder.of(str(out), job, "bench"), job.first_scene)

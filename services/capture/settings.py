@@ -6,7 +6,7 @@ from typing import Any
 from schemas.job.captures import Captures
 from schemas.job.job import Job
 from schemas.job.keys import set_key
-from services.job.read import change_key, validate_job
+from services.job.job_file import change_key, validate_job
 
 
 def capture_job(changes: Sequence[str] = (), keys: Mapping[str, Any] | None = None) -> Job:

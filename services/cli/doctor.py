@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from schemas.errors import MachineError, VersoError
-from services.run.cores import usable_cores
+from services.run.machine import usable_cores
 
 
 @dataclass(frozen=True)

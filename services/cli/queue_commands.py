@@ -14,13 +14,13 @@ from schemas.plain_line import plain_line
 from schemas.queue import JobRequest
 from services.cli.commands import answer_json, tell_result
 from services.cli.environment import default_queue
-from services.job.read import folders_of, load_job, read_text
-from services.queue.store import Queue, make_queue, new_id, open_queue
+from services.job.job_file import folders_of, load_job, read_text
+from services.queue.queue import Queue, make_queue, new_id, open_queue
 
 if TYPE_CHECKING:
     from schemas.job.job import Job
-    from services.queue.drive import Ending
-    from services.queue.ray_jobs import Drivers
+    from services.queue.drivers import Ending
+    from services.queue.supervise import Drivers
 
 
 def submit(options: argparse.Namespace) -> int:
@@ -65,7 +65,7 @@ def jobs(options: argparse.Namespace) -> int:
 
 def logs(options: argparse.Namespace) -> int:
     """`verso logs`."""
-    from services.queue.logs import follow_logs, header, read_logs
+    from services.queue.listing import follow_logs, header, read_logs
 
     queue, drivers = _open(options), _drivers(options)
     view = queue.read(options.id)
@@ -120,9 +120,8 @@ def supervise(options: argparse.Namespace) -> int:
 
 def drive(options: argparse.Namespace) -> int:
     """`verso drive`."""
-    from services.queue.drive import Ending, drive
-    from services.queue.share import Sharing
-    from services.run.step import RunRequest, run_job
+    from services.queue.drivers import Ending, Sharing, drive
+    from services.run.run_job import RunRequest, run_job
 
     queue = _open(options)
 
@@ -154,7 +153,7 @@ def _open(options: argparse.Namespace) -> Queue:
 
 
 def _drivers(options: argparse.Namespace) -> "Drivers":
-    from services.queue.ray_jobs import RayDrivers
+    from services.queue.drivers import RayDrivers
 
     return RayDrivers(options.address)
 

@@ -15,7 +15,7 @@ from schemas.scene.scene import SceneOutput
 from services.dataset.pair import Pair, read_pair
 from services.dataset.pair_table import PAIR_TABLES, pair_table
 from services.dataset.shapes import Shapes
-from services.job.read import load_job, validate_job
+from services.job.job_file import load_job, validate_job
 from services.job.record import JobRecord, record_job
 from workers.pipeline.captures.listing import open_sources
 from workers.pipeline.context import open_worker

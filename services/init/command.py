@@ -41,7 +41,7 @@ from services.init.guess import (
 )
 from services.init.shown import Shown, Tile, draw_left_out, draw_sheet, draw_table, show_items
 from services.job.bounded_yaml import parse_yaml
-from services.job.read import MOST_BYTES, MOST_KEYS, validate_job
+from services.job.job_file import MOST_BYTES, MOST_KEYS, validate_job
 from services.run.progress import ProgressLine
 from workers.assets.catalogue import Catalogue, InstanceRef, open_catalogue
 from workers.render.raster.gbuffer import shared_renderer

@@ -10,7 +10,7 @@ from schemas.dataset.ledger import Ledger
 from schemas.errors import OutputError
 from services.merge.merge import read_success
 from services.run.lock import Holder, read_holder
-from services.run.losses import find_lost
+from services.run.range_planner import find_lost
 from workers.store.attempt import blamed_scene, retry_of_attempt, staged_attempts
 from workers.store.ledger import list_commits
 from workers.store.store import Store

@@ -14,8 +14,8 @@ import yaml
 from schemas.errors import InputError
 from schemas.job.job import Job
 from services.bench.extra import require_extra
-from services.job.read import load_job, read_tree
-from services.run.cores import usable_cores
+from services.job.job_file import load_job, read_tree
+from services.run.machine import usable_cores
 from services.run.progress import ProgressLine
 from services.study.answer import answer, recommend
 from services.study.captures.study import check_captures, run_capture_study

@@ -14,7 +14,7 @@ from schemas.job.job import Job
 from schemas.job.keys import set_key
 from schemas.job.preset import PRESETS
 from schemas.nearest import did_you_mean
-from services.job.faults import describe_fault
+from services.job.job_file import describe_fault
 from services.study.captures.knobs import capture_knobs
 from services.study.model import Changes, Group, Knob, Setting, Value
 

@@ -14,7 +14,7 @@ import pytest
 
 from schemas.errors import VersoError
 from tests.kit.crash_states import Disk, losses, recorded, write_tree
-from tests.made_up_runs import FIRST, RANGE, STOP, broken_promises, contents, leftovers, make_dataset, settings_of
+from tests.kit.made_up_runs import FIRST, RANGE, STOP, broken_promises, contents, leftovers, make_dataset, settings_of
 from tests.made_up_scenes import attempt_at, failed_scene, small_scene
 from workers.store import attempt as attempt_module
 from workers.store.local import LocalStore

@@ -13,7 +13,7 @@ from obstore.store import MemoryStore
 from schemas.dataset.layout import staging_path
 from schemas.errors import VersoError
 from tests.kit.faults import Fault, Killed, requests, unflushed
-from tests.made_up_runs import FIRST, RANGE, STOP, make_dataset, settings_of
+from tests.kit.made_up_runs import FIRST, RANGE, STOP, make_dataset, settings_of
 from tests.made_up_scenes import attempt_at, failed_scene, small_scene
 from workers.store import attempt as attempt_module
 from workers.store.local import LocalStore

@@ -13,15 +13,15 @@ from schemas.dataset.commit import Span
 from schemas.dataset.layout import FENCED, STAGING, staging_path
 from schemas.dataset.shard import ShardOrder
 from schemas.errors import RunError
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.merge.merge import merge
 from services.run import coordinator as module
 from services.run.coordinator import Coordinator, Limits
-from services.run.pattern import Pattern
+from services.run.joining import Pattern
+from services.run.metrics import Tally
 from services.run.range_planner import committed_ranges, plan_ranges
-from services.run.slots import Slots
-from services.run.tally import Tally
-from services.run.worker_terms import WorkerTerms
+from services.run.ray_cluster import Slots
+from services.run.worker_entry import WorkerTerms
 from tests.kit.faults import REQUESTS, check_published, requests, unflushed
 from tests.made_up_scenes import attempt_at, small_scene, terms
 from workers.assets.catalogue import Catalogue

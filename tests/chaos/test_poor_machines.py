@@ -20,11 +20,11 @@ WALL_CLOCK = re.compile(
 MAY_READ_IT = {
     "services/cli/queue_commands.py": "when a job was submitted: the order of jobs of one priority, where any order is right",
     "services/queue/listing.py": "the age of a job, to be shown",
-    "services/queue/store.py": "the time of an event, to be shown",
+    "services/queue/queue.py": "the time of an event, to be shown",
     "services/read/status.py": "the rate of the latest commits, to be shown",
     "services/report/progress.py": "when a range was committed, to be shown",
     "services/run/progress.py": "the time of an event, to be logged",
-    "services/run/tally.py": "when a run began, for the time that is left",
+    "services/run/metrics.py": "when a run began, for the time that is left",
     "workers/store/local.py": "when a file was written, for the rate",
     "workers/store/objects.py": "when an object was put, for the rate",
     "workers/store/file_system.py": "how long ago an unlocked folder was made, which a set clock only leaves longer",

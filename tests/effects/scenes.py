@@ -14,7 +14,7 @@ from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from schemas.scene.plan import ScenePlan
 from schemas.scene.shape import Part, Shape
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.pipeline.context import WorkerContext
 from workers.pipeline.make_scene import Scene, make_scene

@@ -20,7 +20,7 @@ from schemas.base import Pose
 from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.scene.plan import ScenePlan
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from tests.judge.table import STILL_DEG, STILL_MM
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.geometry.frames import pose, rotation_about, transform, translation

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from schemas.base import Array, frozen_array
 from schemas.scene.shape import Loft
 from workers.geometry.hull import convex_hull, least_width_m
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.mesh import hold_to_one_thread, mesh_of, unique_rows
 
 Indices = NDArray[np.int64]
@@ -172,7 +172,7 @@ def _is_convex(rings: Sequence[Ring], outline: Array, tolerance: float) -> bool:
     return _deepest(np.array(line)) <= tolerance
 
 
-@compiled
+@compiled_for("f8[:,::1]")
 def _deepest(line: Array) -> float:
     """The most by which points [N, 2], radius and height, ascending, lie below the hull of them and their mirror images."""
     hull, count = np.empty_like(line), 0
@@ -343,7 +343,7 @@ def _cut_wedges(columns: Array, cell: Indices, bands: Indices, tolerance: float,
     return parts
 
 
-@compiled
+@compiled_for("f8[:,:,::1], f8[:,:,::1], i8, i8")
 def _protrusion(begin: Array, end: Array, first: int, last: int) -> float:
     """Distance by which a cell lies outside the planes of its facets; begin, end [M, k, 3]: of its sides, along k columns.
 

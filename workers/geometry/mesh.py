@@ -12,8 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from schemas.base import Array
 from schemas.scene.shape import Mesh
 from workers.geometry.distance import nearest_on_mesh
-from workers.geometry.frames import dot
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled_for
 
 
 def bounds_of(points: Array) -> Array:
@@ -24,7 +23,7 @@ def bounds_of(points: Array) -> Array:
     return _bounds_of(np.ascontiguousarray(points))
 
 
-@compiled
+@compiled_for("f8[:,::1]", "const(f8[:,::1])")
 def _bounds_of(points: Array) -> Array:
     bounds = np.empty((2, points.shape[1]))
     bounds[0], bounds[1] = np.inf, -np.inf
@@ -45,7 +44,7 @@ def is_first(rows: NDArray[np.int64]) -> NDArray[np.bool_]:
     return first_equal(rows) == np.arange(len(rows))
 
 
-@compiled
+@compiled_for("i8[:,::1]", "const(i8[:,::1])")
 def first_equal(rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """[N]: the first place of a row equal to each of the rows [N, 3]; a row's own where none before it is equal.
 
@@ -112,7 +111,7 @@ def weld(mesh: Mesh) -> Mesh:
     return Mesh(points[places], faces[is_first(np.sort(faces, axis=1).astype(np.int64))])
 
 
-@compiled
+@compiled_for("f8[:,::1], i8[::1], i8[::1], i4[:,::1], i8", "f8[:,::1], i8[::1], i8[::1], const(i4[:,::1]), i8")
 def _welded(
     points: Array, order: NDArray[np.int64], used: NDArray[np.int64], faces: NDArray[np.integer], count: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
@@ -195,19 +194,12 @@ def face_planes(mesh: Mesh) -> tuple[Array, Array]:
     """(normals [F, 3], offsets [F]): unit normal n of each face, 0 where it has no area, and n . p of its points p."""
     vertices, faces = np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)
     normals = face_normals(vertices, faces)
-    return normals, _offsets(vertices, faces, normals)
+    corners = vertices[faces[:, 0]]
+    x, y, z = (corners[:, axis] * normals[:, axis] for axis in range(3))
+    return normals, x + z + y  # as `frames.dot` adds
 
 
-@compiled
-def _offsets(vertices: Array, faces: NDArray[np.integer], normals: Array) -> Array:
-    """[F]: n . p of the first corner p of each face."""
-    offsets = np.empty(len(faces))
-    for face in range(len(faces)):
-        offsets[face] = dot(vertices[faces[face, 0]], normals[face])
-    return offsets
-
-
-@compiled
+@compiled_for("f8[:,::1], const(i4[:,::1])", "f8[:,::1], i8[:,::1]", "const(f8[:,::1]), const(i4[:,::1])")
 def face_normals(vertices: Array, faces: NDArray[np.integer]) -> Array:
     """[F, 3]: unit normals of faces [F, 3] with contiguous vertices [V, 3]; zeros of a face without an area."""
     normals = np.zeros((len(faces), 3))
@@ -222,16 +214,12 @@ def face_normals(vertices: Array, faces: NDArray[np.integer]) -> Array:
     return normals
 
 
-@compiled
 def face_areas(vertices: Array, faces: NDArray[np.integer]) -> Array:
-    """[F]: areas of faces [F, 3] with contiguous vertices [V, 3]."""
-    areas = np.empty(len(faces))
-    for face in range(len(faces)):
-        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
-        vx, vy, vz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
-        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        areas[face] = np.sqrt(x * x + y * y + z * z) / 2.0
+    """[F]: areas of faces [F, 3] with vertices [V, 3]."""
+    a, b, c = (vertices[faces[:, corner]].T for corner in range(3))
+    (ux, uy, uz), (vx, vy, vz) = b - a, c - a
+    x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    areas: Array = np.sqrt(x * x + y * y + z * z) / 2.0
     return areas
 
 
@@ -243,15 +231,11 @@ def has_rim(faces: NDArray[np.integer], count: int) -> bool:
     return bool((starts[:-1] & starts[1:]).any())
 
 
-@compiled
 def edge_keys(faces: NDArray[np.integer], count: int) -> NDArray[np.int64]:
     """[3 F]: a number for each edge of each face [F, 3], the same for two faces' common edge."""
-    keys = np.empty(3 * len(faces), np.int64)
-    for f in range(len(faces)):
-        for k in range(3):
-            one, other = faces[f, k], faces[f, (k + 1) % 3]
-            keys[3 * f + k] = min(one, other) * np.int64(count) + max(one, other)
-    return keys
+    one = faces.astype(np.int64)
+    other = one[:, [1, 2, 0]]
+    return (np.minimum(one, other) * count + np.maximum(one, other)).ravel()
 
 
 def solid_of(mesh: Mesh) -> manifold3d.Manifold | None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.job.images import Images
 from schemas.scene.camera import Camera, Intrinsics
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled, compiled_for
 
 
 class Extent(NamedTuple):
@@ -22,7 +22,7 @@ class Extent(NamedTuple):
     bbox_xywh: tuple[int, int, int, int]
 
 
-@compiled
+@compiled_for("const(f4[:,::1]), f8, f8, f8", "f8[:,::1], f8, f8, f8")
 def round_depth(depth_m: NDArray[np.floating], low_m: float, high_m: float, units_per_m: float) -> NDArray[np.uint16]:
     """[H, W] uint16: depth [H, W] in units, to the nearest (ties to even); 0 unless low < depth < high (0 for nan)."""
     units = np.empty(depth_m.shape, np.uint16)
@@ -33,19 +33,6 @@ def round_depth(depth_m: NDArray[np.floating], low_m: float, high_m: float, unit
             nearest = np.rint(z * units_per_m) if (z > low_m) & (z < high_m) else 0.0
             units[row, column] = np.uint16(np.int32(nearest))
     return units
-
-
-def fourth_channel(rgba: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """[H, W] uint8: the last of four channels [H, W, 4]. OpenCV takes five times as long."""
-    channel = np.empty(rgba.shape[:2], np.uint8)
-    _high_bytes(rgba.reshape(-1).view("<u4"), channel.reshape(-1))
-    return channel
-
-
-@compiled
-def _high_bytes(words: NDArray[np.uint32], high: NDArray[np.uint8]) -> None:
-    for n in range(len(words)):
-        high[n] = np.uint8(words[n] >> np.uint32(24))
 
 
 def fill_plane_depth(
@@ -60,7 +47,7 @@ def fill_plane_depth(
     _fill_plane_depth(depth_m, region, np.uint8(region_id), plane, view)
 
 
-@compiled
+@compiled_for("f4[:,::1], u1[:,::1], u1, f4[::1], f4[::1]")
 def _fill_plane_depth(
     depth_m: NDArray[np.float32],
     region: NDArray[np.uint8],
@@ -79,7 +66,7 @@ def _fill_plane_depth(
             depth_m[row, column] = z if region[row, column] == region_id else depth_m[row, column]
 
 
-@compiled
+@compiled_for("const(u1[:,:,::1]), i4[:,::1]")
 def gather_colours(rgb: NDArray[np.uint8], source: NDArray[np.integer]) -> NDArray[np.uint8]:
     """[H, W, 3] uint8: at each pixel the colour of the pixel of `rgb` with the flat index `source` [H, W]; black for -1."""
     gathered = np.zeros((source.shape[0], source.shape[1], 3), np.uint8)
@@ -93,7 +80,7 @@ def gather_colours(rgb: NDArray[np.uint8], source: NDArray[np.integer]) -> NDArr
     return gathered
 
 
-@compiled
+@compiled_for("u2[:,::1]")
 def split_samples(pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
     """[H, 1 + 2 W] uint8: each row of pixels [H, W] as pairs of bytes, the high one first, after a byte that is 0."""
     rows = np.empty((pixels.shape[0], 1 + 2 * pixels.shape[1]), np.uint8)
@@ -119,7 +106,7 @@ def measure_regions(region: NDArray[np.uint8]) -> list[Extent]:
     return extents
 
 
-@compiled
+@compiled_for("const(u1[:,::1]), const(u8[:,::1]), i8[::1], i8[:,::1]")
 def _measure_regions(
     region: NDArray[np.uint8], words: NDArray[np.uint64], counts: NDArray[np.int64], boxes: NDArray[np.int64]
 ) -> None:
@@ -149,7 +136,7 @@ def _measure_regions(
             first = stop
 
 
-@compiled
+@compiled_for("u2[:,::1], u2[:,::1], f8")
 def count_filled(projected: NDArray[np.uint16], seen: NDArray[np.uint16], behind: float) -> tuple[int, int]:
     """(pixels that are not 0 in `projected`, those of them that lie more than `behind` units behind `seen`)."""
     filled = hidden = 0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from schemas.base import Array, Pose
 from schemas.scene.camera import Camera, Intrinsics
 from workers.geometry.frames import invert
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.pixels import Depth, facing_at, is_smooth
 
 BLOCK = (16, 32)
@@ -116,7 +116,7 @@ def forward_project(
     return Projected(*_splat(depth, units_per_m, source_k, T, target_k, splat // 2, (m.height, m.width)))
 
 
-@compiled
+@compiled_for("u2[:,::1], f8, UniTuple(f8, 4), f8[:,::1], UniTuple(f8, 4), i8, UniTuple(i8, 2)")
 def _splat(
     depth: Depth,
     units_per_m: float,
@@ -273,7 +273,10 @@ def _pinhole(camera: Camera) -> Pinhole:
     return k.cx, k.cy, k.fx, k.fy
 
 
-@compiled
+@compiled_for(
+    "Tuple((u2[:,::1], const(u1[:,::1]))), Tuple((u2[:,::1], const(u1[:,::1]))), i8[::1], UniTuple(f8, 3), f8[:,::1], "
+    "UniTuple(UniTuple(f8, 4), 2), Tuple((f8, UniTuple(f8, 2), f8)), f8"
+)
 def _compare(
     source: Images,
     target: Images,

@@ -22,11 +22,11 @@ from schemas.scene.scene import Placed
 from schemas.scene.shape import Mesh
 from workers.geometry.camera import project
 from workers.geometry.frames import dot, invert, transform
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import face_planes
 
 
-@compiled
+@compiled_for("f8[::1], f8[::1], const(i4[:,::1]), i8, i8")
 def row_spans(
     u: Array, v: Array, faces: NDArray[np.integer], width: int, height: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -54,7 +54,7 @@ def row_spans(
     return first, end
 
 
-@compiled
+@compiled_for("i8[::1], i8[::1], i8")
 def pixels_between(first: NDArray[np.int64], end: NDArray[np.int64], width: int) -> NDArray[np.int64]:
     """Flat numbers, ascending, of the pixels from column `first` [H] up to and without `end` [H] of each row."""
     pixels = np.empty(np.maximum(end - first, 0).sum(), np.int64)
@@ -66,7 +66,7 @@ def pixels_between(first: NDArray[np.int64], end: NDArray[np.int64], width: int)
     return pixels
 
 
-@compiled
+@compiled_for("i8[::1], i8, UniTuple(f8, 4), f8")
 def pixel_rays(
     pixels: NDArray[np.int64], width: int, k: tuple[float, float, float, float], near_m: float
 ) -> tuple[Array, Array]:
@@ -83,7 +83,7 @@ def pixel_rays(
     return origins, directions
 
 
-@compiled
+@compiled_for("i4[::1], Tuple((f8[:,::1], f8[::1])), f8[:,::1], f8[:,::1], f8")
 def meet_planes(
     face: NDArray[np.int32], planes: tuple[Array, Array], origins: Array, directions: Array, grazing: float
 ) -> tuple[Array, Array, int]:
@@ -108,7 +108,7 @@ def meet_planes(
     return distance, cosine, open_ended
 
 
-@compiled
+@compiled_for("Tuple((f8[::1], u1[::1], f4[::1])), i8[::1], UniTuple(f8[::1], 2), i8, f8, f8")
 def keep_nearer(
     best: tuple[Array, NDArray[np.uint8], NDArray[np.float32]],
     rays: NDArray[np.int64],

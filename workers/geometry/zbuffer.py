@@ -17,7 +17,7 @@ from schemas.base import Array, Pose
 from schemas.capture.depth_camera import DepthCamera
 from schemas.scene.camera import Intrinsics
 from schemas.scene.shape import Shape
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.rational_lens import pixel_rays, project_points
 
 STEEPEST = math.tan(math.radians(84.0))
@@ -146,7 +146,7 @@ def count_covered(shape: Shape, T_cam_shape: Pose, k: Intrinsics) -> int | None:
     return None if count == UNKNOWN else int(count)
 
 
-@compiled
+@compiled_for("const(f8[:,::1]), const(i4[:,::1]), b1, f8[:,::1], UniTuple(f8, 4), UniTuple(i8, 2)")
 def _count_covered(
     vertices: Array,
     faces: NDArray[np.int32],

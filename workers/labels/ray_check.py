@@ -15,7 +15,7 @@ from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.scene import PosedScene
 from schemas.scene.view import GBuffer, Pair
 from workers.geometry.camera import unproject
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled_for
 from workers.geometry.raycast import cast_view, edge_distance_px, first_hit
 
 EDGE_PX = 1.0 / 64.0
@@ -73,7 +73,9 @@ def check_against_rays(scene: PosedScene, camera: Camera, buffer: GBuffer, depth
             _check_depth(region_id, error_mm, pixels, to_edge)
 
 
-@compiled
+@compiled_for(
+    "Tuple((const(f4[:,::1]), const(u1[:,::1]))), Tuple((f8[:,::1], u1[:,::1], f4[:,::1])), Tuple((f8, f8, f4))"
+)
 def _compare(
     drawn: tuple[NDArray[np.float32], NDArray[np.uint8]],
     cast: tuple[Array, NDArray[np.uint8], NDArray[np.float32]],

@@ -12,7 +12,7 @@ from schemas.base import Array
 from schemas.scene.shape import Mesh
 from workers.geometry.distance import nearest_on_segments, nearest_on_triangle
 from workers.geometry.frames import dot
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import bounds_of, edge_keys, face_normals, has_rim, numbers_in, weld
 
 SLOPE = 0.02
@@ -22,7 +22,11 @@ SLOPE = 0.02
 Index = NDArray[np.int64]
 
 
-@compiled
+@compiled_for(
+    "f8[:,::1], const(i4[:,::1]), f8[::1], f8[::1]",
+    "f8[:,::1], i8[:,::1], f8[::1], f8[::1]",
+    "const(f8[:,::1]), const(i4[:,::1]), f8[::1], f8[::1]",
+)
 def bounds_in(points: Array, features: NDArray[np.integer], low: Array, high: Array) -> tuple[Index, Array, Array]:
     """(numbers [N], lower and upper bounds [N, 3]) of the features [F, K], corners by number, whose bounds overlap a box."""
     found, count = np.empty(len(features), np.int64), 0
@@ -50,28 +54,13 @@ def find_near(low: Array, high: Array, others_low: Array, others_high: Array, wi
     """
     if len(low) == 0 or len(others_low) == 0:
         return np.empty((0, 2), np.int64)
-    axis, widest, starts = _longest_axis(others_low, others_high)
-    order = np.argsort(starts, kind="stable")  # numba's own takes seconds to compile
+    axis = int((others_high.max(axis=0) - others_low.min(axis=0)).argmax())
+    starts = others_low[:, axis]
+    widest, order = float((others_high[:, axis] - starts).max()), np.argsort(starts, kind="stable")
     return _sweep(low, high, others_low, others_high, within, axis, widest, order, starts[order])
 
 
-@compiled
-def _longest_axis(low: Array, high: Array) -> tuple[int, float, Array]:
-    """(the axis on which boxes, bounds [B, 3], extend farthest; the widest box there; their lower bounds [B] there)."""
-    axis, longest = 0, -1.0
-    for k in range(3):
-        least, most = low[0, k], high[0, k]
-        for n in range(1, len(low)):
-            least, most = min(least, low[n, k]), max(most, high[n, k])
-        if most - least > longest:
-            axis, longest = k, most - least
-    widest, starts = high[0, axis] - low[0, axis], np.empty(len(low))
-    for n in range(len(low)):
-        widest, starts[n] = max(widest, high[n, axis] - low[n, axis]), low[n, axis]
-    return axis, widest, starts
-
-
-@compiled
+@compiled_for("f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8, i8, f8, i8[::1], f8[::1]")
 def _sweep(
     low: Array,
     high: Array,
@@ -167,24 +156,15 @@ def _half_edges(faces: Index, count: int) -> tuple[Index, Index]:
     return keys[which], which
 
 
-@compiled
 def _star(edges: Index, count: int) -> tuple[Index, Index]:
     """(starts [count + 1], members): the neighbours of each vertex, one after the other, ascending as edges [E, 2] are."""
-    starts, free, members = np.zeros(count + 1, np.int64), np.empty(count, np.int64), np.empty(edges.size, np.int64)
-    for n in range(len(edges)):
-        starts[edges[n, 0] + 1] += 1
-        starts[edges[n, 1] + 1] += 1
-    for n in range(count):
-        free[n] = starts[n]
-        starts[n + 1] += starts[n]
-    for here, there in ((1, 0), (0, 1)):
-        for n in range(len(edges)):
-            members[free[edges[n, here]]] = edges[n, there]
-            free[edges[n, here]] += 1
-    return starts, members
+    ends, others = edges[:, ::-1].T.ravel(), edges.T.ravel()
+    starts = np.zeros(count + 1, np.int64)
+    starts[1:] = np.cumsum(np.bincount(ends, minlength=count))
+    return starts, others[np.argsort(ends, kind="stable")]
 
 
-@compiled
+@compiled_for("f8[:,::1], i8[:,::1], f8[:,::1], i8[::1], i8[::1]")
 def _sides(vertices: Array, faces: Index, normals: Array, starts: Index, members: Index) -> Index:
     """[F]: on which side of a face's plane everything about its corners lies, to within `SLOPE`."""
     side = np.empty(len(faces), np.int64)
@@ -205,7 +185,7 @@ def _sides(vertices: Array, faces: Index, normals: Array, starts: Index, members
     return side
 
 
-@compiled
+@compiled_for("f8[:,::1], i8[:,::1], f8[:,::1], i8[::1], i8[::1]")
 def _edges(vertices: Array, faces: Index, normals: Array, keys: Index, which: Index) -> tuple[Index, Index, Index]:
     """The edges [E, 2] of half edges, the vertices across them [E, 2], and those [B] that are not between coplanar faces."""
     edges, across, bent = np.empty((len(keys), 2), np.int64), np.empty((len(keys), 2), np.int64), np.empty_like(keys)
@@ -238,7 +218,7 @@ def faces_within(one: tuple[Array, Index], other: tuple[Array, Index], within_m:
     return np.unique(pairs[near, 0]), np.unique(pairs[near, 1])
 
 
-@compiled
+@compiled_for("f8[:,::1], i8[:,::1], f8[:,::1], i8[:,::1], i8[:,::1], f8")
 def _near(p: Array, p_faces: Index, q: Array, q_faces: Index, pairs: Index, within: float) -> NDArray[np.bool_]:
     """[N]: whether two triangles that do not pierce one another are within a distance."""
     near, limit, here, there = np.zeros(len(pairs), np.bool_), within * within, np.empty(3), np.empty(3)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from schemas.base import Array, Pose
 from workers.geometry.distance import nearest_on_triangle
 from workers.geometry.frames import transform
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.mesh import bounds_of
 from workers.physics.contact_surface import SLOPE, Index, Surface, bounds_in, find_near
 
@@ -145,7 +145,7 @@ def _shallowest(rows: Array, which: Index) -> Array:
     return rows[(~inside | (rows[:, 6] >= best_inside[which[:, 0]])) & (~deep | (rows[:, 6] >= best[which[:, 0]]))]
 
 
-@compiled
+@compiled_for("i8[:,::1], f8[:,::1], i8[::1], i8[::1], f8[:,::1], i8[:,::1], i8[::1], f8, f8")
 def corners_on_faces(
     pairs: Index,
     vertices: Array,
@@ -220,7 +220,7 @@ def cross(u: Array, v: Array, out: Array) -> None:
     out[0], out[1], out[2] = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
-@compiled
+@compiled_for("i8[:,::1], f8[:,::1], i8[:,::1], i8[:,::1], f8[:,::1], i8[:,::1], i8[:,::1], f8, f8")
 def edges_across_edges(
     pairs: Index,
     vertices: Array,

@@ -11,7 +11,7 @@ from schemas.job.physics import Physics
 from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.shape import Hull
 from workers.geometry.frames import transform
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.mesh import fills_hull, is_first
 from workers.physics.support import inside_margin
 
@@ -46,7 +46,7 @@ def is_round(hull: Hull, com: Array) -> bool:
     return _rests_on_round(hull.vertices, normals, com, math.cos(NEIGHBOUR_RAD), math.cos(SAME_PLANE_RAD))
 
 
-@compiled
+@compiled_for("const(f8[:,::1]), f8[:,::1], const(f8[::1]), f8, f8")
 def _rests_on_round(points: Array, normals: Array, com: Array, far: float, near: float) -> bool:
     """Whether com [3] is at most as high over a normal's plane as over its neighbours', and hardly lower than over one.
 

@@ -14,7 +14,7 @@ from scipy.sparse import csc_array, eye_array
 
 from schemas.base import Array, Pose
 from schemas.scene.shape import MassProperties
-from workers.geometry.frames import DOWN, cross_each, pose, rotation_about, transform
+from workers.geometry.frames import DOWN, pose, rotation_about, transform
 from workers.physics.bullet import GRAVITY_M_S2
 from workers.physics.contact_surface import Surface
 from workers.physics.contacts import DEEPEST_M, Contacts, find_contacts, find_near_features
@@ -126,7 +126,7 @@ def _rows(bodies: Sequence[Inertia], roots: Sequence[Array], contacts: Contacts,
         sign = np.where(contacts.upper[own] == number, 1.0, -1.0)[:, None, None]
         levers, along = contacts.points[own] - body.com, edges[own]
         rows[own, :, number, :3] = sign * along / np.sqrt(body.mass_kg)
-        rows[own, :, number, 3:] = sign * cross_each(levers, along) @ root
+        rows[own, :, number, 3:] = sign * np.cross(levers[:, None], along) @ root
     return rows.reshape(-1, 6 * len(bodies))
 
 
@@ -137,9 +137,9 @@ def _pyramid(normals: Array, friction: float) -> Array:
     """
     up = np.array([0.0, 0.0, 1.0]) - normals[:, 2:] * normals
     level = np.linalg.norm(up, axis=1) < 1e-3
-    up[level] = cross_each(normals[level], np.full((np.count_nonzero(level), 1, 3), [0.0, 1.0, 0.0]))[:, 0]
+    up[level] = np.cross(normals[level], [0.0, 1.0, 0.0])
     first = up / np.linalg.norm(up, axis=1, keepdims=True)
-    second = cross_each(normals, first[:, None])[:, 0]
+    second = np.cross(normals, first)
     angle = 2.0 * np.pi * np.arange(CONE_EDGES) / CONE_EDGES
     side = np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
     return normals[:, None] + friction * side

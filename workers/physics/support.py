@@ -14,7 +14,7 @@ from schemas.errors import StartError
 from schemas.scene.plan import Table, TableTop
 from schemas.scene.shape import Asset, Hull, Mesh, Shape
 from workers.geometry.frames import DOWN, pose, rotation_between, transform, translation
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import bounds_of, face_areas, face_normals, numbers_in, piece_of
 
 EDGE_SLACK = 1e-12
@@ -38,7 +38,7 @@ def sample_elevation(points_xy: Array, ground: Mesh, highest: bool = True) -> Ar
     return _crossings(np.ascontiguousarray(points_xy), ground.vertices, ground.faces, highest)
 
 
-@compiled
+@compiled_for("f8[:,::1], const(f8[:,::1]), const(i4[:,::1]), b1")
 def _crossings(points: Array, vertices: Array, faces: NDArray[np.int32], highest: bool) -> Array:
     """[N] the highest or the lowest height at which vertical lines cross triangles [F, 3]; nan where they miss all."""
     found = np.full(len(points), np.nan)
@@ -190,7 +190,7 @@ def find_table_top(shape: Shape) -> TableTop:
     if not len(level):
         raise StartError("no_table_top", "the table's mesh has no level face within 2.6 degrees: leave this table out")
     _, inverse = np.unique(np.round(vertices[:, 2][level].sum(axis=1) / (3 * SAME_LEVEL_M)), return_inverse=True)
-    area = np.bincount(inverse, weights=face_areas(np.ascontiguousarray(vertices), level))
+    area = np.bincount(inverse, weights=face_areas(vertices, level))
     top = int(np.flatnonzero(area >= TOP_SHARE * area.max()).max())
     points = vertices[numbers_in(level[inverse == top], len(vertices))]
     return _describe(points, float(area[top]), float(vertices[:, 2].max()))
@@ -239,7 +239,7 @@ def inside_margin(points_xy: Array, outline: Array) -> Array:
     return _least_distances(np.ascontiguousarray(points_xy), outline)
 
 
-@compiled
+@compiled_for("f8[:,::1], const(f8[:,::1])")
 def _least_distances(points: Array, outline: Array) -> Array:
     """The least signed distance [N] of points to the lines through the edges of a polygon, those without length left out."""
     least = np.full(len(points), np.inf)

@@ -13,6 +13,7 @@ from functools import cache
 from itertools import takewhile
 from typing import IO
 
+import workers.assets.builtin.make  # noqa: F401  so that its loops are compiled with the others
 from schemas.dataset.commit import Span
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, staging_path
@@ -21,11 +22,11 @@ from schemas.errors import FingerprintError, SceneError, VersoError
 from schemas.job.render import Tier
 from schemas.scene.scene import SceneOutput
 from workers.assets.catalogue import Catalogue
+from workers.geometry.jit import compile_planned
 from workers.pipeline.bugs import UnexpectedError, explain, keep_traceback, name_scene
 from workers.pipeline.committer import Committer, MadeRange
 from workers.pipeline.context import WorkerContext, open_worker
 from workers.pipeline.fingerprint import take_fingerprint
-from workers.pipeline.loops import compile_together
 from workers.pipeline.make_scene import make_scene
 from workers.pipeline.rows import failed_scene, record_scene, timing_row
 from workers.pipeline.stopwatch import Stopwatch
@@ -52,7 +53,7 @@ def run_shard(order: ShardOrder, catalogue: Catalogue, is_over: Callable[[], boo
     """
     begun, cpu = time.perf_counter(), time.process_time()
     require_tier(order.job.drawn)
-    compile_together()
+    compile_planned()
     context = open_worker(order.job, catalogue)
     require_device(context.renderer.name, order.job.run.device)
     fingerprint = _fingerprint(order.job.drawn.tier)

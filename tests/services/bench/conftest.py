@@ -4,7 +4,7 @@ import pytest
 
 from services.bench.handover import hand_over
 from services.bench.stages import make_in_memory, open_workbench
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from tests.services.bench.small_job import SMALL
 
 

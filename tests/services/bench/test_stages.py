@@ -5,7 +5,7 @@ import pytest
 from schemas.dataset.commit import Span
 from schemas.errors import RunError, SceneError
 from services.bench.stages import make_in_memory, run_process
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from tests.services.bench.small_job import SMALL
 
 

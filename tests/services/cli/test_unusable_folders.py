@@ -12,7 +12,7 @@ from schemas.dataset.commit import CommitTerms, Span
 from schemas.dataset.layout import JOB_FILE
 from schemas.errors import OutputError
 from services.cli.main import main
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.job.record import encode_job, record_job, refuse_foreign
 from services.run.lock import read_holder
 from workers.store.attempt import begin_attempt

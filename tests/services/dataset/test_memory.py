@@ -8,10 +8,10 @@ import pytest
 
 STREAM = """
 import json, sys
-from tests.memory import peak_mib
+from tests.kit.memory import peak_mib
 from pathlib import Path
 from services.dataset.dataset import Dataset
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.job.record import encode_job, record_job
 from tests.datasets import SMALL
 from tests.kit.many_ranges import ManyRanges

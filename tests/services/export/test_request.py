@@ -1,4 +1,4 @@
-from services.cli.parser import EXPORT_FORMATS
+from services.cli.rows import EXPORT_FORMATS
 from services.export.request import FORMATS, SHARDED
 
 

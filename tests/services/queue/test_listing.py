@@ -5,7 +5,7 @@ import pytest
 from schemas.errors import CorruptError
 from services.queue.listing import format_rows, list_jobs
 from tests.datasets import make_dataset
-from tests.fake_drivers import ids, queue_of, request_of
+from tests.kit.queue_world import ids, queue_of, request_of
 
 A, B, C, D = ids(4)
 

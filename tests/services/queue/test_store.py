@@ -7,8 +7,8 @@ import pytest
 
 from schemas.errors import CorruptError, InputError
 from schemas.queue import MARK_FILE, event_path, request_path
-from services.queue.store import Queue, make_queue, open_queue
-from tests.fake_drivers import ids, queue_of, request_of
+from services.queue.queue import Queue, make_queue, open_queue
+from tests.kit.queue_world import ids, queue_of, request_of
 from tests.kit.s3_server import Bucket, s3_server
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore

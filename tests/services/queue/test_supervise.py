@@ -8,13 +8,11 @@ import pytest
 
 from schemas.errors import RunError
 from schemas.queue import submission_id
-from services.queue.decide import Driver
-from services.queue.store import Queue, make_queue
-from services.queue.supervise import build_entrypoint, hold_queue
-from tests.fake_drivers import ids
+from services.queue.queue import Queue, make_queue
+from services.queue.supervise import Driver, build_entrypoint, hold_queue
 from tests.kit.faults import unflushed
+from tests.kit.queue_world import AT_ONCE, DIES, Killed, World, ids
 from tests.kit.s3_server import Bucket, s3_server
-from tests.queue_world import AT_ONCE, DIES, Killed, World
 from workers.store.objects import ObjectStore
 
 __all__ = ["unflushed"]

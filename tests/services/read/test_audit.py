@@ -14,7 +14,7 @@ import workers.pipeline.make_pair
 import workers.plan.effects
 from schemas.dataset.layout import FINGERPRINT_FILE
 from services.cli.main import main
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.read import audit_motion
 from services.read.audit import Audit, audit, describe_audit
 from services.read.audit_motion import Motion

@@ -7,7 +7,7 @@ import pytest
 import workers.assets.catalogue
 from schemas.errors import JobError
 from services.dataset.dataset import open_dataset
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.read.query import query
 from services.read.replay import replay_scene
 from tests.datasets import SMALL, faults_of, make_dataset, overlaid, run_here

@@ -4,8 +4,8 @@ import pytest
 
 from schemas.dataset.layout import LEDGER_FILE, SUCCESS_FILE, commit_path
 from services.merge.merge import merge
-from services.run import losses
-from services.run.losses import find_lost
+from services.run import range_planner as losses
+from services.run.range_planner import find_lost
 from tests.made_up_datasets import FIRST, STOP, dataset_at
 from tests.made_up_scenes import attempt_at, failed_scene
 from workers.store.ledger import list_commits, save_rows

@@ -9,7 +9,7 @@ from schemas.dataset.fingerprint import Fingerprint
 from schemas.errors import InputError, JobError
 from schemas.job.job import Job
 from services.bench.command import refuse_unmatched
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.job.record import require_job
 from services.merge.dataset_card import describe_dataset
 from services.merge.merge import MergeResult, read_success

@@ -6,7 +6,6 @@ from scipy.spatial.transform import Rotation
 
 from workers.geometry.frames import (
     cross,
-    cross_each,
     half_turn,
     invert,
     pose,
@@ -69,8 +68,3 @@ def test_uniform_rotations_have_no_favourite_direction():
     # Each coordinate of a uniform direction is uniform on [-1, 1]: mean 0, variance 1/3, four standard errors.
     assert np.abs(images.mean(axis=0)).max() < 4 / np.sqrt(3 * 4000)
     assert images.var(axis=0) == pytest.approx(1 / 3, abs=4 * np.sqrt(4 / 45 / 4000))
-
-
-def test_each_cross_product_is_that_of_numpy():
-    one, many = np.random.default_rng(1).normal(size=(5, 3)), np.random.default_rng(2).normal(size=(5, 4, 3))
-    assert np.array_equal(cross_each(one, many), np.cross(one[:, None], many))

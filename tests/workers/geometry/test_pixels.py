@@ -8,7 +8,6 @@ from workers.geometry.pixels import (
     Extent,
     count_filled,
     fill_plane_depth,
-    fourth_channel,
     gather_colours,
     measure_regions,
     round_depth,
@@ -62,12 +61,6 @@ def test_colours_come_from_where_the_source_says_and_holes_are_black():
         [rgb[3, 4].tolist(), [0, 0, 0]],
         [rgb[0, 0].tolist(), rgb[1, 2].tolist()],
     ]
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (3, 5), (48, 64)])
-def test_the_fourth_channel_is_the_last_byte_of_each_pixel(shape):
-    rgba = np.random.default_rng(2).integers(0, 256, (*shape, 4), np.uint8)
-    np.testing.assert_array_equal(fourth_channel(rgba), rgba[..., 3])
 
 
 def test_what_is_filled_and_what_lies_behind_is_counted():

@@ -14,7 +14,7 @@ from schemas.dataset.shard import ShardOrder
 from schemas.errors import JobError, MachineError
 from schemas.job.identity import settings_digest
 from schemas.scene.region import REGION_FIRST_OBJECT
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.frames import invert, transform
 from workers.pipeline.context import WorkerContext

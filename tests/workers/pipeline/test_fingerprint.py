@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.run.sight import processor_flags
+from services.run.worker_entry import processor_flags
 from workers.pipeline.code import code_digest
 from workers.pipeline.fingerprint import TIER_LIBRARIES, maths_digest, numpy_simd, take_fingerprint
 from workers.render.raster.gbuffer import shared_renderer

@@ -7,7 +7,7 @@ import pytest
 
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import SettleError
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from tests.datasets import SMALL, overlaid
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.context import open_worker

@@ -13,7 +13,7 @@ from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, commit_path, range_table_path
 from schemas.dataset.shard import Blame, ShardOrder, ShardReport
 from schemas.errors import FingerprintError, MachineError
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from tests.effects.scenes import SMALL
 from workers.assets.catalogue import open_catalogue
 from workers.pipeline.run_shard import run_shard

@@ -7,7 +7,7 @@ import pytest
 
 from schemas.errors import RunError
 from tests.kit.faults import Killed, check_published, disk, lose_power
-from tests.made_up_runs import FIRST, RANGE, STOP, broken_promises, contents, leftovers, make_dataset
+from tests.kit.made_up_runs import FIRST, RANGE, STOP, broken_promises, contents, leftovers, make_dataset
 from tests.made_up_scenes import attempt_at, small_scene, terms
 from tests.stored_images import iter_records
 from workers.store.attempt import sweep

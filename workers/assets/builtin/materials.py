@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.scene.shape import Material
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled, compiled_for
 
 Choice = TypeVar("Choice")
 Color = tuple[float, float, float]
@@ -185,7 +185,7 @@ def noise(rng: np.random.Generator, height: int, width: int, rows: int, columns:
     return stretched(rng.random((columns, rows), dtype=np.float32), height, width, False)
 
 
-@compiled
+@compiled_for("f4[:,::1], i8, i8, b1")
 def stretched(lattice: Plane, height: int, width: int, smooth: bool) -> Plane:
     """A lattice [columns, rows] interpolated to [height, width], along both the last towards the first.
 
@@ -227,7 +227,7 @@ def blend(a: Color, b: Color, share: Plane) -> Texture:
     return _graded(share, steps)
 
 
-@compiled
+@compiled_for("f4[:,::1], u1[:,::1]")
 def _graded(share: Plane, steps: Texture) -> Texture:
     """The colour of `steps` [64, 3] for each share [h, w] from 0 to 1, rounded to the nearest."""
     height, width = share.shape

@@ -25,7 +25,7 @@ from schemas.base import Array, Pose
 from schemas.scene.region import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.scene import Placed
 from workers.geometry.frames import transform
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import bounds_of
 
 DIRECTIONS = 8
@@ -51,7 +51,7 @@ def column_extents(
     return top, np.where(np.isinf(under), np.float32(0.0), under)
 
 
-@compiled
+@compiled_for("f8[::1], f8[::1], f8[::1], i4[:,::1], f4[:,::1], f4[:,::1]")
 def _fill_columns(
     x: Array, y: Array, z: Array, faces: NDArray[np.integer], top: NDArray[np.float32], under: NDArray[np.float32]
 ) -> None:
@@ -76,7 +76,7 @@ def _fill_columns(
                     under[row, column] = min(under[row, column], elevation)
 
 
-@compiled
+@compiled_for("f4[:,::1], f4[:,::1], f4[:,::1], f8")
 def sky_visibility(
     top: NDArray[np.float32], under: NDArray[np.float32], base: NDArray[np.float32], step_m: float
 ) -> NDArray[np.float32]:
@@ -186,13 +186,10 @@ def level_box(vertices: Array, level_m: float, towards: Array, reach_m: float) -
     return Box(np.eye(4), np.array([[*(centre - half), level_m], [*(centre + half), top]]))
 
 
-@compiled
 def _fall_on_level(vertices: Array, level_m: float, towards: Array) -> Array:
     """[N, 2]: the shadows of vertices [N, 3] on a level, of vertices below it those vertices."""
-    shadows = np.empty((len(vertices), 2))
-    for n in range(len(vertices)):
-        along = max(vertices[n, 2] - level_m, 0.0) / towards[2]
-        shadows[n, 0], shadows[n, 1] = vertices[n, 0] - along * towards[0], vertices[n, 1] - along * towards[1]
+    along = np.maximum(vertices[:, 2:] - level_m, 0.0) / towards[2]
+    shadows: Array = vertices[:, :2] - along * towards[:2]
     return shadows
 
 
@@ -217,7 +214,7 @@ def level_pixels(vertices: Array, faces: NDArray[np.int32], box: Box, hollow: bo
     return pixels
 
 
-@compiled
+@compiled_for("f4[:,:,::1], u1[:,:,::1]")
 def _encode_shares(shares: NDArray[np.float32], codes: NDArray[np.uint8]) -> None:
     """Shares [H, W, C], clipped to [0, 1], in 255ths into the first C channels of codes [H, W, D]."""
     zero, one, most = np.float32(0.0), np.float32(1.0), np.float32(255.0)
@@ -249,7 +246,7 @@ def level_shadow(depth: NDArray[np.float32], light: Box, level: Box, towards: Ar
     return _blend_shadows(narrow, wide, away, np.float32(farthest_m))
 
 
-@compiled
+@compiled_for("f8[:,::1], f8[::1], f8[::1], f8, f4")
 def _place_level(
     M: Array, columns: Array, rows: Array, level_m: float, side_px: np.float32
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
@@ -265,22 +262,16 @@ def _place_level(
     return u, v, z
 
 
-@compiled
 def _compare_depth(
     nearest: NDArray[np.float32], z: NDArray[np.float32], depth_m: np.float32, bias_m: np.float32
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(metres to what is nearest to the light, 0 where that is the level itself; 1 where it is not), both [R, C]."""
-    away_m, dark = np.empty_like(z), np.empty_like(z)
-    zero, one = np.float32(0.0), np.float32(1.0)
-    for i in range(z.shape[0]):
-        for j in range(z.shape[1]):
-            away = (z[i, j] - nearest[i, j]) * depth_m
-            hidden = (away > bias_m) & (nearest[i, j] < one)
-            away_m[i, j], dark[i, j] = away if hidden else zero, one if hidden else zero
-    return away_m, dark
+    away = (z - nearest) * depth_m
+    dark = ((away > bias_m) & (nearest < 1.0)).astype(np.float32)
+    return away * dark, dark
 
 
-@compiled
+@compiled_for("f4[:,::1], f4[:,::1], f4[:,::1], f4")
 def _blend_shadows(
     narrow: NDArray[np.float32], wide: NDArray[np.float32], away_m: NDArray[np.float32], farthest_m: np.float32
 ) -> NDArray[np.uint8]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.scene.shape import Mesh, Part, Shape
 from workers.geometry.colour import SRGB_STEPS, decode_srgb
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import face_planes
 
 BELOW_M = 1e-3
@@ -76,7 +76,7 @@ def seen_ranges(
     return [(first, end - first) for first, end in starts[:count].tolist()]
 
 
-@compiled
+@compiled_for("f4[:,::1], u4[:,::1], f8, f8[:,::1], f8[::1], i8[:,::1]")
 def _seen_ranges(
     positions: NDArray[np.float32],
     faces: NDArray[np.uint32],
@@ -170,7 +170,7 @@ def own_vertices(faces: NDArray, vertex_count: int) -> tuple[NDArray[np.int64], 
     return turned, source[:count]
 
 
-@compiled
+@compiled_for("const(i4[:,::1]), i8, i8[:,::1], i8[::1]")
 def _own_vertices(
     faces: NDArray[np.integer], vertex_count: int, turned: NDArray[np.int64], source: NDArray[np.int64]
 ) -> int:
@@ -224,7 +224,8 @@ def _pack(parts: list[Part], highest_m: float) -> Batch:
     for part, albedo in zip(parts, albedos, strict=True):
         faces, source = own_vertices(part.faces, len(part.vertices))
         vertices = _vertex_columns(part, albedo, source)
-        _write_planes(vertices, faces, *face_planes(Mesh(part.vertices, part.faces)))
+        last = faces[:, 2]  # of each face, the vertex that it owns
+        vertices[last, -4:-1], vertices[last, -1] = face_planes(Mesh(part.vertices, part.faces))
         packed.append(vertices)
         indices.append(faces + start)
         start += len(vertices)
@@ -235,48 +236,21 @@ def _pack(parts: list[Part], highest_m: float) -> Batch:
     return Batch(vertices, corners, texture_of(parts[0]), planar, all(map(is_matte, parts)), top_faces, planar_top)
 
 
-@compiled
 def _tops_first(
     vertices: NDArray[np.float32], faces: NDArray[np.int64], lowest_m: np.float32, plane_z: int
 ) -> tuple[NDArray[np.uint32], int]:
     """(faces [F, 3], those that face up and lie above `lowest_m` before the others; the number of them)."""
-    top, count = np.empty(len(faces), np.bool_), 0
-    for face in range(len(faces)):
-        top[face] = vertices[faces[face, 2], plane_z] > np.float32(0.0)
-        for corner in range(3):
-            top[face] &= vertices[faces[face, corner], 2] > lowest_m
-        count += top[face]
-    ordered, first, other = np.empty((len(faces), 3), np.uint32), 0, count
-    for face in range(len(faces)):
-        row = first if top[face] else other
-        for corner in range(3):
-            ordered[row, corner] = faces[face, corner]
-        first, other = first + top[face], other + (not top[face])
-    return ordered, count
+    top = (vertices[faces[:, 2], plane_z] > 0.0) & (vertices[faces, 2] > lowest_m).all(axis=1)
+    return np.concatenate([faces[top], faces[~top]]).astype(np.uint32), int(top.sum())
 
 
-@compiled
 def _is_planar(vertices: NDArray[np.float32], faces: NDArray[np.uint32], upright: float) -> bool:
     """Whether horizontal faces [F, 3] have no normals but upright ones, and each has one colour."""
-    for face in range(len(faces)):
-        last = vertices[faces[face, 2]]
-        for corner in range(3):
-            vertex = vertices[faces[face, corner]]
-            x, y, z = vertex[3], vertex[4], vertex[5]
-            if x * x + y * y + z * z > 0.01 and z < upright * np.sqrt(x * x + y * y + z * z):
-                return False
-            for column in range(7, 10):
-                if vertex[column] != last[column]:
-                    return False
-    return True
-
-
-@compiled
-def _write_planes(vertices: NDArray[np.float32], faces: NDArray[np.int64], normals: Array, offsets: Array) -> None:
-    """Writes each face's plane, normals [F, 3] and offsets [F], into the last columns of its last vertex."""
-    for face in range(len(faces)):
-        row = vertices[faces[face, 2], -4:]
-        row[0], row[1], row[2], row[3] = normals[face, 0], normals[face, 1], normals[face, 2], offsets[face]
+    corners = vertices[faces]
+    x, y, z = (corners[..., column] for column in (3, 4, 5))
+    square = x * x + y * y + z * z
+    leans = (square > 0.01) & (z < np.float64(upright) * np.sqrt(square))
+    return not (leans.any() or (corners[..., 7:10] != corners[:, 2:, 7:10]).any())
 
 
 def _vertex_columns(part: Part, albedo: Array, source: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -287,19 +261,11 @@ def _vertex_columns(part: Part, albedo: Array, source: NDArray[np.int64]) -> NDA
     row = np.zeros(sum(COLUMNS.values()), np.float32)
     row[6], row[7:10], row[10] = part.material.metallic, albedo, part.material.roughness
     columns = np.tile(row, (len(source), 1))
-    _gather_rows(np.ascontiguousarray(part.vertices), source, columns[:, 0:3])
+    columns[:, 0:3] = part.vertices[source]
     if part.normals is not None:
-        _gather_rows(np.ascontiguousarray(part.normals), source, columns[:, 3:6])
+        columns[:, 3:6] = part.normals[source]
     if part.colors is not None:
-        _gather_rows(albedo * SRGB_STEPS[part.colors[:, :3]], source, columns[:, 7:10])
+        columns[:, 7:10] = (albedo * SRGB_STEPS[part.colors[:, :3]])[source]
     if part.uv is not None:
-        _gather_rows(np.ascontiguousarray(part.uv), source, columns[:, 11:13])
+        columns[:, 11:13] = part.uv[source]
     return columns
-
-
-@compiled
-def _gather_rows(values: Array, source: NDArray[np.int64], rows: NDArray[np.float32]) -> None:
-    """Writes values [V, C] at `source` [N] into rows [N, C]."""
-    for n in range(len(source)):
-        for column in range(values.shape[1]):
-            rows[n, column] = values[source[n], column]

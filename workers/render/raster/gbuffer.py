@@ -39,7 +39,7 @@ from schemas.scene.region import REGION_FLOOR
 from schemas.scene.scene import Placed
 from schemas.scene.view import GBuffer
 from workers.geometry.frames import invert
-from workers.geometry.pixels import fill_plane_depth, fourth_channel
+from workers.geometry.pixels import fill_plane_depth
 from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_edges, smooth_edges
 from workers.render.raster.buffers import INDEX_BYTES, ShapeStore, UploadedShape
 from workers.render.raster.context import ColourTarget, Framebuffer, is_software, open_context
@@ -337,7 +337,7 @@ class Renderer:
         gl.glReadPixels(0, 0, k.width, k.height, gl.GL_RED, gl.GL_FLOAT, depth)
         # OpenCV splits channels 20 times faster than a numpy slice is copied, and faster than GL_RGB is read.
         rgb: NDArray | None = cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB) if view.color else None
-        return rgb, depth, fourth_channel(rgba)
+        return rgb, depth, np.ascontiguousarray(rgba[..., 3])
 
 
 def _is_lit(render: Render, effects: EffectPlan) -> bool:

@@ -19,9 +19,10 @@ from schemas.scene.camera import Intrinsics
 from schemas.scene.region import REGION_FLOOR
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Shape
+from workers.geometry.camera import project_bounds
 from workers.geometry.colour import decode_srgb
 from workers.geometry.frames import transform
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import bounds_of
 from workers.render.raster.buffers import UploadedShape
 from workers.render.raster.draw_calls import DEPTH_BIAS, FLOOR_BIAS, NEAR_M, RenderPass, is_plain
@@ -53,28 +54,14 @@ def window(vertices: Array, k: Intrinsics) -> tuple[int, int, int, int]:
     behind it gets nothing.
     """
     reach = (-k.width, -k.height, 2 * k.width, 2 * k.height)
-    seen, *bounds = _projected_bounds(np.ascontiguousarray(vertices), (k.fx, k.fy, k.cx, k.cy), NEAR_M)
-    if not seen:
+    beyond = vertices[:, 2] > NEAR_M
+    if not beyond.any():
         return (0, 0, 0, 0)
-    if seen < len(vertices):
+    if not beyond.all():
         return reach
+    bounds = project_bounds(vertices, k, NEAR_M)
     left, top, right, bottom = (min(max(bounds[n], reach[n % 2]), reach[n % 2 + 2]) for n in range(4))
     return (math.floor(left), math.floor(top), math.ceil(right), math.ceil(bottom))
-
-
-@compiled
-def _projected_bounds(
-    vertices: Array, k: tuple[float, float, float, float], near_m: float
-) -> tuple[int, float, float, float, float]:
-    """(number of vertices [V, 3] beyond the near plane, their left, top, right and bottom in pixels)."""
-    seen, left, top, right, bottom = 0, np.inf, np.inf, -np.inf, -np.inf
-    for n in range(len(vertices)):
-        z = vertices[n, 2]
-        if z > near_m:
-            u, v = k[0] * vertices[n, 0] / z + k[2], k[1] * vertices[n, 1] / z + k[3]
-            left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
-            seen += 1
-    return seen, left, top, right, bottom
 
 
 def fills_image(shape: Shape, T_cam_shape: Pose, k: Intrinsics) -> bool:
@@ -107,7 +94,6 @@ def _corners(k: Intrinsics) -> tuple[float, float, float, float]:
     return left, (-BORDER_PX - k.cy) / k.fy, right, (k.height + BORDER_PX - k.cy) / k.fy
 
 
-@compiled
 def _meet_level(
     T_cam_shape: Pose, corners: tuple[float, float, float, float], z: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -116,25 +102,22 @@ def _meet_level(
     (least distance along the optical axis, least x and y, greatest x and y, metres; least cosine that a ray between them has
     with the level's normal). The first is 0 where a ray meets nothing, the last where one runs the other way.
     """
-    x = y = eye_z = 0.0  # the eye in the shape's frame
-    for i in range(3):
-        x -= T_cam_shape[i, 3] * T_cam_shape[i, 0]
-        y -= T_cam_shape[i, 3] * T_cam_shape[i, 1]
-        eye_z -= T_cam_shape[i, 3] * T_cam_shape[i, 2]
+    (r00, r01, r02, t0), (r10, r11, r12, t1), (r20, r21, r22, t2), _ = T_cam_shape.tolist()
+    # The eye in the shape's frame
+    x, y = -t0 * r00 - t1 * r10 - t2 * r20, -t0 * r01 - t1 * r11 - t2 * r21
+    eye_z = -t0 * r02 - t1 * r12 - t2 * r22
     fall = z - eye_z
     nearest, left, bottom, right, top = np.inf, np.inf, np.inf, -np.inf, -np.inf
     low, high, length2 = np.inf, -np.inf, 0.0
     for u in (corners[0], corners[2]):
         for v in (corners[1], corners[3]):
-            ray_x = u * T_cam_shape[0, 0] + v * T_cam_shape[1, 0] + T_cam_shape[2, 0]
-            ray_y = u * T_cam_shape[0, 1] + v * T_cam_shape[1, 1] + T_cam_shape[2, 1]
-            ray_z = u * T_cam_shape[0, 2] + v * T_cam_shape[1, 2] + T_cam_shape[2, 2]
+            ray_x, ray_y, ray_z = u * r00 + v * r10 + r20, u * r01 + v * r11 + r21, u * r02 + v * r12 + r22
             low, high, length2 = min(low, ray_z), max(high, ray_z), max(length2, u * u + v * v + 1.0)
             away = fall / ray_z if ray_z * fall > 0.0 else 0.0
             nearest = min(nearest, away)
             left, right = min(left, x + away * ray_x), max(right, x + away * ray_x)
             bottom, top = min(bottom, y + away * ray_y), max(top, y + away * ray_y)
-    return nearest, left, bottom, right, top, max(low, -high, 0.0) / np.sqrt(length2)
+    return nearest, left, bottom, right, top, max(low, -high, 0.0) / math.sqrt(length2)
 
 
 @lru_cache(maxsize=1)  # the views of one scene ask about one floor
@@ -218,7 +201,7 @@ def plain_srgb(shape: Shape, view: RenderPass, plane: Float32) -> Float32:
     return _plain_srgb(normal, albedo, np.array(lights.ambient, np.float32), lights.towards, lights.color)
 
 
-@compiled
+@compiled_for("f4[::1], f4[::1], f4[::1], f4[:,::1], f4[:,::1]")
 def _plain_srgb(normal: Float32, albedo: Float32, ambient: Float32, towards: Float32, color: Float32) -> Float32:
     """The colour of a level by its normal [3], and lights [N, 3], encoded as shaders do."""
     srgb = np.empty(3, np.float32)
@@ -273,24 +256,15 @@ def near_window(
     )
 
 
-@compiled
 def _low_points(vertices: Array, faces: NDArray[np.int32], up: Array, low_m: float) -> Array:
-    """[N, 3]: the corners of what a mesh has below `low_m`, in its frame.
+    """[N, 3]: the corners of what a mesh has below `low_m`, in its frame, in no order.
 
     up [4]: (a, b, c, d) with the height a x + b y + c z + d, metres.
     """
-    height = np.empty(len(vertices))
-    for n in range(len(vertices)):
-        height[n] = up[0] * vertices[n, 0] + up[1] * vertices[n, 1] + up[2] * vertices[n, 2] + up[3]
-    points, count = np.empty((6 * len(faces), 3)), 0
-    for face in range(len(faces)):
-        for corner in range(3):
-            i, j = faces[face, corner], faces[face, (corner + 1) % 3]
-            if height[i] < low_m:
-                points[count] = vertices[i]
-                count += 1
-            if (height[i] < low_m) != (height[j] < low_m):  # the edge leaves what is low
-                share = (low_m - height[i]) / (height[j] - height[i])
-                points[count] = vertices[i] + share * (vertices[j] - vertices[i])
-                count += 1
-    return points[:count].copy()
+    height = up[0] * vertices[:, 0] + up[1] * vertices[:, 1] + up[2] * vertices[:, 2] + up[3]
+    ends, others = faces.ravel(), faces[:, [1, 2, 0]].ravel()
+    leaves = (height[ends] < low_m) != (height[others] < low_m)  # the edge leaves what is low
+    i, j = ends[leaves], others[leaves]
+    share = (low_m - height[i]) / (height[j] - height[i])
+    crossings = vertices[i] + share[:, None] * (vertices[j] - vertices[i])
+    return np.concatenate([vertices[ends[height[ends] < low_m]], crossings])

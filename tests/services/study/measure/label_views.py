@@ -10,7 +10,7 @@ from schemas.scene.appearance import Appearance
 from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed, PosedScene
 from schemas.scene.view import Pair, View
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.study.measure.image_errors import measure_images
 from services.study.measure.truth import Truth
 from tests.effects.scenes import SMALL, context_of, merged

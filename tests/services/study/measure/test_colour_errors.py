@@ -7,7 +7,7 @@ import pytest
 
 from schemas.base import frozen_array
 from schemas.scene.camera import Camera, Intrinsics
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.study.measure import colour_errors
 from services.study.measure.colour_errors import (
     ColourTruth,

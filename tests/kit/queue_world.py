@@ -1,17 +1,73 @@
-"""A queue whose drivers are made up: they begin, work for a while, and end as a test wants, and are watched for doubles."""
+"""A stand-in for Ray's job API, queues with made-up jobs, and a world whose drivers work and are watched for doubles."""
 
+import shlex
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from schemas.errors import VersoError
-from schemas.queue import submission_id
-from services.queue.decide import Driver
-from services.queue.drive import Ending, drive
-from services.queue.store import Queue
-from services.queue.supervise import Rules, Supervisor
-from tests.fake_drivers import FakeDrivers, request_of
+from schemas.errors import MachineError, VersoError
+from schemas.queue import JobRequest, submission_id
+from services.queue.drivers import Ending, drive
+from services.queue.queue import Queue, make_queue
+from services.queue.supervise import Driver, Drivers, Rules, Supervisor
+
+
+class FakeDrivers(Drivers):
+    """Knows what was handed over; a test says what becomes of it."""
+
+    def __init__(self) -> None:
+        self.known: dict[str, Driver] = {}
+        self.entrypoints: dict[str, list[str]] = {}
+        self.stopped: list[str] = []
+        self.logs: dict[str, str] = {}
+        self.handed_over: list[str] = []
+        self.answers = True
+
+    def states(self) -> dict[str, Driver]:
+        self._answer()
+        return dict(self.known)
+
+    def hand_over(self, submission: str, entrypoint: str, metadata: Mapping[str, str]) -> None:
+        self._answer()
+        if submission not in self.known:
+            self.known[submission] = Driver("running")
+            self.handed_over.append(submission)
+            self.entrypoints[submission] = shlex.split(entrypoint)
+
+    def stop(self, submission: str) -> None:
+        self._answer()
+        self.stopped.append(submission)
+
+    def log(self, submission: str) -> str | None:
+        self._answer()
+        return self.logs.get(submission, f"log of {submission}\n") if submission in self.known else None
+
+    def end(self, job: str, attempt: int) -> None:
+        """The driver is over, whatever it told."""
+        self.known[submission_id(job, attempt)] = Driver("over")
+
+    def _answer(self) -> None:
+        if not self.answers:
+            raise MachineError("Ray's job API does not answer")
+
+
+def request_of(job: str, **changes: object) -> JobRequest:
+    made = JobRequest(id=job, name="mugs", text="name: mugs\n", folder="/", out=f"/out/{job}", scenes=8, submitted=1.0)
+    return made.model_copy(update=changes)
+
+
+def ids(count: int) -> list[str]:
+    return [f"j{number:08x}" for number in range(1, count + 1)]
+
+
+def queue_of(folder: Path, *requests: JobRequest) -> Queue:
+    queue = make_queue(str(folder))
+    for request in requests:
+        assert queue.put_request(request)
+    return queue
+
 
 DIES = "dies"
 """In the name of a job: its first driver ends without a word."""

@@ -1,18 +1,141 @@
-"""Reads a job file into a `Job`. An error names the file, the key, its value and what is allowed."""
+"""Reads a job file into a `Job`. An error names the file, the key, its value and what is allowed, in plain words.
 
-from collections.abc import Sequence
+A job file can also be given as one word that no shell changes: `job:` and letters, digits, `-` and `_`.
+"""
+
+import base64
+import binascii
+import zlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from pydantic import ValidationError
 
 from schemas.errors import JobError
 from schemas.job.job import Job
 from schemas.job.keys import set_key
+from schemas.nearest import did_you_mean
 from schemas.plain_line import plain_line
 from services.job.bounded_yaml import MOST_LEVELS, parse_yaml
-from services.job.faults import describe_fault
-from services.job.packed import is_packed, pack, unpack
+from services.job.reference import allowed_keys
+
+MARK: Final = "job:"
+
+MOST_CHARACTERS: Final = 100_000
+"""Longest pack: Linux takes 131,072 bytes for one argument. A job file of ten sources packs into 2,000."""
+
+
+def is_packed(name: str) -> bool:
+    """Whether what is given for a job file is a packed one."""
+    return name.startswith(MARK)
+
+
+def pack(data: bytes) -> str:
+    """The word for a job file's bytes. Raises JobError where it would be too long for a command line."""
+    packed = MARK + base64.urlsafe_b64encode(zlib.compress(data, 9)).decode().rstrip("=")
+    if len(packed) > MOST_CHARACTERS:
+        raise JobError(
+            f"packs into {len(packed)} characters, at most {MOST_CHARACTERS} fit on a command line: bring the file to the "
+            "cluster (file_mounts) and give its path there"
+        )
+    return packed
+
+
+def unpack(word: str, most_bytes: int) -> bytes:
+    """The bytes that were packed, of which no more than `most_bytes` and one are unpacked. Raises JobError."""
+    letters = word.removeprefix(MARK)
+    try:
+        packed = base64.b64decode(letters + "=" * (-len(letters) % 4), altchars=b"-_", validate=True)
+        unpacking = zlib.decompressobj()
+        data = unpacking.decompress(packed, most_bytes + 1)
+    except (binascii.Error, zlib.error, ValueError) as error:
+        raise JobError(f"was cut or changed on its way ({error}): pack it again with `verso pack JOB.yaml`") from error
+    if len(data) <= most_bytes and not unpacking.eof:
+        raise JobError("was cut on its way: pack it again with `verso pack JOB.yaml`")
+    return data
+
+
+_KEYS, _NUMBER, _WHOLE, _TEXT = (
+    "must hold keys with values",
+    "must be a number",
+    "must be a whole number",
+    "must be text: write it in quotes",
+)
+
+_WORDS: Mapping[str, str] = {
+    "model_type": _KEYS,
+    "model_attributes_type": _KEYS,
+    "dict_type": _KEYS,
+    "list_type": "must be a list: [a, b]",
+    "tuple_type": "must be a list: [a, b]",
+    "named_tuple_type": "must be two numbers: [low, high]",
+    "int_type": _WHOLE,
+    "int_parsing": _WHOLE,
+    "int_from_float": _WHOLE,
+    "float_type": _NUMBER,
+    "float_parsing": _NUMBER,
+    "finite_number": "must be a finite number",
+    "bool_type": "must be true or false",
+    "bool_parsing": "must be true or false",
+    "string_type": _TEXT,
+}
+"""By the validator's kind of fault, in place of its own words, which name classes."""
+
+_COUNTS = {"too_short": "at least", "too_long": "at most"}
+
+_BOUNDS: Mapping[str, tuple[str, str]] = {
+    "greater_than_equal": ("ge", "must be at least"),
+    "greater_than": ("gt", "must be greater than"),
+    "less_than_equal": ("le", "must be at most"),
+    "less_than": ("lt", "must be less than"),
+}
+
+
+def describe_fault(fault: Any) -> str:
+    """One line on a fault as pydantic tells it: the key's path, its value, and what is allowed."""
+    words = [plain_line(str(part)) for part in _written(fault["loc"])]
+    key = plain_line(".".join(words), 200)
+    if fault["type"] == "extra_forbidden":
+        allowed = allowed_keys(words)
+        return f"{key}: there is no such key; {did_you_mean(words[-1], allowed)}Allowed here: {', '.join(allowed) or 'nothing'}"
+    if fault["type"] == "missing":
+        return (
+            f"{key}: is missing, and has no default" if not key.rpartition(".")[2].isdigit() else f"{key}: is missing"
+        )
+    message = plain_line(_message(fault), 300)
+    if not words:
+        return message  # of several keys, which it names
+    return f"{key}: {plain_line(repr(fault['input']))}: {message[:1].lower()}{message[1:]}"
+
+
+def _message(fault: Any) -> str:
+    kind, context = fault["type"], fault.get("ctx", {})
+    if kind in _BOUNDS:
+        name, words = _BOUNDS[kind]
+        return f"{words} {context[name]:g}"
+    if kind == "union_tag_not_found":
+        return f"must have a key {context['discriminator']}"
+    if kind == "union_tag_invalid":
+        return f"its {context['discriminator']} {_one_of(context['tag'], context['expected_tags'])}"
+    if kind == "literal_error":
+        return _one_of(fault["input"], context["expected"])
+    if kind in ("too_short", "too_long"):
+        return f"must have {_COUNTS[kind]} {context['min_length' if kind == 'too_short' else 'max_length']} of them"
+    return str(_WORDS.get(kind, fault["msg"].removeprefix("Value error, ")))
+
+
+def _one_of(given: object, allowed: str) -> str:
+    """`allowed` as pydantic lists it: 'a', 'b' or 'c'."""
+    known = [word.strip("'") for word in allowed.replace(" or ", ", ").split(", ")]
+    return f"{did_you_mean(str(given), known)}must be {allowed}"
+
+
+def _written(place: Sequence[str | int]) -> list[str | int]:
+    """The parts of a place that the job file has: not the kind that follows a source's position, nor the mark of a key."""
+    parts = [part for before, part in zip((None, *place), place, strict=False) if not isinstance(before, int)]
+    return parts[:-1] if parts[-1:] == ["[key]"] else parts
+
 
 MOST_BYTES = 250_000
 """Longest job file; the longest example has 2,000 bytes."""

@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from services.run.processes import Process, descendants, read_process, send
+from services.run.machine import Process, descendants, read_process, send
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def deadly_scene(out: Path, scene_id: int) -> contextlib.AbstractContextManager[list[int]]:

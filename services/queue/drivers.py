@@ -1,34 +1,25 @@
-"""Edge: Ray's job API, where the drivers of a queue's jobs run. The token is taken from RAY_AUTH_MODE and RAY_AUTH_TOKEN."""
+"""Edge: drivers. Ray's job API, where they run, and one attempt at a job as it happens on the cluster's head.
+
+The token of the API is taken from RAY_AUTH_MODE and RAY_AUTH_TOKEN.
+"""
 
 import contextlib
-from collections.abc import Iterator, Mapping
-from typing import Any, Final, Protocol
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
 
 from ray.exceptions import AuthenticationError
 from ray.job_submission import JobSubmissionClient
 
-from schemas.errors import MachineError
+from schemas.errors import InUseError, MachineError, RunError, VersoError
 from schemas.plain_line import plain_line
-from services.queue.decide import Driver
+from schemas.queue import JobRequest
+from services.queue.queue import Queue
+from services.queue.supervise import Driver, Drivers
 
 ANSWER_S: Final = 30.0
 """Time for the job API to answer."""
-
-
-class Drivers(Protocol):
-    """Where drivers run. Every method raises MachineError where it does not answer."""
-
-    def states(self) -> dict[str, Driver]:
-        """By submission id: the drivers that are known."""
-
-    def hand_over(self, submission: str, entrypoint: str, metadata: Mapping[str, str]) -> None:
-        """Starts a driver, unless one of this submission id is known already."""
-
-    def stop(self, submission: str) -> None:
-        """Asks for the end of a driver; returns at once."""
-
-    def log(self, submission: str) -> str | None:
-        """What a driver and its commands wrote so far; None where it is not known."""
 
 
 class _PatientClient(JobSubmissionClient):
@@ -103,3 +94,68 @@ def _first_line(text: str | None) -> str:
     """Ray's words, without the end of the log that it adds to them."""
     first = next(iter((text or "").splitlines()), "")
     return plain_line(first.partition(", last available logs")[0].rstrip(".: "), 200)
+
+
+MOST_NOTE = 900
+"""Characters of an error that a job's events keep."""
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a command ended by itself."""
+
+    code: int
+    note: str = ""
+    scenes: int | None = None
+    digest: str | None = None
+
+
+def drive(queue: Queue, job: str, attempt: int, work: Callable[[JobRequest], Ending]) -> int:
+    """The exit code of one attempt. Raises RunError where it is not this driver's turn, and what `work` raises.
+
+    What ends without a word (a kill, a lost Ray, a signal) tells nothing here, and so counts as a death.
+    """
+    view = queue.append(job, "began", attempt)
+    if view is None:
+        now = queue.read(job)
+        raise RunError(
+            f"job {job} is {now.state}, at attempt {now.attempt}: there is nothing to do for attempt {attempt}"
+        )
+    try:
+        ending = work(view.request)
+    except InUseError as error:
+        queue.append(job, "busy", attempt, note=_note(str(error)))
+        raise
+    except VersoError as error:
+        queue.append(job, "ended", attempt, code=error.exit_code, note=_note(str(error)))
+        raise
+    queue.append(
+        job, "ended", attempt, code=ending.code, note=_note(ending.note), scenes=ending.scenes, digest=ending.digest
+    )
+    return ending.code
+
+
+def _note(text: str) -> str:
+    return plain_line(" ".join(text.split()), MOST_NOTE)
+
+
+EVERY_S: Final = 5.0
+"""Between two looks."""
+
+
+class Sharing:
+    """Called, it gives the number of jobs that share the cluster; what was read last where storage does not answer."""
+
+    def __init__(self, queue: Queue, clock: Callable[[], float] = time.monotonic) -> None:
+        self._queue = queue
+        self._clock = clock
+        self._jobs = 1
+        self._read_at = float("-inf")
+
+    def __call__(self) -> int:
+        """At least 1."""
+        if self._clock() - self._read_at >= EVERY_S:
+            self._read_at = self._clock()
+            with contextlib.suppress(VersoError, OSError):
+                self._jobs = self._queue.share()
+        return self._jobs
