@@ -8,9 +8,9 @@ from schemas.base import frozen_array
 from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.shape import Mesh
 from tests.kit.shapes import shape_of
-from workers.capture.raster import draw_depth
 from workers.geometry.camera import look_at
 from workers.geometry.raycast import Placed, cast_view
+from workers.geometry.zbuffer import draw_depth
 
 K = Intrinsics(width=160, height=120, fx=200.0, fy=205.0, cx=81.0, cy=57.5)
 
