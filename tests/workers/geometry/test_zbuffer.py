@@ -13,7 +13,6 @@ import trimesh
 
 from schemas.base import frozen_array
 from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.scene import Placed as PlacedThing
 from schemas.scene.shape import Mesh, Part, Shape
 from tests.kit.shapes import shape_of as shape_of_meshes
 from tests.workers.geometry.made_up_kinect import (
@@ -143,7 +142,7 @@ def test_as_many_pixels_as_rays_that_hit(seed):
     rng = np.random.default_rng(seed)
     mesh = trimesh.creation.annulus(0.05, 0.1, 0.08) if seed % 2 else trimesh.creation.capsule(0.1, 0.05)
     shape, T = shape_of(mesh), pose(uniform_rotation(rng), np.array([0.03, -0.02, 0.6]))
-    _, region, _ = cast_view([PlacedThing(3, shape, T)], Camera(SQUARE, np.eye(4)))
+    _, region, _ = cast_view([Placed(3, shape, T)], Camera(SQUARE, np.eye(4)))
     assert count_covered(shape, T, SQUARE) == pytest.approx((region == 3).sum(), abs=2)
 
 
