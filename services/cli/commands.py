@@ -29,6 +29,11 @@ def extra(options: argparse.Namespace) -> int:
     )
 
 
+def test(options: argparse.Namespace) -> int:
+    """`verso test`. Raises InputError: the tests are no part of the installed package, and the launcher runs them."""
+    raise InputError("test runs the tests of a checkout: type ./verso test there")
+
+
 def lock(options: argparse.Namespace) -> int:
     """`verso lock`. Raises InputError: only the launcher of a checkout can do it."""
     raise InputError("lock makes a checkout's lock files: type ./verso lock there")

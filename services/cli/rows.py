@@ -466,10 +466,15 @@ COMMANDS: dict[str, Command] = {
     ),
     **QUEUE_COMMANDS,
     "test": Command(
-        "lint, types, layer rules and tests",
+        "style, types, layer rules and tests of a checkout; says what was skipped, and why",
         "tests/hard_cases --figures f.json",
-        (option("anything", nargs="*"),),
-        "services.cli.main:run_tests",
+        (
+            option("paths", nargs="*", metavar="PATH", help="only the tests in this file, folder or FILE::TEST"),
+            option("--ci", action="store_true", help="also what takes a minute, and what needs root or Docker"),
+            option("--all", action="store_true", help="also that, and what takes minutes"),
+            option("--figures", type=read_path, metavar="FILE", help="write what the tests measured there, as JSON"),
+            option("-k", metavar="EXPR", help="only tests whose name matches, as in pytest"),
+        ),
     ),
     **STUDY_COMMANDS,
     "doctor": Command("what this machine has, and what is missing", "", (), "services.cli.doctor:main"),
@@ -492,4 +497,4 @@ COMMANDS: dict[str, Command] = {
         "services.cli.commands:lock",
     ),
 }
-"""In the order of `verso --help`. `verso test` is parsed by its own handler: it is here for the list."""
+"""In the order of `verso --help`."""

@@ -1,7 +1,5 @@
 """OUT/DATASET.md: the contents of a dataset, the stack that made it, and the sources of its shapes."""
 
-import json
-
 from schemas.base import Counts
 from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE, stored_roles
@@ -22,9 +20,6 @@ SHAPES_OF_CAPTURES = (
     "- reconstructed from the captures: the merged mesh with the licence in capture.json; what no view saw is missing\n"
     "- boards: a rectangle, CC0-1.0"
 )
-
-DOUBTS = 3
-"""Files of a folder that a line of `describe_doubts` names."""
 
 SEAL = ("<!-- SHA-256 of the text above: ", " -->\n")
 """The ends of the card's last line; cards of earlier versions have none."""
@@ -116,7 +111,7 @@ def _count(count: Counts) -> str:
 
 
 def describe_sources(catalogue: Catalogue) -> list[str]:
-    """One line for each source of objects and of tables with its licence, and those of `describe_left_out`."""
+    """One line for each source of objects and of tables with its licence, and those of `Catalogue.describe_left_out`."""
     lines = []
     for what, sources in (("objects", catalogue.assets.objects), ("tables", catalogue.assets.tables)):
         for source in sources:
@@ -125,28 +120,4 @@ def describe_sources(catalogue: Catalogue) -> list[str]:
             else:
                 origin = f"{source.source} folder {source.folder}, licence {source.licence}"
             lines.append(f"{what}, weight {source.weight:g}: {origin}")
-    return lines + describe_left_out(catalogue)
-
-
-def describe_doubts(catalogue: Catalogue) -> list[str]:
-    """One line for each folder with files that stand on another axis than `up` says."""
-    lines = []
-    for listing in catalogue.doubts():
-        told = ", ".join(f"{path} on {axis}" for path, axis in sorted(listing.doubts.items())[:DOUBTS])
-        more = f" and {len(listing.doubts) - DOUBTS} more" if len(listing.doubts) > DOUBTS else ""
-        path, axis = min(listing.doubts.items())
-        first = f"{{{json.dumps(path, ensure_ascii=False)}: {axis}}}"
-        remedy = (
-            f"if they lie on their side, set `up` of the source, such as {first}; `verso init` shows how they stand"
-        )
-        lines.append(f"{listing.folder}: files stand on another axis than `up` says: {told}{more}; {remedy}")
-    return lines
-
-
-def describe_left_out(catalogue: Catalogue) -> list[str]:
-    """One line for each folder with files that were left out: how many, and why, with the first of them."""
-    return [
-        f"left out of {folder}: {', '.join(f'{count} {reason}' for reason, count in reasons.items())}"
-        + (f"; {'; '.join(examples)}" if (examples := catalogue.examples(folder)) else "")
-        for folder, reasons in catalogue.skipped.items()
-    ]
+    return lines + catalogue.describe_left_out()

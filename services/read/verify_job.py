@@ -9,7 +9,7 @@ from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE, commit_path
 from schemas.errors import CorruptError
 from schemas.job.identity import job_digest
-from services.job.record import JobRecord, decode_job, is_job_sealed, is_job_unsealed
+from services.job.record import JobRecord, decode_job, is_job_sealed
 from services.read.verdict import COPY, Verdict, describe_os_error
 from workers.store.store import Store
 
@@ -44,7 +44,7 @@ def read_stored_job(store: Store, verdict: Verdict) -> StoredJob:
         told = str(error).removeprefix(JOB_FILE).lstrip(": ").removesuffix(COPY).rstrip(";: ")
         verdict.tell(f"{JOB_FILE}: {told}", COPY, "job")
         return StoredJob()
-    found = StoredJob(record, is_job_sealed(data), is_job_sealed(data) or is_job_unsealed(data))
+    found = StoredJob(record, is_job_sealed(data), is_job_sealed(data))
     if not found.whole:
         verdict.tell(f"{JOB_FILE}: was altered after a run wrote it: its seal does not match", verdict.repair, "job")
     elif record.digest != found.digest:

@@ -12,14 +12,14 @@ from schemas.dataset.ledger import Ledger
 from schemas.dataset.shard import JobChange, ShardOrder
 from schemas.errors import FingerprintError
 from schemas.job.job import Job
-from services.job.record import JobRecord, adopt, encode_job, record_job, refuse_foreign
-from services.merge.dataset_card import describe_doubts, describe_left_out, write_card
+from services.job.record import JobRecord, encode_job, record_job, refuse_foreign
+from services.merge.dataset_card import write_card
 from services.merge.merge import MergeResult, merge
 from services.run.coordinator import Coordinator, Limits
 from services.run.joining import Pattern, join_cluster, terms_of_driver, with_own_stack
-from services.run.lock import explain_lost_folder, hold_lock
+from services.run.lock import Lock, explain_lost_folder, hold_lock
 from services.run.metrics import Meter, Tally, serve
-from services.run.progress import ProgressLine, event_log, log_event, note_of_first_start
+from services.run.progress import ProgressLine, event_log, log_event, note_of_first_start, show_counts
 from services.run.range_planner import SpanPlan, deal_shards, find_lost, group_shards, plan_spans
 from services.run.ray_cluster import SharedSlots, Slots, open_ray
 from workers.assets.catalogue import Catalogue
@@ -50,6 +50,24 @@ class RunRequest:
 
 
 @dataclass(frozen=True)
+class Run:
+    """A run on an output folder that this process holds: the state that its phases share and do not change.
+
+    `plan`: what is missing; `keeper`: takes new commits into the kept summary of the ledger; `meter`: what Prometheus reads.
+    """
+
+    request: RunRequest
+    catalogue: Catalogue
+    store: Store
+    lock: Lock
+    meter: Meter
+    record: JobRecord
+    ledger: Ledger
+    keeper: LedgerKeeper
+    plan: SpanPlan
+
+
+@dataclass(frozen=True)
 class RunResult:
     """The merged dataset, the seconds that it took, and the scenes made in this run."""
 
@@ -64,11 +82,7 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
     `cluster` is entered if there is something to make; by default it is the one that the request asks for.
     """
     begun = time.monotonic()
-    require_tier(request.job.drawn)
-    catalogue = open_catalogue(request)
-    store = open_store(request.out)
-    for line in (*describe_left_out(catalogue), *describe_doubts(catalogue)):
-        print(f"verso: {line}", file=sys.stderr)
+    catalogue, store = open_inputs(request)
     refuse_foreign(store)
     store.prepare()
     meter = Meter(request.job.name)
@@ -78,66 +92,75 @@ def run_job(request: RunRequest, cluster: contextlib.AbstractContextManager[Slot
         event_log(store.root),
         serve(meter, request.metrics),
     ):
-        record = adopt(store, record_of(request, catalogue))
-        sweep(store, fenced=None)
-        ledger = list_commits(store)
-        for line in find_lost(store, ledger):
-            print(f"verso: {line}", file=sys.stderr)
-        plan = plan_spans(record.job, ledger, request.retry_failed)
-        made_now = 0
-        with contextlib.closing(LedgerKeeper(store, ledger)) as keeper:
-            if plan.scenes:
-                pattern = Pattern(order_pattern(store, request.out, record, ledger), catalogue, terms_of_driver())
-                if request.address is not None:
-                    pattern = replace(pattern, order=with_own_stack(store, pattern.order))
-                there = f", {ledger.committed} are there" if ledger.committed else ""
-                print(
-                    f"{record.job.name}: {plan.scenes} scenes to make{there}; starting the workers"
-                    f"{'' if request.address else note_of_first_start()}",
-                    file=sys.stderr,
-                    flush=True,
-                )
-                with cluster or open_ray(request.address, record.job.run.workers) as slots:
-                    if request.address is not None:
-                        pattern = join_cluster(store, lock, pattern)
-                    own = SharedSlots.of(slots, request.sharing) if request.sharing else slots
-                    made_now = _make(store, pattern, plan, own, keeper, meter)
+        run = plan_run(request, catalogue, store, lock, meter)
+        with contextlib.closing(run.keeper):
+            made_now = make_missing(run, cluster) if run.plan.scenes else 0
         meter.enter("merging")
-        if store.size(JOB_FILE) is None or store.read(JOB_FILE) != encode_job(record):
-            store.write_whole(JOB_FILE, encode_job(record))
-        merged = merge(store, record.job.first_scene, record.job.stop_scene, lock.require_held)
-        write_card(store, record, catalogue, merged)
-        log_event("finished", job=record.job.name, digest=merged.digest)
+        merged = finish(run)
         meter.enter("done")
     return RunResult(merged, time.monotonic() - begun, made_now)
 
 
-def record_of(request: RunRequest, catalogue: Catalogue) -> JobRecord:
-    """The record of the job that is asked for, with what its sources hold now."""
+def open_inputs(request: RunRequest) -> tuple[Catalogue, Store]:
+    """The job's catalogue and its output folder, which need not be there yet; says which files are left out or doubtful.
+
+    Shows how many files are listed and checked, which takes long where there are many new ones.
+    """
+    with show_counts("assets") as watch:
+        require_tier(request.job.drawn)
+        catalogue = open_sources(request.job, request.job_folder, watch)
+        store = open_store(request.out)
+    for line in (*catalogue.describe_left_out(), *catalogue.describe_doubts()):
+        print(f"verso: {line}", file=sys.stderr)
+    return catalogue, store
+
+
+def plan_run(request: RunRequest, catalogue: Catalogue, store: Store, lock: Lock, meter: Meter) -> Run:
+    """What there is and what is missing. Raises OutputError where the folder belongs to another job."""
     inputs = tuple(listing.sha256 for listing in catalogue.captures)
-    return record_job(request.job, catalogue.digest, request.job_folder, inputs)
+    record = record_job(request.job, catalogue.digest, request.job_folder, inputs, out=store)
+    sweep(store, fenced=None)
+    ledger = list_commits(store)
+    keeper = LedgerKeeper(store, ledger)
+    for line in find_lost(store, ledger):
+        print(f"verso: {line}", file=sys.stderr)
+    plan = plan_spans(record.job, ledger, request.retry_failed)
+    return Run(request, catalogue, store, lock, meter, record, ledger, keeper, plan)
 
 
-def open_catalogue(request: RunRequest) -> Catalogue:
-    """The job's catalogue; shows how many files are listed and checked, which takes long where there are many new ones."""
-    lines = dict[str, ProgressLine]()
+def make_missing(run: Run, cluster: contextlib.AbstractContextManager[Slots] | None) -> int:
+    """Makes what the plan has on a Ray, and shows how many scenes are done. The number of scenes made."""
+    request, job = run.request, run.record.job
+    pattern = Pattern(order_pattern(run.store, run.record, run.ledger), run.catalogue, terms_of_driver())
+    if request.address is not None:
+        pattern = replace(pattern, order=with_own_stack(run.store, pattern.order))
+    there = f", {run.ledger.committed} are there" if run.ledger.committed else ""
+    note = "" if request.address else note_of_first_start()
+    print(
+        f"{job.name}: {run.plan.scenes} scenes to make{there}; starting the workers{note}", file=sys.stderr, flush=True
+    )
+    with cluster or open_ray(request.address, job.run.workers) as slots:
+        if request.address is not None:
+            pattern = join_cluster(run.store, run.lock, pattern)
+        if request.sharing is not None:
+            slots = SharedSlots.of(slots, request.sharing)
+        return _coordinate(run, pattern, slots)
 
-    def watch(what: str, done: int, asked: int) -> None:
-        if what not in lines:
-            lines[what] = ProgressLine(asked, f"assets {what}", "file")
-        lines[what].expect(asked)
-        lines[what].show(done)
 
-    try:
-        return open_sources(request.job, request.job_folder, watch)
-    finally:
-        for line in lines.values():
-            line.close()
+def finish(run: Run) -> MergeResult:
+    """Brings job.yaml up to date, merges, and writes the card. Raises RunError where the lock was lost."""
+    job, text = run.record.job, encode_job(run.record)
+    if run.store.size(JOB_FILE) is None or run.store.read(JOB_FILE) != text:
+        run.store.write_whole(JOB_FILE, text)
+    merged = merge(run.store, job.first_scene, job.stop_scene, run.lock.require_held)
+    write_card(run.store, run.record, run.catalogue, merged)
+    log_event("finished", job=job.name, digest=merged.digest)
+    return merged
 
 
-def order_pattern(store: Store, out: str, record: JobRecord, ledger: Ledger) -> ShardOrder:
+def order_pattern(store: Store, record: JobRecord, ledger: Ledger) -> ShardOrder:
     """The pattern of all orders. A new folder gets its job.yaml at once, a finished one a moment before a new commit."""
-    order = ShardOrder.of(out, record.job, record.digest)
+    order = ShardOrder.of(store.name, record.job, record.digest)
     text = encode_job(record)
     change = None
     if store.size(JOB_FILE) is None:
@@ -164,9 +187,9 @@ def _committed_stack(store: Store, job: Job, ledger: Ledger) -> str:
     return stacks[0] if stacks else ""
 
 
-def _make(store: Store, pattern: Pattern, plan: SpanPlan, slots: Slots, keeper: LedgerKeeper, meter: Meter) -> int:
-    """Makes the ranges, and shows how many scenes are done. The number of scenes made."""
-    job = pattern.order.job
+def _coordinate(run: Run, pattern: Pattern, slots: Slots) -> int:
+    """Gives the missing ranges to Ray and follows what becomes of them. The number of scenes made."""
+    job, plan = run.record.job, run.plan
     tally = Tally(asked=plan.scenes)
     log_event("started", job=job.name, scenes=tally.asked, slots=slots.running)
     limits = Limits(slots, job.run.max_attempts, int(job.run.max_failure_share * job.scenes))
@@ -178,8 +201,8 @@ def _make(store: Store, pattern: Pattern, plan: SpanPlan, slots: Slots, keeper: 
 
         def follow(now: Tally) -> None:
             line.show(now.done + now.under_way, now.failed.total())
-            keeper.add(now.take_commits())
-            meter.show(now.counts(slots.now().running))
+            run.keeper.add(now.take_commits())
+            run.meter.show(now.counts(slots.now().running))
 
-        Coordinator(store, pattern, limits, tally).run(shards, follow)
+        Coordinator(run.store, pattern, limits, tally).run(shards, follow)
     return tally.made

@@ -40,6 +40,10 @@ if TYPE_CHECKING:
 AnySource = ProceduralSource | ShapeNetSource | FolderSource
 
 
+DOUBTS = 3
+"""Files of a folder that a line of `Catalogue.describe_doubts` names."""
+
+
 @dataclass(frozen=True)
 class InstanceRef:
     """One instance of a catalogue: number of its source among objects or tables, and its number within it."""
@@ -107,9 +111,29 @@ class Catalogue:
         listings = (listing for listing in (*self.objects, *self.tables) if listing is not None)
         return next((x.examples for x in listings if x.examples and str(x.folder) == folder), ())
 
-    def doubts(self) -> "list[Listing]":
-        """The listings with files that stand on another axis than `up` says."""
-        return [listing for listing in (*self.objects, *self.tables) if listing is not None and listing.doubts]
+    def describe_left_out(self) -> list[str]:
+        """One line for each folder with files that were left out: how many, and why, with the first of them."""
+        return [
+            f"left out of {folder}: {', '.join(f'{count} {reason}' for reason, count in reasons.items())}"
+            + (f"; {'; '.join(examples)}" if (examples := self.examples(folder)) else "")
+            for folder, reasons in self.skipped.items()
+        ]
+
+    def describe_doubts(self) -> list[str]:
+        """One line for each folder with files that stand on another axis than `up` says."""
+        lines = []
+        for listing in (*self.objects, *self.tables):
+            if listing is None or not listing.doubts:
+                continue
+            doubts = sorted(listing.doubts.items())
+            told = ", ".join(f"{path} on {axis}" for path, axis in doubts[:DOUBTS])
+            more = f" and {len(doubts) - DOUBTS} more" if len(doubts) > DOUBTS else ""
+            first = f"{{{json.dumps(doubts[0][0], ensure_ascii=False)}: {doubts[0][1]}}}"
+            remedy = (
+                f"if they lie on their side, set `up` of the source, such as {first}; `verso init` shows how they stand"
+            )
+            lines.append(f"{listing.folder}: files stand on another axis than `up` says: {told}{more}; {remedy}")
+        return lines
 
     def load(self, ref: InstanceRef) -> Asset:
         """An instance, made, or read in a limited process; MeshError where its mesh is refused or has changed."""

@@ -57,15 +57,6 @@ def test_even_what_changes_no_image_is_told(copy, before, after):
     ]
 
 
-def test_a_dataset_of_an_earlier_version_without_seals_is_whole(copy):
-    for name in ("job.yaml", "DATASET.md"):
-        lines = (copy / name).read_text().splitlines(keepends=True)
-        (copy / name).write_text("".join(lines[:-1]))
-    assert faults_of(LocalStore(copy)) == []
-    (copy / "job.yaml").write_text((copy / "job.yaml").read_text() + "teal: 5\n")
-    assert len(faults_of(LocalStore(copy))) == 1
-
-
 def test_a_fingerprint_that_is_not_the_commits_is_told(copy):
     path = copy / "manifest/_fingerprint.json"
     stored = Fingerprint.model_validate_json(path.read_bytes())

@@ -13,7 +13,7 @@ from services.report.server import Place, serving
 from tests.browser import needs_chromium, open_tab
 from tests.datasets import make_dataset
 
-pytestmark = [pytest.mark.minute, needs_chromium]
+pytestmark = [pytest.mark.minute, pytest.mark.browser, needs_chromium]
 
 CONTROLS = "a[href], button:not([hidden]), input, select, summary, [tabindex='0']"
 PICTURES = "[...document.querySelectorAll('.scene:not([hidden]) img, #wipe img')]"

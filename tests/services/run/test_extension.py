@@ -49,7 +49,7 @@ def order_of(store: LocalStore, **run) -> tuple[ShardOrder, object]:
     request = larger(store, **run)
     catalogue = open_catalogue(request.job.assets, Path(), tuple(request.job.categories))
     record = record_job(request.job, catalogue.digest, Path())
-    pattern = order_pattern(store, request.out, record, list_commits(store))
+    pattern = order_pattern(store, record, list_commits(store))
     return pattern.model_copy(update={"spans": (Span(start=2, stop=3),)}), catalogue
 
 
@@ -95,7 +95,7 @@ def test_an_older_order_does_not_make_a_later_job_smaller(finished):
     tree = {**SMALL, "scenes": 5}
     larger_still = RunRequest(validate_job(tree, "test"), Path(), str(finished.root))
     record = record_job(larger_still.job, catalogue.digest, Path())
-    change = order_pattern(finished, larger_still.out, record, list_commits(finished)).job_change
+    change = order_pattern(finished, record, list_commits(finished)).job_change
     finished.write_whole(JOB_FILE, change.after.encode())
     run_shard(order, catalogue)
     assert require_job(finished).job.scenes == 5
