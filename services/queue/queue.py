@@ -26,8 +26,7 @@ from schemas.queue import (
     log_path,
     request_path,
 )
-from workers.store.local import open_store
-from workers.store.store import Store, retry_if_swept
+from workers.store.store import Store, open_store, retry_if_swept
 
 JobState = Literal["queued", "waiting", "running", "cancelling", "cancelled", "done", "failed", "lost"]
 """waiting: for its output folder. lost: drivers died more often than they are started again."""
@@ -235,7 +234,7 @@ class Queue:
 
     def put_share(self, running: int) -> None:
         """Tells the drivers how many jobs share the cluster."""
-        self.store.write_whole(SHARE_FILE, json.dumps({"running": running}).encode(), durable=False)
+        self.store.put(SHARE_FILE, json.dumps({"running": running}).encode(), durable=False)
 
     def _events(self, job: str) -> list[JobEvent]:
         """A job's events from the first, in their order."""

@@ -109,7 +109,7 @@ class Lock:
             return False
         self._mine = replace(self._mine, beat=self._mine.beat + 1)
         if found is not None:
-            self._store.write_whole(LOCK_FILE, _encode(self._mine), durable=False)
+            self._store.put(LOCK_FILE, _encode(self._mine), durable=False)
         elif not self._store.put_if_absent(LOCK_FILE, _encode(self._mine)):
             return False
         if self._is_late() and _claimant(self._store, self._mine) is not None:
@@ -235,7 +235,7 @@ def _take_over(store: Store, gone: Holder, mine: Holder, period_s: float) -> boo
     if read_holder(store) != gone:
         store.remove(claim)
         return False
-    store.write_whole(LOCK_FILE, _encode(mine))
+    store.put(LOCK_FILE, _encode(mine))
     if _claimant(store, gone) == mine:
         return True
     if _is_held_by(store, mine):

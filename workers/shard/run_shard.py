@@ -44,8 +44,7 @@ from workers.scene.plan import SceneChance, choose_assets, choose_category
 from workers.scene.rows import failed_scene, record_scene, timing_row
 from workers.shard.fingerprint import take_fingerprint
 from workers.store.attempt import TIMED_OUT, Attempt, begin_attempt
-from workers.store.local import open_store
-from workers.store.store import Store
+from workers.store.store import Store, open_store
 
 
 class UnexpectedError(SceneError):
@@ -88,7 +87,7 @@ def keep_traceback(store: Store, scene_id: int, error: BaseException) -> str:
     """Writes the traceback beside the logs; where it is, for the end of a sentence."""
     key = f"{LOG_FOLDER}/scene-{scene_id}.txt"
     try:
-        store.write_whole(key, "".join(traceback.format_exception(error)).encode(), durable=False)
+        store.put(key, "".join(traceback.format_exception(error)).encode(), durable=False)
     except Exception:  # a log must not end the scene's range
         return ""
     return f"; the traceback is in {store.name}/{key}"
@@ -295,7 +294,7 @@ def _join_stack(store: Store, mine: Fingerprint, order: ShardOrder) -> None:
     if store.size(FINGERPRINT_FILE) is None:
         store.put_if_absent(FINGERPRINT_FILE, mine.model_dump_json(indent=1).encode())
     elif wanted and mine != _written_down(store):
-        store.write_whole(FINGERPRINT_FILE, mine.model_dump_json(indent=1).encode())  # it was damaged, or another's
+        store.put(FINGERPRINT_FILE, mine.model_dump_json(indent=1).encode())  # it was damaged, or another's
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
     if order.terms.fingerprint_mode == "strict" and mine != theirs:
         raise _foreign(mine, theirs, theirs.digest)
