@@ -1,5 +1,6 @@
 """What every test shares: which tests run here, and where the figures that they measure go."""
 
+import contextlib
 import functools
 import json
 import os
@@ -12,9 +13,12 @@ import pytest
 from hypothesis import settings
 
 from schemas.environment import settings_to_change
-from services.run.sight import processor_flags
+from services.run.machine import usable_cores
+from services.run.worker_entry import processor_flags
+from tests.kit.skips import Skips
 
-SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+ROOT = Path(__file__).resolve().parents[1]
+SHARED_DATA = ROOT.parent / "shared" / "data"
 
 # The same examples on every run: a failure is a change of the code, not of the dice. No deadline on shared cores.
 settings.register_profile("verso", deadline=None, derandomize=True)
@@ -28,14 +32,26 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    figures_file = config.getoption("--figures")
-    if figures_file and not hasattr(config, "workerinput"):  # with several processes, the first one writes
+    if hasattr(config, "workerinput"):  # of several processes, the first one writes
+        return
+    config.pluginmanager.register(Skips(config.getoption("--scope") != "default"))
+    if figures_file := config.getoption("--figures"):
         config.pluginmanager.register(FiguresWriter(figures_file))
 
 
 def pytest_report_header() -> list[str]:
     changes = settings_to_change(os.environ, processor_flags())
     return [f"environment: not the stack's, bits may differ: {' '.join(sorted(changes))}"] if changes else []
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """A test process holds a GL context, a PyBullet world and a Ray: about 1 GB. More than 8 processes gain nothing.
+
+    One file stays in one process: its tests share what is slow to start, such as a Ray.
+    """
+    one_file = len(config.args) == 1 and Path(config.args[0].split("::")[0]).is_file()
+    processes = min(usable_cores(), 8)
+    return 0 if one_file or processes == 1 else processes
 
 
 # ---------------------------------------------------------------------------------------------- which tests run here
@@ -52,6 +68,28 @@ def docker_answers() -> bool:
         return False
 
 
+NEEDS = {
+    "docker": ("deploy", "docker-compose.yml", ".dockerignore", "pyproject.toml", "requirements.lock", "tests/deploy"),
+    "browser": ("services/report", "tests/services/report"),
+}
+"""What tests with these markers are about: --ci runs them where some of it differs from the base."""
+
+
+@functools.cache
+def changed(*places: str) -> bool:
+    """Whether files differ from the commit where this branch left the main one; true where git cannot tell."""
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+
+    for base in ("origin/HEAD", "origin/main", "main"):
+        with contextlib.suppress(OSError, subprocess.CalledProcessError):
+            left = git("merge-base", base, "HEAD")
+            if left != git("rev-parse", "HEAD"):
+                return bool(git("diff", "--name-only", left, "--", *places))
+    return True
+
+
 def why_skip(markers: set[str], scope: str) -> str:
     """The first reason why a test with these markers cannot or should not run; empty if it runs."""
     if "slow" in markers and scope != "all":
@@ -60,6 +98,8 @@ def why_skip(markers: set[str], scope: str) -> str:
         return "needs root or Docker: runs with --ci"
     if "minute" in markers and scope == "default":
         return "takes about a minute: runs with --ci"
+    if scope == "ci" and any(not changed(*places) for marker, places in NEEDS.items() if marker in markers):
+        return "what it needs has not changed: runs with --all"
     if "docker" in markers and not docker_answers():
         return "no Docker engine answers"
     if "root" in markers and os.geteuid() != 0:
@@ -81,7 +121,6 @@ LONGEST_FIRST = (
     "services/run/test_step.py",
     "services/run/test_several_objects.py",
     "effects/test_random_scenes.py",
-    "services/cli/test_selftest.py",
     "effects/test_physics_effects.py",
     "services/bench/test_command.py",
     "test_energy_minimum.py",

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from services.cli.main import main
-from services.init.walk import SUFFIXES
+from services.init.collection import SUFFIXES
 from services.job.bounded_yaml import parse_yaml
 from tests.own_meshes import mixed_folder
 

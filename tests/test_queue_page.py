@@ -8,9 +8,9 @@ from typing import get_args
 import pytest
 
 from services.cli.parser import build_parser
-from services.cli.queue_parser import QUEUE_COMMANDS
-from services.queue.decide import PAUSES_S
-from services.queue.fold import RESTARTS, JobState
+from services.cli.rows import QUEUE_COMMANDS
+from services.queue.queue import RESTARTS, JobState
+from services.queue.supervise import PAUSES_S
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "queue.md").read_text()
 LINES = [line for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) for line in block.splitlines()]

@@ -13,19 +13,15 @@ from typing import Any
 from ray.cluster_utils import Cluster
 
 from schemas.dataset.commit import CommitSummary, Span
-from schemas.dataset.fingerprint import Fingerprint
-from schemas.dataset.shard import ShardOrder, ShardReport, SpanReport
+from schemas.dataset.shard import Fingerprint, ShardOrder, ShardReport, SpanReport
 from schemas.job.job import Job
 from services.run.coordinator import Coordinator, Limits
-from services.run.joining import terms_of_driver
-from services.run.pattern import Pattern
+from services.run.joining import Pattern, terms_of_driver
+from services.run.metrics import Tally
 from services.run.progress import event_log
 from services.run.range_planner import group_shards
-from services.run.ray_cluster import OBJECT_STORE_BYTES, connection, kept_private
-from services.run.ray_folder import private_folder
-from services.run.slots import PREFETCH, Slots
-from services.run.tally import Tally
-from services.run.worker_terms import WorkerTerms
+from services.run.ray_cluster import OBJECT_STORE_BYTES, PREFETCH, Slots, connection, kept_private, private_folder
+from services.run.worker_entry import WorkerTerms
 from workers.assets.catalogue import open_catalogue
 from workers.store.ledger import LedgerKeeper, list_commits
 from workers.store.local import LocalStore

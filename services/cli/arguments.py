@@ -1,13 +1,15 @@
-"""What is typed for an argument, checked before anything is done with it. Pure."""
+"""What a command of the command line is, and what may be typed for its arguments, checked before anything is done. Pure."""
 
 import argparse
 import re
 import unicodedata
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, NoReturn
+from typing import Any, Final, NoReturn
 
-from schemas.plain_line import plain_line
-from services.job.packed import MOST_CHARACTERS, is_packed
+from schemas.errors import plain_line
+from services.job.job_file import MOST_CHARACTERS, is_packed
 
 JOB_ID: Final = r"j[0-9a-f]{8}"
 """An id of schemas/queue.py, which loads too much for a parser; a test compares the two."""
@@ -137,3 +139,34 @@ def read_priority(text: str) -> int:
     if not re.fullmatch(r"[+-]?[0-9]{1,4}", text, re.ASCII) or abs(int(text)) > 1000:
         raise argparse.ArgumentTypeError(f"{plain_line(repr(text), 40)} is not a whole number from -1000 to 1000")
     return int(text)
+
+
+Option = tuple[tuple[str, ...], dict[str, Any]]
+
+
+def option(*names: str, **settings: Any) -> Option:
+    """An argument of `add_argument`."""
+    return names, settings
+
+
+def number(name: str, text: str, default: int | None = None) -> Option:
+    """An option that takes a whole number from 1 up."""
+    return option(name, type=read_count, metavar="N", default=default, help=text)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command: what it does, arguments of an example, options, and its handler `module:function` (default: commands.py).
+
+    `one_of`: options of which exactly one is given. `commands`: a command that has these has no handler of its own.
+    """
+
+    what: str
+    example: str
+    options: tuple[Option, ...] = ()
+    handler: str = ""
+    starts_ray: Callable[[argparse.Namespace], bool] = lambda options: False
+    kept: str = ""
+    quiet: bool = False
+    one_of: tuple[Option, ...] = ()
+    commands: Mapping[str, "Command"] = field(default_factory=dict)

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import shutil
 import sys
+import time
 from collections.abc import Callable
 from contextlib import closing
 from functools import partial
@@ -13,12 +14,30 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from schemas.errors import InputError, RunError, VersoError
 from services.cli.environment import host_place
-from services.job.read import load_job, pack_job
+from services.job.job_file import load_job, pack_job
 
 if TYPE_CHECKING:
     from schemas.job.job import Job
-    from services.run.step import RunResult
+    from services.run.run_job import RunResult
     from workers.store.store import Store
+
+
+def extra(options: argparse.Namespace) -> int:
+    """`verso extra`. Raises InputError: the launcher has done it before, or there is none."""
+    raise InputError(
+        f"extra {options.name} is installed by `./verso` in a checkout; elsewhere: pip install 'verso-data[{options.name}]'"
+    )
+
+
+def test(options: argparse.Namespace) -> int:
+    """`verso test`. Raises InputError: the tests are no part of the installed package, and the launcher runs them."""
+    raise InputError("test runs the tests of a checkout: type ./verso test there")
+
+
+def lock(options: argparse.Namespace) -> int:
+    """`verso lock`. Raises InputError: only the launcher of a checkout can do it."""
+    raise InputError("lock makes a checkout's lock files: type ./verso lock there")
+
 
 Found = TypeVar("Found")
 
@@ -26,7 +45,7 @@ Found = TypeVar("Found")
 def run(options: argparse.Namespace) -> int:
     """`verso run`."""
     job = load_job(options.job, _changes(options))
-    from services.run.step import RunRequest, run_job
+    from services.run.run_job import RunRequest, run_job
 
     out = options.out or f"data/{job.name}"
     absolute = out if "://" in out else str(Path(out).resolve())
@@ -86,8 +105,8 @@ def pack(options: argparse.Namespace) -> int:
 def status(options: argparse.Namespace) -> int:
     """`verso status`."""
     from services.job.record import require_job
-    from services.read.damage import explain_damage
     from services.read.status import read_status
+    from services.read.verdict import explain_damage
     from services.run.lock import shows_life
 
     store = _dataset(options.out)
@@ -117,10 +136,9 @@ def status(options: argparse.Namespace) -> int:
 
 def verify(options: argparse.Namespace) -> int:
     """`verso verify`."""
-    from services.read.audit import audit, describe_audit
-    from services.read.damage import explain_damage
+    from services.read.audit import audit, describe_audit, describe_independent, verify_independently
+    from services.read.verdict import explain_damage
     from services.read.verify import verify as read_back
-    from services.read.verify_independent import describe_independent, verify_independently
 
     store = _committed(options.out)
     verdict = _with_progress(_scenes_asked(store), "verify", partial(read_back, store))
@@ -176,8 +194,7 @@ def _with_progress(scenes: int, what: str, work: Callable[[Callable[[Any], None]
 
 def query(options: argparse.Namespace) -> int:
     """`verso query`."""
-    from services.read.query import ask
-    from services.read.query_formats import write_rows
+    from services.read.query import ask, write_rows
 
     with ask(_dataset(options.out), options.sql) as rows:
         wide = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
@@ -199,8 +216,8 @@ def columns(options: argparse.Namespace) -> int:
 
 def replay(options: argparse.Namespace) -> int:
     """`verso replay`."""
-    from services.read.damage import explain_damage
     from services.read.replay import replay_scene
+    from services.read.verdict import explain_damage
 
     if options.repair:
         return _repair(options)
@@ -221,8 +238,8 @@ def replay(options: argparse.Namespace) -> int:
 
 def _repair(options: argparse.Namespace) -> int:
     """`verso replay --repair`."""
-    from services.read.damage import explain_damage
     from services.read.repair import repair
+    from services.read.verdict import explain_damage
 
     store = _committed(options.out)
     with explain_damage(store):
@@ -239,8 +256,8 @@ def _repair(options: argparse.Namespace) -> int:
 
 def scene(options: argparse.Namespace) -> int:
     """`verso scene`."""
-    from services.read.damage import explain_damage
-    from services.read.scene_export import export_scene
+    from services.read.scene_geometry import export_scene
+    from services.read.verdict import explain_damage
 
     store = _dataset(options.out)
     with explain_damage(store):
@@ -253,7 +270,7 @@ def scene(options: argparse.Namespace) -> int:
 def _dataset(out: str) -> "Store":
     """The store of an output folder. Raises OutputError where it is none."""
     from services.job.record import require_dataset
-    from workers.store.local import open_store
+    from workers.store.store import open_store
 
     return require_dataset(open_store(out))
 
@@ -261,7 +278,52 @@ def _dataset(out: str) -> "Store":
 def _committed(out: str) -> "Store":
     """The store of an output folder, also of one that lost its job.yaml. Raises OutputError where it is none."""
     from schemas.dataset.layout import COMMITS
-    from workers.store.local import open_store
+    from workers.store.store import open_store
 
     store = open_store(out)
     return store if next(iter(store.files(COMMITS)), None) is not None else _dataset(out)
+
+
+def report(options: argparse.Namespace) -> int:
+    """`verso report`."""
+    from services.look.report import write_report
+    from services.read.verdict import explain_damage
+    from workers.store.store import open_store
+
+    began = time.monotonic()
+    store = open_store(options.out)
+    target = options.file or default_page(options.out)
+    beside = None if options.beside is None else open_store(options.beside)
+    with explain_damage(store):
+        size, made = write_report(store, options.scenes, target, beside)
+    seconds = time.monotonic() - began
+    print(f"{target}: {made.figures.scenes} scenes, pictures of {len(made.sample.scenes)}, {size / 1e6:.1f} MB")
+    answer = {"file": str(target), "bytes": size, "seconds": round(seconds, 2), "scenes": made.figures.scenes}
+    answer_json(options, {"ok": True, **answer, "shown": [one.scene_id for one in made.sample.scenes]})
+    return 0
+
+
+def serve(options: argparse.Namespace) -> int:
+    """`verso serve`."""
+    from services.look.live import Follower
+    from services.look.server import choose_place, ended_by_signal, serving
+    from workers.store.store import open_store
+
+    place = choose_place(options.host, options.port, options.token)
+    follower = Follower(open_store(options.out), options.scenes)
+    with ended_by_signal() as ended, serving(follower, place) as opened:
+        print(f"{options.out}: {opened.address} (Ctrl-C ends it)", flush=True)
+        answer_json(options, {"ok": True, "address": opened.address, "port": opened.port, "token": opened.token})
+        sys.stdout.flush()
+        follower.start()
+        try:
+            ended.wait()
+        finally:
+            follower.stop()
+    return 0
+
+
+def default_page(out: str) -> Path:
+    """The page of a dataset: beside its folder, or here for a bucket's."""
+    name = out.rstrip("/").rpartition("/")[2] or "dataset"
+    return Path(f"{name}-report.html") if "://" in out else Path(out).resolve().with_name(f"{name}-report.html")

@@ -4,7 +4,7 @@ import os
 import sys
 
 from schemas.environment import settings_to_change
-from services.run.sight import processor_flags
+from services.run.worker_entry import processor_flags
 
 
 def enter_stack_environment() -> None:
@@ -27,3 +27,7 @@ def host_place(out: str) -> str:
     host = os.environ.get("VERSO_HOST_DATA")
     place = os.path.realpath(out) if "://" not in out else ""
     return f" (on the host: {host}{place.removeprefix('/data')})" if host and place.startswith("/data/") else ""
+
+
+if __name__ == "__main__":  # what the launcher sets for tools that it starts itself
+    print("\n".join(f"{name}={value}" for name, value in settings_to_change(os.environ, processor_flags()).items()))

@@ -8,7 +8,8 @@ from functools import partial
 
 from schemas.errors import VersoError
 from services.cli.environment import enter_stack_environment
-from services.cli.parser import KEPT, build_parser
+from services.cli.parser import build_parser
+from services.cli.rows import KEPT
 from services.run.supervisor import supervise
 
 
@@ -21,10 +22,6 @@ def main(argv: list[str] | None = None) -> int:
     if argv is None:
         enter_stack_environment()
         argv = sys.argv[1:]
-    if argv[:1] == ["test"]:
-        from services.cli.selftest import main as run_tests
-
-        return run_tests(argv[1:])
     options = build_parser().parse_args(argv)
     if from_shell and options.starts_ray(options):
         return supervise(partial(_run, options), options.kept, quiet=options.quiet, answers=options.json)

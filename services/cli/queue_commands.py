@@ -9,18 +9,17 @@ import urllib.parse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.errors import InputError, JobError, RunError
-from schemas.plain_line import plain_line
+from schemas.errors import InputError, JobError, RunError, plain_line
 from schemas.queue import JobRequest
 from services.cli.commands import answer_json, tell_result
 from services.cli.environment import default_queue
-from services.job.read import folders_of, load_job, read_text
-from services.queue.store import Queue, make_queue, new_id, open_queue
+from services.job.job_file import folders_of, load_job, read_text
+from services.queue.queue import Queue, make_queue, new_id, open_queue
 
 if TYPE_CHECKING:
     from schemas.job.job import Job
-    from services.queue.drive import Ending
-    from services.queue.ray_jobs import Drivers
+    from services.queue.drivers import Ending
+    from services.queue.supervise import Drivers
 
 
 def submit(options: argparse.Namespace) -> int:
@@ -65,7 +64,7 @@ def jobs(options: argparse.Namespace) -> int:
 
 def logs(options: argparse.Namespace) -> int:
     """`verso logs`."""
-    from services.queue.logs import follow_logs, header, read_logs
+    from services.queue.listing import follow_logs, header, read_logs
 
     queue, drivers = _open(options), _drivers(options)
     view = queue.read(options.id)
@@ -120,9 +119,8 @@ def supervise(options: argparse.Namespace) -> int:
 
 def drive(options: argparse.Namespace) -> int:
     """`verso drive`."""
-    from services.queue.drive import Ending, drive
-    from services.queue.share import Sharing
-    from services.run.step import RunRequest, run_job
+    from services.queue.drivers import Ending, Sharing, drive
+    from services.run.run_job import RunRequest, run_job
 
     queue = _open(options)
 
@@ -154,7 +152,7 @@ def _open(options: argparse.Namespace) -> Queue:
 
 
 def _drivers(options: argparse.Namespace) -> "Drivers":
-    from services.queue.ray_jobs import RayDrivers
+    from services.queue.drivers import RayDrivers
 
     return RayDrivers(options.address)
 
@@ -175,7 +173,7 @@ def _absolute(place: str) -> str:
 
 def _refuse_relative_folders(job: "Job", file: Path) -> None:
     """Raises JobError for a folder of assets or captures that only this host, or this user, can find."""
-    from workers.assets.external.folder import PYBULLET_DATA
+    from workers.assets.external.listing import PYBULLET_DATA
 
     for key, folder in folders_of(job).items():
         if folder not in ("", PYBULLET_DATA) and not folder.startswith("/") and "://" not in folder:

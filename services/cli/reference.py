@@ -1,9 +1,42 @@
-"""The page of commands, docs/commands.md, from the table of commands: `python -m services.cli.reference > docs/commands.md`."""
+"""What is written from the table of commands: docs/commands.md, and the script that completes commands in a shell.
 
+The page: `python -m services.cli.reference > docs/commands.md`.
+"""
+
+import argparse
 from collections.abc import Iterator, Mapping
 
-from services.cli.command import Command, Option
-from services.cli.parser import COMMANDS
+import shtab
+
+from services.cli.arguments import Command, Option, read_job, read_path, read_place
+from services.cli.parser import build_parser
+from services.cli.rows import COMMANDS
+
+
+def main(options: argparse.Namespace) -> int:
+    """Prints the script."""
+    print(script_for(options.shell))
+    return 0
+
+
+def script_for(shell: str) -> str:
+    """The script for bash, zsh or tcsh, made from the table of commands."""
+    parser = build_parser()
+    _mark_files(parser)
+    return shtab.complete(parser, shell)
+
+
+def _mark_files(parser: argparse.ArgumentParser) -> None:
+    """Let arguments that are files or folders be completed as such."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for below in action.choices.values():
+                _mark_files(below)
+        elif action.type in (read_path, read_job):
+            action.complete = shtab.FILE  # type: ignore[attr-defined]
+        elif action.type is read_place:
+            action.complete = shtab.DIRECTORY  # type: ignore[attr-defined]
+
 
 EXIT_CODES = (
     (0, "complete"),

@@ -1,12 +1,86 @@
-"""The files of a folder as its job has them: sizes as they will stand, the axis that is up, and how they are loaded."""
+"""Edge: what was read of a folder, as a table for a terminal and as a page of pictures."""
 
-from collections.abc import Sequence
+import math
+import unicodedata
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from schemas.base import frozen_array
 from schemas.job.assets import FolderSource
-from services.init.model import Item
-from services.init.table import describe_size, describe_up, missing_pictures
+from schemas.job.views import Render
+from schemas.scene.scene import EffectPlan, Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, Asset, Material, Part, Shape
+from schemas.scene.view import Camera, Intrinsics
+from services.init.collection import PART, Item, LeftOut
+from workers.assets.appearance import draw_appearance
 from workers.assets.catalogue import Catalogue, InstanceRef
+from workers.assets.external.mesh import transform_shape
+from workers.geometry.frames import pose, translation
+from workers.render.raster.gbuffer import Renderer
+
+MOST_ROWS = 40
+"""Rows that a terminal shows; `--json` has all."""
+
+HEADINGS = ("file", "category", "size, cm", "faces", "closed", "pictures", "up", "notes")
+LEAST = (12, 8, 19, 5, 6, 6, 4, 5)
+"""Widths to which columns may shrink."""
+
+
+def describe_size(extents_m: Sequence[float]) -> str:
+    """Width x depth x height as it will stand, centimetres."""
+    return " x ".join(f"{100 * extent:.3g}" for extent in extents_m)
+
+
+def missing_pictures(notes: Sequence[str]) -> int:
+    """Pictures or material files that are missing or cannot be read, by the notes on a file."""
+    return sum(note.endswith("plain base colour used") for note in notes)
+
+
+def describe_up(axis: str, shape_says: str | None, confidence: str | None) -> str:
+    """The axis that the job has up, and what the shape says to it."""
+    if shape_says is None:
+        return f"{axis}?"
+    return f"{axis} {confidence}" if shape_says == axis else f"{axis} (or {shape_says})"
+
+
+def draw_table(rows: Sequence[Sequence[str]], width: int) -> list[str]:
+    """Lines of at most `width` characters; a cell that does not fit is cut in its middle, where … stands."""
+    shown = [HEADINGS, *rows[:MOST_ROWS]]
+    widths = [max(len(row[column]) for row in shown) for column in range(len(HEADINGS))]
+    least = [min(wanted, low) for wanted, low in zip(widths, LEAST, strict=True)]
+    while sum(widths) + 2 * (len(widths) - 1) > width and widths != least:
+        widest = max((k for k in range(len(widths)) if widths[k] > least[k]), key=lambda k: widths[k])
+        widths[widest] -= 1
+    cells = [[shorten(cell, most).ljust(most) for cell, most in zip(row, widths, strict=True)] for row in shown]
+    lines = [shorten("  ".join(row).rstrip(), width) for row in cells]
+    if len(rows) > MOST_ROWS:
+        lines.append(f"and {len(rows) - MOST_ROWS} more: --json lists all")
+    return lines
+
+
+def draw_left_out(left_out: Sequence[LeftOut], width: int) -> list[str]:
+    """A line for each file that is not used, and how many there are; the parts of URDFs are counted."""
+    if not left_out:
+        return []
+    told = [one for one in left_out if one.reason != PART]
+    lines = [f"left out: {len(told)} file{'s' * (len(told) != 1)}"] if told else []
+    lines += [shorten(f"  {one.path} ({one.reason}): {one.why}", width) for one in told[:MOST_ROWS]]
+    if len(told) > MOST_ROWS:
+        lines.append(f"  and {len(told) - MOST_ROWS} more: --json lists all")
+    if parts := len(left_out) - len(told):
+        lines.append(f"{parts} mesh{'es' * (parts != 1)} not offered by themselves: parts of the URDFs")
+    return lines
+
+
+def shorten(text: str, most: int) -> str:
+    """The text with … in its middle where it is longer than `most`."""
+    if len(text) <= most:
+        return text
+    head = max(1, (most - 1) // 2)
+    return f"{text[:head]}…{text[len(text) - (most - 1 - head) :]}"
 
 
 @dataclass(frozen=True)
@@ -85,3 +159,94 @@ def _show(catalogue: Catalogue, item: Item, source: int, category: str, index: i
         notes=measured.notes,
     )
     return shown, catalogue.refer(source, category, index)
+
+
+MOST = 60
+"""Pictures on a page."""
+
+COLUMNS, TILE = 5, (300, 260)
+LINE, LINES, MARGIN = 17, 5, 10
+FONT = 13
+
+SIZE_M = 0.25
+"""Diagonal at which every object is drawn: the text has its size."""
+
+YAW_RAD, PITCH_RAD, DISTANCE_M = 0.6, 0.5, 0.62
+EFFECTS = EffectPlan(
+    ("rgb", "floor", "textures", "shadows", "ambient_occlusion", "antialiasing", "transparency", "light_maps"), {}
+)
+WARNING = "#b03000"
+
+
+@dataclass(frozen=True)
+class Tile:
+    """An object on the page: how it is loaded, its caption, and the lines that ask for attention."""
+
+    load: Callable[[], Asset]
+    caption: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def draw_sheet(title: str, tiles: Sequence[Tile], notes: Sequence[str], renderer: Renderer) -> Image.Image:
+    """The page: a title, up to `MOST` objects, and notes below them."""
+    shown = tiles[:MOST]
+    if len(tiles) > MOST:
+        notes = [f"and {len(tiles) - MOST} objects more, which are not drawn", *notes]
+    columns = min(COLUMNS, max(len(shown), 3))
+    cell = (TILE[0] + MARGIN, TILE[1] + LINE * LINES + 2 * MARGIN)
+    rows = math.ceil(len(shown) / columns)
+    top = 2 * LINE + MARGIN
+    page = Image.new("RGB", (columns * cell[0] + MARGIN, top + rows * cell[1] + LINE * len(notes) + MARGIN), "white")
+    pen, font = ImageDraw.Draw(page), ImageFont.load_default(FONT)
+    fit = columns * cell[0] // 7
+    pen.text((MARGIN, MARGIN), shorten(title, fit), "black", ImageFont.load_default(FONT + 3))
+    for number, tile in enumerate(shown):
+        left, upper = MARGIN + number % columns * cell[0], top + number // columns * cell[1]
+        page.paste(draw_object(tile.load(), renderer), (left, upper))
+        lines = [(line, "black") for line in tile.caption] + [(line, WARNING) for line in tile.warnings]
+        for row, (line, colour) in enumerate(lines[:LINES]):
+            pen.text((left, upper + TILE[1] + 3 + row * LINE), _fit(line, font, TILE[0]), colour, font)
+    for row, note in enumerate(notes):
+        pen.text((MARGIN, top + rows * cell[1] + row * LINE), _fit(note, font, page.width - 2 * MARGIN), "black", font)
+    return page
+
+
+def draw_object(asset: Asset, renderer: Renderer) -> Image.Image:
+    """The asset on the ground, seen from a little above, with its z up."""
+    lower, upper = asset.shape.bounds
+    scale = SIZE_M / float(np.linalg.norm(upper - lower))
+    shape = transform_shape(asset.shape, pose(scale * np.eye(3), np.zeros(3)))
+    height = scale * float(upper[2] - lower[2])
+    things = [Placed(REGION_FLOOR, _ground(), np.eye(4))]
+    things.append(Placed(REGION_FIRST_OBJECT, shape, translation(0.0, 0.0, -scale * float(lower[2]))))
+    _, light = draw_appearance(np.random.default_rng(4), "flat")
+    seen = renderer.draw(things, light, _camera(0.5 * height), Render(tier="raster"), EFFECTS)
+    assert seen.rgb is not None
+    return Image.fromarray(seen.rgb)
+
+
+def _camera(middle_m: float) -> Camera:
+    """Looks at the middle of the object, in the optical frame."""
+    width, height = TILE
+    level = math.cos(PITCH_RAD)
+    back = np.array([-level * math.sin(YAW_RAD), -level * math.cos(YAW_RAD), math.sin(PITCH_RAD)])
+    right = np.array([math.cos(YAW_RAD), -math.sin(YAW_RAD), 0.0])
+    rotation = np.stack([right, np.cross(-back, right), -back], axis=1)
+    focal = 0.9 * height * DISTANCE_M / SIZE_M
+    intrinsics = Intrinsics(width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)
+    return Camera(intrinsics, pose(rotation, np.array([0.0, 0.0, middle_m]) + DISTANCE_M * back))
+
+
+def _ground() -> Shape:
+    corners = 5.0 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    faces = frozen_array([[0, 1, 2], [0, 2, 3]], np.int32)
+    return Shape((Part("ground", frozen_array(corners), faces, Material((0.75, 0.75, 0.74, 1.0), roughness=0.9)),))
+
+
+def _fit(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: int) -> str:
+    """The text in the letters that the font has, cut in its middle where it is wider than `width` pixels."""
+    text = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
+    most = len(text)
+    while most > 4 and font.getlength(shorten(text, most)) > width:
+        most -= 1
+    return shorten(text, most)

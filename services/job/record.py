@@ -1,6 +1,5 @@
 """OUT/job.yaml: the job that an output folder belongs to. Another job is refused, naming the keys."""
 
-import dataclasses
 import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +11,8 @@ from schemas.dataset.layout import JOB_FILE, LOCK_FILE, LOG_FOLDER, MANIFEST, ST
 from schemas.errors import CorruptError, JobError, OutputError
 from schemas.job.identity import compare_jobs, job_digest
 from schemas.job.job import Job
-from services.job.read import parse_yaml, validate_job
-from workers.store.seal import is_sealed, seal
+from services.job.job_file import parse_yaml, validate_job
+from workers.store.commit import is_sealed, seal
 from workers.store.store import Store
 
 OWN = {MANIFEST, STAGING, LOCK_FILE, LOG_FOLDER}
@@ -30,7 +29,7 @@ HEADER = """\
 """
 
 SEAL = "seal: "
-"""Begins the last line of job.yaml; files of earlier versions have none."""
+"""Begins the last line of job.yaml."""
 
 MAX_BYTES = 1 << 20
 """Larger than any job: what is larger was not written by a run."""
@@ -62,12 +61,24 @@ class JobRecord:
         return "the files of the asset folders"
 
 
-def record_job(job: Job, catalogue_digest: str, folder: Path, inputs: tuple[str, ...] = ()) -> JobRecord:
-    """The record of a job with the digest of its asset catalogue; `folder` is the job file's.
+def record_job(
+    job: Job, catalogue_digest: str, folder: Path, inputs: tuple[str, ...] = (), out: Store | None = None
+) -> JobRecord:
+    """The record of a job with the digest of its asset catalogue; `folder` is the job file's, `out` the output folder.
 
-    The size of ranges is written down also where it follows from the job: a dataset that is extended keeps it.
+    The size of ranges is written down also where it follows from the job: a dataset that is extended keeps it. Raises
+    OutputError where `out` belongs to another job, naming the keys.
     """
-    job = job.model_copy(update={"run": job.run.model_copy(update={"range_size": job.range_size})})
+    old = read_job(out) if out is not None else None
+    if out is not None and old is not None:
+        differing = [f"  {key}: {before} there, {after} here" for key, before, after in compare_jobs(old.job, job)]
+        if old.catalogue != catalogue_digest and not differing:
+            differing.append(f"  {old.describe_change(inputs)} (their digest changed)")
+        if differing:
+            lines = [f"{out.name} belongs to another job; these differ:", *differing]
+            raise OutputError("\n".join([*lines, "choose another --out, or change them back"]))
+    range_size = old.job.range_size if old is not None else job.range_size
+    job = job.model_copy(update={"run": job.run.model_copy(update={"range_size": range_size})})
     return JobRecord(job, job_digest(job, catalogue_digest), catalogue_digest, str(folder.resolve()), inputs)
 
 
@@ -87,7 +98,7 @@ def read_job(store: Store) -> JobRecord | None:
 
 
 def decode_job(data: bytes, name: str) -> JobRecord:
-    """The job in the bytes of a job.yaml, sealed or not. Raises CorruptError naming the file, with one line."""
+    """The job in the bytes of a job.yaml, whatever its seal says. Raises CorruptError naming the file, with one line."""
     if len(data) > MAX_BYTES:
         raise CorruptError(f"{name} has {len(data)} bytes, and a job has less than {MAX_BYTES}: {REMEDY}")
     try:
@@ -110,15 +121,8 @@ def decode_job(data: bytes, name: str) -> JobRecord:
 
 
 def is_job_sealed(data: bytes) -> bool:
-    """Whether the bytes of a job.yaml are those that a run of this version wrote."""
+    """Whether the bytes of a job.yaml are those that a run wrote."""
     return is_sealed(data, SEAL)
-
-
-def is_job_unsealed(data: bytes) -> bool:
-    """Whether the keys of a job.yaml are written as an earlier version wrote them, without a seal."""
-    tree = parse_yaml(data.decode())
-    body = yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=110)
-    return list(tree) == ["digest", "catalogue", "folder", "job"] and data.endswith(body.encode())
 
 
 def _read_bytes(store: Store) -> bytes | None:
@@ -159,18 +163,3 @@ def refuse_foreign(store: Store) -> None:
             f"{store.name} holds {', '.join(foreign[:3])}{' and more' if len(foreign) > 3 else ''}, and no {JOB_FILE}: "
             "choose an empty or a new folder for --out"
         )
-
-
-def adopt(store: Store, new: JobRecord) -> JobRecord:
-    """The record to run: `new`, with the range size of the folder's first run. Raises OutputError for another job."""
-    old = read_job(store)
-    if old is None:
-        return new
-    differing = [f"  {key}: {before} there, {after} here" for key, before, after in compare_jobs(old.job, new.job)]
-    if old.catalogue != new.catalogue and not differing:
-        differing.append(f"  {old.describe_change(new.inputs)} (their digest changed)")
-    if differing:
-        lines = [f"{store.name} belongs to another job; these differ:", *differing]
-        raise OutputError("\n".join([*lines, "choose another --out, or change them back"]))
-    run = new.job.run.model_copy(update={"range_size": old.job.range_size})
-    return dataclasses.replace(new, job=new.job.model_copy(update={"run": run}))

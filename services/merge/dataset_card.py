@@ -1,16 +1,14 @@
 """OUT/DATASET.md: the contents of a dataset, the stack that made it, and the sources of its shapes."""
 
-import json
-
 from schemas.base import Counts
-from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE, stored_roles
+from schemas.dataset.shard import Fingerprint
 from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Captures
 from services.job.record import JobRecord
-from services.merge.step import MergeResult
+from services.merge.merge import MergeResult
 from workers.assets.catalogue import Catalogue
-from workers.store.seal import is_sealed, seal
+from workers.store.commit import is_sealed, seal
 from workers.store.store import Store
 
 ARTICLE = (
@@ -23,22 +21,19 @@ SHAPES_OF_CAPTURES = (
     "- boards: a rectangle, CC0-1.0"
 )
 
-DOUBTS = 3
-"""Files of a folder that a line of `describe_doubts` names."""
-
 SEAL = ("<!-- SHA-256 of the text above: ", " -->\n")
-"""The ends of the card's last line; cards of earlier versions have none."""
+"""The ends of the card's last line."""
 
 
 def is_card_sealed(data: bytes) -> bool:
-    """Whether the bytes of a card are those that a run of this version wrote."""
+    """Whether the bytes of a card are those that a run wrote."""
     return is_sealed(data, *SEAL)
 
 
 def write_card(store: Store, record: JobRecord, catalogue: Catalogue, merged: MergeResult) -> None:
     """Writes DATASET.md."""
     fingerprint = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
-    store.write_whole(README_FILE, seal(describe_dataset(record, catalogue, merged, fingerprint), *SEAL))
+    store.put(README_FILE, seal(describe_dataset(record, catalogue, merged, fingerprint), *SEAL))
 
 
 def describe_dataset(record: JobRecord, catalogue: Catalogue, merged: MergeResult, fingerprint: Fingerprint) -> str:
@@ -116,7 +111,7 @@ def _count(count: Counts) -> str:
 
 
 def describe_sources(catalogue: Catalogue) -> list[str]:
-    """One line for each source of objects and of tables with its licence, and those of `describe_left_out`."""
+    """One line for each source of objects and of tables with its licence, and those of `Catalogue.describe_left_out`."""
     lines = []
     for what, sources in (("objects", catalogue.assets.objects), ("tables", catalogue.assets.tables)):
         for source in sources:
@@ -125,28 +120,4 @@ def describe_sources(catalogue: Catalogue) -> list[str]:
             else:
                 origin = f"{source.source} folder {source.folder}, licence {source.licence}"
             lines.append(f"{what}, weight {source.weight:g}: {origin}")
-    return lines + describe_left_out(catalogue)
-
-
-def describe_doubts(catalogue: Catalogue) -> list[str]:
-    """One line for each folder with files that stand on another axis than `up` says."""
-    lines = []
-    for listing in catalogue.doubts():
-        told = ", ".join(f"{path} on {axis}" for path, axis in sorted(listing.doubts.items())[:DOUBTS])
-        more = f" and {len(listing.doubts) - DOUBTS} more" if len(listing.doubts) > DOUBTS else ""
-        path, axis = min(listing.doubts.items())
-        first = f"{{{json.dumps(path, ensure_ascii=False)}: {axis}}}"
-        remedy = (
-            f"if they lie on their side, set `up` of the source, such as {first}; `verso init` shows how they stand"
-        )
-        lines.append(f"{listing.folder}: files stand on another axis than `up` says: {told}{more}; {remedy}")
-    return lines
-
-
-def describe_left_out(catalogue: Catalogue) -> list[str]:
-    """One line for each folder with files that were left out: how many, and why, with the first of them."""
-    return [
-        f"left out of {folder}: {', '.join(f'{count} {reason}' for reason, count in reasons.items())}"
-        + (f"; {'; '.join(examples)}" if (examples := catalogue.examples(folder)) else "")
-        for folder, reasons in catalogue.skipped.items()
-    ]
+    return lines + catalogue.describe_left_out()

@@ -1,34 +1,29 @@
-"""Reading of committed ranges for the merge: several at a time, in order, in blocks of ranges whose rows are joined."""
+"""Reading of committed ranges for the merge, in blocks whose rows are joined, and the check that their files are published."""
 
-import functools
-import hashlib
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from itertools import chain
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from schemas.dataset.commit import CommitRecord, FileEntry, Span
-from schemas.dataset.layout import asset_path, is_range_file, pose_of_image, range_table_path
+from schemas.dataset.layout import RANGES, asset_path, is_range_file, is_shape, pose_of_image, range_table_path
 from schemas.dataset.tables import SCHEMAS, SHAPE_FILE_COLUMNS, TABLES
 from schemas.errors import CorruptError
-from workers.store.commit import committed_files
-from workers.store.committed_rows import Spread, iter_ranges, range_rows
+from services.merge.shared import explain_full_disk, open_scratch
+from workers.store.commit import committed_files, read_range_file
+from workers.store.ledger import iter_ranges, range_rows
 from workers.store.manifest import conform, decode_rows, join_rows
-from workers.store.store import Store
+from workers.store.store import Store, map_ahead
 
 RANGES_PER_BLOCK = 128
 ROWS_PER_BLOCK = 4_096
 """A block ends with either of them, rows of all tables counted: small enough for memory, large enough to be fast."""
 
-AT_ONCE = 16
-"""Ranges that are read at once from an object store, where each request waits. A disk is read one by one."""
-
-A = TypeVar("A")
-B = TypeVar("B")
 Range = Sequence[CommitRecord]
 """A range's record, followed by its retries."""
 
@@ -54,7 +49,7 @@ class _RangeRead:
     @property
     def rows(self) -> int:
         """Of all tables; those of retries are counted with what they replace."""
-        return sum(entry.rows for record in self.records for entry in record.tables.values())
+        return sum(sum(record.tables.values()) for record in self.records)
 
 
 def read_blocks(store: Store, first_scene: int, stop_scene: int) -> Iterator[Block]:
@@ -63,36 +58,18 @@ def read_blocks(store: Store, first_scene: int, stop_scene: int) -> Iterator[Blo
     Raises as `iter_ranges`, and CorruptError naming a table that is missing or altered, or a range that does not hold
     each of its scenes once.
     """
-    with ThreadPoolExecutor(AT_ONCE) as pool:
-        spread: Spread = functools.partial(map_ahead, pool) if store.root is None else map
-        ranges = iter_ranges(store, first_scene, stop_scene, spread)
-        block: list[_RangeRead] = []
-        rows = 0
-        for read in spread(lambda records: _read_range(store, records), ranges):
-            block.append(read)
-            rows += read.rows
-            if len(block) >= RANGES_PER_BLOCK or rows >= ROWS_PER_BLOCK:
-                yield _joined(block)
-                block, rows = [], 0
-        if block:
+    block: list[_RangeRead] = []
+    rows = 0
+    for read in map_ahead(
+        store, lambda records: _read_range(store, records), iter_ranges(store, first_scene, stop_scene)
+    ):
+        block.append(read)
+        rows += read.rows
+        if len(block) >= RANGES_PER_BLOCK or rows >= ROWS_PER_BLOCK:
             yield _joined(block)
-
-
-def map_ahead(
-    pool: ThreadPoolExecutor, function: Callable[[A], B], items: Iterable[A], window: int = 2 * AT_ONCE
-) -> Iterator[B]:
-    """The results of `function`, in the order of `items`; at most `window` of them are under way or wait."""
-    waiting: deque[Future[B]] = deque()
-    try:
-        for item in items:
-            waiting.append(pool.submit(function, item))
-            if len(waiting) >= window:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-    finally:
-        for future in waiting:
-            future.cancel()
+            block, rows = [], 0
+    if block:
+        yield _joined(block)
 
 
 def _read_range(store: Store, records: Range) -> _RangeRead:
@@ -100,23 +77,14 @@ def _read_range(store: Store, records: Range) -> _RangeRead:
         files = [committed_files(store, record) for record in records]
         return _RangeRead(records, files, {table: range_rows(store, records, table) for table in TABLES})
     (record,) = records
-    tables = {table: _read_table(store, record, table) for table in TABLES if record.tables[table].rows}
+    tables = {
+        table: read_range_file(store, record, _table_path(record, table)) for table in TABLES if record.tables[table]
+    }
     return _RangeRead(records, [record.files], tables)
 
 
-def _read_table(store: Store, record: CommitRecord, table: str) -> bytes:
-    """The bytes of a published file. Raises CorruptError naming one that is missing or altered."""
-    path = range_table_path(record.span.start, table, record.span.retry)
-    entry = next((file for file in record.files if file.path == path), None)
-    if entry is None:
-        raise CorruptError(f"the commit of the range from scene {record.span.start} names no {path}")
-    try:
-        data = store.read(path)
-    except FileNotFoundError as error:
-        raise CorruptError(f"{path} is named by a commit and is neither staged nor published") from error
-    if hashlib.sha256(data).hexdigest() != entry.sha256:
-        raise CorruptError(f"{path} does not match the SHA-256 in its commit: restore it from a copy")
-    return data
+def _table_path(record: CommitRecord, table: str) -> str:
+    return range_table_path(record.span.start, table, record.span.retry)
 
 
 def _joined(block: Sequence[_RangeRead]) -> Block:
@@ -155,8 +123,8 @@ def _decoded(read: _RangeRead, table: str) -> pa.Table:
     data = read.tables[table]
     if isinstance(data, pa.Table):
         return data
-    span, awaited = read.records[0].span, read.records[0].tables[table].rows
-    path = range_table_path(span.start, table, span.retry)
+    awaited = read.records[0].tables[table]
+    path = _table_path(read.records[0], table)
     rows = decode_rows(data, path)
     if len(rows) != awaited:
         raise CorruptError(f"{path} has {len(rows)} rows, and its commit says {awaited}")
@@ -200,3 +168,78 @@ def _check_spans(table: str, rows: pa.Table, parts: Sequence[tuple[Range, pa.Tab
 
 def _not_each_once(start: int) -> CorruptError:
     return CorruptError(f"the rows of the range from scene {start} do not hold each scene once")
+
+
+class PublishedFiles:
+    """Checks the files of ranges. What an object store holds is listed once and kept in an SQLite file in `folder`."""
+
+    def __init__(self, store: Store, folder: Path) -> None:
+        self._store = store
+        self._listed: sqlite3.Connection | None = None
+        if store.at_once > 1:  # one listing in place of a request for each file
+            with explain_full_disk():
+                self._listed = open_scratch(
+                    folder / "listed.sqlite", "CREATE TABLE files (path TEXT PRIMARY KEY, bytes INTEGER)"
+                )
+                self._listed.executemany(
+                    "INSERT OR REPLACE INTO files VALUES (?, ?)", ((one.key, one.bytes) for one in store.files(""))
+                )
+
+    def check(self, block: Block) -> None:
+        """Raises CorruptError naming a file that is missing or has another size than its commit says.
+
+        Tables that have rows were read already, with their checksums. A shape that a mix of stacks shares keeps the size
+        of whichever was first.
+        """
+        named = ((entry.path, entry.bytes, _is_exact(record, entry.path)) for record, entry in unread(block))
+        images = ((path, size, True) for path, size in stored_images(block))
+        for path, size, exact in chain(named, images):
+            found = self._size(path)
+            if found is None:
+                raise CorruptError(f"{path} is named by a commit and is neither staged nor published")
+            if found != size and exact:
+                raise CorruptError(f"{path} has {found} bytes, and its commit says {size}")
+
+    def close(self) -> None:
+        """Closes the file."""
+        if self._listed is not None:
+            self._listed.close()
+
+    def _size(self, path: str) -> int | None:
+        if self._listed is None:
+            return self._store.size(path)
+        row = self._listed.execute("SELECT bytes FROM files WHERE path = ?", (path,)).fetchone()
+        return row[0] if row else None
+
+
+def unread(block: Block) -> Iterator[tuple[CommitRecord, FileEntry]]:
+    """Tars, shapes and tables without rows."""
+    for record, entry in block.files:
+        folder, _, name = entry.path.rpartition("/")
+        table = name.removesuffix(".parquet")
+        if not folder.startswith(RANGES) or not record.tables[table]:
+            yield record, entry
+
+
+def stored_images(block: Block) -> Iterator[tuple[str, int]]:
+    """(path, bytes) of the images that are files of their own.
+
+    Raises CorruptError where a view lists what is no image, or one of another scene.
+    """
+    terms = block.ranges[0][0].terms
+    if terms.layout != "files":
+        return
+    listed = block.rows["views"].column("files").combine_chunks()
+    scenes = block.rows["views"].column("scene_id").combine_chunks().take(pc.list_parent_indices(listed)).to_pylist()
+    files = listed.flatten()
+    for path, size, scene in zip(
+        files.field("path").to_pylist(), files.field("bytes").to_pylist(), scenes, strict=True
+    ):
+        pose = pose_of_image(path)
+        if pose is None or pose // (2 * terms.pairs_per_scene) != scene:
+            raise CorruptError(f"the views of scene {scene} list {path!r}, which is not an image of that scene")
+        yield path, size
+
+
+def _is_exact(record: CommitRecord, path: str) -> bool:
+    return record.terms.fingerprint_mode == "strict" or not is_shape(path)

@@ -8,14 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
-from schemas.dataset.commit import CommitRecord
-from schemas.dataset.ledger import Ledger
+from schemas.dataset.commit import CommitRecord, Ledger
 from schemas.dataset.tables import DETERMINISTIC_TABLES
 from schemas.errors import CorruptError, InputError
 from workers.store.commit import code_of, list_codes, split_code
-from workers.store.committed_rows import iter_committed, range_rows, read_range
 from workers.store.images import decode_png
-from workers.store.ledger import list_commits
+from workers.store.ledger import iter_committed, list_commits, range_rows, read_range
 from workers.store.store import Store
 from workers.store.tars import read_tar
 

@@ -17,10 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
 from schemas.job.physics import Physics
-from schemas.scene.plan import ObjectStart, ScenePlan
-from schemas.scene.scene import Settled
+from schemas.scene.scene import ObjectStart, ScenePlan, Settled
 from workers.geometry.frames import invert, motion_between, transform
-from workers.physics.convex_parts.step import parts_of
+from workers.physics.convex_parts import parts_of
 from workers.physics.effects import is_convex
 from workers.physics.rigid_body import body_frame
 

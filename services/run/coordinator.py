@@ -1,11 +1,16 @@
-"""The coordinator: gives shards to Ray, a limited number at a time, reads every report and counts the attempts."""
+"""The coordinator: gives shards to Ray, a limited number at a time, reads every report and counts attempts and deaths.
+
+Ray tells at once of a worker whose connection was reset. Of one behind a network that was cut it says nothing until TCP
+gives up, a quarter of an hour later, although it counts the node as dead after one minute: so lost nodes are looked for here.
+"""
 
 import logging
 import pickle
 import signal
+import time
 import uuid
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,22 +20,121 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from schemas.dataset.commit import Span
 from schemas.dataset.layout import commit_path, staging_path
-from schemas.dataset.shard import Reason, ShardReport
+from schemas.dataset.shard import Blame, Reason, ShardReport
 from schemas.errors import CommitConflict, RunError, VersoError
-from services.run.deaths import Death, Deaths
-from services.run.lost_nodes import LostNodes, hosts_of
-from services.run.pattern import EnterShard, Pattern
-from services.run.processes import Process, send
+from services.run.joining import EnterShard, Pattern
+from services.run.machine import Process, send
+from services.run.metrics import Tally
 from services.run.progress import log_event, say
-from services.run.slots import Slots
-from services.run.stalls import Stall
-from services.run.tally import Tally
-from services.run.under_way import count_under_way
-from services.run.watchdog import Watchdog, end_worker_here, find_own_workers, scenes_in_progress
-from workers.store.attempt import TIMED_OUT, attempts_at, blamed_scene, host_part, retry_of_attempt
+from services.run.ray_cluster import Slots
+from services.run.watchdog import AttemptName, Stall, Watchdog, end_worker_here, find_own_workers, scenes_in_progress
+from workers.store.attempt import TIMED_OUT, attempts_at, blamed_scene, host_part, retry_of_attempt, sweep_attempt
+from workers.store.commit import read_record
 from workers.store.ledger import read_summary
 from workers.store.store import Store
-from workers.store.sweep import sweep_attempt
+
+NODE_PATIENCE = 5
+"""A node that is lost is seldom the scene's fault: so many times more of them than of other deaths are borne."""
+
+EXPLANATIONS: dict[Reason, str] = {
+    "time": "the scene took longer than run.scene_timeout_s each time: raise it, then run with --retry-failed",
+    "memory": "the worker ran out of memory each time: use fewer workers, then run with --retry-failed",
+    "killed": "the worker was killed or crashed in this scene each time: see OUT/_logs, then run with --retry-failed",
+}
+"""The stored detail of an environmental failure."""
+
+
+@dataclass(frozen=True)
+class Death:
+    """A worker that died with the range from `start`: in which scene, if it had begun one, and of what."""
+
+    start: int
+    scene: int | None
+    reason: Reason
+    message: str
+    with_node: bool = False
+    """Whether its whole node was lost."""
+
+
+class Deaths:
+    """The deaths of a run's workers, by the scene that they died in, or by the range where they had begun none."""
+
+    def __init__(self, attempts: int) -> None:
+        self._attempts = attempts
+        self._counts: Counter[tuple[bool, str, int]] = Counter()
+        self._blamed: dict[int, Blame] = {}
+
+    def count(self, death: Death) -> None:
+        """Counts a death, and blames its scene after too many. Raises RunError where workers die before they begin one."""
+        place = ("range", death.start) if death.scene is None else ("scene", death.scene)
+        self._counts[death.with_node, *place] += 1
+        deaths = self._counts[death.with_node, *place]
+        if deaths < self._attempts * (NODE_PATIENCE if death.with_node else 1):
+            return
+        if death.scene is None:
+            raise RunError(
+                f"the worker for the scenes from {death.start} died {deaths} times before it began one or while it committed "
+                f"({death.reason}: {death.message}): see `verso doctor`"
+            )
+        detail = EXPLANATIONS[death.reason]
+        self._blamed[death.scene] = Blame(scene_id=death.scene, reason=death.reason, detail=detail, attempts=deaths)
+
+    def blamed_in(self, spans: Iterable[Span]) -> tuple[Blame, ...]:
+        """Scenes of these ranges that are not to be tried again."""
+        return tuple(self._blamed[scene] for span in spans for scene in span.scene_ids if scene in self._blamed)
+
+
+def count_under_way(shards: Iterable[tuple[Span, ...]], in_progress: Mapping[int, int | None]) -> int:
+    """How many scenes of these shards are made: ranges before the last one in progress, and scenes before the one in progress.
+
+    in_progress: the scene that a worker makes now by the start of its range; None between scenes, which counts as none of it. A
+    range whose commit is under way is there too, while the next one is made.
+    """
+    return sum(_made_of(spans, in_progress) for spans in shards)
+
+
+def _made_of(spans: tuple[Span, ...], in_progress: Mapping[int, int | None]) -> int:
+    made = before = 0
+    for span in spans:
+        if span.start in in_progress:
+            scene_id, ids = in_progress[span.start], span.scene_ids
+            made = before + (ids.index(scene_id) if scene_id is not None and scene_id in ids else 0)
+        before += span.count
+    return made
+
+
+LOOK_EVERY_S = 2.0
+"""How often the cluster is asked for its nodes."""
+
+
+class LostNodes:
+    """Tells each host once when its last node is gone; `alive` names the hosts that have a node now."""
+
+    def __init__(self, alive: Callable[[], Collection[str]], clock: Callable[[], float] = time.monotonic) -> None:
+        self._alive = alive
+        self._clock = clock
+        self._known: set[str] = set()
+        self._looked_s = float("-inf")
+
+    def take(self) -> set[str]:
+        """The hosts that had a node at the last look and have none now."""
+        if self._clock() - self._looked_s < LOOK_EVERY_S:
+            return set()
+        self._looked_s = self._clock()
+        now = set(self._alive())
+        lost, self._known = self._known - now, now
+        return lost
+
+
+def hosts_of(store: Store, label: str, spans: Iterable[Span]) -> set[str]:
+    """The hosts whose workers have begun these ranges, by what they left: attempts with this label, and commits by them."""
+    names = []
+    for span in spans:
+        names += [(span.start, name) for name in attempts_at(store, span.start)]
+        record = read_record(store, span.start, span.retry)
+        names += [(span.start, record.attempt)] if record is not None else []
+    return {AttemptName(start, name).host for start, name in names if label in name}
+
 
 POLL_S = 0.5
 """Time of one wait for reports: Ctrl-C is seen at least this often."""

@@ -3,23 +3,19 @@
 import os
 import time
 
-from schemas.dataset.ledger import Ledger
-from schemas.durations import describe_seconds
-from schemas.errors import OutputError
+from schemas.dataset.commit import Ledger
+from schemas.errors import OutputError, describe_seconds
 from schemas.job.job import Job
-from services.job.record import adopt, refuse_foreign
-from services.merge.dataset_card import describe_doubts, describe_sources
-from services.run.cores import usable_cores
+from services.job.record import record_job, refuse_foreign
+from services.merge.dataset_card import describe_sources
 from services.run.lock import read_holder, shows_life
+from services.run.machine import usable_cores
 from services.run.range_planner import MAX_SHARD, plan_spans
-from services.run.step import RunRequest, open_catalogue, record_of
+from services.run.run_job import RunRequest, open_inputs
 from workers.assets.catalogue import Catalogue
-from workers.pipeline.context import open_worker
-from workers.pipeline.run_shard import run_scene
-from workers.pipeline.stopwatch import Stopwatch
-from workers.render.tiers import require_tier
+from workers.scene.context import Stopwatch, open_worker
+from workers.shard.run_shard import run_scene
 from workers.store.ledger import list_commits
-from workers.store.local import open_store
 from workers.store.store import Store
 
 TIMED_SCENES = 3
@@ -29,12 +25,11 @@ LONGEST_S = 10.0
 
 def describe_plan(request: RunRequest) -> list[str]:
     """Lines that tell what a run would do. Raises what the run would raise before its first scene."""
-    require_tier(request.job.drawn)
-    catalogue = open_catalogue(request)
-    store = open_store(request.out)
+    catalogue, store = open_inputs(request)
     _require_writable(store)
     refuse_foreign(store)
-    job = adopt(store, record_of(request, catalogue)).job
+    inputs = tuple(listing.sha256 for listing in catalogue.captures)
+    job = record_job(request.job, catalogue.digest, request.job_folder, inputs, out=store).job
     ledger = list_commits(store)
     left = plan_spans(job, ledger, request.retry_failed).scenes
     shards = job.run.shard_size or f"up to {MAX_SHARD}"
@@ -42,7 +37,7 @@ def describe_plan(request: RunRequest) -> list[str]:
         f"job {job.name}: {describe_scenes(job)}, seed {job.seed}",
         f"categories: {', '.join(f'{name} {weight:g}' for name, weight in sorted(job.categories.items()))}",
         *describe_sources(catalogue),
-        *describe_doubts(catalogue),
+        *catalogue.describe_doubts(),
         f"out: {request.out}, ranges of {job.range_size}, shards of {shards} scenes",
         *_describe_holder(store),
         *_describe_left(request, job, catalogue, ledger, left),

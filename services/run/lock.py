@@ -1,6 +1,7 @@
-"""An advisory lock: one coordinator at a time. Its heartbeat is judged by observed change, never by clocks.
+"""The hold on an output folder: one coordinator at a time, and an answer where the folder itself goes away.
 
-It saves two coordinators from doing the same work. Commits are correct without it.
+The lock is advisory: it saves two coordinators from doing the same work, and commits are correct without it. Its heartbeat is
+judged by observed change, never by comparing clocks.
 """
 
 import contextlib
@@ -15,8 +16,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from schemas.dataset.layout import LOCK_CLAIMS, LOCK_FILE
-from schemas.errors import InUseError, RunError
-from services.run.processes import read_process
+from schemas.errors import CorruptError, InUseError, MachineError, RunError, VersoError
+from services.run.machine import read_process
 from workers.store.store import Store
 
 
@@ -108,7 +109,7 @@ class Lock:
             return False
         self._mine = replace(self._mine, beat=self._mine.beat + 1)
         if found is not None:
-            self._store.write_whole(LOCK_FILE, _encode(self._mine), durable=False)
+            self._store.put(LOCK_FILE, _encode(self._mine), durable=False)
         elif not self._store.put_if_absent(LOCK_FILE, _encode(self._mine)):
             return False
         if self._is_late() and _claimant(self._store, self._mine) is not None:
@@ -234,7 +235,7 @@ def _take_over(store: Store, gone: Holder, mine: Holder, period_s: float) -> boo
     if read_holder(store) != gone:
         store.remove(claim)
         return False
-    store.write_whole(LOCK_FILE, _encode(mine))
+    store.put(LOCK_FILE, _encode(mine))
     if _claimant(store, gone) == mine:
         return True
     if _is_held_by(store, mine):
@@ -278,3 +279,51 @@ def _born(pid: int) -> str | None:
 def _now_s() -> float:
     """Seconds by a clock that nobody sets and that counts while the machine sleeps."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+REMOVAL_S = 3.0
+"""Time for a removal to end: its first missing file is met before its last one is gone."""
+
+LOOKS_LOST = (CorruptError, RunError, FileNotFoundError)
+"""What a run meets in a folder that is just being removed."""
+
+
+@contextlib.contextmanager
+def explain_lost_folder(root: Path | None) -> Iterator[None]:
+    """An error in the block that comes of the folder's removal is a MachineError that says so; nothing without a folder.
+
+    Work in a folder that is gone fails in many ways: a file is not found, an attempt looks as if another coordinator had
+    swept it. Parts of the folder may even have been made anew.
+    """
+    if root is None:
+        yield
+        return
+    folder = os.open(root, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield
+    except (VersoError, OSError) as error:
+        lost = _how_lost(folder, root)
+        deadline = time.monotonic() + REMOVAL_S
+        while lost is None and type(error) in LOOKS_LOST and time.monotonic() < deadline:
+            time.sleep(0.1)  # whoever removes it may not be done
+            lost = _how_lost(folder, root)
+        if lost:
+            raise MachineError(f"{root} was {lost} while the run worked in it: {_REMEDIES[lost]}") from error
+        raise
+    finally:
+        os.close(folder)
+
+
+_REMEDIES = {
+    "removed": "what it held is gone, start again to make it anew",
+    "moved": "move it back and start again, what is committed is kept",
+}
+
+
+def _how_lost(folder: int, root: Path) -> str | None:
+    """What became of the folder that was opened; None where it is still what is found at `root`."""
+    opened = os.fstat(folder)
+    with contextlib.suppress(OSError):
+        if os.path.samestat(opened, os.stat(root)):
+            return None
+    return "moved" if opened.st_nlink else "removed"

@@ -6,7 +6,7 @@ import logging.handlers
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 from tqdm import tqdm
 
 from schemas.dataset.layout import LOG_FOLDER
-from schemas.durations import describe_seconds
+from schemas.errors import describe_seconds
 from services.run.supervisor import tell
 from workers.store.file_system import refuse_link_out
 
@@ -72,6 +72,24 @@ class ProgressLine:
         """Ends the bar."""
         if self._bar is not None:
             self._bar.close()
+
+
+@contextmanager
+def show_counts(of: str, unit: str = "file") -> Iterator[Callable[[str, int, int], None]]:
+    """Within the block, what comes back shows numbers of several kinds: it takes the kind, how many are done, and of how many."""
+    lines = dict[str, ProgressLine]()
+
+    def watch(what: str, done: int, asked: int) -> None:
+        if what not in lines:
+            lines[what] = ProgressLine(asked, f"{of} {what}", unit)
+        lines[what].expect(asked)
+        lines[what].show(done)
+
+    try:
+        yield watch
+    finally:
+        for line in lines.values():
+            line.close()
 
 
 def _columns() -> int:

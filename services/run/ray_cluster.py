@@ -1,10 +1,21 @@
-"""The Ray that runs the work: a private one on this machine, or a running cluster."""
+"""The Ray that runs the work: a private one on this machine, or a running cluster; and how many shards it runs at once.
+
+A private Ray listens on loopback alone and answers who shows its token. Its folder is closed to other users, has a name that
+is short enough for sockets, and is removed once its owner is gone. On a cluster the slots change as nodes come and go.
+"""
 
 import contextlib
+import fcntl
+import math
 import os
+import secrets
 import shutil
 import socket
-from collections.abc import Iterator, Mapping, MutableMapping
+import stat
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +26,209 @@ from ray._raylet import AuthenticationTokenLoader, Config  # type: ignore[attr-d
 from ray.exceptions import RayError
 
 from schemas.errors import MachineError
-from services.run.cores import usable_cores
-from services.run.ray_environment import NOT_INHERITED, private_environment
-from services.run.ray_folder import private_folder
-from services.run.slots import PREFETCH, ClusterSlots, Slots
+from services.run.machine import usable_cores
 from services.run.supervisor import core_stderr, tell
+
+PREFETCH = 2
+"""Shards given to Ray for each slot: one that runs and one that waits, so that no slot is idle between two."""
+
+LOOK_EVERY_S = 2.0
+"""How often a cluster is asked for its cores."""
+
+
+@dataclass(frozen=True)
+class Slots:
+    """The number of shards that run at once, and that may be given to Ray at once."""
+
+    running: int
+    in_flight: int
+
+    def now(self) -> "Slots":
+        """The slots at this moment."""
+        return self
+
+
+def slots_of(cores: int, workers: int | None) -> Slots:
+    """The slots of a cluster with that many cores, at least one: `workers` where that is less.
+
+    Any free core would start a waiting shard, so none may wait where there are fewer workers than cores.
+    """
+    cores = max(1, cores)
+    return Slots(workers, workers) if workers and workers < cores else Slots(cores, PREFETCH * cores)
+
+
+@dataclass(frozen=True)
+class ClusterSlots(Slots):
+    """The slots of a cluster as they are at first; `look` tells those of the moment."""
+
+    look: Callable[[], Slots]
+
+    @classmethod
+    def of(
+        cls, count_cores: Callable[[], int], workers: int | None, clock: Callable[[], float] = time.monotonic
+    ) -> "ClusterSlots":
+        """The slots of a cluster whose cores `count_cores` counts; it is asked every few seconds."""
+        known = slots_of(count_cores(), workers)
+        at_s = clock()
+
+        def look() -> Slots:
+            nonlocal known, at_s
+            if clock() - at_s >= LOOK_EVERY_S:
+                known, at_s = slots_of(count_cores(), workers), clock()
+            return known
+
+        return cls(known.running, known.in_flight, look)
+
+    def now(self) -> Slots:
+        """The slots that the cluster has now: at least one, also while it has no node."""
+        return self.look()
+
+
+@dataclass(frozen=True)
+class SharedSlots(Slots):
+    """Slots that several jobs share evenly, as many as `jobs` tells at the moment."""
+
+    whole: Slots
+    jobs: Callable[[], int]
+
+    @classmethod
+    def of(cls, whole: Slots, jobs: Callable[[], int]) -> "SharedSlots":
+        """A share of all slots of a cluster."""
+        return cls(whole.running, whole.in_flight, whole, jobs)
+
+    def now(self) -> Slots:
+        """With other jobs an even share, rounded up, of which none waits in Ray: it would take another job's turn."""
+        whole, jobs = self.whole.now(), self.jobs()
+        if jobs <= 1:
+            return whole
+        share = math.ceil(whole.running / jobs)
+        return Slots(share, share)
+
+
+def private_environment() -> dict[str, str]:
+    """The variables that every process of one private Ray starts with; each call makes a new token."""
+    return {
+        # Who does not show the token is refused. The mode is said outright: left open, Ray takes a token from the home
+        # folder, or leaves one there; and another variable could have it ask Kubernetes who the caller is.
+        "RAY_AUTH_MODE": "token",
+        "RAY_AUTH_TOKEN": secrets.token_hex(32),
+        "RAY_ENABLE_K8S_TOKEN_AUTH": "false",
+        # No cluster, so this node's address is loopback, and every process binds to that. Otherwise Ray replaces
+        # 127.0.0.1 by the machine's own address, and most of its processes listen on all of them.
+        "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+        "RAY_USAGE_STATS_ENABLED": "0",
+        # A GCS of this machine that is gone does not come back, as a cluster's may: its clients end after this time, which
+        # is 60 s otherwise. So do the agents of a Ray whose other processes were killed.
+        "RAY_gcs_rpc_server_reconnect_timeout_s": "15",
+    }
+
+
+NOT_INHERITED = ("RAY_REDIS_ADDRESS",)
+"""Variables of the user's that would tie a private Ray to another one."""
+
+
+PREFIX = "vr-"
+
+OWNER = "owner"
+"""A file that the owner keeps locked. The kernel unlocks it when the process ends, however that happens."""
+
+INNER = "r"
+"""What Ray gets. It opens its own folder to every user (0777), so it gets one inside a folder that nobody else enters."""
+
+SOCKET_BYTES = 107
+"""The longest name of a Unix socket on Linux."""
+
+SESSION_BYTES = len("/session_2026-01-01_00-00-00_000000_4194304/sockets/plasma_store")
+"""What Ray puts behind the name of its folder; 4194304 is the largest process id."""
+
+MAX_BASE_BYTES = SOCKET_BYTES - SESSION_BYTES - len(f"/{PREFIX}12345678/{INNER}")
+"""The longest temporary folder that has room for a private Ray's."""
+
+OTHERS = (Path("/tmp"), Path("/var/tmp"), Path("/dev/shm"))
+"""Where to go when the user's temporary folder has too long a name."""
+
+
+@contextlib.contextmanager
+def private_folder() -> Iterator[Path]:
+    """An empty folder that no other user can enter; removed when the block ends.
+
+    Folders of processes that are gone are removed first. Raises MachineError where no place has a name short enough.
+    """
+    places = _places()
+    for place in places:
+        remove_dead(place)
+    folder, owner = _make(places)
+    try:
+        yield folder / INNER
+    finally:
+        _remove(folder)
+        os.close(owner)
+
+
+def remove_dead(place: Path) -> None:
+    """Removes this user's folders below `place` whose owner does not live."""
+    for folder in place.glob(f"{PREFIX}*"):
+        # Locked by a process that lives, or not one of these folders, or removed by another process meanwhile.
+        with contextlib.suppress(OSError):
+            _remove_if_dead(folder)
+
+
+def _places() -> list[Path]:
+    """The user's temporary folder if its name is short enough, then the others. Raises MachineError if none exists."""
+    try:
+        wanted = Path(tempfile.gettempdir())
+    except FileNotFoundError as error:
+        raise MachineError(f"{error.strerror}: set TMPDIR to one that can be written") from error
+    places = [place for place in (wanted, *OTHERS) if len(os.fsencode(place)) <= MAX_BASE_BYTES]
+    return list(dict.fromkeys(places))
+
+
+def _make(places: Sequence[Path]) -> tuple[Path, int]:
+    """A folder in the first place that takes one, and the open file that shows that its owner lives."""
+    errors = []
+    for place in places:
+        try:
+            folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=place))
+            (folder / INNER).mkdir()
+            return folder, _lock(folder)
+        except OSError as error:
+            errors.append(f"{place} ({error.strerror or error})")
+    wanted = tempfile.gettempdir()
+    tried = f"; cannot be written: {', '.join(errors)}" if errors else ""
+    raise MachineError(
+        f"no place for Ray's sockets: the name of {wanted} has {len(os.fsencode(wanted))} bytes, at most {MAX_BASE_BYTES} "
+        f"fit{tried}: set TMPDIR to a writable folder with a short name"
+    )
+
+
+def _lock(folder: Path) -> int:
+    """Locks the owner's file. It gets its name when it is locked, so that nobody ever finds it unlocked before."""
+    unnamed = folder / f"{OWNER}.new"
+    file = os.open(unnamed, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    unnamed.rename(folder / OWNER)
+    return file
+
+
+def _remove_if_dead(folder: Path) -> None:
+    """Raises OSError where the owner lives, or where the folder is none of this user's."""
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
+        return
+    file = os.open(folder / OWNER, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _remove(folder)
+    finally:
+        os.close(file)
+
+
+def _remove(folder: Path) -> None:
+    """Removes a folder, the owner's file last: what a process that is just ending wrote meanwhile is found again."""
+    shutil.rmtree(folder / INNER, ignore_errors=True)
+    if not (folder / INNER).exists():
+        shutil.rmtree(folder, ignore_errors=True)
+
 
 OBJECT_STORE_BYTES = 128 * 2**20
 """Images never cross Ray, so its shared memory can be small."""

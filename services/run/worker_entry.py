@@ -1,21 +1,193 @@
-"""Where a shard's task enters a worker: refuses a worker that would make other bytes, then loads what makes scenes.
+"""Where a shard's task enters a worker: looks at the node, refuses one that would make other bytes, then loads what makes scenes.
 
-What it is given is packed, so that Ray unpacks bytes and text alone: nothing of this project loads before the check, and a
-node with other code is told as that. Ray itself loads numpy to unpack any argument, so what is checked is the environment
-that the process was started with.
+What it is given is packed, so that Ray unpacks bytes and text alone: nothing heavy of this project loads before the check, and
+a node with other code is told as that. Ray itself loads numpy to unpack any argument, so what is checked is the environment
+that the process was started with. `see` needs the standard library alone: it also runs on nodes that may lack this project.
 """
 
+import json
 import os
 import pickle
+import socket
 import time
+import uuid
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from services.run.sight import see
-from services.run.worker_terms import WorkerTerms, refusal_of_worker
+from schemas.environment import FOR_SPEED, ON_X86_64_V3, STACK_ENVIRONMENT, X86_64_V3
+from schemas.errors import FingerprintError, MachineError, OutputError, VersoError
 
 if TYPE_CHECKING:
     from schemas.dataset.shard import ShardReport
+
+
+LOOK_S = 3.0
+"""Time for a file that was just written to be seen through a network file system."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A node as one of its processes saw it."""
+
+    host: str
+    flags: frozenset[str]
+    """Feature flags of its processor."""
+    environment: dict[str, str]
+    """Of the variables that were asked about, those that the process was started with."""
+    code: str
+    """Digest of the project's code there; empty where it cannot be imported."""
+    no_code: str = ""
+    """Why it cannot."""
+    folder: str = ""
+    """What is wrong with the output folder there; empty where nothing is."""
+
+
+def processor_flags(cpuinfo: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
+    """Feature flags of this machine's first core, from Linux; empty where it does not list them."""
+    try:
+        with cpuinfo.open() as lines:
+            first = next((line for line in lines if line.startswith("flags")), "")
+    except OSError:
+        return frozenset()
+    return frozenset(first.partition(":")[2].split())
+
+
+def start_environment(names: Iterable[str], environ: Path = Path("/proc/self/environ")) -> dict[str, str]:
+    """Of these variables, those that this process was started with: what libraries read that load before our code."""
+    lines = (line.decode(errors="replace").partition("=") for line in environ.read_bytes().split(b"\0"))
+    started = {name: value for name, _, value in lines}
+    return {name: started[name] for name in names if name in started}
+
+
+def look_at_folder(proof: str, token: str, patience_s: float = LOOK_S) -> str:
+    """What is wrong with the folder of the file `proof`, which holds `token` for every node that sees it; or nothing."""
+    folder, deadline = os.path.dirname(proof), time.monotonic() + patience_s
+    while (held := _token_in(proof)) != token:
+        if time.monotonic() > deadline:
+            if not os.path.isdir(folder):
+                return "there is no such folder"
+            return "it is another folder" if held is None else "it holds the lock of another run"
+        time.sleep(0.1)
+    return _why_not_writable(folder)
+
+
+def _token_in(proof: str) -> str | None:
+    try:
+        held = json.loads(Path(proof).read_bytes())
+        return str(held["token"])
+    except (OSError, ValueError, KeyError, TypeError):  # a file that is just being replaced, too
+        return None
+
+
+def _why_not_writable(folder: str) -> str:
+    scratch = os.path.join(folder, "_staging", "_tmp", f"node-{uuid.uuid4().hex}")
+    try:
+        os.makedirs(os.path.dirname(scratch), exist_ok=True)
+        os.close(os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644))
+        os.unlink(scratch)
+    except OSError as error:
+        return f"it cannot be written ({error.strerror})"
+    return ""
+
+
+def _read_code() -> tuple[str, str]:
+    """(the digest of the project's code, "") or ("", why it cannot be imported)."""
+    try:
+        from workers.shard.code import code_digest
+    except ImportError as error:
+        return "", str(error)
+    return code_digest(), ""
+
+
+def see(names: Iterable[str], proof: str, token: str) -> Sight:
+    """This process's node; `proof` is empty where the output is no folder."""
+    code, no_code = _read_code()
+    folder = look_at_folder(proof, token) if proof else ""
+    return Sight(socket.gethostname(), processor_flags(), start_environment(names), code, no_code, folder)
+
+
+VARIABLES = (*STACK_ENVIRONMENT, *ON_X86_64_V3)
+"""The variables that a worker must have as the driver has them."""
+
+
+@dataclass(frozen=True)
+class WorkerTerms:
+    """What every worker of a run must have: the driver's environment, code and output folder."""
+
+    environment: tuple[tuple[str, str], ...]
+    code: str
+    driver: str
+    """The driver's host."""
+    out: str = ""
+    proof: str = ""
+    """A file that only a node which sees the driver's output folder can read `token` from; empty for an object store."""
+    token: str = ""
+
+
+def worker_environment(environ: Mapping[str, str]) -> dict[str, str]:
+    """The variables that a driver with this environment gives to the workers of a cluster."""
+    own = {name: value for name, value in FOR_SPEED.items() if environ.get(name) == value}
+    return own | {name: environ[name] for name in VARIABLES if name in environ}
+
+
+def refusal_of(terms: WorkerTerms, node: Sight) -> VersoError | None:
+    """The error that refuses a node; None where it may work."""
+    return _processor(terms, node) or _code(terms, node) or _folder(terms, node)
+
+
+def refusal_of_worker(terms: WorkerTerms, node: Sight) -> VersoError | None:
+    """The same for a worker, whose environment counts too."""
+    return _processor(terms, node) or _environment(terms, node) or _code(terms, node) or _folder(terms, node)
+
+
+def _processor(terms: WorkerTerms, node: Sight) -> VersoError | None:
+    missing = sorted(X86_64_V3 - node.flags)
+    if not missing or not ON_X86_64_V3.items() <= set(terms.environment):
+        return None
+    return MachineError(
+        f"the processor of {node.host} is below x86-64-v3 (no {', '.join(missing)}), and that of {terms.driver}, where the run "
+        f"was started, is not: they do not make the same bytes. Take {node.host} out of the cluster, or use machines of one kind"
+    )
+
+
+def _environment(terms: WorkerTerms, node: Sight) -> VersoError | None:
+    wrong = [(name, node.environment.get(name), value) for name, value in terms.environment]
+    told = [f"{name} is {_quoted(found)} there and {value!r} here" for name, found, value in wrong if found != value]
+    if not told:
+        return None
+    return FingerprintError(
+        f"a worker on {node.host} has not the environment of the run on {terms.driver}, on which bytes depend: "
+        f"{'; '.join(told)}. Set it for `ray start` on {node.host} (deploy/Dockerfile has the list), and see that nothing "
+        "there changes it"
+    )
+
+
+def _quoted(value: str | None) -> str:
+    return "not set" if value is None else repr(value)
+
+
+def _code(terms: WorkerTerms, node: Sight) -> VersoError | None:
+    if node.code == terms.code:
+        return None
+    have = f"has code {node.code[:12]}" if node.code else f"has no code of this project ({node.no_code})"
+    return FingerprintError(
+        f"{node.host} {have}, and {terms.driver}, where the run was started, has {terms.code[:12]}: install the same wheel "
+        "or image on every node, then start Ray there again"
+    )
+
+
+def _folder(terms: WorkerTerms, node: Sight) -> VersoError | None:
+    if not node.folder:
+        return None
+    return OutputError(
+        f"{node.host} does not share the output folder {terms.out} with {terms.driver}, where the run was started: "
+        f"{node.folder}. Give --out a folder that every node mounts at the same path (NFS), or an object store "
+        "(--out s3://BUCKET/NAME --set output.layout=tar); nothing was made"
+    )
+
 
 DRAIN = "VERSO_DRAIN"
 """The variable that names a file which exists once this node is to end: no range is begun then."""
@@ -29,7 +201,7 @@ def enter_shard(terms: WorkerTerms, order: bytes, catalogue: bytes) -> "ShardRep
     if is_draining():
         time.sleep(DRAINED_PAUSE_S)
     check_worker(terms)
-    from workers.pipeline.run_shard import run_shard
+    from workers.shard.run_shard import run_shard
 
     return run_shard(pickle.loads(order), pickle.loads(catalogue), is_draining)
 

@@ -13,9 +13,8 @@ from pathlib import Path
 import pytest
 
 from schemas.errors import VersoError
-from tests.crash_states import Disk, losses, write_tree
-from tests.disk_recorder import recorded
-from tests.made_up_runs import FIRST, RANGE, STOP, broken_promises, contents, leftovers, make_dataset, settings_of
+from tests.kit.crash_states import Disk, losses, recorded, write_tree
+from tests.kit.made_up_runs import FIRST, RANGE, STOP, broken_promises, contents, leftovers, make_dataset, settings_of
 from tests.made_up_scenes import attempt_at, failed_scene, small_scene
 from workers.store import attempt as attempt_module
 from workers.store.local import LocalStore
@@ -53,9 +52,9 @@ def littered(root: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(attempt_module, "publish", lambda *_: None)
         assert attempt_at(store, FIRST, FIRST + RANGE, settings, small_scene).commit().won
-    store.fence(f"_staging/{FIRST:010d}/{fenced.name}")
+    store.revoke(f"_staging/{FIRST:010d}/{fenced.name}")
     attempt_at(store, FIRST + RANGE, STOP, settings, small_scene)
-    store.write_whole("_staging/_tmp/.dead", b"x")
+    store.put("_staging/_tmp/.dead", b"x")
     assert store.size(f"_staging/{FIRST:010d}/{loser.name}/_current") is not None
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from schemas.errors import VersoError
-from tests.disk_faults import unflushed
-from tests.made_up_runs import broken_promises, contents, leftovers, make_dataset
+from tests.kit.faults import unflushed
+from tests.kit.made_up_runs import broken_promises, contents, leftovers, make_dataset
 from workers.store.local import LocalStore
 
 __all__ = ["unflushed"]

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from services.job.read import load_job
+from services.job.job_file import load_job
 from tests.chaos.test_random_kills import digest_of, running
 from tests.datasets import faults_of, run_here
-from tests.killed_runs import processes_with
+from tests.kit.killed_runs import processes_with
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -12,9 +12,8 @@ from obstore.store import MemoryStore
 
 from schemas.dataset.layout import staging_path
 from schemas.errors import VersoError
-from tests.bucket_faults import Fault, requests
-from tests.disk_faults import Killed, unflushed
-from tests.made_up_runs import FIRST, RANGE, STOP, make_dataset, settings_of
+from tests.kit.faults import Fault, Killed, requests, unflushed
+from tests.kit.made_up_runs import FIRST, RANGE, STOP, make_dataset, settings_of
 from tests.made_up_scenes import attempt_at, failed_scene, small_scene
 from workers.store import attempt as attempt_module
 from workers.store.local import LocalStore
@@ -62,7 +61,7 @@ def littered(store: ObjectStore) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(attempt_module, "publish", lambda *_: None)
         assert attempt_at(store, FIRST, FIRST + RANGE, settings, small_scene).commit().won
-    store.fence(staging_path(FIRST, fenced.name))
+    store.revoke(staging_path(FIRST, fenced.name))
     attempt_at(store, FIRST + RANGE, STOP, settings, small_scene)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.killed_runs import EndedRun, chain_of, disturb_at_first_commit, kill_processes
+from tests.kit.killed_runs import EndedRun, chain_of, disturb_at_first_commit, kill_processes
 
 pytestmark = [pytest.mark.ray, pytest.mark.minute]
 

@@ -13,26 +13,23 @@ from schemas.dataset.commit import Span
 from schemas.dataset.layout import FENCED, STAGING, staging_path
 from schemas.dataset.shard import ShardOrder
 from schemas.errors import RunError
-from services.job.read import validate_job
-from services.merge.step import merge
+from services.job.job_file import validate_job
+from services.merge.merge import merge
 from services.run import coordinator as module
 from services.run.coordinator import Coordinator, Limits
-from services.run.pattern import Pattern
+from services.run.joining import Pattern
+from services.run.metrics import Tally
 from services.run.range_planner import committed_ranges, plan_ranges
-from services.run.slots import Slots
-from services.run.tally import Tally
-from services.run.worker_terms import WorkerTerms
-from tests.bucket_faults import REQUESTS, requests
-from tests.disk_faults import unflushed
+from services.run.ray_cluster import Slots
+from services.run.worker_entry import WorkerTerms
+from tests.kit.faults import REQUESTS, check_published, requests, unflushed
 from tests.made_up_scenes import attempt_at, small_scene, terms
-from tests.published_files import check_published
 from workers.assets.catalogue import Catalogue
-from workers.store.attempt import Attempt, attempts_at, begin_attempt
+from workers.store.attempt import Attempt, attempts_at, begin_attempt, sweep
 from workers.store.commit import publish, read_record
-from workers.store.committed_rows import list_commits
+from workers.store.ledger import list_commits
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
-from workers.store.sweep import sweep
 
 LABEL = "ours"
 TAR = terms(layout="tar", range_size=2)
@@ -43,7 +40,7 @@ WORKER = """
 import os, sys
 from schemas.dataset.commit import Span
 from schemas.errors import VersoError
-from tests.disk_faults import unflushed
+from tests.kit.faults import unflushed
 from tests.made_up_scenes import small_scene, terms
 from workers.store.attempt import begin_attempt
 from workers.store import file_system

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.killed_runs import ROOT, processes_with
+from tests.kit.killed_runs import ROOT, processes_with
 
 pytestmark = pytest.mark.ray
 

@@ -11,10 +11,8 @@ from obstore.store import MemoryStore
 
 from schemas.errors import VersoError
 from services.run.lock import hold_lock
-from tests.bucket_faults import REQUESTS, requests
-from tests.disk_faults import disk
-from tests.lost_locks import STILL, taken_over
-from tests.made_up_runs import FIRST, RANGE, STOP, broken_promises, make_dataset, settings_of
+from tests.kit.faults import REQUESTS, STILL, disk, requests, taken_over
+from tests.kit.made_up_runs import FIRST, RANGE, STOP, broken_promises, make_dataset, settings_of
 from tests.made_up_scenes import attempt_at, small_scene
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore

@@ -13,13 +13,12 @@ from typing import Any
 import pytest
 
 from schemas.errors import MachineError
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.read.query import query
 from services.run import coordinator
-from services.run.ray_cluster import private_ray
-from services.run.slots import Slots
-from services.run.step import RunRequest, run_job
-from tests.killed_runs import disturbed_scene
+from services.run.ray_cluster import Slots, private_ray
+from services.run.run_job import RunRequest, run_job
+from tests.kit.killed_runs import disturbed_scene
 from workers.store.local import LocalStore
 
 pytestmark = [pytest.mark.ray, pytest.mark.minute]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.containers import build_image, local_digest, once
+from tests.kit.containers import build_image, local_digest, once
 
 
 @pytest.fixture(scope="session")

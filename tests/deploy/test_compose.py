@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.containers import (
+from tests.kit.containers import (
     IMAGE,
     JOB,
     SCENES,

@@ -7,8 +7,8 @@ import jsonschema
 import pytest
 import yaml
 
-from tests.containers import ROOT, must, run
 from tests.json_shapes import TEXT, TRUTH, closed, each
+from tests.kit.containers import ROOT, must, run
 
 FILE = ROOT / "docker-compose.yml"
 

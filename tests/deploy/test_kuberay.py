@@ -11,8 +11,8 @@ import jsonschema
 import pytest
 import yaml
 
-from tests.containers import ROOT
 from tests.json_shapes import TEXT, TRUTH, closed, each
+from tests.kit.containers import ROOT
 
 FILE = ROOT / "deploy" / "kuberay" / "rayjob.yaml"
 

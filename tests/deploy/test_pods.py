@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.containers import IMAGE, JOB, SCENES, Done, digest_of, docker, must, wait_for
+from tests.kit.containers import IMAGE, JOB, SCENES, Done, digest_of, docker, must, wait_for
 
 pytestmark = [pytest.mark.docker, pytest.mark.timeout(600)]
 

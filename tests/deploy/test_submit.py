@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.bare_cluster import ROOT, BareCluster, bare_cluster
+from tests.kit.ray_head import ROOT, BareCluster, bare_cluster
 
 SUBMIT = str(ROOT / "deploy" / "submit.py")
 JOB = "name: shapes\nseed: 2024\nscenes: 4\ncategories: [box, can]\nrun: {range_size: 2}\n"

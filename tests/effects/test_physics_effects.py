@@ -8,18 +8,18 @@ import pytest
 import trimesh
 
 from schemas.errors import SettleError
-from schemas.scene.plan import ObjectStart
+from schemas.scene.scene import ObjectStart
 from tests.effects.physics_cases import PHYSICS
 from tests.effects.physics_scenes import drop_on, facts_with, is_still, moved_from, moved_when_forced, settled
 from tests.effects.scenes import Setting, facts_of
 from tests.hard_cases.bodies import built_in, cube, mug_on_peg, over_edge, rod
 from tests.hard_cases.drops import EDGE_M, X, Y, drop, level, lowered, ring, turn
 from tests.hard_cases.measures import Z
+from tests.kit.shapes import asset_of
 from tests.physics.settling import settle_single
-from tests.shapes import asset_of
 from workers.geometry.frames import transform
-from workers.physics.separation import Form, find_gaps_m
-from workers.plan.effects import PHYSICS_EFFECTS, Facts, plan_effects
+from workers.physics.placement import Form, find_gaps_m
+from workers.scene.effects import PHYSICS_EFFECTS, Facts, plan_effects
 
 pytestmark = pytest.mark.minute
 

@@ -8,7 +8,7 @@ import trimesh
 from schemas.base import Array
 from schemas.scene.shape import Asset
 from tests.hard_cases.outside import SIDE_M, enter, obj, of
-from tests.shapes import box
+from tests.kit.shapes import box
 
 S = SIDE_M
 

@@ -11,7 +11,7 @@ from tests.hard_cases.case import FALL, SETTLE, Case
 from tests.hard_cases.drops import EDGE_M, Drop, Y, level, turn, with_peg
 from tests.hard_cases.groups import TOUCH_M, Group, heavy, place, prism, put, together
 from tests.hard_cases.measures import below, both, height, heights, leaning, moved, tilts
-from tests.shapes import asset_of, box
+from tests.kit.shapes import asset_of, box
 
 BOARD_M = (0.3, 0.04, 0.01)
 STAND_M, STAND_HALF_M = 0.05, 0.005

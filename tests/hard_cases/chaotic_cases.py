@@ -18,7 +18,7 @@ from tests.hard_cases.groups import Group, dominoes, pile, put, together, tray
 from tests.hard_cases.hollow_cases import BALL_M, at_the_bottom
 from tests.hard_cases.measures import Made as Objects
 from tests.hard_cases.measures import Measure, Rest, Z, apart, coms, on_a_face, tilt
-from tests.shapes import asset_of, box
+from tests.kit.shapes import asset_of, box
 from workers.geometry.frames import translation, uniform_rotation
 
 SEEDS = 20

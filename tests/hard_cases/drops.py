@@ -9,13 +9,13 @@ import shapely
 import trimesh
 
 from schemas.base import Array, frozen_array
-from schemas.scene.plan import ObjectStart, Table
+from schemas.scene.scene import ObjectStart, Table
 from schemas.scene.shape import Asset
-from tests.shapes import box, shape_of
-from tests.shapes import table as plain_table
+from tests.kit.shapes import box, shape_of
+from tests.kit.shapes import table as plain_table
 from workers.geometry.frames import pose, rotation_about, transform, translation
 from workers.geometry.hull import convex_hull
-from workers.physics.table_top import place_table, support_height
+from workers.physics.support import place_table, support_height
 
 EDGE_M = 0.7
 """Where every table here ends, along x."""

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from schemas.base import Array
-from tests.gravity import set_gravity
+from tests.kit.gravity import set_gravity
 from tests.physics.room import MARGIN_M, G, advance, at, box_body, drop, physics
 from workers.geometry.frames import pose, rotation_about, rotation_from_quaternion
 from workers.physics.rigid_body import Body

@@ -29,7 +29,7 @@ from tests.hard_cases.measures import (
     tilt,
     tilts,
 )
-from tests.shapes import asset_of, box
+from tests.kit.shapes import asset_of, box
 from workers.geometry.frames import transform
 
 

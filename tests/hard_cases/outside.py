@@ -12,7 +12,7 @@ from PIL import Image
 from schemas.base import Array
 from schemas.job.assets import Assets, FolderSource, MeshLimits
 from schemas.scene.shape import Asset
-from tests.shapes import box
+from tests.kit.shapes import box
 from tests.workers.assets.oracles import textured_cube, write
 from workers.assets.external.listing import Entry, hash_files
 from workers.assets.external.mesh import load_shape

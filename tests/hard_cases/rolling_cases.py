@@ -11,7 +11,7 @@ from tests.hard_cases.bodies import ball, built_in, cube, globe, rod
 from tests.hard_cases.case import EITHER, FALL, SETTLE, UNDEFINED, Case
 from tests.hard_cases.drops import EDGE_M, X, drop, level, slope, turn
 from tests.hard_cases.measures import Z, both, height, on_a_face, shift, tilt
-from tests.shapes import asset_of, box
+from tests.kit.shapes import asset_of, box
 
 SMOOTH = {"friction": 0.0, "rolling_friction": 0.0, "spinning_friction": 0.0}
 NO_ROLLING = {"rolling_friction": 0.0}

@@ -6,14 +6,14 @@ from functools import partial
 import trimesh
 
 from schemas.base import Array
-from schemas.scene.plan import Table
+from schemas.scene.scene import Table
 from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import ball, cube, rod
 from tests.hard_cases.case import SETTLE, Case
 from tests.hard_cases.drops import EDGE_M, Drop, X, Y, level, table_of, turn
 from tests.hard_cases.groups import FREE_M, Group, place, prism, put, together
 from tests.hard_cases.measures import Z, below, both, height, leaning, moved
-from tests.shapes import asset_of, box
+from tests.kit.shapes import asset_of, box
 
 WEDGE_M, WEDGE_KG = 0.25, 20.0
 """Length of a wedge's base, and its mass: what slides on it does not move it."""

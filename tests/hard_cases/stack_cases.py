@@ -22,7 +22,7 @@ from tests.hard_cases.groups import (
     tray,
 )
 from tests.hard_cases.measures import Measure, apart, below, both, heights, tilts
-from tests.shapes import asset_of, box
+from tests.kit.shapes import asset_of, box
 
 S = SMALL_M
 

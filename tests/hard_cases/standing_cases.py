@@ -10,7 +10,7 @@ from tests.hard_cases.bodies import built_in, cube, laptop_angles, laptop_leanin
 from tests.hard_cases.case import EITHER, SETTLE, Case
 from tests.hard_cases.drops import X, Y, drop, level, ring, turn
 from tests.hard_cases.measures import Z, both, flat, height, leaning, on_a_face, shift, tilt
-from tests.shapes import asset_of
+from tests.kit.shapes import asset_of
 
 HIGH = (
     Case("cube from 1 m", SETTLE, both(tilt(0.1), shift(0.1)), lambda: drop(cube(), level(), 1.0)),

@@ -7,7 +7,7 @@ from tests.hard_cases.bodies import cube, rod
 from tests.hard_cases.case import SETTLE, Case
 from tests.hard_cases.drops import X, drop, level, ring, turn
 from tests.hard_cases.measures import Measure, both, flat, height, leaning, shift, tilt
-from tests.shapes import asset_of, box
+from tests.kit.shapes import asset_of, box
 
 
 def plate(thick_m: float = 0.0005, side_m: float = 0.2) -> Asset:

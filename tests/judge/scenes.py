@@ -9,9 +9,7 @@ from unittest import mock
 
 from schemas.errors import SceneError
 from schemas.job.physics import Physics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart, ScenePlan
-from schemas.scene.scene import Settled
+from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled
 from schemas.scene.shape import Mesh
 from services.read.referee import hold_scene
 from tests.judge.judge import Thing, Verdict, judge
@@ -19,7 +17,7 @@ from workers.geometry.frames import transform
 from workers.physics import settle
 from workers.physics.effects import called_for
 from workers.physics.fall import FINEST
-from workers.physics.step import recheck_scene, settle_scene
+from workers.physics.settle import recheck_scene, settle_scene
 
 PARTS = ("release", "rest")
 """The parts of `workers.physics.settle` whose time is taken: what moves the objects, and what brings them to rest."""

@@ -28,7 +28,7 @@ def is_allowed(name: str) -> bool:
 def test_the_judge_imports_libraries_and_the_types_of_meshes_alone():
     for module in JUDGE:
         assert [name for name in imported(ROOM / f"{module}.py") if not is_allowed(name)] == []
-    assert not is_allowed("workers.physics.separation") and not is_allowed("trimesh")
+    assert not is_allowed("workers.physics.placement") and not is_allowed("trimesh")
 
 
 def test_loading_the_judge_loads_nothing_of_the_workers():

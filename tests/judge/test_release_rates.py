@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from tests.judge import release_rates
 from tests.judge.release_rates import LIFTS_MM, TILTS_DEG, compare, main
 from workers.assets.catalogue import open_catalogue

@@ -16,12 +16,17 @@ case "$*" in
   "-V") echo "Python 3.12.9" ;;
   "-I -") cat >/dev/null; [ -e "$FAULTS/wrong-version" ] && exit 1; readlink -f "$0" ;;
   "-I -c import ensurepip, venv") [ ! -e "$FAULTS/no-ensurepip" ] ;;
-  "-I -m venv "*) log "venv"; mkdir -p "${!#}/bin"; ln -s "$(readlink -f "$0")" "${!#}/bin/python"; echo "chatter" ;;
+  "-I -m venv "*) log "venv"; mkdir -p "${!#}/bin"; ln -s "$(readlink -f "$0")" "${!#}/bin/python"
+     printf '#!/bin/bash\necho layers\n' >"${!#}/bin/lint-imports"; chmod +x "${!#}/bin/lint-imports"; echo "chatter" ;;
   "-I -m pip --version") ;;
   "-I -m pip "*) log "$@"; echo "chatter"
      [ -e "$FAULTS/pip-fails" ] && exit 1
      [ -e "$FAULTS/pip-hangs" ] && { touch "$FAULTS/hanging"; sleep 60; }
      [ -e "$FAULTS/pip-is-slow" ] && sleep 0.5; true ;;
+  "-P -m services.cli.environment") echo "OMP_NUM_THREADS=1" ;;
+  "-m pytest "*) printf '%s|' pytest "${@:3}" "path=$PYTHONPATH" "threads=$OMP_NUM_THREADS" "in=$PWD"
+     exit "$(cat "$FAULTS/pytest" 2>/dev/null || echo 0)" ;;
+  "-m ruff "* | "-m mypy") echo "${@:2}"; [ ! -e "$FAULTS/$2-fails" ] ;;
   "-P -m services.cli.main"*) printf '%s|' "${@:4}" "path=${PYTHONPATH-}" "in=$PWD"
      [ ! -e "$FAULTS/exit" ] || exit "$(cat "$FAULTS/exit")" ;;
   *) echo "unexpected: $*" >&2; exit 99 ;;

@@ -14,16 +14,15 @@ from schemas.job.job import Job
 from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import cube
 from tests.hard_cases.groups import dominoes, pile, stack
+from tests.kit.shapes import asset_of, box, table
 from tests.physics.energy import Rise, watched, worst_of
 from tests.physics.population import try_scene
 from tests.physics.room import PHYSICS, G, physics
 from tests.physics.settling import settle_group, settle_single
-from tests.shapes import asset_of, box, table
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
-from workers.physics.table_top import place_table
-from workers.plan.randomness import SceneChance
-from workers.plan.step import draw_start
+from workers.physics.support import place_table
+from workers.scene.plan import SceneChance, draw_start
 
 TABLE = place_table(table())
 SEEDS = 20

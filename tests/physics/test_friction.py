@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from tests.gravity import set_gravity
+from tests.kit.gravity import set_gravity
 from tests.physics.room import MARGIN_M, PHYSICS, G, advance, at, box_body, drop, order, physics, slope
 
 MU = PHYSICS.friction**2

@@ -16,15 +16,13 @@ from schemas.base import Array
 from schemas.job.job import Job
 from schemas.job.physics import Physics
 from schemas.scene.shape import Asset
+from tests.kit.shapes import asset_of, box, table
 from tests.physics.room import PHYSICS, physics
 from tests.physics.settling import settle_single
-from tests.shapes import asset_of, box, table
 from workers.geometry.frames import pose, rotation_between, transform
 from workers.geometry.hull import convex_hull
-from workers.physics.rest_pose import DOWN, SAME_PLANE_M, support_margin
-from workers.physics.table_top import place_table
-from workers.plan.randomness import SceneChance
-from workers.plan.step import draw_start
+from workers.physics.support import DOWN, SAME_PLANE_M, place_table, support_margin
+from workers.scene.plan import SceneChance, draw_start
 
 TABLE = place_table(table())
 SIGNIFICANCE = 0.001

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from schemas.base import Array
-from tests.gravity import set_gravity
+from tests.kit.gravity import set_gravity
 from tests.physics.room import advance, at, box_body, drop, order, physics
 from workers.geometry.frames import rotation_from_quaternion
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from schemas.job.physics import Physics
-from tests.gravity import set_gravity
+from tests.kit.gravity import set_gravity
 from tests.physics.room import G, advance, at, box_body, drop, lean, order, physics, slope
 from workers.physics.rigid_body import MARGIN_M
 

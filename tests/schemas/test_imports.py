@@ -23,7 +23,7 @@ def test_importing_schemas_loads_neither_GL_nor_physics_nor_ray():
 
 
 def test_the_heavy_modules_are_found_by_this_test_where_they_are_loaded():
-    assert "pybullet" in loaded_after("import workers.physics.step")
+    assert "pybullet" in loaded_after("import workers.physics.settle")
 
 
 def test_the_command_line_explains_itself_without_loading_what_it_drives():

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.base import Pose, frozen_array
-from schemas.capture.estimate import Reconstruction
+from schemas.capture import Reconstruction
 from schemas.job.assets import Assets
 from schemas.job.captures import Board
 from schemas.scene.shape import Asset, Material, Part, Shape
 from workers.assets.builtin.make import shape_digest
-from workers.assets.external.topology import is_solid
+from workers.assets.external.mesh import is_solid
 from workers.assets.mass import mass_properties
 from workers.geometry.frames import translation
 

@@ -1,4 +1,4 @@
-"""The catalogue: every asset that a job can choose from.
+"""The catalogue: every asset that a job can choose from; and the choice of a scene's objects and table, loaded through a cache.
 
 What makes or reads a shape is imported where it is called: it loads trimesh, scipy and numba, which take longer than the rest of
 a command's start, and a coordinator of built-in shapes needs none of it.
@@ -6,6 +6,7 @@ a command's start, and a coordinator of built-in shapes needs none of it.
 
 import hashlib
 import json
+import sys
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -13,10 +14,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from cachetools import LRUCache
 
-from schemas.capture.listing import CaptureListing
+from schemas.capture import CaptureListing
 from schemas.errors import AssetSourceError
 from schemas.job.assets import (
+    CATEGORIES,
+    TABLE,
     Assets,
     FolderSource,
     MeshLimits,
@@ -25,7 +29,6 @@ from schemas.job.assets import (
     SplitShares,
     deciding_limits,
 )
-from schemas.job.category import CATEGORIES, TABLE
 from schemas.scene.shape import Asset
 from workers.assets.builtin.identity import VERSION, instance_id
 from workers.assets.watch import Watch, ignore
@@ -34,7 +37,12 @@ if TYPE_CHECKING:
     from workers.assets.external.listing import Listing
     from workers.assets.external.verdicts import Verdicts
 
+
 AnySource = ProceduralSource | ShapeNetSource | FolderSource
+
+
+DOUBTS = 3
+"""Files of a folder that a line of `Catalogue.describe_doubts` names."""
 
 
 @dataclass(frozen=True)
@@ -104,9 +112,29 @@ class Catalogue:
         listings = (listing for listing in (*self.objects, *self.tables) if listing is not None)
         return next((x.examples for x in listings if x.examples and str(x.folder) == folder), ())
 
-    def doubts(self) -> "list[Listing]":
-        """The listings with files that stand on another axis than `up` says."""
-        return [listing for listing in (*self.objects, *self.tables) if listing is not None and listing.doubts]
+    def describe_left_out(self) -> list[str]:
+        """One line for each folder with files that were left out: how many, and why, with the first of them."""
+        return [
+            f"left out of {folder}: {', '.join(f'{count} {reason}' for reason, count in reasons.items())}"
+            + (f"; {'; '.join(examples)}" if (examples := self.examples(folder)) else "")
+            for folder, reasons in self.skipped.items()
+        ]
+
+    def describe_doubts(self) -> list[str]:
+        """One line for each folder with files that stand on another axis than `up` says."""
+        lines = []
+        for listing in (*self.objects, *self.tables):
+            if listing is None or not listing.doubts:
+                continue
+            doubts = sorted(listing.doubts.items())
+            told = ", ".join(f"{path} on {axis}" for path, axis in doubts[:DOUBTS])
+            more = f" and {len(doubts) - DOUBTS} more" if len(doubts) > DOUBTS else ""
+            first = f"{{{json.dumps(doubts[0][0], ensure_ascii=False)}: {doubts[0][1]}}}"
+            remedy = (
+                f"if they lie on their side, set `up` of the source, such as {first}; `verso init` shows how they stand"
+            )
+            lines.append(f"{listing.folder}: files stand on another axis than `up` says: {told}{more}; {remedy}")
+        return lines
 
     def load(self, ref: InstanceRef) -> Asset:
         """An instance, made, or read in a limited process; MeshError where its mesh is refused or has changed."""
@@ -115,7 +143,7 @@ class Catalogue:
             from workers.assets.builtin.make import make_asset
 
             return make_asset(ref.category, settings, ref.index, self.assets.density_kg_m3)
-        from workers.assets.external.opening import load_asset_file
+        from workers.assets.external.verdicts import load_asset_file
 
         assert listing is not None
         entry = listing.entries[ref.category][ref.index]
@@ -133,9 +161,8 @@ def list_source(
     """What a source of files offers, None for built-in shapes; AssetSourceError where the folder cannot be used."""
     if isinstance(settings, ProceduralSource):
         return None
-    from workers.assets.external.folder import find_files
-    from workers.assets.external.opening import read_listing
-    from workers.assets.external.shapenet import find_models
+    from workers.assets.external.listing import find_files, find_models
+    from workers.assets.external.verdicts import read_listing
 
     if isinstance(settings, ShapeNetSource):
         return read_listing(settings, *find_models(settings, job_folder, categories), limits, watch)
@@ -159,7 +186,7 @@ def open_catalogue(
         listing = list_source(settings, job_folder, wanted, assets.limits, watch)
         if isinstance(settings, ProceduralSource) or listing is None:
             return None
-        from workers.assets.external.opening import check_listing
+        from workers.assets.external.verdicts import check_listing
 
         assert kept is not None
         return check_listing(settings, listing, assets, kept, watch)
@@ -251,3 +278,57 @@ def split_of(instance: str, shares: SplitShares) -> str:
     """`train`, `val` or `test` by the hash of the instance's id: all scenes of an instance fall into one split."""
     place = int.from_bytes(hashlib.sha256(instance.encode()).digest()[:8], "big") / 2.0**64
     return "train" if place < shares.train else "val" if place < shares.train + shares.val else "test"
+
+
+MAX_CACHED_INSTANCES = 10_000
+"""Sources with more built-in instances are not cached: instances hardly ever repeat."""
+CACHE_BYTES = 256 * 1024 * 1024
+"""Memory that the cached assets of a process may take."""
+
+
+def choose_object(catalogue: Catalogue, category: str, rng: np.random.Generator) -> InstanceRef:
+    """An instance of the category: a source by weight among those that have it, then one that is fit uniformly."""
+    offers = catalogue.offers(category)
+    if not offers:
+        raise AssetSourceError(f"no source offers {category!r}")
+    share = rng.random() * sum(settings.weight for _, settings, _ in offers)
+    chosen = offers[-1]
+    for offer in offers:
+        share -= offer[1].weight
+        if share < 0.0:
+            chosen = offer
+            break
+    return catalogue.draw(chosen[0], category, rng)
+
+
+def choose_table(catalogue: Catalogue, rng: np.random.Generator) -> InstanceRef:
+    """A table, chosen as objects are."""
+    return choose_object(catalogue, TABLE, rng)
+
+
+def load_asset(catalogue: Catalogue, ref: InstanceRef) -> Asset:
+    """The asset, from this process's cache if it is there; MeshError where its mesh is refused."""
+    key = (catalogue.digest, ref)
+    if key in _cache:
+        return _cache[key]
+    asset, settings = catalogue.load(ref), catalogue.settings(ref)
+    if not (isinstance(settings, ProceduralSource) and settings.instances > MAX_CACHED_INSTANCES):
+        _cache[key] = asset
+    return asset
+
+
+def asset_bytes(asset: Asset) -> int:
+    """Memory that an asset takes: its arrays, and about as much again for its hull, its joined mesh and its file."""
+    total = sys.getsizeof(asset)
+    for part in asset.shape.parts:
+        arrays = (part.vertices, part.faces, part.normals, part.uv, part.colors, part.material.texture)
+        total += 2 * sum(array.nbytes for array in arrays if array is not None)
+    return total
+
+
+def open_cache(capacity_bytes: int) -> LRUCache[tuple[str, InstanceRef], Asset]:
+    """An LRU cache of assets. An asset larger than the capacity counts as the capacity, so that one is always kept."""
+    return LRUCache(capacity_bytes, getsizeof=lambda asset: min(asset_bytes(asset), capacity_bytes))
+
+
+_cache = open_cache(CACHE_BYTES)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from schemas.scene.shape import Asset, Part
-from workers.geometry.bounds import bounds_of
-from workers.geometry.srgb import decode_srgb
+from workers.geometry.colour import decode_srgb
+from workers.geometry.mesh import bounds_of
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963

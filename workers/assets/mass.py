@@ -5,9 +5,9 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, frozen_array
 from schemas.scene.shape import MassProperties, Shape
-from workers.assets.external.topology import is_solid
-from workers.geometry.bounds import bounds_of
-from workers.geometry.jit import compiled
+from workers.assets.external.mesh import is_solid
+from workers.geometry.jit import compiled_for
+from workers.geometry.mesh import bounds_of
 
 
 def mass_properties(shape: Shape, density_kg_m3: float, shell_kg_m2: float) -> MassProperties:
@@ -57,7 +57,7 @@ def _corners(vertices: Array, faces: np.ndarray) -> tuple[Array, Array]:
     return middle, np.stack([np.take(local, faces[:, k], axis=1) for k in range(3)])
 
 
-@compiled
+@compiled_for("f8[:,::1], i8[:,::1], f8[::1]", "f8[:,::1], const(i8[:,::1]), f8[::1]")
 def _tetrahedra(vertices: Array, faces: NDArray[np.int64], middle: Array) -> tuple[Array, Array]:
     """The faces' corners measured from `middle` [3], [corner, axis, F], and six times the volumes [F] of their tetrahedra."""
     count = len(faces)
@@ -74,7 +74,7 @@ def _tetrahedra(vertices: Array, faces: NDArray[np.int64], middle: Array) -> tup
     return corners, det
 
 
-@compiled
+@compiled_for("f8[:,:,::1], f8[::1], f8[::1]")
 def _moment_terms(corners: Array, first: Array, second: Array) -> tuple[Array, Array]:
     """What `_assemble` adds up: [3, F] of the first moments, and [6, 4 F] of the second ones, in the order of `_PAIRS`."""
     count = len(first)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from schemas.base import Array, Pose
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled, compiled_for
 
 UP, DOWN = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])
 """The world's up, the floor's normal, and its down."""
@@ -56,7 +56,12 @@ def transform(T: Pose, points: Array) -> Array:
     return _transform(np.ascontiguousarray(T), np.ascontiguousarray(points))
 
 
-@compiled
+@compiled_for(
+    "f8[:,::1], f8[:,::1]",
+    "f8[:,::1], const(f8[:,::1])",
+    "const(f8[:,::1]), f8[:,::1]",
+    "const(f8[:,::1]), const(f8[:,::1])",
+)
 def _transform(T: Pose, points: Array) -> Array:
     moved = np.empty((len(points), 3))
     for n in range(len(points)):
@@ -131,18 +136,6 @@ def quaternion_from_rotation(R: Array) -> Array:
         q[i] = 1.0 + 2.0 * R[i, i] - trace
         q[j], q[m], q[3] = R[i, j] + R[j, i], R[i, m] + R[m, i], R[m, j] - R[j, m]
     return q / np.linalg.norm(q)
-
-
-@compiled
-def cross_each(one: Array, many: Array) -> Array:
-    """[N, K, 3]: the cross products of vectors [N, 3] with K each [N, K, 3]; `numpy.cross` takes five times as long."""
-    products = np.empty_like(many)
-    for n in range(len(one)):
-        a, b, c = one[n]
-        for k in range(many.shape[1]):
-            x, y, z = many[n, k]
-            products[n, k, 0], products[n, k, 1], products[n, k, 2] = b * z - c * y, c * x - a * z, a * y - b * x
-    return products
 
 
 @compiled

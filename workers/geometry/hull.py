@@ -10,11 +10,8 @@ from scipy.spatial import ConvexHull
 
 from schemas.base import Array, frozen_array
 from schemas.scene.shape import Hull, Shape
-from workers.geometry.bounds import bounds_of
-from workers.geometry.convexity import mesh_of
-from workers.geometry.first_equal import is_first
-from workers.geometry.jit import compiled
-from workers.geometry.manifold import hold_to_one_thread
+from workers.geometry.jit import compiled_for
+from workers.geometry.mesh import bounds_of, hold_to_one_thread, is_first, mesh_of
 
 THIN = 1e-4
 """Ratio of a cloud's least to its largest spread below which Qhull is used: manifold3d's hull leaves out points that stand
@@ -69,7 +66,7 @@ def hull_of(shape: Shape) -> Hull:
 _hulls: WeakKeyDictionary[Shape, Hull] = WeakKeyDictionary()
 
 
-@compiled
+@compiled_for("f8[:,::1]", "const(f8[:,::1])")
 def _scatter(points: Array) -> Array:
     """[3, 3]: the sum over points [N, 3] of the outer products of what they are from their mean."""
     mean, scatter = np.zeros(3), np.zeros((3, 3))
@@ -83,7 +80,7 @@ def _scatter(points: Array) -> Array:
     return scatter
 
 
-@compiled
+@compiled_for("f8[:,::1], i4[:,::1], f8")
 def _normals(points: Array, faces: NDArray[np.int32], least: float) -> Array:
     """[N, 3]: unit normals of the triangles of which twice the area is more than `least`."""
     normals, count = np.empty((len(faces), 3)), 0
@@ -114,7 +111,7 @@ def least_width_m(hull: Hull) -> float:
     return float(_least_width(hull.vertices, hull.normals))
 
 
-@compiled
+@compiled_for("const(f8[:,::1]), const(f8[:,::1])")
 def _least_width(points: Array, normals: Array) -> float:
     """The least, over unit normals [F, 3], of the length of points [N, 3] along one."""
     least, top, bottom = np.inf, 0, 0
@@ -135,7 +132,7 @@ def _least_width(points: Array, normals: Array) -> float:
     return least
 
 
-@compiled
+@compiled_for("f8[:,::1], const(f8[:,::1])")
 def depth_m(points: Array, normals: Array) -> float:
     """The least, over unit normals [F, 3], of how far points [N, 3] reach along one from the origin, metres.
 

@@ -1,99 +1,201 @@
 """Compilation by numba of loops that numpy could write only as many passes over memory.
 
 Without `fastmath`, so that sums are added in the order that is written, on every machine.
+
+**Kept on disk.** Compiled loops lie in a folder named by the digest of all code that a loop may be made of: numba compiles loops
+and constants of other files into a loop, but looks for changes in the loop's own file alone. Changed code has another folder.
+
+**Compiled together.** A loop may name the types that scenes call it with. Processes that start at once share these
+(`compile_planned`), each taking one file's loops at a time. All else is compiled when it is first called. Either way a file's
+loops are compiled by one process at a time, under the file's lock: of two at once, numba may keep the one's code as the other's.
 """
 
-import contextlib
+import fcntl
+import gc
+import hashlib
+import re
+import shutil
 from collections.abc import Callable, Iterator
-from types import CodeType
-from typing import Any, TypeVar, cast
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any, TypeVar, cast
 
 import numba
-import numpy as np
-from numba.core.caching import FunctionCache, IndexDataCacheFile, InTreeCacheLocator
+from numba.core import config, event
+
+from schemas.environment import cache_folder
 
 Loop = TypeVar("Loop", bound=Callable[..., object])
 
+ROOT = Path(__file__).resolve().parents[2]
+
+MADE_WITH_THE_CODE = ROOT / ".loops"
+"""Where an image has loops that were compiled when it was built. It may be read-only: they are copied from there."""
+
+_config: Any = config
 _njit: Any = numba.njit
-"""Its types lack `no_cfunc_wrapper`. What C code would call by a pointer, which none does, is a tenth of compiling."""
+_modules: set[str] = set()
+_planned: dict[str, list[tuple[Any, str]]] = {}
+
+
+def _digest() -> str:
+    """Of the place and the text of each file of the project that has a loop, and of all that these import."""
+    found = {path for path in (ROOT / "workers").rglob("*.py") if "\n@compiled" in path.read_text()}
+    ahead = list(found)
+    while ahead:
+        for module in re.findall(r"^from ((?:schemas|workers)[\w.]*) import", ahead.pop().read_text(), re.MULTILINE):
+            path = ROOT / f"{module.replace('.', '/')}.py"
+            if path.exists() and path not in found:
+                found.add(path)
+                ahead.append(path)
+    texts = sorted(f"{path}\0{path.read_text()}" for path in found)
+    return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]
+
+
+def _open_folder() -> Path | None:
+    """The folder of loops of this code, in `NUMBA_CACHE_DIR` or the user's cache; None where it cannot be written to."""
+    above = Path(_config.CACHE_DIR) if _config.CACHE_DIR else cache_folder("loops")
+    if above is None:
+        return None
+    folder = above / f"loops-{_digest()}"
+    made = MADE_WITH_THE_CODE / folder.name
+    try:
+        if made.is_dir() and not folder.exists():
+            shutil.copytree(made, folder, dirs_exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "writable").touch()
+    except OSError:
+        return None
+    _config.CACHE_DIR = str(folder)
+    return folder
+
+
+_folder = _open_folder()
+
+
+class _FileLocks(event.Listener):
+    """The locks of files with loops: one is held from where a loop of the file is compiled until that is kept.
+
+    numba tells where compiling starts, and saves before it leaves its own lock.
+    """
+
+    def __init__(self) -> None:
+        self._held: dict[str, IO[str]] = {}
+        self._depth = 0
+
+    def on_start(self, event: Any) -> None:
+        """Something is compiled or read, or, inside of that, compiled."""
+        if event.kind == "numba:compiler_lock":
+            self._depth += 1
+        else:
+            self.acquire(event.data["dispatcher"].py_func.__module__, wait=True)
+
+    def on_end(self, event: Any) -> None:
+        """The end of the same."""
+        if event.kind == "numba:compiler_lock":
+            self._depth -= 1
+            if self._depth == 0:
+                self.release()
+
+    def acquire(self, module: str, wait: bool) -> bool:
+        """Lock the file of a module until all are released; False where another process has it and this does not `wait`.
+
+        numba's own modules, which are not kept, need no lock.
+        """
+        if _folder is None or module in self._held or module not in _modules:
+            return True
+        file = open(_folder / f"{module}.lock", "w")  # noqa: SIM115
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            file.close()
+            return False
+        self._held[module] = file
+        return True
+
+    @contextmanager
+    def hold(self) -> Iterator[None]:
+        """Release nothing before the end of the block, and then all."""
+        self._depth += 1
+        try:
+            yield
+        finally:
+            self._depth -= 1
+            self.release()
+
+    def release(self) -> None:
+        """Let go of all."""
+        while self._held:
+            self._held.popitem()[1].close()
+
+
+_locks = _FileLocks()
+event.register("numba:compile", _locks)
+event.register("numba:compiler_lock", _locks)
 
 
 def compiled(loop: Loop) -> Loop:
     """The function compiled at its first call, and kept on disk for the next process where there is a place to write."""
-    dispatcher: Any = _njit(error_model="numpy", no_cfunc_wrapper=True)(loop)
-    with contextlib.suppress(RuntimeError):  # where neither the package's folder nor the user's cache is writable
-        dispatcher._cache = _LoopCache(loop)
-    return cast(Loop, dispatcher)
+    # `no_cfunc_wrapper`: what C code would call by a pointer, which none does, is a tenth of compiling
+    kept = _folder is not None and Path(loop.__code__.co_filename).exists()
+    _modules.add(loop.__module__)
+    return cast(Loop, _njit(error_model="numpy", no_cfunc_wrapper=True, cache=kept)(loop))
 
 
-def used_by(loop: Callable[..., object]) -> dict[tuple[str, str], object]:
-    """A loop and all that it uses, by module and name: of loops what they compute, of constants the value."""
-    used: dict[tuple[str, str], object] = {}
-    _find_used(loop, used)
-    return used
+def compiled_for(*types: str) -> Callable[[Loop], Loop]:
+    """The same for a loop that scenes call with these types of arguments, in numba's notation.
 
-
-class _LoopFile(IndexDataCacheFile):
-    """The kept forms of one loop, each with what it was compiled from.
-
-    Of two processes that keep forms of one loop at the same moment, numba may file the one's code under the other's types.
+    `const(...)` is an array that cannot be written to; a loop that gets both kinds names both.
     """
 
-    def save(self, key: object, data: object) -> None:
-        """Keep the form that was compiled for a key."""
-        super().save(key, (self._source_stamp, key, data))
+    def plan(loop: Loop) -> Loop:
+        dispatcher = compiled(loop)
+        _planned.setdefault(loop.__module__, []).extend((dispatcher, each) for each in types)
+        return dispatcher
 
-    def load(self, key: object) -> object:
-        """The form that was compiled for the key, of the loop as it is now; None where it is not kept."""
-        kept: Any = super().load(key)
-        return kept[2] if kept is not None and kept[:2] == (self._source_stamp, key) else None
+    return plan
 
 
-class _LoopCache(FunctionCache):
-    """A loop on disk, as long as what it uses stays the same.
+def compile_planned() -> int:
+    """Compile what the imported loops name types for; returns how many this process compiled. All are kept afterwards.
 
-    numba looks for changes in the loop's own file alone, and what the loop uses of other files is compiled into it. A loop
-    that is not where this process keeps its loops may lie beside the loop's file, as the image has them, which is then read.
+    Takes none where all are kept already, or where none could be kept.
     """
-
-    def __init__(self, loop: Callable[..., object]) -> None:
-        super().__init__(loop)
-        self._own_stamp = self._cache_file._source_stamp
-        beside = InTreeCacheLocator(loop, loop.__code__.co_filename).get_cache_path()
-        own, other = (_LoopFile(path, self._impl.filename_base, self._own_stamp) for path in (self._cache_path, beside))
-        self._cache_file, self._files = own, (own, other)
-
-    def _load_overload(self, signature: object, target_context: Any) -> object:
-        """Reads the loop, at its first call, when all that it uses is defined; saving comes after. None where it is not kept."""
-        used = used_by(self._py_func)
-        key = self._index_key(signature, target_context.codegen())
-        for file in self._files:
-            file._source_stamp = self._own_stamp, used
-            with contextlib.suppress(OSError):
-                if (kept := file.load(key)) is not None:
-                    return self._impl.rebuild(target_context, kept)
-        return None
+    if _folder is None:
+        return 0
+    taken = 0
+    collects = gc.isenabled()
+    gc.disable()  # compiling takes 0.83 of the time without, and 2 MB more for each loop until it runs again
+    try:
+        for wait in (False, True):
+            for module, planned in _planned.items():
+                if not _kept(module).exists() and _locks.acquire(module, wait):
+                    taken += _compile_module(module, planned)
+    finally:
+        if collects:
+            gc.enable()
+    return taken
 
 
-def _find_used(loop: Callable[..., object], used: dict[tuple[str, str], object]) -> None:
-    """Adds a loop and all that it uses to what was found before."""
-    codes = list(_codes_in(loop.__code__))
-    constants = [[value for value in code.co_consts if not isinstance(value, CodeType)] for code in codes]
-    used[loop.__module__, loop.__qualname__] = [(code.co_code, code.co_names) for code in codes], repr(constants)
-    for name in (name for code in codes for name in code.co_names):
-        value, key = loop.__globals__.get(name), (loop.__module__, name)
-        other = getattr(value, "py_func", None)
-        if other is not None and (other.__module__, other.__qualname__) not in used:
-            _find_used(other, used)
-        elif isinstance(value, np.ndarray):
-            used[key] = value.dtype.str, value.shape, value.tobytes()
-        elif isinstance(value, bool | int | float | str | tuple | np.generic):
-            used[key] = repr(value)
+def _compile_module(module: str, planned: list[tuple[Any, str]]) -> int:
+    """Compile a locked module's planned loops unless another process did since; how many."""
+    if _kept(module).exists():
+        _locks.release()
+        return 0
+    with _locks.hold():
+        for loop, types in planned:
+            loop.compile(_types_of(types))
+        _kept(module).touch()  # before another process gets the lock
+    return len(planned)
 
 
-def _codes_in(code: CodeType) -> Iterator[CodeType]:
-    """The code of a function and of its comprehensions."""
-    yield code
-    for inner in code.co_consts:
-        if isinstance(inner, CodeType):
-            yield from _codes_in(inner)
+def _types_of(text: str) -> Any:
+    """A tuple of numba's types, from `compiled_for`'s notation."""
+    names = {**vars(numba.types), "const": lambda array: array.copy(readonly=True)}
+    return eval(f"({text},)", names)
+
+
+def _kept(module: str) -> Path:
+    """The file that says that a module's planned loops are kept, for this processor and numba."""
+    what = "\n".join((numba.__version__, str(_config.CPU_NAME), str(_config.CPU_FEATURES)))
+    return cast(Path, _folder) / f"{module}-{hashlib.sha256(what.encode()).hexdigest()[:8]}.kept"

@@ -3,26 +3,244 @@
 The section of a loft along one column of its rings is an outline that ends at the axis. The part of it that is visible from
 the axis, level with the rings, is cut into stacked bodies, each the hull of whole rings. The rest is cut into plane cells,
 and each cell, between two neighbouring columns, is a wedge: exact where columns lie in planes through the axis, because its
-facets are flat then.
-docs/measured.md says how many parts there are, and how near they are to the surface.
+facets are flat then. docs/measured.md says how many parts there are, and how near they are to the surface.
+
+An outline is cut into cells along its diagonals: the shortest at reflex corners first, and those that later cuts made needless
+are taken out again (Hertel and Mehlhorn 1983). A constrained Delaunay triangulation (shapely) gives as many cells when its
+triangles are merged, but outlines that differ are not cut alike: of built-in bottles with two outlines, every third has a
+triangle of one that is turned over in the other.
 """
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import manifold3d
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from schemas.base import Array, frozen_array
 from schemas.scene.shape import Loft
-from workers.geometry.convex_partition import Indices, partition_outlines
-from workers.geometry.convexity import mesh_of, unique_rows
 from workers.geometry.hull import convex_hull, least_width_m
-from workers.geometry.jit import compiled
-from workers.geometry.manifold import hold_to_one_thread
-from workers.geometry.visible_slabs import is_covered, ring_points, stack_slabs, trace_visible_border
+from workers.geometry.jit import compiled, compiled_for
+from workers.geometry.mesh import hold_to_one_thread, mesh_of, unique_rows
+
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+SHORTENED = 1e-6
+"""Share of a diagonal left out at each end when it is tested for lying inside the outline."""
+
+
+def partition_outlines(outlines: Array, tolerance: float) -> tuple[Indices, ...]:
+    """Cells of simple outlines [K, N, 2], the same for all: ascending numbers [M] of their corners, counter-clockwise.
+
+    The outlines run counter-clockwise, no two corners of one at one place. The hull of a cell reaches out of it by at
+    most `tolerance`, in the outlines' unit. Raises ValueError for an outline that crosses itself, and for outlines so
+    unlike one another that no diagonal lies inside all of them.
+    """
+    diagonals = _inner_diagonals(outlines)
+    cells, cuts, left = [], [], [np.arange(outlines.shape[1])]
+    while left:
+        cell = left.pop()
+        deep = cell[_deep_corners(outlines, cell, tolerance)]
+        if not len(deep):
+            cells.append(cell)
+            continue
+        a, b = np.searchsorted(cell, diagonals.T)
+        inside = np.isin(diagonals, cell).all(axis=1) & (b - a > 1) & (b - a < len(cell) - 1)
+        useful = np.flatnonzero(inside & np.isin(diagonals, deep).any(axis=1))
+        if not len(useful):
+            raise ValueError("an outline that crosses itself, or outlines too unlike one another")
+        shortest = useful[0]
+        cuts.append(shortest)
+        left += [cell[a[shortest] : b[shortest] + 1], np.delete(cell, slice(a[shortest] + 1, b[shortest]))]
+    for cut in sorted(cuts, reverse=True):
+        one, other = (k for k, cell in enumerate(cells) if np.isin(diagonals[cut], cell).all())
+        merged = np.union1d(cells[one], cells[other])
+        if not _deep_corners(outlines, merged, tolerance).any():
+            cells[one] = merged
+            del cells[other]
+    return tuple(cells)
+
+
+def _inner_diagonals(outlines: Array) -> Indices:
+    """[D, 2]: pairs of corners whose line lies strictly inside all outlines, the nearest in the first outline first."""
+    first, last = np.triu_indices(outlines.shape[1], 2)
+    inside = np.ones(len(first), dtype=np.bool_)
+    for outline in outlines:
+        a, b = outline[first], outline[last]
+        lines = shapely.linestrings(np.stack([a + SHORTENED * (b - a), b + SHORTENED * (a - b)], axis=1))
+        polygon = shapely.Polygon(outline)
+        shapely.prepare(polygon)
+        inside &= shapely.contains_properly(polygon, lines)
+    pairs = np.stack([first, last], axis=1)[inside]
+    along = outlines[0, pairs[:, 1]] - outlines[0, pairs[:, 0]]
+    return pairs[np.argsort((along * along).sum(axis=1), kind="stable")]
+
+
+def _deep_corners(outlines: Array, cell: Indices, tolerance: float) -> Mask:
+    """[M] bool: the corners of a cell that are reflex by more than the tolerance in any outline."""
+    return np.logical_or.reduce([_deep(outline[cell], tolerance) for outline in outlines])
+
+
+def _deep(outline: Array, tolerance: float) -> Mask:
+    """[M] bool: reflex corners deeper than the tolerance; where there are none, the deepest corner of each such bay."""
+    deep: Mask = _left_of(outline, np.roll(outline, 1, axis=0), np.roll(outline, -1, axis=0)) > tolerance
+    if deep.any():
+        return deep
+    hull = shapely.get_coordinates(shapely.convex_hull(shapely.multipoints(outline)))
+    on_hull = np.flatnonzero(np.isin(outline @ [1, 1j], hull @ [1, 1j]))
+    for start, stop in zip(on_hull, [*on_hull[1:], on_hull[0] + len(outline)], strict=True):
+        bay = np.arange(start, stop) % len(outline)
+        depth = _left_of(outline[bay], outline[start], outline[stop % len(outline)])
+        deep[bay[depth.argmax()]] = depth.max() > tolerance
+    return deep
+
+
+def _left_of(points: Array, start: Array, stop: Array) -> Array:
+    """[M] float64: distance of points [M, 2] to the left of the lines from start to stop."""
+    along, away = stop - start, points - start
+    length = np.sqrt((along * along).sum(axis=-1))
+    turn = along[..., 0] * away[..., 1] - along[..., 1] * away[..., 0]
+    return turn / np.where(length == 0.0, 1.0, length)
+
+
+INNER_SCALE = 0.5
+"""Scale of the ring that makes a thin body thicker, relative to the body's widest ring."""
+
+GRID_SHARE = 1e-4
+"""Grid on which outlines are compared, as a share of the tolerance."""
+
+
+@dataclass(frozen=True)
+class Ring:
+    """A ring about the axis: the copy of the outline's point at `share` of the side after `corner`.
+
+    radius and height of the outline there, metres; the copy is scaled about the axis by `scale` and higher by `raised`.
+    """
+
+    corner: int
+    share: float
+    radius: float
+    height: float
+    scale: float = 1.0
+    raised: float = 0.0
+
+
+def trace_visible_border(outline: Array) -> list[Ring]:
+    """The border, upwards, of what is visible from the axis between an outline's [N, 2] first and last point.
+
+    Two rings for each slab between neighbouring heights of corners: its bottom and its top.
+    """
+    low, high = outline[:-1], outline[1:]
+    heights = np.unique(outline[:, 1])
+    heights = heights[(heights >= outline[0, 1]) & (heights <= outline[-1, 1])]
+    border = []
+    for bottom, top in itertools.pairwise(heights):
+        spans = np.minimum(low[:, 1], high[:, 1]) <= bottom
+        sides = np.flatnonzero(spans & (np.maximum(low[:, 1], high[:, 1]) >= top))
+        a, b = low[sides], high[sides]
+        shares = [(height - a[:, 1]) / (b[:, 1] - a[:, 1]) for height in (bottom, top)]
+        radii = [a[:, 0] * (1.0 - share) + b[:, 0] * share for share in shares]
+        near = int((radii[0] + radii[1]).argmin())
+        for share, radius, height in zip(shares, radii, (bottom, top), strict=True):
+            border.append(Ring(int(sides[near]), float(share[near]), float(radius[near]), float(height)))
+    return border
+
+
+def stack_slabs(
+    border: Sequence[Ring], profiles: Array, visible: shapely.Polygon, tolerance: float, thin: float
+) -> list[list[Ring]]:
+    """The rings of each convex body, the lowest body first; bodies thinner than `thin` reach into their neighbours."""
+    stacks: list[list[Ring]] = []
+    for slab in zip(border[::2], border[1::2], strict=True):
+        if stacks and all(_is_convex([*stacks[-1], *slab], outline, tolerance) for outline in profiles):
+            stacks[-1] += slab
+        else:
+            stacks.append(list(slab))
+    return [_thicken(stack, visible, tolerance, thin) for stack in stacks]
+
+
+def _is_convex(rings: Sequence[Ring], outline: Array, tolerance: float) -> bool:
+    """Whether no ring lies deeper than the tolerance below the hull of the body of revolution through all."""
+    at = [outline[ring.corner, 0] * (1.0 - ring.share) + outline[ring.corner + 1, 0] * ring.share for ring in rings]
+    line = [(float(radius) * ring.scale, ring.height) for radius, ring in zip(at, rings, strict=True)]
+    return _deepest(np.array(line)) <= tolerance
+
+
+@compiled_for("f8[:,::1]")
+def _deepest(line: Array) -> float:
+    """The most by which points [N, 2], radius and height, ascending, lie below the hull of them and their mirror images."""
+    hull, count = np.empty_like(line), 0
+    for n in range(len(line)):
+        # Andrew's monotone chain (1979), of the side away from the axis
+        while count > 1 and _distance_left_of(line[n], hull[count - 2], hull[count - 1]) <= 0.0:
+            count -= 1
+        hull[count, 0], hull[count, 1] = line[n, 0], line[n, 1]
+        count += 1
+    deepest = 0.0
+    for n in range(len(line)):
+        # The ends of the hull are level
+        depth = min(line[n, 1] - line[0, 1], line[-1, 1] - line[n, 1])
+        for k in range(count - 1):
+            depth = min(depth, _distance_left_of(line[n], hull[k], hull[k + 1]))
+        deepest = max(deepest, depth)
+    return deepest
+
+
+@compiled
+def _distance_left_of(point: Array, start: Array, stop: Array) -> float:
+    """Distance of a point [2] to the left of the line from start to stop, 0 where these are the same."""
+    x, y = stop[0] - start[0], stop[1] - start[1]
+    length = math.sqrt(x * x + y * y)
+    return (x * (point[1] - start[1]) - y * (point[0] - start[0])) / length if length > 0.0 else 0.0
+
+
+def _thicken(rings: list[Ring], visible: shapely.Polygon, tolerance: float, thin: float) -> list[Ring]:
+    """The rings of a body, and where it is thin a narrower one below and above as far as that is visible too."""
+    if rings[-1].height - rings[0].height >= thin:
+        return rings
+    widest = max(rings, key=lambda ring: ring.radius)
+    for end, step in ((rings[0], -thin), (rings[-1], thin)):
+        height = end.height + step
+        raised = height - widest.height
+        inner = dataclasses.replace(
+            widest, radius=INNER_SCALE * widest.radius, height=height, scale=INNER_SCALE, raised=raised
+        )
+        body = shapely.MultiPoint([(0.0, end.height), *((ring.radius, ring.height) for ring in (*rings, inner))])
+        if visible.buffer(0.1 * tolerance).covers(body.convex_hull):
+            rings = [*rings, inner]
+    return rings
+
+
+def is_covered(cell: Array, visible: shapely.Polygon, tolerance: float) -> bool:
+    """Whether a cell [M, 2] lies in the visible polygon, except for slivers narrower than the tolerance."""
+    # On a grid: sides that coincide except for rounding have no valid difference in plain doubles.
+    whole, seen = shapely.make_valid([shapely.Polygon(cell), visible])
+    left = shapely.difference(whole, seen, grid_size=GRID_SHARE * tolerance)
+    return bool(left.buffer(-0.5 * tolerance).is_empty)
+
+
+def ring_points(columns: Array, outline: Array, rings: Sequence[Ring]) -> Array:
+    """[N, 3] float64: the points of rings of the loft whose columns [P, n, 3] follow the outline [P, 2]."""
+    (low, start), (high, stop) = ((float(outline[k, 1]), columns[k, 0]) for k in (0, -1))
+
+    def axis(height: float) -> Array:
+        share = (height - low) / (high - low)
+        return start * (1.0 - share) + stop * share
+
+    clouds = []
+    for ring in rings:
+        points = columns[ring.corner] * (1.0 - ring.share) + columns[ring.corner + 1] * ring.share
+        if ring.scale != 1.0:
+            points = axis(ring.height) + ring.scale * (points - axis(ring.height - ring.raised))
+        clouds.append(points)
+    return np.concatenate(clouds)
+
 
 TOLERANCE = 1.6e-4
 """Share of the size of all lofts by which parts may reach out of one where that saves parts: 40 micrometres of 0.25 m."""
@@ -125,7 +343,7 @@ def _cut_wedges(columns: Array, cell: Indices, bands: Indices, tolerance: float,
     return parts
 
 
-@compiled
+@compiled_for("f8[:,:,::1], f8[:,:,::1], i8, i8")
 def _protrusion(begin: Array, end: Array, first: int, last: int) -> float:
     """Distance by which a cell lies outside the planes of its facets; begin, end [M, k, 3]: of its sides, along k columns.
 

@@ -1,26 +1,101 @@
-"""Rigid bodies on a ground, simulated by PyBullet. The only module that imports PyBullet, so that it can be replaced."""
+"""Rigid bodies on a ground, simulated by PyBullet. The only module that imports PyBullet, so that it can be replaced.
+
+Here too is what works around its flaws: it leaks the shapes that it is given, it prints when it is imported, and it takes
+convex parts only as the text of an OBJ file.
+"""
 
 import math
+import os
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, field
+from functools import cache, lru_cache
 from pathlib import Path
 from uuid import uuid4
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.errors import SettleError
 from schemas.job.physics import Physics
 from schemas.scene.shape import Mesh
-from workers.geometry.bounds import bounds_of
 from workers.geometry.frames import quaternion_from_rotation
-from workers.geometry.obj_text import DECIMALS, obj_of
-from workers.physics.pybullet_flaws import BulletBuffers, silence_stderr
-from workers.physics.rest_pose import stands_on_face
+from workers.geometry.mesh import bounds_of
 from workers.physics.rigid_body import Body, BodyPose
+from workers.physics.support import stands_on_face
+
+STDERR = 2
+
+
+@dataclass(frozen=True)
+class BulletBuffers:
+    """Python objects with new contents for every call.
+
+    PyBullet 3.2.7 takes a reference to each list of vertices or indices and to each item, and never releases it (190
+    bytes a vertex).
+    """
+
+    points: list[list[float]] = field(default_factory=list)
+    integers: list[int] = field(default_factory=list)
+    vertex_list: list[list[float]] = field(default_factory=list)
+    index_list: list[int] = field(default_factory=list)
+
+    def vertices(self, points: Array) -> list[list[float]]:
+        """[N, 3] as lists, valid until the next call."""
+        self.points.extend([0.0, 0.0, 0.0] for _ in range(len(points) - len(self.points)))
+        for mine, point in zip(self.points, points.tolist(), strict=False):
+            mine[:] = point
+        self.vertex_list[:] = self.points[: len(points)]
+        return self.vertex_list
+
+    def indices(self, values: NDArray[np.integer]) -> list[int]:
+        """[N] non-negative integers as a list, valid until the next call."""
+        self.integers.extend(range(len(self.integers), int(values.max()) + 1))
+        self.index_list[:] = [self.integers[value] for value in values.tolist()]
+        return self.index_list
+
+
+@contextmanager
+def silence_stderr() -> Iterator[None]:
+    """Discard what C code prints to standard error; an exception is reported after the block, as usual.
+
+    PyBullet prints its build time on import, at the head of every command's messages.
+    """
+    sys.stderr.flush()
+    with open(os.devnull, "wb") as devnull:
+        kept = os.dup(STDERR)
+        os.dup2(devnull.fileno(), STDERR)
+    try:
+        yield
+    finally:
+        os.dup2(kept, STDERR)
+        os.close(kept)
+
+
+DECIMALS = 8
+"""Decimals that coordinates are rounded to, metres."""
+
+
+def obj_of(parts: Sequence[Array]) -> bytes:
+    """An object `part0`, `part1` ... for each part [N, 3], of which a reader wants the vertices: its faces are a fan over all.
+
+    Coordinates are rounded to `DECIMALS` already. They have nine significant digits, those that float32 keeps.
+    """
+    texts = []
+    for number, part in enumerate(parts):
+        vertices = "v %.9g %.9g %.9g\n" * len(part) % tuple(part.ravel().tolist())
+        texts.append(f"o part{number}\n{vertices}{_fan_over(len(part))}")
+    return "".join(texts).encode("ascii")
+
+
+@lru_cache(1024)
+def _fan_over(count: int) -> str:
+    """The faces over so many vertices, counted from the last vertex back, as OBJ allows, in any part alike."""
+    return "".join(f"f {-count} {k - count} {k - count + 1}\n" for k in range(1, count - 1))
+
 
 with silence_stderr():
     import pybullet

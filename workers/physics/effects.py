@@ -8,13 +8,12 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.job.physics import Physics
-from schemas.scene.plan import ObjectStart, Table
+from schemas.scene.scene import ObjectStart, Table
 from schemas.scene.shape import Hull
-from workers.geometry.convexity import fills_hull
-from workers.geometry.first_equal import is_first
 from workers.geometry.frames import transform
-from workers.geometry.jit import compiled
-from workers.physics.table_top import inside_margin
+from workers.geometry.jit import compiled, compiled_for
+from workers.geometry.mesh import fills_hull, is_first
+from workers.physics.support import inside_margin
 
 NEIGHBOUR_RAD = math.radians(30.0)
 """Greatest angle between normals of a hull that belong to one stretch of its surface."""
@@ -47,7 +46,7 @@ def is_round(hull: Hull, com: Array) -> bool:
     return _rests_on_round(hull.vertices, normals, com, math.cos(NEIGHBOUR_RAD), math.cos(SAME_PLANE_RAD))
 
 
-@compiled
+@compiled_for("const(f8[:,::1]), f8[:,::1], const(f8[::1]), f8, f8")
 def _rests_on_round(points: Array, normals: Array, com: Array, far: float, near: float) -> bool:
     """Whether com [3] is at most as high over a normal's plane as over its neighbours', and hardly lower than over one.
 

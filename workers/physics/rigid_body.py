@@ -8,13 +8,12 @@ import numpy as np
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.job.physics import Physics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart
+from schemas.scene.scene import EffectPlan, ObjectStart
 from schemas.scene.shape import MassProperties
 from workers.geometry.frames import invert, pose, rotation_from_quaternion, transform
 from workers.geometry.hull import convex_hull, depth_m
 from workers.geometry.lathe_decomposition import COARSE, TOLERANCE
-from workers.physics.convex_parts.step import parts_of
+from workers.physics.convex_parts import parts_of
 from workers.physics.effects import is_convex
 
 MARGIN_M = 2e-5

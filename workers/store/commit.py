@@ -1,18 +1,23 @@
-"""Deciding, then publishing: a commit record is put if absent, and any process may then rename its files into place.
+"""Commit records: their sealed bytes, their listing, and the publishing of the files that they name.
 
-The record is the only decision. It is linked from the attempt's own folder, so an attempt whose folder was swept cannot
-commit any more. Publishing may be repeated by any process, at any time, any number of times.
+A record is put if absent: it is the only decision, and it is linked from the attempt's own folder, so an attempt whose
+folder was swept cannot commit any more. Any process may then move the record's files to their places, at any time, any
+number of times. The seal reveals damage; it is no signature, since anyone can seal a record. So decoding refuses every path
+that is not the range's own.
 """
 
 import contextlib
 import hashlib
+import json
 from array import array
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
-from schemas.dataset.commit import MARK, CommitRecord, FileEntry, foreign_path
+from schemas.dataset.commit import COMMIT_VERSION, MARK, CommitRecord, FileEntry, foreign_path
 from schemas.dataset.layout import (
     COMMITS,
     FENCED,
@@ -23,11 +28,106 @@ from schemas.dataset.layout import (
     range_table_path,
     staging_path,
 )
-from schemas.errors import CommitConflict, CorruptError
+from schemas.errors import CommitConflict, CorruptError, OutputError, plain_line
 from workers.store.manifest import listed_files
-from workers.store.record import decode_record as decode_record
-from workers.store.record import encode_record as encode_record
 from workers.store.store import Store
+
+_HEX = 64
+
+
+def seal(text: str, before: str, after: str = "\n") -> bytes:
+    """The text with a last line: the digest between `before` and `after`."""
+    body = text.encode()
+    return body + before.encode() + hashlib.sha256(body).hexdigest().encode() + after.encode()
+
+
+def is_sealed(data: bytes, before: str, after: str = "\n") -> bool:
+    """Whether a file is as it was sealed, to the byte."""
+    line = len(before.encode()) + _HEX + len(after.encode())
+    body = data[: max(len(data) - line, 0)]
+    return data == body + before.encode() + hashlib.sha256(body).hexdigest().encode() + after.encode()
+
+
+_SEAL: Final = (',"seal":"', '"}\n')
+"""What stands before and after the SHA-256 of all bytes above it: the last key of a record."""
+
+
+def encode_record(record: CommitRecord) -> bytes:
+    """Canonical JSON with a seal.
+
+    A file is [path, bytes, sha256], a table its number of rows; `marks` holds the digests of all scenes, and `failed`
+    [scene id, kind, reason] of those that failed.
+    """
+    raw = record.model_dump(mode="json", exclude={"files", "scenes"})
+    raw["files"] = [[entry.path, entry.bytes, entry.sha256] for entry in record.files]
+    raw["marks"] = "".join(scene.digest.ljust(MARK, "-") for scene in record.scenes)
+    raw["failed"] = [[one.scene_id, one.outcome, one.reason] for one in record.scenes if one.outcome != "made"]
+    return seal_record(raw)
+
+
+def seal_record(raw: Mapping[str, object]) -> bytes:
+    """The bytes of a record with these keys."""
+    body = json.dumps(raw, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return seal(body[:-1], *_SEAL)
+
+
+def decode_record(data: bytes, name: str) -> CommitRecord:
+    """The record in a file.
+
+    Raises CorruptError naming it where it is torn, altered or foreign, or names what is not its own; OutputError where a
+    newer version wrote it.
+    """
+    raw = _unsealed(data, name)
+    try:
+        return CommitRecord.model_validate(_expanded(raw))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = plain_line("".join(f"{part}: " for part in (".".join(map(str, first["loc"])),) if part), 100)
+        told = plain_line(first["msg"].removeprefix("Value error, "), 300)
+        raise CorruptError(f"{name} is not a commit record: {where}{told}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise CorruptError(f"{name} is not a commit record: {error!r}"[:300]) from error
+
+
+def _unsealed(data: bytes, name: str) -> dict[str, Any]:
+    """The JSON object of a record whose seal is whole and whose version is not newer than this program's."""
+    try:
+        raw = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise CorruptError(
+            f"{name} is torn or not JSON ({error}): restore it from a copy, or begin a new --out"
+        ) from error
+    if not isinstance(raw, dict) or raw.get("kind") != "verso-commit" or not isinstance(raw.get("schema_version"), int):
+        raise CorruptError(f"{name} is not a commit record of this program: move it away")
+    if raw["schema_version"] > COMMIT_VERSION:
+        raise OutputError(
+            f"{name} has schema_version {raw['schema_version']}, and this program reads up to {COMMIT_VERSION}: "
+            "install a newer verso"
+        )
+    if not is_sealed(data, *_SEAL):
+        raise CorruptError(f"{name} was altered after it was written: its seal does not match")
+    return raw
+
+
+def _expanded(raw: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a record from their short forms. Raises KeyError, TypeError or ValueError where they are none."""
+    span, marks = raw["span"], raw["marks"]
+    ids = span["scenes"] if span["retry"] else range(span["start"], span["stop"])
+    if len(ids) * MARK != len(marks):  # before anything of that length is made
+        raise ValueError(f"{len(marks)} characters of marks for {len(ids)} scenes")
+    failed = {scene_id: {"outcome": kind, "reason": reason} for scene_id, kind, reason in raw["failed"]}
+    scenes = [
+        {
+            "scene_id": scene_id,
+            "digest": marks[at * MARK : (at + 1) * MARK],
+            **failed.pop(scene_id, {"outcome": "made"}),
+        }
+        for at, scene_id in enumerate(ids)
+    ]
+    if failed:
+        raise ValueError(f"scene {next(iter(failed))} failed and is not of the range")
+    files = [dict(zip(("path", "bytes", "sha256"), entry, strict=True)) for entry in raw["files"]]
+    return {**raw, "files": files, "scenes": scenes}
 
 
 def commit_names(store: Store) -> list[tuple[int, int, str]]:
@@ -66,14 +166,15 @@ def commits_digest(store: Store) -> str:
 
 def _codes_and_sizes(store: Store, sizes: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     codes, found = array("q"), array("q")
-    for name, size in store.scan(COMMITS, sizes):
+    for entry in store.files(COMMITS, sizes):
+        name = entry.key.removeprefix(f"{COMMITS}/")
         if name.startswith("."):
             continue
         commit = parse_commit_name(name)
         if commit is None:
             raise CorruptError(f"{COMMITS}/{name} in {store.name} is not a commit of this program: move it away")
         codes.append(code_of(*commit))
-        found.append(size)
+        found.append(entry.bytes)
     return np.asarray(codes), np.asarray(found)
 
 
@@ -108,11 +209,9 @@ def check_retries(start: int, retries: Sequence[int]) -> None:
 def committed_files(store: Store, record: CommitRecord) -> tuple[FileEntry, ...]:
     """Every file of a commit, sorted by path: images or tars, shapes and the range's tables.
 
-    A record of version 1 names them all. For later ones the range's `views` and `assets` are read, in place or staged.
+    The record names tables and tars. The range's `views` and `assets` name the others; they are read in place or staged.
     Raises CorruptError naming a table that is missing, damaged, or lists a file that is not the range's own.
     """
-    if record.schema_version == 1:
-        return record.files
     files = {entry.path: entry for entry in record.files}
     for table in ("assets", "views") if record.terms.layout == "files" else ("assets",):
         path = range_table_path(record.span.start, table, record.span.retry)
@@ -131,18 +230,18 @@ def publish(store: Store, record: CommitRecord, own: Iterable[FileEntry] | None 
     another size by the same stack.
     """
     files = committed_files(store, record) if own is None else tuple(own)
-    folders, plain = _staging_folders(record), set[str]()
+    folders = _staging_folders(record)
     for entry in files:
         final = store.size(entry.path) if is_shape(entry.path) else None
         if final is None:
-            if not _move(store, folders, entry, plain):
+            if not _move(store, folders, entry):
                 _check_final(store, entry)
         elif final != entry.bytes and record.terms.fingerprint_mode == "strict":
             raise CommitConflict(
                 f"{entry.path} has {final} bytes, and {entry.bytes} in the range from scene {record.span.start}, "
                 f"made by {record.terms.fingerprint}: two attempts at one shape differ"
             )
-    store.sync_folders_of(entry.path for entry in files)
+    store.sync(entry.path for entry in files)
     for folder in folders:
         store.remove_tree(folder)
 
@@ -181,7 +280,7 @@ def compare_attempts(
         for scene in mine.scenes
         if (other := theirs.get(scene.scene_id)) is not None
         and "environmental" not in (scene.outcome, other.outcome)
-        and (scene.outcome, scene.digest[:MARK]) != (other.outcome, other.digest[:MARK])
+        and (scene.outcome, scene.digest) != (other.outcome, other.digest)
     ]
     shapes = {entry.path: entry.sha256 for entry in its_files if is_shape(entry.path)}
     different += [entry.path for entry in my_files if shapes.get(entry.path, entry.sha256) != entry.sha256]
@@ -205,11 +304,8 @@ def _staging_folders(record: CommitRecord) -> tuple[str, str]:
     return staging, staging + FENCED
 
 
-def _move(store: Store, folders: Iterable[str], entry: FileEntry, plain: set[str]) -> bool:
-    """Renames one file into place from one of the folders; False where it is not staged (any more).
-
-    `plain`: folders that are known to be no links out of the output folder.
-    """
+def _move(store: Store, folders: Iterable[str], entry: FileEntry) -> bool:
+    """Moves one file into place from one of the folders; False where it is not staged (any more)."""
     for folder in folders:
         source = f"{folder}/{entry.path}"
         staged = store.size(source)
@@ -218,7 +314,7 @@ def _move(store: Store, folders: Iterable[str], entry: FileEntry, plain: set[str
         if staged != entry.bytes:
             raise CorruptError(f"{source} has {staged} bytes, and its commit says {entry.bytes}")
         with contextlib.suppress(FileNotFoundError):
-            store.rename(source, entry.path, plain)
+            store.move(source, entry.path)
             return True
     return False
 

@@ -1,14 +1,18 @@
-"""What the store asks of a local file system: its type, flushing to the disk, a probe, and errors explained."""
+"""Calls to a local file system: its type, flushing to the disk, a probe, temporary files and folders, errors explained."""
 
 import contextlib
 import ctypes
 import errno
+import fcntl
 import os
 import pwd
 import re
+import shutil
+import tempfile
+import time
 import uuid
 import weakref
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import IO
@@ -28,9 +32,6 @@ _AT_ONCE = 8
 
 _FEW_FOLDERS = 3
 """Up to this many folders are flushed one by one; for more, one syncfs is less work where it can be trusted."""
-
-Opener = Callable[[str, int], int]
-"""Opens a path with flags, as `open` takes it."""
 
 _REMEDIES = {
     errno.ENOSPC: "the disk is full; free some space and start again, nothing finished is lost",
@@ -98,20 +99,14 @@ class OpenTree:
                 sync_path(root / folder)
 
 
-def refuse_link_out(root: str | Path, key: str, plain: set[str] | None = None) -> None:
+def refuse_link_out(root: str | Path, key: str) -> None:
     """Raises OutputError where a folder on the way to `key`, or `key` itself, is a symbolic link that leads out of `root`.
 
-    So a folder from somebody else cannot make this program write or remove elsewhere. `plain` collects the folders that were
-    asked: a caller with many keys asks each of them once.
+    So a folder from somebody else cannot make this program write or remove elsewhere.
     """
     base = os.fspath(root)
-    folder, _, _ = key.rpartition("/")
-    if plain is None or folder not in plain:
-        ends = (at for at, letter in enumerate(key) if letter == "/")
-        for end in ends:
-            _refuse_if_link_out(base, key[:end])
-        if plain is not None:
-            plain.add(folder)
+    for end in (at for at, letter in enumerate(key) if letter == "/"):
+        _refuse_if_link_out(base, key[:end])
     _refuse_if_link_out(base, key)
 
 
@@ -224,11 +219,6 @@ def _probe_once(root: Path) -> None:
                 os.unlink(path)
 
 
-def open_uncut(path: str, flags: int) -> int:
-    """A descriptor as `open` asks for it, except that a file that is there keeps its bytes."""
-    return os.open(path, flags & ~os.O_TRUNC, 0o666)
-
-
 def ignore_missing(function: object, path: str, raised: tuple[type[BaseException], BaseException, object]) -> None:
     """For `shutil.rmtree`: what is gone already need not be removed."""
     if not isinstance(raised[1], FileNotFoundError):
@@ -275,3 +265,38 @@ def explain_disk_errors(what: str) -> Iterator[None]:
         if error.errno in _REMEDIES:
             raise MachineError(f"{what}: {remedy_of(error)}") from error
         raise
+
+
+_LOCK = ".in-use"
+_YOUNG_S = 3600.0
+"""A folder without its lock file is left alone so long: its process may be just about to make it."""
+
+
+@contextlib.contextmanager
+def temporary_folder(name: str) -> Iterator[Path]:
+    """An empty folder. Its owner holds a lock on a file in it, which the kernel gives back when the process ends."""
+    remove_abandoned(name)
+    with tempfile.TemporaryDirectory(prefix=f"verso-{name}-") as folder, open(Path(folder, _LOCK), "wb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        inner = Path(folder, "files")
+        inner.mkdir()
+        yield inner
+
+
+def remove_abandoned(name: str) -> None:
+    """Removes the folders of this name whose process is gone."""
+    for folder in Path(tempfile.gettempdir()).glob(f"verso-{name}-*"):
+        with contextlib.suppress(OSError):
+            if _is_abandoned(folder):
+                shutil.rmtree(folder)
+
+
+def _is_abandoned(folder: Path) -> bool:
+    try:
+        with open(folder / _LOCK, "rb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+    except BlockingIOError:
+        return False
+    except FileNotFoundError:
+        return time.time() - folder.stat().st_mtime > _YOUNG_S

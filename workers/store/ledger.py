@@ -1,29 +1,99 @@
-"""The kept summary of all commits: names come from a listing, rows from one file, and only what it lacks from records.
+"""What planning, status, merge and readers ask of all commits: records in order, their rows, and a kept summary.
 
-The holder of the lock rewrites the file now and then; workers never do. It is a cache: a file that is torn, or was made
-for another dataset, is not used. A commit that it names and nobody finds is told as lost.
+Names of commits come from a listing, the summary from one file, and only what that file lacks from the records. A retry's
+rows replace the first ones.
 """
 
 import contextlib
 import hashlib
 import io
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from itertools import islice
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby, islice
+from operator import itemgetter
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from schemas.dataset.commit import CommitSummary, summarize
+from schemas.dataset.commit import LEDGER_SCHEMA, CommitRecord, CommitSummary, Ledger, rows_of, summarize
+from schemas.dataset.commit import join_rows as join_summaries
 from schemas.dataset.layout import LEDGER_FILE, MAX_RETRIES, range_table_path
-from schemas.dataset.ledger import LEDGER_SCHEMA, Ledger, join_rows, rows_of
-from schemas.errors import CorruptError, MachineError
+from schemas.dataset.tables import SORT_KEYS
+from schemas.errors import CorruptError, MachineError, RunError
 from workers.store.commit import check_retries, list_codes, read_range_file, require_record, split_code
-from workers.store.manifest import PARQUET_OPTIONS, decode_table
-from workers.store.store import Store
+from workers.store.manifest import PARQUET_OPTIONS, decode_table, join_rows
+from workers.store.store import Store, map_ahead
+
+
+def iter_committed(store: Store) -> Iterator[list[CommitRecord]]:
+    """The records of every committed range, followed by its retries, in order.
+
+    Raises CorruptError for a damaged or missing record, OutputError for one of a newer version. Some are read ahead
+    where requests wait.
+    """
+    ranges = groupby(map(split_code, list_codes(store)), key=itemgetter(0))
+    groups = ((start, [retry for _, retry in names]) for start, names in ranges)
+    return map_ahead(store, lambda group: read_range(store, *group), groups)
+
+
+def read_range(store: Store, start: int, retries: Sequence[int]) -> list[CommitRecord]:
+    """The records of one range. Raises as `iter_committed`."""
+    check_retries(start, retries)
+    return [require_record(store, start, retry) for retry in retries]
+
+
+def iter_ranges(store: Store, first_scene: int, stop_scene: int) -> Iterator[list[CommitRecord]]:
+    """The records of each range, followed by its retries, in order: exactly the scenes [first_scene, stop_scene).
+
+    Raises RunError naming scenes that nobody committed, or that are committed beyond the end.
+    """
+    awaited = first_scene
+    for records in iter_committed(store):
+        start, stop = records[0].span.start, records[0].span.stop
+        if start != awaited:
+            raise RunError(
+                _gap(awaited, min(start, stop_scene)) if start > awaited else _beyond(start, first_scene, stop_scene)
+            )
+        awaited = stop
+        if awaited > stop_scene:
+            raise RunError(_beyond(awaited - 1, first_scene, stop_scene))
+        yield records
+    if awaited < stop_scene:
+        raise RunError(_gap(awaited, stop_scene))
+
+
+def range_rows(store: Store, records: Sequence[CommitRecord], table: str) -> pa.Table:
+    """The rows of one range, sorted by key; a retry's rows replace those of the scenes that it tried again.
+
+    Rows of `assets` come from all records and may be repeated. Raises CorruptError naming a file that does not match its
+    commit.
+    """
+    parts = [read_range_table(store, record, table) for record in records]
+    if len(parts) == 1:
+        return parts[0]
+    if "scene_id" in parts[0].column_names:
+        for number, part in enumerate(parts):
+            later = {scene_id for record in records[number + 1 :] for scene_id in record.span.scenes}
+            again = pc.is_in(part.column("scene_id"), value_set=pa.array(sorted(later), pa.int64()))
+            parts[number] = part.filter(pc.invert(again))
+    return join_rows(table, parts).sort_by([(key, "ascending") for key in SORT_KEYS[table]])
+
+
+def read_range_table(store: Store, record: CommitRecord, table: str) -> pa.Table:
+    """The rows that one record committed. Raises CorruptError naming a file that is missing or altered."""
+    path = range_table_path(record.span.start, table, record.span.retry)
+    return decode_table(table, read_range_file(store, record, path), path)
+
+
+def _gap(start: int, stop: int) -> str:
+    return f"scenes {start} to {stop - 1} are not committed: run the job again to make them"
+
+
+def _beyond(scene: int, first_scene: int, stop_scene: int) -> str:
+    return f"scene {scene} is committed, outside the {first_scene} to {stop_scene - 1} that were asked for"
+
 
 _BATCH = 4_096
 """Records that are read before their rows are packed into columns."""
@@ -53,22 +123,15 @@ def list_commits(store: Store) -> Ledger:
         kept = kept.filter(pa.array(np.isin(known, codes)))
     unread = np.setdiff1d(codes, known, assume_unique=True)
     parts = [kept]
-    summaries = _read_all(store, map(split_code, unread))
+    summaries = map_ahead(store, lambda code: read_summary(store, *split_code(code)), unread)
     while batch := list(islice(summaries, _BATCH)):
         parts.append(rows_of(batch))
-    return Ledger(join_rows(parts), lost, np.searchsorted(codes, unread))
+    return Ledger(join_summaries(parts), lost, np.searchsorted(codes, unread))
 
 
 def read_summary(store: Store, start: int, retry: int = 0) -> CommitSummary:
-    """The summary of a record; the reasons that a record of version 1 lacks come from its table of failures."""
-    record = require_record(store, start, retry)
-    summary = summarize(record)
-    if all(reason is not None for _, _, reason in summary.failed):
-        return summary
-    path = range_table_path(start, "failures", retry)
-    rows = decode_table("failures", read_range_file(store, record, path), path).to_pylist()
-    reasons = {row["scene_id"]: row["reason"] for row in rows}
-    return replace(summary, failed=tuple((scene, kind, reasons.get(scene, "")) for scene, kind, _ in summary.failed))
+    """The summary of a record. Raises as `require_record`."""
+    return summarize(require_record(store, start, retry))
 
 
 def save_rows(store: Store, rows: pa.Table) -> None:
@@ -76,7 +139,7 @@ def save_rows(store: Store, rows: pa.Table) -> None:
     sink = io.BytesIO()
     pq.write_table(rows, sink, **PARQUET_OPTIONS)
     data = sink.getvalue()
-    store.write_whole(LEDGER_FILE, hashlib.sha256(data).hexdigest().encode() + b"\n" + data)
+    store.put(LEDGER_FILE, hashlib.sha256(data).hexdigest().encode() + b"\n" + data)
 
 
 class LedgerKeeper:
@@ -91,8 +154,8 @@ class LedgerKeeper:
         self._save_if_due()
 
     def add(self, summaries: Iterable[CommitSummary]) -> None:
-        """Takes new commits; those of records of version 1 are left to the next listing."""
-        self._waiting += [one for one in summaries if None not in {reason for _, _, reason in one.failed}]
+        """Takes new commits."""
+        self._waiting += summaries
         if len(self._waiting) >= _BATCH or self._unkept + len(self._waiting) >= SAVE_EACH:
             self._pack()
             self._save_if_due()
@@ -114,7 +177,7 @@ class LedgerKeeper:
             self._save()
 
     def _save(self) -> None:
-        self._parts = [join_rows(self._parts)]
+        self._parts = [join_summaries(self._parts)]
         with contextlib.suppress(MachineError):  # a full disk stops the run where data are written, not here
             save_rows(self._store, self._parts[0])
         self._unkept = 0
@@ -139,7 +202,7 @@ def read_kept_rows(store: Store) -> pa.Table | None:
     try:
         names = ["fingerprint", "job_digest"]
         with pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True, read_dictionary=names) as file:
-            return join_rows([file.read().select(LEDGER_SCHEMA.names).cast(LEDGER_SCHEMA)])
+            return join_summaries([file.read().select(LEDGER_SCHEMA.names).cast(LEDGER_SCHEMA)])
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:
         raise CorruptError(
             f"{LEDGER_FILE} cannot be read ({error}): remove it, the next run writes it again"
@@ -162,14 +225,3 @@ def _read_kept(store: Store, codes: NDArray[np.int64]) -> pa.Table:
         if row.to_pylist() != rows_of([read_summary(store, *split_code(code))]).to_pylist():
             return none
     return rows
-
-
-def _read_all(store: Store, commits: Iterable[tuple[int, int]]) -> Iterator[CommitSummary]:
-    """The summaries of these records, in order; several requests at once where each takes its time."""
-    if store.root is not None:
-        yield from (read_summary(store, start, retry) for start, retry in commits)
-        return
-    commits = iter(commits)
-    with ThreadPoolExecutor(_AT_ONCE) as pool:
-        while batch := list(islice(commits, _BATCH)):
-            yield from pool.map(lambda commit: read_summary(store, *commit), batch)

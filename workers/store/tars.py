@@ -3,25 +3,119 @@
 `mug/RGB00042.png` is the member `00042.RGB.png` of `mug/<start>.tar`, its patch `mug/patches/RGB00042.png` the member
 `00042.RGB.patch.png`, and with several objects `00042.RGB.patch.obj1.png`. The labels of the pose are `00042.json`. The pose
 id comes first, up to a point, so tools that group members by it (WebDataset among them) see one sample for each pose.
+
+A label has the rows of the pose's views by role, each with its objects, and the columns of its scene and its assets that
+training asks for: the tar alone is enough to train from. The tables stay what is checked and queried; the label repeats them.
 """
 
 import contextlib
 import hashlib
 import io
+import json
 import re
 import tarfile
-from collections.abc import Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
-from typing import IO, cast
+from typing import IO, Any, cast
 
 import pyarrow as pa
 
 from schemas.dataset.commit import FileEntry, Span
-from schemas.dataset.layout import IMAGES, Content, image_path, is_shape, patch_path, tar_path
-from schemas.errors import CorruptError
-from schemas.plain_line import plain_line
-from workers.store.pose_labels import LABEL_TABLES, Rows, decode_label, encode_label, label_differences, pose_labels
-from workers.store.store import Store
+from schemas.dataset.layout import IMAGES, Content, file_pose_id, image_path, is_shape, patch_path, tar_path
+from schemas.errors import CorruptError, plain_line
+from workers.store.store import Stage
+
+Rows = Mapping[str, Sequence[Mapping[str, Any]]]
+"""Rows by table, with the values that Arrow gives: a double that happens to be whole is still a float."""
+
+LABEL_TABLES = ("scenes", "views", "objects", "assets")
+"""The tables that labels repeat."""
+
+SCENE_COLUMNS = (
+    *("scene_id", "category", "instance_id", "source", "table_id", "object_scale", "T_world_obj", "T_world_table"),
+    *("pose", "settings_digest"),
+)
+BODY_COLUMNS = ("region_id", "category", "instance_id", "source", "object_scale", "T_world_obj")
+ASSET_COLUMNS = ("category", "source", "licence", "split", "sha256", "extents_m")
+NOT_OF_A_VIEW = frozenset({"files", "scene_id", "category"})
+NOT_OF_AN_OBJECT = frozenset({"pose_id", "role", "scene_id"})
+"""Columns that the label says elsewhere, or, as the files of a view, that its tar says by its members."""
+
+
+def pose_labels(rows: Rows) -> dict[tuple[str, int], dict[str, Any]]:
+    """The label of every pose of one or more scenes, by category and the id in the names of its files.
+
+    A view whose scene has no row is left out.
+    """
+    scenes = {row["scene_id"]: row for row in rows["scenes"]}
+    assets = {row["instance_id"]: row for row in rows["assets"]}
+    objects = defaultdict(list)
+    for row in rows["objects"]:
+        objects[row["pose_id"], row["role"]].append(row)
+    labels: dict[tuple[str, int], dict[str, Any]] = {}
+    for view in rows["views"]:
+        scene, pose_id = scenes.get(view["scene_id"]), file_pose_id(view["role"], view["parent_id"])
+        if scene is None:
+            continue
+        key = (view["category"], pose_id)
+        label = labels.setdefault(key, {"pose_id": pose_id, "views": {}, **_of_scene(scene, assets)})
+        own = sorted(objects[view["pose_id"], view["role"]], key=lambda row: row["region_id"])
+        label["views"][view["role"]] = {
+            **{name: value for name, value in view.items() if name not in NOT_OF_A_VIEW},
+            "objects": [{name: value for name, value in row.items() if name not in NOT_OF_AN_OBJECT} for row in own],
+        }
+    return labels
+
+
+def _of_scene(scene: Mapping[str, Any], assets: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """What all poses of a scene share; `split` is that of the first object."""
+    bodies = scene["bodies"] or []
+    used = {scene["table_id"], scene["instance_id"], *(body["instance_id"] for body in bodies)}
+    return {
+        "scene": {
+            **{name: scene[name] for name in SCENE_COLUMNS},
+            "bodies": [{name: body[name] for name in BODY_COLUMNS} for body in bodies],
+        },
+        "assets": {name: {column: assets[name][column] for column in ASSET_COLUMNS} for name in used if name in assets},
+        "split": assets[scene["instance_id"]]["split"] if scene["instance_id"] in assets else None,
+    }
+
+
+def encode_label(label: Mapping[str, Any]) -> bytes:
+    """Canonical JSON: sorted keys, and of every double the shortest digits that give it back."""
+    text = json.dumps(label, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return text.encode() + b"\n"
+
+
+def decode_label(data: bytes) -> dict[str, Any]:
+    """A stored label. Raises ValueError."""
+    try:
+        label = json.loads(data)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+    if not isinstance(label, dict):
+        raise ValueError("it holds no keys")
+    return label
+
+
+def label_differences(stored: Any, derived: Any, path: str = "") -> Iterator[str]:
+    """Dotted paths at which a stored label differs from the tables'; of keys that were added since, none counts as equal."""
+    if isinstance(stored, dict) and isinstance(derived, dict):
+        for name in sorted(stored.keys() | derived.keys()):
+            if name not in stored and derived[name] is None:
+                continue
+            inner = f"{path}.{name}" if path else name
+            if name not in stored or name not in derived:
+                yield inner
+            else:
+                yield from label_differences(stored[name], derived[name], inner)
+    elif isinstance(stored, list) and isinstance(derived, list) and len(stored) == len(derived):
+        for number, (one, other) in enumerate(zip(stored, derived, strict=True)):
+            yield from label_differences(one, other, f"{path}.{number}")
+    elif type(stored) is not type(derived) or repr(stored) != repr(derived):
+        yield path
+
 
 _PATH = re.compile(
     r"(?P<category>[^/]+)/(?P<patch>patches/)?(?P<content>[A-Za-z]+)(?P<pose>\d{5,})(?:obj(?P<object>\d+))?\.png"
@@ -65,15 +159,14 @@ def read_tar(category: str, data: bytes, name: str) -> Iterator[tuple[str, bytes
 
 
 def read_labels(category: str, data: bytes, name: str) -> Iterator[tuple[int, bytes]]:
-    """(pose id, JSON) of every pose, in order; none in archives of earlier versions. Raises CorruptError as `read_tar`."""
+    """(pose id, JSON) of every pose, in order. Raises CorruptError as `read_tar`."""
     return ((pose_id, content) for path, pose_id, content in _read_members(category, data, name) if not path)
 
 
 def check_labels(category: str, data: bytes, name: str, rows: Rows) -> list[tuple[int, str]]:
     """(pose id, how its labels differ from the rows of the range) of every pose in an archive whose labels are off.
 
-    `rows` are those of all the range's scenes. An archive of an earlier version has no labels, and nothing is off. Raises
-    CorruptError as `read_tar`.
+    `rows` are those of all the range's scenes. Raises CorruptError as `read_tar`.
     """
     stored, imaged = {}, set()
     for path, pose_id, content in _read_members(category, data, name):
@@ -81,8 +174,6 @@ def check_labels(category: str, data: bytes, name: str, rows: Rows) -> list[tupl
             imaged.add(pose_id)
         else:
             stored[pose_id] = content
-    if not stored:
-        return []
     derived = pose_labels(rows)
     faults = [(pose_id, f"{name}: {label_member(pose_id)} is missing") for pose_id in sorted(imaged - stored.keys())]
     for pose_id, content in stored.items():
@@ -121,9 +212,8 @@ def _read_members(category: str, data: bytes, name: str) -> Iterator[tuple[str, 
 class Packing:
     """Stores an attempt's files scene by scene: by path, or, with `tar`, images in archives and shapes by path."""
 
-    def __init__(self, store: Store, staging: str, span: Span, tar: bool) -> None:
-        self._store = store
-        self._staging = staging
+    def __init__(self, stage: Stage, span: Span, tar: bool) -> None:
+        self._stage = stage
         self._span = span
         self._tar = tar
         self._archives: dict[str, _Archive] = {}
@@ -137,12 +227,12 @@ class Packing:
         images = [path for path in files if self._tar and not is_shape(path)]
         for path, data in files.items():
             if not self._tar or is_shape(path):
-                self._store.write_staged(self._staging, path, data)
+                self._stage.write(path, data)
         labels = pose_labels({table: tables[table].to_pylist() for table in LABEL_TABLES}) if images else {}
         for (category, pose_id), paths in groupby(sorted(images, key=member_order), key=_sample_of):
             if category not in self._archives:
                 name = tar_path(category, self._span.start, self._span.retry)
-                self._archives[category] = _Archive(name, self._store.stream_staged(self._staging, name))
+                self._archives[category] = _Archive(name, self._stage.stream(name))
             for path in paths:
                 self._archives[category].add(member_of(path)[1], files[path])
             self._archives[category].add(label_member(pose_id), encode_label(labels[category, pose_id]))

@@ -7,7 +7,7 @@ import pytest
 from ray._common.utils import get_ray_address_file
 
 from services.bench.simulated import compare, describe, measure_simulated, simulated_nodes, sleeping
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from tests.services.bench.small_job import SMALL
 from tests.services.run.test_coordinator import spans
 

@@ -5,8 +5,8 @@ import sys
 
 import pytest
 
-from services.cli.capture_parser import CAPTURE_COMMANDS
 from services.cli.parser import build_parser
+from services.cli.rows import CAPTURE_COMMANDS
 
 
 @pytest.mark.parametrize("name", CAPTURE_COMMANDS)

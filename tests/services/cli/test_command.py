@@ -1,6 +1,6 @@
 import argparse
 
-from services.cli.command import Command, number, option
+from services.cli.arguments import Command, number, option
 
 
 def test_an_option_is_what_add_argument_takes():

@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from services.cli.completion import script_for
+from services.cli.reference import script_for
 
 ASK = """
 source "$1"

@@ -2,7 +2,8 @@ import importlib
 
 import pytest
 
-from services.cli.parser import COMMANDS, build_parser
+from services.cli.parser import build_parser
+from services.cli.rows import COMMANDS
 
 
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("test", "capture")])

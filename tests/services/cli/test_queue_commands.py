@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from services.cli.main import main
-from services.queue.store import open_queue
+from services.queue.queue import open_queue
 from services.queue.supervise import hold_queue
-from tests.fake_drivers import ids, queue_of, request_of
+from tests.kit.queue_world import ids, queue_of, request_of
 
 ROOT = Path(__file__).resolve().parents[3]
 TABLETOP = str(ROOT / "deploy" / "jobs" / "tabletop.yaml")

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from services.cli.parser import COMMANDS
 from services.cli.reference import EXIT_CODES, page
+from services.cli.rows import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -1,7 +1,7 @@
 import json
 
+from services.cli.commands import default_page
 from services.cli.main import main
-from services.cli.report_commands import default_page
 from tests.datasets import make_dataset
 
 

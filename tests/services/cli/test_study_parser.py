@@ -3,7 +3,7 @@
 import pytest
 
 from services.cli.parser import build_parser
-from services.cli.study_parser import STUDY_COMMANDS
+from services.cli.rows import STUDY_COMMANDS
 
 
 @pytest.mark.parametrize("name", STUDY_COMMANDS)

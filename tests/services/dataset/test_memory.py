@@ -8,18 +8,18 @@ import pytest
 
 STREAM = """
 import json, sys
-from tests.memory import peak_mib
+from tests.kit.memory import peak_mib
 from pathlib import Path
 from services.dataset.dataset import Dataset
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.job.record import encode_job, record_job
 from tests.datasets import SMALL
-from tests.many_ranges import ManyRanges
+from tests.kit.many_ranges import ManyRanges
 
 def stream(root, ranges):
     store = ManyRanges(root, ranges)
     store.prepare()
-    store.write_whole("job.yaml", encode_job(record_job(validate_job(SMALL, "test"), "c" * 64, root)))
+    store.put("job.yaml", encode_job(record_job(validate_job(SMALL, "test"), "c" * 64, root)))
     pairs = sum(1 for pair in Dataset(store).pairs() if pair.mirror.images)
     return pairs, peak_mib()
 

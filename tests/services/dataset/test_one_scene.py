@@ -10,7 +10,7 @@ import yaml
 from schemas.errors import JobError, SceneError
 from services.dataset.dataset import open_dataset
 from services.dataset.one_scene import make_scene
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from tests.datasets import SMALL, overlaid
 from tests.services.dataset.conftest import CHANGES
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from services.init.categories import category_of, is_category, map_categories, usable_name
+from services.init.guess import category_of, is_category, map_categories, usable_name
 from services.job.bounded_yaml import parse_yaml
 
 

@@ -10,7 +10,7 @@ from PIL import Image
 from schemas.errors import MachineError
 from services.cli.main import main
 from services.init import command
-from services.job.read import load_job
+from services.job.job_file import load_job
 from tests.own_meshes import cup, mixed_folder, write_gltf, write_mesh
 from workers.assets.catalogue import open_catalogue
 

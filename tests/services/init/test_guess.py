@@ -2,9 +2,9 @@
 
 import pytest
 
+from services.init.collection import Item
 from services.init.guess import guess_scales, guess_ups, plain_axis
-from services.init.model import Item
-from workers.assets.external.measured import Measured
+from workers.assets.external.placement import Measured
 
 
 def item(path, extents=(0.1, 0.1, 0.1), up=None, confidence="sure"):

@@ -5,11 +5,11 @@ from collections import Counter
 import pytest
 
 from schemas.job.assets import FolderSource
+from services.init.collection import Guess
+from services.init.command import write_job
 from services.init.guess import guess_scales, guess_ups
-from services.init.job_text import write_job
-from services.init.model import Guess
 from services.job.bounded_yaml import parse_yaml
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from tests.services.init.test_guess import cubes, item
 
 

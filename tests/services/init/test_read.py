@@ -3,9 +3,7 @@
 import pytest
 import trimesh
 
-from services.init.model import Candidate
-from services.init.read import drop_doubles, read_folder
-from services.init.walk import walk_folder
+from services.init.collection import Candidate, drop_doubles, read_folder, walk_folder
 from tests.own_meshes import cup, mixed_folder, write_mesh
 from tests.services.init.test_guess import item
 

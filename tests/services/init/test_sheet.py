@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from schemas.job.assets import ProceduralSource
-from services.init import sheet
-from services.init.sheet import TILE, Tile, draw_object, draw_sheet
+from services.init import shown as sheet
+from services.init.shown import TILE, Tile, draw_object, draw_sheet
 from workers.assets.builtin.make import make_asset
 from workers.assets.external.mesh import transform_shape
 from workers.geometry.frames import pose

@@ -3,8 +3,7 @@
 import pytest
 
 from schemas.job.assets import Assets, FolderSource
-from services.init.model import Candidate
-from services.init.read import read_folder
+from services.init.collection import Candidate, read_folder
 from services.init.shown import show_items
 from tests.own_meshes import cup, write_mesh
 from workers.assets.catalogue import open_catalogue

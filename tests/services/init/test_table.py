@@ -2,8 +2,8 @@
 
 import pytest
 
-from services.init.model import LeftOut
-from services.init.table import (
+from services.init.collection import LeftOut
+from services.init.shown import (
     MOST_ROWS,
     describe_size,
     describe_up,

@@ -5,10 +5,10 @@ import os
 import pytest
 
 from schemas.errors import AssetSourceError
-from services.init import walk
-from services.init.walk import SUFFIXES, walk_folder
+from services.init import collection as walk
+from services.init.collection import SUFFIXES, walk_folder
 from tests.workers.assets.oracles import write
-from workers.assets.external.reading import MESH_SUFFIXES
+from workers.assets.external.formats import MESH_SUFFIXES
 
 
 def test_meshes_and_urdfs_are_found_at_any_depth_and_hidden_ones_are_left_aside(tmp_path):

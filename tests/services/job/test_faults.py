@@ -4,7 +4,7 @@ import pytest
 from pydantic import ValidationError
 
 from schemas.job.job import Job
-from services.job.faults import describe_fault
+from services.job.job_file import describe_fault
 
 
 def told(**keys) -> list[str]:

@@ -12,7 +12,7 @@ from schemas.errors import JobError
 from schemas.job.assets import ProceduralSource
 from schemas.job.job import Job
 from services.cli.main import main
-from services.job.read import load_job
+from services.job.job_file import load_job
 from services.run import dry_run
 from tests.mutations import mutated_bytes, mutated_tree
 

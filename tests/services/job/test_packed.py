@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.errors import JobError
-from services.job.packed import MARK, MOST_CHARACTERS, is_packed, pack, unpack
-from services.job.read import load_job, pack_job
+from services.job.job_file import MARK, MOST_CHARACTERS, is_packed, load_job, pack, pack_job, unpack
 
 HOSTILE = "verso: 1\nname: odd\nscenes: 4  # $(touch x); `touch y` | 'quote' \"quote\" && > < * ? ~ \\\n"
 

@@ -6,7 +6,7 @@ import pytest
 
 from schemas.errors import JobError
 from schemas.job.job import Job
-from services.job.read import load_job
+from services.job.job_file import load_job
 
 ROOT = Path(__file__).resolve().parents[3]
 

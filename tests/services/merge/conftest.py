@@ -2,7 +2,7 @@
 
 import pytest
 
-from services.merge.step import merge
+from services.merge.merge import merge
 from tests.made_up_datasets import FIRST, STOP, dataset_at
 
 

@@ -9,7 +9,7 @@ import pyarrow.dataset as ds
 import pytest
 
 from schemas.dataset.tables import TABLES
-from services.merge.step import merge, read_success
+from services.merge.merge import merge, read_success
 from tests.made_up_datasets import FIRST, STOP, dataset_at
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene, with_shapes
 from workers.store.local import LocalStore
@@ -48,7 +48,7 @@ def test_a_dataset_extended_twice_has_the_digest_of_one_made_at_once(merged, tmp
     store = LocalStore(tmp_path)
     store.prepare()
     from services.run.range_planner import committed_ranges, plan_ranges
-    from workers.store.committed_rows import list_commits
+    from workers.store.ledger import list_commits
 
     for stop in (9, 10, STOP):
         for start, end in plan_ranges(FIRST, stop, 4, committed_ranges(list_commits(store))):

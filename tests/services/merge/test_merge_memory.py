@@ -9,23 +9,23 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from schemas.dataset.commit import CommitRecord, FileEntry, SceneMark, Span, TableEntry
+from schemas.dataset.commit import CommitRecord, FileEntry, SceneMark, Span
 from schemas.dataset.layout import commit_path, range_table_path
 from schemas.dataset.tables import SCHEMAS, TABLES
 from tests.made_up_scenes import made_scene, terms
+from workers.store.commit import encode_record
 from workers.store.local import LocalStore
 from workers.store.manifest import encode_table, sorted_rows, table_of_rows
-from workers.store.record import encode_record
 
 SCENES = 320
 """In a range; 13 rows and 22 files each."""
 
 MERGE = """
 import json, resource, sys, time
-from services.merge import reading, scratch, tables
-from services.merge.step import merge
+from services.merge import reading, shared, tables
+from services.merge.merge import merge
 from workers.store.local import LocalStore
-tables.ROWS_PER_GROUP, reading.ROWS_PER_BLOCK, scratch.CACHE_KIB = json.loads(sys.argv[5])
+tables.ROWS_PER_GROUP, reading.ROWS_PER_BLOCK, shared.CACHE_KIB = json.loads(sys.argv[5])
 warm, root, scenes = LocalStore(sys.argv[1]), LocalStore(sys.argv[2]), int(sys.argv[3])
 merge(warm, 0, int(sys.argv[4]))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -79,7 +79,7 @@ def commit_ranges(root, ranges: int) -> None:
             (store.root / path).parent.mkdir(parents=True, exist_ok=True)
             (store.root / path).write_bytes(data)
             files.append(FileEntry(path=path, bytes=len(data), sha256=hashlib.sha256(data).hexdigest()))
-            tables[table] = TableEntry(rows=rows.num_rows, digest="")
+            tables[table] = rows.num_rows
         record = CommitRecord(
             schema_version=1,
             span=Span(start=start, stop=start + SCENES),
@@ -121,8 +121,8 @@ def test_merging_a_million_rows_takes_little_more_memory_than_few(tmp_path, reco
 MANY = """
 import json, sys
 from pathlib import Path
-from services.merge.step import merge
-from tests.many_ranges import ManyRanges
+from services.merge.merge import merge
+from tests.kit.many_ranges import ManyRanges
 
 class Watched(ManyRanges):
     rss_mib = {}

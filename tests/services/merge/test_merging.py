@@ -12,8 +12,8 @@ import pytest
 
 from schemas.dataset.layout import STAGING
 from schemas.errors import MachineError
-from services.merge.step import merge
-from tests.disk_faults import disk
+from services.merge.merge import merge
+from tests.kit.faults import disk
 from tests.made_up_datasets import FIRST, STOP, dataset_at
 
 pytestmark = pytest.mark.usefixtures("unflushed")

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.dataset.tables import SCHEMAS
-from services.merge.poses import escaped, object_lines, shortest
+from services.merge.tables import escaped, object_lines, shortest
 from tests.made_up_datasets import FIRST, STOP, plain_rows
 from tests.made_up_scenes import fails, made_scene
 

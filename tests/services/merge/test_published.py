@@ -4,8 +4,7 @@ import pytest
 from obstore.store import MemoryStore
 
 from schemas.errors import CorruptError
-from services.merge.published import PublishedFiles
-from services.merge.reading import read_blocks
+from services.merge.reading import PublishedFiles, read_blocks
 from tests.made_up_scenes import attempt_at, made_scene, terms
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
@@ -42,7 +41,7 @@ def test_a_file_that_is_missing_or_cut_is_told_by_name(store, tmp_path, kind, cu
     if not keys:
         pytest.skip("not in this layout")
     if cut:
-        store.write_whole(keys[-1], b"cut")
+        store.put(keys[-1], b"cut")
     else:
         store.remove(keys[-1])
     with pytest.raises(CorruptError, match=f"{keys[-1]} {'has 3 bytes' if cut else 'is named by a commit'}"):

@@ -3,7 +3,7 @@ import contextlib
 import pytest
 
 from schemas.errors import MachineError
-from services.merge.scratch import explain_full_disk, open_scratch
+from services.merge.shared import explain_full_disk, open_scratch
 
 
 def test_a_full_table_is_explained(tmp_path):

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CommitConflict, CorruptError, MachineError
-from services.merge import scratch as module
+from services.merge import shared as module
 from services.merge.shared import SharedRows
 from tests.made_up_scenes import made_scene
 

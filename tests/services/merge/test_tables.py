@@ -9,7 +9,7 @@ from schemas.dataset.tables import SCHEMAS, SORT_KEYS, TABLES
 from schemas.errors import CorruptError
 from services.merge import reading
 from services.merge import tables as merge_tables
-from services.merge.step import merge
+from services.merge.merge import merge
 from tests.made_up_datasets import FIRST, STOP, dataset_at, plain_rows
 from tests.made_up_scenes import failed_scene, made_scene, scene
 from workers.store.manifest import table_of_rows

@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 
 from schemas.queue import submission_id
-from services.queue.decide import PAUSES_S, Action, Driver, choose_starts, pause_of, tend_drivers, waiting_for_folder
-from services.queue.fold import JobState, JobView
-from tests.fake_drivers import request_of
+from services.queue.queue import JobState, JobView
+from services.queue.supervise import PAUSES_S, Action, Driver, choose_starts, pause_of, tend_drivers, waiting_for_folder
+from tests.kit.queue_world import request_of
 
 A, B, C = "j0000000a", "j0000000b", "j0000000c"
 

@@ -3,8 +3,8 @@
 import pytest
 
 from schemas.errors import CorruptError, InUseError, OutputError, RunError
-from services.queue.drive import Ending, drive
-from tests.fake_drivers import ids, queue_of, request_of
+from services.queue.drivers import Ending, drive
+from tests.kit.queue_world import ids, queue_of, request_of
 
 (A,) = ids(1)
 

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.queue import JobEvent
-from services.queue.fold import RESTARTS, JobView, apply, fold
-from tests.fake_drivers import request_of
+from services.queue.queue import RESTARTS, JobView, apply, fold
+from tests.kit.queue_world import request_of
 
 REQUEST = request_of("j00000001")
 

@@ -1,8 +1,8 @@
 """A job's log: from Ray while it lives, from the queue afterwards."""
 
 from schemas.queue import submission_id
-from services.queue.logs import follow_logs, header, read_logs
-from tests.fake_drivers import FakeDrivers, ids, queue_of, request_of
+from services.queue.listing import follow_logs, header, read_logs
+from tests.kit.queue_world import FakeDrivers, ids, queue_of, request_of
 
 (A,) = ids(1)
 

@@ -5,7 +5,7 @@ import socket
 import pytest
 
 from schemas.errors import MachineError
-from services.queue.ray_jobs import RayDrivers
+from services.queue.drivers import RayDrivers
 
 
 def test_an_address_where_nothing_answers_is_told_in_one_line():

@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 
-from services.job.read import load_job
-from services.queue.store import open_queue
+from services.job.job_file import load_job
+from services.queue.queue import open_queue
 from services.run.lock import read_holder
 from tests.datasets import run_here
-from tests.killed_runs import processes_with
-from tests.ray_head import ROOT, RayHead, ray_head
+from tests.kit.killed_runs import processes_with
+from tests.kit.ray_head import ROOT, RayHead, ray_head
 
 TABLETOP = ROOT / "deploy" / "jobs" / "tabletop.yaml"
 SCENES = 16

@@ -2,9 +2,9 @@
 
 import math
 
-from services.queue.share import EVERY_S, Sharing
-from services.run.slots import SharedSlots, Slots
-from tests.fake_drivers import queue_of
+from services.queue.drivers import EVERY_S, Sharing
+from services.run.ray_cluster import SharedSlots, Slots
+from tests.kit.queue_world import queue_of
 
 
 def test_it_is_read_every_few_seconds_and_survives_a_store_that_fails(tmp_path):

@@ -8,13 +8,11 @@ import pytest
 
 from schemas.errors import RunError
 from schemas.queue import submission_id
-from services.queue.decide import Driver
-from services.queue.store import Queue, make_queue
-from services.queue.supervise import build_entrypoint, hold_queue
-from tests.disk_faults import unflushed
-from tests.fake_drivers import ids
-from tests.queue_world import AT_ONCE, DIES, Killed, World
-from tests.s3_server import Bucket, s3_server
+from services.queue.queue import Queue, make_queue
+from services.queue.supervise import Driver, build_entrypoint, hold_queue
+from tests.kit.faults import unflushed
+from tests.kit.queue_world import AT_ONCE, DIES, Killed, World, ids
+from tests.kit.s3_server import Bucket, s3_server
 from workers.store.objects import ObjectStore
 
 __all__ = ["unflushed"]
@@ -209,7 +207,7 @@ def test_a_cancelled_job_that_waits_never_starts(tmp_path):
 
 def test_a_damaged_job_is_told_once_and_stops_no_other(tmp_path):
     world, said = world_of(tmp_path), []
-    world.queue.store.write_whole(f"jobs/{LAST}/request.json", b"{")
+    world.queue.store.put(f"jobs/{LAST}/request.json", b"{")
     supervisor = world.supervisor(said.append)
     for _ in range(30):
         supervisor.look()

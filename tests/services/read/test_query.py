@@ -6,7 +6,7 @@ import pytest
 from schemas.dataset.layout import STAGING
 from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError, InputError, OutputError
-from services.merge.step import merge, read_success
+from services.merge.merge import merge, read_success
 from services.read.query import query
 from tests.made_up_scenes import attempt_at, failed_scene, fails, scene
 from workers.store.local import LocalStore

@@ -5,7 +5,7 @@ import pytest
 from obstore.store import MemoryStore
 
 from schemas.dataset.tables import SCHEMAS
-from services.merge.step import merge
+from services.merge.merge import merge
 from services.read.query import ask, query
 from services.read.stored_tables import StoredTables, read_merged
 from tests.made_up_scenes import attempt_at, scene

@@ -8,9 +8,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from schemas.dataset.layout import SUCCESS_FILE
-from services.merge.step import encode_success, read_success
+from services.merge.merge import encode_success, read_success
 from services.read.verdict import Verdict
-from services.read.verify_finished import Success, check_success
+from services.read.verify_files import Success, check_success
 from tests.datasets import faults_of
 from workers.store.local import LocalStore
 

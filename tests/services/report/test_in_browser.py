@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.report.follow import Follower
-from services.report.report import write_report
-from services.report.server import Place, serving
+from services.look.live import Follower
+from services.look.report import write_report
+from services.look.server import Place, serving
 from tests.browser import needs_chromium, open_tab
 from tests.datasets import make_dataset
 
-pytestmark = [pytest.mark.minute, needs_chromium]
+pytestmark = [pytest.mark.minute, pytest.mark.browser, needs_chromium]
 
 CONTROLS = "a[href], button:not([hidden]), input, select, summary, [tabindex='0']"
 PICTURES = "[...document.querySelectorAll('.scene:not([hidden]) img, #wipe img')]"

@@ -7,15 +7,14 @@ from typing import cast
 import pytest
 
 from schemas.dataset.commit import Span
-from schemas.dataset.fingerprint import Fingerprint
-from schemas.dataset.shard import ShardOrder, ShardReport, SpanReport
-from services.job.read import validate_job
+from schemas.dataset.shard import Fingerprint, ShardOrder, ShardReport, SpanReport
+from services.job.job_file import validate_job
 from services.run import coordinator as module
 from services.run.coordinator import Coordinator, Limits
-from services.run.pattern import Pattern
-from services.run.slots import ClusterSlots, Slots
-from services.run.tally import Tally
-from services.run.worker_terms import WorkerTerms
+from services.run.joining import Pattern
+from services.run.metrics import Tally
+from services.run.ray_cluster import ClusterSlots, Slots
+from services.run.worker_entry import WorkerTerms
 from workers.assets.catalogue import Catalogue
 from workers.store.local import LocalStore
 

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from services.run.cores import usable_cores
+from services.run.machine import usable_cores
 
 
 def control_groups(tmp_path: Path, membership: str, files: dict[str, str]) -> tuple[Path, Path]:

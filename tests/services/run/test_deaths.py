@@ -4,7 +4,7 @@ import pytest
 
 from schemas.dataset.commit import Span
 from schemas.errors import RunError
-from services.run.deaths import NODE_PATIENCE, Death, Deaths
+from services.run.coordinator import NODE_PATIENCE, Death, Deaths
 
 SPAN = Span(start=4, stop=8)
 

@@ -8,10 +8,10 @@ import pytest
 
 from schemas.errors import OutputError, VersoError
 from schemas.job.job import Job
-from services.job.record import encode_job
+from services.job.record import encode_job, record_job
 from services.run import dry_run
 from services.run.dry_run import describe_plan, measure_scene
-from services.run.step import RunRequest, open_catalogue, record_of
+from services.run.run_job import RunRequest, open_inputs
 
 SMALL = {"cameras": {"sensor": {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0}}}
 
@@ -37,7 +37,7 @@ def test_what_is_left_and_its_cost_are_told_and_nothing_is_made(tmp_path):
 
 def test_a_scene_is_measured_by_making_it():
     asked = request(Path("nowhere"))
-    seconds, size = measure_scene(asked.job, open_catalogue(asked))
+    seconds, size = measure_scene(asked.job, open_inputs(asked)[0])
     assert 0.005 < seconds < 5.0
     assert 5e3 < size < 5e5  # some twelve pictures of 64 x 48
 
@@ -49,7 +49,9 @@ def test_another_jobs_folder_and_somebodys_files_are_refused_as_a_run_refuses_th
     with pytest.raises(OutputError, match=r"holds thesis\.txt, and no job\.yaml"):
         describe_plan(request(tmp_path / "theirs"))
     asked = request(tmp_path)
-    (tmp_path / "job.yaml").write_bytes(encode_job(record_of(asked, open_catalogue(asked))))
+    (tmp_path / "job.yaml").write_bytes(
+        encode_job(record_job(asked.job, open_inputs(asked)[0].digest, asked.job_folder))
+    )
     assert "4 are left" in describe_plan(asked)[-2]
     with pytest.raises(VersoError, match=re.escape("start.pose: upright there, tumbled here")):
         describe_plan(request(tmp_path, start={"pose": "tumbled"}))

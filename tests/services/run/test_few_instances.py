@@ -4,15 +4,14 @@ from typing import Any
 
 import pytest
 
-import workers.assets.step
+import workers.assets.catalogue
 from schemas.errors import JobError
 from services.dataset.dataset import open_dataset
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.read.query import query
 from services.read.replay import replay_scene
 from tests.datasets import SMALL, faults_of, make_dataset, overlaid, run_here
-from workers.assets.catalogue import Catalogue, InstanceRef
-from workers.assets.step import open_cache
+from workers.assets.catalogue import Catalogue, InstanceRef, open_cache
 
 pytestmark = pytest.mark.minute
 
@@ -36,7 +35,7 @@ def made(tmp_path_factory):
 
 @pytest.fixture
 def nothing_cached(monkeypatch):
-    monkeypatch.setattr(workers.assets.step, "_cache", open_cache(2**28))
+    monkeypatch.setattr(workers.assets.catalogue, "_cache", open_cache(2**28))
 
 
 def test_each_instance_is_stored_once_and_its_id_is_category_seed_and_index(made):

@@ -49,7 +49,7 @@ def elsewhere(token="theirs", beat=0) -> Holder:
 
 
 def write(store, holder: Holder) -> None:
-    store.write_whole(LOCK_FILE, json.dumps(holder.__dict__).encode())
+    store.put(LOCK_FILE, json.dumps(holder.__dict__).encode())
 
 
 def test_a_lock_is_there_while_it_is_held_and_gone_afterwards(store):
@@ -209,24 +209,24 @@ def test_a_contender_that_is_late_leaves_the_new_holder_alone(store):
 
 def test_a_claim_of_a_contender_that_died_is_not_in_the_way_for_ever(store):
     write(store, elsewhere())
-    real = LocalStore.write_whole
+    real = LocalStore.put
 
     def dies(self, key, data, durable=True):
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LocalStore, "write_whole", dies)
+        patch.setattr(LocalStore, "put", dies)
         patch.setattr(LocalStore, "remove", lambda self, key: None)
         with pytest.raises(KeyboardInterrupt), hold_lock(store, beat=FAST):
             pass
-    assert LocalStore.write_whole is real
+    assert LocalStore.put is real
     with hold_lock(store, beat=FAST):
         assert read_holder(store).host != "far"
 
 
 @pytest.mark.parametrize("torn", [b"", b"{", b"[]", b'{"token": 1}'])
 def test_a_torn_lock_is_taken_over_after_a_while(store, torn):
-    store.write_whole(LOCK_FILE, torn)
+    store.put(LOCK_FILE, torn)
     with hold_lock(store, beat=FAST):
         assert read_holder(store).pid == os.getpid()
 
@@ -238,7 +238,7 @@ def test_a_heartbeat_survives_a_disk_that_is_full_for_a_while(store, monkeypatch
             def full(*_, **__):
                 raise OSError(28, "No space left on device")
 
-            patch.setattr(store, "write_whole", full)
+            patch.setattr(store, "put", full)
             time.sleep(0.2)
         before = read_holder(store)
         time.sleep(0.2)

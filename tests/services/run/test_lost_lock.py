@@ -11,7 +11,7 @@ from schemas.dataset.layout import LOCK_FILE
 from schemas.errors import RunError
 from services.run import lock as module
 from services.run.lock import hold_lock, read_holder
-from tests.lost_locks import FAST, STILL, taken_over
+from tests.kit.faults import FAST, STILL, taken_over
 from workers.store.local import LocalStore
 
 
@@ -40,7 +40,7 @@ def paused(store, at: int, then):
         return call
 
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("read", "write_whole", "put_if_absent", "remove", "remove_tree"):
+        for name in ("read", "put", "put_if_absent", "remove", "remove_tree"):
             patch.setattr(LocalStore, name, counted(name))
         yield steps
 
@@ -129,7 +129,7 @@ def test_a_lock_file_that_was_removed_by_hand_is_written_again(store):
 @pytest.mark.parametrize("damage", [b"", b"{", b"[]", b"\xff" * 50])
 def test_a_lock_file_that_was_damaged_by_hand_is_written_again(damage, store):
     with hold_lock(store, FAST) as lock:
-        store.write_whole(LOCK_FILE, damage)
+        store.put(LOCK_FILE, damage)
         lock.require_held()
         assert read_holder(store).pid == os.getpid()
 

@@ -1,7 +1,7 @@
 """Hosts that a cluster loses, and whose shards those were."""
 
 from schemas.dataset.commit import Span
-from services.run.lost_nodes import LOOK_EVERY_S, LostNodes, hosts_of
+from services.run.coordinator import LOOK_EVERY_S, LostNodes, hosts_of
 from tests.made_up_scenes import small_scene, terms
 from workers.store import attempt as module
 from workers.store.attempt import Attempt, begin_attempt

@@ -7,14 +7,14 @@ import urllib.request
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-import services.run.step
+import services.run.run_job
 from schemas.errors import MachineError
 from schemas.job.job import Job
-from services.merge.step import merge
+from services.merge.merge import merge
 from services.run.metrics import Counts, Meter, serve
 from services.run.ray_cluster import private_ray
-from services.run.step import RunRequest, run_job
-from tests.ports import free_port
+from services.run.run_job import RunRequest, run_job
+from tests.kit.network import free_port
 from tests.services.bench.small_job import SMALL
 
 
@@ -95,7 +95,7 @@ def test_a_run_serves_what_it_has_made_and_how_long_each_stage_took(tmp_path, mo
         seen.update(scrape(place))
         return merge(*args)
 
-    monkeypatch.setattr(services.run.step, "merge", look_then_merge)
+    monkeypatch.setattr(services.run.run_job, "merge", look_then_merge)
     job = Job.model_validate({**SMALL, "name": "mugs", "scenes": 5})
     request = RunRequest(job, tmp_path, str(tmp_path / "out"), metrics=place)
     with private_ray(1) as slots:

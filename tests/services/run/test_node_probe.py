@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.bare_cluster import ROOT, BareCluster, another_node, bare_cluster
+from tests.kit.ray_head import ROOT, BareCluster, another_node, bare_cluster
 
 pytestmark = [pytest.mark.ray, pytest.mark.minute]
 
@@ -14,7 +14,7 @@ PROBE = """
 import json, sys
 from dataclasses import replace
 from services.run.joining import terms_of_driver
-from services.run.node_probe import check_nodes
+from services.run.joining import check_nodes
 from services.run.ray_cluster import cluster_ray
 address, out = sys.argv[1:]
 open(f"{out}/_lock.json", "w").write(json.dumps({"token": "ours"}))

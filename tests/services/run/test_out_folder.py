@@ -3,7 +3,7 @@
 import pytest
 
 from schemas.errors import MachineError, RunError
-from services.run.out_folder import explain_lost_folder
+from services.run.lock import explain_lost_folder
 
 
 @pytest.mark.parametrize("error", [RunError("swept: another coordinator works on this folder"), FileNotFoundError("x")])

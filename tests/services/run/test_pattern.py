@@ -3,9 +3,9 @@
 from typing import cast
 
 from schemas.dataset.shard import ShardOrder
-from services.job.read import validate_job
-from services.run.pattern import Pattern
-from services.run.worker_terms import WorkerTerms
+from services.job.job_file import validate_job
+from services.run.joining import Pattern
+from services.run.worker_entry import WorkerTerms
 from workers.assets.catalogue import Catalogue
 
 

@@ -8,13 +8,13 @@ import sys
 import time
 from pathlib import Path
 
-from services.run.processes import descendants, marked, read_process, send
+from services.run.machine import descendants, marked, read_process, send
 
 ROOT = Path(__file__).resolve().parents[3]
 
 FAMILY = """
 import json, os, subprocess, sys, time
-from services.run.processes import adopt_orphans, descendants, end_descendants
+from services.run.machine import adopt_orphans, descendants, end_descendants
 adopt_orphans()
 stubborn = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(600)"
 orphan = f"import subprocess, sys; subprocess.Popen([sys.executable, '-c', {stubborn!r}], start_new_session=True)"

@@ -15,7 +15,7 @@ from ray._private.authentication.authentication_utils import is_token_auth_enabl
 
 from schemas.errors import MachineError
 from services.run.ray_cluster import open_ray, private_ray
-from tests.listening import Listener, listeners_of, unix_sockets_of
+from tests.kit.network import Listener, listeners_of, unix_sockets_of
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from services.run.ray_environment import NOT_INHERITED, private_environment
+from services.run.ray_cluster import NOT_INHERITED, private_environment
 
 
 def test_each_run_has_a_token_of_its_own_that_nobody_guesses():
@@ -20,5 +20,5 @@ def test_the_rest_is_the_same_for_every_run():
 
 
 def test_asking_for_it_does_not_import_ray():
-    ask = "import sys; from services.run.ray_environment import private_environment; private_environment()"
+    ask = "import sys; from services.run.ray_cluster import private_environment; private_environment()"
     subprocess.run([sys.executable, "-c", f"{ask}; assert 'ray' not in sys.modules"], check=True)

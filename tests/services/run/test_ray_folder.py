@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from schemas.errors import MachineError
-from services.run import ray_folder
-from services.run.ray_folder import (
+from services.run import ray_cluster as ray_folder
+from services.run.ray_cluster import (
     MAX_BASE_BYTES,
     OWNER,
     PREFIX,

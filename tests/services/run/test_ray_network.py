@@ -16,8 +16,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.listening import Listener, listeners_of, tree_of, unix_sockets_of
-from tests.private_network import HOST_LAN, Network, NoNamespacesError, open_ports, private_network
+from tests.kit.network import (
+    HOST_LAN,
+    Listener,
+    Network,
+    NoNamespacesError,
+    listeners_of,
+    open_ports,
+    private_network,
+    tree_of,
+    unix_sockets_of,
+)
 
 pytestmark = [pytest.mark.root, pytest.mark.ray, pytest.mark.timeout(600)]
 
@@ -75,7 +84,9 @@ def attack(network, tmp_path_factory) -> Attack:
             text=True,
         )
         caller = subprocess.Popen(
-            network.command([sys.executable, str(ROOT / "tests" / "callers_without_token.py"), f"touch {victim}"]),
+            network.command(
+                [sys.executable, str(ROOT / "tests" / "kit" / "callers_without_token.py"), f"touch {victim}"]
+            ),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -13,14 +13,13 @@ import trimesh
 
 import services.read.verify_range
 from schemas.dataset.codec import Row
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.read.query import query
 from services.read.replay import replay_scene
-from services.read.scene_export import export_scene
+from services.read.scene_geometry import export_scene
 from services.read.verify import verify
-from services.run.ray_cluster import private_ray
-from services.run.slots import Slots
-from services.run.step import RunRequest, run_job
+from services.run.ray_cluster import Slots, private_ray
+from services.run.run_job import RunRequest, run_job
 from tests.datasets import SMALL, faults_of, images_of, make_dataset, overlaid
 from workers.store.images import decode_png
 from workers.store.local import LocalStore

@@ -6,8 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-from services.run.sight import Sight, look_at_folder, processor_flags, see, start_environment
-from workers.pipeline.code import code_digest
+from ray import cloudpickle
+
+from services.run import worker_entry
+from services.run.worker_entry import Sight, look_at_folder, processor_flags, see, start_environment
+from workers.shard.code import code_digest
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -28,7 +31,7 @@ def test_processor_flags_are_those_of_the_first_core(tmp_path):
 
 
 def test_what_a_process_sets_later_is_not_what_it_was_started_with():
-    look = "import os; os.environ['ONE'] = 'changed'; from services.run.sight import start_environment as s; print(s"
+    look = "import os; os.environ['ONE'] = 'changed'; from services.run.worker_entry import start_environment as s; print(s"
     command = [sys.executable, "-c", f"{look}(['ONE', 'TWO', 'THREE']))"]
     environ = {"PYTHONPATH": str(ROOT), "ONE": "first", "TWO": "a=b"}
     done = subprocess.run(command, env=environ, capture_output=True, text=True, check=True)
@@ -74,10 +77,17 @@ def test_a_folder_that_can_only_be_read_is_told(tmp_path, monkeypatch):
 
 def test_a_node_tells_its_code_or_why_it_has_none(tmp_path):
     assert see((), "", "").code == code_digest()
-    ask = f"import sys; sys.path = [p for p in sys.path if p != {str(ROOT)!r}]; exec(open({str(ROOT / 'services/run/sight.py')!r}"
-    command = [sys.executable, "-I", "-S", "-c", f"{ask}).read()); print(see((), '', '').no_code)"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == "No module named 'workers'", done.stderr
+    cloudpickle.register_pickle_by_value(worker_entry)
+    try:
+        question = cloudpickle.dumps(lambda: see((), "", "").no_code)
+    finally:
+        cloudpickle.unregister_pickle_by_value(worker_entry)
+    away = f"import sys; sys.path = [p for p in sys.path if p != {str(ROOT)!r}]; from ray import cloudpickle"
+    answer = f"{away}; print(cloudpickle.loads(sys.stdin.buffer.read())())"
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", answer], cwd=tmp_path, input=question, capture_output=True, check=False
+    )
+    assert done.stdout.decode().strip() == "No module named 'workers'", done.stderr
 
 
 def test_a_sight_is_plain_data():

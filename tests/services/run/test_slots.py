@@ -1,6 +1,6 @@
 """Slots follow the cores of a cluster."""
 
-from services.run.slots import LOOK_EVERY_S, PREFETCH, ClusterSlots, Slots, slots_of
+from services.run.ray_cluster import LOOK_EVERY_S, PREFETCH, ClusterSlots, Slots, slots_of
 
 
 def test_fixed_slots_stay():

@@ -2,7 +2,7 @@
 
 import pytest
 
-from services.run.stalls import AttemptName, Sight, find_stalls, look
+from services.run.watchdog import AttemptName, Sight, find_stalls, look
 
 MUG = AttemptName(16, "r0-1a2b3c4d-node_7.lab-4711-0123456789ab")
 CAN = AttemptName(32, "r0-1a2b3c4d-node_8-4712-0123456789ab")

@@ -12,15 +12,14 @@ import pytest
 
 from schemas.errors import OutputError, RunError
 from schemas.job.job import Job
-from services.job.read import load_job, validate_job
+from services.job.job_file import load_job, validate_job
 from services.read.dataset_reader import iter_stored
 from services.read.query import query
 from services.read.replay import replay_scene
 from services.read.verify import verify
-from services.run.ray_cluster import private_ray
-from services.run.slots import Slots
-from services.run.step import RunRequest, run_job
-from tests.killed_runs import deadly_scene, disturb_at_first_commit, interrupt
+from services.run.ray_cluster import Slots, private_ray
+from services.run.run_job import RunRequest, run_job
+from tests.kit.killed_runs import deadly_scene, disturb_at_first_commit, interrupt
 from workers.store.images import decode_png
 from workers.store.local import LocalStore
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from services.run.processes import descendants
+from services.run.machine import descendants
 from services.run.supervisor import LAST_WORDS
-from tests.killed_runs import chain_of
+from tests.kit.killed_runs import chain_of
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -5,14 +5,14 @@ import json
 
 import pytest
 
-from schemas.dataset.fingerprint import Fingerprint
+from schemas.dataset.shard import Fingerprint
 from schemas.errors import InputError, JobError
 from schemas.job.job import Job
 from services.bench.command import refuse_unmatched
-from services.job.read import validate_job
+from services.job.job_file import validate_job
 from services.job.record import require_job
 from services.merge.dataset_card import describe_dataset
-from services.merge.step import MergeResult, read_success
+from services.merge.merge import MergeResult, read_success
 from services.read.contact_sheet import draw_sheet
 from services.read.query import query
 from services.read.replay import open_context, replay_scene

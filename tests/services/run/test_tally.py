@@ -1,6 +1,6 @@
 """What a run counts, as it is served; how reports add up is in test_coordinator.py."""
 
-from services.run.tally import Tally
+from services.run.metrics import Tally
 from tests.services.run.test_coordinator import report, span
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from schemas.dataset.commit import Span
-from services.run.under_way import count_under_way
+from services.run.coordinator import count_under_way
 
 SHARD = (Span(start=0, stop=4), Span(start=4, stop=8))
 

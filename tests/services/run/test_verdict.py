@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from services.run.verdict import Facts, judge
+from services.run.supervisor import Facts, judge
 
 KEPT = "all is kept"
 WITHOUT_A_WORD = 7 << 8

@@ -9,8 +9,15 @@ import obstore.store
 import pytest
 
 from schemas.dataset.commit import CommitTerms, Span
-from services.run.stalls import COMMIT_FACTOR, SCENE_FACTOR, Stall
-from services.run.watchdog import Watchdog, end_worker_here, find_own_workers, scenes_in_progress
+from services.run.watchdog import (
+    COMMIT_FACTOR,
+    SCENE_FACTOR,
+    Stall,
+    Watchdog,
+    end_worker_here,
+    find_own_workers,
+    scenes_in_progress,
+)
 from workers.store.attempt import begin_attempt
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
@@ -18,7 +25,13 @@ from workers.store.store import Store
 
 LIMIT_S = 0.4
 TERMS = CommitTerms(
-    job_digest="j", fingerprint="f", fingerprint_mode="record", layout="tar", first_scene=0, range_size=4
+    job_digest="j",
+    fingerprint="f",
+    fingerprint_mode="record",
+    layout="tar",
+    first_scene=0,
+    range_size=4,
+    pairs_per_scene=1,
 )
 
 

@@ -14,8 +14,7 @@ from schemas.environment import KEEP
 from schemas.errors import FingerprintError, OutputError
 from services.run import worker_entry as module
 from services.run.joining import terms_of_driver
-from services.run.worker_entry import DRAIN, check_worker, enter_shard, is_draining
-from services.run.worker_terms import WorkerTerms
+from services.run.worker_entry import DRAIN, WorkerTerms, check_worker, enter_shard, is_draining
 
 ROOT = Path(__file__).resolve().parents[3]
 

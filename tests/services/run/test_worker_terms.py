@@ -6,8 +6,7 @@ import pytest
 
 from schemas.environment import FOR_SPEED, ON_X86_64_V3, STACK_ENVIRONMENT, X86_64_V3, stack_environment
 from schemas.errors import FingerprintError, MachineError, OutputError
-from services.run.sight import Sight
-from services.run.worker_terms import WorkerTerms, refusal_of, refusal_of_worker, worker_environment
+from services.run.worker_entry import Sight, WorkerTerms, refusal_of, refusal_of_worker, worker_environment
 
 ENVIRONMENT = stack_environment(X86_64_V3)
 TERMS = WorkerTerms(tuple(ENVIRONMENT.items()), "c" * 64, "head", "/data/out", "/data/out/_lock.json", "token")

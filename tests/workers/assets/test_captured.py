@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.capture.estimate import Reconstruction
+from schemas.capture import Reconstruction
 from schemas.job.assets import Assets
 from schemas.job.captures import Board
 from workers.assets.captured import CaptureNames, board_asset, reconstructed_asset
-from workers.assets.external.materials import read_visual
+from workers.assets.external.formats import read_visual
 from workers.assets.glb import asset_glb
 
 NAMES = CaptureNames("box-00003", "box", "CC0-1.0", "capture")

@@ -9,12 +9,18 @@ import numpy as np
 import pytest
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job.assets import Assets, FolderSource, MeshLimits, ProceduralSource, ShapeNetSource, SplitShares
-from schemas.job.category import CATEGORIES
+from schemas.job.assets import (
+    CATEGORIES,
+    Assets,
+    FolderSource,
+    MeshLimits,
+    ProceduralSource,
+    ShapeNetSource,
+    SplitShares,
+)
 from tests.workers.assets.oracles import CUBE, write
-from workers.assets.catalogue import list_source, open_catalogue, split_of
+from workers.assets.catalogue import choose_object, choose_table, list_source, load_asset, open_catalogue, split_of
 from workers.assets.external.verdicts import Verdicts
-from workers.assets.step import choose_object, choose_table, load_asset
 
 BUILT_IN = ProceduralSource(source="procedural")
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -185,7 +191,7 @@ def test_an_opened_catalogue_travels_small_and_loads_the_same_asset_in_another_p
     assert len(data) < 5000
     write(tmp_path / "catalogue.pkl", data)
     code = (
-        "import pickle, sys; from workers.assets.step import load_asset; "
+        "import pickle, sys; from workers.assets.catalogue import load_asset; "
         "print(load_asset(*pickle.load(open(sys.argv[1], 'rb'))).sha256)"
     )
     command = [sys.executable, "-c", code, str(tmp_path / "catalogue.pkl")]

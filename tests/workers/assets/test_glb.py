@@ -9,14 +9,12 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.job.assets import MeshLimits, ProceduralSource
-from schemas.job.category import CATEGORIES
+from schemas.job.assets import CATEGORIES, MeshLimits, ProceduralSource
 from schemas.scene.shape import Material, Part, Shape
-from tests.shapes import asset_of
+from tests.kit.shapes import asset_of
 from tests.workers.assets.oracles import welded, write
 from workers.assets.builtin.make import make_asset
-from workers.assets.external.mesh import load_shape
-from workers.assets.external.topology import is_solid
+from workers.assets.external.mesh import is_solid, load_shape
 from workers.assets.glb import asset_glb
 
 SOURCE = ProceduralSource(source="procedural")

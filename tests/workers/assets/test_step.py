@@ -6,10 +6,9 @@ import trimesh
 
 from schemas.errors import MeshError
 from schemas.job.assets import Assets, ProceduralSource
-from tests.shapes import asset_of
-from workers.assets import step
-from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.assets.step import asset_bytes, choose_object, load_asset, open_cache
+from tests.kit.shapes import asset_of
+from workers.assets import catalogue as step
+from workers.assets.catalogue import Catalogue, asset_bytes, choose_object, load_asset, open_cache, open_catalogue
 
 
 def make(name):

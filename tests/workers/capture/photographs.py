@@ -5,10 +5,10 @@ import numpy as np
 
 from schemas.base import Array, Pose
 from schemas.job.captures import Board
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from workers.geometry.camera import orbit_pose
+from workers.geometry.colour import encode_srgb
 from workers.geometry.frames import invert, rotation_about
-from workers.geometry.srgb import encode_srgb
 
 KINECT = Intrinsics(width=1920, height=1080, fx=912.37, fy=912.25, cx=961.94, cy=548.79)
 HALF = Intrinsics(width=960, height=540, fx=456.185, fy=456.125, cx=480.97, cy=274.395)

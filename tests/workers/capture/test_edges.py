@@ -1,8 +1,8 @@
 import cv2
 import numpy as np
 
-from workers.capture.edges import refine_corners
-from workers.geometry.srgb import encode_srgb
+from workers.capture.board.detect import refine_corners
+from workers.geometry.colour import encode_srgb
 
 
 def square(corners, blur_px, exposure):

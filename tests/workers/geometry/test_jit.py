@@ -1,26 +1,64 @@
-"""Compiled loops: where they are kept, and the order in which they add."""
+"""Compiled loops: the order in which they add, where they are kept, and processes that compile them together."""
 
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from workers.geometry.jit import _LoopFile, compiled
+from workers.geometry import jit
 
 ROOT = Path(__file__).resolve().parents[3]
+HEAD = """
+import time
+from numba.extending import overload
+from workers.geometry.jit import compile_planned, compiled, compiled_for
+def pause(x): return x
+@overload(pause)
+def _pause(x):
+    time.sleep({pause})
+    return lambda x: x
+def kept(*loops): return sum(sum(loop.stats.cache_hits.values()) for loop in loops)
+"""
+ONE_LOOP = "@compiled\ndef run(x):\n    return pause(x) + 1\n"
+NAMES = "abcdefgh"
+TOGETHER = (
+    f"import {', '.join(NAMES)}; from a import compile_planned; print(compile_planned()); print(a.run(2), kept(a.run))"
+)
+SCENES = """
+from numba.core.event import install_recorder
+from workers.geometry.jit import compile_planned
+from workers.shard.run_shard import _fingerprint
+compile_planned()
+with install_recorder("numba:compile") as recorder:
+    _fingerprint("raster")
+names = {event.data["dispatcher"].py_func.__module__ for _, event in recorder.buffer}
+print(sorted(name for name in names if name.startswith("workers.")))
+"""
 
 
-def test_a_loop_is_compiled_also_where_nothing_can_be_kept_on_disk():
-    program = "from workers.geometry import jit; print(jit.compiled(eval('lambda x: x + 1'))(41))"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "42"
+def project(folder: Path, pause: float = 0.0, **modules: str) -> None:
+    for name, text in modules.items():
+        (folder / f"{name}.py").write_text(HEAD.format(pause=pause) + text)
+
+
+def start(folder: Path, program: str, kept: Path | None = None) -> "subprocess.Popen[str]":
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(kept or folder / "kept"), "PYTHONPATH": f"{folder}:{ROOT}"}
+    return subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, cwd=folder, env=env)
+
+
+def said(process: "subprocess.Popen[str]") -> list[str]:
+    out, _ = process.communicate(timeout=200)
+    assert process.returncode == 0
+    return out.split()
 
 
 def test_a_compiled_loop_adds_in_the_order_that_is_written():
-    @compiled
+    @jit.compiled
     def total(values: np.ndarray) -> float:
         result = 0.0
         for value in values:
@@ -31,90 +69,74 @@ def test_a_compiled_loop_adds_in_the_order_that_is_written():
     assert total(values) == sum(values.tolist())
 
 
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [
-        ("def step(x):\n    return x + 1", "def step(x):\n    return x + 20"),
-        ("np.floor", "np.ceil"),
-        ("from far import step", "from farther import step"),
-        ("FACTOR = 3.0", "FACTOR = 50.0"),
-        ("TABLE = np.arange(3.0)", "TABLE = np.arange(3.0) + 7.0"),
-        ("WEIGHTS = (1.0, 2.0)", "WEIGHTS = (1.0, 90.0)"),
-    ],
-)
-def test_what_a_kept_loop_uses_of_another_file_may_change(before, after, tmp_path):
-    """The file of the loop itself stays as it is; it calls a loop that is defined below it, and that uses the tables."""
-    head = "import numpy as np\nfrom workers.geometry.jit import compiled\n"
-    imports = "from near import FACTOR, step\nfrom tables import TABLE, WEIGHTS\n"
-    run = "@compiled\ndef run(x):\n    return FACTOR * step(x) + last(x)\n"
-    last = "@compiled\ndef last(x):\n    return TABLE[1] + sum([n * WEIGHTS[1] for n in range(3)])\n"
-    step = before if "far" in before else "@compiled\ndef step(x):\n    return x + 1 + np.floor(0.5 * x + 0.1)"
-    files = {
-        "far": f"{head}@compiled\ndef step(x):\n    return x - 4\n",
-        "farther": f"{head}@compiled\ndef step(x):\n    return x - 60\n",
-        "near": f"{head}FACTOR = 3.0\n{step}\n",
-        "tables": f"{head}TABLE = np.arange(3.0)\nWEIGHTS = (1.0, 2.0)\n",
-        "loops": head + imports + run + last,
+def test_a_loop_is_compiled_also_where_nothing_can_be_kept_on_disk(tmp_path):
+    project(tmp_path, loops=ONE_LOOP)
+    (tmp_path / "file").write_text("")
+    program = "from loops import *; print(run(2), compile_planned(), compiled(eval('lambda x: x + 1'))(41))"
+    for folder in (tmp_path / "file", tmp_path / "kept"):  # in the second, what has no file has no place
+        assert said(start(tmp_path, program, folder)) == ["3", "0", "42"]
+
+
+def test_the_folder_is_another_one_where_anything_changes_that_a_loop_may_be_made_of(tmp_path, monkeypatch):
+    texts = {
+        "workers/loop.py": "from workers.near import A\n@compiled\ndef f(x): ...\n",
+        "workers/near.py": "from schemas.far import A\n",
+        "schemas/far.py": "A = 1\n",
+        "workers/other.py": "B = 1\n",
     }
-    changed = {**files, **{name: files[name].replace(before, after) for name in ("near", "tables")}}
-    results = []
-    for state in (files, files, changed):
-        for name, content in state.items():
-            path = tmp_path / f"{name}.py"
-            if not path.exists() or path.read_text() != content:
-                path.write_text(content)
-        program = (
-            "import loops; print(loops.run(2.0), sum(loops.run.stats.cache_hits.values()), loops.run.py_func(2.0))"
-        )
-        env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONPATH": f"{tmp_path}:{ROOT}"}
-        done = subprocess.run(
-            [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path, env=env
-        )
-        results.append(tuple(map(float, done.stdout.split())))
-    assert [kept > 0 for _, kept, _ in results] == [False, True, False]
-    assert all(value == plain for value, _, plain in results)
-    assert results[0][0] != results[2][0]
+    monkeypatch.setattr(jit, "ROOT", tmp_path)
+    for name, text in texts.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    before = jit._digest()
+    for name, text in texts.items():
+        (tmp_path / name).write_text(f"{text}C = 3\n")
+        assert (jit._digest() == before) == (name == "workers/other.py")
+        (tmp_path / name).write_text(text)
+    assert jit._digest() == before
 
 
-def test_a_loop_that_was_compiled_beside_its_file_is_read_where_this_process_keeps_its_own_elsewhere(tmp_path):
-    """As in the image, whose code nobody may write to."""
-    (tmp_path / "loops.py").write_text(
-        "from workers.geometry.jit import compiled\n@compiled\ndef run(x):\n    return x + 1\n"
-    )
-    program = "import loops; print(loops.run(2.0), sum(loops.run.stats.cache_hits.values()))"
-
-    def run(**settings: str) -> list[str]:
-        env = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
-        env |= {"PYTHONPATH": f"{tmp_path}:{ROOT}", **settings}
-        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env=env)
-        return done.stdout.split()
-
-    elsewhere = tmp_path / "kept"
-    assert run() == ["3.0", "0"]
-    assert run(NUMBA_CACHE_DIR=str(elsewhere)) == ["3.0", "1"]
-    assert not list(elsewhere.rglob("*.nbc"))
-    beside = tmp_path / "__pycache__"
-    for file in beside.glob("*.nb[ci]"):
-        file.unlink()
-    assert run(NUMBA_CACHE_DIR=str(elsewhere)) == ["3.0", "0"]
-    assert list(elsewhere.rglob("*.nbc"))
+def test_processes_that_start_at_once_share_the_planned_loops_and_later_ones_read_them(tmp_path):
+    project(tmp_path, 0.3, **{name: ONE_LOOP.replace("compiled", 'compiled_for("i8")') for name in NAMES})
+    program = TOGETHER.replace("kept(", "a.kept(")
+    shares = [int(said(each)[0]) for each in [start(tmp_path, program) for _ in range(2)]]
+    assert sum(shares) == len(NAMES) and min(shares) > 0
+    assert said(start(tmp_path, program)) == ["0", "3", "1"]
 
 
-def test_two_processes_that_keep_a_loop_at_once_never_mix_up_its_types(tmp_path):
-    """One writes its index, the other its index and its code, and then the first its code: under numba's names the same file."""
-    one, two = (_LoopFile(str(tmp_path), "loop", "stamp") for _ in range(2))
-    write = one._save_data
+def test_what_a_killed_process_was_compiling_is_compiled_by_the_next(tmp_path):
+    project(tmp_path, 0.6, **{name: ONE_LOOP.replace("compiled", 'compiled_for("i8")') for name in NAMES})
+    program = TOGETHER.replace("kept(", "a.kept(")
+    killed = start(tmp_path, program)
+    while not (done := list((tmp_path / "kept").rglob("*.kept"))):
+        time.sleep(0.05)
+    with killed:
+        killed.send_signal(signal.SIGKILL)
+    done = list((tmp_path / "kept").rglob("*.kept"))
+    assert said(start(tmp_path, program))[0] == str(len(NAMES) - len(done))
+    assert said(start(tmp_path, program))[0] == "0"
 
-    def write_late(name: str, data: object) -> None:
-        two.save("of floats", "code for floats")
-        write(name, data)
 
-    one._save_data = write_late
-    two._load_index = dict  # as it was before the first wrote its own
-    one.save("of ints", "code for ints")
-    later = _LoopFile(str(tmp_path), "loop", "stamp")
-    assert {later.load("of floats"), later.load("of ints")} <= {None}, "both only have to be compiled again"
-    later.save("of floats", "code for floats")
-    later.save("of ints", "code for ints")
-    assert (later.load("of floats"), later.load("of ints")) == ("code for floats", "code for ints")
-    assert _LoopFile(str(tmp_path), "loop", "another stamp").load("of ints") is None
+def test_two_processes_that_compile_one_loop_at_once_never_mix_up_its_types(tmp_path):
+    project(tmp_path, 0.5, loops=ONE_LOOP)
+    program = "from loops import *; print(run({0}), kept(run))"
+    both = [start(tmp_path, program.format(value)) for value in ("2", "2.5")]
+    assert [said(each) for each in both] == [["3", "0"], ["3.5", "0"]]
+    assert said(start(tmp_path, "from loops import *; print(run(2), run(2.5), kept(run))")) == ["3", "3.5", "2"]
+
+
+def test_loops_that_were_compiled_with_an_image_are_read_where_this_process_keeps_its_own_elsewhere(tmp_path):
+    project(tmp_path, loops=ONE_LOOP)
+    made = "import sys; from pathlib import Path; import workers.geometry.jit as jit; "
+    assert said(start(tmp_path, "from loops import *; print(run(2))", tmp_path / "image")) == ["3"]
+    (tmp_path / "image").chmod(0o555)
+    program = f"{made}jit.MADE_WITH_THE_CODE = Path('image'); jit._config.CACHE_DIR = 'own'; jit._folder = jit._open_folder(); "
+    program += "from loops import *; print(run(2), kept(run))"
+    assert said(start(tmp_path, program, tmp_path / "unused")) == ["3", "1"]
+    assert list((tmp_path / "own").rglob("*.nbc"))
+
+
+@pytest.mark.minute
+def test_a_scene_needs_no_loop_that_was_not_planned(tmp_path):
+    """Else each worker compiles it by itself, in the middle of a job."""
+    assert said(start(tmp_path, SCENES)) == ["[]"]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.disk_faults import unflushed
+from tests.kit.faults import unflushed
 from tests.made_up_scenes import attempt_at
 from workers.store.local import LocalStore
 

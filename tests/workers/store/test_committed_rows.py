@@ -4,7 +4,7 @@ from schemas.dataset.layout import STAGING, range_table_path
 from schemas.dataset.tables import TABLES
 from schemas.errors import CorruptError, RunError
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene
-from workers.store.committed_rows import iter_ranges, range_rows
+from workers.store.ledger import iter_ranges, range_rows
 from workers.store.local import LocalStore
 
 pytestmark = pytest.mark.usefixtures("unflushed")
@@ -90,7 +90,7 @@ def test_a_damaged_or_missing_table_is_told_by_name(store):
     (records,) = iter_ranges(store, 0, 4)
     path = range_table_path(0, "views")
     data = store.read(path)
-    store.write_whole(path, data[:-1] + b"X")
+    store.put(path, data[:-1] + b"X")
     with pytest.raises(CorruptError, match=f"{path} does not match the SHA-256 in its commit"):
         range_rows(store, records, "views")
     store.remove(path)

@@ -6,14 +6,13 @@ from pathlib import Path
 import pytest
 
 from schemas.errors import RunError
-from tests.disk_faults import Killed, disk, lose_power
-from tests.made_up_runs import FIRST, RANGE, STOP, broken_promises, contents, leftovers, make_dataset
+from tests.kit.faults import Killed, check_published, disk, lose_power
+from tests.kit.made_up_runs import FIRST, RANGE, STOP, broken_promises, contents, leftovers, make_dataset
 from tests.made_up_scenes import attempt_at, small_scene, terms
-from tests.published_files import check_published
 from tests.stored_images import iter_records
+from workers.store.attempt import sweep
 from workers.store.commit import publish
 from workers.store.local import LocalStore
-from workers.store.sweep import sweep
 
 LAYOUTS = ("files", "tar")
 SOME = 13

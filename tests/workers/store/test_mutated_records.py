@@ -13,10 +13,9 @@ from schemas.dataset.layout import commit_path
 from schemas.errors import CommitConflict, CorruptError, OutputError
 from tests.made_up_scenes import attempt_at, small_scene
 from tests.mutations import mutated_bytes, mutated_tree
-from workers.store.commit import publish, read_record
+from workers.store.attempt import sweep
+from workers.store.commit import decode_record, encode_record, publish, read_record, seal_record
 from workers.store.local import LocalStore
-from workers.store.record import decode_record, encode_record, seal_record
-from workers.store.sweep import sweep
 
 pytestmark = pytest.mark.usefixtures("unflushed")
 

@@ -6,7 +6,7 @@ import pytest
 
 from tests.made_up_scenes import made_scene
 from workers.store.manifest import decode_table, encode_table, sorted_rows, table_of_rows
-from workers.store.pose_labels import LABEL_TABLES, decode_label, encode_label, label_differences, pose_labels
+from workers.store.tars import LABEL_TABLES, decode_label, encode_label, label_differences, pose_labels
 
 
 def tables_of(scene_id):

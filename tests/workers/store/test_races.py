@@ -1,11 +1,11 @@
 import subprocess
 import sys
 
+from tests.kit.faults import check_published
 from tests.made_up_scenes import TERMS
-from tests.published_files import check_published
 from tests.stored_images import iter_records
+from workers.store.attempt import sweep
 from workers.store.local import LocalStore
-from workers.store.sweep import sweep
 
 RACER = """
 import sys, time

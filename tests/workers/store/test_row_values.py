@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 
 from schemas.dataset.tables import CAPTURE_SCHEMAS, SCHEMAS
-from workers.store.row_values import buffers_of, check_values, is_sound
+from workers.store.manifest import buffers_of, check_values, is_sound
 
 KINDS = {
     f"{name}-{table}": pa.struct(list(schemas[table]))

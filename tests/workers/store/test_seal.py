@@ -3,7 +3,7 @@
 import random
 
 from tests.damage import cut, flip
-from workers.store.seal import is_sealed, seal
+from workers.store.commit import is_sealed, seal
 
 TEXT = "key: 5\nname: kubek żółty\n"
 

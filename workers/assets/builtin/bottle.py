@@ -6,12 +6,27 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.scene.shape import Material
-from workers.assets.builtin.curves import bezier, fillet, rounded_sections, squircle
-from workers.assets.builtin.materials import clear_glass, plastic, solid_color, steel, textured
-from workers.assets.builtin.palette import Color, chance, glass_color, jitter, mix, pale, pick, vivid
+from workers.assets.builtin.materials import (
+    Color,
+    band_height,
+    bands,
+    chance,
+    clear_glass,
+    glass_color,
+    jitter,
+    label,
+    mix,
+    pale,
+    pick,
+    plastic,
+    solid_color,
+    steel,
+    textured,
+    vivid,
+)
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import lathe
-from workers.assets.builtin.textures import band_height, bands, label
+from workers.assets.builtin.sweeps import bezier, fillet, rounded_sections, squircle
 
 BODY, LABEL, CAP = 0, 1, 2
 SEGMENTS = 48

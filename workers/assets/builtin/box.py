@@ -6,12 +6,33 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.scene.shape import Material
-from workers.assets.builtin.materials import metal, solid_color, textured
-from workers.assets.builtin.palette import BLACK, WHITE, chance, ink_on, jitter, mix, pale, pick, vivid, wood_colors
+from workers.assets.builtin.materials import (
+    BLACK,
+    WHITE,
+    band_height,
+    bands,
+    blank,
+    chance,
+    dots,
+    ink_on,
+    jitter,
+    kraft,
+    label,
+    metal,
+    mix,
+    pale,
+    pick,
+    rgb,
+    solid_color,
+    textured,
+    upright_stripes,
+    vivid,
+    wood,
+    wood_colors,
+)
 from workers.assets.builtin.parts import Model, Surface, over_top
 from workers.assets.builtin.solid import Solid, circle, combine, difference, lathe, union
 from workers.assets.builtin.sweeps import bevelled_profile, prism, split_sides, straight_prism
-from workers.assets.builtin.textures import band_height, bands, blank, dots, kraft, label, rgb, upright_stripes, wood
 
 SIDE, LID, TOP, BOTTOM, EXTRA, OTHER = 0, 1, 2, 3, 4, 5
 

@@ -3,13 +3,24 @@
 import numpy as np
 
 from schemas.scene.shape import Material
-from workers.assets.builtin.curves import fillet
-from workers.assets.builtin.materials import solid_color, steel, textured
-from workers.assets.builtin.palette import BLACK, Color, chance, jitter, mix, pick, vivid
+from workers.assets.builtin.materials import (
+    BLACK,
+    Color,
+    Texture,
+    blend,
+    chance,
+    jitter,
+    mix,
+    noise,
+    pick,
+    solid_color,
+    steel,
+    textured,
+    vivid,
+)
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import Solid, combine, lathe, level_ring, loft, union_at
-from workers.assets.builtin.sweeps import prism, straight_prism
-from workers.assets.builtin.textures import Texture, blend, noise
+from workers.assets.builtin.sweeps import fillet, prism, straight_prism
 
 SKIN, SHELL, LENS, RING, GLASS, DIAL, DISPLAY, SHOE = 0, 1, 2, 3, 4, 5, 6, 7
 

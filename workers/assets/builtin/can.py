@@ -4,12 +4,28 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from workers.assets.builtin.curves import fillet
-from workers.assets.builtin.materials import plastic, solid_color, steel, textured
-from workers.assets.builtin.palette import Color, chance, ink_on, mix, pale, pick, vivid
+from workers.assets.builtin.materials import (
+    Color,
+    Texture,
+    band_height,
+    bands,
+    blank,
+    chance,
+    ink_on,
+    label,
+    mix,
+    pale,
+    pick,
+    plastic,
+    rgb,
+    solid_color,
+    steel,
+    textured,
+    vivid,
+)
 from workers.assets.builtin.parts import Model, Surface, over_top
 from workers.assets.builtin.solid import lathe
-from workers.assets.builtin.textures import Texture, band_height, bands, blank, label, rgb
+from workers.assets.builtin.sweeps import fillet
 
 SIDE, METAL, LID, TOP = 0, 1, 2, 3
 SEGMENTS = 48

@@ -5,14 +5,42 @@ from dataclasses import replace
 import numpy as np
 
 from schemas.scene.shape import Material
-from workers.assets.builtin.curves import bezier, fillet, rounded_sections, spline, squircle
-from workers.assets.builtin.hollow import OUTSIDE, Wall, wall_around, with_handles
-from workers.assets.builtin.materials import clear_glass, solid_color, textured
-from workers.assets.builtin.palette import WHITE, Color, chance, glaze_color, ink_on, jitter, mix, pale, pick
+from workers.assets.builtin.materials import (
+    WHITE,
+    Color,
+    band_height,
+    bands,
+    blank,
+    chance,
+    clear_glass,
+    dots,
+    flecked,
+    glaze_color,
+    ink_on,
+    jitter,
+    label,
+    mix,
+    pale,
+    pick,
+    solid_color,
+    textured,
+    upright_stripes,
+)
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import Solid, circle, lathe
-from workers.assets.builtin.sweeps import bend_radius, rod
-from workers.assets.builtin.textures import band_height, bands, blank, dots, flecked, label, upright_stripes
+from workers.assets.builtin.sweeps import (
+    OUTSIDE,
+    Wall,
+    bend_radius,
+    bezier,
+    fillet,
+    rod,
+    rounded_sections,
+    spline,
+    squircle,
+    wall_around,
+    with_handles,
+)
 
 EAR = 3
 SEGMENTS = 40

@@ -6,12 +6,29 @@ import math
 import numpy as np
 
 from schemas.base import Array
-from workers.assets.builtin.materials import solid_color, textured
-from workers.assets.builtin.palette import BLACK, WHITE, Color, chance, hsv, jitter, lightness, mix, pick, vivid
+from workers.assets.builtin.materials import (
+    BLACK,
+    WHITE,
+    Color,
+    Texture,
+    blank,
+    blend,
+    chance,
+    draw_small_print,
+    hsv,
+    jitter,
+    lightness,
+    mix,
+    noise,
+    pick,
+    rgb,
+    solid_color,
+    textured,
+    vivid,
+)
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import TRIG_DIGITS, Solid, combine, difference, lathe, union
 from workers.assets.builtin.sweeps import bevelled_profile, prism, straight_prism
-from workers.assets.builtin.textures import Texture, blank, blend, draw_small_print, noise, rgb
 
 CASE, LID, SCREEN, BEZEL, DECK, PAD = 0, 1, 2, 3, 4, 5
 DECK_WIDTH, DECK_DEPTH, DECK_MIDDLE = 0.86, 0.44, 0.12

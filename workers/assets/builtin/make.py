@@ -6,23 +6,21 @@ from collections.abc import Callable
 import numpy as np
 
 from schemas.base import frozen_array
-from schemas.job.assets import ProceduralSource
-from schemas.job.category import TABLE
+from schemas.job.assets import TABLE, ProceduralSource
 from schemas.scene.shape import Asset, Lofted, Shape
 from workers.assets.builtin.bottle import make_bottle
-from workers.assets.builtin.bowl import make_bowl
 from workers.assets.builtin.box import make_box
 from workers.assets.builtin.camera import make_camera
 from workers.assets.builtin.can import make_can
+from workers.assets.builtin.crockery import make_bowl, make_mug
 from workers.assets.builtin.identity import instance_id
 from workers.assets.builtin.jar import make_jar
 from workers.assets.builtin.laptop import make_laptop
-from workers.assets.builtin.mug import make_mug
 from workers.assets.builtin.parts import Model, cut_into_parts
 from workers.assets.builtin.table import make_table
 from workers.assets.mass import solid_mass
-from workers.geometry.bounds import bounds_of
 from workers.geometry.frames import pose
+from workers.geometry.mesh import bounds_of
 
 LICENCE = "CC0-1.0"
 GENERATORS: dict[str, tuple[int, Callable[[np.random.Generator], Model]]] = {

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.scene.shape import Material, Part, Shape
 from workers.assets.builtin.solid import TRIG_DIGITS, Indices, Solid, renumber
-from workers.geometry.bounds import bounds_of
-from workers.geometry.jit import compiled
+from workers.geometry.jit import compiled, compiled_for
+from workers.geometry.mesh import bounds_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,10 @@ def _mapping(surface: Surface, low: Array) -> _Mapping:
     return _NO_MAPPING._replace(kind=_BOX, origin=low, reach=surface.size, sides=_SIDES[surface.grain])
 
 
-@compiled
+@compiled_for(
+    "f8[:,::1], i8[:,::1], i8[:,::1], i8[::1], f8[:,::1], i8[::1]",
+    "f8[:,::1], const(i8[:,::1]), i8[:,::1], i8[::1], f8[:,::1], i8[::1]",
+)
 def _vary(
     laid: Array, faces: Indices, corners: Indices, surface: Indices, across: Array, kinds: Indices
 ) -> tuple[Indices, Array]:
@@ -152,7 +155,7 @@ def _vary(
     return keys, turn
 
 
-@compiled
+@compiled_for("i8[:,::1], i8[::1], i8, i8")
 def _collect(
     keys: Indices, surface: Indices, points: int, surfaces: int
 ) -> tuple[NDArray[np.int32], Indices, NDArray[np.int64]]:
@@ -186,7 +189,7 @@ def _collect(
     return faces, names[:count].copy(), stops
 
 
-@compiled
+@compiled_for("f8[:,::1], i8[::1], i8[::1], f8[::1], i8[:,::1], i8[::1], f8[:,::1], f8[::1], f8[:,:,::1], i8[:,:,::1]")
 def _lay(
     laid: Array,
     place: Indices,
@@ -218,7 +221,7 @@ def _lay(
     return uv
 
 
-@compiled
+@compiled_for("f8[:,::1], i8[:,::1], i8[:,::1], i8", "f8[:,::1], const(i8[:,::1]), i8[:,::1], i8")
 def _shade(vertices: Array, faces: Indices, shaded: Indices, count: int) -> tuple[Array, Array]:
     """The faces' area vectors [3, F], twice their area long, and the shading normals [count, 3] of the points.
 

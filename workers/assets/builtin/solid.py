@@ -17,10 +17,8 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.scene.shape import Loft
-from workers.geometry.convexity import numbers_in
-from workers.geometry.first_equal import first_equal
-from workers.geometry.jit import compiled
-from workers.geometry.manifold import hold_to_one_thread
+from workers.geometry.jit import compiled_for
+from workers.geometry.mesh import first_equal, hold_to_one_thread, numbers_in
 
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -156,7 +154,7 @@ def smoothing_groups(profile: Array) -> Indices:
     return _smoothing_groups(np.ascontiguousarray(profile, dtype=np.float64))
 
 
-@compiled
+@compiled_for("f8[:,::1]")
 def _smoothing_groups(profile: Array) -> Indices:
     """A profile has a few dozen segments: numpy takes longer to begin than to count them."""
     count = len(profile) - 1
@@ -238,7 +236,7 @@ def union_at(solid: Solid, touched: Mask, apex: Array, others: Sequence[Solid], 
     )
 
 
-@compiled
+@compiled_for("i8[:,::1]")
 def renumber(keys: Indices) -> tuple[Indices, Indices]:
     """Keys [F, K] int64 renumbered 0, 1, 2, ... in ascending order, and the key of each number."""
     rows, columns = keys.shape

@@ -1,13 +1,137 @@
-"""Pure: solids swept from an outline: prisms with round edges, and bent rods."""
+"""Pure: plane curves, the solids swept from them, and the walls of hollow vessels.
 
+Curves are computed by +, -, *, / and square roots alone, which give the same bits on every processor.
+"""
+
+import functools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from schemas.base import Array
-from workers.assets.builtin.curves import directions, rounded_rectangles
-from workers.assets.builtin.solid import Indices, Solid, loft, smoothing_groups
+from workers.assets.builtin.solid import Indices, Solid, circle, loft, smoothing_groups, union_at
+
+Point = Sequence[float] | Array
+
+
+def bezier(a: Point, b: Point, c: Point, d: Point, count: int) -> Array:
+    """[count, k] float64: points of the cubic Bezier curve from a to d, at even parameters, both ends included."""
+    t = np.linspace(0.0, 1.0, count)[:, None]
+    s = 1.0 - t
+    pa, pb, pc, pd = (np.asarray(p, dtype=np.float64) for p in (a, b, c, d))
+    points = s * s * s * pa + 3.0 * s * s * t * pb + 3.0 * s * t * t * pc + t * t * t * pd
+    points[0], points[-1] = pa, pd
+    return points
+
+
+def spline(points: Array, count: int) -> Array:
+    """[(P - 1) * count + 1, 2] float64: the Catmull-Rom curve through points [P, 2], `count` segments each."""
+    before = np.concatenate([[2.0 * points[0] - points[1]], points[:-1]])
+    after = np.concatenate([points[1:], [2.0 * points[-1] - points[-2]]])
+    slope = 0.5 * (after - before)
+    t = (np.arange(count) / count)[None, :, None]
+    p, q, m, n = points[:-1, None], points[1:, None], slope[:-1, None], slope[1:, None]
+    t2, t3 = t * t, t * t * t
+    curve = (2 * t3 - 3 * t2 + 1) * p + (t3 - 2 * t2 + t) * m + (3 * t2 - 2 * t3) * q + (t3 - t2) * n
+    return np.concatenate([curve.reshape(-1, points.shape[1]), points[-1:]])
+
+
+def fillet(points: Array, radii: Sequence[float] | Array, steps: int = 3) -> tuple[Array, Array]:
+    """A polyline [P, 2] with its inner corners replaced by quadratic arcs, and the old segment of each new segment.
+
+    `radii` [P] is how far from each corner the arc begins (cut to 45 % of the shorter side; 0 keeps the corner). The
+    first half of an arc belongs to the segment before it. Returns [Q, 2] float64 and [Q - 1] int64.
+    """
+    t = np.arange(steps + 1)[:, None] / steps
+    out, owner = [points[:1]], []
+    for k in range(1, len(points) - 1):
+        before, corner, after = points[k - 1], points[k], points[k + 1]
+        back, ahead = before - corner, after - corner
+        size_b = float(np.sqrt(back[0] * back[0] + back[1] * back[1]))
+        size_a = float(np.sqrt(ahead[0] * ahead[0] + ahead[1] * ahead[1]))
+        reach = min(radii[k], 0.45 * size_b, 0.45 * size_a)
+        if reach <= 0.0:
+            out.append(corner[None])
+            owner.append(k - 1)
+            continue
+        start, stop = corner + back * (reach / size_b), corner + ahead * (reach / size_a)
+        out.append((1 - t) * (1 - t) * start + 2 * t * (1 - t) * corner + t * t * stop)
+        owner += [k - 1] * (1 + steps // 2) + [k] * (steps - steps // 2)
+    out.append(points[-1:])
+    owner.append(len(points) - 2)
+    return np.concatenate(out), np.array(owner, dtype=np.int64)
+
+
+def directions(path: Array, ends: tuple[Array, Array] | None = None) -> Array:
+    """[K, 2] float64: unit directions along a path [K, 2]; `ends`: those at its first and last point, where known."""
+    step = np.empty_like(path)
+    step[1:-1] = path[2:] - path[:-2]
+    step[0], step[-1] = ends or (path[1] - path[0], path[-1] - path[-2])
+    return step / np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2)[:, None]
+
+
+def outward_normals(curve: Array) -> Array:
+    """[P, 2] float64: unit normals to the right of a polyline [P, 2]: out of a wall that runs upwards."""
+    along = directions(curve)
+    return np.stack([along[:, 1], -along[:, 0]], axis=1)
+
+
+def half_circle_points(a: Array, b: Array, count: int) -> Array:
+    """[count, 2] float64: inner points of the half circle from a to b that lies to the right of the line from a to b."""
+    middle, radius = 0.5 * (a + b), 0.5 * (b - a)
+    side = np.array([radius[1], -radius[0]])
+    table = circle(2 * (count + 1))[1 : count + 1]
+    return middle - table[:, 0:1] * radius + table[:, 1:2] * side
+
+
+@functools.cache
+def squircle(count: int, squareness: int) -> Array:
+    """[count, 2] float64: the superellipse |x|^p + |y|^p = 1 with p = 2, 4, 8 for squareness 0, 1, 2."""
+    points = circle(count)
+    power = points * points
+    for _ in range(squareness):
+        power = power * power
+    root = power.sum(axis=1)
+    for _ in range(squareness + 1):
+        root = np.sqrt(root)
+    table = points / root[:, None]
+    table.setflags(write=False)
+    return table
+
+
+def rounded_sections(outline: Array, share: Array) -> Array:
+    """[K, n, 2] float64: the unit circle where a share [K] is 0, an outline [n, 2] where it is 1, and between them."""
+    share = share[:, None, None]
+    return circle(len(outline))[None] * (1.0 - share) + outline[None] * share
+
+
+def rounded_rectangles(size: Array, radius: Array, steps: int = 3, sides: tuple[int, int] = (1, 1)) -> Array:
+    """[L, n, 2] float64: rectangles about the origin with round corners, counter-clockwise, metres.
+
+    size [L, 2]: width along x and depth along y; radius [L]; `sides`: into how many pieces the straight sides along x
+    and along y are cut.
+    """
+    arc = radius[:, None, None] * circle(4 * steps)[: steps + 1]
+    half = 0.5 * size[:, None, :] - radius[:, None, None]
+    c, s, x, y = arc[..., 0], arc[..., 1], half[..., 0], half[..., 1]
+    corners = np.empty((4, len(size), steps + 1, 2))
+    corners[0, ..., 0], corners[0, ..., 1] = x + c, y + s
+    corners[1, ..., 0], corners[1, ..., 1] = -x - s, y + c
+    corners[2, ..., 0], corners[2, ..., 1] = -x - c, -y - s
+    corners[3, ..., 0], corners[3, ..., 1] = x + s, -y - c
+    pieces = []
+    for k in range(4):
+        pieces.append(corners[k])
+        if (count := sides[k % 2]) > 1:
+            t = (np.arange(1, count) / count)[None, :, None]
+            pieces.append(corners[k][:, -1:] * (1 - t) + corners[(k + 1) % 4][:, :1] * t)
+    return np.concatenate(pieces, axis=1)
+
+
+def rounded_rectangle(width: float, depth: float, radius: float, steps: int = 3) -> Array:
+    """[n, 2] float64: one rectangle of `rounded_rectangles`."""
+    return rounded_rectangles(np.array([[width, depth]]), np.array([radius]), steps)[0]
 
 
 def prism(
@@ -80,3 +204,67 @@ def split_sides(solid: Solid, surface: int, numbers: tuple[int, int, int, int]) 
     side = np.where(np.abs(y) >= np.abs(x), np.where(y < 0, 0, 2), np.where(x > 0, 1, 3))
     chosen = solid.surface == surface
     return replace(solid, surface=np.where(chosen, np.array(numbers)[side], solid.surface))
+
+
+HANDLE_ROOM_M = 0.002
+"""A handle may meet the faces of a vessel that are this near to its bounding box."""
+
+OUTSIDE, INSIDE, BASE = 0, 1, 2
+"""Surface numbers of a vessel."""
+
+
+@dataclass(frozen=True, eq=False)
+class Wall:
+    """The profile of a hollow vessel and the surface number of each of its segments.
+
+    profile [P, 2] of (radius, height), metres, axis to axis; surface [P - 1]; outer [Q, 2]: the stretch of the profile
+    that is the outside of the wall, bottom to rim; thickness_m: of the wall.
+    """
+
+    profile: Array
+    surface: Indices
+    outer: Array
+    thickness_m: float
+
+    def radius_at(self, z: float) -> float:
+        """Outer radius at a height, metres."""
+        return float(np.interp(z, self.outer[:, 1], self.outer[:, 0]))
+
+    def normal_at(self, z: float) -> Array:
+        """[2] float64: the unit normal (radius, height) of the outside at a height."""
+        low, high = z - 0.002, z + 0.002
+        step = np.array([self.radius_at(high) - self.radius_at(low), high - low])
+        return np.array([step[1], -step[0]]) / float(np.sqrt(step[0] * step[0] + step[1] * step[1]))
+
+    def middle_at(self, z: float) -> Array:
+        """[2] float64: the point (radius, height) midway through the wall that lies behind the outside at a height."""
+        return np.array([self.radius_at(z), z]) - 0.5 * self.thickness_m * self.normal_at(z)
+
+
+def wall_around(hollow: Array, thickness_m: float, foot_radius: float, foot_width: float, recess: float) -> Wall:
+    """A wall of even thickness around a hollow [P, 2] from (0, height of the inner bottom) to the rim.
+
+    The vessel stands on a ring from foot_radius - foot_width to foot_radius at height 0; inside the ring the underside lies
+    `recess` higher. The rim is round.
+    """
+    offset = hollow + thickness_m * outward_normals(hollow)
+    outer = offset[int(((offset[:, 0] > foot_radius + 2e-4) & (offset[:, 1] > 2e-4)).argmax()) :]
+    inner_foot = foot_radius - foot_width
+    base = np.array([[0.0, recess], [inner_foot - 0.4 * recess, recess], [inner_foot, 0.0], [foot_radius, 0.0]])
+    rim = half_circle_points(outer[-1], hollow[-1], 3)
+    profile = np.concatenate([base, outer, rim, hollow[::-1]])
+    surface = np.repeat([BASE, OUTSIDE, INSIDE], [len(base) - 1, len(outer) + 2, len(hollow) + 1])
+    return Wall(profile, surface, np.concatenate([base[-1:], outer]), thickness_m)
+
+
+def with_handles(body: Solid, outside: int, handles: Sequence[Solid]) -> Solid:
+    """A vessel about the z axis with handles that end inside its wall; `outside`: the surface number of its outside."""
+    a, b, c = (body.vertices[body.faces[:, k]] for k in range(3))
+    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+    touched = np.zeros(len(body.faces), dtype=np.bool_)
+    for handle in handles:
+        start, stop = handle.vertices.min(axis=0) - HANDLE_ROOM_M, handle.vertices.max(axis=0) + HANDLE_ROOM_M
+        touched |= ((high >= start) & (low <= stop)).all(axis=1)
+    touched &= body.surface == outside
+    middle = 0.5 * float(low[touched, 2].min() + high[touched, 2].max())
+    return union_at(body, touched, np.array([0.0, 0.0, middle]), handles)

@@ -6,13 +6,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from schemas.base import Array
-from workers.assets.builtin.curves import bezier, rounded_rectangle, squircle
-from workers.assets.builtin.materials import metal, solid_color, textured
-from workers.assets.builtin.palette import BLACK, WHITE, chance, jitter, mix, pale, pick, vivid, wood_colors
+from workers.assets.builtin.materials import (
+    BLACK,
+    WHITE,
+    chance,
+    jitter,
+    metal,
+    mix,
+    pale,
+    pick,
+    solid_color,
+    speckled,
+    stone,
+    textured,
+    vivid,
+    wood,
+    wood_colors,
+)
 from workers.assets.builtin.parts import Model, Surface
 from workers.assets.builtin.solid import Indices, Solid, circle, combine, lathe, level_ring, loft, union
-from workers.assets.builtin.sweeps import prism
-from workers.assets.builtin.textures import speckled, stone, wood
+from workers.assets.builtin.sweeps import bezier, prism, rounded_rectangle, squircle
 
 TOP, LEG, FRAME = 0, 1, 2
 """Surface numbers of a table."""

@@ -1,14 +1,18 @@
-"""Edge: the instances that a folder of files offers, with the SHA-256 of every file."""
+"""Edge: which files a source offers, and their SHA-256: a folder with a map from file patterns to categories, or ShapeNetCore.
+
+ShapeNetCore is a user's own copy, version 1 or 2 (dataset.md section 1, "ShapeNet").
+"""
 
 import hashlib
+import importlib.util
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from schemas.errors import MeshError
-from schemas.job.assets import FolderSource, MeshLimits, ShapeNetSource, UpAxis
-from workers.assets.external.reading import list_mesh_files
-from workers.assets.external.urdf_file import find_mesh, mesh_names, parse_urdf
+from schemas.errors import AssetSourceError, MeshError
+from schemas.job.assets import TABLE, FolderSource, MeshLimits, ShapeNetSource, UpAxis, matches
+from workers.assets.external.formats import list_mesh_files
+from workers.assets.external.urdf import find_mesh, mesh_names, parse_urdf
 
 UNKNOWN = "unknown"
 """The licence of a source whose user states none."""
@@ -138,3 +142,130 @@ def find_licence(path: Path, folder: Path, stated: str, licences: Collection[Pat
     if stated == UNKNOWN and (file := next(nearest, None)) is not None:
         return f"see {file.relative_to(folder).as_posix()}"
     return stated
+
+
+PYBULLET_DATA = "pybullet_data"
+PYBULLET_MAP: Mapping[str, str] = {
+    "objects/mug.urdf": "mug",
+    "table/table.urdf": TABLE,
+    "table_square/table_square.urdf": TABLE,
+    "random_urdfs/*/*.urdf": "box",
+}
+"""The category of each mesh inside the pybullet_data package that has one."""
+
+
+def locate_folder(name: str, job_folder: Path) -> Path:
+    """The folder of a source: relative to the job file, or that of the installed package pybullet_data, not imported."""
+    if name == PYBULLET_DATA and not (job_folder / name).is_dir():
+        spec = importlib.util.find_spec(PYBULLET_DATA)
+        if spec is None or not spec.submodule_search_locations:
+            raise AssetSourceError("the package pybullet_data is not installed: `pip install pybullet` brings it")
+        return Path(spec.submodule_search_locations[0]).resolve()
+    try:
+        return (job_folder / Path(name).expanduser()).resolve()
+    except RuntimeError as error:
+        raise AssetSourceError(f"{name}: there is no such user, or no home folder") from error
+
+
+def find_files(
+    settings: FolderSource, job_folder: Path, categories: Collection[str]
+) -> tuple[Path, dict[str, list[Path]]]:
+    """The source's folder, and every file that the map names by category, of the categories asked for.
+
+    Raises AssetSourceError where map or folder cannot be used.
+    """
+    folder = locate_folder(settings.folder, job_folder)
+    category_map = _read_map(settings, folder)
+    found: dict[str, list[Path]] = {category: [] for category in sorted(set(category_map.values()) & set(categories))}
+    matched = _match_files(category_map, folder)
+    _check_up(settings, folder, matched)
+    for path, category in sorted(matched.items()):
+        if category in found:
+            found[category].append(path)
+    return folder, found
+
+
+def _match_files(category_map: Mapping[str, str], folder: Path) -> dict[Path, str]:
+    """The category of every file inside the folder that a pattern finds; the first pattern wins."""
+    matches: dict[Path, str] = {}
+    for pattern, category in category_map.items():
+        try:
+            found = [path for path in folder.glob(pattern) if path.is_file()]
+        except (ValueError, NotImplementedError) as error:
+            raise AssetSourceError(f"category_map: {pattern!r} is not a pattern below the folder: {error}") from error
+        for path in found:
+            if path.resolve().is_relative_to(folder):
+                matches.setdefault(path.resolve(), category)
+    return matches
+
+
+def _check_up(settings: FolderSource, folder: Path, files: Iterable[Path]) -> None:
+    """AssetSourceError for a pattern of `up` that finds none of the files: it is most likely misspelt."""
+    if isinstance(settings.up, str):
+        return
+    names = [path.relative_to(folder).as_posix() for path in files]
+    for pattern in settings.up:
+        if not any(matches(name, pattern) for name in names):
+            first = ", ".join(names[:3])
+            raise AssetSourceError(
+                f"up: {pattern!r} finds none of the {len(names)} files of {folder} (such as {first})"
+            )
+
+
+def _read_map(settings: FolderSource, folder: Path) -> Mapping[str, str]:
+    """The category by file pattern; AssetSourceError where there is none."""
+    if not folder.is_dir():
+        raise AssetSourceError(
+            f"{folder} is not a folder. Set `folder` of the urdf source to one, or to `{PYBULLET_DATA}`."
+        )
+    category_map = settings.category_map or (PYBULLET_MAP if settings.folder == PYBULLET_DATA else {})
+    if not category_map:
+        raise AssetSourceError(
+            f'{folder} needs a `category_map`, such as {{"mugs/*.obj": mug}}: nothing says what its files are. '
+            f"It has {describe_folder(folder)}."
+        )
+    return category_map
+
+
+SYNSETS: dict[str, str] = {
+    "bottle": "02876657",
+    "bowl": "02880940",
+    "camera": "02942699",
+    "can": "02946921",
+    "jar": "03593526",
+    "laptop": "03642806",
+    "mug": "03797390",
+    TABLE: "04379243",
+}
+"""ShapeNetCore's synset of each category; it has no box."""
+
+_MESHES = ("models/model_normalized.obj", "model.obj")
+"""Where the mesh lies in a model's folder: version 2, version 1."""
+
+
+def find_models(
+    settings: ShapeNetSource, job_folder: Path, categories: Collection[str]
+) -> tuple[Path, dict[str, list[Path]]]:
+    """The source's folder, and the mesh of every model by category, of the categories that ShapeNetCore has.
+
+    Raises AssetSourceError where the folder is not ShapeNetCore's.
+    """
+    folder = locate_folder(settings.folder, job_folder)
+    if not folder.is_dir():
+        raise AssetSourceError(
+            f"{folder} is not a folder. Set `folder` of the shapenet source to your copy of ShapeNetCore: the folder "
+            "that holds synset folders such as 03797390."
+        )
+    wanted = {category: folder / SYNSETS[category] for category in sorted(categories) if category in SYNSETS}
+    if wanted and not any(synset.is_dir() for synset in wanted.values()):
+        names = ", ".join(f"{synset.name} ({category})" for category, synset in wanted.items())
+        raise AssetSourceError(f"{folder} has none of the synset folders {names}; it has {describe_folder(folder)}.")
+    return folder, {
+        category: [_find_mesh(p) for p in sorted(synset.iterdir()) if p.is_dir()] if synset.is_dir() else []
+        for category, synset in wanted.items()
+    }
+
+
+def _find_mesh(model: Path) -> Path:
+    """The mesh of a model; a path that does not exist where it has none, so that it is counted as missing."""
+    return next((model / name for name in _MESHES if (model / name).is_file()), model / _MESHES[-1])

@@ -1,20 +1,27 @@
-"""Edge: loads an instance of a source of files as an asset: z up, metric, centred on its bounding box, weighed."""
+"""Loads an instance of a source of files as an asset: z up, metric, centred on its bounding box, weighed.
 
+Beside it: which axis of a shape points up, as far as its geometry tells (`find_upright`), and what a person asks about a
+file (`measure_asset`).
+"""
+
+import json
+import math
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from schemas.base import Array, frozen_array
 from schemas.errors import MeshError
-from schemas.job.assets import Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
-from schemas.job.category import TABLE
-from schemas.scene.shape import Asset
+from schemas.job.assets import TABLE, Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
+from schemas.scene.shape import Asset, Hull
 from workers.assets.external.caps import MOST_NOTES, one_line
 from workers.assets.external.listing import Entry, check_unchanged, mesh_root
 from workers.assets.external.mesh import LoadedMesh, load_shape, transform_shape
-from workers.assets.external.upright import find_upright
-from workers.assets.external.urdf_file import load_urdf
+from workers.assets.external.urdf import load_urdf
 from workers.assets.mass import mass_properties
 from workers.geometry.frames import pose
 
@@ -103,3 +110,152 @@ def _check_size(name: str, diagonal_m: float, limits: MeshLimits) -> None:
         if over:
             remedy = "set `scale` (0.001 for millimetres) or `diagonal_m` of its source"
             raise MeshError("size", f"{name} is {diagonal_m:.3g} m across, {word} {key} = {cap:g}: {remedy}")
+
+
+FLAT_SHARE, ROUGH_SHARE = 0.004, 0.016
+"""Shares of the diagonal within which points count as touching the ground: of smooth bottoms, and of scanned ones, which
+are rumpled. A round side touches in a strip that is twice as wide in the second as in the first; a rumpled one in all."""
+
+STANDS, ROLLS = (0.35, 0.65), (0.28, 0.58)
+"""A shape stands where the centre of mass lies at least this share of the shape's half width inside its foot, for one of the
+two; it rolls where both shares are smaller. What lies between is not decided."""
+
+TIPS_DEG = 3.0
+"""A shape that needs less of a lean to tip over does not stand."""
+
+LIKELY_DEG = 10.0
+"""A shape is likely to be upright where it stands by this much firmer than upside down, and so on no other axis."""
+
+Verdict = Literal["stands", "rolls", "undecided"]
+Confidence = Literal["sure", "likely"]
+
+AXES: tuple[UpAxis, ...] = ("x", "y", "z")
+DIRECTIONS = (*AXES, "-x", "-y", "-z")
+
+
+@dataclass(frozen=True)
+class Upright:
+    """An axis that points up, and how far that is to be believed."""
+
+    axis: UpAxis
+    confidence: Confidence
+
+
+@dataclass(frozen=True)
+class Stand:
+    """How a shape stands with one direction up.
+
+    smooth, rough: of its half width, how far the centre of mass lies inside its foot, which is what lies within `FLAT_SHARE`
+    or `ROUGH_SHARE` of the ground; smooth_deg, rough_deg: the lean at which it tips over the edge of that foot.
+    """
+
+    smooth: float
+    rough: float
+    smooth_deg: float
+    rough_deg: float
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the shape stands so."""
+        if self.rough_deg < TIPS_DEG or (self.smooth < ROLLS[0] and self.rough < ROLLS[1]):
+            return "rolls"
+        return "stands" if self.smooth >= STANDS[0] or self.rough >= STANDS[1] else "undecided"
+
+
+def find_upright(hull_vertices: Array, com: Array) -> Upright | None:
+    """Which axis is up; None where nothing tells.
+
+    hull_vertices [H, 3] of the convex hull and com [3], any units, in the frame whose axes are asked about. `sure`: with
+    this axis up or down the shape stands, and on both sides of the two others it rolls or tips. `likely`: it stands on
+    several, and with this one up by `LIKELY_DEG` firmer than upside down, which no other is. Of an axis, the positive side
+    is meant.
+    """
+    stands = {name: measure_stand(hull_vertices, com, name) for name in DIRECTIONS}
+    for axis in AXES:
+        others = [stand.verdict for name, stand in stands.items() if axis not in name]
+        if others == ["rolls"] * 4 and "stands" in (stands[axis].verdict, stands[f"-{axis}"].verdict):
+            return Upright(axis, "sure")
+    firmer = {a: stands[a].smooth_deg - stands[f"-{a}"].smooth_deg for a in AXES if stands[a].verdict != "rolls"}
+    order = sorted(firmer, key=lambda axis: -firmer[axis])
+    if not order or firmer[order[0]] - max((firmer[axis] for axis in order[1:]), default=0.0) < LIKELY_DEG:
+        return None
+    return Upright(order[0], "likely")
+
+
+def measure_stand(hull_vertices: Array, com: Array, up: str) -> Stand:
+    """How the shape stands with the direction `up` upwards."""
+    axis, sign = "xyz".index(up[-1]), -1.0 if up.startswith("-") else 1.0
+    height = sign * hull_vertices[:, axis]
+    ground = float(height.min())
+    diagonal = float(np.linalg.norm(hull_vertices.max(axis=0) - hull_vertices.min(axis=0)))
+    flat = np.delete(hull_vertices, axis, axis=1)
+    middle = np.delete(com, axis)
+    half_width = _depth_inside(flat, middle)
+    if half_width <= 0.0:
+        return Stand(0.0, 0.0, 0.0, 0.0)
+    inside = [
+        max(_depth_inside(flat[height <= ground + share * diagonal], middle), 0.0)
+        for share in (FLAT_SHARE, ROUGH_SHARE)
+    ]
+    leans = [math.degrees(math.atan2(depth, sign * float(com[axis]) - ground)) for depth in inside]
+    return Stand(inside[0] / half_width, inside[1] / half_width, leans[0], leans[1])
+
+
+def _depth_inside(points: Array, point: Array) -> float:
+    """How far a point [2] lies inside the convex hull of points [N, 2]; 0 where that has no area, negative outside."""
+    if len(points) < 3:
+        return 0.0
+    try:
+        sides = ConvexHull(points).equations
+    except (QhullError, ValueError):
+        return 0.0
+    return float(-(sides[:, :2] @ point + sides[:, 2]).max())
+
+
+PLACEHOLDER_PX = 2
+"""Side of the grey picture that trimesh gives a mesh whose material is missing."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One file: sizes along its own axes, in units of its source's `scale`; what was mended, left out or is missing.
+
+    textures: how many pictures its parts have. up, confidence: what its shape tells about the axis that is up, or None.
+    """
+
+    extents: tuple[float, float, float]
+    vertices: int
+    faces: int
+    watertight: bool
+    textures: int
+    notes: tuple[str, ...]
+    up: UpAxis | None = None
+    confidence: Confidence | None = None
+
+
+def measure_asset(asset: Asset, hull: Hull | None) -> str:
+    """The measures of an asset whose source has z up, as JSON."""
+    extents = asset.extents_m
+    textures = [part.material.texture for part in asset.shape.parts if part.material.texture is not None]
+    pictures = {id(texture) for texture in textures if max(texture.shape[:2]) > PLACEHOLDER_PX}
+    found = None if hull is None else find_upright(hull.vertices, asset.mass.com)
+    return json.dumps(
+        asdict(
+            Measured(
+                extents=(float(extents[0]), float(extents[1]), float(extents[2])),
+                vertices=int(np.sum([len(part.vertices) for part in asset.shape.parts])),
+                faces=int(np.sum([len(part.faces) for part in asset.shape.parts])),
+                watertight=asset.watertight,
+                textures=len(pictures),
+                notes=asset.notes,
+                up=None if found is None else found.axis,
+                confidence=None if found is None else found.confidence,
+            )
+        )
+    )
+
+
+def read_measured(data: bytes) -> Measured:
+    """The measures of `measure_asset`'s JSON. Raises ValueError, TypeError or KeyError where it is none."""
+    tree = json.loads(data)
+    return Measured(**{**tree, "extents": tuple(tree["extents"]), "notes": tuple(tree["notes"])})

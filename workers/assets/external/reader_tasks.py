@@ -12,16 +12,14 @@ from pydantic import TypeAdapter
 from scipy.spatial import QhullError
 
 from schemas.errors import MeshError
-from schemas.job.assets import Assets, FolderSource, ShapeNetSource
-from schemas.job.category import TABLE
+from schemas.job.assets import TABLE, Assets, FolderSource, ShapeNetSource
 from schemas.scene.shape import Asset, Hull
 from workers.assets.external.answers import Answer
 from workers.assets.external.asset_bytes import pack_asset
 from workers.assets.external.caps import describe_error, one_line
 from workers.assets.external.listing import Entry, SourceFile, hash_files, list_files
-from workers.assets.external.measured import measure_asset
-from workers.assets.external.placement import find_doubt, load_entry
-from workers.assets.external.urdf_file import all_mesh_names, find_mesh, parse_urdf
+from workers.assets.external.placement import find_doubt, load_entry, measure_asset
+from workers.assets.external.urdf import all_mesh_names, find_mesh, parse_urdf
 from workers.geometry.hull import convex_hull
 
 ANSWER, REFUSAL = b"+", b"-"

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.scene.region import REGION_FLOOR
-from workers.geometry.jit import compiled
-from workers.geometry.srgb import SRGB_STEPS, encode_srgb
+from schemas.scene.shape import REGION_FLOOR
+from workers.geometry.colour import SRGB_STEPS, encode_srgb
+from workers.geometry.jit import compiled, compiled_for
 
 CONTRAST = 24
 """An edge pixel differs from one of its neighbours by more than this, in steps of 8 bits."""
@@ -44,7 +44,7 @@ def find_edges(rgb: NDArray[np.uint8], region: NDArray[np.uint8]) -> NDArray[np.
     return mask
 
 
-@compiled
+@compiled_for("u1[:,:,::1], u1[:,::1], i8, i8, u1[:,::1]")
 def _mark_edges(
     rgb: NDArray[np.uint8], region: NDArray[np.uint8], floor: int, contrast: int, mask: NDArray[np.uint8]
 ) -> None:
@@ -82,7 +82,7 @@ def smooth_edges(rgb: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
     _smooth_edges(rgb, mask, np.float32(SPAN_PX))
 
 
-@compiled
+@compiled_for("u1[:,:,::1], u1[:,::1], f4")
 def _smooth_edges(rgb: NDArray[np.uint8], mask: NDArray[np.uint8], span: np.float32) -> None:
     """Blends all edge pixels before it writes one, so that the image need not be copied."""
     width = mask.shape[1]

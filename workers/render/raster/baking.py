@@ -3,10 +3,13 @@
 **Shadow map.** The depth of everything but the floor as the key light sees it, `SHADOW_PX` square, fitted to the things.
 
 **Level maps.** A level is a horizontal plane: the floor, with a map around the table, and the plane that objects stand on,
-with a map around the objects. Each map is made from elevations on a grid of `LEVEL_PX` square (occlusion.py). RGBA8:
-share of the sky seen from the level, share seen from the top of what stands there, elevation of that top in units of the
-box, and share of the key light. On the floor the last is the table's shadow, with an edge as wide as a lamp of `LAMP_RAD`
-makes it from a table's height.
+with a map around the objects. Each map is made from elevations on a grid of `LEVEL_PX` square. RGBA8: share of the sky seen from
+the level, share seen from the top of what stands there, elevation of that top in units of the box, and share of the key light.
+On the floor the last is the table's shadow, with an edge as wide as a lamp of `LAMP_RAD` makes it from a table's height.
+
+**Sky.** On a square grid, things are columns from `under` to `top` above the level. Seen from a point, in one horizontal
+direction, columns hide the sky between two elevation angles a < b, a share sin^2 b - sin^2 a of the cosine-weighted sky (integral
+of 2 sin cos). Sky visibility is the mean, over directions, of the remaining share.
 """
 
 import math
@@ -19,12 +22,96 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
-from schemas.scene.region import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.scene import Placed
-from workers.geometry.bounds import bounds_of
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
 from workers.geometry.frames import transform
-from workers.geometry.jit import compiled
-from workers.render.raster.occlusion import column_extents, sky_visibility
+from workers.geometry.jit import compiled_for
+from workers.geometry.mesh import bounds_of
+
+DIRECTIONS = 8
+REACHES = (1.0, 2.0, 3.5, 5.5, 8.5, 12.5, 18.0)
+"""Distances of the sampled columns, in steps of the grid."""
+
+_ANGLES = [2.0 * math.pi * (turn + 0.5) / DIRECTIONS for turn in range(DIRECTIONS)]
+OFFSETS = np.array([[(round(r * math.cos(a)), round(r * math.sin(a))) for r in REACHES] for a in _ANGLES])
+"""[DIRECTIONS, len(REACHES), 2]: steps (dx, dy) of the grid to the sampled columns."""
+
+
+def column_extents(
+    vertices: Array, faces: NDArray[np.integer], low: Array, step_m: float, size: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(top, under), each [size, size] float32 metres above `low[2]`: highest and lowest elevation of the triangles.
+
+    Sampled at the centres of cells of `step_m`, the first of which begins at `low` (x along columns, y along rows). Both are
+    0 where nothing is, and points below the level count as on it. Vertices [V, 3] in metres, faces [F, 3].
+    """
+    top, under = np.zeros((size, size), np.float32), np.full((size, size), np.inf, np.float32)
+    local = (vertices - low) / np.array([step_m, step_m, 1.0])
+    _fill_columns(local[:, 0] - 0.5, local[:, 1] - 0.5, np.maximum(local[:, 2], 0.0), faces, top, under)
+    return top, np.where(np.isinf(under), np.float32(0.0), under)
+
+
+@compiled_for("f8[::1], f8[::1], f8[::1], i4[:,::1], f4[:,::1], f4[:,::1]")
+def _fill_columns(
+    x: Array, y: Array, z: Array, faces: NDArray[np.integer], top: NDArray[np.float32], under: NDArray[np.float32]
+) -> None:
+    """Interpolates z by barycentric coordinates at each grid point within a triangle's bounding box."""
+    size = len(top)
+    for face in range(len(faces)):
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        area = (x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])
+        if area == 0.0:
+            continue
+        first = max(int(np.ceil(min(x[a], x[b], x[c]))), 0)
+        last = min(int(np.floor(max(x[a], x[b], x[c]))), size - 1)
+        for row in range(
+            max(int(np.ceil(min(y[a], y[b], y[c]))), 0), min(int(np.floor(max(y[a], y[b], y[c]))), size - 1) + 1
+        ):
+            for column in range(first, last + 1):
+                of_c = ((x[b] - x[a]) * (row - y[a]) - (column - x[a]) * (y[b] - y[a])) / area
+                of_b = ((column - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (row - y[a])) / area
+                if of_b >= 0.0 and of_c >= 0.0 and of_b + of_c <= 1.0:
+                    elevation = np.float32(z[a] + of_b * (z[b] - z[a]) + of_c * (z[c] - z[a]))
+                    top[row, column] = max(top[row, column], elevation)
+                    under[row, column] = min(under[row, column], elevation)
+
+
+@compiled_for("f4[:,::1], f4[:,::1], f4[:,::1], f8")
+def sky_visibility(
+    top: NDArray[np.float32], under: NDArray[np.float32], base: NDArray[np.float32], step_m: float
+) -> NDArray[np.float32]:
+    """[N, N] in [0, 1]: share of the sky seen from points `base` [N, N] metres above the level.
+
+    top, under [N, N] metres above the level, both 0 where there is nothing, as around the grid.
+    """
+    size, step2 = len(top), np.float32(step_m * step_m)
+    one, zero = np.float32(1.0), np.float32(0.0)
+    sky = np.empty_like(top)
+    hidden, high, low = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
+    for y in range(size):  # a row at a time, so that the loops over it are vectorised
+        here, shown = base[y], sky[y]
+        hidden[:] = zero
+        for turn in range(OFFSETS.shape[0]):
+            high[:], low[:] = zero, one
+            for reach in range(OFFSETS.shape[1]):
+                dx, dy = OFFSETS[turn, reach, 0], OFFSETS[turn, reach, 1]
+                if not 0 <= y + dy < size:
+                    break
+                first, count = max(-dx, 0), size - abs(dx)
+                tops, unders = top[y + dy, first + dx :], under[y + dy, first + dx :]
+                bases, highs, lows = here[first:], high[first:], low[first:]
+                square = np.float32(dx * dx + dy * dy) * step2
+                for x in range(count):
+                    rise, foot = tops[x] - bases[x], max(unders[x] - bases[x], zero)
+                    to_top, to_foot = rise * rise / (rise * rise + square), foot * foot / (foot * foot + square)
+                    highs[x] = max(highs[x], to_top) if rise > zero else highs[x]
+                    lows[x] = min(lows[x], to_foot) if rise > zero else lows[x]
+            for x in range(size):
+                hidden[x] += max(high[x] - low[x], zero)
+        for x in range(size):
+            shown[x] = one - hidden[x] / np.float32(OFFSETS.shape[0])
+    return sky
+
 
 SHADOW_PX = 768
 LEVEL_PX = 56
@@ -99,13 +186,10 @@ def level_box(vertices: Array, level_m: float, towards: Array, reach_m: float) -
     return Box(np.eye(4), np.array([[*(centre - half), level_m], [*(centre + half), top]]))
 
 
-@compiled
 def _fall_on_level(vertices: Array, level_m: float, towards: Array) -> Array:
     """[N, 2]: the shadows of vertices [N, 3] on a level, of vertices below it those vertices."""
-    shadows = np.empty((len(vertices), 2))
-    for n in range(len(vertices)):
-        along = max(vertices[n, 2] - level_m, 0.0) / towards[2]
-        shadows[n, 0], shadows[n, 1] = vertices[n, 0] - along * towards[0], vertices[n, 1] - along * towards[1]
+    along = np.maximum(vertices[:, 2:] - level_m, 0.0) / towards[2]
+    shadows: Array = vertices[:, :2] - along * towards[:2]
     return shadows
 
 
@@ -130,7 +214,7 @@ def level_pixels(vertices: Array, faces: NDArray[np.int32], box: Box, hollow: bo
     return pixels
 
 
-@compiled
+@compiled_for("f4[:,:,::1], u1[:,:,::1]")
 def _encode_shares(shares: NDArray[np.float32], codes: NDArray[np.uint8]) -> None:
     """Shares [H, W, C], clipped to [0, 1], in 255ths into the first C channels of codes [H, W, D]."""
     zero, one, most = np.float32(0.0), np.float32(1.0), np.float32(255.0)
@@ -162,7 +246,7 @@ def level_shadow(depth: NDArray[np.float32], light: Box, level: Box, towards: Ar
     return _blend_shadows(narrow, wide, away, np.float32(farthest_m))
 
 
-@compiled
+@compiled_for("f8[:,::1], f8[::1], f8[::1], f8, f4")
 def _place_level(
     M: Array, columns: Array, rows: Array, level_m: float, side_px: np.float32
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
@@ -178,22 +262,16 @@ def _place_level(
     return u, v, z
 
 
-@compiled
 def _compare_depth(
     nearest: NDArray[np.float32], z: NDArray[np.float32], depth_m: np.float32, bias_m: np.float32
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(metres to what is nearest to the light, 0 where that is the level itself; 1 where it is not), both [R, C]."""
-    away_m, dark = np.empty_like(z), np.empty_like(z)
-    zero, one = np.float32(0.0), np.float32(1.0)
-    for i in range(z.shape[0]):
-        for j in range(z.shape[1]):
-            away = (z[i, j] - nearest[i, j]) * depth_m
-            hidden = (away > bias_m) & (nearest[i, j] < one)
-            away_m[i, j], dark[i, j] = away if hidden else zero, one if hidden else zero
-    return away_m, dark
+    away = (z - nearest) * depth_m
+    dark = ((away > bias_m) & (nearest < 1.0)).astype(np.float32)
+    return away * dark, dark
 
 
-@compiled
+@compiled_for("f4[:,::1], f4[:,::1], f4[:,::1], f4")
 def _blend_shadows(
     narrow: NDArray[np.float32], wide: NDArray[np.float32], away_m: NDArray[np.float32], farthest_m: np.float32
 ) -> NDArray[np.uint8]:

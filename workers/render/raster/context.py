@@ -1,12 +1,125 @@
-"""The OpenGL context, one a process: off-screen, through EGL, opened by pyrender's platform."""
+"""The OpenGL context, one a process, its functions and its framebuffers.
+
+Of pyrender the EGL platform alone is used, `pyrender.platforms.egl`: it finds a device and makes an off-screen context, on a GPU
+or in software, in the way that pyrender's users know; drawing is our own (gbuffer.py says why).
+
+The functions that are called most go without PyOpenGL's checks of every argument and of every call. A scene makes 700 calls.
+PyOpenGL spends 2 to 10 microseconds on each, a plain call takes less than one. An error of a plain call is raised by the next
+function that PyOpenGL checks: the read-back of the image at the latest.
+"""
 
 import importlib
 import socket
+from collections.abc import Callable, Mapping
+from ctypes import CFUNCTYPE, c_float, c_int, c_ssize_t, c_ubyte, c_uint, c_void_p
 from types import ModuleType
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from schemas.errors import MachineError
-from workers.render.raster.direct_calls import DirectCalls
+from schemas.scene.shape import Appearance
+from schemas.scene.view import Intrinsics
+from workers.geometry.colour import encode_srgb
+from workers.render.raster.draw_calls import Program
+from workers.render.raster.lit_shaders import MASK_FRAGMENT, MASK_VERTEX
+
+SIGNATURES: dict[str, tuple[Any, ...]] = {
+    "glActiveTexture": (c_uint,),
+    "glBindBuffer": (c_uint, c_uint),
+    "glBindFramebuffer": (c_uint, c_uint),
+    "glBindTexture": (c_uint, c_uint),
+    "glBindVertexArray": (c_uint,),
+    "glColorMaski": (c_uint, c_ubyte, c_ubyte, c_ubyte, c_ubyte),
+    "glDepthFunc": (c_uint,),
+    "glDisable": (c_uint,),
+    "glDrawElements": (c_uint, c_int, c_uint, c_void_p),
+    "glEnable": (c_uint,),
+    "glEnableVertexAttribArray": (c_uint,),
+    "glPixelStorei": (c_uint, c_int),
+    "glReadBuffer": (c_uint,),
+    "glScissor": (c_int, c_int, c_int, c_int),
+    "glStencilFunc": (c_uint, c_int, c_uint),
+    "glStencilOp": (c_uint, c_uint, c_uint),
+    "glUniform1f": (c_int, c_float),
+    "glUniform1i": (c_int, c_int),
+    "glUniform2f": (c_int, c_float, c_float),
+    "glUniform3f": (c_int, c_float, c_float, c_float),
+    "glUniform4f": (c_int, c_float, c_float, c_float, c_float),
+    "glUseProgram": (c_uint,),
+    "glVertexAttribPointer": (c_uint, c_int, c_uint, c_ubyte, c_int, c_void_p),
+    "glViewport": (c_int, c_int, c_int, c_int),
+}
+"""The types of the arguments of functions that return nothing and take no array."""
+
+ARRAYS: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "glBufferData": (None, (c_uint, c_ssize_t, c_void_p, c_uint)),
+    "glClearBufferfv": (np.float32, (c_uint, c_int, c_void_p)),
+    "glDeleteBuffers": (np.uint32, (c_int, c_void_p)),
+    "glDeleteTextures": (np.uint32, (c_int, c_void_p)),
+    "glDeleteVertexArrays": (np.uint32, (c_int, c_void_p)),
+    "glTexImage2D": (None, (c_uint, c_int, c_int, c_int, c_int, c_int, c_uint, c_uint, c_void_p)),
+    "glUniform3fv": (np.float32, (c_int, c_int, c_void_p)),
+    "glUniformMatrix3fv": (np.float32, (c_int, c_int, c_ubyte, c_void_p)),
+    "glUniformMatrix4fv": (np.float32, (c_int, c_int, c_ubyte, c_void_p)),
+}
+"""Functions that take an array: its type, where it is always the same, and the types of the arguments."""
+
+GENERATORS = ("glGenBuffers", "glGenTextures", "glGenVertexArrays")
+
+
+class DirectCalls(ModuleType):
+    """The module OpenGL.GL, in which the functions above are plain calls."""
+
+    def __init__(self, gl: ModuleType) -> None:
+        super().__init__(gl.__name__, gl.__doc__)
+        self._gl = gl
+        calls = {name: _plain(name, *types) for name, types in SIGNATURES.items()}
+        calls |= {name: _with_array(name, *form) for name, form in ARRAYS.items()}
+        calls |= {name: _generator(name) for name in GENERATORS}
+        vars(self).update(calls)
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._gl, name)
+        setattr(self, name, value)  # found at once the next time
+        return value
+
+
+def _plain(name: str, *types: Any) -> Any:
+    """The library's function called `name`, which returns nothing."""
+    platform, kind = importlib.import_module("OpenGL.platform").PLATFORM, CFUNCTYPE(None, *types)
+    try:
+        return kind((name, platform.GL))
+    except AttributeError:  # a library need not export what is newer than OpenGL 1.1
+        return kind(platform.getExtensionProcedure(name.encode()))
+
+
+def _with_array(name: str, dtype: Any, types: tuple[Any, ...]) -> Callable[..., None]:
+    """The same for a function whose only pointer is an array, or None."""
+    call, place = _plain(name, *types), types.index(c_void_p)
+
+    def with_array(*arguments: Any) -> None:
+        if arguments[place] is None:
+            call(*arguments)
+        else:
+            held = np.ascontiguousarray(arguments[place], dtype)
+            call(*arguments[:place], held.ctypes.data, *arguments[place + 1 :])
+
+    return with_array
+
+
+def _generator(name: str) -> Callable[[int], NDArray[np.uint32] | int]:
+    """The same for a function that makes names: one of them, or an array of several."""
+    call = _plain(name, c_int, c_void_p)
+
+    def generate(count: int) -> NDArray[np.uint32] | int:
+        names = np.zeros(count, np.uint32)
+        call(count, names.ctypes.data)
+        return names if count > 1 else int(names[0])
+
+    return generate
+
 
 REMEDY = (
     "rendering needs OpenGL 4.1 through EGL. On Debian or Ubuntu: "
@@ -53,3 +166,113 @@ def open_context() -> tuple[ModuleType, Any]:
         found = "EGL has no device" if isinstance(error, IndexError) else f"{type(error).__name__}: {error}"
         raise MachineError(f"no OpenGL context could be opened ({found}): {REMEDY}") from error
     return DirectCalls(gl), platform
+
+
+class Framebuffer:
+    """Renderbuffers of the size that was bound last: views of one job have the same size."""
+
+    def __init__(self, gl: ModuleType, formats: Mapping[int, int]) -> None:
+        """`formats`: OpenGL's internal format of each attachment point."""
+        self._gl, self._formats = gl, formats
+        self._framebuffer = int(gl.glGenFramebuffers(1))
+        self._buffers = [int(name) for name in np.ravel(gl.glGenRenderbuffers(len(formats)))]
+        self.size = (0, 0)
+        """Width and height, pixels."""
+
+    def bind(self, width: int, height: int) -> None:
+        """Draw into, and read from, this framebuffer. Raises RuntimeError where the driver refuses the size."""
+        gl = self._gl
+        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self._framebuffer)
+        gl.glViewport(0, 0, width, height)
+        if self.size == (width, height):
+            return
+        for (point, form), buffer in zip(self._formats.items(), self._buffers, strict=True):
+            gl.glBindRenderbuffer(gl.GL_RENDERBUFFER, buffer)
+            gl.glRenderbufferStorage(gl.GL_RENDERBUFFER, form, width, height)
+            gl.glFramebufferRenderbuffer(gl.GL_FRAMEBUFFER, point, gl.GL_RENDERBUFFER, buffer)
+        colors = [point for point in self._formats if point in (gl.GL_COLOR_ATTACHMENT0, gl.GL_COLOR_ATTACHMENT1)]
+        gl.glDrawBuffers(max(1, len(colors)), colors or [gl.GL_NONE])
+        status = int(gl.glCheckFramebufferStatus(gl.GL_FRAMEBUFFER))
+        if status != gl.GL_FRAMEBUFFER_COMPLETE:
+            raise RuntimeError(f"a framebuffer of {width} x {height} is not complete: status {status:#x}")
+        self.size = (width, height)
+
+    def clear(self, appearance: Appearance) -> None:
+        """Set every pixel to the background, at no depth and infinitely far away."""
+        gl = self._gl
+        self.clear_depth()
+        self.clear_color(np.append(encode_srgb(np.array(appearance.background)), 0.0))
+        if gl.GL_COLOR_ATTACHMENT1 in self._formats:
+            gl.glClearBufferfv(gl.GL_COLOR, 1, np.zeros(4, np.float32))
+
+    def clear_depth(self) -> None:
+        """Set every pixel infinitely far away: what the depth test compares falls with distance."""
+        self._gl.glClearBufferfv(self._gl.GL_DEPTH, 0, np.zeros(1, np.float32))
+
+    def clear_color(self, rgba: NDArray[np.floating]) -> None:
+        """Set every pixel of the first colour attachment to [4] sRGB and region id / 255."""
+        self._gl.glClearBufferfv(self._gl.GL_COLOR, 0, rgba)
+
+    def limit_to(self, window: tuple[int, int, int, int] | None) -> bool:
+        """Draw into the first colour attachment alone, and within a window, until called with None.
+
+        The window is (left, top, right, bottom), right and bottom excluded. False, without a change, where it is empty.
+        """
+        gl = self._gl
+        if window is None:
+            gl.glDisable(gl.GL_SCISSOR_TEST)
+        else:
+            left, top, right, bottom = window
+            if left >= right or top >= bottom:
+                return False
+            gl.glEnable(gl.GL_SCISSOR_TEST)
+            gl.glScissor(left, top, right - left, bottom - top)
+        gl.glColorMaski(1, *([window is None] * 4))
+        return True
+
+    def read(self, rgba: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Read the first colour attachment into `rgba` [H, W, 4], and return it."""
+        gl = self._gl
+        gl.glReadBuffer(gl.GL_COLOR_ATTACHMENT0)
+        gl.glReadPixels(0, 0, *self.size, gl.GL_RGBA, gl.GL_UNSIGNED_BYTE, rgba)
+        return rgba
+
+
+class ColourTarget(Framebuffer):
+    """Colour, depth, and a stencil of the pixels to draw: other sample points of edge pixels, textures with holes cut out.
+
+    Hidden fragments and those outside the stencil are dropped before they are shaded.
+    """
+
+    def __init__(self, gl: ModuleType) -> None:
+        formats = {gl.GL_COLOR_ATTACHMENT0: gl.GL_RGBA8, gl.GL_DEPTH_STENCIL_ATTACHMENT: gl.GL_DEPTH32F_STENCIL8}
+        super().__init__(gl, formats)
+        self._stencil = Program(gl, MASK_VERTEX, MASK_FRAGMENT)
+        self._empty = int(gl.glGenVertexArrays(1))
+        self._mask = int(gl.glGenTextures(1))
+
+    def select(self, mask: NDArray[np.uint8], k: Intrinsics) -> None:
+        """Bind the framebuffer, and draw only where `mask` [H, W] is not 0, until the stencil test is disabled."""
+        gl = self._gl
+        self.bind(k.width, k.height)
+        gl.glBindTexture(gl.GL_TEXTURE_2D, self._mask)
+        gl.glPixelStorei(gl.GL_UNPACK_ALIGNMENT, 1)
+        form = (k.width, k.height, 0, gl.GL_RED, gl.GL_UNSIGNED_BYTE, mask)
+        gl.glTexImage2D(gl.GL_TEXTURE_2D, 0, gl.GL_R8, *form)
+        for setting in (gl.GL_TEXTURE_MIN_FILTER, gl.GL_TEXTURE_MAG_FILTER):
+            gl.glTexParameteri(gl.GL_TEXTURE_2D, setting, gl.GL_NEAREST)
+        gl.glClearBufferiv(gl.GL_STENCIL, 0, np.zeros(1, np.int32))
+        gl.glEnable(gl.GL_STENCIL_TEST)
+        gl.glStencilFunc(gl.GL_ALWAYS, 1, 0xFF)
+        gl.glStencilOp(gl.GL_REPLACE, gl.GL_REPLACE, gl.GL_REPLACE)
+        gl.glDepthMask(False)
+        gl.glDisable(gl.GL_DEPTH_TEST)
+        gl.glColorMask(False, False, False, False)
+        self._stencil.use()
+        gl.glBindVertexArray(self._empty)
+        gl.glDrawArrays(gl.GL_TRIANGLES, 0, 3)
+        gl.glColorMask(True, True, True, True)
+        gl.glEnable(gl.GL_DEPTH_TEST)
+        gl.glDepthMask(True)
+        gl.glStencilFunc(gl.GL_EQUAL, 1, 0xFF)
+        gl.glStencilOp(gl.GL_KEEP, gl.GL_KEEP, gl.GL_KEEP)

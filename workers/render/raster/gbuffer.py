@@ -1,4 +1,4 @@
-"""The renderer: colour, depth and region id of every pixel from one pass over the scene.
+"""The renderer: colour, depth and region id of every pixel from one pass over the scene, and counts of covered pixels.
 
 **One pass.** pyrender's colour pass resolves four samples a pixel, so its depth and its ids disagree and neither is at the
 pixel's centre. Here one sample, at the centre, gives everything. The context is pyrender's. The vertex arrays are not:
@@ -25,41 +25,85 @@ import ctypes
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from types import ModuleType
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.job.render import Render
-from schemas.scene.appearance import Appearance
-from schemas.scene.camera import Camera
-from schemas.scene.effects import EffectPlan
-from schemas.scene.region import REGION_FLOOR
-from schemas.scene.scene import Placed
-from schemas.scene.view import GBuffer
+from schemas.job.views import Render
+from schemas.scene.scene import EffectPlan, Placed
+from schemas.scene.shape import REGION_FLOOR, Appearance
+from schemas.scene.view import Camera, GBuffer, Intrinsics
 from workers.geometry.frames import invert
-from workers.geometry.pixels import fill_plane_depth, fourth_channel
+from workers.geometry.pixels import fill_plane_depth
 from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_edges, smooth_edges
-from workers.render.raster.buffers import INDEX_BYTES, ShapeStore
-from workers.render.raster.context import is_software, open_context
-from workers.render.raster.counting import PixelCounter
+from workers.render.raster.buffers import INDEX_BYTES, ShapeStore, UploadedShape
+from workers.render.raster.context import ColourTarget, Framebuffer, is_software, open_context
 from workers.render.raster.draw_calls import (
     DEPTH_BIAS,
     FLOOR_BIAS,
     Draw,
+    Program,
     RenderPass,
+    clip_from_cam,
     hides_backs,
     is_beyond_near,
     is_drawn,
     rank_regions,
     sort_draws,
 )
-from workers.render.raster.framebuffer import ColourTarget, Framebuffer
-from workers.render.raster.ground import Ground, find_ground, level_plane, plain_srgb
+from workers.render.raster.ground import TILE_PX, Ground, find_ground, level_plane, plain_srgb, tiles
 from workers.render.raster.light_maps import LightMaps
-from workers.render.raster.programs import Program
-from workers.render.raster.shaders import Variant, label_sources
-from workers.render.raster.tiles import tiles
+from workers.render.raster.lit_shaders import EMPTY_FRAGMENT
+from workers.render.raster.shaders import COUNT_VERTEX, Variant, label_sources
+
+LAST_NUMBER = 255
+"""The greatest number that a stencil of eight bits holds."""
+
+
+class PixelCounter:
+    """A stencil that lets each pixel pass once, and a query that counts what passes.
+
+    Each count has a number of its own, which pixels take when they pass: so the stencil is cleared once in 255 counts.
+    Each has a query of its own too: a driver draws what several of them count at once, when the first is finished.
+    """
+
+    def __init__(self, gl: ModuleType) -> None:
+        self._gl = gl
+        self.program = Program(gl, COUNT_VERTEX, EMPTY_FRAGMENT)
+        self._unused: list[int] = []
+        self._framebuffer = Framebuffer(gl, {gl.GL_STENCIL_ATTACHMENT: gl.GL_STENCIL_INDEX8})
+        self._number = LAST_NUMBER
+
+    def start(self, shape: UploadedShape, tile: Intrinsics) -> int:
+        """The query of how many pixels of a tile, of at most `TILE_PX` a side, a shape covers; `program` holds its pose."""
+        gl = self._gl
+        self._framebuffer.bind(TILE_PX, TILE_PX)
+        gl.glViewport(0, 0, tile.width, tile.height)
+        gl.glDisable(gl.GL_DEPTH_TEST)
+        gl.glEnable(gl.GL_STENCIL_TEST)
+        if self._number == LAST_NUMBER:
+            gl.glClearBufferiv(gl.GL_STENCIL, 0, np.zeros(1, np.int32))
+            self._number = 0
+        self._number += 1
+        gl.glStencilFunc(gl.GL_NOTEQUAL, self._number, 0xFF)
+        gl.glStencilOp(gl.GL_KEEP, gl.GL_REPLACE, gl.GL_REPLACE)
+        self.program.set_view(tile, clip_from_cam(tile))
+        query = self._unused.pop() if self._unused else int(np.ravel(gl.glGenQueries(1))[0])
+        gl.glBeginQuery(gl.GL_SAMPLES_PASSED, query)
+        for batch in shape.batches:
+            gl.glBindVertexArray(batch.vertex_array)
+            gl.glDrawElements(gl.GL_TRIANGLES, batch.index_count, gl.GL_UNSIGNED_INT, None)
+        gl.glEndQuery(gl.GL_SAMPLES_PASSED)
+        gl.glDisable(gl.GL_STENCIL_TEST)
+        return query
+
+    def finish(self, query: int) -> int:
+        """The number of pixels of a query that was started."""
+        self._unused.append(query)
+        return int(np.ravel(self._gl.glGetQueryObjectuiv(query, self._gl.GL_QUERY_RESULT))[0])
+
 
 FLAT = Render(tier="flat")
 
@@ -290,7 +334,7 @@ class Renderer:
         gl.glReadPixels(0, 0, k.width, k.height, gl.GL_RED, gl.GL_FLOAT, depth)
         # OpenCV splits channels 20 times faster than a numpy slice is copied, and faster than GL_RGB is read.
         rgb: NDArray | None = cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB) if view.color else None
-        return rgb, depth, fourth_channel(rgba)
+        return rgb, depth, np.ascontiguousarray(rgba[..., 3])
 
 
 def _is_lit(render: Render, effects: EffectPlan) -> bool:

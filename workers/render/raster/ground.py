@@ -1,32 +1,143 @@
-"""What is known of a floor before it is drawn.
+"""What a thing covers of the pixel grid, and what is known of a floor before it is drawn.
 
 Where a level floor fills the image, its plane alone gives z at its pixels, so that z is computed after the image is read and
 the floor is drawn with one output less. Where it also has one colour, the framebuffer is cleared to that, and the floor is
 drawn only where something comes so near to it that the depth test has to decide.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
-from schemas.scene.region import REGION_FLOOR
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Shape
+from schemas.scene.shape import REGION_FLOOR, Shape
+from schemas.scene.view import Intrinsics
+from workers.geometry.camera import project_bounds
+from workers.geometry.colour import decode_srgb
 from workers.geometry.frames import transform
-from workers.geometry.jit import compiled
-from workers.geometry.srgb import decode_srgb
+from workers.geometry.jit import compiled_for
+from workers.geometry.mesh import bounds_of
 from workers.render.raster.buffers import UploadedShape
-from workers.render.raster.draw_calls import DEPTH_BIAS, FLOOR_BIAS, RenderPass, is_plain
+from workers.render.raster.draw_calls import DEPTH_BIAS, FLOOR_BIAS, NEAR_M, RenderPass, is_plain
 from workers.render.raster.shaders import GRAZING, SRGB_CURVE
-from workers.render.raster.tiles import fills_image, is_steep, window
+
+TILE_PX = 1024
+"""Side of a tile, pixels."""
+
+BORDER_PX = 1.0
+"""A rasteriser moves edges by at most 1/256 of a pixel."""
+
+
+def tiles(shape: Shape, T_cam_shape: Pose, k: Intrinsics) -> Iterator[Intrinsics]:
+    """Cameras of at most `TILE_PX` pixels a side that together cover the shape's projected bounding box.
+
+    Each is `k` with its principal point moved by whole pixels, so that pixels coincide. The bounding box ends one width and
+    one height of the image outside of it.
+    """
+    left, top, right, bottom = window(transform(T_cam_shape, shape.vertices), k)
+    for y, x in product(range(top, bottom, TILE_PX), range(left, right, TILE_PX)):
+        size = {"width": min(TILE_PX, right - x), "height": min(TILE_PX, bottom - y)}
+        yield k.model_copy(update={**size, "cx": k.cx - x, "cy": k.cy - y})
+
+
+def window(vertices: Array, k: Intrinsics) -> tuple[int, int, int, int]:
+    """(left, top, right, bottom), whole pixels, right and bottom excluded: the projected bounding box of vertices.
+
+    vertices [V, 3], optical frame. A thing that crosses the near plane gets the whole image and its surroundings; a thing
+    behind it gets nothing.
+    """
+    reach = (-k.width, -k.height, 2 * k.width, 2 * k.height)
+    beyond = vertices[:, 2] > NEAR_M
+    if not beyond.any():
+        return (0, 0, 0, 0)
+    if not beyond.all():
+        return reach
+    bounds = project_bounds(vertices, k, NEAR_M)
+    left, top, right, bottom = (min(max(bounds[n], reach[n % 2]), reach[n % 2 + 2]) for n in range(4))
+    return (math.floor(left), math.floor(top), math.ceil(right), math.ceil(bottom))
+
+
+def fills_image(shape: Shape, T_cam_shape: Pose, k: Intrinsics) -> bool:
+    """Whether a shape covers every pixel of the image, seen from either side: of rectangles that are floors alone.
+
+    True only where the shape is two triangles that make a rectangle along x and y of its frame, and only where that reaches
+    beyond the image by `BORDER_PX` on all sides, twice as far away as the near plane.
+    """
+    if shape.closed or not _is_rectangle(shape):
+        return False
+    low, high = bounds_of(shape.vertices)
+    nearest_m, left, bottom, right, top, _ = _meet_level(T_cam_shape, _corners(k), low[2])
+    inside = left > low[0] and bottom > low[1] and right < high[0] and top < high[1]
+    return bool(nearest_m > 2.0 * NEAR_M and inside)
+
+
+def is_steep(shape: Shape, T_cam_shape: Pose, k: Intrinsics) -> bool:
+    """Whether a shape is one level plane of its frame, and the rays of all pixels meet it at a cosine above `GRAZING`.
+
+    The cosine, computed by a renderer in float32, is at least twice that. It is bounded by the least slope and the greatest
+    length of the rays through the image's corners, between which both lie.
+    """
+    low, high = bounds_of(shape.vertices)
+    return bool(low[2] == high[2] and _meet_level(T_cam_shape, _corners(k), low[2])[5] > 2.0 * GRAZING)
+
+
+def _corners(k: Intrinsics) -> tuple[float, float, float, float]:
+    """Left, top, right and bottom of the rays through corners `BORDER_PX` beyond the image, 1 long along the optical axis."""
+    left, right = (-BORDER_PX - k.cx) / k.fx, (k.width + BORDER_PX - k.cx) / k.fx
+    return left, (-BORDER_PX - k.cy) / k.fy, right, (k.height + BORDER_PX - k.cy) / k.fy
+
+
+def _meet_level(
+    T_cam_shape: Pose, corners: tuple[float, float, float, float], z: float
+) -> tuple[float, float, float, float, float, float]:
+    """Where the rays through four corners meet the level z of a shape's frame.
+
+    (least distance along the optical axis, least x and y, greatest x and y, metres; least cosine that a ray between them has
+    with the level's normal). The first is 0 where a ray meets nothing, the last where one runs the other way.
+    """
+    (r00, r01, r02, t0), (r10, r11, r12, t1), (r20, r21, r22, t2), _ = T_cam_shape.tolist()
+    # The eye in the shape's frame
+    x, y = -t0 * r00 - t1 * r10 - t2 * r20, -t0 * r01 - t1 * r11 - t2 * r21
+    eye_z = -t0 * r02 - t1 * r12 - t2 * r22
+    fall = z - eye_z
+    nearest, left, bottom, right, top = np.inf, np.inf, np.inf, -np.inf, -np.inf
+    low, high, length2 = np.inf, -np.inf, 0.0
+    for u in (corners[0], corners[2]):
+        for v in (corners[1], corners[3]):
+            ray_x, ray_y, ray_z = u * r00 + v * r10 + r20, u * r01 + v * r11 + r21, u * r02 + v * r12 + r22
+            low, high, length2 = min(low, ray_z), max(high, ray_z), max(length2, u * u + v * v + 1.0)
+            away = fall / ray_z if ray_z * fall > 0.0 else 0.0
+            nearest = min(nearest, away)
+            left, right = min(left, x + away * ray_x), max(right, x + away * ray_x)
+            bottom, top = min(bottom, y + away * ray_y), max(top, y + away * ray_y)
+    return nearest, left, bottom, right, top, max(low, -high, 0.0) / math.sqrt(length2)
+
+
+@lru_cache(maxsize=1)  # the views of one scene ask about one floor
+def _is_rectangle(shape: Shape) -> bool:
+    """Whether a shape is a rectangle along x and y at one z: four corners, and two triangles on either side of a diagonal."""
+    if len(shape.vertices) != 4 or len(shape.faces) != 2:
+        return False
+    vertices, faces = shape.vertices.tolist(), shape.faces.tolist()
+    x, y, z = ({vertex[axis] for vertex in vertices} for axis in range(3))
+    if len({tuple(vertex) for vertex in vertices}) != 4 or [len(x), len(y), len(z)] != [2, 2, 1]:
+        return False
+    if any(len(set(face)) != 3 for face in faces):
+        return False
+    first, second = (vertices[6 - sum(face)] for face in faces)  # the corner that a face lacks
+    return first[0] != second[0] and first[1] != second[1]
+
 
 ROUNDING = 1e-5
 """Share of a distance by which the depths that the rasteriser compares may be off; they are exact to 3e-6."""
 
-BORDER_PX = 1
+MARGIN_PX = 1
 """Pixels around that are drawn too: a rasteriser moves edges by at most 1/256 of one."""
 
 Float32 = NDArray[np.float32]
@@ -89,7 +200,7 @@ def plain_srgb(shape: Shape, view: RenderPass, plane: Float32) -> Float32:
     return _plain_srgb(normal, albedo, np.array(lights.ambient, np.float32), lights.towards, lights.color)
 
 
-@compiled
+@compiled_for("f4[::1], f4[::1], f4[::1], f4[:,::1], f4[:,::1]")
 def _plain_srgb(normal: Float32, albedo: Float32, ambient: Float32, towards: Float32, color: Float32) -> Float32:
     """The colour of a level by its normal [3], and lights [N, 3], encoded as shaders do."""
     srgb = np.empty(3, np.float32)
@@ -137,31 +248,22 @@ def near_window(
         return 0, 0, 0, 0
     left, top, right, bottom = window(points, k)
     return (
-        max(left - BORDER_PX, 0),
-        max(top - BORDER_PX, 0),
-        min(right + BORDER_PX, k.width),
-        min(bottom + BORDER_PX, k.height),
+        max(left - MARGIN_PX, 0),
+        max(top - MARGIN_PX, 0),
+        min(right + MARGIN_PX, k.width),
+        min(bottom + MARGIN_PX, k.height),
     )
 
 
-@compiled
 def _low_points(vertices: Array, faces: NDArray[np.int32], up: Array, low_m: float) -> Array:
-    """[N, 3]: the corners of what a mesh has below `low_m`, in its frame.
+    """[N, 3]: the corners of what a mesh has below `low_m`, in its frame, in no order.
 
     up [4]: (a, b, c, d) with the height a x + b y + c z + d, metres.
     """
-    height = np.empty(len(vertices))
-    for n in range(len(vertices)):
-        height[n] = up[0] * vertices[n, 0] + up[1] * vertices[n, 1] + up[2] * vertices[n, 2] + up[3]
-    points, count = np.empty((6 * len(faces), 3)), 0
-    for face in range(len(faces)):
-        for corner in range(3):
-            i, j = faces[face, corner], faces[face, (corner + 1) % 3]
-            if height[i] < low_m:
-                points[count] = vertices[i]
-                count += 1
-            if (height[i] < low_m) != (height[j] < low_m):  # the edge leaves what is low
-                share = (low_m - height[i]) / (height[j] - height[i])
-                points[count] = vertices[i] + share * (vertices[j] - vertices[i])
-                count += 1
-    return points[:count].copy()
+    height = up[0] * vertices[:, 0] + up[1] * vertices[:, 1] + up[2] * vertices[:, 2] + up[3]
+    ends, others = faces.ravel(), faces[:, [1, 2, 0]].ravel()
+    leaves = (height[ends] < low_m) != (height[others] < low_m)  # the edge leaves what is low
+    i, j = ends[leaves], others[leaves]
+    share = (low_m - height[i]) / (height[j] - height[i])
+    crossings = vertices[i] + share[:, None] * (vertices[j] - vertices[i])
+    return np.concatenate([vertices[ends[height[ends] < low_m]], crossings])

@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Pose
-from schemas.scene.appearance import Appearance
-from schemas.scene.region import REGION_FLOOR
 from schemas.scene.scene import Placed
+from schemas.scene.shape import REGION_FLOOR, Appearance
 from workers.render.raster import baking
 from workers.render.raster.baking import SHADOW_PX, Box
 from workers.render.raster.buffers import ShapeStore
+from workers.render.raster.draw_calls import LEVEL_UNIT, SHADOW_UNIT, MapPlacement, Program
 from workers.render.raster.lit_shaders import CAST_VERTEX, EMPTY_FRAGMENT
-from workers.render.raster.programs import LEVEL_UNIT, SHADOW_UNIT, MapPlacement, Program
 
 UPRIGHT = 1.0 - 1e-9
 """Least cosine between two directions that count as equal."""

@@ -8,8 +8,7 @@ flat inputs where triangles are few, uniforms where they are many.
 
 from typing import NamedTuple
 
-from workers.render.raster.lit_shaders import LIT_FRAGMENT, LIT_VERTEX
-from workers.render.raster.plane_shaders import PLANE_FRAGMENT, PLANE_VERTEX
+from workers.render.raster.lit_shaders import LIT_FRAGMENT, LIT_VERTEX, PLANE_FRAGMENT, PLANE_VERTEX
 
 GRAZING = 0.01
 """Cosine of incidence below which a face's plane does not determine z."""

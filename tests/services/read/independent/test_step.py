@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-import services.merge.poses
-from services.read.verify_independent import describe_independent, verify_independently
+import services.merge.tables
+from services.read.audit import describe_independent, verify_independently
 from tests.datasets import faults_of, make_dataset
 
 Plant = Callable[[Callable, Callable], None]
@@ -17,7 +17,7 @@ SCENES = 2
 
 
 def transposed_poses_in_camposes(plant: Plant, _: Any) -> None:
-    original = services.merge.poses.cam_pose_lines
+    original = services.merge.tables.cam_pose_lines
 
     def planted(views):
         rows = [line.split(",") for line in original(views).decode().splitlines()]
@@ -28,7 +28,7 @@ def transposed_poses_in_camposes(plant: Plant, _: Any) -> None:
 
 
 def cx_and_cy_swapped_in_cameras(plant: Plant, _: Any) -> None:
-    original = services.merge.poses.camera_lines
+    original = services.merge.tables.camera_lines
 
     def planted(views):
         rows = [line.split(",") for line in original(views).decode().splitlines()]
@@ -38,7 +38,7 @@ def cx_and_cy_swapped_in_cameras(plant: Plant, _: Any) -> None:
 
 
 def u_and_v_swapped_in_objects(plant: Plant, _: Any) -> None:
-    original = services.merge.poses.object_lines
+    original = services.merge.tables.object_lines
 
     def planted(objects):
         rows = [line.split(" ") for line in original(objects).decode().splitlines()]

@@ -5,9 +5,9 @@ import pytest
 import trimesh
 
 from schemas.scene.view import Agreement, View
-from services.study.measure.image_errors import measure_images
-from services.study.measure.truth import truth_of
+from services.study.measure.images import measure_images, truth_of
 from tests.effects.scenes import SMALL
+from tests.kit.shapes import box
 from tests.services.study.measure.label_views import (
     HEIGHT,
     TABLE_Z,
@@ -24,7 +24,6 @@ from tests.services.study.measure.label_views import (
     table_and,
     view,
 )
-from tests.shapes import box
 
 
 def test_views_that_are_as_the_formulas_say_have_no_error(seen):

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from schemas.scene.view import Agreement
+from tests.kit.shapes import box
 from tests.services.study.measure.label_views import (
     TOP_Z,
     block,
@@ -16,9 +17,8 @@ from tests.services.study.measure.label_views import (
     thing,
     view,
 )
-from tests.shapes import box
-from workers.cameras.placement import mirror_pose
 from workers.geometry.camera import look_at
+from workers.scene.pairs import mirror_pose
 
 
 def ball(radius=0.1, at=(0.0, 0.0)):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from services.study.measure.truth import Truth, truth_of
+from services.study.measure.images import Truth, truth_of
+from tests.kit.shapes import box
 from tests.services.study.measure.label_views import (
     HEIGHT,
     TOP_Z,
@@ -17,7 +18,6 @@ from tests.services.study.measure.label_views import (
     table_and,
     thing,
 )
-from tests.shapes import box
 from workers.geometry.raycast import cast_view
 
 

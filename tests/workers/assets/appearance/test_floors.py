@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workers.assets.appearance.floors import FLOOR_KINDS, PERIOD_M, TEXTURE_PX, draw_floor_material, make_pattern
+from workers.assets.appearance import FLOOR_KINDS, PERIOD_M, TEXTURE_PX, draw_floor_material, make_pattern
 
 
 @pytest.mark.parametrize("kind", range(len(FLOOR_KINDS)))

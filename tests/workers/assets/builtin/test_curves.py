@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from shapely.geometry import Polygon
 
-from workers.assets.builtin.curves import (
+from workers.assets.builtin.solid import circle
+from workers.assets.builtin.sweeps import (
     bezier,
     fillet,
     half_circle_points,
@@ -16,7 +17,6 @@ from workers.assets.builtin.curves import (
     spline,
     squircle,
 )
-from workers.assets.builtin.solid import circle
 
 
 def test_a_bezier_curve_goes_through_its_ends_along_its_handles_and_through_the_known_middle():

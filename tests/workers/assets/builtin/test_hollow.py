@@ -5,8 +5,8 @@ import pytest
 import trimesh
 from shapely.geometry import Polygon
 
-from workers.assets.builtin.hollow import BASE, INSIDE, OUTSIDE, wall_around
 from workers.assets.builtin.solid import lathe
+from workers.assets.builtin.sweeps import BASE, INSIDE, OUTSIDE, wall_around
 
 
 def mesh_of(solid):

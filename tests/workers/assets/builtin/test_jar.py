@@ -5,9 +5,9 @@ import pytest
 from shapely.geometry import Polygon
 
 from tests.workers.assets.builtin.bottom_heights import bottom_heights
-from workers.assets.builtin.hollow import OUTSIDE
 from workers.assets.builtin.jar import _glass_jar, _pot
 from workers.assets.builtin.make import make_model
+from workers.assets.builtin.sweeps import OUTSIDE
 
 
 @pytest.mark.parametrize("index", range(25))

@@ -6,9 +6,9 @@ from shapely.geometry import Polygon
 
 from tests.workers.assets.builtin.bottom_heights import bottom_heights
 from tests.workers.assets.oracles import hits
-from workers.assets.builtin.hollow import INSIDE
+from workers.assets.builtin.crockery import HANDLE, _body, _handle
 from workers.assets.builtin.make import make_model
-from workers.assets.builtin.mug import HANDLE, _body, _handle
+from workers.assets.builtin.sweeps import INSIDE
 
 
 @pytest.mark.parametrize("index", range(25))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workers.assets.builtin import palette
+from workers.assets.builtin import materials as palette
 
 
 @pytest.mark.parametrize("draw", [palette.vivid, palette.pale, palette.glaze_color, palette.glass_color])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workers.assets.builtin import textures
+from workers.assets.builtin import materials as textures
 
 A, B = (0.2, 0.4, 0.6), (0.9, 0.8, 0.1)
 

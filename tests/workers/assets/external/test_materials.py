@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-from workers.assets.external.materials import DEFAULT, read_visual
+from workers.assets.external.formats import DEFAULT, read_visual
 
 
 def box_with(material):

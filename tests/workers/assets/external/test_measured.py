@@ -8,7 +8,7 @@ from PIL import Image
 from schemas.job.assets import Assets, FolderSource
 from tests.workers.assets.oracles import textured_cube, write
 from workers.assets.external.listing import Entry, hash_files
-from workers.assets.external.measured import read_measured
+from workers.assets.external.placement import read_measured
 from workers.assets.external.reader_tasks import ANSWER, Request, Task, answer_task
 
 SETTINGS = FolderSource(source="urdf", folder=".")

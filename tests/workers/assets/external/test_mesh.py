@@ -9,8 +9,7 @@ import trimesh
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from tests.workers.assets.oracles import CUBE, shape_of, welded, write
-from workers.assets.external.mesh import load_shape, transform_shape
-from workers.assets.external.topology import is_solid
+from workers.assets.external.mesh import is_solid, load_shape, transform_shape
 from workers.geometry.frames import pose
 
 LIMITS = MeshLimits()

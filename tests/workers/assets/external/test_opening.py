@@ -9,10 +9,9 @@ from PIL import Image
 from schemas.errors import AssetSourceError, MeshError
 from schemas.job.assets import Assets, FolderSource, MeshLimits
 from tests.workers.assets.oracles import CUBE, textured_cube, write
-from workers.assets.external import opening
-from workers.assets.external.opening import check_listing, load_asset_file, read_listing
+from workers.assets.external import verdicts as opening
 from workers.assets.external.placement import load_entry
-from workers.assets.external.verdicts import Verdicts
+from workers.assets.external.verdicts import Verdicts, check_listing, load_asset_file, read_listing
 
 SETTINGS = FolderSource(source="urdf", folder=".", licence="MIT")
 

@@ -2,7 +2,7 @@
 
 from schemas.job.assets import MeshLimits
 from tests.workers.assets.oracles import CUBE, write
-from workers.assets.external.reading import list_mesh_files, material_files
+from workers.assets.external.formats import list_mesh_files, material_files
 
 
 def test_material_files_are_found_wherever_they_are_named():

@@ -7,8 +7,8 @@ from schemas.errors import AssetSourceError
 from schemas.job.assets import Assets, MeshLimits, ShapeNetSource
 from tests.workers.assets.oracles import CUBE, write
 from workers.assets.catalogue import list_source
+from workers.assets.external.listing import SYNSETS
 from workers.assets.external.placement import load_entry
-from workers.assets.external.shapenet import SYNSETS
 
 LIMITS, ASSETS = MeshLimits(), Assets(density_kg_m3=600.0, shell_kg_m2=3.0)
 TALL = CUBE.replace("v 0 1", "v 0 3").replace("v 1 1", "v 1 3")  # 1 x 3 x 1: +Y is up

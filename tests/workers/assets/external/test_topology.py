@@ -4,14 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from workers.assets.external.topology import (
-    find_bodies,
-    find_collapsed,
-    find_flips,
-    find_repeated,
-    is_solid,
-    merge_points,
-)
+from workers.assets.external.mesh import find_bodies, find_collapsed, find_flips, find_repeated, is_solid, merge_points
 
 
 def soup(mesh):

@@ -5,12 +5,10 @@ import pytest
 import trimesh
 from shapely import Polygon
 
-from schemas.job.assets import ProceduralSource
-from schemas.job.category import CATEGORIES, TABLE
+from schemas.job.assets import CATEGORIES, TABLE, ProceduralSource
 from tests.workers.assets.oracles import support_margin
 from workers.assets.builtin.make import make_asset
-from workers.assets.external.placement import UP_AXES
-from workers.assets.external.upright import Upright, find_upright, measure_stand
+from workers.assets.external.placement import UP_AXES, Upright, find_upright, measure_stand
 from workers.geometry.hull import convex_hull
 
 SEEDS = 12

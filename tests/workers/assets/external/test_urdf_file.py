@@ -9,7 +9,7 @@ import trimesh
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from tests.workers.assets.oracles import CUBE, welded, write
-from workers.assets.external.urdf_file import find_mesh, load_urdf, parse_urdf
+from workers.assets.external.urdf import find_mesh, load_urdf, parse_urdf
 
 
 def urdf(folder, body, name="a.urdf"):

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from workers.capture.board.layout import marker_corners
+from workers.geometry.colour import SRGB_STEPS
 from workers.geometry.frames import invert
-from workers.geometry.srgb import SRGB_STEPS
 
 REACH_PX, STEP_PX = 3.0, 0.1
 MOST_RESIDUAL_PX = 0.15

@@ -1,0 +1,273 @@
+"""Reads a job file into a `Job`. An error names the file, the key, its value and what is allowed, in plain words.
+
+A job file can also be given as one word that no shell changes: `job:` and letters, digits, `-` and `_`.
+"""
+
+import base64
+import binascii
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import ValidationError
+
+from schemas.errors import JobError, did_you_mean, plain_line
+from schemas.job.job import Job
+from schemas.job.keys import set_key
+from services.job.bounded_yaml import MOST_LEVELS, parse_yaml
+from services.job.reference import allowed_keys
+
+MARK: Final = "job:"
+
+MOST_CHARACTERS: Final = 100_000
+"""Longest pack: Linux takes 131,072 bytes for one argument. A job file of ten sources packs into 2,000."""
+
+
+def is_packed(name: str) -> bool:
+    """Whether what is given for a job file is a packed one."""
+    return name.startswith(MARK)
+
+
+def pack(data: bytes) -> str:
+    """The word for a job file's bytes. Raises JobError where it would be too long for a command line."""
+    packed = MARK + base64.urlsafe_b64encode(zlib.compress(data, 9)).decode().rstrip("=")
+    if len(packed) > MOST_CHARACTERS:
+        raise JobError(
+            f"packs into {len(packed)} characters, at most {MOST_CHARACTERS} fit on a command line: bring the file to the "
+            "cluster (file_mounts) and give its path there"
+        )
+    return packed
+
+
+def unpack(word: str, most_bytes: int) -> bytes:
+    """The bytes that were packed, of which no more than `most_bytes` and one are unpacked. Raises JobError."""
+    letters = word.removeprefix(MARK)
+    try:
+        packed = base64.b64decode(letters + "=" * (-len(letters) % 4), altchars=b"-_", validate=True)
+        unpacking = zlib.decompressobj()
+        data = unpacking.decompress(packed, most_bytes + 1)
+    except (binascii.Error, zlib.error, ValueError) as error:
+        raise JobError(f"was cut or changed on its way ({error}): pack it again with `verso pack JOB.yaml`") from error
+    if len(data) <= most_bytes and not unpacking.eof:
+        raise JobError("was cut on its way: pack it again with `verso pack JOB.yaml`")
+    return data
+
+
+_KEYS, _NUMBER, _WHOLE, _TEXT = (
+    "must hold keys with values",
+    "must be a number",
+    "must be a whole number",
+    "must be text: write it in quotes",
+)
+
+_WORDS: Mapping[str, str] = {
+    "model_type": _KEYS,
+    "model_attributes_type": _KEYS,
+    "dict_type": _KEYS,
+    "list_type": "must be a list: [a, b]",
+    "tuple_type": "must be a list: [a, b]",
+    "named_tuple_type": "must be two numbers: [low, high]",
+    "int_type": _WHOLE,
+    "int_parsing": _WHOLE,
+    "int_from_float": _WHOLE,
+    "float_type": _NUMBER,
+    "float_parsing": _NUMBER,
+    "finite_number": "must be a finite number",
+    "bool_type": "must be true or false",
+    "bool_parsing": "must be true or false",
+    "string_type": _TEXT,
+}
+"""By the validator's kind of fault, in place of its own words, which name classes."""
+
+_COUNTS = {"too_short": "at least", "too_long": "at most"}
+
+_BOUNDS: Mapping[str, tuple[str, str]] = {
+    "greater_than_equal": ("ge", "must be at least"),
+    "greater_than": ("gt", "must be greater than"),
+    "less_than_equal": ("le", "must be at most"),
+    "less_than": ("lt", "must be less than"),
+}
+
+
+def describe_fault(fault: Any) -> str:
+    """One line on a fault as pydantic tells it: the key's path, its value, and what is allowed."""
+    words = [plain_line(str(part)) for part in _written(fault["loc"])]
+    key = plain_line(".".join(words), 200)
+    if fault["type"] == "extra_forbidden":
+        allowed = allowed_keys(words)
+        return f"{key}: there is no such key; {did_you_mean(words[-1], allowed)}Allowed here: {', '.join(allowed) or 'nothing'}"
+    if fault["type"] == "missing":
+        return (
+            f"{key}: is missing, and has no default" if not key.rpartition(".")[2].isdigit() else f"{key}: is missing"
+        )
+    message = plain_line(_message(fault), 300)
+    if not words:
+        return message  # of several keys, which it names
+    return f"{key}: {plain_line(repr(fault['input']))}: {message[:1].lower()}{message[1:]}"
+
+
+def _message(fault: Any) -> str:
+    kind, context = fault["type"], fault.get("ctx", {})
+    if kind in _BOUNDS:
+        name, words = _BOUNDS[kind]
+        return f"{words} {context[name]:g}"
+    if kind == "union_tag_not_found":
+        return f"must have a key {context['discriminator']}"
+    if kind == "union_tag_invalid":
+        return f"its {context['discriminator']} {_one_of(context['tag'], context['expected_tags'])}"
+    if kind == "literal_error":
+        return _one_of(fault["input"], context["expected"])
+    if kind in ("too_short", "too_long"):
+        return f"must have {_COUNTS[kind]} {context['min_length' if kind == 'too_short' else 'max_length']} of them"
+    return str(_WORDS.get(kind, fault["msg"].removeprefix("Value error, ")))
+
+
+def _one_of(given: object, allowed: str) -> str:
+    """`allowed` as pydantic lists it: 'a', 'b' or 'c'."""
+    known = [word.strip("'") for word in allowed.replace(" or ", ", ").split(", ")]
+    return f"{did_you_mean(str(given), known)}must be {allowed}"
+
+
+def _written(place: Sequence[str | int]) -> list[str | int]:
+    """The parts of a place that the job file has: not the kind that follows a source's position, nor the mark of a key."""
+    parts = [part for before, part in zip((None, *place), place, strict=False) if not isinstance(before, int)]
+    return parts[:-1] if parts[-1:] == ["[key]"] else parts
+
+
+MOST_BYTES = 250_000
+"""Longest job file; the longest example has 2,000 bytes."""
+
+MOST_KEYS = 20_000
+"""Most keys and values of a job file: half of what a text may have, because filling in defaults adds more."""
+
+MOST_KEY_CHARACTERS = 400
+"""Longest path of a key in `--set`."""
+
+MOST_FAULTS = 20
+"""Most faults that one message tells."""
+
+
+def load_job(path: Path, changes: Sequence[str] = ()) -> Job:
+    """Read a job file, or a packed one, and apply `path.to.key=value` changes. Raises JobError."""
+    name = name_of(path)
+    job = validate_job(read_tree(path, changes), name)
+    _check_homes(job, name)
+    if is_packed(str(path)):
+        _check_absolute(job, name)
+    return job
+
+
+def pack_job(path: Path) -> str:
+    """A job file as one word, for the command line of another machine. Raises JobError as `load_job`."""
+    if is_packed(str(path)):
+        raise JobError(f"{name_of(path)}: is packed already")
+    _check_absolute(load_job(path), name_of(path))
+    try:
+        return pack(path.read_bytes())
+    except JobError as error:
+        raise JobError(f"{name_of(path)}: {error}") from error
+
+
+def name_of(path: Path) -> str:
+    """What a message calls a job file."""
+    return "the packed job" if is_packed(str(path)) else plain_line(str(path), 300)
+
+
+def folders_of(job: Job) -> dict[str, str]:
+    """Every folder that the job names, by its key."""
+    sources = {
+        f"assets.{branch}.{number}.folder": getattr(source, "folder", "")
+        for branch in ("objects", "tables")
+        for number, source in enumerate(getattr(job.assets, branch))
+    }
+    folders = job.captures.folders if job.captures is not None else []
+    return sources | {f"captures.folders.{number}": folder for number, folder in enumerate(folders)}
+
+
+def _check_absolute(job: Job, name: str) -> None:
+    """Raises JobError for a folder that is meant from the job file's own, which a packed job has not."""
+    from workers.assets.external.listing import PYBULLET_DATA
+
+    for key, folder in folders_of(job).items():
+        if folder not in ("", PYBULLET_DATA) and not folder.startswith(("/", "~")):
+            raise JobError(
+                f"{name}: {key}: {plain_line(repr(folder))}: a packed job has no folder of its own: write the whole path, the "
+                "same on every node"
+            )
+
+
+def _check_homes(job: Job, name: str) -> None:
+    """Raises JobError for a folder that begins with the name of a user whom this machine does not know."""
+    for key, folder in folders_of(job).items():
+        try:
+            Path(folder).expanduser()
+        except RuntimeError as error:
+            raise JobError(f"{name}: {key}: {plain_line(repr(folder))}: there is no such user") from error
+
+
+def read_tree(path: Path, changes: Sequence[str] = ()) -> dict[str, Any]:
+    """The keys of a job file with `path.to.key=value` changes, without defaults. Raises JobError."""
+    name = name_of(path)
+    try:
+        tree = parse_yaml(read_text(path), MOST_KEYS)
+    except FileNotFoundError as error:
+        raise JobError(f"{name}: no such file; the examples are in deploy/jobs/") from error
+    except (OSError, ValueError) as error:
+        raise JobError(f"{name}: cannot be read as UTF-8 text: {plain_line(str(error), 200)}") from error
+    except JobError as error:
+        raise JobError(f"{name}: {error}") from error
+    if not isinstance(tree, dict):
+        found = type(tree).__name__ if tree is not None else "nothing"
+        raise JobError(f"{name}: holds {found}, and must hold keys and values")
+    if sum(map(len, changes)) > MOST_BYTES:
+        raise JobError(f"--set: the changes have over {MOST_BYTES} characters: put them into the job file")
+    for change in changes:
+        change_key(tree, change)
+    return tree
+
+
+def read_text(path: Path) -> str:
+    """The text of a file, of which no more is read than a job file may have. Raises OSError, ValueError, JobError."""
+    if is_packed(str(path)):
+        data = unpack(str(path), MOST_BYTES)
+    else:
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
+    if len(data) > MOST_BYTES:
+        raise JobError(f"has over {MOST_BYTES} bytes, and no job needs as many")
+    return data.decode("utf-8-sig")
+
+
+def change_key(tree: dict[str, Any], change: str) -> None:
+    """Apply one `path.to.key=value` in place; the value is read as YAML. Raises JobError."""
+    path, equals, text = change.partition("=")
+    name = f"--set {plain_line(change, 120)}"
+    if not equals or not path:
+        raise JobError(f"{name}: write it as path.to.key=value, for example --set physics.step_hz=480")
+    if len(path) > MOST_KEY_CHARACTERS or path.count(".") >= MOST_LEVELS:
+        raise JobError(
+            f"{name}: there is no such key: none has over {MOST_LEVELS} parts or {MOST_KEY_CHARACTERS} characters"
+        )
+    try:
+        set_key(tree, path, parse_yaml(text))
+    except (JobError, ValueError) as error:
+        raise JobError(f"{name}: {plain_line(str(error), 300)}") from error
+
+
+def validate_job(tree: dict[str, Any], name: str) -> Job:
+    """A `Job` from parsed keys. Raises JobError with one line for each fault."""
+    version = tree.get("verso", 1)
+    if isinstance(version, int) and version > 1:
+        newer = f"{plain_line(str(version))} is newer than this program, which reads version 1: install a newer Verso"
+        raise JobError(f"{name}: verso: {newer}")
+    try:
+        return Job.model_validate(tree)
+    except ValidationError as error:
+        faults = error.errors()
+        # An invalid item of a list makes the list itself count as too short: that line would confuse.
+        told = [fault for fault in faults if fault["type"] != "too_short" or len(faults) == 1]
+        lines = [f"{name}: {describe_fault(fault)}" for fault in told[:MOST_FAULTS]]
+        if len(told) > MOST_FAULTS:
+            lines.append(f"{name}: and {len(told) - MOST_FAULTS} faults more")
+        raise JobError("\n".join(lines)) from error

@@ -1,0 +1,338 @@
+"""A queue in storage. Every change of a job is one event, put if absent at the next number; a job's state is their fold."""
+
+import json
+import re
+import time
+import uuid
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal, TypeVar
+
+from pydantic import ValidationError
+
+from schemas.base import Frozen
+from schemas.dataset.layout import COMMITS, LOCK_FILE, MANIFEST, RANGES, STAGING
+from schemas.errors import CorruptError, InputError, OutputError, plain_line
+from schemas.queue import (
+    ID_PATTERN,
+    JOBS,
+    MARK_FILE,
+    SHARE_FILE,
+    JobEvent,
+    JobRequest,
+    event_path,
+    events_folder,
+    log_path,
+    request_path,
+)
+from workers.store.store import Store, open_store, retry_if_swept
+
+JobState = Literal["queued", "waiting", "running", "cancelling", "cancelled", "done", "failed", "lost"]
+"""waiting: for its output folder. lost: drivers died more often than they are started again."""
+
+RESTARTS: Final = 3
+"""How often a job whose driver died is taken up again."""
+
+ENDS: Final = frozenset({"cancelled", "done", "failed", "lost"})
+HELD: Final = frozenset({"running", "cancelling"})
+"""States in which a driver is at work, or may be."""
+
+
+@dataclass(frozen=True)
+class JobView:
+    """A job as its events tell it."""
+
+    request: JobRequest
+    events: int = 0
+    """How many there are: the number of the next one."""
+    state: JobState = "queued"
+    attempt: int = 0
+    """The latest one that was started, from 1."""
+    began: bool = False
+    """Whether the driver of the latest attempt has begun its work."""
+    deaths: int = 0
+    busy: int = 0
+    """How often a driver found another run in the output folder, since one last began without."""
+    note: str = ""
+    """Why it is in this state, where that needs words."""
+    code: int | None = None
+    scenes: int | None = None
+    digest: str | None = None
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing will happen to it any more."""
+        return self.state in ENDS
+
+    @property
+    def held(self) -> bool:
+        """Whether a driver is at work for it, or may be."""
+        return self.state in HELD
+
+    @property
+    def claims_folder(self) -> bool:
+        """Whether another job must not work in its output folder: from its first attempt until its end."""
+        return not self.ended and self.attempt > 0
+
+
+def fold(request: JobRequest, events: Sequence[JobEvent]) -> JobView:
+    """The job after all its events. Events that come too late, or twice, change nothing."""
+    view = JobView(request)
+    for event in events:
+        view = replace(apply(view, event), events=view.events + 1)
+    return view
+
+
+def apply(view: JobView, event: JobEvent) -> JobView:
+    """The job after one more event; the same job where the event does not apply."""
+    if not applies(view, event):
+        return view
+    if event.kind == "started":
+        return replace(view, state="running", attempt=event.attempt, began=False, note="")
+    if event.kind == "began":
+        return replace(view, began=True)
+    if event.kind == "cancel":
+        return replace(view, state="cancelling" if view.held else "cancelled", note=event.note)
+    if event.kind == "stopped":
+        return replace(view, state="cancelled")
+    if event.kind == "busy":
+        state: JobState = "cancelled" if view.state == "cancelling" else "waiting"
+        return replace(view, state=state, busy=view.busy + 1, note=event.note)
+    if event.kind == "died":
+        return _after_death(view, event)
+    return _after_end(view, event)
+
+
+def applies(view: JobView, event: JobEvent) -> bool:
+    """Whether an event means anything to a job in this state."""
+    if view.ended:
+        return False
+    if event.kind == "cancel":
+        return view.state != "cancelling"
+    if event.kind == "started":
+        return not view.held and event.attempt == view.attempt + 1
+    if not view.held or event.attempt != view.attempt:
+        return False
+    if event.kind == "began":
+        return not view.began and view.state == "running"
+    if event.kind == "stopped":
+        return view.state == "cancelling"
+    return event.kind == "died" or view.began
+
+
+def _after_death(view: JobView, event: JobEvent) -> JobView:
+    """The job whose driver is gone: it is to be taken up again, unless it was cancelled or that happened too often."""
+    deaths = view.deaths + 1
+    state: JobState = "cancelled" if view.state == "cancelling" else "lost" if deaths > RESTARTS else "queued"
+    return replace(view, state=state, deaths=deaths, note=event.note)
+
+
+def _after_end(view: JobView, event: JobEvent) -> JobView:
+    """The job whose driver told its end: a cancelled one that was finished in time is done."""
+    state: JobState = "done" if event.code == 0 else "cancelled" if view.state == "cancelling" else "failed"
+    return replace(
+        view, state=state, code=event.code, note=event.note, scenes=event.scenes, digest=event.digest, busy=0
+    )
+
+
+Model = TypeVar("Model", bound=Frozen)
+
+AT_ONCE: Final = 16
+"""Requests at once, where many jobs are read."""
+
+OWN: Final = {STAGING, LOCK_FILE, MANIFEST, "lost+found"}
+"""What may stand in a folder that is about to become a queue: what somebody who makes it at this moment has put there."""
+
+MOST_BYTES: Final = 1 << 20
+"""Larger than any request or event."""
+
+MOST_LOG_BYTES: Final = 1 << 20
+"""As much of a driver's log is kept, from its end."""
+
+
+class Queue:
+    """A queue that exists; `store` is the place that it lies in."""
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        self.name = store.name
+        self._known: dict[str, Frozen] = {}
+        """Requests and events that were read, by key: they never change."""
+
+    def ids(self) -> list[str]:
+        """The ids of all jobs."""
+        return [name for name in self.store.children(JOBS) if re.match(ID_PATTERN, name)]
+
+    def put_request(self, request: JobRequest) -> bool:
+        """Stores a new job; False where the id is taken."""
+        return self.store.put_if_absent(request_path(request.id), _encode(request))
+
+    def read(self, job: str) -> JobView:
+        """A job as it is now. Raises InputError where there is none, CorruptError where it cannot be read."""
+        try:
+            request = self._load(JobRequest, request_path(job))
+        except FileNotFoundError:
+            raise InputError(
+                f"{self.name} has no job {plain_line(job)}: `verso jobs` lists those that there are"
+            ) from None
+        if request.id != job:
+            raise CorruptError(f"{self.name}/{request_path(job)} is the request of another job, {request.id}")
+        return fold(request, self._events(job))
+
+    def read_all(self, ids: Iterable[str]) -> tuple[list[JobView], dict[str, str]]:
+        """The jobs as they are now; what cannot be read is told by id. A job whose request is not there yet is left out."""
+        views, faults = [], {}
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            for job, read in [(job, pool.submit(self.read, job)) for job in ids]:
+                try:
+                    views.append(read.result())
+                except InputError:
+                    continue
+                except CorruptError as error:
+                    faults[job] = str(error)
+        return views, faults
+
+    def append(self, job: str, kind: Any, attempt: int = 0, **fields: Any) -> JobView | None:
+        """Adds an event to a job and returns the job after it; None where the event does not apply to it any more.
+
+        Whether it applies is decided by the very events before it: a writer who loses the number reads and decides again.
+        So nothing is decided twice, however many supervisors, drivers and users there are.
+        """
+        event = JobEvent(kind=kind, attempt=attempt, at=time.time(), nonce=uuid.uuid4().hex, **fields)
+        pause_s = 0.01
+        while True:
+            view = self.read(job)
+            if not applies(view, event):
+                return None
+            if self.store.put_if_absent(event_path(job, view.events), _encode(event)):
+                return replace(apply(view, event), events=view.events + 1)
+            time.sleep(pause_s)  # over NFS, the listing may be old for some seconds
+            pause_s = min(1.0, 2 * pause_s)
+
+    def put_log(self, job: str, attempt: int, text: str) -> None:
+        """Keeps the end of a driver's log, once."""
+        self.store.put_if_absent(log_path(job, attempt), text.encode(errors="replace")[-MOST_LOG_BYTES:])
+
+    def read_log(self, job: str, attempt: int) -> str | None:
+        """The kept log of an attempt, None where there is none."""
+        try:
+            return self.store.read(log_path(job, attempt)).decode(errors="replace")
+        except FileNotFoundError:
+            return None
+
+    def has_log(self, job: str, attempt: int) -> bool:
+        """Whether the log of an attempt is kept."""
+        return self.store.size(log_path(job, attempt)) is not None
+
+    def share(self) -> int:
+        """How many jobs share the cluster, at least 1, as the supervisor said last."""
+        try:
+            return max(1, int(json.loads(self.store.read(SHARE_FILE))["running"]))
+        except (FileNotFoundError, ValueError, TypeError, KeyError):
+            return 1
+
+    def put_share(self, running: int) -> None:
+        """Tells the drivers how many jobs share the cluster."""
+        self.store.put(SHARE_FILE, json.dumps({"running": running}).encode(), durable=False)
+
+    def _events(self, job: str) -> list[JobEvent]:
+        """A job's events from the first, in their order."""
+        names = self.store.names(events_folder(job))
+        expected = [event_path(job, number) for number in range(len(names))]
+        if [f"{events_folder(job)}/{name}" for name in names] != expected:
+            raise CorruptError(f"{self.name}/{events_folder(job)} lacks an event, or holds what is none")
+        return [self._load(JobEvent, key) for key in expected]
+
+    def _load(self, model: type[Model], key: str) -> Model:
+        known = self._known.get(key)
+        if not isinstance(known, model):
+            known = self._known[key] = _decode(model, self.store.read(key), f"{self.name}/{key}")
+        return known
+
+
+def open_queue(url: str) -> Queue:
+    """The queue at a folder or a URL. Raises InputError where there is none."""
+    store = open_store(url)
+    if store.root is not None and not store.root.is_dir():
+        raise InputError(
+            f"--queue {url}: there is no such folder; `verso submit` or `verso supervise` makes a new queue"
+        )
+    if store.size(MARK_FILE) is None:
+        raise InputError(
+            f"--queue {url} is no queue: it holds no {MARK_FILE}; `verso submit` or `verso supervise` makes one in a new or "
+            "empty folder"
+        )
+    _decode(Mark, store.read(MARK_FILE), f"{store.name}/{MARK_FILE}")
+    return Queue(store)
+
+
+def make_queue(url: str) -> Queue:
+    """The queue at a folder or a URL, made where there is nothing yet.
+
+    Raises InputError where something else lies there or the folder's own folder is missing, OutputError where the place
+    cannot keep a queue.
+    """
+    store = open_store(url)
+    if store.size(MARK_FILE) is not None:
+        return open_queue(url)
+    if store.root is not None and not store.root.parent.is_dir():
+        raise InputError(
+            f"--queue {url}: there is no folder {store.root.parent}: make it, or mount what should be there"
+        )
+    found = set(store.names(""))
+    if MARK_FILE in found:  # somebody else has made it since
+        return open_queue(url)
+    if foreign := sorted(found - OWN):
+        raise InputError(
+            f"--queue {url} is no queue: it holds {plain_line(', '.join(foreign[:3]))} and no {MARK_FILE}; choose a new or "
+            "an empty folder"
+        )
+    try:
+        retry_if_swept(store.prepare)
+    except (FileNotFoundError, OutputError) as error:
+        if store.size(MARK_FILE) is not None:  # somebody else has made it since, and removed what a queue does not keep
+            return open_queue(url)
+        raise InputError(f"--queue: {error}".replace("--out", "--queue")) from error
+    store.put_if_absent(MARK_FILE, _encode(Mark(nonce=uuid.uuid4().hex)))
+    for folder in (COMMITS, RANGES, MANIFEST):  # of a dataset, to which the same store belongs
+        store.remove_empty(folder)
+    return Queue(store)
+
+
+class Mark(Frozen):
+    """`queue.json`."""
+
+    queue: int = 1
+    nonce: str
+
+
+def new_id() -> str:
+    """An id for a new job."""
+    return f"j{uuid.uuid4().hex[:8]}"
+
+
+def _encode(model: Frozen) -> bytes:
+    return json.dumps(model.model_dump(mode="json"), ensure_ascii=False).encode() + b"\n"
+
+
+def _decode(model: type[Model], data: bytes, name: str) -> Model:
+    """A stored model. Raises CorruptError naming the file, with one line."""
+    if len(data) > MOST_BYTES:
+        raise CorruptError(f"{name} has {len(data)} bytes, and should have less than {MOST_BYTES}")
+    try:
+        tree = json.loads(data)
+        version = tree.get("queue", 1) if isinstance(tree, dict) else 1
+        if isinstance(version, int) and version > 1:
+            raise CorruptError(
+                f"{name}: queue: {version} is newer than this program, which reads 1: install a newer Verso"
+            )
+        return model.model_validate(tree)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        where = plain_line(".".join(map(str, fault["loc"])))
+        raise CorruptError(
+            f"{name} was not written by this program: {where}: {plain_line(fault['msg'], 200)}"
+        ) from error
+    except ValueError as error:
+        raise CorruptError(f"{name} is damaged: {plain_line(str(error), 200)}") from error

@@ -1,0 +1,192 @@
+"""Processes and cores of this machine: who descends from whom, ending descendants, and a container's share of the cores. Edge."""
+
+import contextlib
+import ctypes
+import math
+import os
+import signal
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+_PR_SET_PDEATHSIG = 1
+_PR_SET_CHILD_SUBREAPER = 36
+
+GRACE_S = 3.0
+"""Time that a process gets to end by itself after SIGTERM."""
+
+KILL_S = 5.0
+"""Time that the kernel gets to remove processes after SIGKILL; one that hangs in a driver or on NFS stays longer."""
+
+_POLL_S = 0.02
+
+
+@dataclass(frozen=True)
+class Process:
+    """A process of this machine; `born` is its start in ticks since boot, because process ids are used again."""
+
+    pid: int
+    parent: int
+    born: str
+    state: str
+    """One letter of proc(5): `T` is stopped, `Z` has ended and waits for its parent."""
+    name: str
+
+    @property
+    def ended(self) -> bool:
+        """Whether only its exit status is left."""
+        return self.state in "ZX"
+
+    @property
+    def stopped(self) -> bool:
+        """Whether a signal stopped it, as SIGSTOP does."""
+        return self.state in "Tt"
+
+
+def read_process(pid: int) -> Process | None:
+    """The process with this id, None where there is none."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return None
+    head, _, tail = stat.rpartition(")")
+    state, parent, *rest = tail.split()
+    return Process(pid, int(parent), rest[17], state, head.partition("(")[2])
+
+
+def descendants(pid: int) -> list[Process]:
+    """Children of a process, their children and so on; those that have ended are left out.
+
+    Parents first, and of one generation's the older first.
+    """
+    children: defaultdict[int, list[Process]] = defaultdict(list)
+    for entry in os.listdir("/proc"):
+        if entry.isdigit() and (process := read_process(int(entry))) is not None:
+            children[process.parent].append(process)
+    found, level = [], children[pid]
+    while level:
+        found += sorted(level, key=lambda process: int(process.born))
+        level = [child for process in level for child in children[process.pid]]
+    return [process for process in found if not process.ended]
+
+
+def send(process: Process, number: int) -> None:
+    """Sends a signal to exactly this process; nothing where it is gone, even if its id was given out again."""
+    with contextlib.suppress(OSError), _descriptor(process.pid) as descriptor:
+        now = read_process(process.pid)
+        if now is not None and now.born == process.born:
+            signal.pidfd_send_signal(descriptor, number)
+
+
+def marked(mark: str) -> list[Process]:
+    """Processes whose environment, as they were started, has the line `mark`; without this one."""
+    found = []
+    for entry in os.listdir("/proc"):
+        with contextlib.suppress(OSError):
+            if entry.isdigit() and mark.encode() in Path(f"/proc/{entry}/environ").read_bytes().split(b"\0"):
+                found.append(read_process(int(entry)))
+    return [process for process in found if process and not process.ended and process.pid != os.getpid()]
+
+
+def end_descendants() -> list[Process]:
+    """Ends everything that descends from this process, as `end_all`.
+
+    For a child subreaper alone, whose descendants cannot leave it.
+    """
+    return end_all(lambda: descendants(os.getpid()))
+
+
+def end_all(find: Callable[[], list[Process]]) -> list[Process]:
+    """Ends what `find` finds, until it finds nothing more: SIGTERM, then SIGKILL. Returns what even that did not end."""
+    for number, patience_s in ((signal.SIGTERM, GRACE_S), (signal.SIGKILL, KILL_S)):
+        deadline, told = time.monotonic() + patience_s, set[tuple[int, str]]()
+        while left := find():
+            for process in left:
+                if (process.pid, process.born) not in told:
+                    told.add((process.pid, process.born))
+                    send(process, number)
+            reap()
+            if time.monotonic() > deadline:
+                break
+            time.sleep(_POLL_S)
+        else:
+            break
+    reap()
+    return left
+
+
+def reap() -> dict[int, int]:
+    """Wait statuses of the children that have ended, by process id."""
+    statuses: dict[int, int] = {}
+    with contextlib.suppress(ChildProcessError):
+        while (found := os.waitpid(-1, os.WNOHANG))[0]:
+            statuses[found[0]] = found[1]
+    return statuses
+
+
+def adopt_orphans() -> None:
+    """From now on, descendants of this process whose parents end become its own children."""
+    _prctl(_PR_SET_CHILD_SUBREAPER, 1)
+
+
+def die_with(parent: int, number: int) -> None:
+    """From now on, the end of this process's parent, `parent`, sends it this signal."""
+    _prctl(_PR_SET_PDEATHSIG, number)
+    if os.getppid() != parent:  # it ended before we asked
+        os.kill(os.getpid(), number)
+
+
+def _prctl(option: int, value: int) -> None:
+    if ctypes.CDLL(None, use_errno=True).prctl(option, value, 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), f"prctl {option}")
+
+
+@contextlib.contextmanager
+def _descriptor(pid: int) -> Iterator[int]:
+    descriptor = os.pidfd_open(pid)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def usable_cores(proc: Path = Path("/proc/self/cgroup"), cgroups: Path = Path("/sys/fs/cgroup")) -> int:
+    """The smaller of the cores it may be scheduled on and its control groups' quota, at least 1.
+
+    A quota is rounded up: one worker would waste half a core of 1.5, two share them.
+    """
+    cores = len(os.sched_getaffinity(0))
+    quota = min((_quota(folder) for folder in _control_groups(proc, cgroups)), default=math.inf)
+    return math.ceil(quota) if quota < cores else cores
+
+
+def _control_groups(proc: Path, cgroups: Path) -> list[Path]:
+    """The folders whose limits apply to this process: its own group and all above it, in either version's layout."""
+    try:
+        lines = proc.read_text().splitlines()
+    except OSError:
+        return []
+    folders: list[Path] = []
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if controllers and "cpu" not in controllers.split(","):
+            continue
+        top = cgroups / "cpu" if controllers else cgroups
+        own = top / path.lstrip("/")
+        # Inside a container the path may be the host's, of which only the top is mounted here.
+        folders += [own, *(above for above in own.parents if above.is_relative_to(top))]
+    return folders
+
+
+def _quota(folder: Path) -> float:
+    """Cores that one control group grants, by version 2's `cpu.max` or version 1's pair of files; inf where unlimited."""
+    try:
+        if (both := folder / "cpu.max").exists():
+            granted, period = both.read_text().split()
+        else:
+            granted, period = ((folder / f"cpu.cfs_{part}_us").read_text().strip() for part in ("quota", "period"))
+    except OSError:
+        return math.inf
+    return math.inf if granted in ("max", "-1") else int(granted) / int(period)

@@ -1,0 +1,67 @@
+"""What a coordinator with one worker does to a dataset of made-up scenes, and what must be true of the result."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+from schemas.dataset.commit import CommitTerms
+from schemas.dataset.layout import STAGING
+from schemas.scene.scene import SceneOutput
+from services.merge.merge import MergeResult, merge
+from services.run.lock import Lock
+from services.run.range_planner import committed_ranges, plan_ranges, plan_retries
+from tests.made_up_scenes import attempt_at, small_scene, terms
+from workers.store.attempt import sweep
+from workers.store.ledger import list_commits
+from workers.store.store import Store
+
+FIRST, STOP, RANGE = 4, 7, 2
+
+
+def settings_of(layout: str) -> CommitTerms:
+    return terms(layout=layout, first_scene=FIRST, range_size=RANGE)
+
+
+def make_dataset(
+    store: Store,
+    layout: str = "files",
+    stop: int = STOP,
+    make: Callable[[int], SceneOutput] = small_scene,
+    retry: bool = False,
+    lock: Lock | None = None,
+) -> MergeResult:
+    """Clears up, makes what is missing, tries failures again where asked to, and merges."""
+    store.prepare()
+    sweep(store, fenced=None)
+    for start, end in plan_ranges(FIRST, stop, RANGE, committed_ranges(list_commits(store))):
+        attempt_at(store, start, end, settings_of(layout), make).commit()
+    for span in plan_retries(list_commits(store)) if retry else ():
+        again = {"retry": span.retry, "scenes": span.scenes}
+        attempt_at(store, span.start, span.stop, settings_of(layout), make, **again).commit()
+    return merge(store, FIRST, stop, *([lock.require_held] if lock else []))
+
+
+def contents_of(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "nothing"
+
+
+def contents(root: Path) -> dict[str, str]:
+    """Every file and its digest, but for what names an attempt or a time."""
+    files = [path for path in root.rglob("*") if path.is_file()]
+    found = {str(path.relative_to(root)): contents_of(path) for path in files}
+    varying = ("manifest/_commits/", "manifest/timings/", "manifest/_ranges/", "_SUCCESS")
+    return {name: "" if name.startswith(varying) else digest for name, digest in found.items()}
+
+
+def leftovers(root: Path) -> list[str]:
+    return [str(path) for path in (root / STAGING).rglob("*") if path.is_file() or path.parent.name.isdigit()]
+
+
+def broken_promises(root: Path) -> list[str]:
+    """What `_SUCCESS`, if it is there, says of files and is not so."""
+    success = root / "_SUCCESS"
+    if not success.exists():
+        return []
+    files = json.loads(success.read_text())["files"]
+    return [name for name, file in files.items() if file["sha256"] != contents_of(root / name)]
