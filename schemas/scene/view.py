@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Frozen, Pose
-from schemas.job.views import Sensor
+from schemas.job.views import Patch, Sensor
 
 Role = Literal["input", "aligned", "mirror", "projected"]
 ROLES: tuple[Role, ...] = ("input", "aligned", "mirror", "projected")
@@ -147,3 +147,17 @@ class Pair:
     def views(self) -> tuple[View, ...]:
         """The views that exist, in the order of `ROLES`."""
         return tuple(view for view in (self.input, self.aligned, self.mirror, self.projected) if view is not None)
+
+
+def crop_box(label: ObjectLabel, camera: Camera, patch: Patch) -> tuple[slice, slice] | None:
+    """(rows, columns) of the crop centred on the object's image coordinates.
+
+    None where it would leave the image, and where the view does not see the object.
+    """
+    if label.u < 0 or label.pixels == 0:
+        return None
+    left, top = label.u - patch.width // 2, label.v - patch.height // 2
+    right, bottom = left + patch.width, top + patch.height
+    if left < 0 or top < 0 or right > camera.intrinsics.width or bottom > camera.intrinsics.height:
+        return None
+    return slice(top, bottom), slice(left, right)

@@ -254,19 +254,6 @@ def _repair(options: argparse.Namespace) -> int:
     return 1 if off else 0
 
 
-def scene(options: argparse.Namespace) -> int:
-    """`verso scene`."""
-    from services.read.scene_geometry import export_scene
-    from services.read.verdict import explain_damage
-
-    store = _dataset(options.out)
-    with explain_damage(store):
-        size = export_scene(store, options.scene, options.glb)
-    print(f"{options.glb}: {size / 1e6:.2f} MB, world frame, z up, metres")
-    answer_json(options, {"ok": True, "file": str(options.glb), "bytes": size})
-    return 0
-
-
 def _dataset(out: str) -> "Store":
     """The store of an output folder. Raises OutputError where it is none."""
     from services.job.record import require_dataset

@@ -70,7 +70,7 @@ def _describe(commands: Mapping[str, Command], above: str) -> Iterator[str]:
         yield from (f"\n##{'#' * bool(above)} {words}\n", what, "", f"    verso {words} {command.example}".rstrip())
         options = [*command.options, *command.one_of]
         if rows := [_row(option) for option in options]:
-            yield from ("", "| argument | |", "|---|---|", *rows)
+            yield from ("", *rows)
 
 
 def _row(option: Option) -> str:
@@ -81,7 +81,8 @@ def _row(option: Option) -> str:
     shown = (
         value or names[0] if not names[0].startswith("-") else f"{names[0]}{'' if flag or not value else f' {value}'}"
     )
-    return f"| `{shown.replace('|', ', ')}` | {settings.get('help', '')} |"
+    told = settings.get("help", "")
+    return f"- `{shown}`{f': {told}' if told else ''}"
 
 
 if __name__ == "__main__":

@@ -412,22 +412,6 @@ COMMANDS: dict[str, Command] = {
             ),
         ),
     ),
-    "scene": Command(
-        "write the posed geometry of one scene",
-        "data/tabletop 17 --glb scene17.glb",
-        (OUT, SCENE, option("--glb", type=read_path, required=True, metavar="FILE")),
-    ),
-    "sheet": Command(
-        "draw a page with images of some scenes of each category",
-        "data/tabletop sheet.jpg --scenes 3",
-        (
-            OUT,
-            option("file", type=read_path, metavar="FILE.jpg", help="the picture to write"),
-            number("--scenes", "scenes of each category (default: 1)", 1),
-            option("--category", metavar="NAME", help="only this one"),
-        ),
-        "services.read.contact_sheet:main",
-    ),
     **REPORT_COMMANDS,
     "export": Command(
         "write the dataset in a layout that other people's loaders read",

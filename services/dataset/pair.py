@@ -16,9 +16,8 @@ from schemas.dataset.layout import PixelKind, file_pose_id, patch_index
 from schemas.errors import InputError
 from schemas.job.views import Patch
 from schemas.scene.shape import REGION_FIRST_OBJECT
-from schemas.scene.view import ROLES, Camera, ObjectLabel, Role
+from schemas.scene.view import ROLES, Camera, ObjectLabel, Role, crop_box
 from services.read.stored_tables import patch_paths, view_paths
-from workers.scene.labels import crop_box
 from workers.store.images import decode_png
 
 

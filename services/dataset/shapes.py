@@ -21,9 +21,8 @@ from schemas.job.assets import TABLE
 from schemas.job.views import Patch
 from schemas.scene.shape import REGION_TABLE, Asset
 from services.job.record import JobRecord
-from services.read.scene_geometry import mesh_of_part
 from workers.assets.catalogue import Catalogue
-from workers.scene.plan import SceneChance
+from workers.assets.glb import mesh_of_part
 from workers.store.commit import read_committed
 from workers.store.store import Store
 from workers.store.tars import read_tar
@@ -64,7 +63,7 @@ class Shapes:
         """The shape of a source whose licence keeps it out of the dataset."""
         if self._record.job.captures is not None:
             raise CorruptError(f"{path} is missing: restore it from a copy")
-        from workers.scene.plan import plan_scene  # loads the physics
+        from workers.scene.plan import SceneChance, plan_scene  # loads the physics
 
         plan = plan_scene(self._record.job, self._sources(path), SceneChance(self._record.job.seed, scene_id))
         assets: dict[int, Asset] = {start.region_id: start.asset for start in plan.objects}

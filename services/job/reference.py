@@ -19,10 +19,8 @@ HEADER = """\
 
 Written from `schemas/job/` by `python -m services.job.reference`; a test holds the two together. Every key but `name` has a
 default. A key that is not in this list is refused, and so is a value that is not allowed. Any key can be changed on the
-command line: `--set physics.step_hz=480`.
+command line: `--set physics.step_hz=480`. After each key: what is allowed; the default.
 
-| key | allowed | default | what it does |
-|---|---|---|---|
 """
 
 
@@ -112,9 +110,15 @@ def write_doc() -> str:
     """The whole page."""
     lines = []
     for path, field in list_keys():
-        if not (path.endswith(".source") and len(typing.get_args(field.annotation)) == 1):
-            meaning = " ".join((field.description or "").split())
-            lines.append(f"| `{path}` | {describe_allowed(field)} | {_default(field)} | {meaning} |\n")
+        if path.endswith(".source") and len(typing.get_args(field.annotation)) == 1:
+            continue
+        if path.startswith("assets.tables["):
+            continue  # the same keys as those of objects
+        meaning = " ".join((field.description or "").split())
+        if path == "assets.tables":
+            meaning += " Each has the keys of a source of objects."
+        default = "" if (shown := _default(field)) == "below" else f"; {shown}"
+        lines.append(f"- `{path}` ({describe_allowed(field)}{default}): {meaning}\n")
     return HEADER + "".join(lines)
 
 

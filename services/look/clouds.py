@@ -1,11 +1,10 @@
 """Point clouds of a pair from both cameras with the posed mesh, packed for the page's 3-D view; world frame, metres, z up."""
 
 import base64
+import io
 import json
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from schemas.errors import VersoError
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
 from services.look.pictures import PairImages, metres_of, read_pair
 from services.read.dataset_reader import file_reader, find_scene
-from services.read.scene_geometry import export_scene
+from services.read.scene_geometry import scene_glb
 from workers.geometry.camera import unproject
 from workers.store.store import Store
 
@@ -135,10 +134,7 @@ def _evenly(indices: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 def _read_bodies(store: Store, scene_id: int) -> tuple[tuple[Body, ...], str]:
     """(the meshes of a scene but for the floor, why there are none)."""
     try:
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "scene.glb"
-            export_scene(store, scene_id, file)
-            scene = trimesh.load_scene(file, process=False)
+        scene = trimesh.load_scene(io.BytesIO(scene_glb(store, scene_id)), file_type="glb", process=False)
     except VersoError as error:
         return (), str(error)
     bodies = []

@@ -74,16 +74,8 @@ def write_page() -> str:
             f"{TABLE_MEANINGS[table]} Key: {', '.join(f'`{one}`' for one in key_of(table))}.",
             "",
         ]
-        lines += ["| column | type | unit | frame | meaning |", "|---|---|---|---|---|"]
-        lines += [_row(column) for column in columns_of(table)]
+        lines += [f"- `{column.path}` ({_facts(column)}): {column.meaning.text}" for column in columns_of(table)]
     return "\n".join(lines) + "\n"
-
-
-def _row(column: Column) -> str:
-    meaning = column.meaning
-    kind = column.type + (" or null" if column.nullable else "") + (" (captures)" if column.captures_only else "")
-    frame = " from ".join(meaning.frame.split(", "))
-    return f"| `{column.path}` | {kind} | {meaning.unit} | {frame} | {meaning.text} |"
 
 
 if __name__ == "__main__":

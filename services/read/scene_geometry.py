@@ -1,57 +1,26 @@
-"""The posed geometry of one stored scene or capture.
-
-- A part of a shape as a mesh of trimesh's, with its material.
-- The posed geometry of a stored capture: its board, and the mesh that was reconstructed from it.
-"""
+"""The posed geometry of one stored scene or capture."""
 
 import io
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
-from PIL import Image
-from trimesh.visual import ColorVisuals, TextureVisuals
-from trimesh.visual.material import PBRMaterial
+from trimesh.visual import ColorVisuals
 
-from schemas.base import Array, Pose
+from schemas.base import Pose
 from schemas.dataset.codec import Row, read_world_poses
 from schemas.dataset.layout import asset_path
-from schemas.errors import CorruptError, InputError, OutputError
+from schemas.errors import CorruptError, InputError
 from schemas.job.job import Job
-from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE, Part
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
 from services.job.record import require_job
 from services.read.dataset_reader import StoredRange, find_scene
 from services.read.replay import open_context
 from workers.assets.catalogue import Catalogue
 from workers.assets.external.formats import read_visual
-from workers.geometry.colour import decode_srgb
+from workers.assets.glb import linear_bytes, mesh_of_part
 from workers.scene.plan import SceneChance, plan_scene
 from workers.store.store import Store
-
-
-def mesh_of_part(part: Part) -> trimesh.Trimesh:
-    """The part in the shape's frame, metres. Its material is as glTF has it: colours linear, textures sRGB."""
-    return trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=_visual(part), process=False)
-
-
-def _visual(part: Part) -> TextureVisuals | ColorVisuals:
-    material = part.material
-    if part.colors is not None and material.texture is None:
-        return ColorVisuals(vertex_colors=linear_bytes(part.colors / 255.0))
-    pbr = PBRMaterial(
-        baseColorFactor=linear_bytes(np.array(material.base_color)),
-        metallicFactor=material.metallic,
-        roughnessFactor=material.roughness,
-        baseColorTexture=None if material.texture is None else Image.fromarray(material.texture),
-    )
-    return TextureVisuals(uv=part.uv, material=pbr)
-
-
-def linear_bytes(srgb: Array) -> NDArray[np.uint8]:
-    """[..., 4] colours and vertex colours as glTF has them: linear, where textures and ours are sRGB; alpha as it is."""
-    return np.rint(255.0 * np.concatenate([decode_srgb(srgb[..., :3]), srgb[..., 3:]], axis=-1)).astype(np.uint8)
 
 
 def captured_geometry(store: Store, stored: StoredRange, row: Row) -> Iterator[tuple[str, trimesh.Trimesh, Pose]]:
@@ -74,11 +43,10 @@ def captured_geometry(store: Store, stored: StoredRange, row: Row) -> Iterator[t
         yield f"{row['category']} {row['instance_id']}", mesh, T_world[REGION_FIRST_OBJECT]
 
 
-def export_scene(store: Store, scene_id: int, target: Path) -> int:
-    """Write floor, table and objects where the stored rows put them; returns the bytes written.
+def scene_glb(store: Store, scene_id: int) -> bytes:
+    """A GLB file with floor, table and objects where the stored rows put them: world frame, z up, metres.
 
-    World frame, z up, metres, as everywhere in a dataset. Shapes come from the job's sources; poses from the manifest.
-    Raises InputError where the scene was not made, OutputError where the file cannot be written.
+    Shapes come from the job's sources; poses from the manifest. Raises InputError where the scene was not made.
     """
     record, stored = require_job(store), find_scene(store, scene_id)
     row = stored.scene(scene_id)
@@ -91,12 +59,7 @@ def export_scene(store: Store, scene_id: int, target: Path) -> int:
         context = open_context(record)
         scene = planned_scene(context.job, context.catalogue, scene_id, row)
     data: bytes = scene.export(file_type="glb")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(data)
-    except OSError as error:
-        raise OutputError(f"{target} cannot be written: {error.strerror or error}; choose another --glb") from error
-    return len(data)
+    return data
 
 
 def captured_scene(store: Store, stored: StoredRange, row: Row) -> trimesh.Scene:

@@ -12,9 +12,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from PIL import Image
+from trimesh.visual import ColorVisuals, TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
+from schemas.base import Array
 from schemas.scene.shape import Asset, Part
 from workers.geometry.colour import decode_srgb
 from workers.geometry.mesh import bounds_of
@@ -150,3 +154,26 @@ def _primitive(writer: _Writer, part: Part, material: int) -> dict[str, Any]:
     index = part.faces.ravel().astype("<u2" if small else "<u4")
     indices = writer.add_accessor(index, "SCALAR", _USHORT if small else _UINT, _ELEMENT_BUFFER)
     return {"attributes": attributes, "indices": indices, "material": material}
+
+
+def mesh_of_part(part: Part) -> trimesh.Trimesh:
+    """The part in the shape's frame, metres. Its material is as glTF has it: colours linear, textures sRGB."""
+    return trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=_visual(part), process=False)
+
+
+def _visual(part: Part) -> TextureVisuals | ColorVisuals:
+    material = part.material
+    if part.colors is not None and material.texture is None:
+        return ColorVisuals(vertex_colors=linear_bytes(part.colors / 255.0))
+    pbr = PBRMaterial(
+        baseColorFactor=linear_bytes(np.array(material.base_color)),
+        metallicFactor=material.metallic,
+        roughnessFactor=material.roughness,
+        baseColorTexture=None if material.texture is None else Image.fromarray(material.texture),
+    )
+    return TextureVisuals(uv=part.uv, material=pbr)
+
+
+def linear_bytes(srgb: Array) -> NDArray[np.uint8]:
+    """[..., 4] colours and vertex colours as glTF has them: linear, where textures and ours are sRGB; alpha as it is."""
+    return np.rint(255.0 * np.concatenate([decode_srgb(srgb[..., :3]), srgb[..., 3:]], axis=-1)).astype(np.uint8)

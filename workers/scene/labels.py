@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from schemas.job.views import Distortion, Images, Patch
 from schemas.scene.scene import EffectPlan, Placed, PosedScene, ScenePlan
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
-from schemas.scene.view import Agreement, Camera, Intrinsics, ObjectLabel, View
+from schemas.scene.view import Agreement, Camera, Intrinsics, ObjectLabel, View, crop_box
 from workers.geometry.camera import image_coordinates
 from workers.geometry.distortion import distort
 from workers.geometry.frames import invert
@@ -178,20 +178,6 @@ def _sample_pixels(region: NDArray[np.uint8]) -> NDArray[np.int64]:
     chosen = region >= REGION_FIRST_OBJECT
     chosen[::SCENE_STRIDE, ::SCENE_STRIDE] = True
     return np.flatnonzero(chosen)
-
-
-def crop_box(label: ObjectLabel, camera: Camera, patch: Patch) -> tuple[slice, slice] | None:
-    """(rows, columns) of the crop centred on the object's image coordinates.
-
-    None where it would leave the image, and where the view does not see the object.
-    """
-    if label.u < 0 or label.pixels == 0:
-        return None
-    left, top = label.u - patch.width // 2, label.v - patch.height // 2
-    right, bottom = left + patch.width, top + patch.height
-    if left < 0 or top < 0 or right > camera.intrinsics.width or bottom > camera.intrinsics.height:
-        return None
-    return slice(top, bottom), slice(left, right)
 
 
 def patch_object_fraction(view: View, label: ObjectLabel, patch: Patch) -> float | None:

@@ -16,13 +16,13 @@ from schemas.job.job import Job
 from schemas.job.views import Images, Patch
 from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset
-from schemas.scene.view import ObjectLabel, Pair, View
+from schemas.scene.view import ObjectLabel, Pair, View, crop_box
 from workers.assets.catalogue import split_of
 from workers.assets.glb import asset_glb
 from workers.geometry.camera import inclination, yaw
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.effects import write_receipt
-from workers.scene.labels import crop_box, patch_object_fraction
+from workers.scene.labels import patch_object_fraction
 from workers.scene.make_scene import Scene
 from workers.store.images import encode_png
 

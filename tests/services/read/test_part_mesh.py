@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from schemas.job.assets import ProceduralSource
-from services.read.scene_geometry import mesh_of_part
 from workers.assets.builtin.make import make_asset
+from workers.assets.glb import mesh_of_part
 
 
 @pytest.mark.parametrize("category", ["mug", "laptop", "table"])

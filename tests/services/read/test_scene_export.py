@@ -1,3 +1,4 @@
+import io
 import json
 
 import numpy as np
@@ -6,13 +7,11 @@ import trimesh
 
 from schemas.errors import InputError
 from services.read.query import query
-from services.read.scene_geometry import export_scene
+from services.read.scene_geometry import scene_glb
 
 
-def test_the_exported_scene_has_every_object_where_its_row_puts_it(three_objects, tmp_path):
-    size = export_scene(three_objects, 0, tmp_path / "new" / "scene.glb")
-    assert size == (tmp_path / "new" / "scene.glb").stat().st_size
-    scene = trimesh.load(tmp_path / "new" / "scene.glb")
+def test_the_exported_scene_has_every_object_where_its_row_puts_it(three_objects):
+    scene = trimesh.load_scene(io.BytesIO(scene_glb(three_objects, 0)), file_type="glb")
     (row,) = query(three_objects, "select bodies from scenes").to_pylist()
     for body in row["bodies"]:
         name = f"{body['category']} {body['instance_id']} {body['region_id']}"
@@ -23,15 +22,14 @@ def test_the_exported_scene_has_every_object_where_its_row_puts_it(three_objects
     assert {"floor", "table"} <= {node.split("/")[0].split(" ")[0] for node in scene.graph.nodes_geometry}
 
 
-def test_a_scene_that_is_not_there_is_refused(three_objects, tmp_path):
+def test_a_scene_that_is_not_there_is_refused(three_objects):
     with pytest.raises(InputError, match="scene 7 is not in"):
-        export_scene(three_objects, 7, tmp_path / "scene.glb")
-    assert not list(tmp_path.iterdir())
+        scene_glb(three_objects, 7)
 
 
 def test_colours_are_linear_as_gltf_has_them(three_objects, tmp_path):
     """The stored shapes of the same objects, whose colours are linear, say which colours the scene must have."""
-    export_scene(three_objects, 0, tmp_path / "scene.glb")
+    (tmp_path / "scene.glb").write_bytes(scene_glb(three_objects, 0))
 
     def factors(path):
         data = path.read_bytes()

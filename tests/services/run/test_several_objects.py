@@ -1,6 +1,7 @@
 """Scenes of several objects from the job file to the merged files: ids, patches, rows, and every way to read them back."""
 
 import contextlib
+import io
 import json
 import re
 from pathlib import Path
@@ -16,7 +17,7 @@ from schemas.dataset.codec import Row
 from services.job.job_file import validate_job
 from services.read.query import query
 from services.read.replay import replay_scene
-from services.read.scene_geometry import export_scene
+from services.read.scene_geometry import scene_glb
 from services.read.verify import verify
 from services.run.ray_cluster import Slots, private_ray
 from services.run.run_job import RunRequest, run_job
@@ -168,8 +169,7 @@ def test_two_objects_of_one_instance_share_its_row_and_its_file(tmp_path):
     (row,) = rows(store, "select bodies from scenes")
     assert len({body["instance_id"] for body in row["bodies"]}) == 1
     assert rows(store, "select count(*) as n from assets where category = 'mug'") == [{"n": 1}]
-    assert export_scene(store, 0, tmp_path / "scene.glb") > 0
-    names = trimesh.load(tmp_path / "scene.glb").graph.nodes_geometry
+    names = trimesh.load_scene(io.BytesIO(scene_glb(store, 0)), file_type="glb").graph.nodes_geometry
     assert len({name.partition("/")[0] for name in names if name.startswith("mug ")}) == 3
 
 

@@ -13,7 +13,6 @@ from services.job.job_file import validate_job
 from services.job.record import require_job
 from services.merge.dataset_card import describe_dataset
 from services.merge.merge import MergeResult, read_success
-from services.read.contact_sheet import draw_sheet
 from services.read.query import query
 from services.read.replay import open_context, replay_scene
 from tests.datasets import faults_of, images_of, make_dataset
@@ -117,9 +116,8 @@ def test_an_image_that_is_switched_off_and_there_all_the_same_is_found(full, red
         job.write_text(rightful)
 
 
-def test_the_sheet_and_the_card_are_made_without_it(reduced):
+def test_the_card_is_made_without_it(reduced):
     name, (store, digest), _, _ = reduced
-    assert draw_sheet(store, 1).mode == "RGB"
     record, success = require_job(store), read_success(store)
     fingerprint = Fingerprint.model_validate_json(store.read("manifest/_fingerprint.json"))
     merged = MergeResult(digest, True, dict(success["scenes"]), dict(success["rows"]))

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 
 from schemas.job.views import Patch
-from schemas.scene.view import ObjectLabel
+from schemas.scene.view import ObjectLabel, crop_box
 from tests.workers.labels.planes import HERE, plane_view
-from workers.scene.labels import crop_box, patch_object_fraction
+from workers.scene.labels import patch_object_fraction
 
 
 def label(u: int, v: int) -> ObjectLabel:

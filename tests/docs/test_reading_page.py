@@ -1,7 +1,8 @@
-"""Every block of docs/query.md runs as it is printed, and answers what plain files say."""
+"""Every block of docs/reading.md runs as it is printed, and answers what plain files say."""
 
 import json
 import shlex
+import shutil
 from pathlib import Path
 
 import cv2
@@ -16,8 +17,9 @@ from tests.pages import DOCS, blocks_of, run_blocks
 
 @pytest.fixture(scope="module")
 def here(tmp_path_factory) -> Path:
-    """A folder with the dataset that the page names."""
+    """A folder with the dataset and the job that the page names."""
     root = tmp_path_factory.mktemp("here")
+    shutil.copytree(DOCS.parent / "deploy/jobs", root / "deploy/jobs")
     make_dataset(root / "data/tabletop", scenes=6, categories=["mug", "can"])
     return root
 
@@ -28,15 +30,21 @@ def camera_poses(root: Path) -> dict[int, np.ndarray]:
     return {int(line.split(",")[0]): np.array(line.split(",")[2:], float).reshape(4, 4) for line in lines}
 
 
-def test_the_python_of_the_page_answers(here, monkeypatch):
+def test_the_python_of_the_page_answers(here, monkeypatch, capsys):
     monkeypatch.chdir(here)
-    names = run_blocks(DOCS / "query.md")
+    page = DOCS / "reading.md"
+    assert len(blocks_of(page, "python")) >= 10
+    names = run_blocks(page)
+    assert names["pair"].scene_id == 17 and names["pair"].scene["pose"] == "tumbled"
+    printed = capsys.readouterr().out.splitlines()
+    assert sum("(120, 160, 3)" in line for line in printed) == 6
+    assert "Columns of a pair" in printed[-1]
     paths = sorted(
         str(path.relative_to("data/tabletop")) for path in Path("data/tabletop/mug").glob("RGB0*[02468].png")
     )
     assert names["files"] == paths and len(paths) > 1  # every mug is seen whole
     pixels = [cv2.imread(f"data/tabletop/{path}")[..., ::-1] for path in paths]
-    assert np.array_equal(names["images"], pixels) and np.array_equal(names["batch"], pixels)
+    assert np.array_equal(names["images"], pixels)
     assert 0 < names["rows"].num_rows <= 6
     dat = [line.split() for line in Path("data/tabletop/objects.dat").read_text().splitlines()]
     places = {(int(w[0]), w[2], int(w[4]), int(w[5])) for w in dat if w[3] != "2" and int(w[0]) % 2}
@@ -49,7 +57,7 @@ def test_the_python_of_the_page_answers(here, monkeypatch):
 def test_the_commands_of_the_page_answer(here, monkeypatch, capfdbinary):
     monkeypatch.chdir(here)
     answers = []
-    for line in "".join(blocks_of(DOCS / "query.md", "sh")).splitlines():
+    for line in "".join(blocks_of(DOCS / "reading.md", "sh")).splitlines():
         program, *words = shlex.split(line)
         assert program == "verso"
         if ">" in words and not words[-1].isdigit():
@@ -64,3 +72,15 @@ def test_the_commands_of_the_page_answer(here, monkeypatch, capfdbinary):
     (here / "views.parquet").write_bytes(parquet)
     assert pq.read_table(here / "views.parquet").num_rows == 24
     assert b"T_world_cam" in columns
+
+
+def test_the_filter_of_the_page_chooses_some_and_not_all(here, monkeypatch, capsys):
+    monkeypatch.chdir(here)
+    names: dict = {}
+    blocks = blocks_of(DOCS / "reading.md", "python")
+    exec(next(block for block in blocks if "verso.open" in block), names)
+    capsys.readouterr()
+    (filtering,) = [block for block in blocks if "textured" in block]
+    exec(filtering, names)
+    chosen = capsys.readouterr().out.splitlines()
+    assert 0 < len(chosen) < 6 and all(line.startswith("mug-") for line in chosen)
