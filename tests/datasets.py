@@ -52,7 +52,7 @@ def run_here(job: Job, out: Path, folder: Path = Path()) -> tuple[LocalStore, st
     store = LocalStore(out)
     store.prepare()
     record = record_job(job, catalogue.digest, folder, tuple(one.sha256 for one in catalogue.captures))
-    store.write_whole(JOB_FILE, encode_job(record))
+    store.put(JOB_FILE, encode_job(record))
     fingerprint = take_fingerprint(context.renderer, job.drawn.tier)
     store.put_if_absent(FINGERPRINT_FILE, fingerprint.model_dump_json(indent=1).encode())
     terms = ShardOrder.of(str(out), job, record.digest).terms.model_copy(update={"fingerprint": fingerprint.digest})

@@ -14,9 +14,8 @@ from schemas.errors import FailureKind
 Outcome = Literal["made", "intrinsic", "environmental"]
 """The outcome of a scene: made, or the kind of its failure."""
 
-COMMIT_VERSION = 2
-"""Of the records that this program writes. Records of version 1 list every image; later ones leave to the range's tables
-what these say."""
+COMMIT_VERSION = 1
+"""Of the records that this program writes."""
 
 _Digest = Annotated[str, StringConstraints(pattern=r"^[ -~]{0,128}$")]
 _SceneId = Annotated[int, Field(ge=0, le=MAX_SCENE)]
@@ -61,8 +60,7 @@ class CommitTerms(Frozen):
     first_scene: NonNegativeInt = 0
     """Start of the first range; ranges lie on a grid of `range_size`."""
     range_size: PositiveInt = 16
-    pairs_per_scene: PositiveInt | None = None
-    """None in records of version 1."""
+    pairs_per_scene: PositiveInt
 
 
 class FileEntry(Frozen):
@@ -71,13 +69,6 @@ class FileEntry(Frozen):
     path: str
     bytes: NonNegativeInt
     sha256: str
-
-
-class TableEntry(Frozen):
-    """A table of the range: its rows, and in records of version 1 the digest of its canonical rows."""
-
-    rows: NonNegativeInt
-    digest: str = ""
 
 
 MARK = 16
@@ -93,9 +84,15 @@ class SceneMark(Frozen):
     scene_id: NonNegativeInt
     outcome: Outcome
     digest: str
-    """Hex; records of version 1 have all 64 characters, later ones the first `MARK` of them."""
+    """The first `MARK` characters, in hex."""
     reason: str | None = None
-    """Of the failure; None in records of version 1."""
+    """Of the failure; None where the scene was made."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "SceneMark":
+        if (self.outcome == "made") != (self.reason is None):
+            raise ValueError(f"scene {self.scene_id} must have a reason if and only if it failed")
+        return self
 
 
 class CommitRecord(Frozen):
@@ -112,8 +109,9 @@ class CommitRecord(Frozen):
     attempt: str
     terms: CommitTerms
     files: tuple[FileEntry, ...]
-    """The range's tables and tars, sorted by path; in version 1 images and shapes too (`committed_files` has them all)."""
-    tables: dict[str, TableEntry]
+    """The range's tables and tars, sorted by path; the tables name images and shapes (`committed_files` has them all)."""
+    tables: dict[str, NonNegativeInt]
+    """Number of rows, by table."""
     scenes: tuple[SceneMark, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -130,22 +128,18 @@ class CommitRecord(Frozen):
         return self
 
 
-def foreign_path(files: Iterable[FileEntry], span: Span, pairs: int | None) -> str | None:
+def foreign_path(files: Iterable[FileEntry], span: Span, pairs: int) -> str | None:
     """A path that no commit of this span may name, None where all are its own.
 
-    Names of images must be of poses of the span's scenes: with p pairs in a scene, pose k belongs to scene k // 2p. Where
-    `pairs` is unknown, any p that fits all images will do.
+    Names of images must be of poses of the span's scenes: with p pairs in a scene, pose k belongs to scene k // 2p.
     """
-    poses = {}
     for entry in files:
-        if not is_plain_path(entry.path):
+        pose = pose_of_image(entry.path)
+        of_scene = pose is not None and span.start <= pose // (2 * pairs) < span.stop
+        of_range = pose is None and is_range_file(entry.path, span.start, span.retry)
+        if not (of_scene or of_range) or not is_plain_path(entry.path):
             return entry.path
-        if (pose := pose_of_image(entry.path)) is not None:
-            poses[pose // 2] = entry.path
-        elif not is_range_file(entry.path, span.start, span.retry):
-            return entry.path
-    pairs = pairs or max(poses, default=0) // span.stop + 1
-    return next((path for pose, path in poses.items() if not span.start <= pose // pairs < span.stop), None)
+    return None
 
 
 @dataclass(frozen=True)
@@ -165,8 +159,8 @@ class CommitSummary:
     stop: int
     retry: int
     made: int
-    failed: tuple[tuple[int, FailureKind, str | None], ...]
-    """(scene id, kind, reason), in order; the reason is None in records of version 1."""
+    failed: tuple[tuple[int, FailureKind, str], ...]
+    """(scene id, kind, reason), in order."""
     scenes: tuple[int, ...] = ()
     """The scenes of a retry; empty for a whole range."""
     fingerprint: str = ""
@@ -176,7 +170,7 @@ class CommitSummary:
 def summarize(record: CommitRecord) -> CommitSummary:
     """The part of the record that planning needs."""
     span = record.span
-    failed = tuple((one.scene_id, one.outcome, one.reason) for one in record.scenes if one.outcome != "made")
+    failed = tuple((one.scene_id, one.outcome, one.reason or "") for one in record.scenes if one.outcome != "made")
     terms = record.terms
     return CommitSummary(
         start=span.start,

@@ -15,7 +15,7 @@ _failure = pa.struct(
     [
         pa.field("scene_id", pa.int64(), nullable=False),
         pa.field("kind", pa.string(), nullable=False),
-        pa.field("reason", pa.string()),
+        pa.field("reason", pa.string(), nullable=False),
     ]
 )
 _name = pa.dictionary(pa.int32(), pa.string())

@@ -30,8 +30,7 @@ from services.merge.merge import read_success
 from services.read.dataset_reader import find_records
 from services.read.stored_tables import StoredTables
 from workers.store.ledger import iter_committed, range_rows
-from workers.store.local import open_store
-from workers.store.store import Store
+from workers.store.store import Store, open_store
 
 KEPT_RANGES = 8
 """Ranges whose rows are kept for reading pairs in any order."""

@@ -15,7 +15,7 @@ from services.export.step import LEFT_OUT, ExportResult, export
 from services.job.record import require_dataset
 from services.read.damage import explain_damage
 from services.run.progress import ProgressLine
-from workers.store.local import open_store
+from workers.store.store import open_store
 
 
 def main(options: argparse.Namespace) -> int:

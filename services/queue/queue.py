@@ -26,9 +26,13 @@ from schemas.queue import (
     log_path,
     request_path,
 )
+<<<<<<< HEAD
 from workers.store.events import Events
 from workers.store.local import open_store
 from workers.store.store import Store, retry_if_swept
+=======
+from workers.store.store import Store, open_store, retry_if_swept
+>>>>>>> main
 
 JobState = Literal["queued", "waiting", "running", "cancelling", "cancelled", "done", "failed", "lost"]
 """waiting: for its output folder. lost: drivers died more often than they are started again."""
@@ -237,7 +241,7 @@ class Queue:
 
     def put_share(self, running: int) -> None:
         """Tells the drivers how many jobs share the cluster."""
-        self.store.write_whole(SHARE_FILE, json.dumps({"running": running}).encode(), durable=False)
+        self.store.put(SHARE_FILE, json.dumps({"running": running}).encode(), durable=False)
 
     def _request(self, job: str) -> JobRequest:
         if job not in self._requests:

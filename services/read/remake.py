@@ -110,7 +110,7 @@ class Maker:
     def _merged_rows(self, record: CommitRecord, table: str) -> dict[int, Row]:
         """Rows of merged files that can still be read; whether they are right is for their SHA-256 to say."""
         found: dict[int, Row] = {}
-        for entry in self._store.files(f"{MANIFEST}/{table}"):
+        for entry in sorted(self._store.files(f"{MANIFEST}/{table}")):
             try:
                 rows = read_merged(table, entry.key, self._store.read(entry.key))
             except (pa.ArrowException, OSError, ValueError, KeyError):

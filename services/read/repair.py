@@ -178,8 +178,8 @@ class _Repairing:
         """Writes a file whole and durably in place of what is there."""
         try:
             self._store.remove_empty(path)
-            self._store.write_whole(path, data)
-            self._store.sync_folders_of([path])
+            self._store.put(path, data)
+            self._store.sync([path])
         except OSError as error:
             self._found.left.append(f"{path}: cannot be written ({error.strerror or error}): move what is there away")
         else:
@@ -202,7 +202,7 @@ class _Repairing:
         for retry in sorted(retries, reverse=True):
             self._store.remove(commit_path(start, retry))
             self._store.remove_tree(f"{RANGES}/{range_name(start, retry)}")
-        self._store.sync_folders_of([key])
+        self._store.sync([key])
         self._found.left.append(f"{key}: dropped, because {why}: run the job again to make its scenes")
 
 

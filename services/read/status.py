@@ -87,8 +87,8 @@ def _rate(store: Store, ledger: Ledger) -> float | None:
         *range(max(0, len(ledger.start) - RATE_LOOKS), len(ledger.start)),
     }:
         key = commit_path(int(ledger.start[at]), int(ledger.retry[at]))
-        if (written := store.modified(key)) is not None:
-            scenes[written, key] = ledger.count(at)
+        if (written := store.stat(key)) is not None:
+            scenes[written.modified_s, key] = ledger.count(at)
     latest = sorted(scenes)[-RATE_COMMITS:]
     if len(latest) < 2 or latest[-1][0] <= latest[0][0]:
         return None

@@ -66,7 +66,8 @@ class Known:
 def tell_strays(store: Store, known: Known, verdict: Verdict) -> None:
     """Tells of everything that no commit names."""
     if store.root is None:
-        for key, _ in store.listing():
+        for entry in store.files(""):
+            key = entry.key
             if not FREE & {key, key.partition("/")[0]} and not _belongs(key, known):
                 _tell_file(store, key, verdict)
         return

@@ -12,7 +12,8 @@ from workers.store.store import Store
 
 def commit_groups(store: Store) -> Iterator[tuple[int, list[int]]]:
     """(start, retries) of every range that has a commit record, in order. Other files are left to the search for strays."""
-    names = sorted(name for file, _ in store.scan(COMMITS) if (name := parse_commit_name(file)) is not None)
+    files = (entry.key.removeprefix(f"{COMMITS}/") for entry in store.files(COMMITS, sizes=False))
+    names = sorted(name for file in files if (name := parse_commit_name(file)) is not None)
     for start, group in groupby(names, key=itemgetter(0)):
         yield start, [retry for _, retry in group]
 

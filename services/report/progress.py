@@ -91,7 +91,8 @@ def progress_of(name: str, status: Status, lives: bool) -> Progress:
 def latest_scenes(store: Store, count: int = LATEST) -> list[ShownScene]:
     """The scenes of the newest commits, the newest first; those that cannot be read just now are left out."""
     codes = [split_code(code) for code in list_codes(store)[-LOOKS:]]
-    written = {start: store.modified(commit_path(start, retry)) or 0.0 for start, retry in codes}
+    found = {start: store.stat(commit_path(start, retry)) for start, retry in codes}
+    written = {start: entry.modified_s if entry else 0.0 for start, entry in found.items()}
     shown: list[ShownScene] = []
     for start in sorted(written, key=lambda start: (-written[start], -start)):
         if len(shown) >= count:

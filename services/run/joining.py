@@ -109,7 +109,7 @@ def with_own_stack(store: Store, order: ShardOrder) -> ShardOrder:
     if order.job.run.device == "gpu" and is_software(renderer.name):
         return order
     mine = take_fingerprint(renderer, order.job.drawn.tier)
-    store.write_whole(FINGERPRINT_FILE, mine.model_dump_json(indent=1).encode())
+    store.put(FINGERPRINT_FILE, mine.model_dump_json(indent=1).encode())
     return order.model_copy(update={"terms": order.terms.model_copy(update={"fingerprint": mine.digest})})
 
 

@@ -117,8 +117,26 @@ class Lock:
                 self._store.remove(LOCK_FILE)
                 self._store.remove_tree(LOCK_CLAIMS)
 
+<<<<<<< HEAD
     def _is_last(self) -> bool:
         """Whether the last event is this process's.
+=======
+    def _beat(self) -> bool:
+        """Writes the lock file anew; False where the lock was lost, even if only while this function ran."""
+        begun = _now_s()
+        found = read_holder(self._store)
+        if _claimant(self._store, self._mine) is not None or not self._may_write(found, begun):
+            return False
+        self._mine = replace(self._mine, beat=self._mine.beat + 1)
+        if found is not None:
+            self._store.put(LOCK_FILE, _encode(self._mine), durable=False)
+        elif not self._store.put_if_absent(LOCK_FILE, _encode(self._mine)):
+            return False
+        if self._is_late() and _claimant(self._store, self._mine) is not None:
+            return False
+        self._shown_at = begun
+        return True
+>>>>>>> main
 
         Where the events are gone, removed by hand, it takes the lock again, unless somebody had the time to take over, to
         work and to end.
@@ -233,6 +251,36 @@ def _take(store: Store, mine: Holder, gone: Holder | None) -> bool:
         return Events(store, LOCK_CLAIMS).append(decide) is not None
     except (CorruptError, FileNotFoundError, ValueError, TypeError):  # given back, or damaged, at this moment
         return False
+<<<<<<< HEAD
+=======
+    if read_holder(store) != gone:
+        store.remove(claim)
+        return False
+    store.put(LOCK_FILE, _encode(mine))
+    if _claimant(store, gone) == mine:
+        return True
+    if _is_held_by(store, mine):
+        store.remove(LOCK_FILE)
+    return False
+
+
+def _claim_on(holder: Holder) -> str:
+    return f"{LOCK_CLAIMS}/{uuid.uuid5(uuid.NAMESPACE_OID, holder.token).hex}"
+
+
+def _claimant(store: Store, holder: Holder) -> Holder | None:
+    """The process that claimed the lock of `holder`, None where nobody did."""
+    return _holder_at(store, _claim_on(holder))
+
+
+def _is_held_by(store: Store, holder: Holder) -> bool:
+    current = read_holder(store)
+    return current is not None and current.token == holder.token
+
+
+def _encode(holder: Holder) -> bytes:
+    return json.dumps(asdict(holder)).encode()
+>>>>>>> main
 
 
 def _machine() -> str:

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from schemas.scene.camera import Camera
 from schemas.scene.shape import Mesh
 from workers.capture.object_region import Ground
-from workers.capture.raster import draw_depth
+from workers.geometry.zbuffer import draw_depth
 
 RIM_M = 0.0005
 """Points of an open edge that lie nearer to the cut above the board than this are on it."""

@@ -15,9 +15,13 @@ from workers.capture.depth_fit import FittedDepth
 from workers.capture.posed_view import PosedView
 from workers.geometry.frames import invert
 from workers.geometry.jit import compiled
+from workers.geometry.zbuffer import draw_triangles
 
 SAME_SURFACE = 0.012
 """Neighbouring pixels whose 1/z differs by a larger share are not joined."""
+
+EDGE_SLACK = 1e-6
+"""Share of a triangle's area by which a pixel's centre may lie beyond its edge: coordinates are float32."""
 
 FEATHER_PX = 15
 """Width over which a view's weight falls towards the edges of what it measured, at a focal length of 912 px."""
@@ -77,28 +81,14 @@ def move_depth(depth_m: NDArray[np.float32], source: Camera, target: Camera) -> 
 def warp(source: Source, camera: Camera, factor: float = 1.0) -> Layer:
     """The source as `camera` sees it; its weights times `factor`."""
     k, m = source.camera.intrinsics, camera.intrinsics
-    shape = (m.height, m.width)
-    layer = Layer(
-        np.zeros(shape, np.float32),
-        np.zeros(shape, np.float32),
-        np.zeros((*shape, 3), np.uint8),
-        np.zeros(shape, np.bool_),
+    T, inverse = invert(camera.T_world_cam) @ source.camera.T_world_cam, source.fitted.inverse
+    pixels, z = _carry(inverse, (k.fx, k.fy, k.cx, k.cy), T, (m.fx, m.fy, m.cx, m.cy))
+    triangles = _join(inverse, z)
+    depth, found, shares = draw_triangles(pixels, z, triangles, (m.height, m.width), EDGE_SLACK, True)
+    return Layer(
+        depth.astype(np.float32),
+        *_paint(found, shares, triangles, pixels, source.weight * np.float32(factor), source.rgb, source.mask),
     )
-    T = invert(camera.T_world_cam) @ source.camera.T_world_cam
-    u, v, z = _carry(source.fitted.inverse, (k.fx, k.fy, k.cx, k.cy), T, (m.fx, m.fy, m.cx, m.cy))
-    weight = source.weight * np.float32(factor)
-    _draw_grid(
-        (u, v, z),
-        source.fitted.inverse,
-        source.rgb,
-        source.mask,
-        weight,
-        layer.depth_m,
-        layer.weight,
-        layer.rgb,
-        layer.mask,
-    )
-    return layer
 
 
 @compiled
@@ -138,11 +128,10 @@ def _carry(
     k: tuple[float, float, float, float],
     T: Array,
     m: tuple[float, float, float, float],
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """(u, v, z) [h, w]: pixels of the target with centres on integers; z is 0 where there is nothing in front of it."""
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(u and v [h * w, 2], z [h * w]): pixels of the target with centres on integers; z is 0 where nothing is in front of it."""
     height, width = inverse.shape
-    u, v = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
-    depth = np.zeros((height, width), np.float32)
+    pixels, depth = np.zeros((inverse.size, 2), np.float32), np.zeros(inverse.size, np.float32)
     for row in range(height):
         ray_y = (row + 0.5 - k[3]) / k[1]
         for column in range(width):
@@ -152,77 +141,62 @@ def _carry(
             x, y = (column + 0.5 - k[2]) / k[0] * z, ray_y * z
             Z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
             if Z > 0.05:
-                u[row, column] = m[0] * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / Z + m[2] - 0.5
-                v[row, column] = m[1] * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / Z + m[3] - 0.5
-                depth[row, column] = Z
-    return u, v, depth
+                n = row * width + column
+                pixels[n, 0] = m[0] * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / Z + m[2] - 0.5
+                pixels[n, 1] = m[1] * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / Z + m[3] - 0.5
+                depth[n] = Z
+    return pixels, depth
 
 
 @compiled
-def _draw_grid(
-    uvz: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
-    inverse: NDArray[np.float32],
+def _join(inverse: NDArray[np.float32], z: NDArray[np.float32]) -> NDArray[np.int32]:
+    """[T, 3]: two triangles for each square of four pixels, of the three that lie on one surface, by number.
+
+    The first begins with the lowest number and is wound as the image's axes are, the second with the highest and otherwise.
+    """
+    height, width = inverse.shape
+    triangles, count = np.empty((2 * inverse.size, 3), np.int32), 0
+    of_all = inverse.ravel()
+    for row in range(height - 1):
+        for column in range(width - 1):
+            n = row * width + column
+            for first in (n, n + width + 1):
+                least, most, good = np.inf, 0.0, True
+                for pixel in (first, n + 1, n + width):
+                    good = good and z[pixel] > 0.0
+                    least, most = min(least, of_all[pixel]), max(most, of_all[pixel])
+                if good and not least < (1.0 - SAME_SURFACE) * most:
+                    triangles[count, 0], triangles[count, 1], triangles[count, 2] = first, n + 1, n + width
+                    count += 1
+    return triangles[:count]
+
+
+@compiled
+def _paint(
+    found: NDArray[np.int32],
+    shares: Array,
+    triangles: NDArray[np.int32],
+    pixels: NDArray[np.float32],
+    weight: NDArray[np.float32],
     rgb: NDArray[np.uint8],
     mask: NDArray[np.bool_],
-    weight: NDArray[np.float32],
-    depth_out: NDArray[np.float32],
-    weight_out: NDArray[np.float32],
-    rgb_out: NDArray[np.uint8],
-    mask_out: NDArray[np.bool_],
-) -> None:
-    """Two triangles for each square of four pixels, wound like the image: a surface seen from its front stays so."""
-    u, v, z = uvz
-    height, width = depth_out.shape
-    rows, columns = np.zeros(3, np.int64), np.zeros(3, np.int64)
-    for row in range(inverse.shape[0] - 1):
-        for column in range(inverse.shape[1] - 1):
-            for half in range(2):
-                rows[0], columns[0] = (row, column) if half == 0 else (row + 1, column + 1)
-                rows[1], columns[1] = row, column + 1
-                rows[2], columns[2] = row + 1, column
-                least, most = np.inf, 0.0
-                good = True
-                for i in range(3):
-                    q = inverse[rows[i], columns[i]]
-                    good = good and z[rows[i], columns[i]] > 0.0
-                    least, most = min(least, q), max(most, q)
-                if not good or least < (1.0 - SAME_SURFACE) * most:
-                    continue
-                ua, va = u[rows[0], columns[0]], v[rows[0], columns[0]]
-                ub, vb = u[rows[1], columns[1]], v[rows[1], columns[1]]
-                uc, vc = u[rows[2], columns[2]], v[rows[2], columns[2]]
-                area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)
-                if area == 0.0:
-                    continue
-                front = (area > 0.0) == (half == 0)
-                left, right = max(int(np.ceil(min(ua, ub, uc))), 0), min(int(np.floor(max(ua, ub, uc))), width - 1)
-                top, bottom = max(int(np.ceil(min(va, vb, vc))), 0), min(int(np.floor(max(va, vb, vc))), height - 1)
-                for y in range(top, bottom + 1):
-                    for x in range(left, right + 1):
-                        wb = ((x - ua) * (vc - va) - (uc - ua) * (y - va)) / area
-                        wc = ((ub - ua) * (y - va) - (x - ua) * (vb - va)) / area
-                        wa = 1.0 - wb - wc
-                        if wa < -1e-6 or wb < -1e-6 or wc < -1e-6:
-                            continue
-                        za, zb, zc = z[rows[0], columns[0]], z[rows[1], columns[1]], z[rows[2], columns[2]]
-                        at = 1.0 / (wa / za + wb / zb + wc / zc)
-                        if depth_out[y, x] > 0.0 and depth_out[y, x] <= at:
-                            continue
-                        depth_out[y, x] = at
-                        if not front:
-                            weight_out[y, x] = 0.0
-                            continue
-                        weight_out[y, x] = (
-                            wa * weight[rows[0], columns[0]]
-                            + wb * weight[rows[1], columns[1]]
-                            + wc * weight[rows[2], columns[2]]
-                        )
-                        for c in range(3):
-                            rgb_out[y, x, c] = np.uint8(
-                                wa * rgb[rows[0], columns[0], c]
-                                + wb * rgb[rows[1], columns[1], c]
-                                + wc * rgb[rows[2], columns[2], c]
-                                + 0.5
-                            )
-                        nearest = 0 if wa >= wb and wa >= wc else (1 if wb >= wc else 2)
-                        mask_out[y, x] = mask[rows[nearest], columns[nearest]]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.bool_]]:
+    """(weight, rgb, mask) of a layer, between the corners of the triangle that is drawn at each pixel."""
+    height, width = found.shape
+    weights, colours = np.zeros((height, width), np.float32), np.zeros((height, width, 3), np.uint8)
+    inside = np.zeros((height, width), np.bool_)
+    weight_of, rgb_of, mask_of = weight.ravel(), rgb.reshape(-1, 3), mask.ravel()
+    for y in range(height):
+        for x in range(width):
+            if found[y, x] < 0:
+                continue
+            a, b, c = triangles[found[y, x], 0], triangles[found[y, x], 1], triangles[found[y, x], 2]
+            wa, wb, wc = shares[y, x, 0], shares[y, x, 1], shares[y, x, 2]
+            across, down = pixels[b] - pixels[a], pixels[c] - pixels[a]
+            if (across[0] * down[1] - down[0] * across[1] > 0.0) != (a < b):
+                continue  # seen from behind
+            weights[y, x] = wa * weight_of[a] + wb * weight_of[b] + wc * weight_of[c]
+            for i in range(3):
+                colours[y, x, i] = np.uint8(wa * rgb_of[a, i] + wb * rgb_of[b, i] + wc * rgb_of[c, i] + 0.5)
+            inside[y, x] = mask_of[a if wa >= wb and wa >= wc else (b if wb >= wc else c)]
+    return weights, colours, inside

@@ -185,7 +185,7 @@ def _compile_module(module: str, planned: list[tuple[Any, str]]) -> int:
     with _locks.hold():
         for loop, types in planned:
             loop.compile(_types_of(types))
-    _kept(module).touch()
+        _kept(module).touch()  # before another process gets the lock
     return len(planned)
 
 

@@ -1,6 +1,6 @@
 """Triangles drawn on a pixel grid without a GPU: z-buffers in float64, and the pixels that a shape covers as a GPU counts them.
 
-A z-buffer keeps 1 / z of the nearest surface at each pixel's centre, edges included, so that planes stay planes.
+`draw_triangles` is the z-buffer; depth images are registered to the colour camera beside them with it.
 
 Coverage follows the arithmetic of OpenGL by llvmpipe: float32 from the shape's frame to window coordinates, vertices moved to
 the nearest 1/256 pixel, and a pixel covered where its centre lies within a triangle, by exact integers. A centre on an edge
@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.capture.depth_camera import DepthCamera
-from schemas.scene.camera import Intrinsics
-from schemas.scene.shape import Shape
+from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.shape import Mesh, Shape
+from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.rational_lens import pixel_rays, project_points
 
@@ -27,7 +28,7 @@ At 1 m the Azure Kinect's narrow mode then has a step of 19 mm per pixel, some t
 """
 
 ON_EDGE = 1e-9
-"""A pixel centre so near to a triangle's edge, pixels or shares of its area, is inside: rounding leaves no cracks."""
+"""A pixel centre so near to a triangle, pixels or shares of its area, is inside: rounding leaves no cracks."""
 
 
 def register_depth(
@@ -53,8 +54,21 @@ def register_depth(
     step = STEEPEST / min(k.fx, k.fy) if max_step is None else max_step
     depth = np.ascontiguousarray(depth_m, np.float64)
     points = _lift(depth, pixel_rays(k, camera.lens), camera.T_color_depth)
-    pixels = project_points(points, color, np.zeros(8) if color_lens is None else color_lens)
-    return _draw(pixels, points, depth, step, color.height, color.width)
+    pixels = project_points(points, color, np.zeros(8) if color_lens is None else color_lens) - 0.5
+    size = (color.height, color.width)
+    drawn = draw_triangles(pixels, points[:, 2].copy(), _squares(pixels, depth, step), size, ON_EDGE, False)
+    return drawn[0].astype(np.float64)
+
+
+def draw_depth(mesh: Mesh, camera: Camera, near_m: float = 0.05) -> Array:
+    """[H, W] float64: z of the nearest face at each pixel's centre, both sides of faces, 0 where there is none.
+
+    Faces that reach nearer than `near_m` are left out.
+    """
+    k, points = camera.intrinsics, transform(invert(camera.T_world_cam), mesh.vertices)
+    z = np.where(points[:, 2] > near_m, points[:, 2], np.nan)
+    pixels = np.stack([k.fx * points[:, 0] / z + k.cx - 0.5, k.fy * points[:, 1] / z + k.cy - 0.5], axis=1)
+    return draw_triangles(pixels, z, mesh.faces, (k.height, k.width), 0.0, True)[0].astype(np.float64)
 
 
 @compiled
@@ -75,11 +89,11 @@ def _lift(depth_m: Array, rays: Array, T_color_depth: Array) -> Array:
 
 
 @compiled
-def _draw(pixels: Array, points: Array, depth_m: Array, max_step: float, height: int, width: int) -> Array:
-    """The z-buffer [height, width] of the squares between four points, which are drawn at `pixels` (nan: nowhere)."""
-    inverse = np.zeros((height, width))
-    columns = depth_m.shape[1]
-    for i in range(depth_m.shape[0] - 1):
+def _squares(pixels: Array, depth_m: Array, max_step: float) -> NDArray[np.int32]:
+    """[T, 3]: the two triangles of each square between four pixels of a depth image that lie on one surface, by number."""
+    height, columns = depth_m.shape
+    triangles, count = np.empty((2 * depth_m.size, 3), np.int32), 0
+    for i in range(height - 1):
         for j in range(columns - 1):
             a, d = i * columns + j, (i + 1) * columns + j
             if math.isnan(pixels[a, 0] + pixels[a + 1, 0] + pixels[d, 0] + pixels[d + 1, 0]):
@@ -88,41 +102,57 @@ def _draw(pixels: Array, points: Array, depth_m: Array, max_step: float, height:
             nearest = min(min(z0, z1), min(z2, z3))
             if max(max(z0, z1), max(z2, z3)) - nearest > max_step * nearest:
                 continue
-            for b, c in ((a + 1, d + 1), (d + 1, d)):
-                _draw_triangle(
-                    inverse, pixels[a], pixels[b], pixels[c], 1 / points[a, 2], 1 / points[b, 2], 1 / points[c, 2]
-                )
-    for i in range(height):
-        for j in range(width):
-            if inverse[i, j] > 0.0:
-                inverse[i, j] = 1.0 / inverse[i, j]
-    return inverse
+            triangles[count, 0], triangles[count, 1], triangles[count, 2] = a, a + 1, d + 1
+            triangles[count + 1, 0], triangles[count + 1, 1], triangles[count + 1, 2] = a, d + 1, d
+            count += 2
+    return triangles[:count]
+
+
+Drawn = tuple[NDArray[np.floating], NDArray[np.int32], Array]
+"""(z [H, W], metres, 0 where there is nothing; number of the triangle [H, W], -1 there; its corners' weights [H, W, 3])."""
 
 
 @compiled
-def _draw_triangle(
-    inverse: Array, a: Array, b: Array, c: Array, inverse_a: float, inverse_b: float, inverse_c: float
-) -> None:
-    """Puts 1 / z of a triangle at the pixel centres inside it, edges included, where it is nearer than what is there."""
-    area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-    if not area > 0.0:
-        return  # seen from behind, or edge-on
-    left = max(math.ceil(min(min(a[0], b[0]), c[0]) - 0.5 - ON_EDGE), 0)
-    right = min(math.floor(max(max(a[0], b[0]), c[0]) - 0.5 + ON_EDGE), inverse.shape[1] - 1)
-    top = max(math.ceil(min(min(a[1], b[1]), c[1]) - 0.5 - ON_EDGE), 0)
-    bottom = min(math.floor(max(max(a[1], b[1]), c[1]) - 0.5 + ON_EDGE), inverse.shape[0] - 1)
-    outside = -ON_EDGE * area
-    for row in range(top, bottom + 1):
-        v = row + 0.5
-        for column in range(left, right + 1):
-            u = column + 0.5
-            in_a = (c[0] - b[0]) * (v - b[1]) - (c[1] - b[1]) * (u - b[0])
-            in_b = (a[0] - c[0]) * (v - c[1]) - (a[1] - c[1]) * (u - c[0])
-            in_c = (b[0] - a[0]) * (v - a[1]) - (b[1] - a[1]) * (u - a[0])
-            if in_a >= outside and in_b >= outside and in_c >= outside:
-                at = (in_a * inverse_a + in_b * inverse_b + in_c * inverse_c) / (in_a + in_b + in_c)
-                if at > inverse[row, column]:
-                    inverse[row, column] = at
+def draw_triangles(
+    pixels: NDArray[np.floating],
+    z: NDArray[np.floating],
+    triangles: NDArray[np.int32],
+    shape: tuple[int, int],
+    slack: float,
+    both_sides: bool,
+) -> Drawn:
+    """What of triangles [T, 3] is nearest at each pixel's centre, by a z-buffer; the first of equals.
+
+    pixels [N, 2]: where points are in an image of `shape` (H, W), with the centres of pixels on whole numbers, nan for nowhere;
+    z [N] > 0 along the optical axis, metres, interpolated as 1 / z, so that planes stay planes. A centre is inside up to `slack`,
+    a share of the area, beyond an edge. Of triangles wound the other way than the image's axes are, nothing is drawn unless
+    `both_sides` are.
+    """
+    height, width = shape
+    depth, found = np.zeros(shape, z.dtype), np.full(shape, -1, np.int32)
+    weights = np.zeros((height, width, 3))
+    for t in range(len(triangles)):
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        ua, va, ub, vb, uc, vc = pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1], pixels[c, 0], pixels[c, 1]
+        area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)
+        if not (area > 0.0 or (both_sides and area < 0.0)):
+            continue
+        left = max(int(np.ceil(min(ua, ub, uc) - ON_EDGE)), 0)
+        right = min(int(np.floor(max(ua, ub, uc) + ON_EDGE)), width - 1)
+        top = max(int(np.ceil(min(va, vb, vc) - ON_EDGE)), 0)
+        bottom = min(int(np.floor(max(va, vb, vc) + ON_EDGE)), height - 1)
+        for y in range(top, bottom + 1):
+            for x in range(left, right + 1):
+                wb = ((x - ua) * (vc - va) - (uc - ua) * (y - va)) / area
+                wc = ((ub - ua) * (y - va) - (x - ua) * (vb - va)) / area
+                wa = 1.0 - wb - wc
+                if wa < -slack or wb < -slack or wc < -slack:
+                    continue
+                at = 1.0 / (wa / z[a] + wb / z[b] + wc / z[c])
+                if found[y, x] < 0 or depth[y, x] > at:
+                    depth[y, x], found[y, x] = at, t
+                    weights[y, x, 0], weights[y, x, 1], weights[y, x, 2] = wa, wb, wc
+    return depth, found, weights
 
 
 NEAREST_M = 0.1

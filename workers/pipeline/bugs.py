@@ -52,7 +52,7 @@ def keep_traceback(store: Store, scene_id: int, error: BaseException) -> str:
     """Writes the traceback beside the logs; where it is, for the end of a sentence."""
     key = f"{LOG_FOLDER}/scene-{scene_id}.txt"
     try:
-        store.write_whole(key, "".join(traceback.format_exception(error)).encode(), durable=False)
+        store.put(key, "".join(traceback.format_exception(error)).encode(), durable=False)
     except Exception:  # a log must not end the scene's range
         return ""
     return f"; the traceback is in {store.name}/{key}"

@@ -36,8 +36,7 @@ from workers.render.raster.context import require_device
 from workers.render.raster.gbuffer import shared_renderer
 from workers.render.tiers import require_tier
 from workers.store.attempt import TIMED_OUT, Attempt, begin_attempt
-from workers.store.local import open_store
-from workers.store.store import Store
+from workers.store.store import Store, open_store
 
 
 class BlamedScene(SceneError):
@@ -187,7 +186,7 @@ def _join_stack(store: Store, mine: Fingerprint, order: ShardOrder) -> None:
     if store.size(FINGERPRINT_FILE) is None:
         store.put_if_absent(FINGERPRINT_FILE, mine.model_dump_json(indent=1).encode())
     elif wanted and mine != _written_down(store):
-        store.write_whole(FINGERPRINT_FILE, mine.model_dump_json(indent=1).encode())  # it was damaged, or another's
+        store.put(FINGERPRINT_FILE, mine.model_dump_json(indent=1).encode())  # it was damaged, or another's
     theirs = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
     if order.terms.fingerprint_mode == "strict" and mine != theirs:
         raise _foreign(mine, theirs, theirs.digest)

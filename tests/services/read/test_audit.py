@@ -133,7 +133,7 @@ def test_a_scene_that_is_not_made_the_same_again_blames_no_effect(tmp_path):
 def write_fingerprint(store: LocalStore, changes: dict[str, str]) -> None:
     """This process's fingerprint, with changes, as the dataset's."""
     fingerprint = take_fingerprint(shared_renderer(), JOB.render.tier)
-    store.write_whole(FINGERPRINT_FILE, fingerprint.model_copy(update=changes).model_dump_json().encode())
+    store.put(FINGERPRINT_FILE, fingerprint.model_copy(update=changes).model_dump_json().encode())
 
 
 @pytest.mark.usefixtures("calm")

@@ -16,7 +16,7 @@ def rewrite(out, **changes) -> list[str]:
     store = LocalStore(out)
     record = require_job(store)
     job = record.job.model_copy(update=changes)
-    store.write_whole("job.yaml", encode_job(dataclasses.replace(record, job=job)))
+    store.put("job.yaml", encode_job(dataclasses.replace(record, job=job)))
     return faults_of(store)
 
 

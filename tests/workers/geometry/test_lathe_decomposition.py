@@ -1,4 +1,8 @@
-"""Convex parts of lofts, against manifold3d's booleans, rays and hulls."""
+"""Convex partitions of plane outlines, against shapely's areas and hulls.
+
+What is visible from the axis of outlines that are easy to see. Convex parts of lofts, against manifold3d's booleans,
+rays and hulls.
+"""
 
 import manifold3d
 import numpy as np
@@ -8,15 +12,82 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from schemas.job.assets import ProceduralSource
-from schemas.scene.shape import Loft, Mesh
 from workers.assets.builtin.make import make_asset
-from workers.assets.builtin.solid import circle, difference, lathe, union
+from workers.assets.builtin.solid import lathe, union
 from workers.assets.builtin.sweeps import prism
 from workers.geometry.distance import nearest_on_mesh
-from workers.geometry.lathe_decomposition import COARSE, decompose_lofts
+from workers.geometry.lathe_decomposition import (
+    COARSE,
+    decompose_lofts,
+    partition_outlines,
+    stack_slabs,
+    trace_visible_border,
+)
 from workers.geometry.mesh import solid_of, weld
 from workers.physics import convex_parts as decompose
 from workers.physics.convex_parts import parts_of
+
+L_SHAPE = np.array([(0, 0), (3, 0), (3, 1), (1, 1), (1, 3), (0, 3)], dtype=np.float64)
+STAR = np.array([(np.cos(k * np.pi / 7) * r, np.sin(k * np.pi / 7) * r) for k, r in enumerate([2.0, 0.7] * 7)])
+COMB = np.array([(x, y) for k in range(5) for x, y in ((k, 0.0), (k + 0.5, 0.0), (k + 0.5, -2.0), (k + 1.0, -2.0))])
+OUTLINES = {"l": L_SHAPE, "star": STAR, "comb": np.concatenate([COMB, [(5.0, 1.0), (0.0, 1.0)]])}
+
+
+def polygons(outline, tolerance=0.0):
+    return [shapely.Polygon(outline[cell]) for cell in partition_outlines(outline[None], tolerance)]
+
+
+@pytest.mark.parametrize("name", OUTLINES)
+def test_cells_are_convex_and_tile_the_outline(name):
+    cells, whole = polygons(OUTLINES[name]), shapely.Polygon(OUTLINES[name])
+    assert all(cell.is_valid for cell in cells)
+    assert all(cell.convex_hull.area - cell.area < 1e-12 for cell in cells)
+    assert sum(cell.area for cell in cells) == pytest.approx(whole.area, rel=1e-12)
+    assert (
+        shapely.union_all([shapely.set_precision(cell, 1e-9) for cell in cells]).symmetric_difference(whole).area < 1e-7
+    )
+
+
+def test_a_shallow_arc_is_kept_whole_only_within_the_tolerance():
+    """Each of its corners is 0.0004 deep, all together 0.04: the hull must not reach over it by more than asked."""
+    x = np.linspace(-1.0, 1.0, 21)
+    arc = np.stack([x, 0.04 * (x * x - 1.0)], axis=1)[::-1]
+    outline = np.concatenate([arc, [(-1.0, -2.0), (1.0, -2.0)]])
+    assert len(polygons(outline, 0.041)) == 1
+    for cell in polygons(outline, 0.01):
+        over = cell.convex_hull.difference(shapely.Polygon(outline))
+        assert over.buffer(-0.0051).is_empty
+    assert len(polygons(outline, 0.01)) > 1
+
+
+def test_outlines_that_are_cut_alike_are_all_convex():
+    """The second has a reflex corner where the first is straight."""
+    first = np.array([(0, 0), (2, 0), (2, 1), (2, 2), (0, 2)], dtype=np.float64)
+    second = np.array([(0, 0), (2, 0), (1, 1), (2, 2), (0, 2)], dtype=np.float64)
+    found = partition_outlines(np.stack([first, second]), 1e-9)
+    assert len(found) == 2
+    for outline in (first, second):
+        cells = [shapely.Polygon(outline[cell]) for cell in found]
+        assert all(cell.convex_hull.area - cell.area < 1e-12 for cell in cells)
+        assert sum(cell.area for cell in cells) == pytest.approx(shapely.Polygon(outline).area)
+
+
+SPOOL = np.array([(0.0, 0.0), (3.0, 0.0), (3.0, 1.0), (1.0, 1.0), (1.0, 4.0), (3.0, 4.0), (3.0, 5.0), (0.0, 5.0)])
+
+
+def visible(outline) -> shapely.Polygon:
+    border = trace_visible_border(outline)
+    return shapely.Polygon([outline[0], *((ring.radius, ring.height) for ring in border), outline[-1]])
+
+
+def test_a_thin_neck_reaches_into_its_wider_neighbours():
+    neck = SPOOL.copy()
+    neck[4:, 1] -= 2.9
+    stacks = stack_slabs(trace_visible_border(neck), neck[None], visible(neck), 1e-3, 0.5)
+    heights = [ring.height for ring in stacks[1]]
+    assert heights == pytest.approx([1.0, 1.1, 0.5, 1.6])
+    assert [ring.scale for ring in stacks[1]] == [1.0, 1.0, 0.5, 0.5]
+
 
 AIM_M = 5e-5
 """Largest distance that parts of a shape 0.25 m along its diagonal may stand out, or leave uncovered."""
@@ -91,37 +162,11 @@ def test_parts_have_the_volume_of_the_shape(category, number):
     assert missing < 1e-5 * solid.volume()
 
 
-def test_a_cup_is_a_bottom_and_wedges():
-    """The volume of its wall and bottom over a polygon: Pappus with the polygon's area for the circle's."""
-    body = lathe(CUP, [0] * 5, 24)
-    parts = decompose_lofts(body.lofts)
-    beyond, missing = volumes(parts, solid_of(Mesh(body.vertices, body.faces.astype(np.int32))))
-    assert (beyond, missing) == pytest.approx((0.0, 0.0), abs=1e-4 * 1e-4)
-    assert len(parts) == 1 + 24
-    assert uncovered_m(parts, np.array([(0.0, 0.0, 0.002), (0.0395, 0.0, 0.03)])) < 1e-9
-    assert uncovered_m(parts, np.array([(0.0, 0.0, 0.0052)])) > 1e-4
-
-
-def test_a_bolt_is_stacked_of_whole_rings():
-    """A solid of revolution that is seen from its axis everywhere needs no wedges."""
-    profile = np.array([(0, 0), (10, 0), (10, 5), (4, 5), (4, 30), (0, 30)], dtype=np.float64)
-    parts = decompose_lofts(lathe(profile, [0] * 5, 24).lofts)
-    share = 12 * np.sin(np.pi / 12)  # of a polygon with 24 corners, over the square of its radius
-    assert sorted(ConvexHull(part).volume for part in parts) == pytest.approx([share * 16 * 25, share * 100 * 5])
-
-
-def test_a_notch_is_cut_out_of_a_block():
-    block = prism(np.array([(0.0, 0.0), (0.0, 1.0)]), (2.0, 2.0), 0.1, [0, 0, 0])
-    notch = prism(np.array([(0.0, 0.5), (0.0, 2.0)]), (3.0, 0.5), 0.01, [1, 1, 1])
-    body = difference(block, [notch])
-    parts = decompose_lofts(body.lofts)
-    beyond, missing = volumes(parts, solid_of(Mesh(body.vertices, body.faces.astype(np.int32))))
-    assert (beyond, missing) == pytest.approx((0.0, 0.0), abs=1e-3)
-    assert len(parts) == 3
-
-
 def test_a_union_has_the_parts_of_all_and_moves_with_them():
-    cup, bar = lathe(CUP, [0] * 5, 24), prism(np.array([(0.0, 0.0), (0.0, 0.01)]), (0.2, 0.01), 0.001, [1, 1, 1])
+    cup, bar = (
+        lathe(CUP, [0] * 5, 24),
+        prism(np.array([(0.0, 0.0), (0.0, 0.01)]), (0.2, 0.01), 0.001, [1, 1, 1]),
+    )
     both = union([cup, bar.moved(z=0.02)]).placed(
         np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0, 0, 1.0]]), np.ones(3)
     )
@@ -130,24 +175,6 @@ def test_a_union_has_the_parts_of_all_and_moves_with_them():
     points = np.concatenate(parts)
     assert points.min(axis=0) == pytest.approx(both.vertices.min(axis=0), abs=1e-12)
     assert points.max(axis=0) == pytest.approx(both.vertices.max(axis=0), abs=1e-12)
-
-
-def test_a_union_with_what_is_not_known_is_not_known():
-    known = lathe(CUP, [0] * 5, 24)
-    unknown = prism(np.array([(0.0, 0.0), (0.0, 0.01)]), (0.2, 0.01), 0.001, [1, 1, 1])
-    unknown = type(unknown)(unknown.vertices, unknown.faces, unknown.surface, unknown.smooth)
-    assert union([known, unknown]).lofts is None
-    assert difference(known, [unknown]).lofts is None
-
-
-def test_a_straight_chain_of_rings_is_one_part_and_a_bent_one_several():
-    ring = np.concatenate([circle(8), np.zeros((8, 1))], axis=1)
-    up = np.array([0.0, 0.0, 1.0])
-    straight = np.stack([ring, ring + up, ring + 3.0 * up])
-    ends = np.array([(0, 0, 0), (0, 0, 3.0)])
-    assert len(decompose_lofts([Loft(straight, ends)])) == 1
-    bent = np.stack([ring, ring + 2.0 * up, ring[:, [2, 1, 0]] * [1, 1, -1] + np.array([3.0, 0, 4.0])])
-    assert len(decompose_lofts([Loft(bent, ends)])) == 2
 
 
 def test_built_in_shapes_are_never_handed_to_coacd(monkeypatch):

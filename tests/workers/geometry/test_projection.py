@@ -1,4 +1,8 @@
-"""Forward projection against a plain loop; interpolation against planes."""
+"""Blocks of a depth image in sight of another camera, against the image coordinates of every pixel by numpy.
+
+Forward projection against a plain loop; interpolation against planes. What two cameras both see of planes, and where
+one of them does not.
+"""
 
 import math
 
@@ -6,10 +10,59 @@ import numpy as np
 import pytest
 
 from schemas.scene.camera import Camera, Intrinsics
+from tests.workers.labels.planes import HERE as PLANE_HERE
+from tests.workers.labels.planes import IMAGES, plane_view
+from tests.workers.labels.planes import THERE as PLANE_THERE
 from workers.cameras.placement import mirror_pose
 from workers.geometry.camera import orbit_pose, unproject
-from workers.geometry.frames import invert
-from workers.geometry.projection import forward_project, sample_inverse_depth
+from workers.geometry.frames import invert, pose, uniform_rotation
+from workers.geometry.projection import (
+    BLOCK,
+    Bounds,
+    Seen,
+    bound_view,
+    columns_in_sight,
+    compare_covisible,
+    forward_project,
+    sample_inverse_depth,
+)
+
+HEIGHT, WIDTH, FOCAL_PX = BLOCK[0], 5 * BLOCK[1] + 7, 90.0
+RAY_X, RAY_Y = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL_PX, (np.arange(HEIGHT) + 0.5 - HEIGHT / 2) / FOCAL_PX
+TARGET, SHAPE = (31.0, 23.0, 60.0, 60.0), (48, 64)
+
+
+def columns_seen(depth_m: np.ndarray, T: np.ndarray, reach: int) -> np.ndarray:
+    """Columns with a point in the target's image, which is wider by `reach` pixels on each side."""
+    points = np.stack([RAY_X * depth_m, RAY_Y[:, None] * depth_m, depth_m], axis=-1) @ T[:3, :3].T + T[:3, 3]
+    x, y, z = np.moveaxis(points, -1, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = TARGET[2] * x / z + TARGET[0], TARGET[3] * y / z + TARGET[1]
+    inside = (u >= -reach) & (u < SHAPE[1] + reach) & (v >= -reach) & (v < SHAPE[0] + reach)
+    return np.flatnonzero((inside & (z > 0) & (depth_m > 0)).any(axis=0))
+
+
+@pytest.mark.parametrize("reach", [0, 2])
+def test_every_column_that_is_seen_is_in_sight_and_few_others(reach):
+    rng, units, seen_blocks, blocks_in_sight = np.random.default_rng(1), 5000.0, 0, 0
+    for _ in range(300):
+        depth = rng.integers(9000, 11000, (HEIGHT, WIDTH)).astype(np.uint16)
+        depth[rng.random(depth.shape) < 0.05] = 0
+        T = pose(uniform_rotation(rng), rng.normal(scale=2.0, size=3))
+        start, stop = columns_in_sight(depth, units, RAY_X, RAY_Y, bound_view(T, TARGET, reach, SHAPE))
+        seen = columns_seen(depth / units, T, reach)
+        assert len(seen) == 0 or start <= seen[0] <= seen[-1] < stop
+        seen_blocks += len(np.unique(seen // BLOCK[1]))
+        blocks_in_sight += -(-(stop - start) // BLOCK[1])
+    assert 100 < seen_blocks <= blocks_in_sight < 2 * seen_blocks
+
+
+def test_a_pixel_that_is_nan_hides_no_other_one():
+    depth = np.zeros((HEIGHT, WIDTH))
+    depth[3, WIDTH // 2], depth[0], depth[5] = 2.0, np.nan, np.nan
+    start, stop = columns_in_sight(depth, 1.0, RAY_X, RAY_Y, bound_view(np.eye(4), TARGET, 0, SHAPE))
+    assert start <= WIDTH // 2 < stop <= start + BLOCK[1]
+
 
 K = Intrinsics(width=40, height=30, fx=33.0, fy=33.0, cx=20.0, cy=15.0)
 HERE = Camera(K, orbit_pose(np.zeros(3), 0.8, 0.3, 2.5))
@@ -47,22 +100,6 @@ def test_forward_projection_is_its_definition(splat):
     assert projected.depth_m == pytest.approx(expected, abs=1e-12)
 
 
-def test_of_points_at_one_depth_the_first_source_pixel_wins():
-    K1 = Intrinsics(width=4, height=2, fx=1.0, fy=1.0, cx=2.0, cy=1.0)
-    camera = Camera(K1, np.eye(4))
-    wide = Camera(Intrinsics(width=1, height=1, fx=0.01, fy=0.01, cx=0.5, cy=0.5), np.eye(4))
-    assert forward_project(np.ones((2, 4)), camera, wide).source[0, 0] == 0
-
-
-def test_projection_into_the_same_camera_changes_nothing():
-    depth = np.random.default_rng(5).uniform(1, 3, (30, 40))
-    depth[3, 4] = 0
-    same = forward_project(depth, HERE, HERE)
-    assert same.depth_m == pytest.approx(depth, abs=1e-12)
-    assert same.source[3, 4] == -1
-    assert np.array_equal(same.source[depth > 0], np.flatnonzero(depth))
-
-
 def test_interpolation_in_inverse_depth_is_exact_on_a_plane():
     rows, columns = np.mgrid[0:30, 0:40]
     rays = unproject(rows.ravel(), columns.ravel(), np.ones(1200), K)
@@ -76,8 +113,39 @@ def test_interpolation_in_inverse_depth_is_exact_on_a_plane():
     assert z == pytest.approx(exact, rel=1e-12)
 
 
-def test_nothing_is_interpolated_across_regions_holes_or_the_border():
-    depth, region = np.ones((4, 4)), np.full((4, 4), 2, np.uint8)
-    region[0, 0], depth[3, 3] = 3, 0.0
-    found = [sample_inverse_depth(depth, region, *at, 1.0) for at in ((1.0, 1.0), (3.0, 3.0), (0.2, 2.0), (2.0, 2.0))]
-    assert found == [(0.0, 0), (0.0, 0), (0.0, 0), (1.0, 2)]
+BOUNDS = Bounds(facing=0.1, smooth_m=(0.002, 0.001), hidden_m=0.01)
+UNITS = IMAGES.depth_units_per_m
+
+
+def seen(camera, height_m=0.0, region=3):
+    view = plane_view("input", camera, height_m, region)
+    return Seen(view.depth, view.region, camera)
+
+
+def compare(source, target, bounds=BOUNDS):
+    everywhere = np.arange(source.depth.size)
+    return compare_covisible(source, target, everywhere, bounds, UNITS)
+
+
+def test_a_difference_is_along_the_targets_axis_and_as_large_as_the_planes_are_apart():
+    """Along an axis that meets the planes at an angle they are further apart than along their normal."""
+    near, far = (np.median(compare(seen(PLANE_HERE), seen(PLANE_THERE, height_m=-m))[0]) for m in (0.002, 0.004))
+    assert near > 0.002
+    assert far == pytest.approx(2.0 * near, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "bounds"),
+    [
+        (seen(PLANE_HERE), seen(PLANE_THERE, region=4), BOUNDS),
+        (seen(PLANE_HERE), seen(PLANE_THERE, height_m=0.1), BOUNDS),
+        (seen(PLANE_HERE), seen(PLANE_THERE), BOUNDS._replace(facing=1.0)),
+        (seen(PLANE_HERE), seen(PLANE_THERE), BOUNDS._replace(smooth_m=(0.0, 0.001))),
+        (seen(PLANE_HERE), seen(PLANE_THERE), BOUNDS._replace(smooth_m=(0.002, 0.0))),
+        (seen(PLANE_HERE)._replace(depth=np.zeros_like(seen(PLANE_HERE).depth)), seen(PLANE_THERE), BOUNDS),
+    ],
+    ids=["another region", "hidden", "turned away", "rough source", "rough target", "no depth"],
+)
+def test_nothing_else_is_compared(source, target, bounds):
+    difference_m, region = compare(source, target, bounds)
+    assert len(difference_m) == len(region) == 0

@@ -1,4 +1,8 @@
-"""The simulator's room: the same bits whatever came before, and nothing kept of what was."""
+"""The simulator's room: the same bits whatever came before, and nothing kept of what was.
+
+Lists for PyBullet, new contents in the same objects; and standard error of compiled code, within the block and after
+it. Convex parts as OBJ, read back by the format's rules.
+"""
 
 import dataclasses
 import errno
@@ -15,12 +19,11 @@ from scipy.spatial.transform import Rotation
 
 from schemas.job.job import Job
 from schemas.scene.shape import Mesh
-from tests.kit.gravity import set_gravity
 from tests.kit.shapes import box
-from tests.physics.room import at, ball_body, drop, physics
+from tests.physics.room import at, ball_body, drop
 from workers.geometry.frames import pose, quaternion_from_rotation, rotation_about, uniform_rotation
 from workers.physics import bullet
-from workers.physics.bullet import GRAVITY_M_S2, open_world
+from workers.physics.bullet import DECIMALS, STDERR, BulletBuffers, obj_of, open_world, silence_stderr
 from workers.physics.rigid_body import Body, octants
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -61,28 +64,6 @@ def fall(body: Body, T, advances: int = 60):
         for _ in range(advances):
             world.advance()
         return world.pose(), world.velocity()
-
-
-def test_what_sleeps_hangs_in_the_air_until_something_falls_onto_it():
-    body = body_of(box(0.1, 0.1, 0.1))
-    with open_world([(body, at(0.0, 1.0)), (body, at(0.0, 1.3))], 0.0, PHYSICS, STEPS) as world:
-        for _ in range(20):  # 0.17 s, in which the upper one falls 0.14 of the 0.2 m between them
-            world.let_sleep(0)
-            world.advance()
-        assert world.pose(0)[0][2] == 1.0
-        assert world.pose(1)[0][2] < 1.2
-        for _ in range(20):
-            world.let_sleep(0)
-            world.advance()
-        assert world.pose(0)[0][2] < 0.99
-
-
-def test_a_body_in_the_air_falls_as_half_g_t_squared():
-    position, velocity = fall(body_of(box(0.1, 0.08, 0.2)), pose(np.eye(3), np.array([0, 0, 3.0])), 60)
-    t = 60 * STEPS / PHYSICS.step_hz
-    # Semi-implicit steps of h fall g t h / 2 further.
-    assert position[0][2] == pytest.approx(3.0 - GRAVITY_M_S2 * t * (t + 1 / PHYSICS.step_hz) / 2, abs=1e-9)
-    assert velocity[0][2] == pytest.approx(-GRAVITY_M_S2 * t)
 
 
 def test_what_was_simulated_before_leaves_no_trace_in_the_bits():
@@ -126,53 +107,6 @@ def test_worlds_that_begin_without_a_reset_have_the_bits_of_those_that_begin_wit
             assert ended(*drops[number]) == expected[number]
 
 
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [((1913.6, 14, 39), (3729.7, 6)), ((3315.1, 3, 3), (3596.9, 6)), ((3899.2, 12, 26), (710.2, 5))],
-)
-def test_what_a_world_leaves_over_of_a_step_is_not_in_the_next(before, after, monkeypatch):
-    """Rates (1/s), steps at once and advances for which Bullet would take a step more or less in the second world."""
-    body, T = body_of(box(0.1, 0.08, 0.2)), pose(np.eye(3), np.array([0.0, 0.0, 0.3]))
-
-    def ended(step_hz, steps, advances):
-        with drop(body, T, 0.0, PHYSICS, steps) as world:
-            world.set_rate(step_hz)
-            for _ in range(advances):
-                world.advance()
-            return world.pose(), world.velocity()
-
-    with monkeypatch.context() as patch:
-        patch.setattr(bullet, "MOST_KEPT", 0)
-        ended(*before)
-        expected = ended(*after, 30)
-    bullet._empty_world(plain=False)
-    monkeypatch.setattr(bullet, "MOST_KEPT", 1)
-    ended(*before)
-    assert ended(*after, 30) == expected
-
-
-def test_an_error_inside_a_world_does_not_harm_the_next():
-    T = pose(np.eye(3), np.array([0, 0, 0.2]))
-    body = body_of(box(0.1, 0.08, 0.2))
-    first = fall(body, T)
-    with pytest.raises(ZeroDivisionError), drop(body, T, 0.0, PHYSICS, STEPS):
-        raise ZeroDivisionError
-    assert fall(body, T) == first
-
-
-def test_a_push_and_another_gravity_end_with_their_world():
-    T = pose(np.eye(3), np.array([0, 0, 3.0]))
-    body = body_of(box(0.1, 0.08, 0.2))
-    first = fall(body, T)
-    with drop(body, T, 0.0, PHYSICS, STEPS) as world:
-        world.set_velocity((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
-        set_gravity(world, (0.0, 0.0, 0.0))
-        assert world.velocity() == ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
-        world.advance()
-        assert world.pose()[0] == pytest.approx(np.array([1.0, 2.0, 3.0]) * STEPS / PHYSICS.step_hz + T[:3, 3])
-    assert fall(body, T) == first
-
-
 def test_worlds_come_and_go_without_their_memory_staying():
     run = [sys.executable, "-c", GROWTH]
     kilobytes = float(subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()[-1])
@@ -187,17 +121,6 @@ def test_quaternions_agree_with_scipy(seed):
     assert abs(quaternion_from_rotation(R) @ Rotation.from_matrix(R).as_quat()) == pytest.approx(1.0)
     half = Rotation.from_rotvec(math.pi * np.eye(3)[seed % 3]).as_matrix()
     assert Rotation.from_quat(quaternion_from_rotation(half)).as_matrix() == pytest.approx(half, abs=1e-12)
-
-
-@pytest.mark.parametrize("step_hz", [240, 3840, 15360])
-def test_what_overlaps_is_moved_apart_and_gains_no_speed(step_hz):
-    deep = 1e-4
-    with drop(ball_body(0.05), at(0.0, 0.05 - deep), 0.0, physics(step_hz=step_hz), 1) as world:
-        set_gravity(world, (0.0, 0.0, 0.0))
-        world.advance()
-        assert world.velocity()[0] == (0.0, 0.0, 0.0)
-        raised = world.pose()[0][2] - (0.05 - deep)
-        assert raised == pytest.approx(0.08 * (deep - 1e-5), rel=0.01)  # Bullet's share, and what it leaves
 
 
 def test_no_file_of_parts_stays_behind_also_where_the_disk_is_full(monkeypatch, tmp_path):
@@ -215,3 +138,29 @@ def test_no_file_of_parts_stays_behind_also_where_the_disk_is_full(monkeypatch, 
     with pytest.raises(OSError, match=r"No space left on device: .*verso-parts-"):
         fall(body, at(0.0, 1.0))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_longer_and_shorter_lists_have_their_own_contents_in_the_same_objects():
+    buffers, rng = BulletBuffers(), np.random.default_rng(0)
+    seen = set()
+    for count in (5, 2, 7, 7):
+        points, values = rng.standard_normal((count, 3)), rng.integers(0, 300, count)
+        vertices, indices = buffers.vertices(points), buffers.indices(values)
+        assert np.array_equal(vertices, points)
+        assert indices == values.tolist()
+        seen |= {id(vertices), id(indices), *map(id, vertices)}
+    assert len(seen) == 2 + 7
+
+
+def test_what_c_code_writes_is_dropped_within_the_block_alone(capfd):
+    with silence_stderr():
+        os.write(STDERR, b"banner")
+    os.write(STDERR, b"message")
+    assert capfd.readouterr().err == "message"
+
+
+@pytest.mark.parametrize("size_m", [1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 0.1, 1.0, 9.9, 11.0, 2e4])
+def test_coordinates_are_written_as_python_writes_them_with_nine_digits(size_m):
+    part = np.round(np.random.default_rng(0).uniform(-size_m, size_m, (500, 3)), DECIMALS)
+    lines = [line for line in obj_of([part]).decode("ascii").splitlines() if line.startswith("v")]
+    assert lines == ["v " + " ".join(f"{value:.9g}" for value in point) for point in part.tolist()]

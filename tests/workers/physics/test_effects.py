@@ -17,16 +17,13 @@ from workers.geometry.frames import pose, rotation_about, translation
 from workers.geometry.hull import convex_hull
 from workers.physics.effects import (
     AT_REST,
-    LEAST_ROOM_M,
     PREDICATES,
     called_for,
     is_convex,
     is_round,
     rooms_m,
-    starts_over_top,
 )
 from workers.physics.support import place_table
-from workers.plan.effects import PHYSICS_EFFECTS
 
 PHYSICS = Job(name="t").physics
 TABLE = place_table(table())
@@ -85,12 +82,6 @@ def test_rooms_are_half_of_what_lies_between_the_balls_that_objects_may_turn_in(
     assert rooms_m(starts[:2]) == pytest.approx([far, far])
 
 
-def test_rooms_are_about_the_centre_of_mass_and_not_about_the_origin():
-    shifted = asset_of(box(0.1, 0.1, 0.1, (0.3, 0.0, 0.0)))
-    assert rooms_m([start_of(shifted), start_of(shifted, 0.5)]) == pytest.approx([0.25 - 0.05 * math.sqrt(3.0)] * 2)
-    assert rooms_m([start_of(shifted), start_of(CUBE, 0.8)])[0] == pytest.approx(0.25 - 0.05 * math.sqrt(3.0))
-
-
 def test_no_two_objects_meet_within_their_rooms_however_they_turn():
     rng = np.random.default_rng(0)
     starts = [start_of(asset_of(box(*rng.uniform(0.02, 0.2, 3))), *rng.uniform(-0.5, 0.5, 2)) for _ in range(8)]
@@ -99,16 +90,6 @@ def test_no_two_objects_meet_within_their_rooms_however_they_turn():
             reaches = [np.linalg.norm(s.hull.vertices - s.asset.mass.com, axis=1).max() for s in (one, other)]
             between = np.linalg.norm((one.T_world_obj - other.T_world_obj)[:2, 3])
             assert a == b or between - room - its >= sum(reaches) - 1e-12
-
-
-@pytest.mark.parametrize(("x", "expected"), [(0.64, True), (0.649, True), (0.651, False), (0.8, False)])
-def test_an_object_starts_over_the_top_while_all_of_it_does(x, expected):
-    assert starts_over_top(start_of(CUBE, x), TABLE) == expected
-
-
-def test_nothing_starts_over_a_top_that_is_not_convex():
-    uneven = dataclasses.replace(TABLE, top=dataclasses.replace(TABLE.top, convex=False))
-    assert not starts_over_top(start_of(CUBE), uneven)
 
 
 CAN = vessel("can")
@@ -132,27 +113,6 @@ def test_an_effect_is_called_for_by_a_scene_that_needs_it_and_not_by_one_that_do
     assert name in called_for(needs, TABLE, PHYSICS)
     assert name not in called_for(does_not, TABLE, PHYSICS)
     assert PREDICATES[name](does_not, TABLE, PHYSICS)  # and says why
-
-
-def test_bouncing_is_called_for_where_the_job_asks_for_it():
-    bouncing = PHYSICS.model_copy(update={"restitution": 0.2})
-    assert "restitution" in called_for([start_of(CUBE)], TABLE, bouncing)
-    assert "restitution" not in called_for([start_of(CUBE)], TABLE, PHYSICS)
-    assert {effect.name: effect.kind for effect in PHYSICS_EFFECTS}["restitution"] == "asked"
-
-
-def test_objects_are_cut_into_parts_where_they_may_meet_only_if_one_of_them_is_not_convex():
-    assert "decomposition" in called_for([start_of(CUBE), start_of(MUG, 0.1)], TABLE, PHYSICS)
-    assert "decomposition" not in called_for([start_of(CUBE), start_of(CUBE, 0.1)], TABLE, PHYSICS)
-    assert "decomposition" not in called_for([start_of(CUBE), start_of(MUG, FAR)], TABLE, PHYSICS)
-
-
-def test_objects_with_less_room_than_a_centimetre_fall_together():
-    """Two cubes whose middles are 2 x 0.0866 m and twice the room apart."""
-    width = 0.1 * math.sqrt(3.0)
-    for room, expected in ((LEAST_ROOM_M - 1e-4, True), (LEAST_ROOM_M + 1e-4, False)):
-        starts = [start_of(CUBE), start_of(CUBE, width + 2 * room)]
-        assert ("object_contacts" in called_for(starts, TABLE, PHYSICS)) == expected
 
 
 def test_nothing_is_called_for_where_everything_is_placed_and_all_of_it_where_one_is_not():

@@ -1,37 +1,45 @@
-"""What the simulator is told of a scene: the size of steps, and the settings of the effects that the plan runs."""
+"""What the simulator is told of a scene: the size of steps, and the settings of the effects that the plan runs.
+
+What is let go again with the skins of its mesh: what rests stays, what does not goes, and rest is held.
+"""
 
 import dataclasses
-import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
 from schemas.job.job import Job
 from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart
+from schemas.scene.plan import ObjectStart, Table
 from schemas.scene.shape import Asset
-from tests.hard_cases.bodies import built_in, cube, rod
-from tests.hard_cases.drops import X, turn
+from tests.hard_cases.bodies import built_in, cube
+from tests.hard_cases.drops import X, Y, level, table_of, turn
 from tests.hard_cases.groups import put, stack, together, tray
 from tests.kit.shapes import asset_of, box, table
 from tests.physics.settling import recheck_group, settle_group
-from workers.geometry.frames import pose
+from workers.geometry.frames import motion_between, pose, transform, translation
 from workers.geometry.hull import convex_hull
-from workers.physics.fall import FINEST, LOOK_STEPS, SAMPLE_STEPS, fall
+from workers.physics import release as module
+from workers.physics.exact_rest import rest
+from workers.physics.fall import LOOK_STEPS, SAMPLE_STEPS, fall
+from workers.physics.placement import Placement, forms_of, place
 from workers.physics.release import (
-    CROWD,
     DOUBTFUL_RISE,
+    FAR_M,
+    HELD,
     KNOWN_RISE,
     MANY,
+    MOST_HOLDS,
     MOST_RISE,
     PACES,
     PACES_MANY,
     PACES_TOGETHER,
     Drop,
-    Pace,
+    hold,
+    let_go,
     release,
-    settings_of,
 )
 from workers.physics.support import place_table
 
@@ -65,40 +73,6 @@ def test_steps_are_as_fine_as_the_highest_fall_and_the_thinnest_object_ask(heigh
     assert [(steps.base_hz, pytest.approx(steps.max_travel_m)) for steps in seen] == [(PHYSICS.step_hz, travel_m)]
 
 
-def seconds_to_rest(start: ObjectStart, names: tuple[str, ...], **changes) -> float:
-    physics = PHYSICS.model_copy(update={"max_settle_s": 3.0, **changes})
-    return release(Drop((start,), TABLE, physics, EffectPlan(names, {})), True, PACES).seconds
-
-
-def test_a_cube_bounces_only_where_the_plan_runs_restitution():
-    """From 0.2 m a restitution of 0.64 between the two makes it bounce for longer than the fall took."""
-    start = start_of(CUBE, 0.0, 0.0, 0.23)
-    still = seconds_to_rest(start, ("dynamics", "fine_step"))
-    assert seconds_to_rest(start, ("dynamics", "fine_step"), restitution=0.8) == still
-    assert seconds_to_rest(start, ("dynamics", "fine_step", "restitution"), restitution=0.8) > still + 0.202
-
-
-def test_a_can_is_braked_against_rolling_only_where_the_plan_runs_rolling_friction():
-    start = start_of(rod(0.033, 0.12, 360), 0.0, 0.0, 0.08, turn(X, 60) @ turn(np.array([0.0, 1.0, 0.0]), 20))
-    rolling = ("dynamics", "fine_step", "rolling_friction")
-    assert seconds_to_rest(start, rolling, rolling_friction=0.005) < 3.0
-    assert seconds_to_rest(start, rolling[:2], rolling_friction=0.005) >= 3.0
-
-
-def test_objects_as_boxes_keep_the_height_of_their_lowest_point_together_as_alone():
-    """A tilted can's box reaches lower than the can: let go 1 mm above the table it would begin within the top."""
-    tilted = turn(X, 40) @ turn(np.array([0.0, 0.0, 1.0]), 45)
-    can = rod(0.03, 0.1)
-    low = float((can.shape.vertices @ tilted.T)[:, 2].min())
-    starts = [start_of(can, x, 0.0, 0.001 - low, tilted) for x in (-0.1, 0.1)]
-    physics = PHYSICS.model_copy(update={"collision": "box", "max_settle_s": 0.01})
-    plan = EffectPlan(("dynamics", "fine_step"), {})
-    both = release(Drop(tuple(starts), TABLE, physics, plan), True, PACES_TOGETHER)
-    alone = [release(Drop((start,), TABLE, physics, plan), True, PACES) for start in starts]
-    for beside, one in zip(both.poses, alone, strict=True):
-        assert beside[2, 3] == pytest.approx(one.poses[0][2, 3], abs=1e-4)
-
-
 def falls_of(drop: Drop, rises: list[float], monkeypatch) -> list[tuple[float, int]]:
     """(rate over the job's, steps between looks) of one fall after the other, when energy rises by these shares of its bound."""
     falls, left = [], iter(rises)
@@ -110,19 +84,6 @@ def falls_of(drop: Drop, rises: list[float], monkeypatch) -> list[tuple[float, i
     monkeypatch.setattr("workers.physics.release.fall", risen)
     release(drop, True, drop.ways[0])
     return falls
-
-
-def test_a_pace_has_its_share_of_the_rest_window_and_of_the_rest_speed():
-    rest, other = PHYSICS.rest, settings_of(ALONE, Pace(window=0.1, speed=10.0)).rest
-    assert other.window_s == pytest.approx(0.1 * rest.window_s)
-    assert (other.speed_mm_s, other.spin_rad_s) == pytest.approx((10.0 * rest.speed_mm_s, 10.0 * rest.spin_rad_s))
-
-
-@pytest.mark.parametrize("count", [MANY, CROWD - 1, CROWD, 100])
-def test_a_crowd_falls_in_the_finest_steps_at_once_whatever_it_is_of(count):
-    for drop in (ALONE, many_mugs()):
-        paces = itertools.chain(*dataclasses.replace(drop, starts=ALONE.starts * count).ways)
-        assert all(pace.rate == FINEST for pace in paces) == (count >= CROWD)
 
 
 def test_a_tall_stack_rests_where_not_all_of_an_impulse_is_kept_and_sways_where_it_is():
@@ -157,13 +118,6 @@ def many_mugs() -> Drop:
     return Drop(starts, TABLE, BRIEF, EffectPlan(("dynamics", "fine_step", "object_contacts", "decomposition"), {}))
 
 
-def test_a_doubtful_drop_is_looked_at_after_each_step_before_it_falls_in_shorter_ones(monkeypatch):
-    first, second = ((pace.rate, LOOK_STEPS) for pace in PACES[:2])
-    again = (PACES[0].rate, 1)
-    assert falls_of(ALONE, [1.01 * DOUBTFUL_RISE, 0.99 * KNOWN_RISE], monkeypatch) == [first, again]
-    assert falls_of(ALONE, [1.01 * DOUBTFUL_RISE, 1.01 * KNOWN_RISE, 0.0], monkeypatch) == [first, again, second]
-
-
 def test_looks_at_the_energy_change_nothing_of_a_drop(monkeypatch):
     start = start_of(CUBE, 0.0, 0.0, 0.1, turn(X, 40) @ turn(np.array([0.0, 1.0, 0.0]), 25))
     drop = Drop((start,), TABLE, PHYSICS, EffectPlan(("dynamics", "fine_step"), {}))
@@ -189,3 +143,124 @@ def test_a_cube_beside_a_wall_that_is_let_go_again_keeps_all_four_of_its_corners
     motions = recheck_group(group.starts, settled, table, PHYSICS)
     assert max(mm for mm, _ in motions) < 0.01
     assert max(degrees for _, degrees in motions) < 0.001
+
+
+"""A friction of 0.7, so that a contact's is 0.49: the angle of friction is 26.1 degrees."""
+
+HELD_M = HELD[0][2]
+
+PLAN = EffectPlan(("dynamics", "fine_step", "object_contacts"), {})
+
+
+def let_go_for(seconds: float, starts: Sequence[ObjectStart], table: Table) -> float:
+    """Metres that the farthest point moves in this time."""
+    rests = PHYSICS.rest.model_copy(update={"window_s": 2.0 * seconds})
+    drop, placement = released(starts, table, PHYSICS.model_copy(update={"max_settle_s": seconds, "rest": rests}))
+    poses = [one.T_world_obj for one in starts]
+    after = let_go(drop, placement, poses)
+    return max(motion_between(one.hull.vertices, *T)[0] for one, *T in zip(starts, poses, after, strict=True))
+
+
+def released(starts: Sequence[ObjectStart], table: Table, physics=PHYSICS) -> tuple[Drop, Placement]:
+    poses = [one.T_world_obj for one in starts]
+    placement = place(starts, poses, forms_of(starts), table, physics.friction**2)
+    return Drop(tuple(starts), table, physics, PLAN), placement
+
+
+def overhanging(by_m: float) -> tuple[tuple[ObjectStart, ...], Table]:
+    """A plank of 120 mm on a cube of 50: its centre of mass so far beyond the cube's edge."""
+    table = level()
+    plank = put(asset_of(box(0.12, 0.04, 0.02)), table, 0.05, (0.025 + by_m, 0.0))
+    return together(table, [put(cube(0.05), table, 0.0), plank]).starts, table
+
+
+def test_a_plank_stays_with_its_centre_of_mass_a_millimetre_inside_an_edge_and_falls_with_it_outside():
+    assert let_go_for(0.5, *overhanging(-0.001)) < HELD_M
+    assert let_go_for(0.5, *overhanging(0.001)) > FAR_M
+
+
+def leaning(degrees: float) -> tuple[tuple[ObjectStart, ...], Table]:
+    """A cube on the side of a ramp that falls by so much, with a second one at its upper end."""
+    ramp = box(0.6, 0.3, 0.02, (0.0, 0.0, -0.01))
+    ramp.apply_transform(np.block([[turn(Y, degrees), np.zeros((3, 1))], [0.0, 0.0, 0.0, 1.0]]))
+    table = table_of(ramp, box(0.05, 0.05, 0.02, (0.0, 0.4, 0.3)))
+    shift = table.mesh.vertices[:8].mean(axis=0) - ramp.vertices.mean(axis=0)
+    up = turn(Y, degrees) @ np.array([0.0, 0.0, 0.025])
+    starts = []
+    for along_m in (-0.1, 0.1):
+        start = put(cube(0.05), table, 0.0, R=turn(Y, degrees))
+        centre = shift + turn(Y, degrees) @ np.array([along_m, 0.0, 0.0]) + up
+        T = translation(*(centre - start.T_world_obj[:3, 3])) @ start.T_world_obj
+        starts.append(dataclasses.replace(start, T_world_obj=T))
+    return together(table, starts).starts, table
+
+
+def test_cubes_stay_on_a_ramp_a_degree_below_the_angle_of_friction_and_slide_on_one_a_degree_above():
+    assert let_go_for(0.3, *leaning(25.1)) < HELD_M
+    assert let_go_for(0.3, *leaning(27.1)) > FAR_M
+
+
+def test_a_small_cube_in_a_hollow_stays_where_exact_rest_puts_it():
+    """In a bowl, whose parts and whose hull would push it out."""
+    table = level()
+    bowl = put(built_in("bowl"), table, 0.0)
+    inner = float(transform(bowl.T_world_obj, bowl.asset.shape.vertices)[:, 2].max()) - table.top.height_m
+    starts = together(table, [bowl, put(cube(0.02), table, inner + 0.002)]).starts
+    settled = settle_group(starts, table, PHYSICS)
+    at = [dataclasses.replace(one, T_world_obj=rest.T_world_obj) for one, rest in zip(starts, settled, strict=True)]
+    assert let_go_for(0.25, at, table) < 1e-4
+    lifted = dataclasses.replace(at[1], T_world_obj=translation(0.0, 0.0, 3e-4) @ at[1].T_world_obj)
+    assert let_go_for(0.25, [at[0], lifted], table) > 1e-4
+
+
+def hanging() -> tuple[tuple[ObjectStart, ...], Table]:
+    """A cube of 50 mm in a slot of 50 mm, 20 mm above its floor, and one that lies beside the slot."""
+    walls = [box(0.02, 0.3, 0.1, (x, 0.0, 0.05)) for x in (-0.035, 0.035)]
+    table = table_of(box(0.4, 0.4, 0.03, (0.0, 0.0, -0.015)), *walls)
+    floor = float(np.sort(np.unique(np.round(table.mesh.vertices[:, 2], 9)))[1]) - table.top.height_m
+    starts = [put(cube(0.05), table, floor + 0.02), put(cube(0.05), table, floor, (0.12, 0.0))]
+    return together(table, starts).starts, table
+
+
+def test_what_friction_could_hold_but_does_not_is_balanced_and_falls_when_it_is_let_go(monkeypatch):
+    """Walls that squeeze the cube hard enough would hold it, and nothing squeezes it."""
+    starts, table = hanging()
+    drop, placement = released(starts, table)
+    poses = [one.T_world_obj for one in starts]
+    rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction)
+    assert rested.still and np.abs(np.subtract(rested.poses, poses)).max() < 1e-6
+    assert let_go_for(0.25, starts, table) > FAR_M
+    assert not hold(drop, placement, poses).still
+
+
+def beside(gap_m: float) -> tuple[tuple[ObjectStart, ...], Table]:
+    """A cube on another, and a third so far beside them."""
+    table = level()
+    upright = [
+        put(cube(0.05), table, 0.0),
+        put(cube(0.05), table, 0.05),
+        put(cube(0.05), table, 0.0, (0.05 + gap_m, 0.0)),
+    ]
+    return together(table, upright).starts, table
+
+
+@pytest.mark.parametrize("slips", [0, 1, MOST_HOLDS - 1, MOST_HOLDS])
+def test_what_slips_comes_to_rest_where_it_went_until_it_stays(slips, monkeypatch):
+    """The upper of two cubes slips by twice the bound along x, so many times; it is let go from there the next time."""
+    table = level()
+    starts = together(table, [put(cube(0.05), table, 0.0), put(cube(0.04), table, 0.05)]).starts
+    drop, placement = released(starts, table)
+    left, seen = [slips], []
+
+    def slip(_drop, _placement, poses, _far_m, level):
+        assert not level
+        seen.append(poses[1][0, 3])
+        left[0] -= 1
+        by_m = 2.0 * HELD_M if left[0] >= 0 else 0.5 * HELD_M
+        return poses[0], translation(by_m, 0.0, 0.0) @ poses[1]
+
+    monkeypatch.setattr(module, "let_go", slip)
+    held = hold(drop, placement, [one.T_world_obj for one in starts])
+    assert held.still == (slips < MOST_HOLDS)
+    assert held.poses[1][0, 3] == pytest.approx(2.0 * HELD_M * slips, abs=1e-9)
+    assert seen == pytest.approx([2.0 * HELD_M * k for k in range(min(slips + 1, MOST_HOLDS))], abs=1e-9)

@@ -9,14 +9,12 @@ from schemas.scene.effects import EffectPlan
 from schemas.scene.plan import ObjectStart
 from schemas.scene.shape import Asset
 from tests.kit.shapes import asset_of, box
-from workers.geometry.frames import pose, rotation_about, transform, uniform_rotation
+from workers.geometry.frames import pose, transform, uniform_rotation
 from workers.geometry.hull import convex_hull, depth_m
 from workers.physics import rigid_body
-from workers.physics.rigid_body import body_frame, choose_collision_shape, make_body, octants
+from workers.physics.rigid_body import body_frame, make_body, octants
 
 PHYSICS = Job(name="t").physics
-BOXED = PHYSICS.model_copy(update={"collision": "box"})
-CAN = asset_of(trimesh.creation.cylinder(0.04, 0.12, sections=48))
 TRAY = asset_of(box(0.2, 0.2, 0.05).difference(box(0.18, 0.18, 0.05).apply_translation([0, 0, 0.01])))
 
 SHAPES = {
@@ -56,20 +54,6 @@ def test_the_octants_of_a_hull_lie_in_it_and_have_all_of_its_vertices(name):
     assert (every @ directions.T).max(axis=0) == pytest.approx((hull @ directions.T).max(axis=0), abs=1e-15)
 
 
-@pytest.mark.parametrize("size", [(0.1, 0.1, 0.1), (0.2, 0.1, 1e-4)])
-def test_every_octant_has_a_volume_even_that_of_a_plate_with_one_corner(size):
-    (hull,) = make_body(start_of(asset_of(box(*size)))).parts
-    for part in octants(hull, min(size) / 2):
-        spread = np.linalg.svd(part - part.mean(axis=0), compute_uv=False)
-        assert spread.min() > 0.1 * min(size)
-
-
-def test_only_a_hull_that_meets_level_ground_alone_is_cut():
-    start, none = start_of(CAN), EffectPlan((), {})
-    assert len(rigid_body.build_body(start, PHYSICS, none, level=True).parts) == 8
-    assert len(rigid_body.build_body(start, PHYSICS, none).parts) == 1
-
-
 def test_parts_become_parts_of_one_body_about_the_centre_of_mass_of_all():
     legs = [box(0.02, 0.1, 0.1, (x, 0, 0.05)) for x in (-0.09, 0.09)]
     top = box(0.2, 0.1, 0.001, (0, 0, 0.1005))
@@ -82,17 +66,6 @@ def test_parts_become_parts_of_one_body_about_the_centre_of_mass_of_all():
         assert back.max(axis=0) == pytest.approx(mesh.bounds[1], abs=1e-12)
     far = np.linalg.norm(start.hull.vertices - start.asset.mass.com, axis=1).max()
     assert made.reach_m == pytest.approx(far)
-
-
-def test_the_box_about_an_object_has_its_size_along_its_own_axes_and_its_lowest_point():
-    turned = rotation_about(np.array([0.3, 0.9, 0.1]), 0.7)
-    start = start_of(CAN, pose(turned, np.zeros(3)))
-    boxed = choose_collision_shape(start, BOXED)
-    assert np.ptp(boxed.hull.vertices, axis=0) == pytest.approx(np.ptp(start.hull.vertices, axis=0))
-    assert len(boxed.hull.vertices) == 8
-    lows = [transform(one.T_world_obj, one.hull.vertices)[:, 2].min() for one in (start, boxed)]
-    assert lows[0] == pytest.approx(lows[1], abs=1e-12)
-    assert choose_collision_shape(start, PHYSICS) is start
 
 
 def test_convex_parts_of_a_mesh_from_outside_are_as_fine_as_the_key_says(monkeypatch):

@@ -43,7 +43,13 @@ def job_of(width: int, height: int, focal: float, **changes):
 
 def order_of(job, out: Path, scenes: int) -> ShardOrder:
     terms = CommitTerms(
-        job_digest="test", fingerprint="", fingerprint_mode="record", layout="files", first_scene=0, range_size=scenes
+        job_digest="test",
+        fingerprint="",
+        fingerprint_mode="record",
+        layout="files",
+        first_scene=0,
+        range_size=scenes,
+        pairs_per_scene=job.pairs_per_scene,
     )
     return ShardOrder(out=str(out), job=job, terms=terms, spans=(Span(start=0, stop=scenes),))
 

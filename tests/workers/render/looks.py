@@ -1,8 +1,13 @@
-"""Looks for tests of the renderer: a tier's settings, and the plan of effects of a scene that calls for all it has."""
+"""Looks for tests of the renderer: a tier's settings, and the plan of effects of a scene that calls for all it has.
 
+What the tests of the path-traced tier share.
+"""
+
+import importlib.util
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from schemas.base import Array, frozen_array
 from schemas.job.render import Render
@@ -67,3 +72,19 @@ def pixel_of(point: Array, view: Camera) -> tuple[float, float]:
     x, y, z = (invert(view.T_world_cam) @ np.append(point, 1.0))[:3]
     k = view.intrinsics
     return k.fx * x / z + k.cx, k.fy * y / z + k.cy
+
+
+MITSUBA = importlib.util.find_spec("mitsuba") is not None
+traced = pytest.mark.skipif(not MITSUBA, reason="Mitsuba is not installed: the path-traced tier goes untested")
+
+OVERHEAD = Light(frozen_array([0.0, 0.0, 1.0]), (0.7, 0.7, 0.7))
+
+
+def with_material(shape: Shape, material: Material) -> Shape:
+    return Shape(tuple(Part(p.name, p.vertices, p.faces, material, p.normals, p.uv, p.colors) for p in shape.parts))
+
+
+def matte(albedo: float) -> Material:
+    """The sRGB value whose linear light is `albedo`."""
+    s = 12.92 * albedo if albedo <= 0.0031308 else 1.055 * albedo ** (1 / 2.4) - 0.055
+    return Material((s, s, s, 1.0), roughness=1.0)

@@ -1,13 +1,18 @@
-"""Whether a tier's packages are asked for where they are needed, and what is said without them."""
+"""Whether a tier's packages are asked for where they are needed, and what is said without them.
+
+Rendering of one view: labels are one in all tiers, colour obeys the plan of effects.
+"""
 
 import importlib.util
 
+import numpy as np
 import pytest
 
+import workers.render.tiers
 from schemas.errors import InputError
-from schemas.job.job import Job
-from workers.render import tiers
-from workers.render.tiers import require_mitsuba
+from tests.workers.render.looks import FLAT, FOUR, RASTER, paths, traced, without
+from tests.workers.render.random_scenes import APPEARANCE, camera, orbit_and_mirror, random_things, small
+from workers.render.tiers import draw_view, require_mitsuba
 
 
 def test_without_mitsuba_the_message_says_how_to_get_it(monkeypatch):
@@ -17,12 +22,29 @@ def test_without_mitsuba_the_message_says_how_to_get_it(monkeypatch):
     assert caught.value.exit_code == 2
 
 
-def test_path_tracing_is_not_needed_where_no_rgb_is_asked(monkeypatch):
-    def refuse() -> None:
-        raise AssertionError("Mitsuba is looked for")
+@traced
+def test_labels_are_the_same_to_the_byte_in_all_tiers(renderer):
+    rng = np.random.default_rng(900)
+    things, height = random_things(rng)
+    view = camera(small(64, 48), orbit_and_mirror(rng, height)[0].T_world_cam)
+    drawn = [
+        draw_view(renderer, things, APPEARANCE, view, render, lambda: rng, effects)
+        for render, effects in (FLAT, RASTER, paths(1))
+    ]
+    assert len({one.depth_m.tobytes() for one in drawn}) == 1
+    assert len({one.region.tobytes() for one in drawn}) == 1
+    assert len({one.rgb.tobytes() for one in drawn}) == 3
 
-    monkeypatch.setattr(tiers, "require_mitsuba", refuse)
-    job = Job.model_validate({"name": "t", "render": {"tier": "pathtraced", "rgb": False}})
-    tiers.require_tier(job.render)
-    with pytest.raises(AssertionError):
-        tiers.require_tier(job.render.model_copy(update={"rgb": True}))
+
+def test_without_rgb_nothing_is_traced(renderer, monkeypatch):
+    monkeypatch.setattr(workers.render.tiers, "shared_tracer", lambda: pytest.fail("a path was traced"))
+    rng = np.random.default_rng(900)
+    things, height = random_things(rng)
+    view = camera(small(64, 48), orbit_and_mirror(rng, height)[0].T_world_cam)
+    labels = []
+    for look in (FLAT, RASTER, FOUR, paths(1)):
+        render, effects = without(look, "rgb")
+        seen = draw_view(renderer, things, APPEARANCE, view, render, lambda: rng, effects)
+        assert seen.rgb is None
+        labels.append((seen.depth_m.tobytes(), seen.region.tobytes()))
+    assert len(set(labels)) == 1

@@ -1,7 +1,5 @@
 """Antialiasing of colour: smooth edges with it, the colour of pixel centres without it."""
 
-from unittest import mock
-
 import numpy as np
 import pytest
 
@@ -9,11 +7,9 @@ from schemas.scene.appearance import Appearance
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Material
 from tests.workers.render.looks import BLACK, FLAT, FOUR, RASTER, without
-from tests.workers.render.random_scenes import APPEARANCE, camera, orbit_and_mirror, procedural_things, quad, small
-from workers.geometry.colour import encode_srgb
+from tests.workers.render.random_scenes import camera, quad, small
 from workers.geometry.frames import translation
-from workers.render.raster.antialiasing import blend_samples, find_edges
-from workers.render.raster.gbuffer import Renderer
+from workers.render.raster.antialiasing import find_edges
 
 
 @pytest.mark.parametrize("render", [RASTER, FOUR])
@@ -54,31 +50,9 @@ def test_without_antialiasing_a_pixel_has_the_colour_of_its_centre(renderer, loo
     assert smooth.region.tobytes() == seen.region.tobytes() and smooth.depth_m.tobytes() == seen.depth_m.tobytes()
 
 
-def test_without_samples_one_sample_is_taken_although_the_job_has_four(renderer):
-    rng = np.random.default_rng(31)
-    things, height = procedural_things(rng)
-    view = orbit_and_mirror(rng, height)[0]
-    with mock.patch.object(Renderer, "_draw_colour", autospec=True, side_effect=Renderer._draw_colour) as drawn:
-        four = renderer.draw(things, APPEARANCE, view, *FOUR)
-        taken = drawn.call_count
-        one = renderer.draw(things, APPEARANCE, view, *without(FOUR, "samples"))
-    assert (taken, drawn.call_count) == (3, 3)
-    assert np.array_equal(one.rgb, renderer.draw(things, APPEARANCE, view, *RASTER).rgb)
-    assert not np.array_equal(one.rgb, four.rgb)
-    assert one.region.tobytes() == four.region.tobytes() and one.depth_m.tobytes() == four.depth_m.tobytes()
-
-
 def test_the_floor_has_no_edges_amid_its_texture():
     rgb = np.zeros((6, 6, 3), np.uint8)
     rgb[:, 3:] = 100
     assert (find_edges(rgb, np.ones((6, 6), np.uint8)) == 0).all()
     edges = find_edges(rgb, np.full((6, 6), 2, np.uint8))
     assert (edges[:, 2:4] == 255).all() and edges.sum() == 12 * 255
-
-
-def test_samples_are_averaged_in_linear_light():
-    """Three black samples and a white one: a quarter of white, code 137 of sRGB."""
-    rgb = np.full((1, 2, 3), 255, np.uint8)
-    blend_samples(rgb, [np.zeros((1, 2, 4), np.uint8)] * 3, np.array([[255, 0]], np.uint8))
-    assert rgb[0, 0].tolist() == [round(float(255.0 * encode_srgb(np.array(0.25))))] * 3
-    assert (rgb[0, 1] == 255).all()

@@ -1,4 +1,8 @@
-"""Draw calls: exact no-ops that are forced do their work and change no byte; withdrawn ones are not drawn. Ranks of regions."""
+"""The projection and the lights that reach the GPU.
+
+Draw calls: exact no-ops that are forced do their work and change no byte; withdrawn ones are not drawn. Ranks of
+regions.
+"""
 
 from collections import Counter
 from unittest import mock
@@ -8,16 +12,31 @@ import pytest
 import trimesh
 
 import workers.render.raster.gbuffer
-from schemas.scene.camera import Camera
+from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed
 from tests.kit.shapes import shape_of
 from tests.workers.render.looks import FLAT, FOUR, RASTER, Look, forcing, without
 from tests.workers.render.random_scenes import APPEARANCE, VGA, orbit_and_mirror, procedural_things, random_things
-from workers.geometry.camera import orbit_pose
+from workers.geometry.camera import orbit_pose, project
 from workers.geometry.frames import translation
-from workers.plan.effects import names_of_kind
-from workers.render.raster.draw_calls import rank_regions, sort_draws
+from workers.render.raster.draw_calls import NEAR_M, clip_from_cam, rank_regions, sort_draws
 from workers.render.raster.light_maps import LightMaps
+
+
+def test_clip_space_gives_the_cameras_image_coordinates():
+    k = Intrinsics(width=641, height=333, fx=512.3, fy=498.7, cx=301.4, cy=177.9)
+    points = np.random.default_rng(0).uniform([-2, -2, 0.1], [2, 2, 9], (50, 3))
+    clip = np.column_stack([points, np.ones(50)]) @ clip_from_cam(k).T
+    window = (clip[:, :2] / clip[:, 3:] + 1.0) / 2.0 * [k.width, k.height]
+    np.testing.assert_allclose(window, np.stack(project(points, k), axis=1), rtol=1e-12)
+
+
+def test_the_near_plane_cuts_and_nothing_is_cut_far_away():
+    k = Intrinsics(width=4, height=4, fx=1.0, fy=1.0, cx=2.0, cy=2.0)
+    for z, inside in ((NEAR_M * 0.999, False), (NEAR_M * 1.001, True), (1.0, True), (1e6, True)):
+        clip = clip_from_cam(k) @ [0.0, 0.0, z, 1.0]
+        assert (-clip[3] <= clip[2] <= clip[3]) == inside, z
+
 
 DRAWN = ("floor", "light_maps", "table", "textures", "transparency")
 """The no-ops that the renderer knows of."""
@@ -32,10 +51,6 @@ def scenes(count: int):
         rng = np.random.default_rng(2_000 + seed)
         things, height = procedural_things(rng) if seed % 2 else random_things(rng)
         yield things, orbit_and_mirror(rng, height)
-
-
-def test_the_names_are_those_of_effects():
-    assert set(DRAWN) == names_of_kind("no_op") - {"exact_agreement"}
 
 
 @pytest.mark.parametrize(
@@ -94,14 +109,6 @@ def test_a_forced_pass_does_its_work_where_nothing_calls_for_it(renderer):
     assert again["region 1"] == plain["region 1"] > 0
 
 
-def test_a_pass_that_is_left_out_is_not_drawn(renderer):
-    plain = work(renderer, RASTER)
-    assert plain["region 1"] > 0 and plain["region 2"] > 0
-    assert work(renderer, without(RASTER, "floor"))["region 1"] == 0
-    assert work(renderer, without(RASTER, "table"))["region 2"] == 0
-    assert work(renderer, without(RASTER, "floor", "table"))["region 3"] == plain["region 3"] > 0
-
-
 def cubes(*spots: tuple[float, float, float], first: int = 3) -> list[Placed]:
     return [Placed(first + k, CUBE, translation(*spot)) for k, spot in enumerate(spots)]
 
@@ -112,20 +119,6 @@ def ranks(things: list[Placed]) -> dict[int, int]:
 
 def test_a_stack_stands_back_step_by_step_and_what_stands_beside_it_does_not():
     assert ranks(cubes((0, 0, 0), (0, 0, 0.1), (0, 0, 0.2), (1, 0, 0.2))) == {3: 0, 4: 1, 5: 2, 6: 0}
-
-
-def test_twenty_things_side_by_side_stand_back_as_far_as_one_alone():
-    plate = Placed(2, shape_of(trimesh.creation.box((9.0, 9.0, 0.1))), translation(0, 0, -0.1))
-    things = [plate, *cubes(*((0.2 * k, 0.0, 0.0) for k in range(20)))]
-    found = rank_regions(things, [plate.shape.vertices, *[CORNERS] * 20])
-    assert found == {2: 0, **dict.fromkeys(range(3, 23), 1)}
-
-
-def test_the_order_that_things_come_in_and_two_of_one_region_make_no_difference():
-    things = cubes((0, 0, 0), (0, 0, 0.1), (0, 0, 0.2))
-    again = [*things[::-1], Placed(3, CUBE, translation(5, 5, 5))]
-    assert ranks(things) == ranks(things[::-1]) == ranks(again) == {3: 0, 4: 1, 5: 2}
-    assert ranks([]) == {}
 
 
 def test_the_twentieth_of_many_is_not_lost_behind_what_it_lies_closely_over(renderer):

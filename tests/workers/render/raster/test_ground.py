@@ -1,4 +1,7 @@
-"""What is known of a floor before it is drawn, against floors that are drawn whole."""
+"""The part of the pixel grid on which a thing is counted, what covers all of the image, and what is seen steeply.
+
+What is known of a floor before it is drawn, against floors that are drawn whole.
+"""
 
 from unittest import mock
 
@@ -8,31 +11,108 @@ import trimesh
 
 import workers.render.raster.gbuffer
 from schemas.base import frozen_array
-from schemas.scene.appearance import Appearance
+from schemas.scene.camera import Intrinsics
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Material, Part, Shape
+from schemas.scene.shape import Part, Shape
 from tests.workers.render.looks import FLAT, RASTER, without
 from tests.workers.render.random_scenes import (
     APPEARANCE,
     EYE,
-    WHITE,
+    FLOOR_HALF_M,
     camera,
     floor,
     object_shape,
     orbit_and_mirror,
     procedural_things,
-    quad,
     random_things,
     shape_of,
     small,
     stand,
 )
 from workers.geometry.camera import orbit_pose
-from workers.geometry.colour import decode_srgb, encode_srgb
 from workers.geometry.frames import invert, pose, transform, translation, uniform_rotation
 from workers.render.raster.context import is_software
 from workers.render.raster.draw_calls import RenderPass
-from workers.render.raster.ground import Ground, find_ground, near_window
+from workers.render.raster.ground import TILE_PX, Ground, fills_image, find_ground, is_steep, near_window, tiles
+from workers.render.raster.shaders import GRAZING
+
+K = Intrinsics(width=100, height=80, fx=100.0, fy=100.0, cx=50.0, cy=40.0)
+
+
+def test_tiles_cover_the_window_once_on_the_same_pixel_grid():
+    k = Intrinsics(width=700, height=300, fx=350.5, fy=351.5, cx=340.25, cy=160.75)
+    seen = np.zeros((900, 2100), int)
+    for tile in tiles(shape_of(trimesh.creation.box((3.0, 2.0, 0.1))), translation(0, 0, 1.5), k):
+        assert max(tile.width, tile.height) <= TILE_PX
+        assert (tile.fx, tile.fy) == (k.fx, k.fy)
+        x, y = k.cx - tile.cx, k.cy - tile.cy
+        assert x == round(x) and y == round(y)
+        seen[round(y) + 300 : round(y) + 300 + tile.height, round(x) + 700 : round(x) + 700 + tile.width] += 1
+    # The box's nearer side, 1.45 m away, has the larger image; the surroundings begin at (-700, -300).
+    half = np.array([1.5 * k.fx, 1.0 * k.fy]) / 1.45
+    left, top = np.floor(np.array([k.cx, k.cy]) - half).astype(int) + np.array([700, 300])
+    right, bottom = np.ceil(np.array([k.cx, k.cy]) + half).astype(int) + np.array([700, 300])
+    expected = np.zeros_like(seen)
+    expected[top:bottom, left:right] = 1
+    np.testing.assert_array_equal(seen, expected)
+
+
+def test_a_floor_that_fills_the_image_is_met_by_the_ray_of_every_pixel():
+    """True for nearly all views that meet it in every pixel; never for one that misses it somewhere."""
+    rng, agreed = np.random.default_rng(5), []
+    shape = floor().shape
+    for _ in range(300):
+        T_world_cam = orbit_pose(rng.normal(0.0, 12.0, 3) * [1, 1, 0], rng.uniform(-1.5, 1.5), rng.uniform(-3, 3), 3.0)
+        x, y = np.meshgrid(np.linspace(0, K.width, 41), np.linspace(0, K.height, 41))
+        rays = np.stack([(x - K.cx) / K.fx, (y - K.cy) / K.fy, np.ones_like(x)], -1) @ T_world_cam[:3, :3].T
+        away = -T_world_cam[2, 3] / rays[..., 2]
+        met = T_world_cam[:2, 3] + away[..., None] * rays[..., :2]
+        every = bool((away > 0.05).all() and (abs(met) < FLOOR_HALF_M).all())
+        fills = fills_image(shape, invert(T_world_cam), K)
+        assert every or not fills
+        agreed.append((every, fills))
+    every, fills = np.array(agreed).T
+    assert 30 < fills.sum() < 270
+    assert fills.sum() >= 0.95 * every.sum()
+
+
+def test_only_a_rectangle_of_two_triangles_fills_an_image():
+    corners, above = [[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], invert(orbit_pose(np.zeros(3), 1.0, 0.0, 1.0))
+    whole = np.array(corners, float)
+    tilted, slanted = whole.copy(), whole.copy()
+    tilted[2:, 2] = slanted[2, 0] = 10.0
+    halves, twice = [[0, 1, 2], [0, 2, 3]], [[0, 1, 2], [1, 2, 3]]
+    cases = [(whole, halves, True), (whole, twice, False), (tilted, halves, False), (slanted, halves, False)]
+    cases += [(whole, halves[:1] * 2, False), (whole, halves[:1], False), (0.01 * whole, halves, False)]
+    for vertices, faces, fills in cases:
+        shape = Shape((Part("p", frozen_array(vertices), np.array(faces, np.int32)),))
+        assert fills_image(shape, above, K) == fills
+
+
+def cosines(T_world_cam: np.ndarray) -> np.ndarray:
+    """Of the angle between the level's normal and the ray of each of 41 x 41 points of the image, with its sign."""
+    x, y = np.meshgrid(np.linspace(0, K.width, 41), np.linspace(0, K.height, 41))
+    rays = np.stack([(x - K.cx) / K.fx, (y - K.cy) / K.fy, np.ones_like(x)], -1)
+    return (rays @ T_world_cam[:3, :3].T)[..., 2] / np.linalg.norm(rays, axis=-1)
+
+
+def test_a_level_that_is_seen_steeply_is_met_by_every_ray_above_the_grazing_angle():
+    """True for nearly all views that meet it so, but for those at the limit; never for one that does not somewhere."""
+    rng, agreed = np.random.default_rng(6), []
+    for turn in range(400):
+        inclination = (
+            rng.uniform(-1.5, 1.5) if turn % 2 else rng.uniform(0.36, 0.42)
+        )  # the highest rays are level there
+        T_world_cam = orbit_pose(rng.normal(0.0, 3.0, 3), inclination, rng.uniform(-3, 3), 3.0)
+        found = cosines(T_world_cam)
+        every = bool((found > GRAZING).all() or (found < -GRAZING).all())
+        steep = is_steep(floor().shape, invert(T_world_cam), K)
+        assert every or not steep
+        agreed.append((every, steep))
+    every, steep = np.array(agreed).T
+    assert 100 < steep.sum() < 350
+    assert steep[1::2].sum() >= 0.9 * every[1::2].sum()
+
 
 GPU_DIVISION = 2.0**-21
 """Relative error of z that a GPU draws: GLSL allows a division 2.5 units in the last place, and fused sums another one or two."""
@@ -93,18 +173,6 @@ def test_a_known_floor_is_seen_to_the_same_bytes(renderer, look):
         assert 0.02 < np.median(shares) < 0.6
 
 
-def test_a_floor_under_a_table_is_drawn_around_its_feet_alone(renderer):
-    things, height = random_things(np.random.default_rng(3))
-    view = orbit_and_mirror(np.random.default_rng(4), height)[0]
-    left, top, right, bottom = known(renderer, things, view).window
-    low = np.concatenate([transform(thing.T_world_shape, thing.shape.vertices) for thing in things[1:]])
-    low = transform(invert(view.T_world_cam), low[low[:, 2] < 1e-9])
-    k = view.intrinsics
-    u, v = k.fx * low[:, 0] / low[:, 2] + k.cx, k.fy * low[:, 1] / low[:, 2] + k.cy
-    feet = np.array([u.min(), v.min(), u.max(), v.max()])
-    np.testing.assert_allclose([left, top, right, bottom], np.clip(feet, 0, [k.width, k.height] * 2), atol=4.0)
-
-
 def window_of(renderer, thing: Placed, view, up_m: float = 0.0):
     """The window about one thing on a floor that is moved up by `up_m`."""
     passed = RenderPass(APPEARANCE, view.intrinsics, invert(view.T_world_cam), FLAT[1], True, False)
@@ -148,56 +216,3 @@ def test_where_the_depth_test_may_decide_everywhere_the_window_is_the_image(rend
     far = camera(narrow, orbit_pose(np.zeros(3), 0.9, 0.0, 6.0))
     left, top, right, bottom = window_of(renderer, Placed(3, box, translation(1.5, 1.5, 0.0)), far)
     assert left >= right or top >= bottom, "it is beside the image"
-
-
-def test_a_floor_that_varies_or_does_not_fill_the_image_is_drawn(renderer):
-    above, level = camera(T=orbit_pose(np.zeros(3), 0.8, 0.3, 2.0)), camera(T=orbit_pose(np.zeros(3), 0.05, 0.3, 2.0))
-    assert known(renderer, [floor()], above).cleared is not None
-    assert known(renderer, [floor()], level) is None
-    assert known(renderer, [floor(), floor()], above) is None
-    assert known(renderer, [floor()], above, without(FLAT, "floor")) is None
-    (part,) = floor().shape.parts
-    texture = np.full((4, 4, 3), 90, np.uint8)
-    uv = frozen_array(part.vertices[:, :2] * 3)
-    for material, coords in ((Material(roughness=0.3), None), (Material(roughness=0.9, texture=texture), uv)):
-        varied = Placed(1, Shape((Part("p", part.vertices, part.faces, material, None, coords),)), EYE)
-        assert known(renderer, [varied], above).cleared is None
-
-
-def test_a_sheet_that_hovers_by_less_than_the_bias_is_hidden_as_by_a_floor_that_is_drawn(renderer):
-    view = camera(small(60, 50), orbit_pose(np.zeros(3), 0.8, 0.3, 2.0))
-    hidden = []
-    for height_m in (0.0, 5e-6, 2e-5, 1e-4, 1e-3, 5e-3):
-        sheet = quad([[-0.3, -0.3, 0], [0.3, -0.3, 0], [0.3, 0.3, 0], [-0.3, 0.3, 0]])
-        things = [floor(), Placed(3, sheet, translation(0.0, 0.0, height_m))]
-        assert known(renderer, things, view).cleared is not None
-        seen = renderer.draw(things, APPEARANCE, view, *FLAT)
-        with mock.patch.object(workers.render.raster.gbuffer, "find_ground", return_value=None):
-            drawn = renderer.draw(things, APPEARANCE, view, *FLAT)
-        np.testing.assert_array_equal(seen.region, drawn.region)
-        hidden.append(bool((seen.region == 1).all()))
-    assert hidden[0] and hidden[1] and not hidden[-1]
-
-
-def test_from_below_a_floor_has_the_light_of_the_sky_alone(renderer):
-    view = camera(small(20, 16), orbit_pose(np.zeros(3), -1.2, 0.4, 2.0))
-    rgb = renderer.draw([floor()], APPEARANCE, view, *FLAT).rgb
-    ambient = np.array(APPEARANCE.ambient)
-    expected = encode_srgb((decode_srgb(np.array(0.7)) + 0.04) * ambient)
-    assert np.abs(rgb / 255.0 - expected).max() * 255.0 <= 0.7
-
-
-def test_a_slanted_floor_of_one_colour_has_the_light_of_its_own_plane(renderer):
-    """It is not level in its own frame, so its colour is not found before it is drawn, and keeps its weak highlight."""
-    matte, view = Material(roughness=0.9), camera(small(20, 16), orbit_pose(np.zeros(3), 1.2, 0.4, 2.0))
-    h = 4.0
-    slanted = quad([[-h, -h, -h], [h, -h, h], [h, h, h], [-h, h, -h]], material=matte)
-    turned = Placed(
-        1, floor().shape, np.array([[1, 0, -1, 0], [0, 2**0.5, 0, 0], [1, 0, 1, 0], [0, 0, 0, 2**0.5]]) / 2**0.5
-    )
-    look = Appearance((0.1, 0.1, 0.1), APPEARANCE.lights, WHITE.background)
-    seen, same = (renderer.draw([one], look, view, *FLAT) for one in (Placed(1, slanted, EYE), turned))
-    both = (seen.region == 1) & (same.region == 1)
-    assert both.sum() > 100
-    assert np.abs(seen.rgb.astype(int) - same.rgb)[both].max() <= 3
-    assert seen.rgb[both].min() > 60

@@ -1,5 +1,10 @@
-"""Light maps: made once a scene, only those that the plan asks for, and what colour is without them."""
+"""Sky visibility above a level, against closed forms, and elevations, against boxes whose elevations are known.
 
+Light maps before they are uploaded, against geometry. Light maps: made once a scene, only those that the plan asks
+for, and what colour is without them.
+"""
+
+import math
 from dataclasses import replace
 from unittest import mock
 
@@ -14,12 +19,10 @@ from schemas.scene.shape import Shape
 from tests.workers.render.looks import (
     BLACK,
     DOWN,
-    FLAT,
     FOUR,
     RASTER,
     WHITE_MATTE,
     brightness,
-    forcing,
     pixel_of,
     white_floor,
     without,
@@ -34,9 +37,57 @@ from tests.workers.render.random_scenes import (
     small,
 )
 from workers.geometry.camera import orbit_pose
-from workers.geometry.frames import translation
-from workers.render.raster.baking import MAP_PX, SHADOW_PX
+from workers.geometry.frames import transform, translation
+from workers.render.raster.baking import (
+    MAP_PX,
+    SCENE_MARGIN_M,
+    SHADOW_PX,
+    light_box,
+    shadow_casters,
+    sky_visibility,
+    triangles_of,
+)
 from workers.render.raster.light_maps import LightMaps
+
+
+def test_a_long_wall_hides_what_its_form_factor_says():
+    """A wall of height h at distance d, endless: half of 1 - d / sqrt(d^2 + h^2) of the sky."""
+    top, nothing, step = np.zeros((120, 120), np.float32), np.zeros((120, 120), np.float32), 0.01
+    top[:, 60:] = 0.06
+    seen = sky_visibility(top, nothing, nothing, step)
+    for steps in (2, 4, 8):
+        d = (steps + 0.0) * step
+        expected = 1.0 - 0.5 * (1.0 - d / math.hypot(d, 0.06))
+        assert seen[60, 60 - steps] == pytest.approx(expected, abs=0.06)
+
+
+def test_a_board_overhead_hides_the_sky_and_lets_light_in_from_the_sides():
+    top, under = np.zeros((80, 80), np.float32), np.zeros((80, 80), np.float32)
+    top[30:50, 30:50], under[30:50, 30:50] = 0.12, 0.1
+    seen = sky_visibility(top, under, np.zeros_like(top), 0.01)
+    assert 0.35 < seen[40, 40] < 0.7
+    assert seen[40, 40] < seen[40, 52] < seen[40, 70] <= 1.0
+    higher = sky_visibility(top + 0.3 * (top > 0), under + 0.3 * (top > 0), np.zeros_like(top), 0.01)
+    assert higher[40, 40] > seen[40, 40]
+
+
+TOWARDS = np.array([0.6, 0.0, 0.8])
+BOX = shape_of(trimesh.creation.box((0.2, 0.2, 0.2)))
+
+
+def things():
+    return [floor(), Placed(2, BOX, translation(0.0, 0.0, 0.1)), Placed(3, BOX, translation(0.3, 0.1, 0.3))]
+
+
+def test_the_lights_box_holds_every_vertex_and_its_depth_grows_away_from_the_light():
+    vertices, _ = triangles_of(shadow_casters(things()))
+    box = light_box(vertices, TOWARDS)
+    unit = transform(box.unit_from_world, vertices)
+    assert (unit > 0.0).all() and (unit < 1.0).all()
+    size = box.bounds[1] - box.bounds[0]
+    assert unit.min(axis=0) * size == pytest.approx(SCENE_MARGIN_M) == (1.0 - unit.max(axis=0)) * size
+    assert np.ptp(unit[:, 2] * size[2] + vertices @ TOWARDS) < 1e-12
+    assert transform(box.clip_from_world, vertices) == pytest.approx(2.0 * unit - 1.0)
 
 
 def counted(name: str):
@@ -112,24 +163,3 @@ def test_where_a_thing_stands_the_table_is_darker_without_any_light_but_the_sky(
     at = {x: seen[pixel(x)] for x in (0.03, 0.1, 0.5)}
     assert 0.4 < at[0.03] / at[0.5] < 0.75
     assert at[0.03] < at[0.1] < at[0.5]
-
-
-def test_without_ambient_occlusion_the_whole_sky_is_seen_beside_a_wall_as_far_from_it(renderer):
-    """Sky 0.5 x (albedo + 4 % that is mirrored), everywhere on the table; and shadows stay."""
-    things, view, pixel = wall_on_a_table()
-    look = without(RASTER, "ambient_occlusion")
-    seen = brightness(renderer.draw(things, SKY, view, *look).rgb)
-    albedo = brightness(np.array([0.0, 0.7 * 255.0, 0.0]))
-    for x in (0.03, 0.1, 0.5):
-        assert seen[pixel(x)] == pytest.approx(0.5 * (albedo + 0.04), rel=0.03), f"{x} m from the wall"
-    beyond = Appearance(BLACK, (Light(frozen_array([-0.6, 0.0, 0.8]), (0.9, 0.9, 0.9)),), BLACK)
-    both = [brightness(renderer.draw(things, beyond, view, *one).rgb)[pixel(0.1)] for one in (RASTER, look)]
-    assert max(both) < 0.02, "light from beyond the wall arrives"
-
-
-def test_maps_that_are_forced_are_made_in_full_although_no_colour_uses_them(renderer):
-    things, view, _ = wall_on_a_table()
-    renderer.draw([floor()], APPEARANCE, view, *RASTER)
-    with counted("_cast") as cast:
-        renderer.draw(things, APPEARANCE, view, *forcing(FLAT, "light_maps"))
-    assert cast.call_count == 1

@@ -1,4 +1,8 @@
-"""Colours, against what light and albedo say."""
+"""Shading of tier raster, against geometry and Lambert's law.
+
+Light that is found once a face, against light that is found at every pixel. Colours, against what light and albedo
+say.
+"""
 
 import numpy as np
 import pytest
@@ -8,69 +12,113 @@ from schemas.base import frozen_array
 from schemas.scene.appearance import Appearance, Light
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Material, Part, Shape
-from tests.workers.render.looks import FLAT, RASTER
-from tests.workers.render.random_scenes import (
-    EYE,
-    WHITE,
-    camera,
-    facing,
-    floor,
-    part_of,
-    small,
-)
+from tests.workers.render.looks import BLACK, DOWN, FLAT, RASTER, brightness, pixel_of, white_floor, without
+from tests.workers.render.random_scenes import EYE, WHITE, camera, facing, floor, part_of, shape_of, small
 from workers.geometry.camera import orbit_pose
 from workers.geometry.colour import decode_srgb, encode_srgb
 from workers.geometry.frames import translation
-
-PLANE_MM = 0.001
-"""float32 depth of a plane some metres away: a few units in the last place."""
+from workers.render.raster.batches import pack_shape
 
 
-@pytest.mark.parametrize("level", [0.0, 0.02, 0.2, 0.5, 0.9, 1.0])
-def test_under_white_light_a_rough_surface_shows_its_base_color(renderer, level):
-    """4 % of the light is mirrored and not albedo: ambient light adds it."""
-    (part,) = facing(2.0).parts
-    material = Material(base_color=(level, 0.5, 1.0 - level, 1.0))
-    seen = renderer.draw(
-        [Placed(3, Shape((Part("p", part.vertices, part.faces, material),)), EYE)], WHITE, camera(small(4, 4))
-    )
-    expected = encode_srgb(np.minimum(decode_srgb(np.array([level, 0.5, 1.0 - level])) + 0.04, 1.0)) * 255
-    assert np.abs(seen.rgb[2, 2] - expected).max() <= 0.7
+def test_a_white_plane_under_one_light_is_as_bright_as_lambert_says(renderer):
+    """No light but the key: color x albedo x cosine, to 2 %, below the knee of the tone curve."""
+    view = camera(small(33, 33), orbit_pose(np.zeros(3), 0.8, 0.3, 2.0))
+    for angle in (0.0, 0.4, 0.8, 1.1):
+        light = Light(frozen_array([np.sin(angle), 0.0, np.cos(angle)]), (0.75, 0.75, 0.75))
+        seen = renderer.draw([white_floor()], Appearance(BLACK, (light,), BLACK), view, *RASTER)
+        assert brightness(seen.rgb)[16, 16] == pytest.approx(0.75 * np.cos(angle), rel=0.02), f"at {angle} rad"
 
 
-def test_light_falls_off_with_the_cosine(renderer):
-    (part,) = facing(2.0).parts
-    shape = Shape((Part("p", part.vertices, part.faces, Material((1.0, 1.0, 1.0, 1.0), roughness=1.0)),))
-    for angle in (0.0, 0.5, 1.0, 1.4):
-        light = Light(frozen_array([np.sin(angle), 0.0, -np.cos(angle)]), (0.5, 0.5, 0.5))
-        seen = renderer.draw([Placed(3, shape, EYE)], Appearance((0.0,) * 3, (light,), (0.0,) * 3), camera(small(9, 9)))
-        linear = decode_srgb(seen.rgb[4, 4] / 255.0)
-        assert linear == pytest.approx(0.5 * np.cos(angle), abs=0.02), f"at {angle} rad"
+@pytest.mark.parametrize("level", ["floor", "table"])
+def test_a_boxes_shadow_ends_where_geometry_says(renderer, level):
+    """A box 0.2 high throws a shadow 0.2 / tan of the light's elevation long: its end, within 2 px of the image.
+
+    On the floor as a table (region 2), and on a table as an object.
+    """
+    height = 0.2
+    box = shape_of(trimesh.creation.box((0.2, 0.2, height)))
+    slab = shape_of(trimesh.creation.box((1.6, 1.2, 0.05)))
+    ground = 0.0 if level == "floor" else 0.6
+    things = [floor(), Placed(2, box, translation(0.0, 0.0, height / 2))]
+    if level == "table":
+        things = [
+            floor(),
+            Placed(2, slab, translation(0, 0, 0.575)),
+            Placed(3, box, translation(0.0, 0.0, 0.6 + height / 2)),
+        ]
+    view = camera(T=orbit_pose(np.array([0.0, 0.0, ground]), 1.0, -np.pi / 2, 1.5))
+    seen = brightness(renderer.draw(things, DOWN, view, *RASTER).rgb)
+    end = -0.1 - height * 0.6 / 0.8
+    profile = []
+    for x in np.linspace(-0.12, -0.40, 281):
+        u, v = pixel_of(np.array([x, 0.0, ground]), view)
+        profile.append((x, u, seen[int(v), int(u)]))
+    lit = profile[-1][2]
+    assert lit > 0.1
+    assert profile[10][2] < 0.1 * lit, "in the middle of the shadow there is hardly any light"
+    edge = next(u for _, u, value in profile if value > 0.5 * lit)
+    assert edge == pytest.approx(pixel_of(np.array([end, 0.0, ground]), view)[0], abs=2.0)
 
 
-def test_light_comes_from_where_it_comes_from_in_the_world(renderer):
-    """A matte floor under a slanting light has one colour, that of the world's cosine, from wherever it is seen."""
-    light = Light(frozen_array([0.6, 0.0, 0.8]), (0.5, 0.5, 0.5))
-    look = Appearance((0.0,) * 3, (light,), (0.0,) * 3)
-    grey = decode_srgb(np.array(0.7))
-    for inclination, yaw in ((0.8, 0.0), (0.8, 2.0), (0.4, -1.0), (1.5, 0.7)):
-        view = camera(small(9, 9), orbit_pose(np.zeros(3), inclination, yaw, 2.0))
-        linear = decode_srgb(renderer.draw([floor()], look, view).rgb[4, 4] / 255.0)
-        assert linear == pytest.approx(0.5 * 0.8 * grey, abs=0.005)
+LOOKS = {"flat": FLAT, "raster": without(RASTER, "antialiasing")}
+
+TEXTURE = np.random.default_rng(4).integers(60, 256, (16, 16, 3), np.uint8)
+MATERIALS = {
+    "dielectric": Material((0.8, 0.5, 0.3, 1.0), 0.0, 0.35),
+    "metal": Material((0.9, 0.7, 0.4, 1.0), 1.0, 0.45),
+    "half metal": Material((0.9, 0.7, 0.4, 1.0), 0.5, 0.6, texture=TEXTURE),
+    "matte": Material((0.6, 0.6, 0.6, 1.0), 0.0, 1.0, texture=TEXTURE),
+}
+LOOK = Appearance(
+    (0.25, 0.3, 0.4),
+    (
+        Light(frozen_array([-0.48, 0.36, 0.8]), (0.5, 0.45, 0.4)),
+        Light(frozen_array([0.6, 0.0, 0.8]), (0.1, 0.15, 0.2)),
+    ),
+    (0.1, 0.08, 0.05),
+)
+
+
+def slab(material: Material, varied: bool) -> Shape:
+    """A square 1 m wide and 0.04 m thick; `varied`: one corner is darker by one of 255 steps, so that colours vary."""
+    half = np.array([0.5, 0.5, 0.02])
+    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
+    quads = ((1, 5, 7, 3), (0, 2, 6, 4), (0, 4, 5, 1), (4, 6, 7, 5), (6, 2, 3, 7), (2, 0, 1, 3))
+    faces = frozen_array([face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))], np.int32)
+    colors = np.full((8, 4), 255, np.uint8)
+    colors[7, :3] = 254
+    uv = frozen_array(corners[:, :2] + 0.5)
+    return Shape((Part("p", frozen_array(corners), faces, material, None, uv, colors if varied else None),))
 
 
 @pytest.mark.parametrize("tier", ["flat", "raster"])
-def test_the_open_floor_has_the_light_of_the_sky_and_of_all_lamps(renderer, tier):
-    """Away from all things: albedo times the light of the sky and of each lamp by its cosine, and 4 % of the sky mirrored."""
-    box = Shape((part_of(trimesh.creation.box((0.1, 0.1, 0.1))),))
-    colors, sky = ((0.3, 0.1, 0.2), (0.1, 0.2, 0.05)), np.array((0.2, 0.3, 0.4))
-    lights = tuple(Light(frozen_array([x, 0.0, 0.8]), color) for x, color in zip((0.6, -0.6), colors, strict=True))
-    look = Appearance(tuple(sky), lights, (0.1, 0.0, 0.0))
-    view = camera(small(9, 9), orbit_pose(np.array([4.0, 4.0, 0.0]), 0.6, 1.0, 1.0))
-    things = [floor(), Placed(3, box, translation(0.0, 0.0, 0.06))]
-    rgb = renderer.draw(things, look, view, *(FLAT if tier == "flat" else RASTER)).rgb
-    expected = decode_srgb(np.array(0.7)) * (sky + 0.8 * np.sum(colors, axis=0)) + 0.04 * sky
-    assert np.abs(rgb[4, 4] - 255 * encode_srgb(expected)).max() <= 0.7
+@pytest.mark.parametrize("name", MATERIALS)
+@pytest.mark.parametrize("level", [True, False], ids=["top", "wall"])
+def test_a_face_has_the_light_that_each_of_its_pixels_would_find(renderer, tier, name, level):
+    """To two steps, from five sides: among them where a light is mirrored."""
+    plain, varied = (slab(MATERIALS[name], varied) for varied in (False, True))
+    (once,), (everywhere,) = pack_shape(plain), pack_shape(varied)
+    assert once.planar and once.planar_top
+    assert not everywhere.planar and not everywhere.planar_top
+    stand, ball = translation(0.0, 0.0, 0.6), part_of(trimesh.creation.icosphere(2, 0.08))
+    T = stand if level else stand @ np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
+    brightest = 0
+    for yaw in (0.0, 1.3, 2.4, 3.6, 5.7):
+        view = camera(small(120, 90), orbit_pose(np.array([0.0, 0.0, 0.6]), 0.7, yaw, 1.4))
+        seen = []
+        for shape in (plain, varied):
+            things = [
+                floor(),
+                Placed(2, shape, T),
+                Placed(3, Shape((ball,)), translation(0.1, 0.2, 0.7 if level else 1.2)),
+            ]
+            seen.append(renderer.draw(things, LOOK, view, *LOOKS[tier]))
+        a, b = seen
+        assert a.depth_m.tobytes() == b.depth_m.tobytes() and a.region.tobytes() == b.region.tobytes()
+        assert (a.region == 2).sum() > 300
+        assert np.abs(a.rgb.astype(int) - b.rgb).max() <= 2
+        brightest = max(brightest, int(a.rgb[a.region == 2].max()))
+    assert brightest > 120
 
 
 def test_a_smooth_metal_mirrors_a_light_and_a_rough_one_spreads_it(renderer):
@@ -115,34 +163,3 @@ def test_a_texture_stands_upright_and_multiplies_colours(renderer):
         }
         for (row, column), color in expected.items():
             assert np.abs(seen.rgb[row, column] - np.array(color)).max() <= 2
-
-
-def test_vertex_colours_are_interpolated_in_linear_light(renderer):
-    (part,) = facing(2.0, 2.0).parts
-    colors = frozen_array([[0, 0, 0, 255], [255, 255, 255, 255], [255, 255, 255, 255], [0, 0, 0, 255]], np.uint8)
-    shape = Shape((Part("p", part.vertices, part.faces, Material((1.0, 1.0, 1.0, 1.0)), colors=colors),))
-    seen = renderer.draw([Placed(3, shape, EYE)], WHITE, camera(small(101, 101)))
-    linear = decode_srgb(seen.rgb[50, :, 1] / 255.0)
-    expected = np.minimum((np.arange(101) + 0.5) / 101 + 0.04, 1.0)
-    assert np.abs(linear - expected)[:95].max() < 0.02
-
-
-def test_many_triangles_look_like_few(renderer):
-    """Two programs draw batches of few and of many triangles: a square of 2 and of 3,200 gives the same image."""
-    (part,) = facing(2.0, 1.0).parts
-    fine = trimesh.Trimesh(part.vertices, part.faces, process=False)
-    for _ in range(6):
-        fine = fine.subdivide()
-    assert len(fine.faces) > 3000
-    lights = (Light(frozen_array([0.3, 0.2, -0.93]), (0.6, 0.5, 0.4)),)
-    look = Appearance((0.2, 0.2, 0.2), lights, (0.0, 0.0, 0.0))
-    a, b = (renderer.draw([Placed(3, s, EYE)], look, camera()) for s in (Shape((part,)), Shape((part_of(fine),))))
-    np.testing.assert_array_equal(a.region, b.region)
-    assert np.abs(a.rgb.astype(int) - b.rgb).max() <= 1
-    assert np.abs(a.depth_m - b.depth_m).max() * 1e3 < PLANE_MM
-
-
-def test_too_many_lights_are_refused(renderer):
-    lights = (Light(frozen_array([0.0, 0.0, 1.0]), (0.1, 0.1, 0.1)),) * 7
-    with pytest.raises(ValueError, match="7 lights: the renderer takes at most 6"):
-        renderer.draw([floor()], Appearance((0.1,) * 3, lights, (0.0,) * 3), camera())

@@ -1,11 +1,14 @@
-"""The nearest point of a surface, against trimesh and by hand."""
+"""The nearest point of a surface, against trimesh and by hand.
+
+Distances to a mesh, held against the plain search and against closed forms.
+"""
 
 import numpy as np
 import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from workers.geometry.distance import nearest_on_mesh, nearest_on_segments
+from workers.geometry.distance import distance_to_mesh, nearest_on_mesh, nearest_on_segments
 
 
 def test_the_nearest_point_is_the_one_that_trimesh_finds():
@@ -18,25 +21,6 @@ def test_the_nearest_point_is_the_one_that_trimesh_finds():
     assert np.linalg.norm(found - points, axis=1) == pytest.approx(expected, abs=1e-12)
     on_plane = ((found - body.triangles[faces][:, 0]) * body.face_normals[faces]).sum(axis=1)
     assert np.abs(on_plane).max() < 1e-12
-
-
-def test_nothing_is_found_beyond_the_limit():
-    triangle = Mesh(
-        np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], dtype=np.float64), np.array([(0, 1, 2)], dtype=np.int32)
-    )
-    found, faces = nearest_on_mesh(np.array([(0.2, 0.2, 0.1), (0.2, 0.2, 0.1001)]), triangle, within_m=0.1)
-    assert faces.tolist() == [0, -1]
-    assert found[0] == pytest.approx([0.2, 0.2, 0.0])
-    assert np.isnan(found[1]).all()
-
-
-@pytest.mark.parametrize(
-    "corners", [[(0, 0, 0)] * 3, [(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 0, 0), (0, 0, 0), (2, 0, 0)]]
-)
-def test_a_triangle_without_area_is_a_line_or_a_point(corners):
-    flat = Mesh(np.array(corners, dtype=np.float64), np.array([(0, 1, 2)], dtype=np.int32))
-    found, _ = nearest_on_mesh(np.array([(1.5, 1.0, 0.0)]), flat)
-    assert found[0] == pytest.approx([min(1.5, max(c[0] for c in corners)), 0.0, 0.0])
 
 
 def test_the_nearest_points_of_two_segments_are_as_near_as_any_of_many():
@@ -61,3 +45,16 @@ def test_the_nearest_points_of_two_segments_are_as_near_as_any_of_many():
     ):
         nearest_on_segments(a, b, c, d, here, there)
         assert np.linalg.norm(there - here) == pytest.approx(far)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_distances_are_those_of_the_plain_search(seed):
+    rng = np.random.default_rng(seed)
+    knot = trimesh.creation.torus(0.1, 0.03, major_sections=30, minor_sections=12)
+    mesh = Mesh(np.array(knot.vertices), np.array(knot.faces, np.int32))
+    points = rng.normal(0, 0.1, (300, 3))
+    distance, face = distance_to_mesh(points, mesh)
+    near, _ = nearest_on_mesh(points, mesh)
+    assert np.allclose(distance, np.linalg.norm(near - points, axis=1), atol=1e-12)
+    on_face, _ = nearest_on_mesh(points[:1], Mesh(mesh.vertices, mesh.faces[face[:1]]))
+    assert np.linalg.norm(on_face - points[:1]) == pytest.approx(distance[0])

@@ -1,4 +1,8 @@
-"""The path tracer: the camera and its samples, against the label pass and against counting."""
+"""Lights of the path tracer, against formulas.
+
+Materials of the path tracer: textures, glass, holes. The path tracer: the camera and its samples, against the label
+pass and against counting.
+"""
 
 import hashlib
 import subprocess
@@ -9,11 +13,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.scene.appearance import Appearance
+from schemas.base import frozen_array
+from schemas.scene.appearance import Appearance, Light
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.scene import Placed
-from tests.workers.render.looks import BLACK, paths, without
-from tests.workers.render.pathtraced.scenes import DOWN, matte, traced, with_material
+from schemas.scene.shape import Material, Part, Shape
+from tests.workers.render.looks import BLACK, DOWN, matte, paths, traced, with_material, without
 from tests.workers.render.random_scenes import (
     APPEARANCE,
     EYE,
@@ -29,7 +34,87 @@ from tests.workers.render.random_scenes import (
 )
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import invert, pose, rotation_about, translation
-from workers.render.pathtraced import clamp_fireflies, encode_light, round_up_samples, square_pixels
+from workers.render.pathtraced import (
+    encode_light,
+    lamp_directions,
+    sky_directions,
+    sky_picture,
+)
+
+
+@traced
+@pytest.mark.parametrize("angle", [0.0, 0.5, 1.0])
+def test_a_lit_plane_is_as_bright_as_lambert_says(tracer, angle):
+    """albedo x irradiance / pi, that is albedo x color x cosine, to 2 %: lamps and glow together."""
+    light = Light(frozen_array([np.sin(angle), 0.0, np.cos(angle)]), (0.9, 0.8, 0.7))
+    ground = Placed(1, with_material(floor().shape, matte(0.5)), EYE)
+    view = camera(small(24, 24), orbit_pose(np.zeros(3), 0.8, 0.3, 2.0))
+    seen = tracer.radiance([ground], Appearance(BLACK, (light,), BLACK), view, *paths(16), 0)[8:16, 8:16].mean((0, 1))
+    assert seen == pytest.approx(0.5 * np.cos(angle) * np.array(light.color), rel=0.02)
+
+
+@traced
+def test_a_plane_under_an_open_sky_sees_the_ambient_light_whatever_the_skys_gradient(tracer):
+    ambient = (0.4, 0.5, 0.6)
+    ground = Placed(1, with_material(floor().shape, matte(0.5)), EYE)
+    view = camera(small(24, 24), orbit_pose(np.zeros(3), 0.8, 0.3, 2.0))
+    seen = tracer.radiance([ground], Appearance(ambient, (), BLACK), view, *paths(16), 0)[8:16, 8:16].mean((0, 1))
+    assert seen == pytest.approx(0.5 * np.array(ambient), rel=0.02)
+
+
+def test_lamps_lie_evenly_on_the_disc_and_the_sky_is_as_strong_as_the_lights_say():
+    towards = np.array([0.48, 0.6, 0.64])
+    spread = lamp_directions(towards)
+    assert np.linalg.norm(spread.mean(axis=0) - towards) < 2e-3
+    assert np.arccos((spread @ towards).min()) == pytest.approx(0.03, rel=0.03)
+    directions = sky_directions((np.arange(64) + 0.5) / 64)
+    fill = Light(frozen_array([0.6, 0.0, 0.8]), (0.3, 0.3, 0.3))
+    picture = sky_picture(Appearance(BLACK, (Light(frozen_array([0.0, 0.0, 1.0]), BLACK), fill), BLACK), directions)[
+        ..., 0
+    ]
+    height, width = picture.shape
+    cell = np.sqrt(1.0 - directions[..., 2] ** 2) * (2 * np.pi / width) * (np.pi / height)
+    received = (picture * np.maximum(directions @ fill.direction, 0.0) * cell).sum()
+    assert received == pytest.approx(0.3 * np.pi, rel=1e-3)
+    assert (directions[height // 4, picture[height // 4].argmax()] @ fill.direction) > 0.97
+
+
+RED = Material((0.9, 0.05, 0.05, 1.0), roughness=1.0)
+
+
+def through(tracer, material, look=None):
+    """Mean linear colour of a red wall with a pane of this material in front of it."""
+    wall = Placed(3, with_material(facing(3.0, 9.0), RED), EYE)
+    pane = Placed(4, with_material(facing(2.0, 4.0), material), EYE)
+    sky = Appearance((0.8, 0.8, 0.8), (), BLACK, (0.8, 0.8, 0.8))
+    return tracer.radiance([wall, pane], sky, camera(small(9, 9)), *(look or paths(64)), 0).mean((0, 1))
+
+
+@traced
+def test_the_second_side_of_a_wall_changes_nothing(tracer):
+    behind = Material((0.7, 0.8, 0.8, 1.0), transmission=1.0, ior=1.0)
+    (part,) = facing(3.0, 9.0).parts
+    wall = Placed(3, with_material(facing(3.0, 9.0), RED), EYE)
+    look = Appearance((0.8, 0.8, 0.8), (), BLACK, (0.8, 0.8, 0.8))
+    alone = tracer.radiance([wall], look, camera(small(9, 9)), *paths(64), 0).mean((0, 1))
+    assert through(tracer, behind) == pytest.approx(alone, rel=0.02)
+    assert part.faces.shape == (2, 3)
+
+
+@traced
+def test_only_the_clear_part_of_a_labelled_glass_lets_light_through(tracer):
+    half = np.zeros((8, 8), np.uint8)
+    half[:4] = 255
+    (part,) = facing(2.0, 4.0).parts
+    uv = frozen_array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    paper = Material((0.2, 0.2, 0.9, 1.0), roughness=1.0, transmission=1.0, transmission_map=half)
+    pane = Placed(4, Shape((Part("pane", part.vertices, part.faces, paper, uv=uv),)), EYE)
+    wall = Placed(3, with_material(facing(3.0, 9.0), RED), EYE)
+    look = Appearance((0.8, 0.8, 0.8), (), BLACK, (0.8, 0.8, 0.8))
+    seen = tracer.radiance([wall, pane], look, camera(small(16, 16)), *paths(16), 0)
+    lower, upper = seen[:6].mean((0, 1)), seen[-6:].mean((0, 1))  # v runs up, and y of this camera down
+    assert upper[0] > 2.0 * upper[2]
+    assert lower[2] > 2.0 * lower[0]
 
 
 def cast(tracer, things, appearance, view):
@@ -97,13 +182,6 @@ def test_colour_covers_the_pixels_that_the_mask_covers(renderer, tracer, k):
     assert (light[inside & ~mask] == 0.0).all()
 
 
-def test_the_film_of_square_pixels_holds_the_image_and_is_no_coarser():
-    for k in (small(64, 48), small(64, 48, fx=32.0, fy=50.0), small(7, 1, fx=9.0, fy=2.0)):
-        width, height, f = square_pixels(k)
-        assert width >= k.width and height >= k.height and f == max(k.fx, k.fy)
-        assert width - 1 < k.width * f / k.fx <= width + 1e-6
-
-
 RUN = """
 import hashlib, numpy as np
 from tests.workers.render.random_scenes import APPEARANCE, camera, orbit_and_mirror, random_things, small
@@ -146,27 +224,6 @@ def test_sixteen_samples_leave_at_most_half_the_noise_of_four(tracer):
         return float(np.std(many, axis=0).mean())
 
     assert noise(16) < 0.55 * noise(4)
-
-
-def test_specks_are_taken_away_and_lines_and_spots_of_three_pixels_stay():
-    light = np.full((9, 9, 3), 0.2)
-    light[4, 4] = light[0, 8] = 5.0
-    light[1, 1] = light[2, 1] = light[2, 2] = 3.0
-    light[7, :] = 0.5
-    seen = clamp_fireflies(light)
-    specks = np.zeros((9, 9), bool)
-    specks[4, 4] = specks[0, 8] = True
-    assert seen[specks] == pytest.approx(0.2)
-    assert (seen[~specks] == light[~specks]).all()
-    assert (clamp_fireflies(np.ones((1, 1, 3))) == 1.0).all()
-
-
-def test_samples_fill_a_grid_and_are_never_fewer_than_asked():
-    for asked in range(1, 300):
-        taken = round_up_samples(asked)
-        assert asked <= taken < asked + np.sqrt(asked)
-        assert any(taken % side == 0 for side in range(int(np.sqrt(asked)), int(np.sqrt(asked)) + 1))
-    assert [round_up_samples(n) for n in (1, 2, 4, 13, 16, 64)] == [1, 2, 4, 15, 16, 64]
 
 
 @traced
