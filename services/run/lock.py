@@ -94,9 +94,7 @@ class Lock:
     def show_life(self) -> bool:
         """Writes the heartbeat's file anew; true."""
         self._beats += 1
-        self._store.write_whole(
-            LOCK_FILE, json.dumps(asdict(self._mine) | {"beat": self._beats}).encode(), durable=False
-        )
+        self._store.put(LOCK_FILE, json.dumps(asdict(self._mine) | {"beat": self._beats}).encode(), durable=False)
         return True
 
     def require_held(self) -> None:
@@ -115,28 +113,10 @@ class Lock:
         with self._one_at_a_time:
             if not self._lost and read_holder(self._store) == self._mine:
                 self._store.remove(LOCK_FILE)
-                self._store.remove_tree(LOCK_CLAIMS)
+                _clear(self._store)
 
-<<<<<<< HEAD
     def _is_last(self) -> bool:
         """Whether the last event is this process's.
-=======
-    def _beat(self) -> bool:
-        """Writes the lock file anew; False where the lock was lost, even if only while this function ran."""
-        begun = _now_s()
-        found = read_holder(self._store)
-        if _claimant(self._store, self._mine) is not None or not self._may_write(found, begun):
-            return False
-        self._mine = replace(self._mine, beat=self._mine.beat + 1)
-        if found is not None:
-            self._store.put(LOCK_FILE, _encode(self._mine), durable=False)
-        elif not self._store.put_if_absent(LOCK_FILE, _encode(self._mine)):
-            return False
-        if self._is_late() and _claimant(self._store, self._mine) is not None:
-            return False
-        self._shown_at = begun
-        return True
->>>>>>> main
 
         Where the events are gone, removed by hand, it takes the lock again, unless somebody had the time to take over, to
         work and to end.
@@ -240,7 +220,7 @@ def _find_gone(store: Store, beat: Beat) -> Holder | None:
 def _take(store: Store, mine: Holder, gone: Holder | None) -> bool:
     """Puts the event by which this process follows `gone` (None: a lock that is free); False where another was faster."""
     if gone == UNREADABLE:
-        store.remove_tree(LOCK_CLAIMS)
+        _clear(store)
         gone = None
 
     def decide(before: Sequence[bytes]) -> bytes | None:
@@ -251,36 +231,13 @@ def _take(store: Store, mine: Holder, gone: Holder | None) -> bool:
         return Events(store, LOCK_CLAIMS).append(decide) is not None
     except (CorruptError, FileNotFoundError, ValueError, TypeError):  # given back, or damaged, at this moment
         return False
-<<<<<<< HEAD
-=======
-    if read_holder(store) != gone:
-        store.remove(claim)
-        return False
-    store.put(LOCK_FILE, _encode(mine))
-    if _claimant(store, gone) == mine:
-        return True
-    if _is_held_by(store, mine):
-        store.remove(LOCK_FILE)
-    return False
 
 
-def _claim_on(holder: Holder) -> str:
-    return f"{LOCK_CLAIMS}/{uuid.uuid5(uuid.NAMESPACE_OID, holder.token).hex}"
-
-
-def _claimant(store: Store, holder: Holder) -> Holder | None:
-    """The process that claimed the lock of `holder`, None where nobody did."""
-    return _holder_at(store, _claim_on(holder))
-
-
-def _is_held_by(store: Store, holder: Holder) -> bool:
-    current = read_holder(store)
-    return current is not None and current.token == holder.token
-
-
-def _encode(holder: Holder) -> bytes:
-    return json.dumps(asdict(holder)).encode()
->>>>>>> main
+def _clear(store: Store) -> None:
+    """Removes the events, and the folder only where nobody has taken the lock meanwhile."""
+    for name in store.names(LOCK_CLAIMS):
+        store.remove(f"{LOCK_CLAIMS}/{name}")
+    store.remove_empty(LOCK_CLAIMS)
 
 
 def _machine() -> str:
