@@ -13,8 +13,7 @@ from pydantic import ValidationError
 
 from schemas.base import Frozen
 from schemas.dataset.layout import COMMITS, LOCK_FILE, MANIFEST, RANGES, STAGING
-from schemas.errors import CorruptError, InputError, OutputError
-from schemas.plain_line import plain_line
+from schemas.errors import CorruptError, InputError, OutputError, plain_line
 from schemas.queue import (
     ID_PATTERN,
     JOBS,
