@@ -9,7 +9,6 @@ MAX_LINES = 300
 
 TESTED_ELSEWHERE: dict[str, str] = {
     "services/bench/cycles_script.py": "runs in a foreign interpreter that has bpy",
-    "workers/assets/watch.py": "a type, and a function that does nothing",
 }
 """Modules of workers and services without a test file of their own, and why."""
 

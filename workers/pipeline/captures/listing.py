@@ -8,7 +8,7 @@ from schemas.capture.listing import CaptureListing
 from schemas.errors import AssetSourceError, CaptureError
 from schemas.job.job import Job
 from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.assets.watch import Watch, ignore
+from workers.assets.external.listing import Watch, ignore
 from workers.store.capture_inputs import digest_inputs
 
 

@@ -14,7 +14,7 @@ from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from tests.workers.assets.oracles import CUBE, textured_cube, write
 from workers.assets.external.caps import FolderResolver, check_counts, declared_counts, open_image
-from workers.assets.external.mesh import load_shape
+from workers.assets.external.formats import load_shape
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".ply"])

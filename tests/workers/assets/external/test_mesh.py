@@ -9,7 +9,8 @@ import trimesh
 from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from tests.workers.assets.oracles import CUBE, shape_of, welded, write
-from workers.assets.external.mesh import is_solid, load_shape, transform_shape
+from workers.assets.external.formats import load_shape
+from workers.assets.external.mesh import is_solid, transform_shape
 from workers.geometry.frames import pose
 
 LIMITS = MeshLimits()

@@ -5,9 +5,9 @@ import pytest
 
 from schemas.errors import AssetSourceError
 from schemas.job.assets import Assets, MeshLimits, ShapeNetSource
+from schemas.job.category import BUILT_IN
 from tests.workers.assets.oracles import CUBE, write
 from workers.assets.catalogue import list_source
-from workers.assets.external.listing import SYNSETS
 from workers.assets.external.placement import load_entry
 
 LIMITS, ASSETS = MeshLimits(), Assets(density_kg_m3=600.0, shell_kg_m2=3.0)
@@ -19,11 +19,11 @@ def settings(**more):
 
 
 def version_2(root, category, model, text=TALL):
-    return write(root / SYNSETS[category] / model / "models" / "model_normalized.obj", text)
+    return write(root / str(BUILT_IN[category].synset) / model / "models" / "model_normalized.obj", text)
 
 
 def version_1(root, category, model, text=TALL):
-    return write(root / SYNSETS[category] / model / "model.obj", text)
+    return write(root / str(BUILT_IN[category].synset) / model / "model.obj", text)
 
 
 @pytest.mark.parametrize("layout", [version_1, version_2])
@@ -52,7 +52,7 @@ def test_tables_have_their_own_scale_and_a_setting_replaces_both(tmp_path):
 def test_models_without_a_usable_mesh_are_skipped_and_counted_by_reason(tmp_path):
     version_2(tmp_path, "mug", "good")
     version_2(tmp_path, "mug", "large", TALL * 3)
-    (tmp_path / SYNSETS["mug"] / "empty").mkdir()
+    (tmp_path / str(BUILT_IN["mug"].synset) / "empty").mkdir()
     listing = list_source(settings(), tmp_path, {"mug"}, MeshLimits(max_faces=17))
     assert [entry.instance_id for entry in listing.entries["mug"]] == ["03797390-good"]
     assert listing.skipped == {"missing": 1, "too_large": 1}
