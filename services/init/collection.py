@@ -12,7 +12,8 @@ from schemas.errors import AssetSourceError, MeshError
 from schemas.job.assets import Assets, FolderSource, MeshLimits, UpAxis
 from schemas.plain_line import plain_line
 from workers.assets.external.listing import Entry, SourceFile
-from workers.assets.external.placement import Measured, read_measured
+from workers.assets.external.formats import FORMATS
+from workers.assets.external.placement import ASSEMBLIES, Measured, read_measured
 from workers.assets.external.reader import Kind, Request, Task, ask_all
 
 PART = "part"
@@ -94,7 +95,7 @@ class Guess:
     """Category by pattern; the first match wins."""
 
 
-SUFFIXES = (".urdf", ".glb", ".gltf", ".obj", ".ply", ".stl")
+SUFFIXES = (*ASSEMBLIES, *FORMATS)
 """What is read; of one mesh in several formats, the first."""
 
 FOREIGN = (

@@ -6,9 +6,8 @@ import pytest
 
 from schemas.errors import AssetSourceError
 from services.init import collection as walk
-from services.init.collection import SUFFIXES, walk_folder
+from services.init.collection import walk_folder
 from tests.workers.assets.oracles import write
-from workers.assets.external.formats import MESH_SUFFIXES
 
 
 def test_meshes_and_urdfs_are_found_at_any_depth_and_hidden_ones_are_left_aside(tmp_path):
@@ -71,10 +70,6 @@ def test_a_folder_or_a_file_without_permission_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(walk.Path, "iterdir", deny)
     with pytest.raises(AssetSourceError, match="cannot be listed: Permission denied"):
         walk_folder(tmp_path)
-
-
-def test_what_is_read_is_what_the_reader_reads():
-    assert set(SUFFIXES) == {".urdf", *MESH_SUFFIXES}
 
 
 def test_too_many_files_are_no_folder_of_meshes(tmp_path, monkeypatch):

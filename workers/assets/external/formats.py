@@ -162,13 +162,13 @@ class Format:
 
 
 FORMATS: Mapping[str, Format] = {
-    ".obj": Format(lambda _, data: material_files(data), _read_by_trimesh),
-    ".stl": Format(lambda *_: [], _read_by_trimesh),
-    ".ply": Format(lambda _, data: _decode(_PLY_TEXTURE.findall(data)), _read_by_trimesh),
     ".glb": Format(named_by_gltf, read_gltf, counted=False),
     ".gltf": Format(named_by_gltf, read_gltf, counted=False),
+    ".obj": Format(lambda _, data: material_files(data), _read_by_trimesh),
+    ".ply": Format(lambda _, data: _decode(_PLY_TEXTURE.findall(data)), _read_by_trimesh),
+    ".stl": Format(lambda *_: [], _read_by_trimesh),
 }
-"""The formats of mesh files by suffix."""
+"""The formats of mesh files by suffix, the one that says most about a thing first."""
 
 
 def read_visual(mesh: trimesh.Trimesh) -> tuple[MeshVisual, tuple[str, ...]]:
