@@ -72,7 +72,8 @@ def read_gltf(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh
         tree, chunk = _parse(path, data)
         _refuse_extensions(path, tree)
         _check_caps(path, tree, len(data), resolver)
-        return list(_File(path, tree, chunk, resolver).meshes())
+        with np.errstate(all="ignore"):  # what is not finite is refused where the mesh is placed
+            return list(_File(path, tree, chunk, resolver).meshes())
     except MALFORMED as error:
         raise _unreadable(path, error) from error
 
