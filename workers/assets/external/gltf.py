@@ -34,6 +34,7 @@ from workers.assets.external.caps import (
     describe_error,
 )
 from workers.assets.external.mesh import DEFAULT, WHITE, MeshVisual, RawMesh, make_material
+from workers.assets.glb import split_glb
 from workers.geometry.colour import encode_srgb
 
 MALFORMED = (struct.error, ArithmeticError, ValueError, LookupError, TypeError, AttributeError, RecursionError)
@@ -80,13 +81,7 @@ def read_gltf(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh
 
 def _parse(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
     """The tree, and the bytes behind the JSON chunk of a GLB, empty for a .gltf."""
-    binary = b""
-    if path.suffix.lower() == ".glb":
-        magic, _, _, length, kind = struct.unpack_from("<4sIII4s", data)
-        if magic != b"glTF" or kind != b"JSON":
-            raise ValueError("no glTF header")
-        binary, data = data[20 + length + 8 :], data[20 : 20 + length]
-    tree = json.loads(data)
+    tree, binary = split_glb(data) if path.suffix.lower() == ".glb" else (json.loads(data), b"")
     if not isinstance(tree, dict) or not isinstance(tree.get("asset"), dict):
         raise ValueError("no glTF: it has no `asset`")
     if not str(tree["asset"].get("version", "")).startswith("2"):
