@@ -42,6 +42,7 @@ from workers.assets.external.mesh import (
     make_material,
     place_mesh,
 )
+from workers.geometry.colour import encode_srgb
 
 _OBJ_COUNTED_BACK = re.compile(rb"^f[ \t][^\n]*-\d", re.MULTILINE)
 _MAP_KD = re.compile(rb"^[ \t]*map_Kd[ \t]+([^\r\n]+)", re.MULTILINE | re.IGNORECASE)
@@ -171,40 +172,50 @@ FORMATS: Mapping[str, Format] = {
 """The formats of mesh files by suffix, the one that says most about a thing first."""
 
 
-def read_visual(mesh: trimesh.Trimesh) -> tuple[MeshVisual, tuple[str, ...]]:
-    """The material and colours of one trimesh geometry, and notes."""
+def read_visual(mesh: trimesh.Trimesh, linear: bool = False) -> tuple[MeshVisual, tuple[str, ...]]:
+    """The material and colours of one trimesh geometry, and notes. `linear`: its colours are linear, as those of a stored GLB."""
     visual: Any = mesh.visual
     if visual.kind == "texture":
         uv = getattr(visual, "uv", None)
         usable = uv is not None and np.shape(uv) == (len(mesh.vertices), 2) and bool(np.isfinite(uv).all())
         material, notes = _material(visual.material, textured=usable)
-        colors = _attribute_colors(visual.vertex_attributes.get("color"), len(mesh.vertices))
+        colors = _attribute_colors(visual.vertex_attributes.get("color"), len(mesh.vertices), linear)
         return MeshVisual(material, np.asarray(uv, dtype=np.float64) if usable else None, colors), notes
     if visual.kind == "vertex" and len(visual.vertex_colors) == len(mesh.vertices):
-        return MeshVisual(WHITE, colors=np.asarray(visual.vertex_colors, dtype=np.uint8)), ()
+        return MeshVisual(
+            WHITE, colors=_attribute_colors(np.asarray(visual.vertex_colors), len(mesh.vertices), linear)
+        ), ()
     if visual.kind == "face" and len(visual.face_colors) == len(mesh.faces):
         return MeshVisual(WHITE, face_colors=np.asarray(visual.face_colors, dtype=np.uint8)), ()
     return MeshVisual(DEFAULT), ()
 
 
-def _attribute_colors(values: NDArray | None, count: int) -> NDArray[np.uint8] | None:
-    """Vertex colours stored beside a material, as floats in [0, 1] or as integers that use the whole range of their type."""
+def _attribute_colors(values: NDArray | None, count: int, linear: bool) -> NDArray[np.uint8] | None:
+    """Vertex colours, floats in [0, 1] or integers that use the whole range of their type, as [V, 4] uint8 sRGB."""
     if values is None or np.shape(values) not in ((count, 3), (count, 4)):
         return None
     whole = np.issubdtype(values.dtype, np.integer)
     share = np.ones((count, 4))
     share[:, : values.shape[1]] = values / np.iinfo(values.dtype).max if whole else values
-    return np.round(255.0 * np.clip(share, 0.0, 1.0)).astype(np.uint8) if np.isfinite(share).all() else None
+    if not np.isfinite(share).all():
+        return None
+    share = np.clip(share, 0.0, 1.0)
+    if linear:
+        share[:, :3] = encode_srgb(share[:, :3])
+    return np.round(255.0 * share).astype(np.uint8)
 
 
 def _material(source: object, textured: bool) -> tuple[Material, tuple[str, ...]]:
     if isinstance(source, MultiMaterial):
         source = source.materials[0] if source.materials else None
+    notes: list[str] = []
     if isinstance(source, PBRMaterial):
-        source = source.to_simple()
+        factor = np.ones(4) if source.baseColorFactor is None else np.asarray(source.baseColorFactor) / 255.0
+        metallic, roughness = (1.0 if x is None else float(x) for x in (source.metallicFactor, source.roughnessFactor))
+        texture = _texture(source.baseColorTexture, notes) if textured else None
+        return make_material(np.append(encode_srgb(factor[:3]), factor[3]), metallic, roughness, texture)
     if not isinstance(source, SimpleMaterial):
         return DEFAULT, ()
-    notes: list[str] = []
     texture = _texture(source.image, notes) if textured else None
     color = np.asarray(source.diffuse, dtype=np.float64) / 255.0
     color[3] = _opacity(source, float(color[3]))

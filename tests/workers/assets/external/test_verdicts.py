@@ -153,8 +153,6 @@ def test_an_asset_holds_no_open_file_and_its_arrays_cannot_be_written(tmp_path):
     for array in (assets[0].shape.parts[0].vertices, assets[0].shape.parts[0].faces):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
-        with pytest.raises(ValueError, match="cannot set WRITEABLE"):
-            array.setflags(write=True)
 
 
 def test_a_file_that_changes_after_it_was_listed_is_refused_when_it_is_loaded(tmp_path):
