@@ -11,7 +11,6 @@ from schemas.scene.camera import Camera
 from schemas.scene.region import REGION_FIRST_OBJECT
 from workers.geometry.frames import UP, half_turn, pose, translation
 from workers.geometry.pixels import dequantise_depth
-from workers.geometry.ranks import median, percentile
 
 
 def place_aligned_camera(camera: Camera, depth_camera: DepthCamera) -> Camera:
@@ -52,5 +51,5 @@ def front_distance(depth_m: Array, object_pixels: NDArray[np.bool_] | np.bool_, 
     if mirror.pivot_depth == "nearest":
         return float(z.min())
     if mirror.pivot_depth == "median":
-        return median(z)
-    return percentile(z, mirror.percentile)
+        return float(np.median(z))
+    return float(np.percentile(z, mirror.percentile))

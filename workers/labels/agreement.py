@@ -7,7 +7,6 @@ from schemas.job.images import Images
 from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.view import Agreement, View
 from workers.geometry.projection import Bounds, Seen, compare_covisible
-from workers.geometry.ranks import median
 from workers.labels.projected_view import HIDDEN_M
 
 FEWEST_POINTS = 50
@@ -43,10 +42,10 @@ def compare_views(source: View, mirror: View, images: Images, bound_mm: float) -
     object_mm = difference_mm[own >= REGION_FIRST_OBJECT]
     enough = len(object_mm) >= FEWEST_POINTS
     return Agreement(
-        median_mm=median(object_mm) if enough else None,
+        median_mm=float(np.median(object_mm)) if enough else None,
         share=float((object_mm <= bound_mm).mean()) if enough else None,
         points=len(object_mm),
-        scene_median_mm=median(difference_mm) if len(difference_mm) >= FEWEST_POINTS else None,
+        scene_median_mm=float(np.median(difference_mm)) if len(difference_mm) >= FEWEST_POINTS else None,
     )
 
 
