@@ -12,11 +12,10 @@ from services.merge.dataset_card import write_card
 from services.merge.merge import merge
 from services.read.verify import verify
 from services.run.range_planner import plan_spans
-from workers.pipeline.captures.listing import open_sources
-from workers.pipeline.context import open_worker
-from workers.pipeline.fingerprint import take_fingerprint
-from workers.pipeline.run_shard import run_scene
-from workers.pipeline.stopwatch import Stopwatch
+from workers.capture.results import open_sources
+from workers.scene.context import Stopwatch, open_worker
+from workers.shard.fingerprint import take_fingerprint
+from workers.shard.run_shard import run_scene
 from workers.store.attempt import begin_attempt
 from workers.store.ledger import list_commits
 from workers.store.local import LocalStore
@@ -52,7 +51,7 @@ def run_here(job: Job, out: Path, folder: Path = Path()) -> tuple[LocalStore, st
     store = LocalStore(out)
     store.prepare()
     record = record_job(job, catalogue.digest, folder, tuple(one.sha256 for one in catalogue.captures))
-    store.write_whole(JOB_FILE, encode_job(record))
+    store.put(JOB_FILE, encode_job(record))
     fingerprint = take_fingerprint(context.renderer, job.drawn.tier)
     store.put_if_absent(FINGERPRINT_FILE, fingerprint.model_dump_json(indent=1).encode())
     terms = ShardOrder.of(str(out), job, record.digest).terms.model_copy(update={"fingerprint": fingerprint.digest})

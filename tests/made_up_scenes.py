@@ -13,7 +13,7 @@ from workers.store.attempt import Attempt, begin_attempt
 from workers.store.store import Store
 
 CATEGORIES = ("bottle", "camera", "mug")
-TERMS = CommitTerms(job_digest="j" * 64, fingerprint="stack-a", range_size=4)
+TERMS = CommitTerms(job_digest="j" * 64, fingerprint="stack-a", range_size=4, pairs_per_scene=1)
 
 
 def terms(**changes) -> CommitTerms:

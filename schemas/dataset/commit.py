@@ -1,10 +1,19 @@
-"""A commit: the record that a range of scenes is done, and the terms that all commits of a dataset share."""
+"""Commits: the record that a range of scenes is done, and the ledger of all records.
+
+- A commit: the record that a range of scenes is done, and the terms that all commits of a dataset share.
+- The ledger: what planning and status need of every commit, in columns, about 40 bytes for each.
+"""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from typing import Annotated, Literal
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
 from schemas.base import Frozen, NonNegativeInt, PositiveInt
@@ -14,9 +23,8 @@ from schemas.errors import FailureKind
 Outcome = Literal["made", "intrinsic", "environmental"]
 """The outcome of a scene: made, or the kind of its failure."""
 
-COMMIT_VERSION = 2
-"""Of the records that this program writes. Records of version 1 list every image; later ones leave to the range's tables
-what these say."""
+COMMIT_VERSION = 1
+"""Of the records that this program writes."""
 
 _Digest = Annotated[str, StringConstraints(pattern=r"^[ -~]{0,128}$")]
 _SceneId = Annotated[int, Field(ge=0, le=MAX_SCENE)]
@@ -61,8 +69,7 @@ class CommitTerms(Frozen):
     first_scene: NonNegativeInt = 0
     """Start of the first range; ranges lie on a grid of `range_size`."""
     range_size: PositiveInt = 16
-    pairs_per_scene: PositiveInt | None = None
-    """None in records of version 1."""
+    pairs_per_scene: PositiveInt
 
 
 class FileEntry(Frozen):
@@ -71,13 +78,6 @@ class FileEntry(Frozen):
     path: str
     bytes: NonNegativeInt
     sha256: str
-
-
-class TableEntry(Frozen):
-    """A table of the range: its rows, and in records of version 1 the digest of its canonical rows."""
-
-    rows: NonNegativeInt
-    digest: str = ""
 
 
 MARK = 16
@@ -93,9 +93,15 @@ class SceneMark(Frozen):
     scene_id: NonNegativeInt
     outcome: Outcome
     digest: str
-    """Hex; records of version 1 have all 64 characters, later ones the first `MARK` of them."""
+    """The first `MARK` characters, in hex."""
     reason: str | None = None
-    """Of the failure; None in records of version 1."""
+    """Of the failure; None where the scene was made."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "SceneMark":
+        if (self.outcome == "made") != (self.reason is None):
+            raise ValueError(f"scene {self.scene_id} must have a reason if and only if it failed")
+        return self
 
 
 class CommitRecord(Frozen):
@@ -112,8 +118,9 @@ class CommitRecord(Frozen):
     attempt: str
     terms: CommitTerms
     files: tuple[FileEntry, ...]
-    """The range's tables and tars, sorted by path; in version 1 images and shapes too (`committed_files` has them all)."""
-    tables: dict[str, TableEntry]
+    """The range's tables and tars, sorted by path; the tables name images and shapes (`committed_files` has them all)."""
+    tables: dict[str, NonNegativeInt]
+    """Number of rows, by table."""
     scenes: tuple[SceneMark, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -130,22 +137,18 @@ class CommitRecord(Frozen):
         return self
 
 
-def foreign_path(files: Iterable[FileEntry], span: Span, pairs: int | None) -> str | None:
+def foreign_path(files: Iterable[FileEntry], span: Span, pairs: int) -> str | None:
     """A path that no commit of this span may name, None where all are its own.
 
-    Names of images must be of poses of the span's scenes: with p pairs in a scene, pose k belongs to scene k // 2p. Where
-    `pairs` is unknown, any p that fits all images will do.
+    Names of images must be of poses of the span's scenes: with p pairs in a scene, pose k belongs to scene k // 2p.
     """
-    poses = {}
     for entry in files:
-        if not is_plain_path(entry.path):
+        pose = pose_of_image(entry.path)
+        of_scene = pose is not None and span.start <= pose // (2 * pairs) < span.stop
+        of_range = pose is None and is_range_file(entry.path, span.start, span.retry)
+        if not (of_scene or of_range) or not is_plain_path(entry.path):
             return entry.path
-        if (pose := pose_of_image(entry.path)) is not None:
-            poses[pose // 2] = entry.path
-        elif not is_range_file(entry.path, span.start, span.retry):
-            return entry.path
-    pairs = pairs or max(poses, default=0) // span.stop + 1
-    return next((path for pose, path in poses.items() if not span.start <= pose // pairs < span.stop), None)
+    return None
 
 
 @dataclass(frozen=True)
@@ -165,8 +168,8 @@ class CommitSummary:
     stop: int
     retry: int
     made: int
-    failed: tuple[tuple[int, FailureKind, str | None], ...]
-    """(scene id, kind, reason), in order; the reason is None in records of version 1."""
+    failed: tuple[tuple[int, FailureKind, str], ...]
+    """(scene id, kind, reason), in order."""
     scenes: tuple[int, ...] = ()
     """The scenes of a retry; empty for a whole range."""
     fingerprint: str = ""
@@ -176,7 +179,7 @@ class CommitSummary:
 def summarize(record: CommitRecord) -> CommitSummary:
     """The part of the record that planning needs."""
     span = record.span
-    failed = tuple((one.scene_id, one.outcome, one.reason) for one in record.scenes if one.outcome != "made")
+    failed = tuple((one.scene_id, one.outcome, one.reason or "") for one in record.scenes if one.outcome != "made")
     terms = record.terms
     return CommitSummary(
         start=span.start,
@@ -188,3 +191,113 @@ def summarize(record: CommitRecord) -> CommitSummary:
         fingerprint=terms.fingerprint,
         job_digest=terms.job_digest,
     )
+
+
+_failure = pa.struct(
+    [
+        pa.field("scene_id", pa.int64(), nullable=False),
+        pa.field("kind", pa.string(), nullable=False),
+        pa.field("reason", pa.string(), nullable=False),
+    ]
+)
+_name = pa.dictionary(pa.int32(), pa.string())
+
+LEDGER_SCHEMA = pa.schema(
+    [
+        pa.field("start", pa.int64(), nullable=False),
+        pa.field("stop", pa.int64(), nullable=False),
+        pa.field("retry", pa.int32(), nullable=False),
+        pa.field("made", pa.int32(), nullable=False),
+        pa.field("failed", pa.list_(_failure), nullable=False),
+        pa.field("scenes", pa.list_(pa.int64()), nullable=False),
+        pa.field("fingerprint", _name, nullable=False),
+        pa.field("job_digest", _name, nullable=False),
+    ]
+)
+"""Fields of `CommitSummary`."""
+
+
+def rows_of(summaries: Iterable[CommitSummary]) -> pa.Table:
+    """A row of `LEDGER_SCHEMA` for each."""
+    keys = ("scene_id", "kind", "reason")
+    rows = [
+        {**vars(one), "failed": [dict(zip(keys, failure, strict=True)) for failure in one.failed]} for one in summaries
+    ]
+    return pa.Table.from_pylist(rows, LEDGER_SCHEMA)
+
+
+def join_rows(parts: Iterable[pa.Table]) -> pa.Table:
+    """All rows, by start and retry, each commit once."""
+    rows = pa.concat_tables([LEDGER_SCHEMA.empty_table(), *parts]).unify_dictionaries().combine_chunks()
+    rows = rows.sort_by([("start", "ascending"), ("retry", "ascending")])
+    start, retry = rows.column("start").to_numpy(), rows.column("retry").to_numpy()
+    repeated = (start[1:] == start[:-1]) & (retry[1:] == retry[:-1])
+    return rows.filter(pa.array(np.append(True, ~repeated))) if repeated.any() else rows
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """Every commit of a dataset, by start and retry."""
+
+    rows: pa.Table
+    """Of `LEDGER_SCHEMA`."""
+    lost: tuple[tuple[int, int], ...] = ()
+    """(start, retry) of commits that were there once and are not any more."""
+    unkept: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """[U] rows that were read from records, because the kept summary lacks them."""
+
+    @cached_property
+    def start(self) -> NDArray[np.int64]:
+        """[N] first scene of each commit's range."""
+        return self.rows.column("start").to_numpy()
+
+    @cached_property
+    def stop(self) -> NDArray[np.int64]:
+        """[N] end of each commit's range."""
+        return self.rows.column("stop").to_numpy()
+
+    @cached_property
+    def retry(self) -> NDArray[np.int32]:
+        """[N] 0 for the range itself, k for its k-th retry."""
+        return self.rows.column("retry").to_numpy()
+
+    def count(self, row: int) -> int:
+        """Number of scenes of one commit."""
+        again = len(self.rows.column("scenes")[row])
+        return again or int(self.stop[row] - self.start[row])
+
+    @property
+    def ranges(self) -> NDArray[np.int64]:
+        """[R, 2] start and stop of every committed range, in order."""
+        whole = self.retry == 0
+        return np.stack([self.start[whole], self.stop[whole]], axis=1)
+
+    @property
+    def committed(self) -> int:
+        """Number of scenes in committed ranges."""
+        whole = self.retry == 0
+        return int((self.stop[whole] - self.start[whole]).sum())
+
+    @cached_property
+    def failures(self) -> pa.Table:
+        """Failures that no retry made good: columns start, scene_id, kind and reason, in order of the scenes."""
+        failed, row = self._flat("failed")
+        table = pa.table({name: pc.struct_field(failed, name) for name in ("scene_id", "kind", "reason")})
+        scene = table.column("scene_id").to_numpy()
+        again, of = self._flat("scenes")
+        last = dict(zip(again.to_pylist(), self.retry[of].tolist(), strict=True))  # later retries come later
+        stands = np.array([last.get(one, 0) for one in scene.tolist()], np.int32) == self.retry[row]
+        table = table.append_column("start", pa.array(self.start[row])).filter(pa.array(stands))
+        return table.sort_by([("scene_id", "ascending")])
+
+    @property
+    def fingerprints(self) -> list[str]:
+        """The stacks that made the commits, sorted."""
+        return sorted(pc.unique(self.rows.column("fingerprint")).to_pylist())
+
+    def _flat(self, name: str) -> tuple[pa.Array, NDArray[np.int64]]:
+        """The items of a list column, and the row of each."""
+        lists = self.rows.column(name).combine_chunks()
+        lists = lists.combine_chunks() if isinstance(lists, pa.ChunkedArray) else lists
+        lengths = pc.fill_null(pc.list_value_length(lists), 0).to_numpy(zero_copy_only=False)
+        return lists.flatten(), np.repeat(np.arange(len(lengths)), lengths)

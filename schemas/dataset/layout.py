@@ -7,8 +7,8 @@ from operator import attrgetter
 from typing import Literal
 
 from schemas.job.job import Job
-from schemas.scene.camera import ROLES, Role
-from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.view import ROLES, Role
 
 JOB_FILE = "job.yaml"
 README_FILE = "DATASET.md"
@@ -18,6 +18,8 @@ LOG_FOLDER = "_logs"
 STAGING = "_staging"
 FENCED = ".fenced"
 """Ends the name of an attempt's folder that was taken out of the attempt's reach."""
+BEGUN = "_begun"
+"""A mark in an attempt's folder, from its beginning until the folder is revoked."""
 TEMPORARY = f"{STAGING}/_tmp"
 """Files on their way to their final names; one that a killed process left is swept."""
 LOCK_CLAIMS = f"{STAGING}/_lock"

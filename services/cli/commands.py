@@ -105,8 +105,8 @@ def pack(options: argparse.Namespace) -> int:
 def status(options: argparse.Namespace) -> int:
     """`verso status`."""
     from services.job.record import require_job
-    from services.read.damage import explain_damage
     from services.read.status import read_status
+    from services.read.verdict import explain_damage
     from services.run.lock import shows_life
 
     store = _dataset(options.out)
@@ -136,10 +136,9 @@ def status(options: argparse.Namespace) -> int:
 
 def verify(options: argparse.Namespace) -> int:
     """`verso verify`."""
-    from services.read.audit import audit, describe_audit
-    from services.read.damage import explain_damage
+    from services.read.audit import audit, describe_audit, describe_independent, verify_independently
+    from services.read.verdict import explain_damage
     from services.read.verify import verify as read_back
-    from services.read.verify_independent import describe_independent, verify_independently
 
     store = _committed(options.out)
     verdict = _with_progress(_scenes_asked(store), "verify", partial(read_back, store))
@@ -195,8 +194,7 @@ def _with_progress(scenes: int, what: str, work: Callable[[Callable[[Any], None]
 
 def query(options: argparse.Namespace) -> int:
     """`verso query`."""
-    from services.read.query import ask
-    from services.read.query_formats import write_rows
+    from services.read.query import ask, write_rows
 
     with ask(_dataset(options.out), options.sql) as rows:
         wide = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
@@ -218,8 +216,8 @@ def columns(options: argparse.Namespace) -> int:
 
 def replay(options: argparse.Namespace) -> int:
     """`verso replay`."""
-    from services.read.damage import explain_damage
     from services.read.replay import replay_scene
+    from services.read.verdict import explain_damage
 
     if options.repair:
         return _repair(options)
@@ -240,8 +238,8 @@ def replay(options: argparse.Namespace) -> int:
 
 def _repair(options: argparse.Namespace) -> int:
     """`verso replay --repair`."""
-    from services.read.damage import explain_damage
     from services.read.repair import repair
+    from services.read.verdict import explain_damage
 
     store = _committed(options.out)
     with explain_damage(store):
@@ -258,8 +256,8 @@ def _repair(options: argparse.Namespace) -> int:
 
 def scene(options: argparse.Namespace) -> int:
     """`verso scene`."""
-    from services.read.damage import explain_damage
-    from services.read.scene_export import export_scene
+    from services.read.scene_geometry import export_scene
+    from services.read.verdict import explain_damage
 
     store = _dataset(options.out)
     with explain_damage(store):
@@ -272,7 +270,7 @@ def scene(options: argparse.Namespace) -> int:
 def _dataset(out: str) -> "Store":
     """The store of an output folder. Raises OutputError where it is none."""
     from services.job.record import require_dataset
-    from workers.store.local import open_store
+    from workers.store.store import open_store
 
     return require_dataset(open_store(out))
 
@@ -280,7 +278,7 @@ def _dataset(out: str) -> "Store":
 def _committed(out: str) -> "Store":
     """The store of an output folder, also of one that lost its job.yaml. Raises OutputError where it is none."""
     from schemas.dataset.layout import COMMITS
-    from workers.store.local import open_store
+    from workers.store.store import open_store
 
     store = open_store(out)
     return store if next(iter(store.files(COMMITS)), None) is not None else _dataset(out)
@@ -288,9 +286,9 @@ def _committed(out: str) -> "Store":
 
 def report(options: argparse.Namespace) -> int:
     """`verso report`."""
-    from services.read.damage import explain_damage
-    from services.report.report import write_report
-    from workers.store.local import open_store
+    from services.look.report import write_report
+    from services.read.verdict import explain_damage
+    from workers.store.store import open_store
 
     began = time.monotonic()
     store = open_store(options.out)
@@ -307,9 +305,9 @@ def report(options: argparse.Namespace) -> int:
 
 def serve(options: argparse.Namespace) -> int:
     """`verso serve`."""
-    from services.report.follow import Follower
-    from services.report.server import choose_place, ended_by_signal, serving
-    from workers.store.local import open_store
+    from services.look.live import Follower
+    from services.look.server import choose_place, ended_by_signal, serving
+    from workers.store.store import open_store
 
     place = choose_place(options.host, options.port, options.token)
     follower = Follower(open_store(options.out), options.scenes)

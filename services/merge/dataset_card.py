@@ -1,8 +1,8 @@
 """OUT/DATASET.md: the contents of a dataset, the stack that made it, and the sources of its shapes."""
 
 from schemas.base import Counts
-from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE, stored_roles
+from schemas.dataset.shard import Fingerprint
 from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Captures
 from services.job.record import JobRecord
@@ -22,18 +22,18 @@ SHAPES_OF_CAPTURES = (
 )
 
 SEAL = ("<!-- SHA-256 of the text above: ", " -->\n")
-"""The ends of the card's last line; cards of earlier versions have none."""
+"""The ends of the card's last line."""
 
 
 def is_card_sealed(data: bytes) -> bool:
-    """Whether the bytes of a card are those that a run of this version wrote."""
+    """Whether the bytes of a card are those that a run wrote."""
     return is_sealed(data, *SEAL)
 
 
 def write_card(store: Store, record: JobRecord, catalogue: Catalogue, merged: MergeResult) -> None:
     """Writes DATASET.md."""
     fingerprint = Fingerprint.model_validate_json(store.read(FINGERPRINT_FILE))
-    store.write_whole(README_FILE, seal(describe_dataset(record, catalogue, merged, fingerprint), *SEAL))
+    store.put(README_FILE, seal(describe_dataset(record, catalogue, merged, fingerprint), *SEAL))
 
 
 def describe_dataset(record: JobRecord, catalogue: Catalogue, merged: MergeResult, fingerprint: Fingerprint) -> str:

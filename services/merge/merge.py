@@ -20,12 +20,10 @@ above `objects.CONDITIONAL_BYTES` are asked for and then put, not in one step.
 """
 
 import contextlib
-import functools
 import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -36,14 +34,14 @@ import pyarrow.parquet as pq
 from schemas.dataset.layout import CAM_POSES, CAMERAS, MANIFEST, OBJECTS, SUCCESS_FILE, is_merged_path, is_shape
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMA_VERSION, SCHEMAS, TABLES
 from schemas.errors import RunError, VersoError
-from services.merge.reading import Block, PublishedFiles, map_ahead, read_blocks
-from services.merge.shared import SCRATCH, SharedRows, merge_folder
+from services.merge.reading import Block, PublishedFiles, read_blocks
+from services.merge.shared import SharedRows, merge_folder
 from services.merge.tables import MergedTable, PoseFiles
 from workers.store.attempt import sweep
 from workers.store.canonical import dataset_digest
 from workers.store.commit import commits_digest
 from workers.store.manifest import PARQUET_OPTIONS
-from workers.store.store import Store, Version
+from workers.store.store import Entry, Store, map_ahead, stat_all
 
 
 class Merging:
@@ -122,7 +120,7 @@ class Installation:
         self._store = store
         self._folder = folder
         self._require_unchanged = require_unchanged
-        self._new: dict[str, Version] = {}
+        self._new: dict[str, Entry] = {}
         """Objects that were put where there was nothing."""
 
     def __enter__(self) -> "Installation":
@@ -135,7 +133,7 @@ class Installation:
         for key, mine in self._new.items():
             with contextlib.suppress(VersoError):
                 if key.endswith(".parquet"):
-                    self._store.install(_empty_table(self._folder, key), key, mine)
+                    self._store.replace(_empty_table(self._folder, key), key, mine)
 
     def put_files(self, files: Mapping[str, Path]) -> dict[str, dict[str, object]]:
         """Takes `_SUCCESS` away, then puts the files into their places; older ones that have no successor go.
@@ -144,46 +142,41 @@ class Installation:
         these come back. Raises RunError where another merge replaced a file meanwhile.
         """
         store = self._store
-        before = store.versions(_FOLDERS, [*_SINGLE, SUCCESS_FILE])
+        before = stat_all(store, _FOLDERS, [*_SINGLE, SUCCESS_FILE])
         self._require_unchanged()
         if before.pop(SUCCESS_FILE, None) is not None:
-            store.withdraw(SUCCESS_FILE, self._folder)
-            store.sync_folders_of([SUCCESS_FILE])
+            if not store.withdraw(SUCCESS_FILE, self._folder):
+                store.remove(SUCCESS_FILE)
+            store.sync([SUCCESS_FILE])
         stale = sorted(before.keys() - files.keys())
         emptied = {}
         for key in stale:
-            if store.root is None and is_merged_path(key):
+            if not store.withdraw(key, self._folder):
                 emptied[key] = _empty_table(self._folder, key)
-            else:
-                store.withdraw(key, self._folder)
-                store.remove_empty(key.rpartition("/")[0])
-        with ThreadPoolExecutor(AT_ONCE) as pool:
-            spread = functools.partial(map_ahead, pool, window=AT_ONCE) if store.root is None else map
-            for _ in spread(
-                lambda item: self._put(item[0], item[1], before.get(item[0])), {**emptied, **files}.items()
-            ):
-                pass
-        store.sync_folders_of([*files, *stale])
+        placed = {**emptied, **files}.items()
+        for _ in map_ahead(store, lambda item: self._put(*item, before.get(item[0])), placed, at_once=AT_ONCE):
+            pass
+        store.sync([*files, *stale])
         return {key: file_entry(path) for key, path in emptied.items()}
 
     def put_success(self, data: bytes) -> None:
         """Writes `_SUCCESS`. Raises RunError where another merge wrote it, or took this merge's folder away."""
         local = self._folder / SUCCESS_FILE
         local.write_bytes(data)
-        before = self._store.versions((), (SUCCESS_FILE,))
+        before = self._store.stat(SUCCESS_FILE)
         self._require_unchanged()
-        self._store.install(local, SUCCESS_FILE, before.get(SUCCESS_FILE))
+        self._store.replace(local, SUCCESS_FILE, before)
 
-    def _put(self, key: str, local: Path, before: Version | None) -> None:
-        now = self._store.install(local, key, before)
+    def _put(self, key: str, local: Path, before: Entry | None) -> None:
+        now = self._store.replace(local, key, before)
         if now is not None and before is None:
             self._new[key] = now
 
 
 def sizes_agree(store: Store, files: Mapping[str, Mapping[str, object]]) -> bool:
     """Whether these files are there with their sizes, and no others where merged files are."""
-    found = store.versions(_FOLDERS, _SINGLE)
-    return {key: version.bytes for key, version in found.items()} == {key: file["bytes"] for key, file in files.items()}
+    found = stat_all(store, _FOLDERS, _SINGLE)
+    return {key: entry.bytes for key, entry in found.items()} == {key: file["bytes"] for key, file in files.items()}
 
 
 def _empty_table(folder: Path, key: str) -> Path:
@@ -223,7 +216,8 @@ def merge(
     commits = commits_digest(store)
     asked = {"first_scene": first_scene, "stop_scene": stop_scene, "commits": commits}
     if (done := _merged_already(store, asked)) is not None:
-        store.drop_scratch(SCRATCH)
+        with merge_folder(store):
+            pass  # what a killed merge left goes
         return _result(done)
 
     def require_unchanged() -> None:

@@ -1,15 +1,10 @@
 """Reading of committed ranges for the merge, in blocks whose rows are joined, and the check that their files are published."""
 
-import functools
-import hashlib
 import sqlite3
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -20,20 +15,15 @@ from schemas.dataset.layout import RANGES, asset_path, is_range_file, is_shape, 
 from schemas.dataset.tables import SCHEMAS, SHAPE_FILE_COLUMNS, TABLES
 from schemas.errors import CorruptError
 from services.merge.shared import explain_full_disk, open_scratch
-from workers.store.commit import committed_files
-from workers.store.ledger import Spread, iter_ranges, range_rows
+from workers.store.commit import committed_files, read_range_file
+from workers.store.ledger import iter_ranges, range_rows
 from workers.store.manifest import conform, decode_rows, join_rows
-from workers.store.store import Store
+from workers.store.store import Store, map_ahead
 
 RANGES_PER_BLOCK = 128
 ROWS_PER_BLOCK = 4_096
 """A block ends with either of them, rows of all tables counted: small enough for memory, large enough to be fast."""
 
-AT_ONCE = 16
-"""Ranges that are read at once from an object store, where each request waits. A disk is read one by one."""
-
-A = TypeVar("A")
-B = TypeVar("B")
 Range = Sequence[CommitRecord]
 """A range's record, followed by its retries."""
 
@@ -59,7 +49,7 @@ class _RangeRead:
     @property
     def rows(self) -> int:
         """Of all tables; those of retries are counted with what they replace."""
-        return sum(entry.rows for record in self.records for entry in record.tables.values())
+        return sum(sum(record.tables.values()) for record in self.records)
 
 
 def read_blocks(store: Store, first_scene: int, stop_scene: int) -> Iterator[Block]:
@@ -68,36 +58,18 @@ def read_blocks(store: Store, first_scene: int, stop_scene: int) -> Iterator[Blo
     Raises as `iter_ranges`, and CorruptError naming a table that is missing or altered, or a range that does not hold
     each of its scenes once.
     """
-    with ThreadPoolExecutor(AT_ONCE) as pool:
-        spread: Spread = functools.partial(map_ahead, pool) if store.root is None else map
-        ranges = iter_ranges(store, first_scene, stop_scene, spread)
-        block: list[_RangeRead] = []
-        rows = 0
-        for read in spread(lambda records: _read_range(store, records), ranges):
-            block.append(read)
-            rows += read.rows
-            if len(block) >= RANGES_PER_BLOCK or rows >= ROWS_PER_BLOCK:
-                yield _joined(block)
-                block, rows = [], 0
-        if block:
+    block: list[_RangeRead] = []
+    rows = 0
+    for read in map_ahead(
+        store, lambda records: _read_range(store, records), iter_ranges(store, first_scene, stop_scene)
+    ):
+        block.append(read)
+        rows += read.rows
+        if len(block) >= RANGES_PER_BLOCK or rows >= ROWS_PER_BLOCK:
             yield _joined(block)
-
-
-def map_ahead(
-    pool: ThreadPoolExecutor, function: Callable[[A], B], items: Iterable[A], window: int = 2 * AT_ONCE
-) -> Iterator[B]:
-    """The results of `function`, in the order of `items`; at most `window` of them are under way or wait."""
-    waiting: deque[Future[B]] = deque()
-    try:
-        for item in items:
-            waiting.append(pool.submit(function, item))
-            if len(waiting) >= window:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-    finally:
-        for future in waiting:
-            future.cancel()
+            block, rows = [], 0
+    if block:
+        yield _joined(block)
 
 
 def _read_range(store: Store, records: Range) -> _RangeRead:
@@ -105,23 +77,14 @@ def _read_range(store: Store, records: Range) -> _RangeRead:
         files = [committed_files(store, record) for record in records]
         return _RangeRead(records, files, {table: range_rows(store, records, table) for table in TABLES})
     (record,) = records
-    tables = {table: _read_table(store, record, table) for table in TABLES if record.tables[table].rows}
+    tables = {
+        table: read_range_file(store, record, _table_path(record, table)) for table in TABLES if record.tables[table]
+    }
     return _RangeRead(records, [record.files], tables)
 
 
-def _read_table(store: Store, record: CommitRecord, table: str) -> bytes:
-    """The bytes of a published file. Raises CorruptError naming one that is missing or altered."""
-    path = range_table_path(record.span.start, table, record.span.retry)
-    entry = next((file for file in record.files if file.path == path), None)
-    if entry is None:
-        raise CorruptError(f"the commit of the range from scene {record.span.start} names no {path}")
-    try:
-        data = store.read(path)
-    except FileNotFoundError as error:
-        raise CorruptError(f"{path} is named by a commit and is neither staged nor published") from error
-    if hashlib.sha256(data).hexdigest() != entry.sha256:
-        raise CorruptError(f"{path} does not match the SHA-256 in its commit: restore it from a copy")
-    return data
+def _table_path(record: CommitRecord, table: str) -> str:
+    return range_table_path(record.span.start, table, record.span.retry)
 
 
 def _joined(block: Sequence[_RangeRead]) -> Block:
@@ -160,8 +123,8 @@ def _decoded(read: _RangeRead, table: str) -> pa.Table:
     data = read.tables[table]
     if isinstance(data, pa.Table):
         return data
-    span, awaited = read.records[0].span, read.records[0].tables[table].rows
-    path = range_table_path(span.start, table, span.retry)
+    awaited = read.records[0].tables[table]
+    path = _table_path(read.records[0], table)
     rows = decode_rows(data, path)
     if len(rows) != awaited:
         raise CorruptError(f"{path} has {len(rows)} rows, and its commit says {awaited}")
@@ -213,12 +176,14 @@ class PublishedFiles:
     def __init__(self, store: Store, folder: Path) -> None:
         self._store = store
         self._listed: sqlite3.Connection | None = None
-        if store.root is None:
+        if store.at_once > 1:  # one listing in place of a request for each file
             with explain_full_disk():
                 self._listed = open_scratch(
                     folder / "listed.sqlite", "CREATE TABLE files (path TEXT PRIMARY KEY, bytes INTEGER)"
                 )
-                self._listed.executemany("INSERT OR REPLACE INTO files VALUES (?, ?) ", store.listing())
+                self._listed.executemany(
+                    "INSERT OR REPLACE INTO files VALUES (?, ?)", ((one.key, one.bytes) for one in store.files(""))
+                )
 
     def check(self, block: Block) -> None:
         """Raises CorruptError naming a file that is missing or has another size than its commit says.
@@ -252,7 +217,7 @@ def unread(block: Block) -> Iterator[tuple[CommitRecord, FileEntry]]:
     for record, entry in block.files:
         folder, _, name = entry.path.rpartition("/")
         table = name.removesuffix(".parquet")
-        if not folder.startswith(RANGES) or not record.tables[table].rows:
+        if not folder.startswith(RANGES) or not record.tables[table]:
             yield record, entry
 
 
@@ -271,7 +236,7 @@ def stored_images(block: Block) -> Iterator[tuple[str, int]]:
         files.field("path").to_pylist(), files.field("bytes").to_pylist(), scenes, strict=True
     ):
         pose = pose_of_image(path)
-        if pose is None or (terms.pairs_per_scene and pose // (2 * terms.pairs_per_scene) != scene):
+        if pose is None or pose // (2 * terms.pairs_per_scene) != scene:
             raise CorruptError(f"the views of scene {scene} list {path!r}, which is not an image of that scene")
         yield path, size
 

@@ -34,8 +34,6 @@ def merge_folder(store: Store) -> Iterator[Path]:
         with explain_full_disk(), store.scratch(SCRATCH) as folder:
             yield folder
     except (MachineError, FileNotFoundError) as error:
-        if store.root is not None and not store.root.is_dir():
-            raise MachineError(f"{store.name} was removed while it was merged") from error
         if isinstance(error, FileNotFoundError):
             raise RunError(
                 f"{error.filename or SCRATCH} was removed while {store.name} was merged: another coordinator merges here; "

@@ -5,13 +5,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from schemas.durations import describe_seconds
-from schemas.errors import MachineError, VersoError
+from schemas.errors import MachineError, VersoError, describe_seconds
 from schemas.queue import submission_id
 from services.queue.queue import JobView, Queue
 from services.queue.supervise import Drivers, turn, waiting_for_folder
 from workers.store.ledger import list_commits
-from workers.store.local import open_store
+from workers.store.store import open_store
 
 MOST_LOOKS: Final = 20
 """Output folders that are looked into for one listing: those of the latest jobs."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import pyarrow.compute as pc
 
+from schemas.dataset.commit import Ledger
 from schemas.dataset.layout import COMMITS, STAGING, commit_path
-from schemas.dataset.ledger import Ledger
 from schemas.errors import OutputError
 from services.merge.merge import read_success
 from services.run.lock import Holder, read_holder
@@ -87,8 +87,8 @@ def _rate(store: Store, ledger: Ledger) -> float | None:
         *range(max(0, len(ledger.start) - RATE_LOOKS), len(ledger.start)),
     }:
         key = commit_path(int(ledger.start[at]), int(ledger.retry[at]))
-        if (written := store.modified(key)) is not None:
-            scenes[written, key] = ledger.count(at)
+        if (written := store.stat(key)) is not None:
+            scenes[written.modified_s, key] = ledger.count(at)
     latest = sorted(scenes)[-RATE_COMMITS:]
     if len(latest) < 2 or latest[-1][0] <= latest[0][0]:
         return None

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from schemas.dataset.commit import Ledger
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
-from schemas.dataset.ledger import Ledger
 from schemas.dataset.shard import JobChange, ShardOrder
 from schemas.errors import FingerprintError
 from schemas.job.job import Job
@@ -23,12 +23,11 @@ from services.run.progress import ProgressLine, event_log, log_event, note_of_fi
 from services.run.range_planner import SpanPlan, deal_shards, find_lost, group_shards, plan_spans
 from services.run.ray_cluster import SharedSlots, Slots, open_ray
 from workers.assets.catalogue import Catalogue
-from workers.pipeline.captures.listing import open_sources
+from workers.capture.results import open_sources
 from workers.render.tiers import require_tier
 from workers.store.attempt import sweep
 from workers.store.ledger import LedgerKeeper, list_commits
-from workers.store.local import open_store
-from workers.store.store import Store
+from workers.store.store import Store, open_store
 
 
 @dataclass(frozen=True)
@@ -151,7 +150,7 @@ def finish(run: Run) -> MergeResult:
     """Brings job.yaml up to date, merges, and writes the card. Raises RunError where the lock was lost."""
     job, text = run.record.job, encode_job(run.record)
     if run.store.size(JOB_FILE) is None or run.store.read(JOB_FILE) != text:
-        run.store.write_whole(JOB_FILE, text)
+        run.store.put(JOB_FILE, text)
     merged = merge(run.store, job.first_scene, job.stop_scene, run.lock.require_held)
     write_card(run.store, run.record, run.catalogue, merged)
     log_event("finished", job=job.name, digest=merged.digest)
@@ -164,7 +163,7 @@ def order_pattern(store: Store, record: JobRecord, ledger: Ledger) -> ShardOrder
     text = encode_job(record)
     change = None
     if store.size(JOB_FILE) is None:
-        store.write_whole(JOB_FILE, text)
+        store.put(JOB_FILE, text)
     elif (before := store.read(JOB_FILE)) != text:
         change = JobChange(before=before.decode(), after=text.decode())
     if not ledger.rows.num_rows and not ledger.lost:

@@ -52,9 +52,9 @@ def littered(root: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(attempt_module, "publish", lambda *_: None)
         assert attempt_at(store, FIRST, FIRST + RANGE, settings, small_scene).commit().won
-    store.fence(f"_staging/{FIRST:010d}/{fenced.name}")
+    store.revoke(f"_staging/{FIRST:010d}/{fenced.name}")
     attempt_at(store, FIRST + RANGE, STOP, settings, small_scene)
-    store.write_whole("_staging/_tmp/.dead", b"x")
+    store.put("_staging/_tmp/.dead", b"x")
     assert store.size(f"_staging/{FIRST:010d}/{loser.name}/_current") is not None
 
 

@@ -167,14 +167,14 @@ def test_on_a_real_disk_that_loses_writes_the_kernel_tells_the_attempt_and_no_la
         store = LocalStore(mounted / "out")
         store.prepare()
         staging = staging_path(0, "r0-mine")
-        store.open_staging(staging)
+        stage = store.stage(staging)
         other = "import os, sys; descriptor = os.open(sys.argv[1], os.O_RDONLY); input(); os.sync()\n"
         other += "import ctypes; sys.exit(ctypes.CDLL(None).syncfs(descriptor) != 0)"
         with subprocess.Popen([sys.executable, "-c", other, str(mounted)], stdin=subprocess.PIPE) as program:
-            store.write_staged(staging, "mug/big.png", os.urandom(30 << 20))
+            stage.write("mug/big.png", os.urandom(30 << 20))
             program.communicate(b"\n")
             assert program.returncode == 1, "the other program was told"
         subprocess.run(["mount", "-o", "remount,size=80m", str(below)], check=True)
         file_system.sync_tree(store.path(staging))  # the old order: a descriptor that is opened now hears nothing
         with pytest.raises(MachineError, match="disk"):
-            store.make_durable(staging)
+            stage.flush()

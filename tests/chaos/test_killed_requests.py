@@ -61,7 +61,7 @@ def littered(store: ObjectStore) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(attempt_module, "publish", lambda *_: None)
         assert attempt_at(store, FIRST, FIRST + RANGE, settings, small_scene).commit().won
-    store.fence(staging_path(FIRST, fenced.name))
+    store.revoke(staging_path(FIRST, fenced.name))
     attempt_at(store, FIRST + RANGE, STOP, settings, small_scene)
 
 

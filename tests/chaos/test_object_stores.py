@@ -152,15 +152,16 @@ def test_files_that_are_put_in_parts_arrive_whole_through_faults(tmp_path):
     data = random.Random(0).randbytes(12 << 20)
     local = tmp_path / "large"
     with store_in(bucket, timeout_s=2.0) as store:
+        stage = store.stage("_staging/0/r0-x")
         for number in itertools.count():
-            with store.stream_staged("_staging/0/r0-x", f"{number}.tar") as file:
+            with stage.stream(f"{number}.tar") as file:
                 file.write(data)
             local.write_bytes(data)
-            store.install(local, f"{number}.csv")
+            store.replace(local, f"{number}.csv")
             assert store.read(f"_staging/0/r0-x/{number}.tar") == store.read(f"{number}.csv") == data
             if bucket.requests["fault"] >= 5:
                 break
         fail_puts_of(bucket, "_staging/0/r0-x/last.tar", ["reset when done"], method="POST", skip=1)
-        with store.stream_staged("_staging/0/r0-x", "last.tar") as file:
+        with stage.stream("last.tar") as file:
             file.write(data)  # the parts are joined, and nobody hears of it
         assert store.read("_staging/0/r0-x/last.tar") == data

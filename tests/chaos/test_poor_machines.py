@@ -13,14 +13,16 @@ from tests.chaos.test_lost_processes import JOB
 
 ROOT = Path(__file__).resolve().parents[2]
 
-WALL_CLOCK = re.compile(r"time\.time\b|datetime|gmtime|localtime|st_[mc]time|CLOCK_REALTIME|last_modified|\.modified\(")
+WALL_CLOCK = re.compile(
+    r"time\.time\b|datetime|gmtime|localtime|st_[mc]time|CLOCK_REALTIME|last_modified|\.modified_s\b"
+)
 
 MAY_READ_IT = {
     "services/cli/queue_commands.py": "when a job was submitted: the order of jobs of one priority, where any order is right",
     "services/queue/listing.py": "the age of a job, to be shown",
     "services/queue/queue.py": "the time of an event, to be shown",
     "services/read/status.py": "the rate of the latest commits, to be shown",
-    "services/report/progress.py": "when a range was committed, to be shown",
+    "services/look/live.py": "when a range was committed, to be shown",
     "services/run/progress.py": "the time of an event, to be logged",
     "services/run/metrics.py": "when a run began, for the time that is left",
     "workers/store/local.py": "when a file was written, for the rate",

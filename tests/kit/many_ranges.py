@@ -13,13 +13,14 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.dataset.commit import COMMIT_VERSION, CommitRecord, FileEntry, SceneMark, Span, TableEntry
+from schemas.dataset.commit import COMMIT_VERSION, CommitRecord, FileEntry, SceneMark, Span
 from schemas.dataset.layout import COMMITS, RANGES, commit_path, image_path, range_table_path, tar_path
 from schemas.dataset.tables import TABLES
 from tests.made_up_scenes import failed_scene, made_scene, terms
 from workers.store.commit import encode_record
 from workers.store.local import LocalStore
 from workers.store.manifest import sorted_rows, table_of_rows
+from workers.store.store import Entry
 
 PAIRS = 5
 CATEGORY = "mug"
@@ -58,7 +59,7 @@ def record_of(scene_id: int, tables: dict[str, bytes]) -> CommitRecord:
         attempt="r0-made-up",
         terms=TERMS,
         files=tuple(FileEntry(path=path, bytes=size, sha256=sha) for path, (size, sha) in sorted(files.items())),
-        tables={table: TableEntry(rows=rows[table].num_rows) for table in TABLES},
+        tables={table: rows[table].num_rows for table in TABLES},
         scenes=(SceneMark(scene_id=scene_id, outcome="made" if made else "intrinsic", digest="0" * 64),),
     )
 
@@ -108,11 +109,11 @@ class ManyRanges(LocalStore):
             return TAR_BYTES
         return super().size(key)
 
-    def scan(self, prefix: str, sizes: bool = False) -> Iterator[tuple[str, int]]:
-        """Names directly below `prefix`."""
+    def files(self, prefix: str, sizes: bool = True) -> Iterator[Entry]:
+        """The records, and what is really there in other folders."""
         if prefix != COMMITS:
-            return super().scan(prefix, sizes)
-        return ((commit_path(scene_id).rpartition("/")[2], 1) for scene_id in range(self.scenes))
+            return super().files(prefix, sizes)
+        return (Entry(commit_path(scene_id), 1, 0.0, None) for scene_id in range(self.scenes))
 
     def _tables(self, scene_id: int) -> dict[str, bytes]:
         if self._last[0] != scene_id:

@@ -16,9 +16,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from cachetools import LRUCache
 
-from schemas.capture.listing import CaptureListing
+from schemas.capture import CaptureListing
 from schemas.errors import AssetSourceError
 from schemas.job.assets import (
+    BUILT_IN,
+    TABLE,
+    VERSION,
     Assets,
     FolderSource,
     MeshLimits,
@@ -26,8 +29,8 @@ from schemas.job.assets import (
     ShapeNetSource,
     SplitShares,
     deciding_limits,
+    instance_id,
 )
-from schemas.job.category import BUILT_IN, TABLE, VERSION, instance_id
 from schemas.scene.shape import Asset
 from workers.assets.external.listing import Listing, Watch, find_files, find_models, ignore
 

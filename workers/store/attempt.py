@@ -24,7 +24,6 @@ from schemas.dataset.commit import (
     FileEntry,
     SceneMark,
     Span,
-    TableEntry,
     foreign_path,
 )
 from schemas.dataset.layout import (
@@ -58,7 +57,7 @@ from workers.store.manifest import (
     table_of_rows,
     with_shape_files,
 )
-from workers.store.store import Store
+from workers.store.store import Store, is_live
 from workers.store.tars import Packing
 
 CURRENT = "_current"
@@ -79,13 +78,12 @@ def begin_attempt(store: Store, span: Span, terms: CommitTerms, label: str = "")
     `label` becomes part of its name, by which the coordinator knows its own attempts. Raises OutputError where the store
     cannot hold the layout.
     """
-    if store.tar_only and terms.layout != "tar":
+    if terms.layout not in store.layouts:
         raise OutputError(
             f"{store.name} is an object store, which needs output.layout: tar; the job says {terms.layout}"
         )
     host = host_part(socket.gethostname())
     name = "-".join(part for part in (f"r{span.retry}", label, host, str(os.getpid()), uuid.uuid4().hex[:12]) if part)
-    store.open_staging(staging_path(span.start, name))
     return Attempt(store, span, terms, name)
 
 
@@ -98,10 +96,10 @@ def reopen(store: Store, job_change: JobChange | None = None) -> None:
     """Makes a finished dataset an unfinished one, just before it gets another commit. Anyone may, any number of times."""
     with contextlib.suppress(FileNotFoundError):
         if job_change is not None and store.read(JOB_FILE) == job_change.before.encode():
-            store.write_whole(JOB_FILE, job_change.after.encode())
+            store.put(JOB_FILE, job_change.after.encode())
     if store.size(SUCCESS_FILE) is not None:
         store.remove(SUCCESS_FILE)
-        store.sync_folders_of([SUCCESS_FILE])
+        store.sync([SUCCESS_FILE])
 
 
 def retry_of_attempt(name: str) -> int | None:
@@ -114,7 +112,7 @@ def attempts_at(store: Store, start: int) -> list[str]:
     """Names of the attempts that have a folder for the range at `start`, except fenced ones."""
     names = store.children(staging_path(start, "")[:-1])
     known = (name for name in names if retry_of_attempt(name) is not None and not name.endswith(FENCED))
-    return [name for name in known if not store.is_fenced(staging_path(start, name))]
+    return [name for name in known if is_live(store, staging_path(start, name))]
 
 
 def staged_attempts(store: Store) -> Iterator[tuple[int, str]]:
@@ -144,11 +142,11 @@ class Attempt:
         """True once the folder was swept: the attempt can still be compared, but no longer win."""
         self._store = store
         self._terms = terms
-        self._staging = staging_path(span.start, name)
+        self._stage = store.stage(staging_path(span.start, name))
         self._files: dict[str, FileEntry] = {}
         self._rows: dict[str, list[pa.Table]] = {table: [] for table in TABLES}
         self._scenes: list[SceneMark] = []
-        self._packing = Packing(store, self._staging, span, tar=terms.layout == "tar")
+        self._packing = Packing(self._stage, span, tar=terms.layout == "tar")
         self._noted: Mapping[str, object] | None = None
 
     def begin_scene(self, scene_id: int) -> None:
@@ -208,21 +206,22 @@ class Attempt:
     def abandon(self) -> None:
         """Removes the attempt's folder."""
         self._packing.close()
-        self._store.remove_tree(self._staging)
+        self._stage.close()
+        self._store.remove_tree(staging_path(self.span.start, self.name))
 
     def _finish(self) -> CommitRecord:
         """The record of this attempt, after the last of its files is written."""
         tables, entries = {}, []
         for table in TABLES:
             rows = sorted_rows(table, join_rows(table, self._rows[table]).combine_chunks())
-            tables[table] = TableEntry(rows=rows.num_rows)
+            tables[table] = rows.num_rows
             if table == "assets":
                 rows = with_shape_files(rows, self._files)
                 listed = set(shape_paths(rows))
                 entries += [one for path, one in self._files.items() if is_shape(path) and path not in listed]
             file = encoded_file(range_table_path(self.span.start, table, self.span.retry), encode_table(rows))
             with self._skip_if_swept():
-                self._store.write_staged(self._staging, file.path, file.data)
+                self._stage.write(file.path, file.data)
             entries.append(_entry_of(file))
         with self._skip_if_swept():
             entries += self._packing.finish()
@@ -252,9 +251,9 @@ class Attempt:
         key = commit_path(self.span.start, self.span.retry)
         with self._skip_if_swept():
             if not self.fenced and self._store.size(key) is None:
-                self._store.make_durable(self._staging)
+                self._stage.flush()
                 reopen(self._store, job_change)
-                return self._store.put_if_absent(key, encode_record(record), self._staging)
+                return self._stage.put_if_absent(key, encode_record(record))
         return False
 
     def _concede(self, mine: CommitRecord) -> CommitResult:
@@ -273,7 +272,7 @@ class Attempt:
         if current == self._noted:
             return
         with self._skip_if_swept():
-            self._store.write_note(self._staging, CURRENT, json.dumps(current).encode().ljust(_NOTE_BYTES))
+            self._stage.write(CURRENT, json.dumps(current).encode().ljust(_NOTE_BYTES))
         self._noted = current
 
     @contextlib.contextmanager
@@ -309,7 +308,8 @@ def sweep(store: Store, fenced: Collection[tuple[int, str]] | None = ()) -> list
             if sweep_attempt(store, start, attempt, given_up):
                 removed.append(attempt)
         store.remove_empty(f"{STAGING}/{folder}")
-    probes = [f"{COMMITS}/{name}" for name, _ in store.scan(COMMITS) if name.startswith(PROBE_PREFIX)]
+    commits = (entry.key for entry in store.files(COMMITS, sizes=False))
+    probes = [key for key in commits if key.startswith(f"{COMMITS}/{PROBE_PREFIX}")]
     for key in [*probes, *(entry.key for entry in store.files(TEMPORARY))]:
         store.remove(key)  # a living process writes its temporary file again
     return removed
@@ -319,22 +319,23 @@ def sweep_attempt(store: Store, start: int, attempt: str, given_up: bool) -> boo
     """Publishes or removes one attempt's folder; True where it was removed.
 
     An attempt at a range that is not committed is removed only where it is `given_up`, and only after it was fenced:
-    should it be alive, it cannot commit any more. A store where it still may (`fence_is_final`) keeps its files until
-    another attempt has committed the range.
+    should it be alive, it cannot commit any more. A store where it still may (`revoke`) keeps its files until another attempt
+    has committed the range.
     """
     staging = staging_path(start, attempt)
     retry = retry_of_attempt(attempt)
     if retry is None:
         raise CorruptError(f"{staging} is not an attempt of this program: move it away")
+    final = True
     if store.size(commit_path(start, retry)) is None:
         if not given_up:
             return False
-        store.fence(staging)
+        final = store.revoke(staging)
     record = read_record(store, start, retry)
     if record is not None and record.attempt == attempt:
         publish(store, record)
         return False
-    if record is None and not store.fence_is_final:
+    if record is None and not final:
         return False
     for folder in (staging, staging + FENCED):
         store.remove_tree(folder)

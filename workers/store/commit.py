@@ -28,8 +28,7 @@ from schemas.dataset.layout import (
     range_table_path,
     staging_path,
 )
-from schemas.errors import CommitConflict, CorruptError, OutputError
-from schemas.plain_line import plain_line
+from schemas.errors import CommitConflict, CorruptError, OutputError, plain_line
 from workers.store.manifest import listed_files
 from workers.store.store import Store
 
@@ -59,10 +58,9 @@ def encode_record(record: CommitRecord) -> bytes:
     A file is [path, bytes, sha256], a table its number of rows; `marks` holds the digests of all scenes, and `failed`
     [scene id, kind, reason] of those that failed.
     """
-    raw = record.model_dump(mode="json", exclude={"files", "tables", "scenes"})
+    raw = record.model_dump(mode="json", exclude={"files", "scenes"})
     raw["files"] = [[entry.path, entry.bytes, entry.sha256] for entry in record.files]
-    raw["tables"] = {table: entry.rows for table, entry in record.tables.items()}
-    raw["marks"] = "".join(scene.digest[:MARK].ljust(MARK, "-") for scene in record.scenes)
+    raw["marks"] = "".join(scene.digest.ljust(MARK, "-") for scene in record.scenes)
     raw["failed"] = [[one.scene_id, one.outcome, one.reason] for one in record.scenes if one.outcome != "made"]
     return seal_record(raw)
 
@@ -81,7 +79,7 @@ def decode_record(data: bytes, name: str) -> CommitRecord:
     """
     raw = _unsealed(data, name)
     try:
-        return CommitRecord.model_validate(_expanded(raw) if "marks" in raw else raw)
+        return CommitRecord.model_validate(_expanded(raw))
     except ValidationError as error:
         first = error.errors()[0]
         where = plain_line("".join(f"{part}: " for part in (".".join(map(str, first["loc"])),) if part), 100)
@@ -129,8 +127,7 @@ def _expanded(raw: dict[str, Any]) -> dict[str, Any]:
     if failed:
         raise ValueError(f"scene {next(iter(failed))} failed and is not of the range")
     files = [dict(zip(("path", "bytes", "sha256"), entry, strict=True)) for entry in raw["files"]]
-    tables = {table: {"rows": rows} for table, rows in raw["tables"].items()}
-    return {**raw, "files": files, "tables": tables, "scenes": scenes}
+    return {**raw, "files": files, "scenes": scenes}
 
 
 def commit_names(store: Store) -> list[tuple[int, int, str]]:
@@ -169,14 +166,15 @@ def commits_digest(store: Store) -> str:
 
 def _codes_and_sizes(store: Store, sizes: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     codes, found = array("q"), array("q")
-    for name, size in store.scan(COMMITS, sizes):
+    for entry in store.files(COMMITS, sizes):
+        name = entry.key.removeprefix(f"{COMMITS}/")
         if name.startswith("."):
             continue
         commit = parse_commit_name(name)
         if commit is None:
             raise CorruptError(f"{COMMITS}/{name} in {store.name} is not a commit of this program: move it away")
         codes.append(code_of(*commit))
-        found.append(size)
+        found.append(entry.bytes)
     return np.asarray(codes), np.asarray(found)
 
 
@@ -211,11 +209,9 @@ def check_retries(start: int, retries: Sequence[int]) -> None:
 def committed_files(store: Store, record: CommitRecord) -> tuple[FileEntry, ...]:
     """Every file of a commit, sorted by path: images or tars, shapes and the range's tables.
 
-    A record of version 1 names them all. For later ones the range's `views` and `assets` are read, in place or staged.
+    The record names tables and tars. The range's `views` and `assets` name the others; they are read in place or staged.
     Raises CorruptError naming a table that is missing, damaged, or lists a file that is not the range's own.
     """
-    if record.schema_version == 1:
-        return record.files
     files = {entry.path: entry for entry in record.files}
     for table in ("assets", "views") if record.terms.layout == "files" else ("assets",):
         path = range_table_path(record.span.start, table, record.span.retry)
@@ -234,18 +230,18 @@ def publish(store: Store, record: CommitRecord, own: Iterable[FileEntry] | None 
     another size by the same stack.
     """
     files = committed_files(store, record) if own is None else tuple(own)
-    folders, plain = _staging_folders(record), set[str]()
+    folders = _staging_folders(record)
     for entry in files:
         final = store.size(entry.path) if is_shape(entry.path) else None
         if final is None:
-            if not _move(store, folders, entry, plain):
+            if not _move(store, folders, entry):
                 _check_final(store, entry)
         elif final != entry.bytes and record.terms.fingerprint_mode == "strict":
             raise CommitConflict(
                 f"{entry.path} has {final} bytes, and {entry.bytes} in the range from scene {record.span.start}, "
                 f"made by {record.terms.fingerprint}: two attempts at one shape differ"
             )
-    store.sync_folders_of(entry.path for entry in files)
+    store.sync(entry.path for entry in files)
     for folder in folders:
         store.remove_tree(folder)
 
@@ -284,7 +280,7 @@ def compare_attempts(
         for scene in mine.scenes
         if (other := theirs.get(scene.scene_id)) is not None
         and "environmental" not in (scene.outcome, other.outcome)
-        and (scene.outcome, scene.digest[:MARK]) != (other.outcome, other.digest[:MARK])
+        and (scene.outcome, scene.digest) != (other.outcome, other.digest)
     ]
     shapes = {entry.path: entry.sha256 for entry in its_files if is_shape(entry.path)}
     different += [entry.path for entry in my_files if shapes.get(entry.path, entry.sha256) != entry.sha256]
@@ -308,11 +304,8 @@ def _staging_folders(record: CommitRecord) -> tuple[str, str]:
     return staging, staging + FENCED
 
 
-def _move(store: Store, folders: Iterable[str], entry: FileEntry, plain: set[str]) -> bool:
-    """Renames one file into place from one of the folders; False where it is not staged (any more).
-
-    `plain`: folders that are known to be no links out of the output folder.
-    """
+def _move(store: Store, folders: Iterable[str], entry: FileEntry) -> bool:
+    """Moves one file into place from one of the folders; False where it is not staged (any more)."""
     for folder in folders:
         source = f"{folder}/{entry.path}"
         staged = store.size(source)
@@ -321,7 +314,7 @@ def _move(store: Store, folders: Iterable[str], entry: FileEntry, plain: set[str
         if staged != entry.bytes:
             raise CorruptError(f"{source} has {staged} bytes, and its commit says {entry.bytes}")
         with contextlib.suppress(FileNotFoundError):
-            store.rename(source, entry.path, plain)
+            store.move(source, entry.path)
             return True
     return False
 

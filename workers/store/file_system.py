@@ -12,7 +12,7 @@ import tempfile
 import time
 import uuid
 import weakref
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import IO
@@ -32,9 +32,6 @@ _AT_ONCE = 8
 
 _FEW_FOLDERS = 3
 """Up to this many folders are flushed one by one; for more, one syncfs is less work where it can be trusted."""
-
-Opener = Callable[[str, int], int]
-"""Opens a path with flags, as `open` takes it."""
 
 _REMEDIES = {
     errno.ENOSPC: "the disk is full; free some space and start again, nothing finished is lost",
@@ -102,20 +99,14 @@ class OpenTree:
                 sync_path(root / folder)
 
 
-def refuse_link_out(root: str | Path, key: str, plain: set[str] | None = None) -> None:
+def refuse_link_out(root: str | Path, key: str) -> None:
     """Raises OutputError where a folder on the way to `key`, or `key` itself, is a symbolic link that leads out of `root`.
 
-    So a folder from somebody else cannot make this program write or remove elsewhere. `plain` collects the folders that were
-    asked: a caller with many keys asks each of them once.
+    So a folder from somebody else cannot make this program write or remove elsewhere.
     """
     base = os.fspath(root)
-    folder, _, _ = key.rpartition("/")
-    if plain is None or folder not in plain:
-        ends = (at for at, letter in enumerate(key) if letter == "/")
-        for end in ends:
-            _refuse_if_link_out(base, key[:end])
-        if plain is not None:
-            plain.add(folder)
+    for end in (at for at, letter in enumerate(key) if letter == "/"):
+        _refuse_if_link_out(base, key[:end])
     _refuse_if_link_out(base, key)
 
 
@@ -226,11 +217,6 @@ def _probe_once(root: Path) -> None:
         for path in (source, target):
             with contextlib.suppress(OSError):
                 os.unlink(path)
-
-
-def open_uncut(path: str, flags: int) -> int:
-    """A descriptor as `open` asks for it, except that a file that is there keeps its bytes."""
-    return os.open(path, flags & ~os.O_TRUNC, 0o666)
 
 
 def ignore_missing(function: object, path: str, raised: tuple[type[BaseException], BaseException, object]) -> None:

@@ -7,12 +7,9 @@ rows replace the first ones.
 import contextlib
 import hashlib
 import io
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby, islice
 from operator import itemgetter
-from typing import Protocol, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -20,35 +17,25 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from schemas.dataset.commit import CommitRecord, CommitSummary, summarize
+from schemas.dataset.commit import LEDGER_SCHEMA, CommitRecord, CommitSummary, Ledger, rows_of, summarize
+from schemas.dataset.commit import join_rows as join_summaries
 from schemas.dataset.layout import LEDGER_FILE, MAX_RETRIES, range_table_path
-from schemas.dataset.ledger import LEDGER_SCHEMA, Ledger, rows_of
-from schemas.dataset.ledger import join_rows as join_summaries
 from schemas.dataset.tables import SORT_KEYS
 from schemas.errors import CorruptError, MachineError, RunError
 from workers.store.commit import check_retries, list_codes, read_range_file, require_record, split_code
 from workers.store.manifest import PARQUET_OPTIONS, decode_table, join_rows
-from workers.store.store import Store
-
-A = TypeVar("A")
-B = TypeVar("B")
+from workers.store.store import Store, map_ahead
 
 
-class Spread(Protocol):
-    """Calls a function for each item and gives the results in order, as `map` does; it may call ahead, several at once."""
-
-    def __call__(self, function: Callable[[A], B], items: Iterable[A], /) -> Iterator[B]:
-        """The results in order."""
-
-
-def iter_committed(store: Store, spread: Spread = map) -> Iterator[list[CommitRecord]]:
+def iter_committed(store: Store) -> Iterator[list[CommitRecord]]:
     """The records of every committed range, followed by its retries, in order.
 
-    Raises CorruptError for a damaged or missing record, OutputError for one of a newer version.
+    Raises CorruptError for a damaged or missing record, OutputError for one of a newer version. Some are read ahead
+    where requests wait.
     """
     ranges = groupby(map(split_code, list_codes(store)), key=itemgetter(0))
     groups = ((start, [retry for _, retry in names]) for start, names in ranges)
-    return spread(lambda group: read_range(store, *group), groups)
+    return map_ahead(store, lambda group: read_range(store, *group), groups)
 
 
 def read_range(store: Store, start: int, retries: Sequence[int]) -> list[CommitRecord]:
@@ -57,13 +44,13 @@ def read_range(store: Store, start: int, retries: Sequence[int]) -> list[CommitR
     return [require_record(store, start, retry) for retry in retries]
 
 
-def iter_ranges(store: Store, first_scene: int, stop_scene: int, spread: Spread = map) -> Iterator[list[CommitRecord]]:
+def iter_ranges(store: Store, first_scene: int, stop_scene: int) -> Iterator[list[CommitRecord]]:
     """The records of each range, followed by its retries, in order: exactly the scenes [first_scene, stop_scene).
 
     Raises RunError naming scenes that nobody committed, or that are committed beyond the end.
     """
     awaited = first_scene
-    for records in iter_committed(store, spread):
+    for records in iter_committed(store):
         start, stop = records[0].span.start, records[0].span.stop
         if start != awaited:
             raise RunError(
@@ -136,22 +123,15 @@ def list_commits(store: Store) -> Ledger:
         kept = kept.filter(pa.array(np.isin(known, codes)))
     unread = np.setdiff1d(codes, known, assume_unique=True)
     parts = [kept]
-    summaries = _read_all(store, map(split_code, unread))
+    summaries = map_ahead(store, lambda code: read_summary(store, *split_code(code)), unread)
     while batch := list(islice(summaries, _BATCH)):
         parts.append(rows_of(batch))
     return Ledger(join_summaries(parts), lost, np.searchsorted(codes, unread))
 
 
 def read_summary(store: Store, start: int, retry: int = 0) -> CommitSummary:
-    """The summary of a record; the reasons that a record of version 1 lacks come from its table of failures."""
-    record = require_record(store, start, retry)
-    summary = summarize(record)
-    if all(reason is not None for _, _, reason in summary.failed):
-        return summary
-    path = range_table_path(start, "failures", retry)
-    rows = decode_table("failures", read_range_file(store, record, path), path).to_pylist()
-    reasons = {row["scene_id"]: row["reason"] for row in rows}
-    return replace(summary, failed=tuple((scene, kind, reasons.get(scene, "")) for scene, kind, _ in summary.failed))
+    """The summary of a record. Raises as `require_record`."""
+    return summarize(require_record(store, start, retry))
 
 
 def save_rows(store: Store, rows: pa.Table) -> None:
@@ -159,7 +139,7 @@ def save_rows(store: Store, rows: pa.Table) -> None:
     sink = io.BytesIO()
     pq.write_table(rows, sink, **PARQUET_OPTIONS)
     data = sink.getvalue()
-    store.write_whole(LEDGER_FILE, hashlib.sha256(data).hexdigest().encode() + b"\n" + data)
+    store.put(LEDGER_FILE, hashlib.sha256(data).hexdigest().encode() + b"\n" + data)
 
 
 class LedgerKeeper:
@@ -174,8 +154,8 @@ class LedgerKeeper:
         self._save_if_due()
 
     def add(self, summaries: Iterable[CommitSummary]) -> None:
-        """Takes new commits; those of records of version 1 are left to the next listing."""
-        self._waiting += [one for one in summaries if None not in {reason for _, _, reason in one.failed}]
+        """Takes new commits."""
+        self._waiting += summaries
         if len(self._waiting) >= _BATCH or self._unkept + len(self._waiting) >= SAVE_EACH:
             self._pack()
             self._save_if_due()
@@ -245,14 +225,3 @@ def _read_kept(store: Store, codes: NDArray[np.int64]) -> pa.Table:
         if row.to_pylist() != rows_of([read_summary(store, *split_code(code))]).to_pylist():
             return none
     return rows
-
-
-def _read_all(store: Store, commits: Iterable[tuple[int, int]]) -> Iterator[CommitSummary]:
-    """The summaries of these records, in order; several requests at once where each takes its time."""
-    if store.root is not None:
-        yield from (read_summary(store, start, retry) for start, retry in commits)
-        return
-    commits = iter(commits)
-    with ThreadPoolExecutor(_AT_ONCE) as pool:
-        while batch := list(islice(commits, _BATCH)):
-            yield from pool.map(lambda commit: read_summary(store, *commit), batch)

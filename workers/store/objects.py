@@ -9,8 +9,7 @@ import contextlib
 import functools
 import tempfile
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, TypeVar
 
@@ -18,10 +17,10 @@ import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError, GenericError, NotSupportedError, PreconditionError
 from obstore.store import from_url
 
-from schemas.dataset.layout import PROBE_PREFIX, TEMPORARY
+from schemas.dataset.layout import BEGUN, PROBE_PREFIX, TEMPORARY
 from schemas.errors import MachineError, OutputError, RunError
-from workers.store.file_system import remove_abandoned, temporary_folder
-from workers.store.store import Entry, Store, Version
+from workers.store.file_system import temporary_folder
+from workers.store.store import Entry, Stage, Store, is_live
 
 if TYPE_CHECKING:
     from obstore import PutMode, PutResult
@@ -36,12 +35,6 @@ _NOT_IMPLEMENTED = ("NotImplemented", "501 Not Implemented")
 
 CONDITIONAL_BYTES = 64 << 20
 """Larger files are put in parts, which cannot be made conditional."""
-
-_AT_ONCE = 16
-"""Requests at once."""
-
-_BEGUN = "_begun"
-"""A mark in an attempt's folder from its beginning until it is swept."""
 
 
 def open_object_store(url: str) -> "ObjectStore":
@@ -59,8 +52,8 @@ class ObjectStore(Store):
     """A bucket, or a prefix in one; what each operation promises stands in `Store`."""
 
     root = None
-    tar_only = True
-    fence_is_final = False
+    layouts = ("tar",)
+    at_once = 16
 
     def __init__(self, bucket: obstore.store.ObjectStore, name: str) -> None:
         self._bucket = bucket
@@ -95,30 +88,12 @@ class ObjectStore(Store):
                 self.remove(key)
         return False
 
-    def open_staging(self, staging: str) -> None:
-        """Marks the attempt as begun."""
-        self.write_whole(f"{staging}/{_BEGUN}", b"")
-
-    def write_staged(self, staging: str, path: str, data: bytes) -> None:
-        """Puts an object of an attempt."""
-        self.write_whole(f"{staging}/{path}", data)
-
-    @contextlib.contextmanager
-    def stream_staged(self, staging: str, path: str) -> Iterator[IO[bytes]]:
-        """A temporary file on the local disk, put as one object in the end."""
-        with tempfile.TemporaryFile() as file:
-            yield file
-            with self._explained(path):
-                self._put_file(f"{staging}/{path}", file)
-
-    def put_if_absent(self, key: str, data: bytes, staging: str | None = None) -> bool:
+    def put_if_absent(self, key: str, data: bytes) -> bool:
         """Puts on the condition that nothing is there.
 
         A put whose answer was lost is sent again, and then refused: what is there tells whether it is ours, because no
         two callers ever put the same bytes at one key.
         """
-        if staging is not None and self.is_fenced(staging):
-            raise FileNotFoundError(f"{staging} was swept")
         try:
             with self._explained(key):
                 _repeat_unanswered(lambda: obstore.put(self._bucket, key, data, mode="create"))
@@ -126,7 +101,7 @@ class ObjectStore(Store):
             return self.read(key) == data
         return True
 
-    def write_whole(self, key: str, data: bytes, durable: bool = True) -> None:
+    def put(self, key: str, data: bytes, durable: bool = True) -> None:
         """Puts an object over what was there."""
         with self._explained(key):
             obstore.put(self._bucket, key, data)
@@ -143,53 +118,40 @@ class ObjectStore(Store):
                 return
         raise MachineError(f"{key} in {self.name}: the store lost the parts of an upload {_TRIES} times")
 
-    def rename(self, source: str, target: str, plain: set[str] | None = None) -> None:
+    def move(self, source: str, target: str) -> None:
         """Copies, then deletes: a kill in between leaves both, and a second call deletes the first."""
         with self._explained(target):
             obstore.copy(self._bucket, source, target)
         self.remove(source)
 
-    def fence(self, staging: str) -> None:
-        """Removes the mark that an attempt looks for just before it commits. Its objects stay where they are."""
-        self.remove(f"{staging}/{_BEGUN}")
+    def sync(self, keys: Iterable[str]) -> None:
+        """Does nothing: an object is durable as soon as it is put."""
 
-    def is_fenced(self, staging: str) -> bool:
-        """Whether the attempt's mark is gone."""
-        return self.size(f"{staging}/{_BEGUN}") is None
+    def stage(self, staging: str) -> "ObjectStage":
+        """Marks the attempt as begun."""
+        return ObjectStage(self, staging)
+
+    def revoke(self, staging: str) -> bool:
+        """Removes the mark that an attempt looks for just before it commits. Its objects stay where they are."""
+        self.remove(f"{staging}/{BEGUN}")
+        return False
 
     def read(self, key: str) -> bytes:
         """The bytes at `key`."""
         with self._explained(key):
             return bytes(obstore.get(self._bucket, key).bytes())
 
-    def size(self, key: str) -> int | None:
-        """Bytes at `key`, or None."""
-        head = self._head(key)
-        return head["size"] if head else None
+    def stat(self, key: str) -> Entry | None:
+        """Size, time and entity tag of an object."""
+        with contextlib.suppress(FileNotFoundError), self._explained(key):
+            return _entry(obstore.head(self._bucket, key))
+        return None
 
-    def modified(self, key: str) -> float | None:
-        """When the object was put, or None."""
-        head = self._head(key)
-        return head["last_modified"].timestamp() if head else None
-
-    def files(self, prefix: str) -> Iterator[Entry]:
-        """Every object below `prefix`."""
-        with self._explained(prefix):
-            found = obstore.list(self._bucket, prefix).collect()
-        entries = (Entry(meta["path"], meta["size"]) for meta in found)
-        yield from sorted(entries, key=lambda entry: entry.key.split("/"))
-
-    def listing(self) -> Iterator[Entry]:
-        """Every object there is, a page at a time."""
-        with self._explained("the listing"):
-            for page in obstore.list(self._bucket):
-                yield from (Entry(meta["path"], meta["size"]) for meta in page)
-
-    def scan(self, prefix: str, sizes: bool = False) -> Iterator[tuple[str, int]]:
-        """Names and sizes, page by page."""
-        with self._explained(prefix):
-            for page in obstore.list(self._bucket, prefix):
-                yield from ((meta["path"].removeprefix(f"{prefix}/"), meta["size"]) for meta in page)
+    def files(self, prefix: str, sizes: bool = True) -> Iterator[Entry]:
+        """Every object below `prefix`, a page at a time."""
+        with self._explained(prefix or "the listing"):
+            for page in obstore.list(self._bucket, prefix or None):
+                yield from map(_entry, page)
 
     def children(self, prefix: str) -> list[str]:
         """Common prefixes of keys, directly below `prefix`."""
@@ -211,10 +173,13 @@ class ObjectStore(Store):
 
     def remove_tree(self, prefix: str) -> None:
         """Deletes all objects below `prefix`; the mark of an attempt goes first."""
-        self.remove(f"{prefix}/{_BEGUN}")
+        self.remove(f"{prefix}/{BEGUN}")
         if keys := [entry.key for entry in self.files(prefix)]:
             with self._explained(prefix), contextlib.suppress(FileNotFoundError):
                 _repeat_unanswered(lambda: obstore.delete(self._bucket, keys))
+
+    def remove_empty(self, prefix: str) -> None:
+        """Does nothing: there are no folders."""
 
     @contextlib.contextmanager
     def scratch(self, name: str) -> Iterator[Path]:
@@ -222,52 +187,34 @@ class ObjectStore(Store):
         with temporary_folder(name) as folder:
             yield folder
 
-    def drop_scratch(self, name: str) -> None:
-        """Removes those of processes of this machine that were killed."""
-        remove_abandoned(name)
-
-    def install(self, local: Path, key: str, over: Version | None = None) -> Version | None:
+    def replace(self, local: Path, key: str, over: Entry | None = None) -> Entry | None:
         """Puts a local file on the condition that nothing else is there; where it is large, in parts, having asked before."""
         size = local.stat().st_size
         try:
             with self._explained(key):
                 if size <= CONDITIONAL_BYTES:
                     put = self._put_over(local.read_bytes(), key, over)
-                elif self.versions((), (key,)).get(key) == over:
+                elif _tag(self.stat(key)) == _tag(over):
                     put = obstore.put(self._bucket, key, local)
                 else:
                     raise _replaced(key)
-                return Version(size, put["e_tag"])
+                return Entry(key, size, 0.0, put["e_tag"])
         except (AlreadyExistsError, PreconditionError, FileNotFoundError) as error:
-            found = self.versions((), (key,)).get(key)
+            found = self.stat(key)
             if found is None or found.bytes != size or self.read(key) != local.read_bytes():
                 raise _replaced(key) from error
             return None  # an answer was lost, or another put the same
 
-    def _put_over(self, data: bytes, key: str, over: Version | None) -> "PutResult":
+    def withdraw(self, key: str, folder: Path) -> bool:
+        """False: an object cannot be deleted on a condition."""
+        return False
+
+    def _put_over(self, data: bytes, key: str, over: Entry | None) -> "PutResult":
         mode: PutMode = "create" if over is None else {"e_tag": over.tag}
         try:
             return _repeat_unanswered(lambda: obstore.put(self._bucket, key, data, mode=mode, use_multipart=False))
         except NotImplementedError:  # the client of a folder knows no condition but absence
             return obstore.put(self._bucket, key, data)
-
-    def versions(self, folders: Iterable[str], keys: Iterable[str]) -> dict[str, Version]:
-        """Sizes and entity tags, from one listing for each folder and one request for each key, at once."""
-        with ThreadPoolExecutor(_AT_ONCE) as pool:
-            listed = [pool.submit(self._listed, folder) for folder in folders]
-            single = [pool.submit(self._head, key) for key in keys]
-            found = [meta for future in listed for meta in future.result()]
-            found += [meta for future in single if (meta := future.result()) is not None]
-        return {meta["path"]: Version(meta["size"], meta["e_tag"]) for meta in found}
-
-    def _listed(self, folder: str) -> "Sequence[obstore.ObjectMeta]":
-        with self._explained(folder):
-            return obstore.list(self._bucket, folder).collect()
-
-    def _head(self, key: str) -> "obstore.ObjectMeta | None":
-        with contextlib.suppress(FileNotFoundError), self._explained(key):
-            return obstore.head(self._bucket, key)
-        return None
 
     @contextlib.contextmanager
     def _explained(self, key: str) -> Iterator[None]:
@@ -278,6 +225,47 @@ class ObjectStore(Store):
             raise
         except BaseError as error:
             raise MachineError(f"{key} in {self.name}: {_first_line(error)}") from error
+
+
+class ObjectStage(Stage):
+    """The objects of an attempt; what each operation promises stands in `Stage`."""
+
+    def __init__(self, store: ObjectStore, staging: str) -> None:
+        self._store = store
+        self._staging = staging
+        self.write(BEGUN, b"")
+
+    def write(self, path: str, data: bytes) -> None:
+        """Puts an object."""
+        self._store.put(f"{self._staging}/{path}", data)
+
+    @contextlib.contextmanager
+    def stream(self, path: str) -> Iterator[IO[bytes]]:
+        """A temporary file on the local disk, put as one object in the end."""
+        with tempfile.TemporaryFile() as file:
+            yield file
+            with self._store._explained(path):
+                self._store._put_file(f"{self._staging}/{path}", file)
+
+    def flush(self) -> None:
+        """Does nothing: an object is durable as soon as it is put."""
+
+    def put_if_absent(self, key: str, data: bytes) -> bool:
+        """Looks for the mark, then puts."""
+        if not is_live(self._store, self._staging):
+            raise FileNotFoundError(f"{self._staging} was swept")
+        return self._store.put_if_absent(key, data)
+
+    def close(self) -> None:
+        """Does nothing."""
+
+
+def _entry(meta: "obstore.ObjectMeta") -> Entry:
+    return Entry(meta["path"], meta["size"], meta["last_modified"].timestamp(), meta["e_tag"])
+
+
+def _tag(entry: Entry | None) -> str | None:
+    return entry and entry.tag
 
 
 def _replaced(key: str) -> RunError:

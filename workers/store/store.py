@@ -1,41 +1,58 @@
-"""The operations on a dataset's place that the commit protocol is built on, for a disk and for an object store.
+"""The verbs of a dataset's place, the same for a folder and for an object store, and what is made of them alone.
 
 A key is a path below the output folder with `/` between its parts. Everything unfinished lies under `_staging/`. Every
-other key appears whole, in one step: by `put_if_absent`, `write_whole`, `rename` or `install`.
+other key appears whole, in one step: by `put`, `put_if_absent`, `move` or `replace`.
 """
 
 import contextlib
+import re
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import IO, NamedTuple, Protocol, TypeVar
 
-T = TypeVar("T")
+from schemas.dataset.layout import BEGUN
 
+A = TypeVar("A")
+B = TypeVar("B")
 
-def retry_if_swept(step: Callable[[], T]) -> T:
-    """The result of `step`, called up to three times: another coordinator may sweep its temporary file in between.
-
-    Raises FileNotFoundError where the last call does.
-    """
-    for _ in range(2):
-        with contextlib.suppress(FileNotFoundError):
-            return step()
-    return step()
+_URL = re.compile(r"[a-z][a-z0-9+.-]+://")
 
 
 class Entry(NamedTuple):
-    """A stored file."""
+    """A stored file as it is now."""
 
     key: str
     bytes: int
-
-
-class Version(NamedTuple):
-    """A file as it is now."""
-
-    bytes: int
+    modified_s: float
+    """When it was written, seconds since 1970 by the place's clock."""
     tag: str | None
     """Of an object: differs for every content. None on a disk."""
+
+
+class Stage(Protocol):
+    """An attempt's folder, the only place that the attempt writes.
+
+    It is never made anew: once a disk's is revoked, every method raises FileNotFoundError.
+    """
+
+    def stream(self, path: str) -> contextlib.AbstractContextManager[IO[bytes]]:
+        """A writable file at `path` below the folder, stored when the context ends without an error."""
+
+    def write(self, path: str, data: bytes) -> None:
+        """Stores `data` at `path` below the folder; over an earlier file only where that has as many bytes."""
+        with self.stream(path) as file:
+            file.write(data)
+
+    def flush(self) -> None:
+        """Returns when everything in the folder survives a loss of power. Not to be called again after an error."""
+
+    def put_if_absent(self, key: str, data: bytes) -> bool:
+        """`Store.put_if_absent`, unless the folder was revoked. An object store may miss a revocation at the same moment."""
+
+    def close(self) -> None:
+        """Frees what the stage holds of this process; its files stay."""
 
 
 class Store(Protocol):
@@ -44,96 +61,49 @@ class Store(Protocol):
     name: str
     """The place, as a user writes it."""
     root: Path | None
-    """The output folder on a disk of this machine, None for an object store."""
-    tar_only: bool
-    """True where a file for each image would be too many."""
-    fence_is_final: bool
-    """True where a fenced attempt can no longer commit; False where it still may, if it was just about to."""
+    """The output folder on a disk of this machine, for what only a disk has; None for an object store."""
+    layouts: tuple[str, ...]
+    """The values of `output.layout` that the place can hold: a file for each image is too many for an object store."""
+    at_once: int
+    """Requests that are worth having under way at once: 1 where they do not wait for a network."""
 
     def prepare(self) -> None:
         """Makes the output folder and proves `put_if_absent`. Raises OutputError naming the place and a remedy."""
 
-    def open_staging(self, staging: str) -> None:
-        """Makes the folder of an attempt, the only place that the attempt writes."""
-
-    def write_staged(self, staging: str, path: str, data: bytes) -> None:
-        """Writes `staging/path`. Raises FileNotFoundError where the folder was swept: it is never made anew."""
-        with self.stream_staged(staging, path) as file:
-            file.write(data)
-
-    def stream_staged(self, staging: str, path: str) -> contextlib.AbstractContextManager[IO[bytes]]:
-        """A writable file at `staging/path`, stored when the context ends without an error. Raises as `write_staged`."""
-
-    def write_note(self, staging: str, path: str, data: bytes) -> None:
-        """Writes `staging/path` anew, with as many bytes as every time. Raises as `write_staged`."""
-        self.write_staged(staging, path, data)
-
-    def make_durable(self, staging: str) -> None:
-        """Returns when everything under `staging` survives a loss of power. By default, writes are durable at once."""
-        return
-
-    def put_if_absent(self, key: str, data: bytes, staging: str | None = None) -> bool:
-        """Stores `data` whole and durably at `key` unless something is there; False where something else is.
-
-        With `staging`, raises FileNotFoundError if that folder was swept first. A disk always detects that; an object
-        store may miss a sweep at the same moment.
-        """
-
-    def write_whole(self, key: str, data: bytes, durable: bool = True) -> None:
-        """Puts `data` at `key` in one step, replacing what was there."""
-
-    def rename(self, source: str, target: str, plain: set[str] | None = None) -> None:
-        """Moves a file, replacing the target in one step. Raises FileNotFoundError where the source is gone.
-
-        `plain` collects folders that were found to lead nowhere else: calls that share it ask each of them once.
-        """
-
-    def sync_folders_of(self, keys: Iterable[str]) -> None:
-        """Returns when the names `keys` survive a loss of power. By default, names are durable at once."""
-        return
-
-    def fence(self, staging: str) -> None:
-        """Takes an attempt's folder, if there is one, out of the attempt's reach for good (to a name with FENCED on a disk).
-
-        With `fence_is_final`, a fenced attempt can neither write nor commit.
-        """
-
-    def is_fenced(self, staging: str) -> bool:
-        """Whether an attempt lost its folder, or the mark in it, to `fence`."""
-
     def read(self, key: str) -> bytes:
         """The bytes at `key`. Raises FileNotFoundError."""
 
+    def stat(self, key: str) -> Entry | None:
+        """The file at `key`, None where there is none."""
+
     def size(self, key: str) -> int | None:
         """Bytes of the file at `key`, None where there is none."""
+        found = self.stat(key)
+        return found.bytes if found else None
 
-    def modified(self, key: str) -> float | None:
-        """When the file at `key` was written, seconds since 1970 by the place's clock; None where there is none."""
+    def files(self, prefix: str, sizes: bool = True) -> Iterator[Entry]:
+        """Every file at any depth below the folder `prefix` (all there are for ""), in any order, one at a time.
 
-    def files(self, prefix: str) -> Iterator[Entry]:
-        """Every file at any depth below the folder `prefix`, in the order of the keys' parts."""
-
-    def versions(self, folders: Iterable[str], keys: Iterable[str]) -> dict[str, Version]:
-        """By key: every file at any depth below the folders, and those of `keys` that are there."""
-        entries = [entry for folder in folders for entry in self.files(folder)]
-        single = ((key, self.size(key)) for key in keys)
-        return {key: Version(size, None) for key, size in (*entries, *single) if size is not None}
-
-    def listing(self) -> Iterator[Entry]:
-        """Every file there is, in any order; of an object store a page at a time."""
-        yield from self.files("")
-
-    def scan(self, prefix: str, sizes: bool = False) -> Iterator[tuple[str, int]]:
-        """(name, bytes) of everything directly below the folder `prefix`, one at a time, in any order.
-
-        Bytes are 0 unless `sizes` asks for them: a listing without is several times as fast on a disk.
+        Without `sizes`, a disk gives names alone, several times as fast; other fields are 0.
         """
+
+    def names(self, prefix: str) -> list[str]:
+        """Names of the files and folders directly below `prefix`, sorted."""
 
     def children(self, prefix: str) -> list[str]:
         """Names of the folders directly below `prefix`, sorted."""
 
-    def names(self, prefix: str) -> list[str]:
-        """Names of the files and folders directly below `prefix`, sorted."""
+    def put(self, key: str, data: bytes, durable: bool = True) -> None:
+        """Puts `data` at `key` in one step, replacing what was there."""
+
+    def put_if_absent(self, key: str, data: bytes) -> bool:
+        """Stores `data` whole and durably at `key` unless something is there; False where something else is."""
+
+    def move(self, source: str, target: str) -> None:
+        """Moves a file, replacing the target in one step. Raises FileNotFoundError where the source is gone."""
+
+    def sync(self, keys: Iterable[str]) -> None:
+        """Returns when the names `keys` survive a loss of power."""
 
     def remove(self, key: str) -> None:
         """Removes a file, if there is one."""
@@ -142,22 +112,90 @@ class Store(Protocol):
         """Removes a folder with its contents, if there is one."""
 
     def remove_empty(self, prefix: str) -> None:
-        """Removes a folder if it is empty. By default there are no folders."""
-        return
+        """Removes a folder if it is there and empty."""
+
+    def stage(self, staging: str) -> Stage:
+        """Begins an attempt in the folder `staging`."""
+
+    def revoke(self, staging: str) -> bool:
+        """Takes an attempt's folder, if there is one, out of the attempt's reach for good.
+
+        A disk gives it a name that ends in FENCED. True where the attempt can no longer commit; False where it still may, if
+        it was just about to.
+        """
 
     def scratch(self, name: str) -> contextlib.AbstractContextManager[Path]:
-        """An empty folder on a local disk whose files `install` can move into place; removed afterwards."""
+        """An empty folder on a local disk for the files of `replace`, removed afterwards.
 
-    def drop_scratch(self, name: str) -> None:
-        """Removes what killed processes left of scratch folders of this name; on a disk, those in use too."""
+        What killed processes left of folders of this name goes first; on a disk, so does one that is in use.
+        """
 
-    def install(self, local: Path, key: str, over: Version | None = None) -> Version | None:
+    def replace(self, local: Path, key: str, over: Entry | None = None) -> Entry | None:
         """Moves a finished file of a scratch folder to `key` in one step, durably, replacing what was there.
 
         Raises FileNotFoundError where the scratch folder was taken away (a disk), RunError where there is something else
-        than `over`, None for nothing (an object store). An object's version comes back where it is surely this call's.
+        than `over`, None for nothing (an object store). An object's entry comes back where it is surely this call's.
         """
 
-    def withdraw(self, key: str, folder: Path) -> None:
-        """Takes a file away, if there is one: on a disk into a scratch folder, which must still be there."""
-        self.remove(key)
+    def withdraw(self, key: str, folder: Path) -> bool:
+        """Takes a file away if `folder`, a scratch folder, is still there; False where the place has no such condition."""
+
+
+def open_store(out: str) -> Store:
+    """The store that a user's --out means: an object store for a URL such as s3://bucket/path, otherwise a folder.
+
+    Reads and writes nothing yet. Raises OutputError for a URL of an unknown kind.
+    """
+    if _URL.match(out):
+        from workers.store.objects import open_object_store  # obstore loads only where it is needed
+
+        return open_object_store(out)
+    from workers.store.local import LocalStore
+
+    return LocalStore(out)
+
+
+def is_live(store: Store, staging: str) -> bool:
+    """Whether an attempt has begun in this folder and was not revoked."""
+    return store.stat(f"{staging}/{BEGUN}") is not None
+
+
+def stat_all(store: Store, folders: Iterable[str], keys: Iterable[str]) -> dict[str, Entry]:
+    """By key: every file at any depth below the folders, and those of `keys` that are there."""
+    asked: list[tuple[bool, str]] = [*((True, folder) for folder in folders), *((False, key) for key in keys)]
+    found = map_ahead(store, lambda one: [*store.files(one[1])] if one[0] else [store.stat(one[1])], asked)
+    return {entry.key: entry for entries in found for entry in entries if entry is not None}
+
+
+def map_ahead(store: Store, function: Callable[[A], B], items: Iterable[A], at_once: int | None = None) -> Iterator[B]:
+    """The results of `function` in the order of `items`; as many calls at once as the store is worth, `at_once` at most.
+
+    Twice as many results are under way or wait. On a disk, items are taken one by one.
+    """
+    threads = min(store.at_once, at_once or store.at_once)
+    if threads == 1:
+        yield from map(function, items)
+        return
+    waiting: deque[Future[B]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for item in items:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) >= (at_once or 2 * threads):
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def retry_if_swept(step: Callable[[], B]) -> B:
+    """The result of `step`, called up to three times: another coordinator may sweep its temporary file in between.
+
+    Raises FileNotFoundError where the last call does.
+    """
+    for _ in range(2):
+        with contextlib.suppress(FileNotFoundError):
+            return step()
+    return step()

@@ -23,9 +23,8 @@ import pyarrow as pa
 
 from schemas.dataset.commit import FileEntry, Span
 from schemas.dataset.layout import IMAGES, Content, file_pose_id, image_path, is_shape, patch_path, tar_path
-from schemas.errors import CorruptError
-from schemas.plain_line import plain_line
-from workers.store.store import Store
+from schemas.errors import CorruptError, plain_line
+from workers.store.store import Stage
 
 Rows = Mapping[str, Sequence[Mapping[str, Any]]]
 """Rows by table, with the values that Arrow gives: a double that happens to be whole is still a float."""
@@ -160,15 +159,14 @@ def read_tar(category: str, data: bytes, name: str) -> Iterator[tuple[str, bytes
 
 
 def read_labels(category: str, data: bytes, name: str) -> Iterator[tuple[int, bytes]]:
-    """(pose id, JSON) of every pose, in order; none in archives of earlier versions. Raises CorruptError as `read_tar`."""
+    """(pose id, JSON) of every pose, in order. Raises CorruptError as `read_tar`."""
     return ((pose_id, content) for path, pose_id, content in _read_members(category, data, name) if not path)
 
 
 def check_labels(category: str, data: bytes, name: str, rows: Rows) -> list[tuple[int, str]]:
     """(pose id, how its labels differ from the rows of the range) of every pose in an archive whose labels are off.
 
-    `rows` are those of all the range's scenes. An archive of an earlier version has no labels, and nothing is off. Raises
-    CorruptError as `read_tar`.
+    `rows` are those of all the range's scenes. Raises CorruptError as `read_tar`.
     """
     stored, imaged = {}, set()
     for path, pose_id, content in _read_members(category, data, name):
@@ -176,8 +174,6 @@ def check_labels(category: str, data: bytes, name: str, rows: Rows) -> list[tupl
             imaged.add(pose_id)
         else:
             stored[pose_id] = content
-    if not stored:
-        return []
     derived = pose_labels(rows)
     faults = [(pose_id, f"{name}: {label_member(pose_id)} is missing") for pose_id in sorted(imaged - stored.keys())]
     for pose_id, content in stored.items():
@@ -216,9 +212,8 @@ def _read_members(category: str, data: bytes, name: str) -> Iterator[tuple[str, 
 class Packing:
     """Stores an attempt's files scene by scene: by path, or, with `tar`, images in archives and shapes by path."""
 
-    def __init__(self, store: Store, staging: str, span: Span, tar: bool) -> None:
-        self._store = store
-        self._staging = staging
+    def __init__(self, stage: Stage, span: Span, tar: bool) -> None:
+        self._stage = stage
         self._span = span
         self._tar = tar
         self._archives: dict[str, _Archive] = {}
@@ -232,12 +227,12 @@ class Packing:
         images = [path for path in files if self._tar and not is_shape(path)]
         for path, data in files.items():
             if not self._tar or is_shape(path):
-                self._store.write_staged(self._staging, path, data)
+                self._stage.write(path, data)
         labels = pose_labels({table: tables[table].to_pylist() for table in LABEL_TABLES}) if images else {}
         for (category, pose_id), paths in groupby(sorted(images, key=member_order), key=_sample_of):
             if category not in self._archives:
                 name = tar_path(category, self._span.start, self._span.retry)
-                self._archives[category] = _Archive(name, self._store.stream_staged(self._staging, name))
+                self._archives[category] = _Archive(name, self._stage.stream(name))
             for path in paths:
                 self._archives[category].add(member_of(path)[1], files[path])
             self._archives[category].add(label_member(pose_id), encode_label(labels[category, pose_id]))

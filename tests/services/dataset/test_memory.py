@@ -19,7 +19,7 @@ from tests.kit.many_ranges import ManyRanges
 def stream(root, ranges):
     store = ManyRanges(root, ranges)
     store.prepare()
-    store.write_whole("job.yaml", encode_job(record_job(validate_job(SMALL, "test"), "c" * 64, root)))
+    store.put("job.yaml", encode_job(record_job(validate_job(SMALL, "test"), "c" * 64, root)))
     pairs = sum(1 for pair in Dataset(store).pairs() if pair.mirror.images)
     return pairs, peak_mib()
 

@@ -89,7 +89,7 @@ def test_a_source_that_is_gone_or_another_is_told(copy, files):
     record = read_job(store)
     gone = {"objects": [{"source": "urdf", "folder": "/nowhere", "category_map": {"*": "mug"}}]}
     job = type(record.job).model_validate({**record.job.model_dump(mode="json"), "assets": gone})
-    store.write_whole("job.yaml", encode_job(type(record)(job, record.digest, record.catalogue, record.folder)))
+    store.put("job.yaml", encode_job(type(record)(job, record.digest, record.catalogue, record.folder)))
     (pair, *_) = open_dataset(copy).pairs()
     with pytest.raises(InputError, match=r"assets/mug/.*\.glb is not in the dataset.*/nowhere"):
         pair.mesh()

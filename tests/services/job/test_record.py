@@ -26,7 +26,7 @@ def record(catalogue: str = "c", inputs: tuple[str, ...] = (), out: LocalStore |
 def test_a_record_reads_back_as_it_was_written(store):
     assert read_job(store) is None
     for written in (record(scenes=5, categories=["mug"]), record(inputs=("1" * 64, "2" * 64), captures=CAPTURES)):
-        store.write_whole(JOB_FILE, encode_job(written))
+        store.put(JOB_FILE, encode_job(written))
         assert require_job(store) == written
         assert is_job_sealed(store.read(JOB_FILE)) and not is_job_sealed(store.read(JOB_FILE)[1:])
     assert written.folder == str(Path("jobs").resolve())
@@ -34,7 +34,7 @@ def test_a_record_reads_back_as_it_was_written(store):
 
 
 def test_more_scenes_go_on_with_the_first_range_size_and_another_job_is_refused_by_key(store):
-    store.write_whole(JOB_FILE, encode_job(record(scenes=5, run={"range_size": 4})))
+    store.put(JOB_FILE, encode_job(record(scenes=5, run={"range_size": 4})))
     adopted = record(scenes=9, run={"range_size": 64, "workers": 2}, out=store)
     assert (adopted.job.scenes, adopted.job.run.range_size, adopted.job.run.workers) == (9, 4, 2)
     assert adopted.digest == record(scenes=9).digest
@@ -45,7 +45,7 @@ def test_more_scenes_go_on_with_the_first_range_size_and_another_job_is_refused_
 
 
 def test_captures_whose_files_changed_are_named_by_their_folders(store):
-    store.write_whole(JOB_FILE, encode_job(record(inputs=("1" * 64, "2" * 64), captures=CAPTURES)))
+    store.put(JOB_FILE, encode_job(record(inputs=("1" * 64, "2" * 64), captures=CAPTURES)))
     assert record(inputs=("1" * 64, "2" * 64), captures=CAPTURES, out=store).inputs == ("1" * 64, "2" * 64)
     with pytest.raises(OutputError, match="captures in shots/box ") as caught:
         record("d", ("1" * 64, "3" * 64), store, captures=CAPTURES)
@@ -66,6 +66,6 @@ def test_a_damaged_record_is_told(store):
     folders = ("../elsewhere", "", 5, None, ["/a"], "/a\nverso: all is well", "/a\0b")
     tree = yaml.safe_load(encode_job(record()))
     for text in ("- a list", "job: [", "digest: x", *(yaml.safe_dump(tree | {"folder": folder}) for folder in folders)):
-        store.write_whole(JOB_FILE, text.encode())
+        store.put(JOB_FILE, text.encode())
         with pytest.raises(CorruptError, match="is not a job that `verso run` wrote"):
             require_job(store)

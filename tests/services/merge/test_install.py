@@ -13,13 +13,14 @@ from obstore.store import MemoryStore
 
 from schemas.dataset.layout import SUCCESS_FILE
 from schemas.errors import RunError
-from services.merge import merge as install
+from services.merge import merge as merge_module
 from services.merge import reading
 from services.merge.merge import merge, read_success
 from tests.kit.faults import disk
 from tests.kit.s3_server import Bucket, s3_server
 from tests.made_up_scenes import attempt_at, failed_scene, small_scene, terms
-from workers.store import objects
+from workers.store import ledger, objects
+from workers.store import store as store_module
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 
@@ -164,8 +165,8 @@ def copy_of(seed: MemoryStore) -> ObjectStore:
 def test_paused_at_a_request_to_an_object_store_while_a_newer_merge_completes(
     newer, stop, stride, expected, monkeypatch
 ):
-    for module in (install, reading):
-        monkeypatch.setattr(module, "AT_ONCE", 1)  # the same order each time
+    for module in (store_module, merge_module, reading, ledger):  # requests in the same order each time
+        monkeypatch.setattr(module, "map_ahead", lambda store, function, items, at_once=None: map(function, items))
     seed = MemoryStore()
     begin(ObjectStore(seed, "memory://"))
     finished, refused = [], []
@@ -213,13 +214,13 @@ def test_a_merge_whose_lock_is_lost_stops_before_it_replaces_anything(question, 
 def test_a_commit_that_arrives_during_the_merge_is_noticed(far, tmp_path, monkeypatch):
     store = ObjectStore(MemoryStore(), "memory://") if far else LocalStore(tmp_path)
     begin(store)
-    real = install.Installation.put_files
+    real = merge_module.Installation.put_files
 
     def late(*arguments):
         attempt_at(store, 4, 6, terms(layout="tar" if far else "files", range_size=2), small_scene).commit()
         return real(*arguments)
 
-    monkeypatch.setattr(install.Installation, "put_files", late)
+    monkeypatch.setattr(merge_module.Installation, "put_files", late)
     with pytest.raises(RunError, match="committed while they were merged"):
         merge(store, 0, 4)
     assert read_success(store) is None

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from schemas.dataset.commit import CommitRecord, FileEntry, SceneMark, Span, TableEntry
+from schemas.dataset.commit import CommitRecord, FileEntry, SceneMark, Span
 from schemas.dataset.layout import commit_path, range_table_path
 from schemas.dataset.tables import SCHEMAS, TABLES
 from tests.made_up_scenes import made_scene, terms
@@ -22,10 +22,10 @@ SCENES = 320
 
 MERGE = """
 import json, resource, sys, time
-from services.merge import reading, scratch, tables
+from services.merge import reading, shared, tables
 from services.merge.merge import merge
 from workers.store.local import LocalStore
-tables.ROWS_PER_GROUP, reading.ROWS_PER_BLOCK, scratch.CACHE_KIB = json.loads(sys.argv[5])
+tables.ROWS_PER_GROUP, reading.ROWS_PER_BLOCK, shared.CACHE_KIB = json.loads(sys.argv[5])
 warm, root, scenes = LocalStore(sys.argv[1]), LocalStore(sys.argv[2]), int(sys.argv[3])
 merge(warm, 0, int(sys.argv[4]))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -79,7 +79,7 @@ def commit_ranges(root, ranges: int) -> None:
             (store.root / path).parent.mkdir(parents=True, exist_ok=True)
             (store.root / path).write_bytes(data)
             files.append(FileEntry(path=path, bytes=len(data), sha256=hashlib.sha256(data).hexdigest()))
-            tables[table] = TableEntry(rows=rows.num_rows, digest="")
+            tables[table] = rows.num_rows
         record = CommitRecord(
             schema_version=1,
             span=Span(start=start, stop=start + SCENES),

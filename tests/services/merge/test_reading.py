@@ -1,6 +1,3 @@
-import threading
-from concurrent.futures import ThreadPoolExecutor
-
 import pytest
 
 from schemas.dataset.commit import Span
@@ -8,7 +5,7 @@ from schemas.dataset.layout import range_table_path
 from schemas.dataset.tables import TABLES
 from schemas.errors import CorruptError
 from services.merge import reading
-from services.merge.reading import map_ahead, read_blocks
+from services.merge.reading import read_blocks
 from tests.made_up_datasets import FIRST, STOP, dataset_at, plain_rows
 from tests.made_up_scenes import failed_scene, made_scene, terms
 from workers.store.attempt import begin_attempt
@@ -29,36 +26,6 @@ def test_blocks_hold_every_range_and_every_row_in_order(tmp_path, monkeypatch, r
         assert [row for block in blocks for row in block.rows[table].to_pylist()] == plain_rows(table)
 
 
-def test_no_more_is_read_ahead_than_was_said():
-    begun, taken, lead = [], [], []
-    lock = threading.Lock()
-
-    def work(item):
-        with lock:
-            begun.append(item)
-            lead.append(len(begun) - len(taken))
-        return item
-
-    with ThreadPoolExecutor(3) as pool:
-        for item in map_ahead(pool, work, range(50), window=6):
-            taken.append(item)
-    assert taken == list(range(50))
-    assert max(lead) <= 7  # six, and the one that is handed on
-
-
-def test_what_cannot_be_read_is_told_where_it_lies_in_the_order(tmp_path):
-    def fail_at_two(item):
-        if item == 2:
-            raise CorruptError("two")
-        return item
-
-    with ThreadPoolExecutor(3) as pool:
-        results = map_ahead(pool, fail_at_two, range(9))
-        assert [next(results), next(results)] == [0, 1]
-        with pytest.raises(CorruptError, match="two"):
-            next(results)
-
-
 @pytest.mark.parametrize("harm", ["missing", "altered"])
 def test_a_table_that_is_missing_or_altered_is_told_by_name(tmp_path, harm):
     store = dataset_at(tmp_path)
@@ -68,7 +35,7 @@ def test_a_table_that_is_missing_or_altered_is_told_by_name(tmp_path, harm):
     else:
         path.write_bytes(path.read_bytes()[::-1])
     with pytest.raises(
-        CorruptError, match=f"{path.relative_to(tmp_path)} {'is named' if harm == 'missing' else 'does not'}"
+        CorruptError, match=f"{path.relative_to(tmp_path)} {'is committed' if harm == 'missing' else 'does not'}"
     ):
         list(read_blocks(store, FIRST, STOP))
 

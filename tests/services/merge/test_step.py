@@ -76,7 +76,7 @@ def test_a_gap_is_refused_and_nothing_is_merged(tmp_path):
 def test_an_image_that_is_missing_or_cut_is_told_by_name(tmp_path):
     store = dataset_at(tmp_path, 0, 8)
     image = made_scene(1).files[0].path
-    store.write_whole(image, b"cut")
+    store.put(image, b"cut")
     with pytest.raises(CorruptError, match=f"{image} has 3 bytes"):
         merge(store, 0, 8)
     store.remove(image)

@@ -39,7 +39,7 @@ def test_a_row_for_each_job_in_the_order_of_its_turn(tmp_path):
 
 def test_a_damaged_job_has_a_row_that_says_so(tmp_path):
     queue = queue_of(tmp_path / "q", request_of(A))
-    queue.store.write_whole(f"jobs/{A}/request.json", b"{")
+    queue.store.put(f"jobs/{A}/request.json", b"{")
     (row,) = list_jobs(queue)
     assert (row.id, row.state) == (A, "unreadable")
     with pytest.raises(CorruptError):

@@ -69,7 +69,7 @@ def test_the_share_is_what_was_said_last(queue):
     assert queue.share() == 1
     queue.put_share(3)
     assert queue.share() == 3
-    queue.store.write_whole("share.json", b"{torn")
+    queue.store.put("share.json", b"{torn")
     assert queue.share() == 1
 
 
@@ -99,7 +99,7 @@ def test_an_unknown_id_is_told_in_one_line(queue):
 )
 def test_a_damaged_job_is_told_by_file_and_leaves_the_others_alone(tmp_path, key, data, words):
     queue = queue_of(tmp_path / "q", request_of(A), request_of(B))
-    queue.store.write_whole(key, data)
+    queue.store.put(key, data)
     views, faults = queue.read_all(queue.ids())
     assert [view.request.id for view in views] == [B]
     assert words in faults[A] and key.rpartition("/")[0] in faults[A] and "\n" not in faults[A]
@@ -109,7 +109,7 @@ def test_a_damaged_job_is_told_by_file_and_leaves_the_others_alone(tmp_path, key
 
 def test_a_request_in_the_place_of_another_is_refused(tmp_path):
     queue = queue_of(tmp_path / "q", request_of(A), request_of(B))
-    queue.store.write_whole(request_path(A), queue.store.read(request_path(B)))
+    queue.store.put(request_path(A), queue.store.read(request_path(B)))
     with pytest.raises(CorruptError, match="is the request of another job"):
         queue.read(A)
 

@@ -207,7 +207,7 @@ def test_a_cancelled_job_that_waits_never_starts(tmp_path):
 
 def test_a_damaged_job_is_told_once_and_stops_no_other(tmp_path):
     world, said = world_of(tmp_path), []
-    world.queue.store.write_whole(f"jobs/{LAST}/request.json", b"{")
+    world.queue.store.put(f"jobs/{LAST}/request.json", b"{")
     supervisor = world.supervisor(said.append)
     for _ in range(30):
         supervisor.look()

@@ -89,9 +89,7 @@ def test_what_is_lost_is_told_and_a_finished_dataset_is_not_whole_then(store, ca
     for start in (0, 4):
         attempt_at(store, start, start + 4).commit()
     merge(store, 0, 8)
-    store.write_whole(
-        "job.yaml", encode_job(record_job(Job.model_validate({"name": "a", "scenes": 8}), "c", Path("/")))
-    )
+    store.put("job.yaml", encode_job(record_job(Job.model_validate({"name": "a", "scenes": 8}), "c", Path("/"))))
     assert main(["status", str(store.root)]) == 0
     (store.root / "manifest/_commits/0000000004.json").unlink()
     capsys.readouterr()

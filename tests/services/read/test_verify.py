@@ -8,7 +8,7 @@ import pyarrow as pa
 import pytest
 from obstore.store import MemoryStore
 
-from schemas.dataset.ledger import LEDGER_SCHEMA, join_rows
+from schemas.dataset.commit import LEDGER_SCHEMA, join_rows
 from services.read.verify import verify
 from tests.datasets import faults_of, make_dataset
 from workers.store.ledger import list_commits, save_rows
@@ -69,7 +69,7 @@ def test_a_dataset_in_an_object_store_is_read_back_as_on_a_disk(packed):
         obstore.put(bucket, path.relative_to(packed.root).as_posix(), path)
     store = ObjectStore(bucket, "memory://dataset")
     assert verify(store, lambda _: None).faults == []
-    store.write_whole("box/stray.png", b"x")
+    store.put("box/stray.png", b"x")
     store.remove("camPoses.csv")
     store.remove("manifest/_ranges/0000000001/objects.parquet")
     told = verify(store, lambda _: None).faults

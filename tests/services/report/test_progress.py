@@ -4,9 +4,9 @@ import pytest
 
 from schemas.job.job import Job
 from services.job.record import encode_job, record_job
+from services.look.live import latest_scenes, progress_of, read_progress
 from services.merge.merge import merge
 from services.read.status import Running, Status
-from services.report.progress import latest_scenes, progress_of, read_progress
 from services.run.lock import hold_lock
 from tests.made_up_scenes import attempt_at
 from workers.store.local import LocalStore
@@ -22,9 +22,7 @@ def store(tmp_path):
 
 
 def begin(store, scenes: int) -> None:
-    store.write_whole(
-        "job.yaml", encode_job(record_job(Job(name="small", seed=1, scenes=scenes), "0" * 64, store.root))
-    )
+    store.put("job.yaml", encode_job(record_job(Job(name="small", seed=1, scenes=scenes), "0" * 64, store.root)))
 
 
 def test_a_folder_that_is_not_there_and_an_empty_one_wait_for_a_job(tmp_path, store):
@@ -54,7 +52,7 @@ def test_a_merged_dataset_is_finished(store):
 
 
 def test_a_damaged_job_is_told_and_not_raised(store):
-    store.write_whole("job.yaml", b"verso: [")
+    store.put("job.yaml", b"verso: [")
     progress = read_progress(store)
     assert progress.phase == "unreadable" and "job.yaml" in progress.told[0]
 

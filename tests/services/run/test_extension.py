@@ -16,8 +16,8 @@ from services.job.record import record_job, require_job
 from services.run.run_job import RunRequest, order_pattern, run_job
 from tests.datasets import SMALL, make_dataset
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline import run_shard as module
-from workers.pipeline.run_shard import run_shard
+from workers.shard import run_shard as module
+from workers.shard.run_shard import run_shard
 from workers.store.ledger import list_commits
 from workers.store.local import LocalStore
 
@@ -96,7 +96,7 @@ def test_an_older_order_does_not_make_a_later_job_smaller(finished):
     larger_still = RunRequest(validate_job(tree, "test"), Path(), str(finished.root))
     record = record_job(larger_still.job, catalogue.digest, Path())
     change = order_pattern(finished, record, list_commits(finished)).job_change
-    finished.write_whole(JOB_FILE, change.after.encode())
+    finished.put(JOB_FILE, change.after.encode())
     run_shard(order, catalogue)
     assert require_job(finished).job.scenes == 5
 
@@ -112,7 +112,7 @@ def test_another_stack_is_refused_by_what_the_commits_say(finished, monkeypatch,
     mine = another_stack(monkeypatch)
     finished.remove(FINGERPRINT_FILE)
     if not gone:
-        finished.write_whole(FINGERPRINT_FILE, module._fingerprint("raster").model_dump_json().encode())
+        finished.put(FINGERPRINT_FILE, module._fingerprint("raster").model_dump_json().encode())
     before = kept(finished)
     with pytest.raises(FingerprintError, match=f"the dataset's is {mine.digest[:12]}"):
         run_shard(*order_of(finished))
@@ -126,7 +126,7 @@ def test_a_lost_or_damaged_fingerprint_file_is_written_again_by_the_same_stack(f
         if damaged is None:
             finished.remove(FINGERPRINT_FILE)
         else:
-            finished.write_whole(FINGERPRINT_FILE, damaged)
+            finished.put(FINGERPRINT_FILE, damaged)
         order, _ = order_of(finished)
         module._join_stack(finished, module._fingerprint("raster"), order)
         assert json.loads(finished.read(FINGERPRINT_FILE)) == whole

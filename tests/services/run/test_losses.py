@@ -60,7 +60,7 @@ def test_of_very_many_commits_the_counts_of_scenes_are_compared(finished, monkey
     assert find_lost(finished) == []
     success = json.loads(finished.read(SUCCESS_FILE))
     success["scenes"]["made"] += 1
-    finished.write_whole(SUCCESS_FILE, json.dumps(success).encode())
+    finished.put(SUCCESS_FILE, json.dumps(success).encode())
     assert find_lost(finished)[0].startswith("the commits are not those that the finished dataset was merged from: ")
 
 
@@ -78,7 +78,7 @@ def test_where_all_commits_are_gone_few_lines_tell_it(finished, monkeypatch):
 @pytest.mark.parametrize("damage", [{"stop_scene": None}, {"stop_scene": "x"}, {"first_scene": []}, {}])
 def test_a_damaged_success_file_ends_nothing(finished, damage):
     success = json.loads(finished.read(SUCCESS_FILE)) | damage
-    finished.write_whole(SUCCESS_FILE, json.dumps(success).encode())
+    finished.put(SUCCESS_FILE, json.dumps(success).encode())
     assert find_lost(finished) == []
 
 

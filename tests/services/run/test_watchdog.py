@@ -25,7 +25,13 @@ from workers.store.store import Store
 
 LIMIT_S = 0.4
 TERMS = CommitTerms(
-    job_digest="j", fingerprint="f", fingerprint_mode="record", layout="tar", first_scene=0, range_size=4
+    job_digest="j",
+    fingerprint="f",
+    fingerprint_mode="record",
+    layout="tar",
+    first_scene=0,
+    range_size=4,
+    pairs_per_scene=1,
 )
 
 

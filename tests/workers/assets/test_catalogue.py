@@ -10,8 +10,15 @@ import pytest
 import trimesh
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job.assets import Assets, FolderSource, MeshLimits, ProceduralSource, ShapeNetSource, SplitShares
-from schemas.job.category import CATEGORIES
+from schemas.job.assets import (
+    CATEGORIES,
+    Assets,
+    FolderSource,
+    MeshLimits,
+    ProceduralSource,
+    ShapeNetSource,
+    SplitShares,
+)
 from tests.kit.shapes import asset_of
 from tests.workers.assets.oracles import CUBE, write
 from workers.assets import catalogue as step

@@ -9,16 +9,15 @@ from pathlib import Path
 import pytest
 
 from schemas.dataset.commit import CommitTerms, Span
-from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, commit_path, range_table_path
-from schemas.dataset.shard import Blame, ShardOrder, ShardReport
+from schemas.dataset.shard import Blame, Fingerprint, ShardOrder, ShardReport
 from schemas.errors import FingerprintError, MachineError
 from services.job.job_file import validate_job
 from tests.effects.scenes import SMALL
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.run_shard import run_shard
+from workers.shard.run_shard import run_shard
 from workers.store.attempt import Attempt, blamed_scene, staged_attempts
-from workers.store.local import LocalStore
+from workers.store.local import LocalStage, LocalStore
 from workers.store.manifest import decode_table
 
 OTHER = Fingerprint(canary="0" * 64, code="0" * 64, libraries={}, simd="none", renderer="none")
@@ -33,7 +32,13 @@ def run(
 ) -> ShardReport:
     job = validate_job(SMALL, "a test")
     terms = CommitTerms(
-        job_digest="test", fingerprint="", fingerprint_mode=mode, layout="files", first_scene=0, range_size=2
+        job_digest="test",
+        fingerprint="",
+        fingerprint_mode=mode,
+        layout="files",
+        first_scene=0,
+        range_size=2,
+        pairs_per_scene=job.pairs_per_scene,
     )
     spans = tuple(Span(start=stop - 2, stop=stop) for stop in stops)
     order = ShardOrder(out=str(out), job=job, terms=terms, spans=spans, blamed=blamed)
@@ -59,19 +64,19 @@ def test_a_worker_that_is_to_end_finishes_its_range_and_begins_no_other(tmp_path
 
 def test_the_next_range_is_made_while_a_commit_waits_for_the_disk(tmp_path, monkeypatch):
     begun = threading.Event()
-    begin_scene, make_durable = Attempt.begin_scene, LocalStore.make_durable
+    begin_scene, flush = Attempt.begin_scene, LocalStage.flush
 
     def note(attempt, scene_id):
         begin_scene(attempt, scene_id)
         if scene_id == 2:
             begun.set()
 
-    def wait(store, staging):
+    def wait(stage):
         assert begun.wait(60.0), "scene 2 is not begun while the range before it is committed"
-        make_durable(store, staging)
+        flush(stage)
 
     monkeypatch.setattr(Attempt, "begin_scene", note)
-    monkeypatch.setattr(LocalStore, "make_durable", wait)
+    monkeypatch.setattr(LocalStage, "flush", wait)
     assert [span.won for span in run(tmp_path, stops=(2, 4)).spans] == [True, True]
 
 
@@ -92,7 +97,7 @@ def test_one_range_at_a_time_is_committed_in_order(tmp_path, monkeypatch):
 
 def test_a_range_that_cannot_be_committed_is_told_and_made_again_by_the_next_run(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(LocalStore, "make_durable", raises(MachineError("the disk is full")))
+        patch.setattr(LocalStage, "flush", raises(MachineError("the disk is full")))
         with pytest.raises(MachineError, match="the disk is full"):
             run(tmp_path, stops=(2, 4, 6))
     store = LocalStore(tmp_path)
@@ -101,19 +106,19 @@ def test_a_range_that_cannot_be_committed_is_told_and_made_again_by_the_next_run
 
 
 def test_an_error_in_a_range_lets_the_commit_before_it_end(tmp_path, monkeypatch):
-    make_durable, failed = LocalStore.make_durable, threading.Event()
+    flush, failed = LocalStage.flush, threading.Event()
 
     def fail(attempt, scene_id):
         if scene_id == 2:
             failed.set()
             raise MachineError("the GPU is gone")
 
-    def wait(store, staging):
+    def wait(stage):
         failed.wait(60.0)
-        make_durable(store, staging)
+        flush(stage)
 
     monkeypatch.setattr(Attempt, "begin_scene", fail)
-    monkeypatch.setattr(LocalStore, "make_durable", wait)
+    monkeypatch.setattr(LocalStage, "flush", wait)
     with pytest.raises(MachineError, match="the GPU is gone"):
         run(tmp_path, stops=(2, 4))
     store = LocalStore(tmp_path)
@@ -122,7 +127,7 @@ def test_an_error_in_a_range_lets_the_commit_before_it_end(tmp_path, monkeypatch
 
 
 def test_a_range_that_waits_for_the_commit_before_it_has_no_scene_in_progress(tmp_path, monkeypatch):
-    make_durable, ended, noted = LocalStore.make_durable, threading.Event(), []
+    flush, ended, noted = LocalStage.flush, threading.Event(), []
     end_scenes = Attempt.end_scenes
 
     def note(attempt):
@@ -130,13 +135,14 @@ def test_a_range_that_waits_for_the_commit_before_it_has_no_scene_in_progress(tm
         if attempt.span.start == 2:
             ended.set()
 
-    def wait(store, staging):
+    def wait(stage):
         assert ended.wait(60.0)
+        store = LocalStore(tmp_path)
         noted.extend(blamed_scene(store, start, name) for start, name in staged_attempts(store))
-        make_durable(store, staging)
+        flush(stage)
 
     monkeypatch.setattr(Attempt, "end_scenes", note)
-    monkeypatch.setattr(LocalStore, "make_durable", wait)
+    monkeypatch.setattr(LocalStage, "flush", wait)
     run(tmp_path, stops=(2, 4))
     assert noted[:2] == [None, None]
 

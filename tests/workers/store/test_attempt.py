@@ -39,7 +39,7 @@ def test_a_record_names_every_file_with_its_size_and_digest_and_the_rows_of_ever
     assert named == {name: (len(data), hashlib.sha256(data).hexdigest()) for name, data in on_disk.items()}
     for table in TABLES:
         path = range_table_path(0, table)
-        assert decode_table(table, on_disk[path], path).num_rows == record.tables[table].rows
+        assert decode_table(table, on_disk[path], path).num_rows == record.tables[table]
     assert [(mark.scene_id, mark.outcome) for mark in record.scenes] == [(i, "made") for i in range(4)]
 
 
@@ -226,7 +226,7 @@ def test_attempts_with_other_ends_are_compared_over_the_scenes_they_share(store)
 def test_an_attempt_that_was_swept_without_a_winner_says_who_may_have_done_it(store):
     attempt = begin_attempt(store, Span(start=0, stop=2), terms())
     attempt.add_scene(made_scene(0))
-    store.fence(f"{STAGING}/0000000000/{attempt.name}")
+    store.revoke(f"{STAGING}/0000000000/{attempt.name}")
     attempt.begin_scene(1)
     attempt.add_scene(made_scene(1))
     assert attempt.fenced

@@ -6,6 +6,7 @@ from schemas.dataset.commit import Span
 from schemas.dataset.layout import MAX_SCENE, STAGING
 from tests.made_up_scenes import attempt_at, made_scene, terms
 from workers.store.attempt import attempts_at, begin_attempt, blamed_scene
+from workers.store.local import LocalStage
 
 
 def test_a_scene_is_blamed_from_its_beginning_until_the_commit(store):
@@ -31,10 +32,10 @@ def test_a_worker_that_dies_while_it_commits_blames_no_scene(store, monkeypatch)
     class Died(BaseException):
         pass
 
-    def dies(staging):
+    def dies(stage):
         raise Died
 
-    monkeypatch.setattr(store, "make_durable", dies)
+    monkeypatch.setattr(LocalStage, "flush", dies)
     with pytest.raises(Died):
         attempt.commit()
     assert attempts_at(store, 0) == [attempt.name]
@@ -45,8 +46,10 @@ def test_a_range_that_is_known_to_have_no_scene_in_progress_is_not_told_so_again
     attempt = attempt_at(store, 0, 4)
     attempt.end_scenes()
     assert blamed_scene(store, 0, attempt.name) is None
-    monkeypatch.setattr(store, "write_note", None)  # called, it would raise
+    write, written = LocalStage.write, []
+    monkeypatch.setattr(LocalStage, "write", lambda stage, path, data: (written.append(path), write(stage, path, data)))
     assert attempt.commit().won
+    assert written and "_current" not in written
 
 
 def test_a_shorter_note_replaces_a_longer_one_in_place(store):
@@ -63,7 +66,7 @@ def test_a_shorter_note_replaces_a_longer_one_in_place(store):
 def test_a_note_is_not_written_where_the_folder_was_swept(store):
     attempt = begin_attempt(store, Span(start=0, stop=2), terms())
     attempt.begin_scene(0)
-    store.fence(f"{STAGING}/0000000000/{attempt.name}")
+    store.revoke(f"{STAGING}/0000000000/{attempt.name}")
     attempt.begin_scene(1)
     assert attempt.fenced
     assert not (store.root / f"{STAGING}/0000000000/{attempt.name}").exists()

@@ -90,7 +90,7 @@ def test_a_damaged_or_missing_table_is_told_by_name(store):
     (records,) = iter_ranges(store, 0, 4)
     path = range_table_path(0, "views")
     data = store.read(path)
-    store.write_whole(path, data[:-1] + b"X")
+    store.put(path, data[:-1] + b"X")
     with pytest.raises(CorruptError, match=f"{path} does not match the SHA-256 in its commit"):
         range_rows(store, records, "views")
     store.remove(path)

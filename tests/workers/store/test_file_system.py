@@ -7,7 +7,7 @@ from schemas.dataset.layout import TEMPORARY
 from schemas.errors import MachineError, OutputError
 from workers.store import file_system
 from workers.store.attempt import sweep
-from workers.store.file_system import explain_disk_errors, file_system_of, refuse_link_out
+from workers.store.file_system import explain_disk_errors, file_system_of
 from workers.store.local import LocalStore
 
 
@@ -51,7 +51,7 @@ def test_names_in_many_folders_are_flushed_by_one_syncfs(tmp_path, monkeypatch):
     monkeypatch.setattr(
         file_system, "_syncfs", lambda descriptor: flushed.append(os.readlink(f"/proc/self/fd/{descriptor}"))
     )
-    store.sync_folders_of(many_names())
+    store.sync(many_names())
     assert flushed == [str(tmp_path)]
 
 
@@ -59,7 +59,7 @@ def test_without_syncfs_every_folder_up_to_the_output_folder_is_flushed(tmp_path
     store, flushed = LocalStore(tmp_path), []
     monkeypatch.setattr(file_system, "_trusts_syncfs", lambda folder: False)
     monkeypatch.setattr(file_system, "sync_path", lambda path: flushed.append(path))
-    store.sync_folders_of(many_names())
+    store.sync(many_names())
     below = {tmp_path / f"c{number}" for number in range(4)}
     assert set(flushed) == {tmp_path, *below, *(folder / "patches" for folder in below)}
     assert flushed[-1] == tmp_path
@@ -130,29 +130,11 @@ def test_a_probe_whose_files_are_swept_by_a_coordinator_at_work_is_made_again(tm
     assert swept
 
 
-def test_many_keys_ask_each_folder_once_and_each_file(tmp_path, monkeypatch):
-    root, asked = tmp_path / "out", []
-    (root / "a/b").mkdir(parents=True)
-    islink = os.path.islink
-    monkeypatch.setattr(os.path, "islink", lambda path: asked.append(os.path.relpath(path, root)) or islink(path))
-    plain: set[str] = set()
-    for name in ("x", "y"):
-        refuse_link_out(root, f"a/b/{name}", plain)
-    assert asked == ["a", "a/b", "a/b/x", "a/b/y"]
-    (root / "a/b/z").symlink_to(tmp_path / "secret")
-    with pytest.raises(OutputError, match="a/b/z is a symbolic link that leads out of "):
-        refuse_link_out(root, "a/b/z", plain)
-    (root / "c").symlink_to(tmp_path)
-    with pytest.raises(OutputError, match="/c is a symbolic link that leads out of "):
-        refuse_link_out(root, "c/x", plain)
-    assert plain == {"a/b"}
-
-
 def test_a_full_disk_is_told_with_what_to_do(store, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    store.open_staging("_staging/0/a")
+    store.stage("_staging/0/a")
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(MachineError, match=r"manifest/_commits/a.json.*disk is full.*free some space"):
         store.put_if_absent("manifest/_commits/a.json", b"x")

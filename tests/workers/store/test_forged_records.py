@@ -176,9 +176,9 @@ def test_a_run_does_not_begin_where_a_link_leads_out(tmp_path, key):
     with pytest.raises(OutputError, match=f"{key} is a symbolic link that leads out of "):
         store.prepare()
     for write in (
-        lambda: store.write_whole(f"{key}/x", b""),
+        lambda: store.put(f"{key}/x", b""),
         lambda: store.put_if_absent(f"{key}/x", b""),
-        lambda: store.open_staging(f"{key}/x"),
+        lambda: store.stage(f"{key}/x"),
         lambda: store.remove(f"{key}/RGB00000.png"),
         lambda: store.remove_tree(key),
     ):
@@ -211,7 +211,7 @@ def test_a_success_file_that_names_other_files_is_not_whole(tmp_path):
     assert read_success(store) == success
     for path in ("../victim", "job.yaml", "mug/RGB00000.png", "manifest/views/category=a/../x.parquet", ""):
         forged = success | {"files": success["files"] | {path: {"bytes": 8, "sha256": "0" * 64}}}
-        store.write_whole(SUCCESS_FILE, json.dumps(forged).encode())
+        store.put(SUCCESS_FILE, json.dumps(forged).encode())
         assert read_success(store) is None
 
 

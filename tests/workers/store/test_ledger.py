@@ -3,13 +3,11 @@ import itertools
 import pyarrow as pa
 import pytest
 
-from schemas.dataset.commit import CommitSummary
+from schemas.dataset.commit import LEDGER_SCHEMA, CommitSummary, join_rows, rows_of
 from schemas.dataset.layout import LEDGER_FILE, commit_path
-from schemas.dataset.ledger import LEDGER_SCHEMA, join_rows, rows_of
 from schemas.errors import CorruptError, MachineError
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, terms
 from workers.store import ledger as module
-from workers.store.commit import committed_files, read_record, seal_record
 from workers.store.ledger import LedgerKeeper, list_commits, read_kept_rows, read_summary, save_rows
 
 pytestmark = pytest.mark.usefixtures("unflushed")
@@ -112,7 +110,7 @@ def test_every_cut_and_flip_of_the_kept_summary_is_found_and_hides_nothing(fille
     data = filled.read(LEDGER_FILE)
     for at in range(0, len(data), 41):
         for damaged in (data[:at], data[:at] + bytes([data[at] ^ 4]) + data[at + 1 :]):
-            filled.write_whole(LEDGER_FILE, damaged)
+            filled.put(LEDGER_FILE, damaged)
             with pytest.raises(CorruptError, match="manifest/_ledger is damaged: remove it"):
                 read_kept_rows(filled)
             assert list_commits(filled).rows.to_pylist() == whole, at
@@ -127,7 +125,7 @@ def test_a_summary_of_another_dataset_is_not_used(filled, tmp_path):
     again = list_commits(filled)
     assert again.rows.to_pylist() == own.rows.to_pylist()
     assert again.lost == ()
-    filled.write_whole(LEDGER_FILE, b"")
+    filled.put(LEDGER_FILE, b"")
     assert list_commits(filled).rows.num_rows == 5
 
 
@@ -135,17 +133,6 @@ def test_a_missing_retry_is_told_by_name(filled):
     filled.remove(commit_path(0))
     with pytest.raises(CorruptError, match=r"retries \[1\] of the range from scene 0, and must have all from 0"):
         list_commits(filled)
-
-
-def test_reasons_that_a_record_of_version_1_lacks_come_from_its_rows(store):
-    """Written by hand as version 1 did."""
-    record = attempt_at(store, 4, 8).commit().record  # scene 5 fails
-    raw = record.model_dump(mode="json") | {"schema_version": 1}
-    raw["files"] = [entry.model_dump() for entry in committed_files(store, record)]
-    raw["scenes"] = [{k: v for k, v in mark.items() if k != "reason"} for mark in raw["scenes"]]
-    (store.root / commit_path(4)).write_bytes(seal_record(raw))
-    assert read_record(store, 4).scenes[1].reason is None
-    assert read_summary(store, 4).failed == ((5, "intrinsic", "left_table"),)
 
 
 def summary(number: int) -> CommitSummary:

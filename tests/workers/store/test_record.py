@@ -4,17 +4,12 @@ import pytest
 
 from schemas.dataset.layout import commit_path
 from schemas.errors import CorruptError, OutputError
-from tests.kit.faults import check_published
 from tests.made_up_scenes import attempt_at, made_scene
 from tests.stored_images import iter_records
 from workers.store.commit import (
-    committed_files,
-    compare_attempts,
     decode_record,
     encode_record,
-    publish,
     read_record,
-    seal_record,
 )
 from workers.store.ledger import read_summary
 
@@ -26,42 +21,18 @@ def test_a_record_reads_back_as_it_was_and_always_has_the_same_bytes(store):
     data = store.read(commit_path(0))
     assert decode_record(data, "x") == record
     assert encode_record(decode_record(data, "x")) == data
-    assert json.loads(data)["schema_version"] == 2
+    assert json.loads(data)["schema_version"] == 1
     assert json.loads(data)["span"] == {"start": 0, "stop": 4, "retry": 0, "scenes": []}
 
 
 def test_a_record_is_small_and_grows_by_sixteen_characters_a_scene(store):
-    """The whole record of 16 scenes with all their images and shapes; version 1 took 54 kB."""
+    """The whole record of 16 scenes with all their images and shapes."""
     record = attempt_at(store, 40, 44).commit().record
     assert all(entry.path.startswith("manifest/_ranges/") for entry in record.files)
     small = len(store.read(commit_path(attempt_at(store, 0, 4, make=made_scene).commit().record.span.start)))
     large = len(store.read(commit_path(attempt_at(store, 20, 36, make=made_scene).commit().record.span.start)))
     assert large < 2048
     assert large - small < 12 * 16 + 50
-
-
-def test_a_record_of_version_1_reads_as_ever(store):
-    """Made by hand in the old form, with its images named in the record and whole digests of scenes."""
-    record = attempt_at(store, 0, 4).commit().record
-    old = {
-        "kind": "verso-commit",
-        "schema_version": 1,
-        "span": {"start": 0, "stop": 4, "retry": 0, "scenes": []},
-        "attempt": record.attempt,
-        "terms": record.terms.model_dump(mode="json"),
-        "files": [entry.model_dump(mode="json") for entry in committed_files(store, record)],
-        "tables": {table: {"rows": entry.rows, "digest": "0" * 64} for table, entry in record.tables.items()},
-        "scenes": [
-            {"scene_id": i, "outcome": "made", "digest": record.scenes[i].digest.ljust(64, "0")} for i in range(4)
-        ],
-    }
-    (store.root / commit_path(0)).write_bytes(seal_record(old))
-    read = read_record(store, 0)
-    assert committed_files(store, read) == read.files == committed_files(store, record)
-    publish(store, read)
-    check_published(store, read)
-    assert compare_attempts(record, (), read, ()) is None
-    assert read_summary(store, 0).made == 4
 
 
 def test_every_altered_byte_of_a_record_is_found(store):
@@ -92,8 +63,8 @@ def test_a_torn_record_is_refused_by_name(store):
 
 def test_a_record_of_a_newer_version_is_refused_and_one_with_more_keys_is_read(store):
     record = attempt_at(store, 0, 2).commit().record
-    newer = record.model_copy(update={"schema_version": 3})
-    with pytest.raises(OutputError, match="schema_version 3, and this program reads up to 2: install a newer"):
+    newer = record.model_copy(update={"schema_version": 2})
+    with pytest.raises(OutputError, match="schema_version 2, and this program reads up to 1: install a newer"):
         decode_record(encode_record(newer), "x")
 
     class More(type(record)):

@@ -27,14 +27,14 @@ def test_a_retry_of_a_committed_range_is_not_swept_as_its_loser(store):
 
 
 def test_sweeping_leaves_what_is_not_ours_and_says_so(store):
-    store.write_whole(f"{STAGING}/0000000000/mine/notes.txt", b"")
+    store.put(f"{STAGING}/0000000000/mine/notes.txt", b"")
     with pytest.raises(CorruptError, match=f"{STAGING}/0000000000/mine is not an attempt"):
         sweep(store)
 
 
 def test_temporary_files_of_the_dead_are_swept(store):
-    store.write_whole("manifest/_commits/.probe-1", b"")
-    store.write_whole(f"{STAGING}/_tmp/.x", b"")
+    store.put("manifest/_commits/.probe-1", b"")
+    store.put(f"{STAGING}/_tmp/.x", b"")
     sweep(store)
     assert not list(store.files("manifest/_commits"))
     assert not list(store.files(STAGING))

@@ -12,7 +12,7 @@ from tests.made_up_scenes import attempt_at, made_scene, scene, terms
 from tests.stored_images import read_images
 from workers.store.local import LocalStore
 from workers.store.manifest import table_of_rows
-from workers.store.tars import LABEL_TABLES, check_labels, member_of, path_of, read_labels, read_tar
+from workers.store.tars import LABEL_TABLES, check_labels, member_of, path_of, read_tar
 
 pytestmark = pytest.mark.usefixtures("unflushed")
 
@@ -202,20 +202,6 @@ def test_labels_of_a_pose_that_the_tables_do_not_have_are_told(store, tmp_path):
     (path,) = tmp_path.glob(f"{made_scene(0).rows['scenes'][0]['category']}/*.tar")
     faults = check_labels(path.parent.name, path.read_bytes(), "here.tar", range_rows_of(range(1, 4)))
     assert faults[0] == (0, "here.tar: 00000.json is of a pose that the tables do not have")
-
-
-def test_a_tar_of_an_earlier_version_has_no_labels_and_nothing_is_off(store, tmp_path):
-    attempt_at(store, 0, 1, TAR).commit()
-    (path,) = tmp_path.glob("*/*.tar")
-    out = io.BytesIO()
-    with tarfile.open(path) as archive, tarfile.open(fileobj=out, mode="w") as other:
-        for header in archive:
-            if header.name.endswith(".png"):
-                other.addfile(header, archive.extractfile(header))
-    category = path.parent.name
-    assert check_labels(category, out.getvalue(), "here.tar", range_rows_of(range(1))) == []
-    assert list(read_labels(category, out.getvalue(), "here.tar")) == []
-    assert dict(read_tar(category, out.getvalue(), "x")) == dict(read_tar(category, path.read_bytes(), "x"))
 
 
 def test_a_member_that_is_no_file_is_told(store):

@@ -8,8 +8,7 @@ from functools import cache
 import numpy as np
 
 from schemas.base import frozen_array
-from schemas.job.assets import ProceduralSource
-from schemas.job.category import BUILT_IN, TABLE, instance_id
+from schemas.job.assets import BUILT_IN, TABLE, ProceduralSource, instance_id
 from schemas.scene.shape import Asset, Lofted, Shape
 from workers.assets.builtin.parts import Model, cut_into_parts
 from workers.assets.mass import solid_mass

@@ -10,9 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job.assets import FolderSource, ShapeNetSource, UpAxis
-from schemas.job.category import BUILT_IN, TABLE
-from schemas.job.pattern import matches
+from schemas.job.assets import BUILT_IN, TABLE, FolderSource, ShapeNetSource, UpAxis, matches
 
 UNKNOWN = "unknown"
 """The licence of a source whose user states none."""

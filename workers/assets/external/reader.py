@@ -35,8 +35,7 @@ from scipy.spatial import QhullError
 
 from schemas.base import frozen_array
 from schemas.errors import MachineError, MeshError
-from schemas.job.assets import Assets, FolderSource, MeshLimits, ShapeNetSource
-from schemas.job.category import TABLE
+from schemas.job.assets import TABLE, Assets, FolderSource, MeshLimits, ShapeNetSource
 from schemas.scene.shape import Asset, Hull, MassProperties, Material, Part, Shape
 from workers.assets.external.caps import describe_error, one_line
 from workers.assets.external.listing import Entry, hash_files

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.job.assets import ProceduralSource
-from schemas.job.category import CATEGORIES, instance_id
+from schemas.job.assets import CATEGORIES, ProceduralSource, instance_id
 from tests.workers.assets.oracles import faulty_rays, support_margin, welded
 from workers.assets.builtin.make import make_asset, make_model, shape_digest
 
@@ -144,7 +143,7 @@ def test_instances_differ_and_stay_within_their_budget_of_faces(category):
 
 def test_the_same_instance_comes_again_from_another_process_with_another_hash_seed():
     code = (
-        "from workers.assets.builtin.make import *; from schemas.job.category import CATEGORIES;"
+        "from workers.assets.builtin.make import *; from schemas.job.assets import CATEGORIES;"
         "s = ProceduralSource(source='procedural');"
         "print(' '.join(make_asset(c, s, 5, 600.0).sha256 for c in (*CATEGORIES, 'table')))"
     )
@@ -158,7 +157,7 @@ def test_the_same_instance_comes_again_from_another_process_with_another_hash_se
 def test_shapes_have_the_same_bits_with_and_without_wide_vector_instructions():
     """Dispatch in numpy differs with AVX-512 and AVX2 off; coordinates do not."""
     code = (
-        "from workers.assets.builtin.make import *; from schemas.job.category import CATEGORIES;"
+        "from workers.assets.builtin.make import *; from schemas.job.assets import CATEGORIES;"
         "print(' '.join(str(hash(make_model(c, 0, 5).solid.vertices.tobytes())) for c in (*CATEGORIES, 'table')))"
     )
     digests = []

@@ -9,8 +9,7 @@ import pytest
 
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job.assets import Assets, FolderSource, MeshLimits, ShapeNetSource
-from schemas.job.category import BUILT_IN
+from schemas.job.assets import BUILT_IN, Assets, FolderSource, MeshLimits, ShapeNetSource
 from schemas.job.job import Job
 from tests.workers.assets.oracles import CUBE, textured_cube, write
 from workers.assets.catalogue import list_source
@@ -25,7 +24,7 @@ from workers.assets.external.listing import (
     locate_folder,
 )
 from workers.assets.external.placement import load_entry
-from workers.pipeline.rows import asset_row
+from workers.scene.rows import asset_row
 
 
 def test_a_file_that_changed_since_is_noticed(tmp_path):

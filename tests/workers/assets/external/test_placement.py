@@ -5,8 +5,7 @@ import pytest
 import trimesh
 from shapely import Polygon
 
-from schemas.job.assets import Assets, FolderSource, ProceduralSource
-from schemas.job.category import CATEGORIES, TABLE
+from schemas.job.assets import CATEGORIES, TABLE, Assets, FolderSource, ProceduralSource
 from tests.workers.assets.oracles import shape_of, support_margin, welded, write
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
