@@ -75,14 +75,6 @@ def test_a_folder_or_a_file_without_permission_is_told(tmp_path, monkeypatch):
         walk_folder(tmp_path)
 
 
-def test_too_many_files_are_no_folder_of_meshes(tmp_path, monkeypatch):
-    monkeypatch.setattr(walk, "MOST_FILES", 3)
-    for number in range(4):
-        write(tmp_path / f"{number}.obj", "")
-    with pytest.raises(AssetSourceError, match="over 3 meshes"):
-        walk_folder(tmp_path)
-
-
 def read(folder):
     told = []
     candidates = [Candidate(path, "c") for path in walk_folder(folder).paths]
@@ -135,8 +127,3 @@ def test_of_one_mesh_in_several_formats_the_first_stays_and_different_names_are_
     kept, left_out = drop_doubles(items)
     assert [one.path for one in kept] == ["a/m.glb", "a/n.obj", "b/m.obj"]
     assert {one.path for one in left_out} == {"a/m.stl", "a/m.obj"}
-
-
-def test_an_item_knows_its_format_and_its_diagonal():
-    one = item("a/B.GLB", extents=(3.0, 4.0, 12.0))
-    assert one.suffix == ".glb" and one.diagonal == pytest.approx(13.0)

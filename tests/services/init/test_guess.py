@@ -10,9 +10,7 @@ from services.init.guess import (
     is_category,
     map_categories,
     plain_axis,
-    usable_name,
 )
-from services.job.bounded_yaml import parse_yaml
 from workers.assets.external.placement import Measured
 
 
@@ -41,13 +39,6 @@ def test_a_category_follows_from_where_a_file_lies(path, source, category):
     assert is_category(category)
 
 
-@pytest.mark.parametrize(
-    "text", ["", "---", "1", "table", "TABLE", "manifest", "a/b", "\x00", "x" * 300, "9" * 64, "😀", "_a_"]
-)
-def test_any_text_becomes_a_name(text):
-    assert is_category(usable_name(text))
-
-
 CASES = {
     "one folder each": ({"mug/a.obj": "mug", "mug/b.obj": "mug", "can/a.obj": "can"}, (), ()),
     "deep": ({"mug/1/m.obj": "mug", "mug/2/m.obj": "mug", "mug/2/x/n.obj": "mug"}, (), ()),
@@ -74,15 +65,6 @@ def test_patterns_find_the_files_of_their_category_and_no_others(tmp_path, name)
             if path.is_file():
                 found.setdefault(path.relative_to(tmp_path).as_posix(), category)
     assert {path: category for path, category in found.items() if path not in harmless} == items
-
-
-def test_a_folder_a_category_has_one_pattern():
-    items = {f"{name}/{k}.obj": name for name in ("mug", "can") for k in range(100)}
-    assert map_categories(items, (), ()) == {"can/*.obj": "can", "mug/*.obj": "mug"}
-
-
-def test_names_are_yaml_as_they_are():
-    assert parse_yaml(f"{{{category_of('no/a.obj', None)}_: 1}}") == {"no_": 1}
 
 
 def item(path, extents=(0.1, 0.1, 0.1), up=None, confidence="sure"):
@@ -149,9 +131,3 @@ def test_what_is_only_likely_counts_where_nothing_is_sure_and_nothing_at_all_is_
     (rule,) = guess_ups([item("a.obj"), item("b.obj")])
     assert rule.axis == "z" and rule.why.startswith("not known")
     assert ups(item("a.obj", up="y"), item("b.obj", up="x")) == {"a.obj": "y", "b.obj": "x", "**/*.obj": "z"}
-
-
-def test_a_folder_of_a_strange_name_has_its_line_too():
-    mine = [item(f"mine/{k}.obj", up="z") for k in range(6)]
-    theirs = [item(f"[x] y/{k}.obj", up="y") for k in range(2)]
-    assert ups(*mine, *theirs) == {"[[]x] y/**/*.obj": "y", "**/*.obj": "z"}

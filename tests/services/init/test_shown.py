@@ -10,14 +10,10 @@ from services.init.shown import (
     MOST_ROWS,
     TILE,
     Tile,
-    describe_size,
-    describe_up,
     draw_left_out,
     draw_object,
     draw_sheet,
     draw_table,
-    missing_pictures,
-    shorten,
     show_items,
 )
 from tests.own_meshes import cup, write_mesh
@@ -56,17 +52,6 @@ def test_what_is_not_shown_is_counted():
     assert draw_left_out([], 100) == []
 
 
-def test_words_of_cells():
-    assert describe_size((0.105, 0.0796, 1.23456)) == "10.5 x 7.96 x 123"
-    assert [describe_up("y", *says) for says in ((None, None), ("y", "sure"), ("z", "likely"))] == [
-        "y?",
-        "y sure",
-        "y (or z)",
-    ]
-    assert missing_pictures(("a.png is missing: plain base colour used", "6 doubled or empty faces dropped")) == 1
-    assert [shorten("abcdefgh", most) for most in (8, 5, 2)] == ["abcdefgh", "ab…gh", "a…"]
-
-
 @pytest.mark.parametrize(
     ("up", "size"), [("x", (0.06, 0.06, 0.12)), ("y", (0.06, 0.06, 0.12)), ("z", (0.06, 0.06, 0.12))]
 )
@@ -83,14 +68,6 @@ def test_sizes_are_those_of_the_asset_that_is_loaded(tmp_path, up, size):
     assert shown.up == up and shown.shape_says == ("y" if up == "y" else "z")
     assert shown.row[:2] == ("cup.stl", "cup") and shown.row[4] == "yes"
     assert any("up: " in line for line in shown.caption)
-
-
-def test_a_source_that_resizes_shows_the_size_that_comes_of_it(tmp_path):
-    path = write_mesh(tmp_path / "cup.stl", cup())
-    (item,) = read_folder(tmp_path, [Candidate(path.name, "cup")], lambda *_: None).items
-    source = FolderSource(source="urdf", folder=str(tmp_path), category_map={"*.stl": "cup"}, diagonal_m=0.25)
-    ((shown, _),) = show_items(open_catalogue(Assets(objects=(source,)), tmp_path, ("cup",)), [item])
-    assert sum(extent**2 for extent in shown.size_m) ** 0.5 == pytest.approx(0.25)
 
 
 def asset(scale=1.0, turned=False):

@@ -13,15 +13,11 @@ from workers.assets.builtin.sweeps import (
     INSIDE,
     OUTSIDE,
     bend_radius,
-    bevelled_profile,
     bezier,
     fillet,
-    half_circle_points,
-    outward_normals,
     prism,
     rod,
     rounded_rectangle,
-    rounded_sections,
     spline,
     split_sides,
     squircle,
@@ -54,26 +50,6 @@ def test_a_rounded_corner_leaves_and_meets_its_sides_and_knows_them():
     assert Polygon([*points, [0, 1]]).area == pytest.approx(1 - 0.2 * 0.2 / 3, rel=0.02)  # a parabola cuts off a third
 
 
-def test_a_corner_that_is_not_rounded_stays():
-    corners = np.array([[0.0, 0], [1, 0], [1, 1]])
-    points, owner = fillet(corners, [0, 0, 0])
-    assert points.tolist() == corners.tolist()
-    assert owner.tolist() == [0, 1]
-
-
-def test_outwards_is_down_along_a_floor_and_out_of_a_wall():
-    normals = outward_normals(np.array([[0.0, 0], [1, 0], [2, 0]]))
-    assert normals == pytest.approx(np.array([[0, -1]] * 3))
-    assert outward_normals(np.array([[1.0, 0], [1, 1], [1, 2]])) == pytest.approx(np.array([[1, 0]] * 3))
-
-
-def test_a_rim_is_a_half_circle_over_the_wall():
-    points = half_circle_points(np.array([2.0, 5.0]), np.array([1.0, 5.0]), 3)
-    assert points[1] == pytest.approx([1.5, 5.5])
-    assert np.hypot(points[:, 0] - 1.5, points[:, 1] - 5.0) == pytest.approx(np.full(3, 0.5))
-    assert points[0, 0] > points[2, 0]
-
-
 @pytest.mark.parametrize("squareness", [0, 1, 2])
 def test_a_squircle_satisfies_its_equation(squareness):
     power = 2 ** (squareness + 1)
@@ -87,13 +63,6 @@ def test_a_rounded_rectangle_has_its_size_and_runs_counter_clockwise():
     assert outline.area == pytest.approx(8 - (4 - math.pi) * 0.25, rel=1e-3)
 
 
-def test_sections_turn_from_a_circle_into_an_outline():
-    sections = rounded_sections(squircle(16, 2), np.array([0.0, 0.25, 1.0]))
-    assert sections[0].tolist() == circle(16).tolist()
-    assert sections[2].tolist() == squircle(16, 2).tolist()
-    assert sections[1] == pytest.approx(0.75 * sections[0] + 0.25 * sections[2])
-
-
 def mesh_of(solid):
     return trimesh.Trimesh(solid.vertices, solid.faces, process=False)
 
@@ -103,12 +72,6 @@ def test_a_prism_has_its_size_and_the_volume_of_a_box_without_its_corners():
     assert mesh.is_volume
     assert mesh.bounds == pytest.approx(np.array([[-0.2, -0.1, 0.0], [0.2, 0.1, 0.3]]))
     assert mesh.volume == pytest.approx(0.3 * (0.08 - (4 - math.pi) * 0.0025), rel=1e-3)
-
-
-def test_a_bevel_is_taken_off_both_edges():
-    assert bevelled_profile(0.1, 0.01, 1.0).tolist() == pytest.approx(
-        np.array([[0.01, 1], [0, 1.01], [0, 1.09], [0.01, 1.1]])
-    )
 
 
 def test_a_rod_bent_into_a_half_circle_has_the_volume_that_pappus_gives_it():
@@ -165,7 +128,3 @@ def test_a_vessel_stands_on_its_foot_ring_and_holds_what_its_hollow_says():
     assert np.hypot(ring[:, 0], ring[:, 1]).max() == pytest.approx(0.025)
     inside = wall.surface == INSIDE
     assert wall.profile[1:][inside][-1].tolist() == [0.0, 0.01]
-
-
-def test_the_middle_of_a_wall_lies_half_its_thickness_inside():
-    assert beaker().middle_at(0.06) == pytest.approx([0.042, 0.06], abs=5e-5)

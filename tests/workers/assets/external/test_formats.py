@@ -11,10 +11,9 @@ import trimesh
 from PIL import Image
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from tests.workers.assets.oracles import CUBE, textured_cube, write
-from workers.assets.external.caps import FolderResolver, check_counts, declared_counts, open_image
+from workers.assets.external.caps import FolderResolver, declared_counts
 from workers.assets.external.formats import list_mesh_files, load_shape, material_files, read_visual
 from workers.assets.external.mesh import DEFAULT
 
@@ -25,20 +24,6 @@ def test_the_counts_that_a_file_declares_are_those_that_it_holds(suffix):
     vertices, faces = declared_counts(suffix, mesh.export(file_type=suffix[1:]))
     assert faces == len(mesh.faces)
     assert vertices in (len(mesh.vertices), 3 * len(mesh.faces))
-
-
-def test_an_obj_is_counted_by_its_lines():
-    assert declared_counts(".obj", CUBE.encode()) == (8, 6)
-
-
-def test_ascii_stl_is_counted_by_its_facets():
-    text = trimesh.creation.box((1, 1, 1)).export(file_type="stl_ascii")
-    assert declared_counts(".stl", text.encode())[1] == 12
-
-
-def test_a_count_over_its_cap_names_the_cap(tmp_path):
-    with pytest.raises(MeshError, match="6 faces, over max_faces = 5"):
-        check_counts(tmp_path / "x.obj", 8, 6, MeshLimits(max_faces=5))
 
 
 def load(path, **limits):
@@ -52,12 +37,6 @@ def test_names_with_backslashes_and_folders_that_do_not_exist_are_found_beside_t
         assert resolver.find(name) == tmp_path / "mesh" / "skin.png"
     assert resolver.find("../../etc/passwd") is None
     assert resolver.find("bad\0name") is None
-
-
-def test_a_picture_that_cannot_be_read_says_why():
-    assert "not a PNG or JPEG" in str(open_image(b"BM123", MeshLimits())[1])
-    torn = b"\x89PNG\r\n\x1a\n" + bytes(9)
-    assert "cannot be opened" in str(open_image(torn, MeshLimits())[1])
 
 
 def test_a_texture_comes_along_with_its_coordinates_right_way_up(tmp_path):
@@ -75,12 +54,6 @@ def test_alpha_is_kept(tmp_path):
     part = load(textured_cube(tmp_path, more="d 0.5\n")).shape.parts[0]
     assert part.material.texture.shape == (2, 2, 4)
     assert part.material.base_color[3] == 0.5
-
-
-def test_a_missing_texture_leaves_the_base_colour_and_a_note(tmp_path):
-    loaded = load(textured_cube(tmp_path))
-    assert loaded.shape.parts[0].material.texture is None
-    assert "skin.png is missing" in loaded.notes[0]
 
 
 @pytest.mark.parametrize("name", ["skin.gif", "skin.png"])

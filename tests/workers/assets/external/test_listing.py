@@ -116,12 +116,6 @@ def test_a_link_out_of_the_folder_is_not_followed(tmp_path):
     assert list_source(source(category_map={"*.obj": "mug"}), tmp_path / "in", {"mug"}, LIMITS).entries["mug"] == ()
 
 
-def test_a_category_has_any_name(tmp_path):
-    write(tmp_path / "a.obj", CUBE)
-    listing = list_source(source(category_map={"*.obj": "banana"}), tmp_path, {"banana"}, LIMITS)
-    assert [entry.files[0].path for entry in listing.entries["banana"]] == ["a.obj"]
-
-
 def test_a_map_that_cannot_be_used_is_refused_with_the_remedy(tmp_path):
     write(tmp_path / "a.obj", CUBE)
     with pytest.raises(AssetSourceError, match=r"needs a `category_map`.*It has a\.obj"):

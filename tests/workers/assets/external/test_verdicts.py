@@ -83,12 +83,6 @@ def test_without_a_folder_that_can_be_written_verdicts_are_kept_in_memory(tmp_pa
         assert "a" in verdicts
 
 
-def test_the_axis_that_a_file_stands_on_is_kept_too(tmp_path):
-    Verdicts(tmp_path).put([("a", "y"), ("b", None)], "/one")
-    kept = Verdicts(tmp_path)
-    assert (kept.get("a", "/two"), kept.get("b", "/two")) == ("y", None)
-
-
 MIT = FolderSource(source="urdf", folder=".", licence="MIT")
 
 
