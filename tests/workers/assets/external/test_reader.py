@@ -147,12 +147,11 @@ def _short(receive):
 
 def test_a_fork_server_that_has_ended_is_started_again_and_one_that_cannot_start_is_the_machine_s_fault(tmp_path):
     code = (
-        "import os, signal, sys, multiprocessing.forkserver as f;"
-        "from pathlib import Path; from tests.workers.assets.external.test_reader import *;"
-        "folder = Path(sys.argv[1]); print(act(folder, 'fine'));"
-        "os.kill(f._forkserver._forkserver_pid, signal.SIGKILL); print(act(folder, 'fine'));"
-        "os.kill(f._forkserver._forkserver_pid, signal.SIGKILL);"
-        "import multiprocessing.spawn as s; s.set_executable('/bin/false'); import time; time.sleep(0.2)\n"
+        "import os, signal, sys, time, multiprocessing.forkserver as f, multiprocessing.spawn as s\n"
+        "from pathlib import Path; from tests.workers.assets.external.test_reader import *\n"
+        "def kill(): os.kill(f._forkserver._forkserver_pid, signal.SIGKILL); time.sleep(1)\n"
+        "folder = Path(sys.argv[1]); print(act(folder, 'fine')); kill(); print(act(folder, 'fine')); kill()\n"
+        "s.set_executable('/bin/false')\n"
         "try: act(folder, 'fine')\n"
         "except MachineError as error: print(error)"
     )
