@@ -7,7 +7,7 @@ import multiprocessing
 import os
 from concurrent.futures import ProcessPoolExecutor
 
-import workers.pipeline.run_shard  # noqa: F401  every file with loops for scenes
+import workers.shard.run_shard  # noqa: F401  every file with loops for scenes
 from workers.geometry.jit import compile_planned
 
 if __name__ == "__main__":

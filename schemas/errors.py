@@ -23,6 +23,8 @@ A message says what failed, the number measured, and the setting to change. All 
 because an exception that crosses processes is rebuilt from them.
 """
 
+import difflib
+from collections.abc import Iterable
 from typing import Literal
 
 FailureKind = Literal["intrinsic", "environmental"]
@@ -133,3 +135,30 @@ class CaptureError(SceneError):
     """A capture that cannot be read, or whose poses cannot be estimated."""
 
     stage = "capture"
+
+
+def plain_line(text: str, most: int = 80) -> str:
+    """`text` with at most `most` characters of it, and an escape in place of what is not printable."""
+    cut = text if len(text) <= most else f"{text[: most - 3]}..."
+    return cut if cut.isprintable() else "".join(map(_printable, cut))
+
+
+def _printable(character: str) -> str:
+    return character if character.isprintable() else character.encode("unicode_escape").decode()
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """A question with the nearest of the known words and a space behind it; empty where none is near."""
+    near = difflib.get_close_matches(word, known, n=1)
+    return f"did you mean '{near[0]}'? " if near else ""
+
+
+_SPANS = ((60.0, 1.0, "s"), (5400.0, 60.0, "min"), (48 * 3600.0, 3600.0, "h"), (float("inf"), 86400.0, "d"))
+"""(below so many seconds, seconds in one, its symbol)."""
+
+
+def describe_seconds(seconds: float) -> str:
+    """Seconds in one unit, with two digits or whole: "0.12 s", "8 s", "2.5 min", "31 h", "9 d"."""
+    _, one, name = next(span for span in _SPANS if seconds < span[0])
+    value = seconds / one
+    return f"{float(f'{value:.2g}') if value < 100.0 else round(value):g} {name}"

@@ -10,38 +10,40 @@ import numpy as np
 import pytest
 
 from schemas.base import frozen_array
-from schemas.capture.estimate import (
+from schemas.capture import (
+    CaptureCamera,
+    CapturedView,
     CaptureEstimate,
+    CaptureScore,
+    CaptureTruth,
     DepthCorrection,
     Estimates,
+    PosedImages,
+    ProcessedCapture,
     Reconstruction,
     SynthesizedView,
     ViewEstimate,
+    ViewScore,
 )
-from schemas.capture.processed import CaptureScore, PosedImages, ProcessedCapture, ViewScore
-from schemas.capture.view import CaptureCamera, CapturedView, CaptureTruth
 from schemas.job.assets import Assets, ProceduralSource
 from schemas.job.captures import Board, Captures, Simulate
 from schemas.job.job import Job
-from schemas.job.render import Render
-from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
-from schemas.scene.scene import Placed
-from schemas.scene.shape import Asset
+from schemas.job.views import Render
+from schemas.scene.scene import EffectPlan, Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE, Asset
+from schemas.scene.view import Camera, Intrinsics
 from services.job.job_file import validate_job
 from tests.datasets import overlaid
 from workers.assets.appearance import draw_appearance
 from workers.assets.builtin.make import make_asset
 from workers.assets.captured import board_asset
+from workers.capture import make_capture
+from workers.capture.folder import CaptureFile, CaptureFolder, TrueObject, write_description, write_truth, write_view
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import pose, rotation_about, translation
-from workers.pipeline.captures import make_capture
-from workers.pipeline.stopwatch import Stopwatch
-from workers.plan.randomness import SceneChance
 from workers.render.raster.gbuffer import shared_renderer
-from workers.store.capture_folder import CaptureFile, CaptureFolder, write_description, write_view
-from workers.store.capture_truth import TrueObject, write_truth
+from workers.scene.context import Stopwatch
+from workers.scene.plan import SceneChance
 
 SMALL_CAPTURES: dict[str, Any] = {
     "name": "captures",

@@ -12,11 +12,10 @@ from services.merge.dataset_card import write_card
 from services.merge.merge import merge
 from services.read.verify import verify
 from services.run.range_planner import plan_spans
-from workers.pipeline.captures.listing import open_sources
-from workers.pipeline.context import open_worker
-from workers.pipeline.fingerprint import take_fingerprint
-from workers.pipeline.run_shard import run_scene
-from workers.pipeline.stopwatch import Stopwatch
+from workers.capture.results import open_sources
+from workers.scene.context import Stopwatch, open_worker
+from workers.shard.fingerprint import take_fingerprint
+from workers.shard.run_shard import run_scene
 from workers.store.attempt import begin_attempt
 from workers.store.ledger import list_commits
 from workers.store.local import LocalStore

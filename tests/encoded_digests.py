@@ -35,10 +35,9 @@ def render(scenes: int, seed: int = 11) -> list[NDArray]:
     from schemas.job.identity import settings_digest
     from schemas.job.job import Job
     from workers.assets.catalogue import open_catalogue
-    from workers.pipeline.context import WorkerContext
-    from workers.pipeline.make_scene import make_scene
-    from workers.pipeline.stopwatch import Stopwatch
     from workers.render.raster.gbuffer import shared_renderer
+    from workers.scene.context import Stopwatch, WorkerContext
+    from workers.scene.make_scene import make_scene
 
     job = Job(name="digests", seed=seed, scenes=scenes)
     catalogue = open_catalogue(job.assets, Path(), tuple(job.categories))

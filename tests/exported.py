@@ -9,9 +9,8 @@ import numpy as np
 import pyarrow.dataset as ds
 from numpy.typing import NDArray
 
-from services.export.choice import Choice
-from services.export.request import ExportRequest
-from services.export.step import ExportResult, export
+from services.export.export import ExportResult, export
+from services.export.formats import Choice, ExportRequest
 from workers.store.store import Store
 
 

@@ -5,8 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from services.study.errors import ERRORS
-from services.study.model import Figure, Row, Setting, Study
+from services.study.model import ERRORS, Figure, Row, Setting, Study
 
 
 def figure(value: float, spread: float = 0.1, scenes: int = 48) -> Figure:

@@ -8,16 +8,14 @@ import pytest
 import trimesh
 
 from schemas.job.job import Job
-from schemas.scene.region import REGION_FIRST_OBJECT
-from schemas.scene.shape import Part, Shape
+from schemas.scene.shape import REGION_FIRST_OBJECT, Part, Shape
 from tests.kit.shapes import asset_of
 from workers.assets.builtin.solid import circle, lathe
 from workers.assets.catalogue import open_catalogue
 from workers.assets.glb import asset_glb
-from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import make_scene
-from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.gbuffer import shared_renderer
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.make_scene import make_scene
 
 FACETS = 1000
 

@@ -29,10 +29,9 @@ from schemas.scene.scene import PosedScene
 from schemas.scene.view import Pair
 from services.job.job_file import load_job
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import make_scene
-from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.gbuffer import shared_renderer
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.make_scene import make_scene
 
 JOB = load_job(Path(__file__).resolve().parents[1] / "deploy" / "jobs" / "tabletop.yaml")
 MEDIAN_MM = 0.1

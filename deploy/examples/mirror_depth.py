@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
-from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
 from services.dataset.pair import Pair, View
 
 CROP = (96, 128)

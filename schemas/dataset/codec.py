@@ -6,11 +6,9 @@ from typing import Any
 import numpy as np
 
 from schemas.base import Pose, frozen_array
-from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.plan import ObjectStart
-from schemas.scene.region import REGION_FIRST_OBJECT, REGION_TABLE
-from schemas.scene.scene import ContactForce, Settled
-from schemas.scene.view import ObjectLabel
+from schemas.scene.scene import ContactForce, ObjectStart, Settled
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
+from schemas.scene.view import Camera, Intrinsics, ObjectLabel
 
 Row = dict[str, Any]
 

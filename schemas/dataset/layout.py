@@ -7,8 +7,8 @@ from operator import attrgetter
 from typing import Literal
 
 from schemas.job.job import Job
-from schemas.scene.camera import ROLES, Role
-from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.view import ROLES, Role
 
 JOB_FILE = "job.yaml"
 README_FILE = "DATASET.md"

@@ -1,14 +1,123 @@
-"""The `assets` branch of a job: where objects and tables come from."""
+"""The `assets` branch of a job, the names of categories, and patterns of file names.
 
+- Patterns of file names, as `Path.glob` reads them, for paths that are already known.
+- Names of categories: what a user may call them, and which ones the sources of a job offer.
+- The `assets` branch of a job: where objects and tables come from.
+"""
+
+import itertools
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from schemas.base import Folder, Frozen, Positive, PositiveInt, Seed, Share, Text, Weight
-from schemas.job.category import MappedName
-from schemas.job.pattern import matches
+from schemas.errors import did_you_mean
+
+
+def matches(path: str, pattern: str) -> bool:
+    """Whether `Path.glob(pattern)` finds the file of this path, both relative with `/` between; `**`: any folders, or none."""
+    *folders, file = path.split("/")
+    *wanted, name = [part for part in pattern.split("/") if part not in ("", ".")] or ["**"]
+    if name == "**" or not fnmatchcase(file, name):  # `**` alone finds folders
+        return False
+    reached = {0}
+    for part in wanted:
+        if part == "**":
+            reached = {place for start in reached for place in range(start, len(folders) + 1)}
+        else:
+            reached = {place + 1 for place in reached if place < len(folders) and fnmatchcase(folders[place], part)}
+    return len(folders) in reached
+
+
+CATEGORIES = ("bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box")
+"""What the built-in shapes are; the article's categories."""
+
+TABLE = "table"
+"""The category of tables, in `category_map` and in the tables of a dataset."""
+
+IN_SHAPENET = tuple(name for name in CATEGORIES if name != "box")
+"""Those of them that ShapeNetCore has."""
+
+MOST_TOLD = 20
+"""Categories that a message names."""
+
+_ALLOWED = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+
+_TAKEN = frozenset({"assets", "manifest"})
+"""Names of a dataset's own folders."""
+
+
+def _usable(name: str) -> str:
+    if not _ALLOWED.fullmatch(name):
+        raise ValueError(
+            "a category is 1 to 64 letters, digits, - and _, the first a letter or digit: it names a folder"
+        )
+    if name.lower() in _TAKEN:
+        raise ValueError("a dataset has a folder of this name: choose another")
+    if name.isdigit():
+        raise ValueError(
+            f"digits alone would be read as a number by those who query the dataset: write a letter too, such as n{name}"
+        )
+    return name
+
+
+def _of_objects(name: str) -> str:
+    if name.lower() == TABLE:
+        raise ValueError("the name of what objects stand on: choose another")
+    return _usable(name)
+
+
+CategoryName = Annotated[str, Field(max_length=1000), AfterValidator(_of_objects)]
+"""A category of objects: any name that can be a folder's."""
+
+MappedName = Annotated[str, Field(max_length=1000), AfterValidator(_usable)]
+"""The same, or `table`."""
+
+
+def offered_by(sources: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
+    """The categories that sources of objects offer by their keys as a job file has them, the built-in ones first.
+
+    Nothing of a source of files without a `category_map`. What is malformed is skipped: it is refused elsewhere.
+    """
+    names: dict[str, None] = {}
+    for source in sources:
+        kind, mapped = source.get("source"), source.get("category_map")
+        names |= dict.fromkeys({"procedural": CATEGORIES, "shapenet": IN_SHAPENET}.get(str(kind), ()))
+        if kind == "urdf" and isinstance(mapped, dict):
+            names |= dict.fromkeys(name for name in mapped.values() if isinstance(name, str) and name != TABLE)
+    return tuple(names)
+
+
+def with_categories(tree: dict[str, Any]) -> dict[str, Any]:
+    """The keys of a job with `categories`: where there are none, all that its sources offer, with equal weights."""
+    if "categories" in tree:
+        return tree
+    return {**tree, "categories": dict.fromkeys(offered_by(_sources(tree)) or CATEGORIES, 1.0)}
+
+
+def _sources(tree: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    assets = tree.get("assets")
+    found = assets.get("objects") if isinstance(assets, dict) else None
+    sources = found if isinstance(found, list) else [{"source": "procedural"}]
+    return [source for source in sources if isinstance(source, dict)]
+
+
+def describe_unknown(names: Iterable[str], offered: Sequence[str]) -> str:
+    """What is wrong with names that no source offers, with the nearest one that some source does; empty where all are known."""
+    some = tuple(itertools.islice(offered, MOST_TOLD))
+    known = dict.fromkeys((*offered, *CATEGORIES))
+    for name in names:
+        if name not in known:
+            return (
+                f"categories.{name}: no source offers it; {did_you_mean(name, known)}offered: {', '.join(some)}. A source of "
+                "files offers what its category_map names"
+            )
+    return ""
+
 
 UpAxis = Literal["x", "y", "z"]
 """An axis of a file."""

@@ -22,9 +22,9 @@ from schemas.base import (
     Share,
     Text,
 )
-from schemas.job.category import CategoryName
+from schemas.job.assets import CategoryName
 from schemas.job.keys import set_key
-from schemas.job.sensor import Distortion, Exposure, RgbNoise
+from schemas.job.views import Distortion, Exposure, RgbNoise
 
 Estimate = Literal["markers", "article", "joint"]
 BoardFrame = Literal["centre", "opencv", "opencv_old"]

@@ -1,9 +1,17 @@
-"""The job file: one tree of frozen models, parsed once. A step gets its own branch and no other.
+"""The job file: one tree of frozen models, parsed once.
+
+- The `check`, `output` and `run` branches of a job: what is checked, how files are laid out, how the work is driven.
+- The number of scenes in a range, where the job does not give it.
+- Presets: defaults for several keys at once, chosen from the measurement in docs/tradeoff.
 
 Every key but `name` has a default, and an unknown key is an error.
 """
 
+import copy
+import math
 import re
+from collections.abc import Mapping
+from contextlib import suppress
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -15,19 +23,103 @@ from pydantic import (
     model_validator,
 )
 
-from schemas.base import Frozen, NonNegativeInt, PositiveInt, Seed, Weight
-from schemas.job.assets import Assets
-from schemas.job.cameras import Cameras
+from schemas.base import Frozen, NonNegativeInt, Positive, PositiveInt, Seed, Share, Weight
+from schemas.job.assets import CATEGORIES, Assets, CategoryName, describe_unknown, offered_by, with_categories
 from schemas.job.captures import Captures, with_capture_keys
-from schemas.job.category import CATEGORIES, CategoryName, describe_unknown, offered_by, with_categories
-from schemas.job.images import Images
-from schemas.job.physics import Physics
-from schemas.job.preset import PresetName, with_preset
-from schemas.job.range_size import choose_range_size
-from schemas.job.render import Render
-from schemas.job.run import Check, Output, Run
-from schemas.job.sensor import SensorEffects
-from schemas.job.start import ONE_OBJECT, ObjectCount, Start
+from schemas.job.keys import set_key
+from schemas.job.physics import ONE_OBJECT, ObjectCount, Physics, Start
+from schemas.job.views import Cameras, Images, Render, SensorEffects
+
+RangeSize = Annotated[int, Field(ge=1, le=100_000)]
+"""A worker keeps the rows of a whole range, some kilobytes a scene."""
+
+
+class Check(Frozen):
+    """What is checked before a scene is committed."""
+
+    raycast_share: Share = 0.01
+    """Share of scenes, chosen by scene id, whose depth and masks are compared with a ray caster, and whose objects are
+    released again to see that they stay where they are."""
+    mirror_agreement_mm: Positive = 1.0
+    """Largest median difference between input depth carried into the mirror view and the mirror depth."""
+
+
+class Output(Frozen):
+    """How files are laid out."""
+
+    layout: Literal["files", "tar"] = "files"
+    """`tar`: one tar for each range and category, with images and labels; required on object stores."""
+
+
+class Run(Frozen):
+    """Workers, shards, ranges and limits. None of these keys changes a byte of the dataset."""
+
+    workers: Annotated[int, Field(ge=1, le=100_000)] | None = None
+    """None: the cores that this container may use, or the cluster's."""
+    shard_size: PositiveInt | None = None
+    """Scenes in a Ray task; rounded up to whole ranges. None: at most 64, and fewer towards the end."""
+    range_size: RangeSize | None = None
+    """Scenes in a commit; recorded at the first run. None: at most 16, and fewer where scenes are few or slow."""
+    max_failure_share: Share = 0.01
+    """Above this share of failed scenes the run exits 1, and stops early once that is certain."""
+    max_attempts: PositiveInt = 3
+    """Tries of a range whose worker dies, before the scene it died in is recorded as an environmental failure."""
+    scene_timeout_s: Positive = 120.0
+    """A worker that takes longer over one scene is killed."""
+    device: Literal["any", "gpu"] = "any"
+    """Allowed renderers: `gpu` refuses workers where OpenGL runs in software, on the CPU."""
+    fingerprint: Literal["strict", "record"] = "strict"
+    """`strict` refuses workers whose stack makes other bytes; `record` allows them and stores which made what."""
+
+
+MOST = 16
+"""Of quick scenes: a few seconds of work, of which a commit takes about a hundredth."""
+
+FEWEST_RANGES = 32
+"""A job has as many ranges at least, if it has the scenes: for that many workers, or for a few that end together."""
+
+RANGE_S = 10.0
+"""Processor time that a range should take: about what is lost with a worker."""
+
+SCENE_S, FALLING_S, PILED_S = 0.12, 0.1, 0.25
+"""Processor time of a pair with one object (measured), of each further object spread out (a guess), and of each in a pile (a
+pile of eight takes 1.7 s on average)."""
+
+PATH_S = 1.0
+"""Processor time of each path through every pixel of a pair's three images: 16 paths take 5.6 s an image."""
+
+
+def choose_range_size(scenes: int, most_objects: int, pairs: int, start: Start, render: Render) -> int:
+    """Scenes in a range. It changes no byte of the dataset, and a rough estimate of a scene's time will do."""
+    further = PILED_S if start.arrange == "pile" else FALLING_S
+    traced = PATH_S * render.path_samples * pairs if render.tier == "pathtraced" else 0.0
+    scene_s = SCENE_S * pairs + further * (most_objects - 1) + traced
+    return max(1, min(MOST, int(RANGE_S / scene_s), math.ceil(scenes / FEWEST_RANGES)))
+
+
+PresetName = Literal["fast", "balanced", "exact"]
+
+PRESETS: dict[PresetName, dict[str, Any]] = {
+    "fast": {"physics.step_hz": 240, "render.tier": "flat", "render.samples": 1},
+    "balanced": {"physics.step_hz": 960, "render.tier": "raster", "render.samples": 1},
+    "exact": {"physics.step_hz": 1920, "render.tier": "raster", "render.samples": 4},
+}
+"""Values by preset and dotted key; all presets set the same keys. They set effort, and never what is stored (image size,
+units, how d_z is read). `balanced` equals the keys' own defaults."""
+
+
+def with_preset(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of a job's keys, with those of its preset where the job does not give them.
+
+    An unknown preset is left to validation; a branch that is no mapping is left as it is.
+    """
+    filled = copy.deepcopy(dict(tree))
+    chosen = next((keys for name, keys in PRESETS.items() if name == filled.get("preset", "balanced")), {})
+    for path, value in chosen.items():
+        with suppress(ValueError):
+            set_key(filled, path, value, keep=True)
+    return filled
+
 
 MOST_SCENE_IDS = 10**10
 """Ids of scenes have ten digits in the names of ranges, which sort like numbers."""

@@ -1,12 +1,102 @@
-"""A scene from rest to output: settled objects, posed geometry, and all that is written of it."""
+"""A scene from its plan to its output: effects, plan, settled objects, posed geometry.
+
+- Which effects a scene runs: what the plan decides, and what every step asks.
+- The plan of a scene: all that is random, drawn before anything moves.
+- A scene from rest to output: settled objects, posed geometry, and all that is written of it.
+"""
 
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from schemas.base import Array, Pose
-from schemas.scene.appearance import Appearance
-from schemas.scene.shape import Shape
+from schemas.scene.shape import Appearance, Asset, Hull, Mesh, Shape
+from schemas.scene.view import Camera
+
+EffectKind = Literal["asked", "no_op", "approximation"]
+"""asked: a switch of the job. no_op: where the scene does not call for it, leaving it out changes no byte. approximation:
+leaving it out changes less than a stated tolerance."""
+
+
+@dataclass(frozen=True, eq=False)
+class EffectPlan:
+    """The effects that are to run, and why each of the others is not, in the table's order.
+
+    `forced` are those that run everywhere, also in views and on things that do not call for them.
+    """
+
+    ran: tuple[str, ...]
+    skipped: Mapping[str, str]
+    forced: frozenset[str] = frozenset()
+
+    def runs(self, name: str) -> bool:
+        """Whether the effect is to run."""
+        return name in self.ran
+
+    def without(self, *names: str) -> "EffectPlan":
+        """The plan with these effects taken out, whether the scene calls for them or not; for tests and the audit."""
+        return replace(
+            self,
+            ran=tuple(name for name in self.ran if name not in names),
+            skipped={**self.skipped, **{name: "withdrawn" for name in self.ran if name in names}},
+            forced=self.forced.difference(names),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TableTop:
+    """The level that objects stand on, in its mesh's frame.
+
+    centre [2]: middle of the level's bounding box; outline [N, 2] float64: its convex hull, counter-clockwise; convex:
+    whether the level fills that hull and nothing of the mesh rises above it.
+    """
+
+    height_m: float
+    centre: Array
+    outline: Array
+    convex: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A table with its pose `T_world_table` [4, 4], and its mesh and top in world coordinates."""
+
+    asset: Asset
+    T_world_table: Pose
+    mesh: Mesh
+    top: TableTop
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectStart:
+    """The start of one object: its pose `T_world_obj` [4, 4] at release, and the number of positions rejected before it.
+
+    `hull` is the convex hull of the asset's shape, in the object frame.
+    """
+
+    asset: Asset
+    hull: Hull
+    region_id: int
+    T_world_obj: Pose
+    redraws: int
+    placed: bool
+    """Whether it was set down in a stable pose and needs no drop."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePlan:
+    """The plan of one scene."""
+
+    scene_id: int
+    category: str
+    table: Table
+    floor: Shape
+    objects: tuple[ObjectStart, ...]
+    input_cameras: tuple[Camera, ...]
+    """One for each pair, RGB camera."""
+    appearance: Appearance
+
 
 SupportedBy = Literal["flat_top", "mesh", "placed"]
 """The support of a drop: the table's flat top alone, its whole mesh, or none where the object was set down at rest."""

@@ -1,4 +1,9 @@
-"""Shapes: meshes, parts with materials, mass, and assets. Arrays are read-only."""
+"""What is in a scene: region ids, shapes with materials and mass, lights and background. Arrays are read-only.
+
+- Region ids: the pixel values of segment images; objects count from REGION_FIRST_OBJECT.
+- Shapes: meshes, parts with materials, mass, and assets. Arrays are read-only.
+- Lights and background of a scene: what only RGB depends on.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,6 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
+
+REGION_NOTHING = 0
+REGION_FLOOR = 1
+REGION_TABLE = 2
+REGION_FIRST_OBJECT = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,3 +204,26 @@ class Asset:
         """[3] float64: size of the bounding box along the object axes."""
         lower, upper = self.shape.bounds
         return upper - lower
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """A distant light: `direction` [3] unit, from the surface towards the light, world; `color` linear RGB radiance."""
+
+    direction: Array
+    color: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Appearance:
+    """Lights and background; linear RGB radiance. The floor's surface is part of its shape.
+
+    `ambient` comes from all directions in the flat tier; in the raster tier it comes from above, and `below` from below.
+    The first light is the key light: it casts shadows in the raster tier.
+    """
+
+    ambient: tuple[float, float, float]
+    lights: tuple[Light, ...]
+    background: tuple[float, float, float]
+    """Linear RGB where nothing is hit."""
+    below: tuple[float, float, float] = (0.0, 0.0, 0.0)

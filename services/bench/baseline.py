@@ -9,6 +9,9 @@ write to get images like those of the raster tier: the floor's texture, each of 
 own shadows of them. All other settings are pyrender's defaults.
 """
 
+import json
+import os
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,7 +29,13 @@ import trimesh  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from PIL import Image  # noqa: E402
 
-from services.bench.answers import FLOOR, OBJECT, OPTICAL_TO_OPENGL, SECONDS, STEP_HZ, TABLE, answer_scenes  # noqa: E402
+STEP_HZ, SECONDS = 240, 3.0
+"""The simulation, as such scripts have it."""
+
+FLOOR, TABLE, OBJECT = 1, 2, 3
+"""Region ids."""
+
+OPTICAL_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 Images = dict[str, NDArray]
 
@@ -178,5 +187,23 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - begun
 
 
+def answer_scenes() -> None:
+    """Answers one line of JSON with one line until there are no more."""
+    # Libraries talk on standard output, so that is moved.
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    print(json.dumps({"ready": True}), file=answers)
+    script = Script()
+    for line in sys.stdin:
+        asked = json.loads(line)
+        path, before = Path(asked["scene"]), time.perf_counter()
+        description = json.loads(path.read_text())
+        meshes = load_meshes(description, path.parent, asked["look"])
+        wall, cpu = time.perf_counter(), time.process_time()
+        stages = script.make((description, path.parent, meshes), asked)
+        answer = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu, "stages_s": stages}
+        print(json.dumps(answer | {"load_s": wall - before}), file=answers)
+
+
 if __name__ == "__main__":
-    answer_scenes(lambda told, folder, asked: (told, folder, load_meshes(told, folder, asked["look"])), Script().make)
+    answer_scenes()

@@ -1,23 +1,35 @@
-"""`verso bench`: measures, and prints the figures as text and JSON."""
+"""`verso bench`: measures, and prints the figures as text and JSON; and the packages that it and `verso tradeoff` need."""
 
 import argparse
 import json
 import shlex
 import sys
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import InputError
+from schemas.errors import InputError, MachineError
 from schemas.job.job import Job
-from schemas.job.start import ONE_OBJECT
-from services.bench import effects, report, traced
-from services.bench.extra import require_extra
+from schemas.job.physics import ONE_OBJECT
+from services.bench import effects, report
 from services.bench.measure import bench_folder, measure
-from services.bench.memory import measure_memory
-from services.bench.others import other_systems
+from services.bench.scaling import measure_memory
 from services.job.job_file import change_key, load_job, validate_job
 from workers.store.file_system import file_system_of
+
+PACKAGES = {"flip_evaluator": "flip-evaluator", "isal": "isal", "matplotlib": "matplotlib"}
+"""Names on the index by the names that are imported."""
+
+
+def require_extra(command: str) -> None:
+    """Raises MachineError, with the remedy, where a package of the extra is not installed."""
+    missing = [name for module, name in PACKAGES.items() if find_spec(module) is None]
+    if missing:
+        raise MachineError(
+            f"`verso {command}` needs {', '.join(missing)}: `./verso extra study` installs what is missing in a checkout; "
+            "elsewhere use `pip install --require-hashes -r requirements-study.lock`"
+        )
 
 
 def main(options: argparse.Namespace) -> int:
@@ -39,9 +51,6 @@ def main(options: argparse.Namespace) -> int:
 
             laps = simulated.measure_simulated(job, folder, options.nodes, simulated.SHARD_S)
             return _print(options, job, {"simulated": laps}, simulated.describe)
-        if options.pathtraced is not None:
-            timed = traced.measure_traced(job, job_folder, folder, options.scenes, options.pathtraced)
-            return _print(options, job, timed, traced.describe)
         # Printed before the folder is deleted, which takes a while on a busy disk.
         return _print(options, job, _measure_all(options, job, job_folder, folder), report.describe)
 
@@ -54,8 +63,7 @@ def _measure_all(options: argparse.Namespace, job: Job, job_folder: Path, folder
         from services.bench.scaling import measure_scaling  # loads Ray, which would count as our start-up
 
         scaling = measure_scaling(job, job_folder, folder, options.workers, options.scaling_scenes)
-    last = {"memory": memory, "scaling": scaling, "other_systems": other_systems()}
-    return {"file_system": file_system_of(folder), **rounds, **last}
+    return {"file_system": file_system_of(folder), **rounds, "memory": memory, "scaling": scaling}
 
 
 def _print(

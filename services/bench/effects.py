@@ -13,17 +13,15 @@ import numpy as np
 from schemas.base import Array
 from schemas.errors import RunError, SceneError
 from schemas.job.job import Job
-from schemas.scene.effects import EffectPlan
-from services.bench.machine import describe_machine, pinned
-from services.bench.ratios import Spread, format_spread
+from schemas.scene.scene import EffectPlan
+from services.bench.figures import Spread, describe_machine, format_spread, pinned
 from services.bench.report import describe_head
 from workers.assets.catalogue import open_catalogue
 from workers.physics.effects import called_for
 from workers.physics.settle import settle_scene
-from workers.pipeline.context import open_worker
-from workers.plan.effects import PHYSICS_EFFECTS, Facts, plan_effects
-from workers.plan.randomness import SceneChance
-from workers.plan.step import plan_scene
+from workers.scene.context import open_worker
+from workers.scene.effects import PHYSICS_EFFECTS, Facts, plan_effects
+from workers.scene.plan import SceneChance, plan_scene
 
 ROUNDS = 3
 """Timed rounds, after one round that fills the caches."""

@@ -14,9 +14,9 @@ import fpng
 import numpy as np
 from numpy.typing import NDArray
 
-from services.bench.ratios import Lap
-from workers.pipeline.make_scene import Scene
+from services.bench.figures import Lap
 from workers.render.raster.gbuffer import FLAT, Renderer
+from workers.scene.make_scene import Scene
 from workers.store.file_system import sync_path, sync_tree
 from workers.store.images import Pixels, decode_png, encode_png
 

@@ -1,23 +1,111 @@
-"""The rounds of the benchmark: ours, the lower bound, the script and other systems, in turn, on one core."""
+"""The rounds of the benchmark: whole scenes of a job by the production code onto a real disk, beside the other sides."""
 
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
-from schemas.errors import MachineError, OutputError
-from schemas.job.job import Job
-from schemas.job.range_size import MOST
-from services.bench.handover import hand_over
+from schemas.dataset.commit import Span
+from schemas.dataset.shard import ShardOrder
+from schemas.errors import OutputError, RunError, SceneError
+from schemas.job.job import MOST, Job
+from services.bench.figures import Lap, describe_machine, pinned, process_age_s
 from services.bench.lower_bound import choose_encoders, images_of, run_lower_bound
-from services.bench.machine import describe_machine, pinned, process_age_s
-from services.bench.others import Side, SideProcess, sides_of, start_side
-from services.bench.ratios import Lap
-from services.bench.stages import make_in_memory, open_workbench
-from workers.pipeline.make_scene import Scene
+from services.bench.script import Look, hand_over, looks_of, start_script
+from workers.assets.catalogue import open_catalogue
+from workers.geometry.jit import compile_planned
+from workers.render.raster.context import require_device
+from workers.scene.context import Stopwatch, WorkerContext, open_worker
+from workers.scene.make_scene import Scene, make_scene
+from workers.shard.run_shard import run_ranges
+from workers.store.commit import committed_files, read_record
 from workers.store.file_system import sync_tree
+from workers.store.local import LocalStore
+
+LOOP_TURNS = 10_000
+"""Turns of an empty loop, 0.2 ms, between two looks at the clock."""
+
+
+@dataclass(eq=False)
+class Workbench:
+    """A worker's context and a dataset's folder, ready to make one range after another."""
+
+    context: WorkerContext
+    store: LocalStore
+    order: ShardOrder
+    next_scene: int
+
+    def next_span(self, scenes: int) -> Span:
+        """The next range, of new scenes, so that no shape is cached already."""
+        span = Span(start=self.next_scene, stop=self.next_scene + scenes)
+        self.next_scene = span.stop
+        return span
+
+    def run(self, *spans: Span) -> Lap:
+        """Make and commit ranges. Raises RunError where none of their scenes could be made."""
+        watch = Stopwatch()
+        wall, cpu = time.perf_counter(), time.process_time()
+        reports = run_ranges(self.context, self.store, self.order, spans, watch)
+        made = sum(report.made for report in reports)
+        lap = Lap(made, time.perf_counter() - wall, time.process_time() - cpu, watch.seconds)
+        if not made:
+            failed = {reason for report in reports for reason in report.failed}
+            raise RunError(
+                f"none of the scenes {spans[0].start} to {spans[-1].stop - 1} could be made: {', '.join(sorted(failed))}"
+            )
+        return lap
+
+    def files(self, span: Span) -> dict[str, bytes]:
+        """The bytes of every file that the range's commit names, by path."""
+        record = read_record(self.store, span.start)
+        assert record is not None
+        return {
+            entry.path: (self.store.root / entry.path).read_bytes() for entry in committed_files(self.store, record)
+        }
+
+
+def open_workbench(job: Job, job_folder: Path, out: Path) -> Workbench:
+    """A workbench for the job's scenes in an empty folder."""
+    catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
+    store = LocalStore(out)
+    store.prepare()
+    compile_planned()
+    context = open_worker(job, catalogue)
+    require_device(context.renderer.name, job.run.device)
+    return Workbench(context, store, ShardOrder.of(str(out), job, "bench"), job.first_scene)
+
+
+def make_in_memory(context: WorkerContext, span: Span) -> list[Scene]:
+    """The scenes that can be made, as input for the other sides. Raises RunError for none."""
+    made, reason = [], ""
+    for scene_id in span.scene_ids:
+        try:
+            made.append(make_scene(context, scene_id, Stopwatch()))
+        except SceneError as error:
+            reason = str(error)
+    if not made:
+        raise RunError(f"none of the scenes {span.start} to {span.stop - 1} could be made: {reason}")
+    return made
+
+
+def run_process(job: Job, job_folder: Path, folder: Path, span: Span) -> Lap:
+    """A plain process's part: make and commit a span into a new folder, range by range."""
+    bench = open_workbench(job, job_folder, folder)
+    starts = range(span.start, span.stop, job.range_size)
+    return bench.run(*(Span(start=start, stop=min(start + job.range_size, span.stop)) for start in starts))
+
+
+def count_for(seconds: float) -> Lap:
+    """So many turns of an empty loop as `scenes`: what the core gives to one that uses no memory and waits for nothing."""
+    turns, wall, cpu = 0, time.perf_counter(), time.process_time()
+    while time.perf_counter() < wall + seconds:
+        for _ in range(LOOP_TURNS):
+            pass
+        turns += LOOP_TURNS
+    return Lap(turns, time.perf_counter() - wall, time.process_time() - cpu, {})
+
 
 WARM_UP = 8
 """Scenes before the clock: they compile shaders, of which pyrender has one for each number of lights, and fill caches."""
@@ -25,17 +113,6 @@ WARM_UP = 8
 ROUND = MOST
 """Scenes of a round where the job does not give its range's: as in a job of 512 scenes or more, whose ranges they are. A
 smaller job commits more often."""
-
-
-@dataclass
-class Others:
-    """The sides that could be started, their processes by module, and the time that each took to its first scenes' end."""
-
-    sides: list[Side] = field(default_factory=list)
-    processes: dict[str, SideProcess] = field(default_factory=dict)
-    startup_s: dict[str, float] = field(default_factory=dict)
-    left_out: dict[str, str] = field(default_factory=dict)
-    """Optional sides that are installed but could not run, and why."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +125,9 @@ class Measured:
     """By the side's name; `ours` and `floor`, the lower bound, are the first two."""
     bytes: int
     encoders: dict[str, str]
-    others: Others
+    looks: Mapping[str, Look]
+    startup_s: dict[str, float]
+    """From the start of each side's process to the end of its first scenes."""
 
 
 @contextmanager
@@ -64,7 +143,7 @@ def bench_folder(parent: Path) -> Iterator[Path]:
 
 
 def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
-    """Ranges until `scenes` are made, each by all sides in turn.
+    """Ranges until `scenes` are made, each by all sides in turn on one core: ours, the lower bound, each look of the script.
 
     Nothing is deleted in between: for seconds afterwards ext4 searches the deleted entries whenever it makes a file.
     """
@@ -75,8 +154,12 @@ def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
         startup_s = {"ours": process_age_s()}
         encoders = choose_encoders(images_of(bench.files(warm)))
         given = _hand_over(make_in_memory(bench.context, warm), job, folder / "given_warm")
-        others = start_others(sides_of(job), given, folder, running)
-        laps: dict[str, list[Lap]] = {name: [] for name in ("ours", "floor", *(side.name for side in others.sides))}
+        begun = time.perf_counter()
+        script, looks = running.enter_context(start_script()), looks_of(job)
+        for word, look in looks.items():
+            script.run(given, folder / look.name, word)
+            startup_s[look.name] = time.perf_counter() - begun
+        laps: dict[str, list[Lap]] = {name: [] for name in ("ours", "floor", *(look.name for look in looks.values()))}
         written = 0
         size = job.run.range_size or ROUND
         for start in range(0, scenes, size):
@@ -90,34 +173,12 @@ def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
             made, out = make_in_memory(bench.context, span), folder / f"lower_bound{span.start}"
             laps["floor"].append(run_lower_bound(bench.context.renderer, made, files, encoders, out))
             given = _hand_over(made, job, folder / f"given{span.start}")
-            for side in others.sides:
-                laps[side.name].append(others.processes[side.module].run(given, folder / side.name, side.asked))
-    others.startup_s = startup_s | others.startup_s
+            for word, look in looks.items():
+                laps[look.name].append(script.run(given, folder / look.name, word))
     names = {kind: name for kind, (name, _) in encoders.items()}
-    return Measured(describe_machine(bench.context.renderer.name), core, laps, written, names, others)
-
-
-def start_others(sides: Sequence[Side], given: list[Path], folder: Path, running: ExitStack) -> Others:
-    """Start the other systems and let each make these scenes.
-
-    Raises MachineError where the script cannot run; an optional side that cannot is left out with the reason.
-    """
-    others = Others()
-    for side in sides:
-        begun = time.perf_counter()
-        try:
-            if side.module not in others.processes:
-                others.processes[side.module] = running.enter_context(start_side(side.module))
-            others.processes[side.module].run(given, folder / side.name, side.asked)
-            others.sides.append(side)
-        except MachineError as error:
-            if side.package is None:
-                raise
-            others.left_out[side.title] = str(error)
-        others.startup_s[side.name] = time.perf_counter() - begun
-    return others
+    return Measured(describe_machine(bench.context.renderer.name), core, laps, written, names, looks, startup_s)
 
 
 def _hand_over(scenes: Sequence[Scene], job: Job, folder: Path) -> list[Path]:
-    """The same scenes as files for the other sides."""
+    """The same scenes as files for the script."""
     return [hand_over(scene, job, folder / str(scene.plan.scene_id)) for scene in scenes]

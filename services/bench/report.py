@@ -5,14 +5,14 @@ from dataclasses import asdict
 from statistics import mean, median
 from typing import Any
 
+from services.bench.figures import Lap, by_clock, by_processor, format_spread, slope_ratio, stage_table, with_loading
 from services.bench.measure import Measured
-from services.bench.others import Side
-from services.bench.ratios import Lap, by_clock, by_processor, format_spread, slope_ratio, stage_table, with_loading
+from services.bench.script import Look
 
 
 def summarise(measured: Measured) -> dict[str, Any]:
     """The figures of the rounds: plain numbers, milliseconds per scene, ratios of slopes."""
-    laps, others = measured.laps, measured.others
+    laps = measured.laps
     ours, bound = laps["ours"], laps["floor"]
     scenes = sum(lap.scenes for lap in ours)
     return {
@@ -21,21 +21,20 @@ def summarise(measured: Measured) -> dict[str, Any]:
         "scenes": scenes,
         "rounds": len(ours),
         "bytes_per_scene": measured.bytes / scenes,
-        "startup_s": others.startup_s,
+        "startup_s": measured.startup_s,
         "ours": _side(ours),
         "floor": _side(bound) | {"encoders": measured.encoders, "upload_ms": _apart(bound)},
         "times_floor": asdict(slope_ratio(ours, bound)),
         "times_floor_cpu": asdict(slope_ratio(ours, bound, by_processor)),
-        "others": {side.name: _other(side, laps[side.name], ours) for side in others.sides},
-        "left_out": others.left_out,
+        "others": {look.name: _other(look, laps[look.name], ours) for look in measured.looks.values()},
     }
 
 
-def _other(side: Side, laps: Sequence[Lap], ours: Sequence[Lap]) -> dict[str, Any]:
-    """One of the other systems; a ratio is how many times as many scenes we make in the same time."""
+def _other(look: Look, laps: Sequence[Lap], ours: Sequence[Lap]) -> dict[str, Any]:
+    """A look of the script; a ratio is how many times as many scenes we make in the same time."""
     return _side(laps) | {
-        "title": side.title,
-        "makes": side.makes,
+        "title": look.title,
+        "makes": look.makes,
         "load_ms": _apart(laps),
         "ratio": asdict(slope_ratio(laps, ours)),
         "ratio_cpu": asdict(slope_ratio(laps, ours, by_processor)),
@@ -97,9 +96,7 @@ def describe(figures: dict[str, Any]) -> list[str]:
     lines += [f"{'times the lower bound':24} {_times(figures['times_floor']):24} {_times(figures['times_floor_cpu'])}"]
     lines += _describe_memory(figures["memory"]) if figures["memory"] else []
     lines += _describe_scaling(figures["scaling"]) if figures["scaling"] else []
-    return lines + [
-        f"{name:24} {figures['left_out'].get(name, found)}" for name, found in figures["other_systems"].items()
-    ]
+    return lines
 
 
 def _table(what: str, side: dict[str, Any]) -> list[str]:

@@ -13,8 +13,7 @@ from typing import Any
 from ray.cluster_utils import Cluster
 
 from schemas.dataset.commit import CommitSummary, Span
-from schemas.dataset.fingerprint import Fingerprint
-from schemas.dataset.shard import ShardOrder, ShardReport, SpanReport
+from schemas.dataset.shard import Fingerprint, ShardOrder, ShardReport, SpanReport
 from schemas.job.job import Job
 from services.run.coordinator import Coordinator, Limits
 from services.run.joining import Pattern, terms_of_driver

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-from schemas.plain_line import plain_line
+from schemas.errors import plain_line
 from services.job.job_file import MOST_CHARACTERS, is_packed
 
 JOB_ID: Final = r"j[0-9a-f]{8}"

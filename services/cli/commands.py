@@ -105,8 +105,8 @@ def pack(options: argparse.Namespace) -> int:
 def status(options: argparse.Namespace) -> int:
     """`verso status`."""
     from services.job.record import require_job
-    from services.read.damage import explain_damage
     from services.read.status import read_status
+    from services.read.verdict import explain_damage
     from services.run.lock import shows_life
 
     store = _dataset(options.out)
@@ -136,10 +136,9 @@ def status(options: argparse.Namespace) -> int:
 
 def verify(options: argparse.Namespace) -> int:
     """`verso verify`."""
-    from services.read.audit import audit, describe_audit
-    from services.read.damage import explain_damage
+    from services.read.audit import audit, describe_audit, describe_independent, verify_independently
+    from services.read.verdict import explain_damage
     from services.read.verify import verify as read_back
-    from services.read.verify_independent import describe_independent, verify_independently
 
     store = _committed(options.out)
     verdict = _with_progress(_scenes_asked(store), "verify", partial(read_back, store))
@@ -195,8 +194,7 @@ def _with_progress(scenes: int, what: str, work: Callable[[Callable[[Any], None]
 
 def query(options: argparse.Namespace) -> int:
     """`verso query`."""
-    from services.read.query import ask
-    from services.read.query_formats import write_rows
+    from services.read.query import ask, write_rows
 
     with ask(_dataset(options.out), options.sql) as rows:
         wide = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
@@ -218,8 +216,8 @@ def columns(options: argparse.Namespace) -> int:
 
 def replay(options: argparse.Namespace) -> int:
     """`verso replay`."""
-    from services.read.damage import explain_damage
     from services.read.replay import replay_scene
+    from services.read.verdict import explain_damage
 
     if options.repair:
         return _repair(options)
@@ -240,8 +238,8 @@ def replay(options: argparse.Namespace) -> int:
 
 def _repair(options: argparse.Namespace) -> int:
     """`verso replay --repair`."""
-    from services.read.damage import explain_damage
     from services.read.repair import repair
+    from services.read.verdict import explain_damage
 
     store = _committed(options.out)
     with explain_damage(store):
@@ -258,8 +256,8 @@ def _repair(options: argparse.Namespace) -> int:
 
 def scene(options: argparse.Namespace) -> int:
     """`verso scene`."""
-    from services.read.damage import explain_damage
-    from services.read.scene_export import export_scene
+    from services.read.scene_geometry import export_scene
+    from services.read.verdict import explain_damage
 
     store = _dataset(options.out)
     with explain_damage(store):
@@ -288,8 +286,8 @@ def _committed(out: str) -> "Store":
 
 def report(options: argparse.Namespace) -> int:
     """`verso report`."""
-    from services.read.damage import explain_damage
-    from services.report.report import write_report
+    from services.look.report import write_report
+    from services.read.verdict import explain_damage
     from workers.store.store import open_store
 
     began = time.monotonic()
@@ -307,8 +305,8 @@ def report(options: argparse.Namespace) -> int:
 
 def serve(options: argparse.Namespace) -> int:
     """`verso serve`."""
-    from services.report.follow import Follower
-    from services.report.server import choose_place, ended_by_signal, serving
+    from services.look.live import Follower
+    from services.look.server import choose_place, ended_by_signal, serving
     from workers.store.store import open_store
 
     place = choose_place(options.host, options.port, options.token)

@@ -89,8 +89,8 @@ def _renderer() -> Finding:
 
 def _stack() -> Finding:
     try:
-        from workers.pipeline.fingerprint import take_fingerprint
         from workers.render.raster.gbuffer import shared_renderer
+        from workers.shard.fingerprint import take_fingerprint
 
         stack = take_fingerprint(shared_renderer(), "raster")
     except VersoError as error:

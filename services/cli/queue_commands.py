@@ -9,8 +9,7 @@ import urllib.parse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.errors import InputError, JobError, RunError
-from schemas.plain_line import plain_line
+from schemas.errors import InputError, JobError, RunError, plain_line
 from schemas.queue import JobRequest
 from services.cli.commands import answer_json, tell_result
 from services.cli.environment import default_queue

@@ -1,6 +1,5 @@
 """The commands and their options, as one table. Handlers are named and not imported, so that `--help` loads nothing heavy."""
 
-import sys
 from pathlib import Path
 from typing import Final
 
@@ -58,7 +57,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
             BOARD,
             number("--dpi", "resolution of a PNG, dots an inch (default: 300)", 300),
         ),
-        "services.capture.board:board",
+        "services.capture:board",
     ),
     "simulate": Command(
         "make a virtual capture with known truth",
@@ -70,7 +69,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
             option("--category", default="mug", metavar="NAME", help="what is captured (default: mug)"),
             SET,
         ),
-        "services.capture.simulate:simulate",
+        "services.capture:simulate",
     ),
     "import": Command(
         "make a capture from an Azure Kinect recording, without its SDK",
@@ -83,7 +82,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
             option("--name", metavar="NAME", help="of the object (default: the name of DIR)"),
             option("--category", default="object", metavar="NAME", help=f"{CATEGORY_HELP} (default: object)"),
         ),
-        "services.capture.import_recording:import_recording",
+        "services.capture:import_recording",
     ),
     "process": Command(
         "estimate the camera poses of a capture, and merge its views into a cloud and a mesh",
@@ -97,7 +96,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
             ),
             SET,
         ),
-        "services.capture.process:process",
+        "services.capture:process",
     ),
     "synthesize": Command(
         "make RGB, depth and mask of a processed capture from other poses",
@@ -106,7 +105,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
             FOLDER,
             option("--out", type=read_path, metavar="DIR", help="where the views go (default: DIR/views)"),
         ),
-        "services.capture.synthesize:synthesize",
+        "services.capture:synthesize",
         one_of=(
             option("--pose", type=read_path, metavar="FILE", help="T_board_cam, 4 lines of 4 numbers"),
             option("--mirror", action="store_true", help="the mirror view of every captured view"),
@@ -116,7 +115,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
         "score a processed capture against its truth or a given mesh",
         "data/mug --json",
         (FOLDER, option("--mesh", type=read_path, metavar="FILE", help="the object's mesh, metres, in its own frame")),
-        "services.capture.evaluate:evaluate",
+        "services.capture:evaluate",
     ),
 }
 
@@ -187,13 +186,6 @@ STUDY_COMMANDS: dict[str, Command] = {
             number("--workers", "also compare N workers with one, beside N plain processes"),
             number("--scaling-scenes", "how many scenes that comparison makes", 512),
             SET,
-            option(
-                "--pathtraced",
-                nargs="?",
-                const=sys.executable,
-                metavar="PYTHON",
-                help="time the path-traced tier instead, beside Blender's Cycles where PYTHON (default: this one) has bpy",
-            ),
             option(
                 "--nodes",
                 type=read_counts,
@@ -457,7 +449,7 @@ COMMANDS: dict[str, Command] = {
                 help="size of a file of webdataset and huggingface, 10^6 bytes (default: 256)",
             ),
         ),
-        "services.export.command:main",
+        "services.export.export:main",
     ),
     "capture": Command(
         "real photographs of an object on a marker board: print a board, simulate, import, process, make views, score",

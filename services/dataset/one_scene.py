@@ -9,18 +9,17 @@ import trimesh
 
 from schemas.dataset.codec import Row
 from schemas.errors import CorruptError, SceneError
-from schemas.job.images import Patch
 from schemas.job.job import Job
+from schemas.job.views import Patch
 from schemas.scene.scene import SceneOutput
+from services.dataset.dataset import PAIR_TABLES, pair_table
 from services.dataset.pair import Pair, read_pair
-from services.dataset.pair_table import PAIR_TABLES, pair_table
 from services.dataset.shapes import Shapes
 from services.job.job_file import load_job, validate_job
 from services.job.record import JobRecord, record_job
-from workers.pipeline.captures.listing import open_sources
-from workers.pipeline.context import open_worker
-from workers.pipeline.run_shard import run_scene
-from workers.pipeline.stopwatch import Stopwatch
+from workers.capture.results import open_sources
+from workers.scene.context import Stopwatch, open_worker
+from workers.shard.run_shard import run_scene
 from workers.store.manifest import table_of_rows
 
 

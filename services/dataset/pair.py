@@ -14,12 +14,11 @@ from schemas.base import Array, Pose
 from schemas.dataset.codec import Row, read_camera, read_label, read_world_poses
 from schemas.dataset.layout import PixelKind, file_pose_id, patch_index
 from schemas.errors import InputError
-from schemas.job.images import Patch
-from schemas.scene.camera import ROLES, Camera, Role
-from schemas.scene.region import REGION_FIRST_OBJECT
-from schemas.scene.view import ObjectLabel
-from services.read.stored_paths import patch_paths, view_paths
-from workers.labels.patches import crop_box
+from schemas.job.views import Patch
+from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.view import ROLES, Camera, ObjectLabel, Role
+from services.read.stored_tables import patch_paths, view_paths
+from workers.scene.labels import crop_box
 from workers.store.images import decode_png
 
 

@@ -1,22 +1,32 @@
-"""Shapes of a dataset's objects as meshes in the object frame: from the stored GLB, or from the job's sources."""
+"""Shapes and files of a dataset's pairs.
+
+- Shapes of a dataset's objects as meshes in the object frame: from the stored GLB, or from the job's sources.
+- Files of a dataset's pairs, from single files or from tars; the tars that are read are kept, bounded by their bytes.
+"""
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import trimesh
+from cachetools import LRUCache
 
-from schemas.dataset.layout import asset_path
+from schemas.dataset.codec import Row
+from schemas.dataset.commit import CommitRecord
+from schemas.dataset.layout import asset_path, tar_path
 from schemas.errors import CorruptError, InputError, MachineError
-from schemas.job.category import TABLE
-from schemas.scene.region import REGION_TABLE
-from schemas.scene.shape import Asset
+from schemas.job.assets import TABLE
+from schemas.job.views import Patch
+from schemas.scene.shape import REGION_TABLE, Asset
 from services.job.record import JobRecord
-from services.read.part_mesh import mesh_of_part
+from services.read.scene_geometry import mesh_of_part
 from workers.assets.catalogue import Catalogue
-from workers.plan.randomness import SceneChance
+from workers.scene.plan import SceneChance
+from workers.store.commit import read_committed
+from workers.store.store import Store
+from workers.store.tars import read_tar
 
 ReadShape = Callable[[str], bytes]
 """Returns the bytes of a stored shape by its path. Raises FileNotFoundError."""
@@ -54,7 +64,7 @@ class Shapes:
         """The shape of a source whose licence keeps it out of the dataset."""
         if self._record.job.captures is not None:
             raise CorruptError(f"{path} is missing: restore it from a copy")
-        from workers.plan.step import plan_scene  # loads the physics
+        from workers.scene.plan import plan_scene  # loads the physics
 
         plan = plan_scene(self._record.job, self._sources(path), SceneChance(self._record.job.seed, scene_id))
         assets: dict[int, Asset] = {start.region_id: start.asset for start in plan.objects}
@@ -62,7 +72,7 @@ class Shapes:
         return _join([mesh_of_part(part) for part in asset.shape.parts])
 
     def _sources(self, path: str) -> Catalogue:
-        from workers.pipeline.captures.listing import open_sources
+        from workers.capture.results import open_sources
 
         if self._catalogue is None:
             told = f"{path} is not in the dataset (its licence is not free, or assets.copy_assets is off)"
@@ -88,3 +98,54 @@ def _join(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     joined = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
     assert isinstance(joined, trimesh.Trimesh)
     return joined
+
+
+TAR_BYTES = 256 << 20
+"""Bytes of images from tars that are kept; always at least one tar."""
+
+Members = dict[str, bytes]
+
+
+class StoredFiles:
+    """Files of a whole dataset."""
+
+    def __init__(self, store: Store, job: JobRecord) -> None:
+        self.store = store
+        self.shapes = Shapes(store.read, job)
+        self.patch: Patch = job.job.images.patch
+        self._tars: LRUCache[str, Members] = LRUCache(TAR_BYTES, lambda tar: sum(map(len, tar.values())))
+
+    def tar(self, record: CommitRecord, category: str) -> Members:
+        """The images in a commit's tar of one category, by path; none where it has none."""
+        path = tar_path(category, record.span.start, record.span.retry)
+        if path in self._tars:
+            return self._tars[path]
+        if path not in {entry.path for entry in record.files}:
+            return {}
+        members = dict(read_tar(category, read_committed(self.store, record, path), path))
+        if sum(map(len, members.values())) <= TAR_BYTES:
+            self._tars[path] = members
+        return members
+
+
+class RangeFiles:
+    """The files of one committed range."""
+
+    def __init__(self, files: StoredFiles, records: Sequence[CommitRecord]) -> None:
+        self._files = files
+        self._records = records
+        self.patch = files.patch
+
+    def image(self, scene_id: int, path: str) -> bytes:
+        """The bytes of an image, published or not yet. Raises CorruptError where it is missing."""
+        record = next(one for one in reversed(self._records) if scene_id in one.span.scene_ids)
+        if record.terms.layout == "files":
+            return read_committed(self._files.store, record, path)
+        members = self._files.tar(record, path.partition("/")[0])
+        if path not in members:
+            raise CorruptError(f"{path} is committed and in no tar: `verso verify {self._files.store.name}` tells more")
+        return members[path]
+
+    def mesh(self, scene: Row, region_id: int) -> trimesh.Trimesh:
+        """The shape of a region in its own frame, as `Shapes.mesh`."""
+        return self._files.shapes.mesh(scene, region_id)

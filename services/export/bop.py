@@ -1,18 +1,38 @@
 """Format `bop`: the scenewise layout of the BOP benchmark (6-D object pose), one BOP scene for each scene of the dataset.
 
-Images of a scene are the input, aligned and mirror views of its pairs. Poses are model to camera in millimetres, K has pixel
-centres on integers, as OpenCV has them. A scene's folder appears whole.
+- One scene of a BOP export: its images, masks, and the three files that describe them.
+- The object models of a BOP export: numbered as they first appear, one PLY file each, in a constant amount of memory.
+
+Images of a scene are the input, aligned and mirror views of its pairs. Poses are model to camera in millimetres, K has
+pixel centres on integers, as OpenCV has them. A scene's folder appears whole.
 """
 
-from typing import Any
+import csv
+import io
+import json
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
 
-from services.export.bop_models import BopModels
-from services.export.bop_scene import SceneDraft, encode_json
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from schemas.base import Array
+from schemas.dataset.codec import Row, read_matrix
+from schemas.scene.shape import REGION_FIRST_OBJECT, Part
+from schemas.scene.view import Role
 from services.export.folder import ExportFolder
-from services.export.shapes import Shapes
-from services.export.source import ExportScene
-from services.export.writer import Added, LeftOut
+from services.export.formats import Added, LeftOut
+from services.export.shapes import ColoredShape, Shapes, Silhouette, box_of, whole_silhouette
+from services.export.source import ExportPair, ExportScene
 from services.job.record import JobRecord
+from workers.geometry.frames import invert
+from workers.geometry.hull import convex_hull
+from workers.store.images import decode_png, encode_mask
 from workers.store.store import Store
 
 
@@ -79,3 +99,242 @@ class Bop:
             "pixels": "cam_K has pixel centres on integers, as OpenCV has them",
             "depth": "millimetres are the stored value times depth_scale, z along the optical axis",
         }
+
+
+ROLES: Final[tuple[Role, ...]] = ("input", "aligned", "mirror")
+"""Pair k has the images 3 k, 3 k + 1 and 3 k + 2 of its scene."""
+
+NO_SHAPE: Final = "an object is hidden in part, and its shape is neither stored nor here"
+_MM = 1000.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Thing:
+    """An object in an image: its row of `objects`, what is seen of it [H, W], and its whole silhouette."""
+
+    label: Row
+    visible: NDArray[np.bool_]
+    whole: Silhouette
+
+
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """An image of a scene: its number, its row of `views`, two PNG files, and the objects in it."""
+
+    number: int
+    view: Row
+    rgb: bytes
+    depth: bytes
+    things: tuple[_Thing, ...]
+
+
+class SceneDraft:
+    """The folder of one scene while it is written."""
+
+    def __init__(self, folder: ExportFolder, scene: ExportScene, numbers: dict[int, int], shapes: Shapes) -> None:
+        self._folder, self._scene, self._numbers, self._shapes = folder, scene, numbers, shapes
+        self._place = folder.temporary("scene")
+        shutil.rmtree(self._place, ignore_errors=True)
+        self.cameras: dict[int, Row] = {}
+        self.sensor: dict[str, Any] | None = None
+        self._poses: dict[int, list[Row]] = {}
+        self._infos: dict[int, list[Row]] = {}
+
+    def add(self, pair: ExportPair) -> str:
+        """Writes the images of a pair; a reason why not, empty where it was written."""
+        shots = []
+        for place, role in enumerate(ROLES):
+            if role in pair.views:
+                shot = self._shot(len(ROLES) * pair.number + place, pair, role)
+                if isinstance(shot, str):
+                    return shot
+                shots.append(shot)
+        for shot in shots:
+            self._write(shot)
+        return ""
+
+    def _shot(self, number: int, pair: ExportPair, role: Role) -> "_Shot | str":
+        """An image with its masks, or a reason why there is none."""
+        rgb, region, depth = pair.image(role, "rgb"), pair.pixels(role, "region"), pair.image(role, "depth")
+        if rgb is None or region is None or depth is None:
+            return f"no {'rgb' if rgb is None else 'labels'} of the {role} view"
+        things = []
+        for label in pair.labels(role):
+            if label["region_id"] >= REGION_FIRST_OBJECT:
+                visible = region == label["region_id"]
+                whole = self._silhouette(label, pair.views[role], visible)
+                if whole is None:
+                    return NO_SHAPE
+                things.append(_Thing(label, visible, whole))
+        return _Shot(number, pair.views[role], rgb, depth, tuple(things))
+
+    def install(self, path: str) -> None:
+        """Gives the folder its name, unless a killed export did."""
+        for name, tree in (("camera", self.cameras), ("gt", self._poses), ("gt_info", self._infos)):
+            (self._place / f"scene_{name}.json").write_bytes(encode_json(tree))
+        if not (self._folder.root / path).exists():
+            self._folder.install(self._place, path)
+
+    def _silhouette(self, label: Row, view: Row, visible: NDArray[np.bool_]) -> Silhouette | None:
+        hidden = label["visible_fraction"] < 1.0
+        colored = self._shapes.load(self._scene, label["instance_id"]) if hidden else None
+        return whole_silhouette(label, view, visible, None if colored is None else colored.shape)
+
+    def _write(self, shot: "_Shot") -> None:
+        self.cameras[shot.number] = _camera(shot.view)
+        self.sensor = self.sensor or _sensor(shot.view)
+        self._write_file(f"rgb/{shot.number:06d}.png", shot.rgb)
+        self._write_file(f"depth/{shot.number:06d}.png", shot.depth)
+        depth = decode_png(shot.depth)
+        for number, thing in enumerate(shot.things):
+            self._write_file(f"mask/{shot.number:06d}_{number:06d}.png", encode_mask(thing.whole.mask))
+            self._write_file(f"mask_visib/{shot.number:06d}_{number:06d}.png", encode_mask(thing.visible))
+        self._poses[shot.number] = [_pose(self._numbers[one.label["region_id"]], one.label) for one in shot.things]
+        self._infos[shot.number] = [_info(one, depth) for one in shot.things]
+
+    def _write_file(self, path: str, data: bytes) -> None:
+        target = self._place / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(data)
+
+
+def encode_json(tree: object) -> bytes:
+    """A JSON file."""
+    return (json.dumps(tree, indent=1) + "\n").encode()
+
+
+def _camera(view: Row) -> Row:
+    """An entry of scene_camera.json."""
+    T_cam_world = invert(read_matrix(view["T_world_cam"]))
+    return {
+        "cam_K": [view["fx"], 0.0, view["cx_opencv"], 0.0, view["fy"], view["cy_opencv"], 0.0, 0.0, 1.0],
+        "depth_scale": _MM / view["depth_units_per_m"],
+        "cam_R_w2c": T_cam_world[:3, :3].ravel().tolist(),
+        "cam_t_w2c": (_MM * T_cam_world[:3, 3]).tolist(),
+    }
+
+
+def _sensor(view: Row) -> dict[str, Any]:
+    """camera.json: the sensor of the first image."""
+    names = {"width": "width", "height": "height", "fx": "fx", "fy": "fy", "cx": "cx_opencv", "cy": "cy_opencv"}
+    return {**{name: view[column] for name, column in names.items()}, "depth_scale": _MM / view["depth_units_per_m"]}
+
+
+def _pose(number: int, label: Row) -> Row:
+    """An entry of scene_gt.json."""
+    T = read_matrix(label["T_cam_obj"])
+    return {"cam_R_m2c": T[:3, :3].ravel().tolist(), "cam_t_m2c": (_MM * T[:3, 3]).tolist(), "obj_id": number}
+
+
+def _info(thing: "_Thing", depth: NDArray) -> Row:
+    """An entry of scene_gt_info.json; pixels and box of the whole silhouette count what lies outside the image too."""
+    whole, seen = thing.whole, int(thing.visible.sum())
+    return {
+        "bbox_obj": list(whole.box),
+        "bbox_visib": list(box_of(thing.visible)),
+        "px_count_all": whole.pixels,
+        "px_count_valid": int((depth[whole.mask] > 0).sum()),
+        "px_count_visib": seen,
+        "visib_fract": seen / whole.pixels if whole.pixels else 0.0,
+    }
+
+
+_INFO, _NAMES = "models/models_info.json", "objects.csv"
+_MM_bop_models = 1000.0
+_AT_ONCE = 512
+"""Rows of a block of distances: some tens of megabytes at most."""
+
+
+class BopModels:
+    """Gives each instance its number, obj_id, from 1, and writes its model in millimetres when it first appears."""
+
+    def __init__(self, folder: ExportFolder, state: dict[str, Any] | None) -> None:
+        self._folder = folder
+        self._next = 1 if state is None else int(state["next_object"])
+        self.without = 0 if state is None else int(state["without_model"])
+        """Objects whose shape is not here."""
+        self._first = True if state is None else bool(state["first"])
+        self._db = sqlite3.connect(folder.work / "objects.sqlite")
+        self._db.execute("PRAGMA synchronous = OFF")  # a power loss is not what this is for
+        self._db.execute("CREATE TABLE IF NOT EXISTS objects (instance TEXT PRIMARY KEY, id INTEGER) WITHOUT ROWID")
+        self._db.execute("DELETE FROM objects WHERE id >= ?", (self._next,))
+        if state is None:
+            folder.append(_NAMES, b"obj_id,category,instance_id,split,source,licence\n")
+            folder.append(_INFO, b"{")
+
+    def number(self, instance_id: str) -> int | None:
+        """The obj_id of an instance, None where it is new."""
+        found = self._db.execute("SELECT id FROM objects WHERE instance = ?", (instance_id,)).fetchone()
+        return None if found is None else int(found[0])
+
+    def add(self, asset: Row, shape: ColoredShape | None) -> int:
+        """The obj_id of a new instance, whose row of `assets` and shape these are."""
+        number, self._next = self._next, self._next + 1
+        self._db.execute("INSERT INTO objects VALUES (?, ?)", (asset["instance_id"], number))
+        text = io.StringIO()
+        names = ("category", "instance_id", "split", "source", "licence")
+        csv.writer(text, lineterminator="\n").writerow((number, *(asset[name] for name in names)))
+        self._folder.append(_NAMES, text.getvalue().encode())
+        if shape is None:
+            self.without += 1
+            return number
+        self._folder.put(f"models/obj_{number:06d}.ply", b"".join(ply_lines(shape)))
+        entry = f'{"" if self._first else ","}\n "{number}": {json.dumps(model_info(_MM_bop_models * shape.shape.vertices))}'
+        self._folder.append(_INFO, entry.encode())
+        self._first = False
+        return number
+
+    def state(self) -> dict[str, Any]:
+        """What a new one must know; the numbers themselves are safe on the disk."""
+        self._db.commit()
+        return {"next_object": self._next, "without_model": self.without, "first": self._first}
+
+    def finish(self) -> None:
+        """Ends models_info.json."""
+        self._folder.append(_INFO, b"\n}\n")
+
+    def close(self) -> None:
+        """Closes the file of numbers."""
+        self._db.close()
+
+    @property
+    def count(self) -> int:
+        """How many instances have a number."""
+        return self._next - 1
+
+
+def model_info(vertices_mm: Array) -> dict[str, float]:
+    """Bounding box and diameter, the largest distance between two vertices, in millimetres."""
+    low, high = vertices_mm.min(axis=0), vertices_mm.max(axis=0)
+    sizes = dict(zip(("min_x", "min_y", "min_z"), low.tolist(), strict=True))
+    sizes |= dict(zip(("size_x", "size_y", "size_z"), (high - low).tolist(), strict=True))
+    return {"diameter": _diameter(vertices_mm), **sizes}
+
+
+def _diameter(points: Array) -> float:
+    """The largest distance between two of the points [N, 3]."""
+    corners = convex_hull(points).vertices
+    blocks = (corners[first : first + _AT_ONCE] for first in range(0, len(corners), _AT_ONCE))
+    return float(max(cdist(block, corners).max() for block in blocks))
+
+
+def ply_lines(colored: ColoredShape) -> Iterator[bytes]:
+    """An ASCII PLY file: vertices in millimetres, unit normals, colours, and triangles."""
+    shape, mesh = colored.shape, colored.shape.mesh
+    normals = np.concatenate([_normals(part) for part in shape.parts])
+    floats, letters = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
+    header = ["ply", "format ascii 1.0", f"element vertex {len(mesh.vertices)}"]
+    header += [f"property float {name}" for name in floats] + [f"property uchar {name}" for name in letters]
+    header += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header"]
+    yield "".join(f"{line}\n" for line in header).encode()
+    rows = zip((_MM_bop_models * mesh.vertices).tolist(), normals.tolist(), colored.colors.tolist(), strict=True)
+    line = "%.9g %.9g %.9g %.6g %.6g %.6g %d %d %d\n"
+    yield "".join(line % (*xyz, *normal, *rgb) for xyz, normal, rgb in rows).encode()
+    yield "".join(f"3 {a} {b} {c}\n" for a, b, c in mesh.faces.tolist()).encode()
+
+
+def _normals(part: Part) -> Array:
+    """[V, 3]: those of the part, else the mean of the faces about each vertex, weighed by their angles."""
+    if part.normals is not None:
+        return part.normals
+    return np.asarray(trimesh.Trimesh(part.vertices, part.faces, process=False).vertex_normals)

@@ -1,7 +1,9 @@
 """The folder that an export writes: claimed, filled whole file by whole file, and gone on with after a kill.
 
-While it is being made, `_export/` in it holds what was asked, how far it came, and files that are not finished. `export.json`,
-written last, says what is there and what was left out. A file has its final name only when it is whole.
+- Files that many pairs share: one open for each split, all ended together, so that a killed export goes on at an end.
+
+While it is being made, `_export/` in it holds what was asked, how far it came, and files that are not finished.
+`export.json`, written last, says what is there and what was left out. A file has its final name only when it is whole.
 """
 
 import contextlib
@@ -10,9 +12,9 @@ import json
 import os
 import shutil
 import urllib.parse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Protocol
 
 from schemas.errors import CorruptError, InUseError, OutputError
 
@@ -175,3 +177,60 @@ def _read_tree(path: Path) -> Tree | None:
     if not isinstance(tree, dict):
         raise CorruptError(f"{path} is damaged: remove the folder {path.parent.parent}, and export again")
     return tree
+
+
+class Shard(Protocol):
+    """A file that is being written."""
+
+    bytes: int
+    """About how large it is."""
+
+    def close(self) -> None:
+        """Ends the file; nothing is added afterwards."""
+
+
+class Rounds:
+    """Opens shards by split; ends a round, which is one shard of each split at most, when the largest is full."""
+
+    def __init__(
+        self, folder: ExportFolder, open_shard: Callable[[Path], Any], pattern: str, most_bytes: int, state: dict | None
+    ) -> None:
+        self._folder, self._open, self._pattern, self._most = folder, open_shard, pattern, most_bytes
+        """The pattern has places for `split` and `number`."""
+        self._next: dict[str, int] = dict((state or {}).get("next", {}))
+        self._shards: dict[str, Any] = {}
+
+    def shard(self, split: str) -> Any:
+        """The open shard of a split."""
+        if split not in self._shards:
+            self._shards[split] = self._open(self._folder.temporary(f"{split}.shard"))
+        return self._shards[split]
+
+    def end_if_full(self) -> None:
+        """Ends the round where a shard has its size. To be called between scenes."""
+        if any(shard.bytes >= self._most for shard in self._shards.values()):
+            self.end()
+
+    def end(self) -> None:
+        """Gives every open shard its final name."""
+        for split in sorted(self._shards):
+            self._shards.pop(split).close()
+            number = self._next.get(split, 0)
+            self._folder.install(
+                self._folder.temporary(f"{split}.shard"), self._pattern.format(split=split, number=number)
+            )
+            self._next[split] = number + 1
+
+    def state(self) -> dict[str, Any] | None:
+        """The next number of each split; None within a round."""
+        return None if self._shards else {"next": self._next}
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Shards by split."""
+        return dict(sorted(self._next.items()))
+
+    def close(self) -> None:
+        """Closes what is open, unfinished."""
+        for shard in self._shards.values():
+            shard.close()

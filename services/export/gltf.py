@@ -13,13 +13,12 @@ import numpy as np
 
 from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import SceneError
-from schemas.scene.camera import ROLES
+from schemas.scene.view import ROLES
 from services.export.folder import ExportFolder
-from services.export.source import ExportScene
-from services.export.sources import unchanged_sources
-from services.export.writer import Added, LeftOut
+from services.export.formats import Added, LeftOut
+from services.export.source import ExportScene, unchanged_sources
 from services.job.record import JobRecord
-from services.read.scene_export import captured_scene, planned_scene
+from services.read.scene_geometry import captured_scene, planned_scene
 from workers.assets.catalogue import Catalogue
 from workers.store.store import Store
 

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import PixelKind
-from schemas.scene.camera import Role
-from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.view import Role
 from services.export.folder import ExportFolder
+from services.export.formats import Added, LeftOut
 from services.export.source import ExportPair, ExportScene
-from services.export.writer import Added, LeftOut
 from services.merge.tables import escaped
 from workers.store.images import decode_png, encode_png
 

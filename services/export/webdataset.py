@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import PixelKind
-from schemas.scene.camera import ROLES
-from services.export.folder import ExportFolder
-from services.export.rounds import Rounds
+from schemas.scene.view import ROLES
+from services.export.folder import ExportFolder, Rounds
+from services.export.formats import Added
 from services.export.source import ExportPair, ExportScene
-from services.export.writer import Added
 
 _PATTERN: Final = "{split}-{number:06d}.tar"
 _PICTURES: Final[tuple[PixelKind, ...]] = ("rgb", "region")

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 
-from schemas.errors import AssetSourceError, MeshError
+from schemas.errors import AssetSourceError, MeshError, plain_line
 from schemas.job.assets import Assets, FolderSource, MeshLimits, UpAxis
-from schemas.plain_line import plain_line
 from workers.assets.external.listing import Entry, SourceFile
 from workers.assets.external.placement import Measured, read_measured
 from workers.assets.external.reader import ask_all

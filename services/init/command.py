@@ -13,9 +13,8 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
-from schemas.errors import AssetSourceError, InputError, MachineError, OutputError
+from schemas.errors import AssetSourceError, InputError, MachineError, OutputError, plain_line
 from schemas.job.job import Job
-from schemas.plain_line import plain_line
 from services.init.collection import (
     LARGEST,
     SMALLEST,

@@ -10,9 +10,7 @@ from statistics import median
 
 from pydantic import TypeAdapter, ValidationError
 
-from schemas.job.assets import UpAxis
-from schemas.job.category import CategoryName
-from schemas.job.pattern import matches
+from schemas.job.assets import CategoryName, UpAxis, matches
 from services.init.collection import Item, Scale, UpRule
 
 BY_FOLDER, BY_FILE = "folder", "file"

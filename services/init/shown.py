@@ -10,12 +10,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from schemas.base import frozen_array
 from schemas.job.assets import FolderSource
-from schemas.job.render import Render
-from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.region import REGION_FIRST_OBJECT, REGION_FLOOR
-from schemas.scene.scene import Placed
-from schemas.scene.shape import Asset, Material, Part, Shape
+from schemas.job.views import Render
+from schemas.scene.scene import EffectPlan, Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, Asset, Material, Part, Shape
+from schemas.scene.view import Camera, Intrinsics
 from services.init.collection import PART, Item, LeftOut
 from workers.assets.appearance import draw_appearance
 from workers.assets.catalogue import Catalogue, InstanceRef

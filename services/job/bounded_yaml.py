@@ -9,8 +9,7 @@ from typing import Any
 
 import yaml
 
-from schemas.errors import JobError
-from schemas.plain_line import plain_line
+from schemas.errors import JobError, plain_line
 
 MOST_CHARACTERS = 1_000_000
 """Longest text. A job file may have a quarter, because filling in defaults makes it longer."""

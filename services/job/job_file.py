@@ -12,11 +12,9 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from schemas.errors import JobError
+from schemas.errors import JobError, did_you_mean, plain_line
 from schemas.job.job import Job
 from schemas.job.keys import set_key
-from schemas.nearest import did_you_mean
-from schemas.plain_line import plain_line
 from services.job.bounded_yaml import MOST_LEVELS, parse_yaml
 from services.job.reference import allowed_keys
 

@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 
 from schemas.base import Counts, Range
 from schemas.job.job import Job
-from schemas.job.start import MOST_OBJECTS
+from schemas.job.physics import MOST_OBJECTS
 
 HEADER = """\
 # Keys of a job file

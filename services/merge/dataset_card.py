@@ -1,8 +1,8 @@
 """OUT/DATASET.md: the contents of a dataset, the stack that made it, and the sources of its shapes."""
 
 from schemas.base import Counts
-from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, README_FILE, stored_roles
+from schemas.dataset.shard import Fingerprint
 from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Captures
 from services.job.record import JobRecord

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from schemas.dataset.layout import CAM_POSES, CAMERAS, OBJECTS, merged_table_path
 from schemas.dataset.tables import SCHEMAS, SORT_KEYS, schema_of
 from schemas.errors import CorruptError
-from schemas.scene.camera import ROLES
+from schemas.scene.view import ROLES
 from workers.store.canonical import TableDigest, text_bytes
 from workers.store.manifest import PARQUET_OPTIONS
 

@@ -12,8 +12,7 @@ from typing import Any, Final
 from ray.exceptions import AuthenticationError
 from ray.job_submission import JobSubmissionClient
 
-from schemas.errors import InUseError, MachineError, RunError, VersoError
-from schemas.plain_line import plain_line
+from schemas.errors import InUseError, MachineError, RunError, VersoError, plain_line
 from schemas.queue import JobRequest
 from services.queue.queue import Queue
 from services.queue.supervise import Driver, Drivers

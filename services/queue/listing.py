@@ -5,8 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from schemas.durations import describe_seconds
-from schemas.errors import MachineError, VersoError
+from schemas.errors import MachineError, VersoError, describe_seconds
 from schemas.queue import submission_id
 from services.queue.queue import JobView, Queue
 from services.queue.supervise import Drivers, turn, waiting_for_folder

@@ -6,8 +6,7 @@ from typing import Any
 
 from schemas.dataset.columns import FRAMES, TABLE_MEANINGS, Column, columns_of, key_of
 from schemas.dataset.tables import TABLES
-from schemas.errors import InputError
-from schemas.nearest import did_you_mean
+from schemas.errors import InputError, did_you_mean
 
 WIDTH = 100
 """Columns of a terminal that meanings are wrapped to."""

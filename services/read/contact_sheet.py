@@ -12,7 +12,7 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 from schemas.dataset.codec import Row, read_world_poses
 from schemas.dataset.layout import Content, image_path, patch_index, patch_path
 from schemas.errors import InputError
-from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.shape import REGION_FIRST_OBJECT
 from services.read.dataset_reader import ReadFile, StoredRange, file_reader, iter_stored, read_image
 from workers.store.store import Store, open_store
 

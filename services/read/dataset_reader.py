@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
-from schemas.dataset.commit import CommitRecord
-from schemas.dataset.ledger import Ledger
+from schemas.dataset.commit import CommitRecord, Ledger
 from schemas.dataset.tables import DETERMINISTIC_TABLES
 from schemas.errors import CorruptError, InputError
 from workers.store.commit import code_of, list_codes, split_code

@@ -1,16 +1,26 @@
-"""`verso query`: SQL over the manifests of a dataset, finished or being made. Reads nothing else and writes nothing."""
+"""`verso query`: SQL over the manifests of a dataset, finished or being made. Reads nothing else and writes nothing.
 
+- Query results as a table for people, or as CSV, JSON or Parquet for programs, written as they come.
+"""
+
+import csv
+import io
+import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
+from itertools import chain, islice
+from typing import IO, Literal
 
 import duckdb
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from schemas.dataset.tables import TABLES
 from schemas.errors import CorruptError, InputError, VersoError
-from services.read.damage import explain_damage
 from services.read.stored_tables import StoredTables
+from services.read.verdict import explain_damage
 from workers.store.store import Store
 
 _LOCKED = {
@@ -104,3 +114,158 @@ def _register(connection: duckdb.DuckDBPyConnection, store: Store) -> None:
         union = " UNION ALL ".join(f"SELECT {columns} FROM _{table}_{number}" for number in range(len(parts)))
         once = "DISTINCT ON (instance_id)" if table == "assets" else ""
         connection.execute(f"CREATE VIEW {table} AS SELECT {once} {columns} FROM ({union})")
+
+
+Format = Literal["table", "csv", "parquet", "json"]
+
+_WIDEST_CELL = 60
+"""Characters; longer cells are cut in a table that goes to no terminal."""
+
+_CUT = "…"
+
+_MEASURED_ROWS = 1000
+"""The first rows, which decide how wide the columns of a table are; wider cells of later ones push their line."""
+
+_ROW_GROUP_BYTES = 4 << 20
+"""Bytes in memory of a row group of the Parquet format."""
+
+Record = tuple[object, ...]
+_Writer = Callable[[pa.Schema, Iterable[Record]], Iterator[str]]
+
+
+def write_rows(rows: pa.RecordBatchReader, style: Format, sink: IO[bytes], wide: int | None = None) -> None:
+    """Writes the rows in one of four formats, a batch in memory at a time.
+
+    A list or struct is JSON in its cell; the JSON format is one array of objects. A table that a terminal of `wide` columns has
+    no room for is written row by row, a line for each cell; without a width long cells are cut, and the last line says so.
+    """
+    if style == "parquet":
+        with pq.ParquetWriter(_Counted(sink), rows.schema, compression="zstd") as writer:
+            for group in _row_groups(rows):
+                writer.write_table(group)
+        return
+    writers: dict[str, _Writer] = {"json": _json, "csv": _csv, "table": partial(_table, wide=wide)}
+    for text in writers[style](rows.schema, _records(rows)):
+        sink.write(text.encode())
+
+
+def format_rows(rows: pa.Table, style: Format) -> bytes:
+    """The rows of a whole table, as `write_rows`."""
+    sink = io.BytesIO()
+    write_rows(rows.to_reader(), style, sink)
+    return sink.getvalue()
+
+
+def _row_groups(rows: pa.RecordBatchReader) -> Iterator[pa.Table]:
+    """The rows in tables of about `_ROW_GROUP_BYTES`: the writer keeps a row group until it is whole."""
+    kept: list[pa.RecordBatch] = []
+    for batch in rows:
+        kept.append(batch)
+        if sum(one.nbytes for one in kept) >= _ROW_GROUP_BYTES:
+            yield pa.Table.from_batches(kept)
+            kept = []
+    if kept:
+        yield pa.Table.from_batches(kept)
+
+
+class _Counted(io.RawIOBase):
+    """A pipe that Parquet can be written to: it knows how many bytes went through."""
+
+    def __init__(self, sink: IO[bytes]) -> None:
+        self._sink = sink
+        self._written = 0
+
+    def writable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._written
+
+    def write(self, data: object) -> int:
+        count = self._sink.write(memoryview(data).cast("B"))  # type: ignore[arg-type]
+        self._written += count
+        return count
+
+    def close(self) -> None:
+        """Leaves the pipe open."""
+
+
+def _records(rows: pa.RecordBatchReader) -> Iterator[Record]:
+    for batch in rows:
+        yield from zip(*(column.to_pylist() for column in batch.columns), strict=True)
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    return json.dumps(value, default=str) if isinstance(value, list | dict | bool) else str(value)
+
+
+def _json(schema: pa.Schema, records: Iterable[Record]) -> Iterator[str]:
+    before = "["
+    for record in records:
+        yield before + json.dumps(dict(zip(schema.names, record, strict=True)), default=str)
+        before = ", "
+    yield "]\n" if before != "[" else "[]\n"
+
+
+def _csv(schema: pa.Schema, records: Iterable[Record]) -> Iterator[str]:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(schema.names)
+    for record in records:
+        writer.writerow(map(_cell, record))
+        yield text.getvalue()
+        text.seek(0)
+        text.truncate()
+    yield text.getvalue()
+
+
+def _table(schema: pa.Schema, records: Iterable[Record], wide: int | None) -> Iterator[str]:
+    records = iter(records)
+    most = _WIDEST_CELL if wide is None else None
+    first = [_cells(record, most) for record in islice(records, _MEASURED_ROWS)]
+    widths = [max(map(len, column)) for column in zip(schema.names, *first, strict=True)]
+    rest = (_cells(record, most) for record in records)
+    if wide is not None and sum(widths) + 2 * (len(widths) - 1) > wide:
+        yield from _one_by_one(schema.names, chain(first, rest))
+        return
+    numeric = [pa.types.is_integer(kind) or pa.types.is_floating(kind) for kind in schema.types]
+    signs = [f"{'>' if right else '<'}{width}" for right, width in zip(numeric, widths, strict=True)]
+    count, cut = 0, False
+    for cells in (schema.names, ["-" * width for width in widths]):
+        yield _line(cells, signs)
+    for cells in chain(first, rest):
+        count += 1
+        cut = cut or any(cell.endswith(_CUT) for cell in cells)
+        yield _line(cells, signs)
+    told = (
+        f"; cells of over {_WIDEST_CELL} characters end in {_CUT}: --format csv or json has them whole" if cut else ""
+    )
+    yield f"({_count(count)}{told})\n"
+
+
+def _one_by_one(names: Sequence[str], rows: Iterable[list[str]]) -> Iterator[str]:
+    """A line for each cell: `category  mug`, and a line of dashes above each row."""
+    longest, count = max(map(len, names)), 0
+    for cells in rows:
+        count += 1
+        yield f"-- row {count}\n"
+        yield from (f"{name:{longest}}  {cell}".rstrip() + "\n" for name, cell in zip(names, cells, strict=True))
+    yield f"({_count(count)})\n"
+
+
+def _count(rows: int) -> str:
+    return f"{rows} row{'' if rows == 1 else 's'}"
+
+
+def _line(cells: Iterable[str], signs: Iterable[str]) -> str:
+    return "  ".join(map(format, cells, signs)).rstrip() + "\n"
+
+
+def _cells(record: Record, most: int | None) -> list[str]:
+    return [_cut(_cell(value).replace("\n", " "), most) for value in record]
+
+
+def _cut(text: str, most: int | None) -> str:
+    return text if most is None or len(text) <= most else text[: most - 1] + _CUT

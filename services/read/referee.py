@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
 from schemas.job.physics import Physics
-from schemas.scene.plan import ObjectStart, ScenePlan
-from schemas.scene.scene import Settled
+from schemas.scene.scene import ObjectStart, ScenePlan, Settled
 from workers.geometry.frames import invert, motion_between, transform
 from workers.physics.convex_parts import parts_of
 from workers.physics.effects import is_convex

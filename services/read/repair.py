@@ -7,23 +7,21 @@ from functools import cached_property
 from pathlib import Path
 
 from schemas.dataset.commit import CommitRecord, FileEntry
-from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE, RANGES, commit_path, range_name
+from schemas.dataset.shard import Fingerprint
 from schemas.errors import CorruptError, VersoError
 from services.job.record import encode_job, record_job
 from services.merge.dataset_card import write_card
 from services.merge.merge import merge
-from services.read.remake import Maker
+from services.read.replay import Maker
 from services.read.verdict import COPY, Verdict
-from services.read.verify import verify
-from services.read.verify_finished import read_stored_success
-from services.read.verify_job import StoredJob, Terms, check_fingerprint, encode_fingerprint, read_stored_job
-from services.read.verify_range import read_records
-from services.read.verify_span import commit_groups
+from services.read.verify import StoredJob, Terms, check_fingerprint, encode_fingerprint, read_stored_job, verify
+from services.read.verify_files import read_stored_success
+from services.read.verify_range import commit_groups, read_records
 from services.run.lock import hold_lock
-from workers.pipeline.captures.listing import open_sources
-from workers.pipeline.fingerprint import take_fingerprint
+from workers.capture.results import open_sources
 from workers.render.raster.gbuffer import shared_renderer
+from workers.shard.fingerprint import take_fingerprint
 from workers.store.attempt import reopen
 from workers.store.commit import committed_files, read_committed
 from workers.store.store import Store

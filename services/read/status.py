@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import pyarrow.compute as pc
 
+from schemas.dataset.commit import Ledger
 from schemas.dataset.layout import COMMITS, STAGING, commit_path
-from schemas.dataset.ledger import Ledger
 from schemas.errors import OutputError
 from services.merge.merge import read_success
 from services.run.lock import Holder, read_holder

@@ -1,27 +1,106 @@
-"""The tables of a dataset as pyarrow datasets: finished or being made, in a folder or a bucket."""
+"""The tables of a dataset as pyarrow datasets: finished or being made, in a folder or a bucket.
+
+- The paths of a view's images that are stored, by its row of `views`. Pure.
+- The files of a dataset as a file system of pyarrow's, so that a bucket is scanned as a folder is, a file at a time.
+"""
 
 import contextlib
 import urllib.parse
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from itertools import groupby
-from typing import Any, TypeAlias
+from types import MappingProxyType
+from typing import Any, NoReturn, TypeAlias
 
 import pyarrow as pa
 import pyarrow.dataset as ds
+import pyarrow.fs as fs
 import pyarrow.parquet as pq
 
 from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import COMMITS, MANIFEST, STAGING, SUCCESS_FILE, range_name, range_table_path
+from schemas.dataset.layout import (
+    COMMITS,
+    IMAGES,
+    MANIFEST,
+    STAGING,
+    SUCCESS_FILE,
+    PixelKind,
+    image_path,
+    patch_path,
+    range_name,
+    range_table_path,
+)
 from schemas.dataset.tables import CAPTURE_SCHEMAS, SCHEMAS, TABLES, schema_of
 from schemas.errors import CorruptError, OutputError
 from services.job.record import read_job
 from services.merge.merge import read_success
-from services.read.store_files import file_system_of
 from workers.store.commit import commit_names, read_record
 from workers.store.ledger import range_rows
 from workers.store.manifest import join_rows
 from workers.store.store import Store
+
+
+def view_paths(row: Mapping[str, Any]) -> Mapping[PixelKind, str]:
+    """The paths of a view's images that are stored, by kind."""
+    named = {i.pixels: image_path(row["category"], i.content, row["pose_id"]) for i in IMAGES if i.role == row["role"]}
+    return _stored(row, named)
+
+
+def patch_paths(row: Mapping[str, Any], index: int | None) -> Mapping[PixelKind, str]:
+    """The paths of the patches of a view's object that are stored, by kind."""
+    named = {
+        i.pixels: patch_path(row["category"], i.content, row["pose_id"], index) for i in IMAGES if i.role == row["role"]
+    }
+    return _stored(row, named)
+
+
+def _stored(row: Mapping[str, Any], named: Mapping[PixelKind, str]) -> Mapping[PixelKind, str]:
+    listed = {file["path"] for file in row["files"]}
+    return MappingProxyType({kind: path for kind, path in named.items() if path in listed})
+
+
+def file_system_of(store: Store) -> fs.FileSystem:
+    """Reads files by their keys: straight from a disk, from a bucket each as a whole when it is scanned."""
+    if store.root is not None:
+        return fs.SubTreeFileSystem(str(store.root), fs.LocalFileSystem())
+    return fs.PyFileSystem(_StoreFiles(store))
+
+
+class _StoreFiles(fs.FileSystemHandler):
+    """Reads whole objects; nothing can be written, and nothing is listed."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+
+    def get_type_name(self) -> str:
+        """The kind of file system, for messages."""
+        return "verso"
+
+    def normalize_path(self, path: str) -> str:
+        """The key itself."""
+        return path
+
+    def get_file_info(self, paths: list[str]) -> list[fs.FileInfo]:
+        """What is known of files without asking for them: the commits or `_SUCCESS` name them."""
+        return [fs.FileInfo(path, fs.FileType.File) for path in paths]
+
+    def open_input_file(self, path: str) -> pa.NativeFile:
+        """The object's bytes. Raises CorruptError where it is gone."""
+        try:
+            return pa.BufferReader(self._store.read(path))
+        except FileNotFoundError as error:
+            raise CorruptError(f"{path} is committed and missing: restore it from a copy") from error
+
+    def open_input_stream(self, path: str) -> pa.NativeFile:
+        """The object's bytes."""
+        return self.open_input_file(path)
+
+    def _refuse(self, *_: Any, **__: Any) -> NoReturn:
+        raise NotImplementedError("a dataset is only read here")
+
+    get_file_info_selector = create_dir = delete_dir = delete_dir_contents = delete_root_dir_contents = _refuse
+    delete_file = move = copy_file = open_output_stream = open_append_stream = _refuse
+
 
 Rows: TypeAlias = ds.Dataset | pa.Table
 

@@ -1,4 +1,7 @@
-"""`verso verify`: proves that a folder is exactly its dataset: every scene asked, every file and label, and nothing else.
+"""`verso verify`: proves that a folder is exactly its dataset: every scene asked, every file and label, no more.
+
+- The merge of ranges that `verify` has read, made again in a temporary folder: what `_SUCCESS` and its files must be.
+- What a dataset says of itself, against its commits: job.yaml and the fingerprint of its stack.
 
 Ranges are read one by one, and what they share is kept in a temporary folder: memory does not grow with the dataset.
 """
@@ -6,10 +9,13 @@ Ranges are read one by one, and what they share is kept in a temporary folder: m
 import contextlib
 import errno
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
+from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import (
     CAM_POSES,
     CAMERAS,
@@ -20,28 +26,186 @@ from schemas.dataset.layout import (
     README_FILE,
     SUCCESS_FILE,
     commit_path,
+    pose_of_image,
 )
+from schemas.dataset.shard import Fingerprint
+from schemas.dataset.tables import TABLES
 from schemas.errors import CommitConflict, CorruptError, MachineError
-from services.read.path_index import PathIndex
-from services.read.remerge import Remerge
-from services.read.stray_files import Known, tell_strays
-from services.read.verdict import COPY, Verdict, describe_os_error
-from services.read.verify_finished import (
+from schemas.job.identity import job_digest
+from services.job.record import JobRecord, decode_job, is_job_sealed
+from services.merge.merge import Merging
+from services.merge.reading import RANGES_PER_BLOCK, ROWS_PER_BLOCK, Block
+from services.read.verdict import COPY, PathIndex, Verdict, describe_os_error
+from services.read.verify_files import (
+    Known,
     Success,
     check_card,
     check_merged,
     check_success,
     check_told,
     read_stored_success,
+    tell_strays,
 )
-from services.read.verify_job import StoredJob, Terms, check_fingerprint, check_terms, read_stored_job
-from services.read.verify_range import RangeCheck, read_records
-from services.read.verify_span import Spans, commit_groups
-from workers.pipeline.allocator import keep_freed_memory
+from services.read.verify_range import RangeCheck, ReadRange, Spans, commit_groups, read_records
+from workers.scene.context import keep_freed_memory
 from workers.store.commit import commits_digest
 from workers.store.file_system import temporary_folder
 from workers.store.ledger import read_kept_rows
+from workers.store.manifest import join_rows
 from workers.store.store import Store
+
+
+class Remerge:
+    """Takes whole ranges in order, and joins their rows in blocks as the merge does."""
+
+    def __init__(self, folder: Path) -> None:
+        self._merging = Merging(folder)
+        self._waiting: list[ReadRange] = []
+        self._rows = 0
+
+    def add(self, one: ReadRange) -> None:
+        """Takes the next range, with its rows. Raises CorruptError where rows do not join."""
+        assert one.rows is not None
+        self._waiting.append(one)
+        self._rows += sum(map(len, one.rows.values()))
+        if len(self._waiting) >= RANGES_PER_BLOCK or self._rows >= ROWS_PER_BLOCK:
+            self._flush()
+
+    def finish(self) -> tuple[dict[str, Any], dict[str, Path]]:
+        """The contents of `_SUCCESS`, and the finished files by key. Raises CorruptError, CommitConflict."""
+        self._flush()
+        return self._merging.finish()
+
+    def close(self) -> None:
+        """Closes every file, finished or not."""
+        self._merging.close()
+
+    def _flush(self) -> None:
+        waiting, self._waiting, self._rows = self._waiting, [], 0
+        if not waiting:
+            return
+        files = [(one.records[0], entry) for one in waiting for entry in one.files if pose_of_image(entry.path) is None]
+        rows = {
+            table: join_rows(table, [one.rows[table] for one in waiting if one.rows]).combine_chunks()
+            for table in TABLES
+        }
+        self._merging.add(Block([one.records for one in waiting], files, rows))
+
+
+MOST_TOLD = 100
+"""Different jobs or stacks that are remembered with a commit of theirs."""
+
+
+@dataclass(frozen=True)
+class StoredJob:
+    """A job.yaml as it was found: its record, None where it cannot be read, and whether its bytes are as they were written."""
+
+    record: JobRecord | None = None
+    sealed: bool = False
+    whole: bool = False
+    """As an earlier version wrote it, or sealed."""
+
+    @property
+    def digest(self) -> str | None:
+        """The job digest of the keys as they are now."""
+        return job_digest(self.record.job, self.record.catalogue) if self.record else None
+
+
+def read_stored_job(store: Store, verdict: Verdict) -> StoredJob:
+    """job.yaml, and what is wrong with it by itself."""
+    try:
+        data = store.read(JOB_FILE)
+        record = decode_job(data, JOB_FILE)
+    except OSError as error:
+        verdict.tell(f"{JOB_FILE}: {describe_os_error(error)}", COPY, "job")
+        return StoredJob()
+    except CorruptError as error:
+        told = str(error).removeprefix(JOB_FILE).lstrip(": ").removesuffix(COPY).rstrip(";: ")
+        verdict.tell(f"{JOB_FILE}: {told}", COPY, "job")
+        return StoredJob()
+    found = StoredJob(record, is_job_sealed(data), is_job_sealed(data))
+    if not found.whole:
+        verdict.tell(f"{JOB_FILE}: was altered after a run wrote it: its seal does not match", verdict.repair, "job")
+    elif record.digest != found.digest:
+        verdict.tell(f"{JOB_FILE}: its digest is not that of its keys", verdict.repair, "job")
+    return found
+
+
+@dataclass
+class Terms:
+    """The jobs and stacks that commits were made with, each with the first commit that names it."""
+
+    jobs: dict[str, str] = field(default_factory=dict)
+    range_sizes: dict[int, str] = field(default_factory=dict)
+    stacks: dict[tuple[str, str], str] = field(default_factory=dict)
+    """By (fingerprint, mode)."""
+
+    def take(self, record: CommitRecord) -> None:
+        """Remembers what a commit says."""
+        key, terms = commit_path(record.span.start, record.span.retry), record.terms
+        if len(self.jobs) < MOST_TOLD:
+            self.jobs.setdefault(terms.job_digest, key)
+        if len(self.range_sizes) < MOST_TOLD:
+            self.range_sizes.setdefault(terms.range_size, key)
+        if len(self.stacks) < MOST_TOLD:
+            self.stacks.setdefault((terms.fingerprint, terms.fingerprint_mode), key)
+
+
+def check_terms(job: StoredJob, terms: Terms, verdict: Verdict) -> None:
+    """Compares job.yaml with the job digest that every commit holds."""
+    if job.record is None or not terms.jobs:
+        return
+    if job.digest not in terms.jobs:
+        digest, key = next(iter(terms.jobs.items()))
+        told = f"{JOB_FILE}: its keys or asset files (digest {str(job.digest)[:12]}) are not those of {key} ({digest[:12]})"
+        verdict.tell(told, f"{COPY}, or change them back", "job")
+    else:
+        for digest, key in terms.jobs.items():
+            if digest != job.digest:
+                verdict.tell(f"{key}: is a commit of another job ({digest[:12]}) than {JOB_FILE}", COPY)
+    size = job.record.job.range_size
+    if size not in terms.range_sizes and terms.range_sizes:
+        told = f"{JOB_FILE}: run.range_size is {size}, that of the commits {next(iter(terms.range_sizes))}"
+        verdict.tell(told, f"{COPY}, or change it back", "job")
+
+
+def check_fingerprint(store: Store, terms: Terms, verdict: Verdict) -> None:
+    """Compares the stored fingerprint with those of the commits, to the byte."""
+    try:
+        data = store.read(FINGERPRINT_FILE)
+        stored = Fingerprint.model_validate_json(data)
+    except OSError as error:
+        verdict.tell(f"{FINGERPRINT_FILE}: {describe_os_error(error)}", verdict.repair, "job")
+        return
+    except (ValidationError, ValueError):
+        verdict.tell(f"{FINGERPRINT_FILE}: is damaged: it is no fingerprint", verdict.repair, "job")
+        return
+    if not terms.stacks:
+        return
+    if data != encode_fingerprint(stored):
+        verdict.tell(f"{FINGERPRINT_FILE}: was altered after a worker wrote it", verdict.repair, "job")
+    elif stored.digest not in {stack for stack, _ in terms.stacks} and not _is_in_card(store, stored):
+        told = f"{FINGERPRINT_FILE}: is the fingerprint {stored.digest[:12]}, which no commit has"
+        verdict.tell(told, verdict.repair, "job")
+    else:
+        for (stack, mode), key in terms.stacks.items():
+            if mode == "strict" and stack != stored.digest:
+                told = f"{key}: has the fingerprint {stack[:12]}, the dataset's is {stored.digest[:12]}"
+                verdict.tell(told, "two stacks made one dataset although run.fingerprint was strict; make it anew")
+
+
+def encode_fingerprint(fingerprint: Fingerprint) -> bytes:
+    """The bytes of manifest/_fingerprint.json, as the first worker writes it."""
+    return fingerprint.model_dump_json(indent=1).encode()
+
+
+def _is_in_card(store: Store, stored: Fingerprint) -> bool:
+    """Whether DATASET.md names a stack: under `run.fingerprint: record` the first worker may have committed nothing."""
+    try:
+        return stored.digest.encode() in store.read(README_FILE)
+    except OSError:
+        return False
+
 
 TOP_FILES = (JOB_FILE, README_FILE, SUCCESS_FILE, FINGERPRINT_FILE, LEDGER_FILE, CAM_POSES, CAMERAS, OBJECTS)
 """Files with one place each; whether they are whole is checked by name."""

@@ -3,9 +3,8 @@
 import os
 import time
 
-from schemas.dataset.ledger import Ledger
-from schemas.durations import describe_seconds
-from schemas.errors import OutputError
+from schemas.dataset.commit import Ledger
+from schemas.errors import OutputError, describe_seconds
 from schemas.job.job import Job
 from services.job.record import record_job, refuse_foreign
 from services.merge.dataset_card import describe_sources
@@ -14,9 +13,8 @@ from services.run.machine import usable_cores
 from services.run.range_planner import MAX_SHARD, plan_spans
 from services.run.run_job import RunRequest, open_inputs
 from workers.assets.catalogue import Catalogue
-from workers.pipeline.context import open_worker
-from workers.pipeline.run_shard import run_scene
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch, open_worker
+from workers.shard.run_shard import run_scene
 from workers.store.ledger import list_commits
 from workers.store.store import Store
 

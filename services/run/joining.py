@@ -22,7 +22,7 @@ from services.run.lock import Lock
 from services.run.progress import say
 from services.run.worker_entry import WorkerTerms, enter_shard, refusal_of, worker_environment
 from workers.assets.catalogue import Catalogue
-from workers.pipeline.code import code_digest
+from workers.shard.code import code_digest
 from workers.store.store import Store
 
 EnterShard = Callable[[WorkerTerms, bytes, bytes], ShardReport]
@@ -101,9 +101,9 @@ def with_own_stack(store: Store, order: ShardOrder) -> ShardOrder:
     """
     if order.terms.fingerprint_mode != "strict" or order.terms.fingerprint:
         return order
-    from workers.pipeline.fingerprint import take_fingerprint  # loads GL
     from workers.render.raster.context import is_software
     from workers.render.raster.gbuffer import shared_renderer
+    from workers.shard.fingerprint import take_fingerprint  # loads GL
 
     renderer = shared_renderer()
     if order.job.run.device == "gpu" and is_software(renderer.name):

@@ -14,7 +14,7 @@ from typing import Any
 from tqdm import tqdm
 
 from schemas.dataset.layout import LOG_FOLDER
-from schemas.durations import describe_seconds
+from schemas.errors import describe_seconds
 from services.run.supervisor import tell
 from workers.store.file_system import refuse_link_out
 

@@ -11,9 +11,8 @@ import numpy as np
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from schemas.dataset.commit import Span
+from schemas.dataset.commit import Ledger, Span
 from schemas.dataset.layout import commit_path
-from schemas.dataset.ledger import Ledger
 from schemas.errors import OutputError
 from schemas.job.job import Job
 from services.merge.merge import read_success

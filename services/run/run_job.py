@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from schemas.dataset.commit import Ledger
 from schemas.dataset.layout import FINGERPRINT_FILE, JOB_FILE
-from schemas.dataset.ledger import Ledger
 from schemas.dataset.shard import JobChange, ShardOrder
 from schemas.errors import FingerprintError
 from schemas.job.job import Job
@@ -23,7 +23,7 @@ from services.run.progress import ProgressLine, event_log, log_event, note_of_fi
 from services.run.range_planner import SpanPlan, deal_shards, find_lost, group_shards, plan_spans
 from services.run.ray_cluster import SharedSlots, Slots, open_ray
 from workers.assets.catalogue import Catalogue
-from workers.pipeline.captures.listing import open_sources
+from workers.capture.results import open_sources
 from workers.render.tiers import require_tier
 from workers.store.attempt import sweep
 from workers.store.ledger import LedgerKeeper, list_commits

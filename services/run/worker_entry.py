@@ -96,7 +96,7 @@ def _why_not_writable(folder: str) -> str:
 def _read_code() -> tuple[str, str]:
     """(the digest of the project's code, "") or ("", why it cannot be imported)."""
     try:
-        from workers.pipeline.code import code_digest
+        from workers.shard.code import code_digest
     except ImportError as error:
         return "", str(error)
     return code_digest(), ""
@@ -201,7 +201,7 @@ def enter_shard(terms: WorkerTerms, order: bytes, catalogue: bytes) -> "ShardRep
     if is_draining():
         time.sleep(DRAINED_PAUSE_S)
     check_worker(terms)
-    from workers.pipeline.run_shard import run_shard
+    from workers.shard.run_shard import run_shard
 
     return run_shard(pickle.loads(order), pickle.loads(catalogue), is_draining)
 

@@ -13,25 +13,22 @@ import yaml
 
 from schemas.errors import InputError
 from schemas.job.job import Job
-from services.bench.extra import require_extra
+from services.bench.command import require_extra
 from services.job.job_file import load_job, read_tree
 from services.run.machine import usable_cores
 from services.run.progress import ProgressLine
-from services.study.answer import answer, recommend
-from services.study.captures.study import check_captures, run_capture_study
-from services.study.choose import parse_targets
-from services.study.journal import Journal
+from services.study.captures import check_captures, run_capture_study
+from services.study.choose import answer, parse_targets, recommend
 from services.study.knobs import apply, choose_knobs, job_tree_with, knobs_of, preset_settings, settings_of
-from services.study.measure.colour_errors import colour_truth_missing
+from services.study.measure.colour import colour_truth_missing
 from services.study.model import Plan, Row, Sizes
-from services.study.report.page import write_page
-from services.study.report.tables import write_tables
-from services.study.study import header_of, run_study, study_of
+from services.study.report.page import write_page, write_tables
+from services.study.study import Journal, header_of, run_study, study_of
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.code import code_digest
-from workers.pipeline.context import open_worker
 from workers.render.raster.context import require_device
 from workers.render.tiers import require_tier
+from workers.scene.context import open_worker
+from workers.shard.code import code_digest
 
 LEAST_SCENES = 4
 """Fewer tell nothing of a 95th percentile."""

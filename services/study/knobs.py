@@ -1,4 +1,8 @@
-"""The knobs that the study turns, and the settings made of them. Pure."""
+"""The knobs that a study turns, of scenes and of captures, and the settings made of them. Pure.
+
+- The knobs of captures that the study turns. Pure.
+- The knobs that the study turns, and the settings made of them. Pure.
+"""
 
 import copy
 import itertools
@@ -9,14 +13,35 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import to_jsonable_python
 
-from schemas.errors import InputError
-from schemas.job.job import Job
+from schemas.errors import InputError, did_you_mean
+from schemas.job.captures import ESTIMATES, Captures
+from schemas.job.job import PRESETS, Job
 from schemas.job.keys import set_key
-from schemas.job.preset import PRESETS
-from schemas.nearest import did_you_mean
 from services.job.job_file import describe_fault
-from services.study.captures.knobs import capture_knobs
 from services.study.model import Changes, Group, Knob, Setting, Value
+
+VIEWS = (4, 6, 10, 20, 40)
+"""Numbers of views, as far as the job's captures have as many."""
+
+
+def capture_knobs(captures: Captures) -> tuple[Knob, ...]:
+    """Every knob of a job of simulated captures, from coarse to fine where its values have an order.
+
+    `markers` and `article` estimate each view by itself, `joint` all together.
+    """
+    knobs = {
+        "views": _values("captures.simulate.views", (n for n in VIEWS if n < captures.simulate.views)),
+        "estimate": [Value(name, {"captures.estimation.estimate": name}) for name in ESTIMATES],
+        "iterations": _values("captures.estimation.max_iterations", (1, 2, 5, 20)),
+        "voxel": _values("captures.fusion.voxel_m", (0.006, 0.004, 0.002, 0.0015)),
+        "merged_views": _values("captures.synthesis.views", (1, 3, 6, 12)),
+    }
+    return tuple(Knob(name, "capture", tuple(values)) for name, values in knobs.items())
+
+
+def _values(key: str, values: Iterable[float]) -> list[Value]:
+    return [Value(f"{value:g}", {key: value}) for value in values]
+
 
 SPIN_PER_SPEED = 0.01
 """rad/s of `physics.rest.spin_rad_s` for each mm/s of `physics.rest.speed_mm_s`: their defaults' ratio."""
@@ -30,9 +55,9 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
     if job.captures is not None:
         return capture_knobs(job.captures)
     physics = {
-        "step": _values("physics.step_hz", (60, 120, 240, 480, 960, 1920)),
-        "step_travel": _values("physics.max_step_travel_mm", (1.0, 0.3, 0.1, 0.05, 0.035)),
-        "iterations": _values("physics.solver_iterations", (5, 10, 25, 50, 100, 200)),
+        "step": _values_knobs("physics.step_hz", (60, 120, 240, 480, 960, 1920)),
+        "step_travel": _values_knobs("physics.max_step_travel_mm", (1.0, 0.3, 0.1, 0.05, 0.035)),
+        "iterations": _values_knobs("physics.solver_iterations", (5, 10, 25, 50, 100, 200)),
         "rest": [
             Value(f"{v:g}", {"physics.rest.speed_mm_s": v, "physics.rest.spin_rad_s": SPIN_PER_SPEED * v})
             for v in (30.0, 10.0, 3.0, 1.0, 0.3)
@@ -50,7 +75,7 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
     return (
         *(Knob(name, "physics", tuple(values)) for name, values in physics.items()),
         Knob("size", "labels", tuple(size_value(job, width) for width in WIDTHS)),
-        Knob("units", "labels", tuple(_values("images.depth_units_per_m", units))),
+        Knob("units", "labels", tuple(_values_knobs("images.depth_units_per_m", units))),
         Knob("pivot_depth", "mirror", tuple(_pivot_depths())),
         Knob("splat", "mirror", tuple(splats)),
         Knob("sensor", "labels", tuple(sensors)),
@@ -58,7 +83,7 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
     )
 
 
-def _values(key: str, values: Iterable[float]) -> list[Value]:
+def _values_knobs(key: str, values: Iterable[float]) -> list[Value]:
     return [Value(f"{value:g}", {key: value}) for value in values]
 
 

@@ -1,30 +1,244 @@
-"""The whole study: every knob by itself, then promising combinations, and the table of both."""
+"""The whole study: its journal, every knob by itself, then promising combinations, and the table of both.
+
+- The journal of a study: a file of answers, with which the same command goes on where it stopped.
+- Chooses the combinations of settings to measure, once each knob has been measured by itself. Pure.
+- A round of the study: settings that are measured side by side, the units of work, and the resulting table.
+- The whole study: every knob by itself, then promising combinations, and the table of both.
+"""
 
 import hashlib
+import itertools
+import json
 import multiprocessing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from schemas.errors import OutputError
 from schemas.job.job import Job
-from services.bench.machine import describe_machine, pinned
+from services.bench.figures import describe_machine, pinned
 from services.run.progress import ProgressLine
-from services.study.answer import DEFAULT_TARGETS, default_targets
-from services.study.choose import TargetError, close_calls
-from services.study.journal import Journal
-from services.study.knobs import apply
-from services.study.measure.convergence import slopes
-from services.study.measure.scene_images import measure_colour, measure_scene_images
-from services.study.measure.settling import measure_settling
-from services.study.measure.timing import time_scene, warm_up
-from services.study.model import Plan, Row, Setting, Study
-from services.study.pairs import promising
-from services.study.rounds import Round, Unit
+from services.study.choose import DEFAULT_TARGETS, TargetError, close_calls, default_targets
+from services.study.knobs import apply, groups_of, joined
+from services.study.measure.images import measure_colour, measure_scene_images
+from services.study.measure.settling import measure_settling, slopes
+from services.study.measure.timing import image_figures, settling_figures, time_scene, timed_rows, warm_up
+from services.study.model import ERRORS, Figure, Group, Plan, Row, Setting, Study
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.context import WorkerContext, open_worker
+from workers.scene.context import WorkerContext, open_worker
+
+JOURNAL_FILE = "journal.jsonl"
+
+
+class Journal(dict[str, Any], AbstractContextManager):
+    """Answers by the unit's name, one JSON line each; the first line identifies the study.
+
+    A line that the end of a process cut off is dropped, and its unit measured again.
+    """
+
+    def __init__(self, folder: Path, header: Mapping[str, Any]) -> None:
+        """Raises OutputError where the folder cannot be written, or holds another study."""
+        self._path = folder / JOURNAL_FILE
+        super().__init__()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._file = self._path.open("a+b")
+        except OSError as error:
+            raise OutputError(f"{folder} cannot be written: {error.strerror or error}; choose another --out") from error
+        try:
+            self._read(header)
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _read(self, header: Mapping[str, Any]) -> None:
+        self._file.seek(0)
+        written = self._file.read()
+        whole = written[: written.rfind(b"\n") + 1]
+        self._file.truncate(len(whole))
+        if not whole:
+            self._write(header)
+            return
+        first, *entries = map(json.loads, whole.splitlines())
+        wanted = json.loads(json.dumps(header))
+        if other := sorted(key for key in {*first, *wanted} if first.get(key) != wanted.get(key)):
+            raise OutputError(
+                f"{self._path.parent} holds the measurements of another study (other {', '.join(other)}): choose another "
+                f"--out, or delete {self._path.name} there"
+            )
+        self.update((entry["unit"], entry["answer"]) for entry in entries)
+
+    def add(self, unit: str, answer: Any) -> None:
+        """Keep an answer, on disk too."""
+        self[unit] = answer
+        self._write({"unit": unit, "answer": answer})
+
+    def _write(self, entry: Mapping[str, Any]) -> None:
+        self._file.write(json.dumps(entry, sort_keys=True).encode() + b"\n")
+        self._file.flush()
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+
+SAVES = 0.98
+"""A value is cheaper where it takes at most this share of the job's own time."""
+
+WORSE = 1.5
+"""An error is kept where it grows by at most this factor."""
+
+BETTER = 0.67
+"""An error is better below this share of the job's own."""
+
+NEGLIGIBLE: Mapping[str, float] = {"mm": 0.02, "deg": 0.02, "": 0.001}
+"""By unit: errors below this are as good as none, however they compare."""
+
+DEAREST = 5.0
+"""A value that takes at least this many times the job's time is measured by itself only."""
+
+MOST_OF_A_KIND = 3
+"""The most knobs that are paired among those that save time, and among those that are more exact."""
+
+
+def promising(rows: Sequence[Row], targets: Mapping[str, float]) -> tuple[Setting, ...]:
+    """Settings of two and more knobs to measure next.
+
+    `rows`: the job's own first, then one value of one knob each. For each knob the cheapest value that keeps every error, and
+    the most exact value that shrinks one; of either kind the best knobs, two by two and all at once; and at once the cheapest
+    value of every knob that meets the targets.
+    """
+    singles = [row for row in rows[1:] if len(row.setting.parts) == 1 and row.ratio < DEAREST]
+    shares = {row.setting.name: _least_share(row, rows[0]) for row in singles}
+    cheap = sorted((row for row in singles if row.ratio < SAVES), key=lambda row: (row.ratio, row.setting.name))
+    ranks = {name: share for name, share in shares.items() if share is not None and share < BETTER}
+    saving = _first_of_knobs(row for row in cheap if shares[row.setting.name] is not None)
+    shrinking = [row for row in singles if row.setting.name in ranks]
+    exact = _first_of_knobs(sorted(shrinking, key=lambda row: (ranks[row.setting.name], row.setting.name)))
+    meeting = _first_of_knobs(
+        row for row in cheap if all(row.errors[name].value <= targets[name] for name in set(targets) & set(row.errors))
+    )
+    pairs = [pair for kind in (saving, exact) for pair in itertools.combinations(kind[:MOST_OF_A_KIND], 2)]
+    # In the order of the table, whatever the ranks, so that names do not depend on noise.
+    found = [
+        joined([row.setting for row in singles if row in some])
+        for some in (*pairs, saving, exact, meeting)
+        if len(some) > 1
+    ]
+    return tuple({setting.name: setting for setting in found}.values())
+
+
+def _first_of_knobs(rows: Iterable[Row]) -> list[Row]:
+    """The first value of each knob, in the order of the rows."""
+    first: dict[str, Row] = {}
+    for row in rows:
+        first.setdefault(row.setting.knob, row)
+    return list(first.values())
+
+
+def _least_share(row: Row, own: Row) -> float | None:
+    """The least of its errors as a share of the job's own where that is not negligible, 1 without any.
+
+    None where an error has grown beyond the factor and is not negligible.
+    """
+    both = [name for name in row.errors if name in own.errors]
+    pairs = [(row.errors[name].value, own.errors[name].value, NEGLIGIBLE[ERRORS[name].unit]) for name in both]
+    if any(value > max(negligible, WORSE * mine) for value, mine, negligible in pairs):
+        return None
+    return min((value / mine for value, mine, negligible in pairs if mine > negligible), default=1.0)
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One scene to measure with these settings; its answer is kept by its name.
+
+    `kind`: time, settling, images or colour. Of time: its `lap`. Of settling: whether poses are held against the truth
+    (`posed`) and objects released again (`released`).
+    """
+
+    name: str
+    kind: str
+    settings: tuple[Setting, ...]
+    scene_id: int
+    lap: int = 0
+    posed: bool = False
+    released: bool = False
+
+
+@dataclass(frozen=True)
+class Round:
+    """Settings that are measured side by side; the first is the job itself."""
+
+    plan: Plan
+    name: str
+    settings: tuple[Setting, ...]
+    times_only: bool = False
+
+    def of(self, *groups: Group) -> tuple[Setting, ...]:
+        """The job's own setting, and those that change any of these parts of a scene."""
+        knobs = {knob.name: knob for knob in self.plan.knobs}
+        return (self.settings[0], *(one for one in self.settings[1:] if groups_of(one, knobs) & set(groups)))
+
+    def timings(self) -> list[Unit]:
+        """The units of time, in the order in which they are taken: lap by lap."""
+        first, sizes = self.plan.job.first_scene, self.plan.sizes
+        return [
+            Unit(f"{self.name}/time/{lap}/{scene}", "time", self.settings, scene, lap)
+            for lap, scene in itertools.product(range(sizes.laps), range(first, first + sizes.timed))
+        ]
+
+    def errors(self) -> list[Unit]:
+        """The units of errors."""
+        first, sizes = self.plan.job.first_scene, self.plan.sizes
+        kinds: list[tuple[str, tuple[Setting, ...], int]] = [
+            ("colour", self.of("colour"), sizes.coloured),
+            ("images", self.of("labels", "mirror"), sizes.scenes),
+            ("settling", self.of("physics"), sizes.settled),
+        ]
+        return [
+            Unit(
+                f"{self.name}/{kind}/{first + number}",
+                kind,
+                settings,
+                first + number,
+                posed=number < sizes.posed,
+                released=number < sizes.released,
+            )
+            for kind, settings, count in kinds
+            for number in range(count)
+            if len(settings) > 1 and not self.times_only
+        ]
+
+    def rows(self, journal: Journal) -> tuple[Row, ...]:
+        """The round's table, from the answers in the journal; settings without a time are left out."""
+        laps: list[dict[int, dict[str, Any]]] = [{} for _ in range(self.plan.sizes.laps)]
+        for unit in self.timings():
+            laps[unit.lap][unit.scene_id] = journal[unit.name]
+        return tuple(self._with_errors(journal, row, scenes) for row, scenes in timed_rows(self.settings, laps))
+
+    def _with_errors(self, journal: Journal, row: Row, scenes: int) -> Row:
+        errors = self._errors(journal, row.setting.name)
+        return replace(
+            row,
+            errors=errors,
+            failed_share=errors["failed_share"].value if "failed_share" in errors else 0.0,
+            notes=() if scenes >= self.plan.sizes.timed else (f"timed in {scenes} scenes",),
+        )
+
+    def _errors(self, journal: Journal, name: str) -> dict[str, Figure]:
+        """A setting's errors, `failed_share` last and the others in the order of `ERRORS`."""
+        answers: dict[str, list[dict[str, Any]]] = {"settling": [], "images": [], "colour": []}
+        for unit in self.errors():
+            answers[unit.kind].append(journal[unit.name])
+        found = settling_figures(name, answers["settling"])
+        for kind in ("images", "colour"):
+            found |= image_figures([one[name] for one in answers[kind] if name in one])
+        order = [error for error in ERRORS if error != "failed_share"]
+        return {error: found[error] for error in (*order, "failed_share") if error in found}
+
 
 LAPS_OF_CLOSE_CALLS = 3
 """Factor on the rounds of timing for settings whose time decides the choice."""

@@ -1,6 +1,6 @@
 """Amounts, times and sizes in words, for the sentence, the plots and the page. Pure."""
 
-from services.study.errors import ERRORS
+from services.study.model import ERRORS
 
 _SIZES = ((1e3, 1.0, "kB"), (1e6, 1e3, "MB"), (1e9, 1e6, "GB"), (float("inf"), 1e9, "TB"))
 

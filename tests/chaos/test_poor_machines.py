@@ -22,7 +22,7 @@ MAY_READ_IT = {
     "services/queue/listing.py": "the age of a job, to be shown",
     "services/queue/queue.py": "the time of an event, to be shown",
     "services/read/status.py": "the rate of the latest commits, to be shown",
-    "services/report/progress.py": "when a range was committed, to be shown",
+    "services/look/live.py": "when a range was committed, to be shown",
     "services/run/progress.py": "the time of an event, to be logged",
     "services/run/metrics.py": "when a run began, for the time that is left",
     "workers/store/local.py": "when a file was written, for the rate",

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from schemas.scene.plan import ScenePlan
+from schemas.scene.scene import ScenePlan
 from tests.effects.cases import Case
 from tests.effects.scenes import Setting
 

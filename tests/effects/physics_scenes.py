@@ -5,16 +5,14 @@ from collections.abc import Sequence
 from functools import cache
 
 from schemas.base import Pose
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ScenePlan
-from schemas.scene.scene import Settled
-from services.read.audit_motion import MOST_DEG, MOST_MM
+from schemas.scene.scene import EffectPlan, ScenePlan, Settled
+from services.read.audit import MOST_DEG, MOST_MM
 from tests.effects.scenes import Setting, facts_of
 from tests.hard_cases.drops import Drop
 from workers.physics.fall import Outcome, StepSizes, fall, falls_below
 from workers.physics.rigid_body import make_body
 from workers.physics.settle import Rest, moved_by, release_again, settle_scene
-from workers.plan.effects import Facts, plan_effects
+from workers.scene.effects import Facts, plan_effects
 
 RELEASE_S = 1.0
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from schemas.errors import SceneError, SettleError
-from schemas.scene.region import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
 from tests.effects.cases import ASKED, NO_OPS, RASTER, TRACED, WITHOUT_MIRROR
 from tests.effects.physics_cases import PHYSICS
 from tests.effects.physics_scenes import facts_with

@@ -10,13 +10,12 @@ import shapely
 import trimesh
 
 from schemas.base import Pose
-from schemas.job.category import CATEGORIES
-from schemas.scene.plan import ObjectStart, Table
-from schemas.scene.scene import Settled
+from schemas.job.assets import CATEGORIES
+from schemas.scene.scene import ObjectStart, Settled, Table
 from tests.effects.physics_cases import on_a_bumpy_table
 from tests.effects.scenes import Setting
 from workers.geometry.frames import transform
-from workers.plan.effects import Facts
+from workers.scene.effects import Facts
 
 TOUCH_M = 1e-4
 """More than this above the table, an object falls."""

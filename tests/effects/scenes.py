@@ -9,21 +9,19 @@ from unittest import mock
 
 import numpy as np
 
-import workers.pipeline.make_scene
+import workers.scene.make_scene
 from schemas.job.identity import settings_digest
 from schemas.job.job import Job
-from schemas.scene.plan import ScenePlan
+from schemas.scene.scene import ScenePlan
 from schemas.scene.shape import Part, Shape
 from services.job.job_file import validate_job
 from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import Scene, make_scene
-from workers.pipeline.rows import record_scene
-from workers.pipeline.stopwatch import Stopwatch
-from workers.plan.effects import Facts, is_raycast_scene
-from workers.plan.randomness import SceneChance
-from workers.plan.step import plan_scene
 from workers.render.raster.gbuffer import shared_renderer
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.effects import Facts, is_raycast_scene
+from workers.scene.make_scene import Scene, make_scene
+from workers.scene.plan import SceneChance, plan_scene
+from workers.scene.rows import record_scene
 
 SMALL: dict[str, Any] = {
     "name": "effects",
@@ -108,7 +106,7 @@ def make(setting: Setting, forced: Iterable[str] = (), withdrawn: Iterable[str] 
     def draw(job: Job, catalogue: Catalogue, chance: SceneChance) -> ScenePlan:
         return setting.edit(plan_scene(job, catalogue, chance))
 
-    with mock.patch.object(workers.pipeline.make_scene, "plan_scene", draw):
+    with mock.patch.object(workers.scene.make_scene, "plan_scene", draw):
         scene = make_scene(context, setting.scene_id, stopwatch)
     output = record_scene(context, scene, stopwatch)
     rows = {

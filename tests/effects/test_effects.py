@@ -7,7 +7,7 @@ import pytest
 from tests.effects.cases import ASKED, NO_OPS, Case
 from tests.effects.physics_cases import PHYSICS
 from tests.effects.scenes import Setting, facts_of, make
-from workers.plan.effects import EFFECTS, names_of_kind, plan_effects, write_receipt
+from workers.scene.effects import EFFECTS, names_of_kind, plan_effects, write_receipt
 
 CASES: dict[str, Case] = {**PHYSICS, **ASKED, **NO_OPS}
 

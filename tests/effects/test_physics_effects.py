@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from schemas.errors import SettleError
-from schemas.scene.plan import ObjectStart
+from schemas.scene.scene import ObjectStart
 from tests.effects.physics_cases import PHYSICS
 from tests.effects.physics_scenes import drop_on, facts_with, is_still, moved_from, moved_when_forced, settled
 from tests.effects.scenes import Setting, facts_of
@@ -19,7 +19,7 @@ from tests.kit.shapes import asset_of
 from tests.physics.settling import settle_single
 from workers.geometry.frames import transform
 from workers.physics.placement import Form, find_gaps_m
-from workers.plan.effects import PHYSICS_EFFECTS, Facts, plan_effects
+from workers.scene.effects import PHYSICS_EFFECTS, Facts, plan_effects
 
 pytestmark = pytest.mark.minute
 

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from schemas.errors import SceneError
-from schemas.job.category import CATEGORIES
-from schemas.scene.camera import Camera
-from schemas.scene.region import REGION_FLOOR, REGION_TABLE
+from schemas.job.assets import CATEGORIES
 from schemas.scene.scene import Placed
+from schemas.scene.shape import REGION_FLOOR, REGION_TABLE
+from schemas.scene.view import Camera
 from tests.effects.cases import NO_OPS
 from tests.effects.physics_cases import PHYSICS
 from tests.effects.random_physics import needed, random_physics
 from tests.effects.scenes import Setting, facts_of, make, with_holes, without_textures
-from workers.cameras.placement import place_aligned_camera, place_mirror_camera
 from workers.geometry.raycast import cast_view
 from workers.physics.settle import settle_scene
-from workers.plan.effects import EFFECTS, Facts, names_of_kind, plan_effects
+from workers.scene.effects import EFFECTS, Facts, names_of_kind, plan_effects
+from workers.scene.pairs import place_aligned_camera, place_mirror_camera
 
 pytestmark = pytest.mark.minute
 

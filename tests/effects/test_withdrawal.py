@@ -6,7 +6,7 @@ import pytest
 
 from tests.effects.proofs import PROOFS, attempt
 from tests.effects.scenes import Made, Setting, facts_of
-from workers.plan.effects import EFFECTS, plan_effects
+from workers.scene.effects import EFFECTS, plan_effects
 
 TRACED_EFFECTS = ("global_illumination", "glass")
 

@@ -13,18 +13,18 @@ import trimesh
 
 from schemas.base import Array, Pose, Range, frozen_array
 from schemas.job.job import Job
-from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed, PosedScene
+from schemas.scene.view import Camera, Intrinsics
 from tests.hard_cases.case import refuse
 from tests.kit.shapes import box, shape_of, table
 from tests.workers.render.random_scenes import APPEARANCE, VGA, floor
-from workers.cameras.placement import object_distance, place_mirror_camera
 from workers.geometry.camera import look_at, orbit_pose, yaw
 from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.geometry.pixels import quantise_depth
 from workers.geometry.raycast import cast_view, edge_distance_px
-from workers.labels.ray_check import EDGE_PX, check_against_rays
 from workers.render.raster.gbuffer import Renderer
+from workers.scene.pairs import object_distance, place_mirror_camera
+from workers.scene.ray_check import EDGE_PX, check_against_rays
 
 JOB = Job(name="t")
 HOLD = "must hold"

@@ -15,8 +15,7 @@ import cv2
 import numpy as np
 
 from schemas.base import Pose
-from schemas.capture.estimate import CaptureEstimate
-from schemas.capture.view import CaptureCamera, CapturedView
+from schemas.capture import CaptureCamera, CapturedView, CaptureEstimate
 from schemas.job.captures import Board, Estimation
 from tests.hard_cases.case import refuse
 from tests.workers.capture.depths import surface_depth
@@ -24,10 +23,10 @@ from tests.workers.capture.photographs import HALF, hand_held, photograph, print
 from tests.workers.capture.poses.scenes import errors
 from tests.workers.pipeline.captures.folders import draw_view
 from workers.capture.board.layout import marker_corners
+from workers.capture.estimate import estimate_poses
+from workers.capture.folder import CaptureFile, open_folder, write_description, write_view
+from workers.capture.reconstruct import given_files
 from workers.geometry.camera import look_at, orbit_pose
-from workers.pipeline.captures.corrections import given_files
-from workers.pipeline.captures.estimate import estimate_poses
-from workers.store.capture_folder import CaptureFile, open_folder, write_description, write_view
 
 HOLD, FLAG = "must hold", "must flag view 0"
 BOARD = Board()

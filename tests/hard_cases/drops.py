@@ -9,7 +9,7 @@ import shapely
 import trimesh
 
 from schemas.base import Array, frozen_array
-from schemas.scene.plan import ObjectStart, Table
+from schemas.scene.scene import ObjectStart, Table
 from schemas.scene.shape import Asset
 from tests.kit.shapes import box, shape_of
 from tests.kit.shapes import table as plain_table

@@ -11,7 +11,7 @@ import shapely
 import trimesh
 
 from schemas.base import Array, frozen_array
-from schemas.scene.plan import ObjectStart, Table
+from schemas.scene.scene import ObjectStart, Table
 from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import ball, built_in, cube
 from tests.hard_cases.drops import Y, level, table_of, turn

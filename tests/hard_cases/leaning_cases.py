@@ -12,7 +12,7 @@ import math
 import shapely
 
 from schemas.job.job import Job
-from schemas.scene.plan import ObjectStart, Table
+from schemas.scene.scene import ObjectStart, Table
 from tests.hard_cases.case import SETTLE, Case
 from tests.hard_cases.drops import Drop, Y, level, turn
 from tests.hard_cases.groups import FREE_M, LEAN_DEG, SMALL_M, Group, leaning, place, prism, put, together, tray

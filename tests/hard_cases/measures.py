@@ -9,8 +9,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from schemas.base import Array
-from schemas.scene.plan import ObjectStart, Table
-from schemas.scene.scene import Settled
+from schemas.scene.scene import ObjectStart, Settled, Table
 from workers.geometry.frames import transform
 
 Z = np.array([0.0, 0.0, 1.0])

@@ -27,8 +27,8 @@ from tests.workers.capture.recording.made_up_recording import (
     without,
 )
 from tests.workers.capture.recording.matroska import Track, write_recording
-from workers.pipeline.captures.import_recording import Imported, import_recording
-from workers.store.capture_folder import CaptureFile, open_folder, read_view
+from workers.capture.folder import CaptureFile, open_folder, read_view
+from workers.capture.recording.import_recording import Imported, import_recording
 
 COUNT = 6
 DEPTH_MM = 1.3

@@ -6,7 +6,7 @@ from functools import partial
 import trimesh
 
 from schemas.base import Array
-from schemas.scene.plan import Table
+from schemas.scene.scene import Table
 from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import ball, cube, rod
 from tests.hard_cases.case import SETTLE, Case

@@ -12,9 +12,9 @@ from schemas.job.captures import Fusion
 from tests.hard_cases.camera_cases import HOLD
 from tests.hard_cases.case import refuse
 from tests.workers.capture.analytic_capture import BOARD, Thing, capture, cast
-from workers.capture.fuse import fuse_views
-from workers.capture.object_region import find_object
-from workers.capture.posed_view import PosedView
+from workers.capture.surface.fusion import fuse_views
+from workers.capture.surface.object_mask import find_object
+from workers.capture.surface.posed_view import PosedView
 from workers.geometry.frames import invert, transform
 
 SIGMA_M = 0.003

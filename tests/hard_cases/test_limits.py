@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from schemas.scene.plan import ObjectStart
+from schemas.scene.scene import ObjectStart
 from tests.hard_cases.arch_cases import THICK_M, THIN_M, thrust_fits
 from tests.hard_cases.balance_cases import BALANCE, hook_demand
 from tests.hard_cases.case import SETTLE, Case

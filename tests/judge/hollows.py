@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 
 from schemas.job.job import Job
-from schemas.scene.plan import ScenePlan
+from schemas.scene.scene import ScenePlan
 from schemas.scene.shape import Asset
 from tests.hard_cases.drops import level
 from tests.hard_cases.groups import put, together

@@ -21,8 +21,7 @@ from services.read.referee import is_installed
 from tests.judge.scenes import CRASHED, Asked, Outcome, try_scene
 from tests.judge.table import describe, is_within, summary, tabulate
 from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.plan.randomness import SceneChance
-from workers.plan.step import plan_scene
+from workers.scene.plan import SceneChance, plan_scene
 
 
 @functools.cache

@@ -19,16 +19,15 @@ import numpy as np
 from schemas.base import Pose
 from schemas.errors import SceneError
 from schemas.job.job import Job
-from schemas.scene.plan import ScenePlan
+from schemas.scene.scene import ScenePlan
 from services.job.job_file import validate_job
 from tests.judge.table import STILL_DEG, STILL_MM
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.geometry.frames import pose, rotation_about, transform, translation
 from workers.physics.fall import FINEST
 from workers.physics.settle import RECHECK_RATE, RECHECK_S, moved_by, release_again, settle_scene
-from workers.plan.effects import Facts, plan_effects
-from workers.plan.randomness import SceneChance
-from workers.plan.step import plan_scene
+from workers.scene.effects import Facts, plan_effects
+from workers.scene.plan import SceneChance, plan_scene
 
 TILTS_DEG = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 0.005, 0.02)
 LIFTS_MM = (0.005, 0.05, 0.09, 0.15)

@@ -9,9 +9,7 @@ from unittest import mock
 
 from schemas.errors import SceneError
 from schemas.job.physics import Physics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart, ScenePlan
-from schemas.scene.scene import Settled
+from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled
 from schemas.scene.shape import Mesh
 from services.read.referee import hold_scene
 from tests.judge.judge import Thing, Verdict, judge

@@ -18,7 +18,7 @@ import numpy as np
 from schemas.base import Array
 from schemas.errors import SceneError
 from schemas.job.job import Job
-from schemas.scene.plan import ScenePlan, Table
+from schemas.scene.scene import ScenePlan, Table
 from schemas.scene.shape import Mesh
 from tests.physics.energy import watched, worst_of
 from tests.physics.room import G
@@ -26,8 +26,7 @@ from tests.physics.settling import recheck, settle_single
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.geometry.frames import transform
 from workers.physics.support import sample_elevation
-from workers.plan.randomness import SceneChance
-from workers.plan.step import choose_category, plan_scene
+from workers.scene.plan import SceneChance, choose_category, plan_scene
 
 GAP_MM, MOVE_MM, TURN_DEG = 0.1, 0.1, 0.1
 

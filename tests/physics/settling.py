@@ -6,15 +6,12 @@ from functools import cache
 
 from schemas.job.job import Job
 from schemas.job.physics import Physics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart, ScenePlan, Table
-from schemas.scene.scene import Settled
+from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled, Table
 from tests.kit.shapes import asset_of, box, table
 from workers.physics.effects import called_for, called_for_with
 from workers.physics.fall import FINEST
 from workers.physics.settle import RECHECK_S, moved_by, release_again, settle_scene
-from workers.plan.randomness import SceneChance
-from workers.plan.step import draw_scene
+from workers.scene.plan import SceneChance, draw_scene
 
 PHYSICS = Job(name="t").physics
 

@@ -22,8 +22,7 @@ from tests.physics.settling import settle_group, settle_single
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
 from workers.physics.support import place_table
-from workers.plan.randomness import SceneChance
-from workers.plan.step import draw_start
+from workers.scene.plan import SceneChance, draw_start
 
 TABLE = place_table(table())
 SEEDS = 20

@@ -22,8 +22,7 @@ from tests.physics.settling import settle_single
 from workers.geometry.frames import pose, rotation_between, transform
 from workers.geometry.hull import convex_hull
 from workers.physics.support import DOWN, SAME_PLANE_M, place_table, support_margin
-from workers.plan.randomness import SceneChance
-from workers.plan.step import draw_start
+from workers.scene.plan import SceneChance, draw_start
 
 TABLE = place_table(table())
 SIGNIFICANCE = 0.001

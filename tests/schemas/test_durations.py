@@ -2,7 +2,7 @@
 
 import pytest
 
-from schemas.durations import describe_seconds
+from schemas.errors import describe_seconds
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.plain_line import plain_line
+from schemas.errors import plain_line
 
 
 def test_what_can_be_printed_stays_as_it_is():

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, frozen_array
-from schemas.job.render import Tier
-from schemas.scene.appearance import Appearance, Light
-from schemas.scene.shape import Material, Part, Shape
+from schemas.job.views import Tier
+from schemas.scene.shape import Appearance, Light, Material, Part, Shape
 from workers.assets.builtin.materials import Plane, Texture, stretched
 
 FLOOR_HALF_M = 30.0

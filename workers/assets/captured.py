@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.base import Pose, frozen_array
-from schemas.capture.estimate import Reconstruction
+from schemas.capture import Reconstruction
 from schemas.job.assets import Assets
 from schemas.job.captures import Board
 from schemas.scene.shape import Asset, Material, Part, Shape

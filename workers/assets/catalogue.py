@@ -16,9 +16,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from cachetools import LRUCache
 
-from schemas.capture.listing import CaptureListing
+from schemas.capture import CaptureListing
 from schemas.errors import AssetSourceError
 from schemas.job.assets import (
+    CATEGORIES,
+    TABLE,
     Assets,
     FolderSource,
     MeshLimits,
@@ -27,7 +29,6 @@ from schemas.job.assets import (
     SplitShares,
     deciding_limits,
 )
-from schemas.job.category import CATEGORIES, TABLE
 from schemas.scene.shape import Asset
 from workers.assets.builtin.identity import VERSION, instance_id
 from workers.assets.watch import Watch, ignore

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.frames import UP, cross, invert, pose, transform
 
 MARGIN_PX = 2.0

@@ -3,8 +3,8 @@
 import numpy as np
 
 from schemas.base import Array
-from schemas.job.sensor import Distortion
-from schemas.scene.camera import Intrinsics
+from schemas.job.views import Distortion
+from schemas.scene.view import Intrinsics
 
 STEPS = 20
 """Steps of Newton's method; a lens that can be inverted needs fewer than ten."""

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.job.images import Images
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.job.views import Images
+from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.jit import compiled, compiled_for
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.frames import invert
 from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.pixels import Depth, facing_at, is_smooth

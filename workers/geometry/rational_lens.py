@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from schemas.base import Array
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from workers.geometry.jit import compiled
 
 WIDEST = 5.0

@@ -17,9 +17,9 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.scene.camera import Camera
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera
 from workers.geometry.camera import project
 from workers.geometry.frames import dot, invert, transform
 from workers.geometry.jit import compiled_for

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
-from schemas.capture.depth_camera import DepthCamera
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.capture import DepthCamera
 from schemas.scene.shape import Mesh, Shape
+from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled, compiled_for
 from workers.geometry.rational_lens import pixel_rays, project_points

@@ -8,7 +8,7 @@ import numpy as np
 
 from schemas.base import Array
 from schemas.job.physics import Physics
-from schemas.scene.plan import ObjectStart, Table
+from schemas.scene.scene import ObjectStart, Table
 from schemas.scene.shape import Hull
 from workers.geometry.frames import transform
 from workers.geometry.jit import compiled, compiled_for

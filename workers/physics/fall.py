@@ -12,8 +12,7 @@ import numpy as np
 
 from schemas.base import Array, Pose
 from schemas.job.physics import Physics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart, Table
+from schemas.scene.scene import EffectPlan, ObjectStart, Table
 from schemas.scene.shape import Mesh
 from workers.geometry.frames import invert, translation
 from workers.geometry.hull import least_width_m

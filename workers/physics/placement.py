@@ -9,10 +9,8 @@ import manifold3d
 import numpy as np
 
 from schemas.base import Pose, frozen_array
-from schemas.scene.plan import ObjectStart, Table
-from schemas.scene.region import REGION_TABLE
-from schemas.scene.scene import ContactForce
-from schemas.scene.shape import Mesh
+from schemas.scene.scene import ContactForce, ObjectStart, Table
+from schemas.scene.shape import REGION_TABLE, Mesh
 from workers.geometry.frames import DOWN, motion_between, transform
 from workers.geometry.hull import convex_hull, least_width_m
 from workers.geometry.mesh import bounds_of, hold_to_one_thread, mesh_of, solid_of, weld

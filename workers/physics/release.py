@@ -16,8 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from schemas.base import Array, Pose
 from schemas.job.physics import Physics, Rest
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart, Table
+from schemas.scene.scene import EffectPlan, ObjectStart, Table
 from workers.geometry.frames import transform
 from workers.physics.bullet import SLOP_SHARE, GroundShape
 from workers.physics.contact_surface import faces_within, skin_of

@@ -8,8 +8,7 @@ import numpy as np
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.job.physics import Physics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart
+from schemas.scene.scene import EffectPlan, ObjectStart
 from schemas.scene.shape import MassProperties
 from workers.geometry.frames import invert, pose, rotation_from_quaternion, transform
 from workers.geometry.hull import convex_hull, depth_m

@@ -14,9 +14,7 @@ import numpy as np
 from schemas.base import Pose, frozen_array
 from schemas.errors import SettleError
 from schemas.job.physics import Physics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart, ScenePlan
-from schemas.scene.scene import Settled, SupportedBy
+from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled, SupportedBy
 from workers.geometry.frames import motion_between, transform, translation
 from workers.physics.effects import called_for_with, rooms_m
 from workers.physics.exact_rest import rest

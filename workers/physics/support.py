@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import StartError
-from schemas.scene.plan import Table, TableTop
+from schemas.scene.scene import Table, TableTop
 from schemas.scene.shape import Asset, Hull, Mesh, Shape
 from workers.geometry.frames import DOWN, pose, rotation_between, transform, translation
 from workers.geometry.jit import compiled_for

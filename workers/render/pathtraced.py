@@ -37,12 +37,10 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.errors import InputError
-from schemas.job.render import Render
-from schemas.scene.appearance import Appearance, Light
-from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import Placed
-from schemas.scene.shape import Material, Part
+from schemas.job.views import Render
+from schemas.scene.scene import EffectPlan, Placed
+from schemas.scene.shape import Appearance, Light, Material, Part
+from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.colour import HOLE_ALPHA, SRGB_STEPS, decode_srgb, encode_codes, has_holes
 from workers.geometry.frames import transform
 from workers.render.raster.baking import LAMP_RAD

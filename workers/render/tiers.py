@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from schemas.errors import InputError
-from schemas.job.render import Render
-from schemas.scene.appearance import Appearance
-from schemas.scene.camera import Camera
-from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import Placed
-from schemas.scene.view import GBuffer
+from schemas.job.views import Render
+from schemas.scene.scene import EffectPlan, Placed
+from schemas.scene.shape import Appearance
+from schemas.scene.view import Camera, GBuffer
 
 if TYPE_CHECKING:
     from workers.render.raster.gbuffer import Renderer

@@ -28,8 +28,7 @@ from schemas.dataset.layout import (
     range_table_path,
     staging_path,
 )
-from schemas.errors import CommitConflict, CorruptError, OutputError
-from schemas.plain_line import plain_line
+from schemas.errors import CommitConflict, CorruptError, OutputError, plain_line
 from workers.store.manifest import listed_files
 from workers.store.store import Store
 

@@ -17,10 +17,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from schemas.dataset.commit import CommitRecord, CommitSummary, summarize
+from schemas.dataset.commit import LEDGER_SCHEMA, CommitRecord, CommitSummary, Ledger, rows_of, summarize
+from schemas.dataset.commit import join_rows as join_summaries
 from schemas.dataset.layout import LEDGER_FILE, MAX_RETRIES, range_table_path
-from schemas.dataset.ledger import LEDGER_SCHEMA, Ledger, rows_of
-from schemas.dataset.ledger import join_rows as join_summaries
 from schemas.dataset.tables import SORT_KEYS
 from schemas.errors import CorruptError, MachineError, RunError
 from workers.store.commit import check_retries, list_codes, read_range_file, require_record, split_code

@@ -23,8 +23,7 @@ import pyarrow as pa
 
 from schemas.dataset.commit import FileEntry, Span
 from schemas.dataset.layout import IMAGES, Content, file_pose_id, image_path, is_shape, patch_path, tar_path
-from schemas.errors import CorruptError
-from schemas.plain_line import plain_line
+from schemas.errors import CorruptError, plain_line
 from workers.store.store import Stage
 
 Rows = Mapping[str, Sequence[Mapping[str, Any]]]

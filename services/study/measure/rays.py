@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.scene.camera import Camera
-from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.scene import Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.view import Camera
 from workers.geometry.camera import project, project_bounds, unproject
 from workers.geometry.frames import invert, transform
 from workers.geometry.raycast import NEAR_M, first_hit

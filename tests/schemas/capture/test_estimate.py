@@ -1,4 +1,4 @@
-from schemas.capture.estimate import CaptureEstimate, Estimates, ViewEstimate
+from schemas.capture import CaptureEstimate, Estimates, ViewEstimate
 
 
 def view(number: int, px: float) -> ViewEstimate:

@@ -15,9 +15,8 @@ from schemas.dataset.codec import (
     read_world_poses,
 )
 from schemas.dataset.tables import SCHEMAS
-from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import ContactForce
-from schemas.scene.view import ObjectLabel
+from schemas.scene.view import Camera, Intrinsics, ObjectLabel
 
 T = np.arange(16.0).reshape(4, 4) / 7.0
 BODY = {

@@ -2,7 +2,7 @@
 
 import pytest
 
-from schemas.dataset.fingerprint import Fingerprint
+from schemas.dataset.shard import Fingerprint
 
 MINE = Fingerprint(
     canary="c", code="d", libraries={"numpy": "2.4.6"}, simd="X86_V2 X86_V3", renderer="llvmpipe, 256 bits"

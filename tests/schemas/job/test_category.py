@@ -3,7 +3,7 @@
 import pytest
 from pydantic import ValidationError
 
-from schemas.job.category import CATEGORIES, offered_by
+from schemas.job.assets import CATEGORIES, offered_by
 from schemas.job.job import Job
 
 FRUIT = {"source": "urdf", "folder": "fruit", "category_map": {"*.obj": "banana", "*.glb": "Pear-2", "t.obj": "table"}}

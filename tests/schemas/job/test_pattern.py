@@ -2,7 +2,7 @@
 
 import pytest
 
-from schemas.job.pattern import matches
+from schemas.job.assets import matches
 
 FILES = ("a.obj", "b.OBJ", "x/a.obj", "x/y/a.obj", "x/y/z/b.obj", "x[1]/a b.obj", ".h/a.obj", "x/ü.glb", "xy/a.obj")
 PATTERNS = (

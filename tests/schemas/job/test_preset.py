@@ -1,6 +1,6 @@
 import pytest
 
-from schemas.job.preset import PRESETS, with_preset
+from schemas.job.job import PRESETS, with_preset
 
 
 def test_a_preset_fills_the_keys_that_the_job_does_not_give():

@@ -2,8 +2,8 @@
 
 import pytest
 
-from services.bench.handover import hand_over
-from services.bench.stages import make_in_memory, open_workbench
+from services.bench.measure import make_in_memory, open_workbench
+from services.bench.script import hand_over
 from services.job.job_file import validate_job
 from tests.services.bench.small_job import SMALL
 

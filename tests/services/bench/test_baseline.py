@@ -6,7 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from services.bench.others import start_side
+from schemas.environment import FOR_SPEED
+from schemas.errors import MachineError
+from services.bench import script as bench_script
+from services.bench.script import looks_of, start_script
 
 
 def pictures(folder) -> dict[str, tuple[tuple[int, ...], str]]:
@@ -19,16 +22,13 @@ def pictures(folder) -> dict[str, tuple[tuple[int, ...], str]]:
     return found
 
 
-SCRIPT = "services.bench.baseline"
-
-
 @pytest.fixture(scope="module")
 def looks(given, tmp_path_factory):
     """Folders with what the script makes of them, by look."""
     folder = tmp_path_factory.mktemp("looks")
-    with start_side(SCRIPT) as script:
+    with start_script() as script:
         for look in ("plain", "same"):
-            assert script.run(given, folder / look, {"look": look}).scenes == len(given) == 4
+            assert script.run(given, folder / look, look).scenes == len(given) == 4
     return {look: folder / look for look in ("plain", "same")}
 
 
@@ -69,10 +69,30 @@ def test_the_same_look_throws_shadows(bench, given, tmp_path):
         picture = tmp_path / path.parent.name / "floor.png"
         cv2.imwrite(str(picture), np.full((8, 8, 3), 128, np.uint8))
     plain_floors = [tmp_path / path.parent.name / path.name for path in given]
-    with start_side(SCRIPT) as script:
-        script.run(plain_floors, tmp_path / "out", {"look": "same"})
+    with start_script() as script:
+        script.run(plain_floors, tmp_path / "out", "same")
     dark = []
     for region, image in zip(regions, inputs(tmp_path / "out", "RGB"), strict=True):
         shade = image.mean(axis=2)[region == 1]
         dark.append(float((shade < 0.8 * np.median(shade)).mean()))
     assert sum(0.005 < share < 0.5 for share in dark) >= 2, dark
+
+
+def test_only_the_raster_tier_has_a_same_look_to_be_compared_with(bench):
+    job = bench[0].context.job
+    flat = job.model_copy(update={"render": job.render.model_copy(update={"tier": "flat"})})
+    assert list(looks_of(job)) == ["plain", "same"] and list(looks_of(flat)) == ["plain"]
+
+
+def test_a_script_that_dies_says_why(tmp_path):
+    with start_script() as script, pytest.raises(MachineError, match=r"the script ended.*No such file"):
+        script.ask({"scene": str(tmp_path / "nothing.json"), "out": str(tmp_path), "look": "plain"})
+
+
+def test_a_script_does_not_inherit_what_is_set_for_our_speed(monkeypatch):
+    [(name, value)] = FOR_SPEED.items()
+    monkeypatch.setenv("OTHER", "kept")
+    for given, seen in ((value, None), ("glibc.cpu.hwcaps=-AVX2", "glibc.cpu.hwcaps=-AVX2")):
+        monkeypatch.setenv(name, given)
+        inherited = bench_script._plain_environment()
+        assert (inherited.get(name), inherited["OTHER"]) == (seen, "kept")

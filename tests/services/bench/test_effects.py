@@ -21,7 +21,7 @@ from tests.effects.physics_scenes import facts_with
 from tests.hard_cases.bodies import built_in, cube
 from tests.hard_cases.drops import drop, level
 from workers.physics.effects import PREDICATES
-from workers.plan.effects import names_of_kind
+from workers.scene.effects import names_of_kind
 
 NEVER = np.full((2, 3), np.nan)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from schemas.errors import MachineError
-from services.bench.extra import PACKAGES, require_extra
+from services.bench.command import PACKAGES, require_extra
 from services.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -21,14 +21,14 @@ def test_where_all_is_installed_nothing_is_said():
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_a_missing_package_is_named_with_both_remedies(monkeypatch, package):
-    monkeypatch.setattr("services.bench.extra.find_spec", lambda name: None if name == package else object())
+    monkeypatch.setattr("services.bench.command.find_spec", lambda name: None if name == package else object())
     with pytest.raises(MachineError, match=rf"needs {PACKAGES[package]}: .*extra study.*requirements-study\.lock"):
         require_extra("tradeoff")
 
 
 @pytest.mark.parametrize("words", [["bench"], ["tradeoff", JOB, "--out", "OUT"]])
 def test_the_command_ends_with_the_one_message_before_anything_is_made(monkeypatch, tmp_path, capsys, words):
-    monkeypatch.setattr("services.bench.extra.find_spec", lambda name: None)
+    monkeypatch.setattr("services.bench.command.find_spec", lambda name: None)
     monkeypatch.chdir(tmp_path)
     assert main([*words, "--json"]) == 1
     told = capsys.readouterr()

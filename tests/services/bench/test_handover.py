@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from services.bench.stages import make_in_memory
+from services.bench.measure import make_in_memory
 
 
 def test_the_files_have_our_poses_shapes_and_images(bench, given):

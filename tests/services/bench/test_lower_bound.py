@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from services.bench.lower_bound import choose_encoders, encoders, images_of, kind_of, run_lower_bound, write_durably
-from services.bench.stages import make_in_memory
+from services.bench.measure import make_in_memory
 from workers.store.commit import committed_files, read_record
 
 

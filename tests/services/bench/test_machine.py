@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from services.bench.machine import pinned, process_age_s, threads_per_core
+from services.bench.figures import pinned, process_age_s, threads_per_core
 
 
 def test_cores_are_given_back_also_after_an_error():

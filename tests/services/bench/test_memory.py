@@ -2,7 +2,7 @@
 
 import pytest
 
-from services.bench.memory import Sample, summarise
+from services.bench.scaling import Sample, summarise
 
 
 def test_memory_is_compared_after_it_settled():

@@ -4,16 +4,7 @@ from statistics import fmean
 
 import pytest
 
-from services.bench.ratios import (
-    Lap,
-    Spread,
-    by_processor,
-    growth,
-    idle_share,
-    slope_ratio,
-    stage_table,
-    with_loading,
-)
+from services.bench.figures import Lap, Spread, by_processor, growth, idle_share, slope_ratio, stage_table, with_loading
 
 
 def test_the_ratio_is_of_slopes_and_by_pairs():

@@ -3,7 +3,7 @@
 import pytest
 
 from schemas.dataset.commit import Span
-from services.bench.ratios import Lap
+from services.bench.figures import Lap
 from services.bench.scaling import gain_of, measure_scaling, plain_processes
 from services.job.job_file import validate_job
 from tests.services.bench.small_job import SMALL

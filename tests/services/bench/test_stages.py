@@ -4,7 +4,7 @@ import pytest
 
 from schemas.dataset.commit import Span
 from schemas.errors import RunError, SceneError
-from services.bench.stages import make_in_memory, run_process
+from services.bench.measure import make_in_memory, run_process
 from services.job.job_file import validate_job
 from tests.services.bench.small_job import SMALL
 
@@ -19,7 +19,7 @@ def test_the_scenes_in_memory_are_those_of_the_committed_files(bench):
 
 
 def test_where_no_scene_can_be_made_the_reason_is_given(bench, monkeypatch):
-    monkeypatch.setattr("services.bench.stages.make_scene", _fail)
+    monkeypatch.setattr("services.bench.measure.make_scene", _fail)
     with pytest.raises(RunError, match=r"none of the scenes 0 to 3 could be made: .*fell off"):
         make_in_memory(bench[0].context, bench[1])
 

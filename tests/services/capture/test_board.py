@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from schemas.errors import CaptureError, InputError, OutputError
-from services.capture.board import board
+from services import capture as board
 
 
 def options(path: Path, **changes: Any) -> argparse.Namespace:

@@ -7,7 +7,7 @@ import pytest
 from schemas.errors import CaptureError, InputError, OutputError
 from services.cli.main import main
 from tests.workers.capture.recording.made_up_recording import recording
-from workers.store.capture_folder import open_folder
+from workers.capture.folder import open_folder
 
 
 def run(*words: object) -> int:

@@ -1,7 +1,7 @@
 import pytest
 
 from schemas.errors import JobError
-from services.capture.settings import capture_job, capture_settings
+from services.capture import capture_job, capture_settings
 
 
 def test_options_come_first_and_set_has_the_last_word():

@@ -6,8 +6,7 @@ import pytest
 
 from schemas.errors import InputError, OutputError
 from services.cli.main import main
-from workers.store.capture_folder import open_folder
-from workers.store.capture_truth import read_truth
+from workers.capture.folder import open_folder, read_truth
 
 SMALL = ["--set", "captures.simulate.image_scale=0.1"]
 

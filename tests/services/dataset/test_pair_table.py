@@ -6,7 +6,7 @@ import pytest
 
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import InputError
-from services.dataset.pair_table import PAIR_TABLES, choose_pairs, pair_table
+from services.dataset.dataset import PAIR_TABLES, choose_pairs, pair_table
 from tests.made_up_scenes import made_scene
 from workers.store.manifest import table_of_rows
 

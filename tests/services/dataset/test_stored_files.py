@@ -5,7 +5,7 @@ from collections import Counter
 import pytest
 
 from schemas.errors import CorruptError
-from services.dataset import stored_files
+from services.dataset import shapes as stored_files
 from services.dataset.dataset import Dataset
 from workers.store.local import LocalStore
 

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Part, Shape
-from services.export.bop_models import BopModels, model_info, ply_lines
+from services.export.bop import BopModels, model_info, ply_lines
 from services.export.folder import ExportFolder
 from services.export.shapes import color_vertices
 from tests.bop_reader import load_model

@@ -1,6 +1,6 @@
 import shutil
 
-from services.export.bop_scene import NO_SHAPE
+from services.export.bop import NO_SHAPE
 from services.job.record import require_job
 from tests.exported import export_to
 from workers.store.local import LocalStore

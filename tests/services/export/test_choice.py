@@ -1,7 +1,7 @@
 import pytest
 
 from schemas.errors import InputError
-from services.export.choice import Choice, Chooser
+from services.export.formats import Choice, Chooser
 from services.export.source import iter_ranges
 from workers.store.commit import list_codes
 

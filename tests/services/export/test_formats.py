@@ -1,8 +1,7 @@
 """Every format has a writer, and each writer a part of its own."""
 
 from services.export.folder import ExportFolder
-from services.export.formats import open_writer
-from services.export.request import FORMATS, ExportRequest
+from services.export.formats import FORMATS, ExportRequest, open_writer
 from services.job.record import require_job
 
 

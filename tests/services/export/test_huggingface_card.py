@@ -4,7 +4,7 @@ import pyarrow as pa
 import pytest
 import yaml
 
-from services.export.huggingface_card import card_text, features_metadata
+from services.export.huggingface import card_text, features_metadata
 
 IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 SCHEMA = pa.schema(

@@ -1,5 +1,5 @@
 from services.cli.rows import EXPORT_FORMATS
-from services.export.request import FORMATS, SHARDED
+from services.export.formats import FORMATS, SHARDED
 
 
 def test_the_command_line_names_every_format():

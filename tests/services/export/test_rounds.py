@@ -1,7 +1,6 @@
 from pathlib import Path
 
-from services.export.folder import ExportFolder
-from services.export.rounds import Rounds
+from services.export.folder import ExportFolder, Rounds
 
 
 class Lines:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from schemas.scene.shape import Part, Shape
-from services.export.silhouette import box_of, whole_silhouette
+from services.export.shapes import box_of, whole_silhouette
 
 K = {"width": 160, "height": 120, "fx": 100.0, "fy": 100.0, "cx": 80.0, "cy": 60.0}
 PLATE = np.array([[-0.4, -0.4, 0.0], [0.4, -0.4, 0.0], [0.4, 0.4, 0.0], [-0.4, 0.4, 0.0]])

@@ -3,7 +3,7 @@
 import dataclasses
 
 from schemas.job.job import Job
-from services.export.sources import unchanged_sources
+from services.export.source import unchanged_sources
 from services.job.record import require_job
 
 

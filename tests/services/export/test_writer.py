@@ -3,10 +3,8 @@ import json
 import pytest
 
 from services.export.folder import ExportFolder
-from services.export.formats import open_writer
-from services.export.request import FORMATS, ExportRequest
+from services.export.formats import FORMATS, Added, ExportRequest, open_writer
 from services.export.source import iter_ranges, scenes_of
-from services.export.writer import Added
 from services.job.record import require_job
 from workers.store.commit import list_codes
 

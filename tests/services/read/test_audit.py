@@ -10,21 +10,20 @@ import numpy as np
 import pytest
 
 import services.read.audit
-import workers.pipeline.make_pair
-import workers.plan.effects
+import workers.scene.effects
+import workers.scene.pairs
 from schemas.dataset.layout import FINGERPRINT_FILE
 from services.cli.main import main
 from services.job.job_file import validate_job
-from services.read import audit_motion
-from services.read.audit import Audit, audit, describe_audit
-from services.read.audit_motion import Motion
+from services.read import audit as audit_motion
+from services.read.audit import Audit, Motion, audit, describe_audit
 from services.read.referee import Held
 from tests.datasets import run_here
 from tests.effects.scenes import SMALL, merged
 from workers.geometry.frames import translation
-from workers.pipeline.fingerprint import take_fingerprint
-from workers.plan.effects import EFFECTS, Effect
 from workers.render.raster.gbuffer import shared_renderer
+from workers.scene.effects import EFFECTS, Effect
+from workers.shard.fingerprint import take_fingerprint
 from workers.store.local import LocalStore
 
 JOB = validate_job(merged(SMALL, {"scenes": 4, "categories": ["can", "box"]}), "a test")
@@ -109,7 +108,7 @@ def test_an_effect_that_was_left_out_wrongly_is_found_and_named(tmp_path):
         blinded = dataclasses.replace(effect, skipped_because=lambda _: "nobody looks")
         return blinded if effect.name == "floor" else effect
 
-    with mock.patch.object(workers.plan.effects, "EFFECTS", tuple(map(blind, EFFECTS))):
+    with mock.patch.object(workers.scene.effects, "EFFECTS", tuple(map(blind, EFFECTS))):
         store = dataset(tmp_path / "blind")
         found = run_audit(store, 2)
     assert len(found.faults) == 2
@@ -122,7 +121,7 @@ def test_an_effect_that_was_left_out_wrongly_is_found_and_named(tmp_path):
 def test_a_scene_that_is_not_made_the_same_again_blames_no_effect(tmp_path):
     store = dataset(tmp_path / "other")
     with mock.patch.object(
-        workers.pipeline.make_pair, "quantise_depth", lambda depth, images: (depth * 4999).astype(np.uint16)
+        workers.scene.pairs, "quantise_depth", lambda depth, images: (depth * 4999).astype(np.uint16)
     ):
         write_fingerprint(store, {})
         found = run_audit(store, 1)

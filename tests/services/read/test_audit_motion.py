@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed, PosedScene
-from schemas.scene.view import View
-from services.read.audit_motion import compare_masks, move_between, shift_px
+from schemas.scene.view import Camera, Intrinsics, View
+from services.read.audit import compare_masks, move_between, shift_px
 from tests.kit.shapes import box, shape_of
 from tests.workers.render.random_scenes import APPEARANCE, floor
 from workers.geometry.frames import UP, pose, rotation_about, translation

@@ -3,8 +3,8 @@ from pathlib import Path
 import pytest
 
 from schemas.errors import CorruptError
-from services.read.capture_export import captured_geometry
 from services.read.dataset_reader import find_scene
+from services.read.scene_geometry import captured_geometry
 from tests.captures import captures_job, use_exact_captures
 from tests.datasets import run_here
 

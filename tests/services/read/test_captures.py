@@ -11,19 +11,18 @@ import trimesh
 
 from schemas.errors import CaptureError, InputError, MachineError
 from schemas.job.job import Job
-from services.read.audit import audit
-from services.read.capture_export import captured_geometry
+from services.read.audit import audit, verify_independently
 from services.read.contact_sheet import draw_sheet
 from services.read.dataset_reader import find_scene
 from services.read.query import query
 from services.read.repair import repair
 from services.read.replay import replay_scene
-from services.read.scene_export import export_scene
+from services.read.scene_geometry import captured_geometry, export_scene
 from services.read.status import read_status
-from services.read.verify_independent import verify_independently
 from tests.captures import captures_job, use_exact_captures, write_folder
 from tests.datasets import faults_of, run_here
-from workers.pipeline.captures import capture_pair, make_capture
+from workers.capture import make_capture
+from workers.capture import rows as capture_pair
 from workers.store.local import LocalStore
 
 

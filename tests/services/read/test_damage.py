@@ -3,7 +3,7 @@
 import pytest
 
 from services.cli.main import main
-from services.read.damage import explain_damage
+from services.read.verdict import explain_damage
 from tests.damage import choose_places, damaged
 from workers.store.local import LocalStore
 

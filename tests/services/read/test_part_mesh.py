@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from schemas.job.assets import ProceduralSource
-from services.read.part_mesh import mesh_of_part
+from services.read.scene_geometry import mesh_of_part
 from workers.assets.builtin.make import make_asset
 
 

@@ -1,4 +1,4 @@
-from services.read.path_index import PathIndex
+from services.read.verdict import PathIndex
 
 
 def test_paths_and_their_folders_are_known_and_nothing_else(tmp_path):

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from services.read.query_formats import format_rows, write_rows
+from services.read.query import format_rows, write_rows
 
 ROWS = pa.table({"n": [1, 2], "name": ["a,b", None], "list": [[1.5, -0.0], []], "flag": [True, False]})
 
@@ -74,7 +74,7 @@ def batches(count: int, size: int = 1000):
 
 @pytest.mark.parametrize("style", ["table", "csv", "json", "parquet"])
 def test_a_long_answer_leaves_in_pieces_and_is_whole(style, monkeypatch):
-    monkeypatch.setattr("services.read.query_formats._ROW_GROUP_BYTES", 30_000)
+    monkeypatch.setattr("services.read.query._ROW_GROUP_BYTES", 30_000)
     pipe = Pipe()
     write_rows(batches(20_000), style, pipe)
     assert pipe.largest < len(pipe.data) / 4

@@ -10,7 +10,7 @@ ASK = """
 import json, os, sys
 from tests.kit.memory import peak_mib
 from services.read.query import ask
-from services.read.query_formats import write_rows
+from services.read.query import write_rows
 from workers.store.local import LocalStore
 peaks = []
 for times in map(int, sys.argv[4:]):

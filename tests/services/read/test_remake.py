@@ -3,8 +3,8 @@
 import pytest
 
 from services.job.record import require_job
-from services.read import remake
-from services.read.remake import Maker
+from services.read import replay as remake
+from services.read.replay import Maker
 from workers.store.commit import committed_files, read_record
 
 

@@ -6,10 +6,9 @@ import hashlib
 import pytest
 
 from services.merge.merge import read_success
-from services.read import remerge
-from services.read.path_index import PathIndex
-from services.read.remerge import Remerge
-from services.read.verdict import Verdict
+from services.read import verify as remerge
+from services.read.verdict import PathIndex, Verdict
+from services.read.verify import Remerge
 from services.read.verify_range import RangeCheck, read_records
 
 

@@ -10,7 +10,7 @@ from schemas.scene.scene import encoded_file
 from services.cli.main import main
 from services.job.record import require_job
 from services.merge.merge import read_success
-from services.read import remake
+from services.read import replay as remake
 from services.read.repair import Repair, repair
 from tests.damage import files_by_kind, kind_of
 from tests.datasets import faults_of, run_here

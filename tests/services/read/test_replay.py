@@ -9,8 +9,8 @@ from schemas.errors import CorruptError
 from services.job.record import require_job
 from services.read.dataset_reader import find_scene
 from services.read.replay import compare_files, compare_rows, open_context, replay_scene
-from workers.pipeline.run_shard import run_scene
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch
+from workers.shard.run_shard import run_scene
 from workers.store.images import decode_png, encode_png
 from workers.store.local import LocalStore
 

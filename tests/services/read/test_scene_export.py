@@ -6,7 +6,7 @@ import trimesh
 
 from schemas.errors import InputError
 from services.read.query import query
-from services.read.scene_export import export_scene
+from services.read.scene_geometry import export_scene
 
 
 def test_the_exported_scene_has_every_object_where_its_row_puts_it(three_objects, tmp_path):

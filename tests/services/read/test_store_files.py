@@ -8,7 +8,7 @@ import pytest
 from obstore.store import MemoryStore
 
 from schemas.errors import CorruptError
-from services.read.store_files import file_system_of
+from services.read.stored_tables import file_system_of
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 

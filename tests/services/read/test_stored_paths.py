@@ -1,6 +1,6 @@
 """Paths of a view's images, by its row."""
 
-from services.read.stored_paths import patch_paths, view_paths
+from services.read.stored_tables import patch_paths, view_paths
 
 ROW = {"category": "mug", "role": "aligned", "pose_id": 12}
 

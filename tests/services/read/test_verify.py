@@ -8,7 +8,7 @@ import pyarrow as pa
 import pytest
 from obstore.store import MemoryStore
 
-from schemas.dataset.ledger import LEDGER_SCHEMA, join_rows
+from schemas.dataset.commit import LEDGER_SCHEMA, join_rows
 from services.read.verify import verify
 from tests.datasets import faults_of, make_dataset
 from workers.store.ledger import list_commits, save_rows

@@ -10,7 +10,7 @@ import pytest
 from schemas.dataset.layout import SUCCESS_FILE
 from services.merge.merge import encode_success, read_success
 from services.read.verdict import Verdict
-from services.read.verify_finished import Success, check_success
+from services.read.verify_files import Success, check_success
 from tests.datasets import faults_of
 from workers.store.local import LocalStore
 

@@ -1,6 +1,6 @@
 """The second derivation, as a command uses it; its formulas are tested in tests/services/read/independent."""
 
-from services.read.verify_independent import describe_independent, verify_independently
+from services.read.audit import describe_independent, verify_independently
 
 
 def test_some_scenes_are_derived_and_counted(tiny):

@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 
-from schemas.dataset.fingerprint import Fingerprint
+from schemas.dataset.shard import Fingerprint
 from services.job.record import encode_job, require_job
-from services.read.verify_job import encode_fingerprint
+from services.read.verify import encode_fingerprint
 from tests.datasets import faults_of
 from workers.store.local import LocalStore
 

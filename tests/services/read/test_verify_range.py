@@ -3,9 +3,8 @@
 from pathlib import Path
 
 from schemas.dataset.layout import commit_path
-from services.read.path_index import PathIndex
-from services.read.verdict import Verdict
-from services.read.verify_job import read_stored_job
+from services.read.verdict import PathIndex, Verdict
+from services.read.verify import read_stored_job
 from services.read.verify_range import RangeCheck, read_records
 from tests.datasets import faults_of, make_dataset
 from workers.store.local import LocalStore

@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 from services.read.verdict import Verdict
-from services.read.verify_span import Spans, commit_groups
+from services.read.verify_range import Spans, commit_groups
 from tests.datasets import faults_of
 from workers.store.attempt import reopen
 from workers.store.local import LocalStore

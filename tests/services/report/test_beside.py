@@ -2,11 +2,11 @@ import re
 
 import pytest
 
-from services.report.beside import beside_html
-from services.report.collect import collect
-from services.report.histogram import Histogram
-from services.report.report import page_of, read_report
-from services.report.sample import Sample
+from services.look.charts import Histogram
+from services.look.collect import collect
+from services.look.pictures import Sample
+from services.look.report import page_of, read_report
+from services.look.sections import beside_html
 from tests.datasets import make_dataset
 from tests.services.report.test_collect import SCENES, TIMINGS, VIEWS, Handmade
 from tests.services.report.test_gallery import address, scene

@@ -3,8 +3,7 @@ import re
 import numpy as np
 import pytest
 
-from services.report.charts import HEIGHT, Chart, amount, chart_html, length_of_decade
-from services.report.histogram import Histogram
+from services.look.charts import HEIGHT, Chart, Histogram, amount, chart_html, length_of_decade
 
 
 def metres(value: float) -> str:

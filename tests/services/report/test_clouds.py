@@ -6,8 +6,8 @@ import pytest
 import trimesh
 
 from schemas.errors import MachineError
-from services.report import clouds as module
-from services.report.clouds import Body, coarsen, pack_space, read_space
+from services.look import clouds as module
+from services.look.clouds import Body, coarsen, pack_space, read_space
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import pyarrow as pa
 import pytest
 
 from schemas.dataset.tables import CAPTURE_SCHEMAS
-from services.report.collect import collect
+from services.look.collect import collect
 
 SCENES = [
     {"scene_id": 0, "category": "mug", "effects": ["drop", "rgb"], "hover_gap_mm": 0.01,

@@ -4,9 +4,9 @@ import time
 import numpy as np
 import pytest
 
-from services.report import follow as module
-from services.report.follow import Follower, PictureShelf
-from services.report.pictures import picture_of_colour
+from services.look import live as module
+from services.look.live import Follower, PictureShelf
+from services.look.pictures import picture_of_colour
 from workers.store.local import LocalStore
 
 

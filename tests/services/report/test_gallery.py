@@ -3,10 +3,9 @@ import re
 import numpy as np
 import pytest
 
-from services.report.clouds import Body, Cloud, Space
-from services.report.gallery import compare_html, sheets_html, space_html
-from services.report.pictures import picture_of_colour
-from services.report.sample import ShownScene
+from services.look.clouds import Body, Cloud, Space
+from services.look.pictures import ShownScene, picture_of_colour
+from services.look.sections import compare_html, sheets_html, space_html
 
 HOSTILE = '"><script>x</script>'
 

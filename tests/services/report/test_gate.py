@@ -1,6 +1,6 @@
 import pytest
 
-from services.report.gate import Gate, is_host_known, is_loopback, is_same, judge, make_token
+from services.look.server import Gate, is_host_known, is_loopback, is_same, judge, make_token
 
 TOKEN = "a-token-of-some-length"
 OPEN = Gate(frozenset({"localhost", "lab7"}), None, "verso_1")

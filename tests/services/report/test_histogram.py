@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from services.report.histogram import FINE, Histogram, Window, window_of
+from services.look.charts import FINE, Histogram, Window, window_of
 
 
 def values_of(seed: int = 3, count: int = 5_000) -> np.ndarray:

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from schemas.errors import CorruptError
+from services.look.pictures import metres_of, read_pair
 from services.read.dataset_reader import file_reader, find_scene
-from services.report.images import metres_of, read_pair
 
 
 def pair_of(store):

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.report.follow import Follower
-from services.report.report import write_report
-from services.report.server import Place, serving
+from services.look.live import Follower
+from services.look.report import write_report
+from services.look.server import Place, serving
 from tests.browser import needs_chromium, open_tab
 from tests.datasets import make_dataset
 

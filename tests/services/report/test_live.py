@@ -1,7 +1,6 @@
 from dataclasses import replace
 
-from services.report.live import live_html, title_of
-from services.report.progress import Progress
+from services.look.live import Progress, live_html, title_of
 from tests.services.report.test_gallery import address, scene
 
 MAKING = Progress("making", "small", 1000, 380, {"intrinsic: left_table": 2}, 3.14159, 197.0, (41, 57))

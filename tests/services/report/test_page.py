@@ -1,4 +1,4 @@
-from services.report.page import SCRIPTS, WEB, Page, Section, read_web, section_html, whole_page
+from services.look.report import SCRIPTS, WEB, Page, Section, read_web, section_html, whole_page
 
 PAGE = Page("a <b>", "c & d", [Section("one", "One", "<p>1</p>"), Section("two", "Two", "")], "the end")
 

@@ -4,7 +4,7 @@ import io
 import numpy as np
 from PIL import Image
 
-from services.report.pictures import (
+from services.look.pictures import (
     FIXED_REGIONS,
     MOST_WIDTH,
     OBJECT_REGIONS,

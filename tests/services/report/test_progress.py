@@ -4,9 +4,9 @@ import pytest
 
 from schemas.job.job import Job
 from services.job.record import encode_job, record_job
+from services.look.live import latest_scenes, progress_of, read_progress
 from services.merge.merge import merge
 from services.read.status import Running, Status
-from services.report.progress import latest_scenes, progress_of, read_progress
 from services.run.lock import hold_lock
 from tests.made_up_scenes import attempt_at
 from workers.store.local import LocalStore

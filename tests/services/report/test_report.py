@@ -5,7 +5,7 @@ import pytest
 
 from schemas.errors import OutputError
 from services.cli.main import main
-from services.report.report import page_of, read_report, write_report
+from services.look.report import page_of, read_report, write_report
 from workers.store.local import LocalStore
 
 VOID = {"meta", "img", "input", "link", "br"}

@@ -1,7 +1,7 @@
 import numpy as np
 import pyarrow as pa
 
-from services.report.sample import choose_scenes, show_scenes
+from services.look.pictures import choose_scenes, show_scenes
 
 
 class Rows:

@@ -4,9 +4,9 @@ from dataclasses import replace
 import pytest
 
 from schemas.job.job import Job
-from services.report.collect import CaptureQuality, Cost, Failure, collect
-from services.report.histogram import Histogram
-from services.report.sections import captures_html, charts_html, effects_html, failures_html, overview_html
+from services.look.charts import Histogram
+from services.look.collect import CaptureQuality, Cost, Failure, collect
+from services.look.sections import captures_html, charts_html, effects_html, failures_html, overview_html
 from tests.services.report.test_collect import FAILURES, SCENES, TIMINGS, VIEWS, Handmade
 
 HOSTILE = '<script>alert("&")</script>'

@@ -13,10 +13,9 @@ from pathlib import Path
 import pytest
 
 from schemas.errors import InputError
-from services.report import server as module
-from services.report.follow import Follower
-from services.report.gate import HEADERS
-from services.report.server import Place, choose_place, serving
+from services.look import server as module
+from services.look.live import Follower
+from services.look.server import HEADERS, Place, choose_place, serving
 
 ROOT = Path(__file__).resolve().parents[3]
 TOKEN = "a-token-of-some-length"

@@ -6,9 +6,9 @@ import pyarrow.dataset as ds
 import pytest
 
 from schemas.dataset.layout import SUCCESS_FILE
-from services.report import tables as module
-from services.report.report import read_report
-from services.report.tables import choose_spread, open_tables
+from services.look import collect as module
+from services.look.collect import choose_spread, open_tables
+from services.look.report import read_report
 from tests.datasets import make_dataset
 from tests.made_up_scenes import attempt_at
 from workers.store.local import LocalStore

@@ -1,5 +1,4 @@
-from services.report.page import Section
-from services.report.view import View, live_page
+from services.look.report import Section, View, live_page
 
 VIEW = View("small", "38% · small", "<p>now</p>", (Section("one", "One", "<p>1</p>"), Section("two", "Two", "")), 7)
 

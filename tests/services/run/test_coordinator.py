@@ -7,8 +7,7 @@ from typing import cast
 import pytest
 
 from schemas.dataset.commit import Span
-from schemas.dataset.fingerprint import Fingerprint
-from schemas.dataset.shard import ShardOrder, ShardReport, SpanReport
+from schemas.dataset.shard import Fingerprint, ShardOrder, ShardReport, SpanReport
 from services.job.job_file import validate_job
 from services.run import coordinator as module
 from services.run.coordinator import Coordinator, Limits

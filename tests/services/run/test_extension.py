@@ -16,8 +16,8 @@ from services.job.record import record_job, require_job
 from services.run.run_job import RunRequest, order_pattern, run_job
 from tests.datasets import SMALL, make_dataset
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline import run_shard as module
-from workers.pipeline.run_shard import run_shard
+from workers.shard import run_shard as module
+from workers.shard.run_shard import run_shard
 from workers.store.ledger import list_commits
 from workers.store.local import LocalStore
 

@@ -8,16 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE
-from schemas.dataset.shard import ShardOrder
+from schemas.dataset.shard import Fingerprint, ShardOrder
 from services.job.job_file import validate_job
 from services.run.joining import terms_of_driver, with_own_stack
 from services.run.worker_entry import processor_flags
 from tests.kit.ray_head import BareCluster, bare_cluster
-from workers.pipeline.code import code_digest
-from workers.pipeline.fingerprint import take_fingerprint
 from workers.render.raster.gbuffer import shared_renderer
+from workers.shard.code import code_digest
+from workers.shard.fingerprint import take_fingerprint
 from workers.store.local import LocalStore
 
 JOB = "name: shapes\nseed: 2024\nscenes: 8\ncategories: [box, can]\nrun: {range_size: 2}\n"

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.dataset.commit import CommitSummary, Span
-from schemas.dataset.ledger import Ledger, join_rows, rows_of
+from schemas.dataset.commit import CommitSummary, Ledger, Span, join_rows, rows_of
 from schemas.errors import OutputError
 from schemas.job.job import Job
 from services.run.range_planner import (

@@ -16,7 +16,7 @@ from schemas.dataset.codec import Row
 from services.job.job_file import validate_job
 from services.read.query import query
 from services.read.replay import replay_scene
-from services.read.scene_export import export_scene
+from services.read.scene_geometry import export_scene
 from services.read.verify import verify
 from services.run.ray_cluster import Slots, private_ray
 from services.run.run_job import RunRequest, run_job

@@ -10,7 +10,7 @@ from ray import cloudpickle
 
 from services.run import worker_entry
 from services.run.worker_entry import Sight, look_at_folder, processor_flags, see, start_environment
-from workers.pipeline.code import code_digest
+from workers.shard.code import code_digest
 
 ROOT = Path(__file__).resolve().parents[3]
 

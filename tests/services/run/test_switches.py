@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from schemas.dataset.fingerprint import Fingerprint
+from schemas.dataset.shard import Fingerprint
 from schemas.errors import InputError, JobError
 from schemas.job.job import Job
 from services.bench.command import refuse_unmatched

@@ -3,8 +3,7 @@
 import pytest
 
 from schemas.errors import InputError
-from services.study.answer import answer, blind_knobs, next_better, recommend
-from services.study.choose import TargetError, parse_targets
+from services.study.choose import TargetError, answer, blind_knobs, next_better, parse_targets, recommend
 from tests.made_up_studies import large_study, row, study
 
 OWN = row(penetration_mm=0.01, gap_mm=0.0, mask_share=0.0002, depth_mm=0.1, flip=0.1)

@@ -19,9 +19,8 @@ from services.study.choose import (
     own_row,
     parse_targets,
 )
-from services.study.errors import ERRORS
 from services.study.knobs import job_tree_with
-from services.study.model import Row
+from services.study.model import ERRORS, Row
 from tests.made_up_studies import large_study, row
 
 OWN = row(depth_mm=0.1, penetration_mm=0.01, mirror_mm=1.0)

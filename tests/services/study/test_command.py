@@ -10,7 +10,7 @@ import yaml
 from schemas.errors import MachineError
 from services.cli.main import main
 from services.study import command, study
-from services.study.journal import JOURNAL_FILE
+from services.study.study import JOURNAL_FILE
 from tests.services.cli.test_main import TABLETOP, told
 from tests.stored_studies import read_study
 

@@ -1,6 +1,6 @@
 """Errors: each has a name, a unit, and a short name of its own."""
 
-from services.study.errors import ERRORS
+from services.study.model import ERRORS
 from services.study.words import short
 
 

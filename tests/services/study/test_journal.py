@@ -3,7 +3,7 @@
 import pytest
 
 from schemas.errors import OutputError
-from services.study.journal import JOURNAL_FILE, Journal
+from services.study.study import JOURNAL_FILE, Journal
 
 HEADER = {"job": "abc", "sizes": {"scenes": 4}}
 

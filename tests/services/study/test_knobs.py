@@ -5,7 +5,6 @@ import pytest
 from schemas.errors import InputError
 from schemas.job.job import Job
 from services.study import knobs
-from services.study.errors import ERRORS
 from services.study.knobs import (
     apply,
     choose_knobs,
@@ -15,7 +14,7 @@ from services.study.knobs import (
     knobs_of,
     settings_of,
 )
-from services.study.model import Setting
+from services.study.model import ERRORS, Setting
 
 JOB = Job(name="t")
 KNOBS = knobs_of(JOB)

@@ -1,7 +1,7 @@
 """What is measured together: what saves and keeps, what is more exact, and what meets the targets."""
 
 from services.study.model import Figure, Row, Setting
-from services.study.pairs import promising
+from services.study.study import promising
 
 
 def figure(value: float) -> Figure:

@@ -6,13 +6,11 @@ from pathlib import Path
 import pytest
 
 from schemas.job.identity import settings_digest
-from schemas.job.job import Job
-from schemas.job.preset import PRESETS
+from schemas.job.job import PRESETS, Job
 from services.study.choose import error_of, own_row
-from services.study.errors import ERRORS
 from services.study.knobs import apply
-from services.study.model import Figure, Row, Setting
-from services.study.pairs import NEGLIGIBLE
+from services.study.model import ERRORS, Figure, Row, Setting
+from services.study.study import NEGLIGIBLE
 from tests.stored_studies import read_study
 
 EVIDENCE = Path(__file__).resolve().parents[3] / "docs" / "tradeoff"

@@ -5,7 +5,7 @@ from pathlib import Path
 from schemas.job.job import Job
 from services.study.knobs import choose_knobs, knobs_of, settings_of
 from services.study.model import Plan, Sizes
-from services.study.rounds import Round
+from services.study.study import Round
 
 SIZES = Sizes(scenes=3, settled=5, released=1, posed=2, timed=2, laps=2, coloured=1)
 

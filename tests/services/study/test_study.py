@@ -6,11 +6,10 @@ from pathlib import Path
 from schemas.job.job import Job
 from services.study.measure.settling import measure_settling
 from services.study.model import Plan, Setting, Sizes
-from services.study.rounds import Unit
-from services.study.study import header_of, measure_in_pool, with_time_of
+from services.study.study import Unit, header_of, measure_in_pool, with_time_of
 from tests.made_up_studies import row
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.context import open_worker
+from workers.scene.context import open_worker
 
 JOB = Job(name="t", seed=2024)
 PLAN = Plan(JOB, Path(), (), (Setting(),), (), None, Sizes(scenes=4))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.capture.estimate import Reconstruction
+from schemas.capture import Reconstruction
 from schemas.job.assets import Assets
 from schemas.job.captures import Board
 from workers.assets.captured import CaptureNames, board_asset, reconstructed_asset

@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job.assets import Assets, FolderSource, MeshLimits, ProceduralSource, ShapeNetSource, SplitShares
-from schemas.job.category import CATEGORIES
+from schemas.job.assets import (
+    CATEGORIES,
+    Assets,
+    FolderSource,
+    MeshLimits,
+    ProceduralSource,
+    ShapeNetSource,
+    SplitShares,
+)
 from tests.workers.assets.oracles import CUBE, write
 from workers.assets.catalogue import choose_object, choose_table, list_source, load_asset, open_catalogue, split_of
 from workers.assets.external.verdicts import Verdicts

@@ -9,8 +9,7 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.job.assets import MeshLimits, ProceduralSource
-from schemas.job.category import CATEGORIES
+from schemas.job.assets import CATEGORIES, MeshLimits, ProceduralSource
 from schemas.scene.shape import Material, Part, Shape
 from tests.kit.shapes import asset_of
 from tests.workers.assets.oracles import welded, write

@@ -7,16 +7,10 @@ import pytest
 
 from schemas.errors import ViewError
 from schemas.job.job import Job
-from schemas.scene.camera import Camera, Intrinsics
-from workers.cameras.placement import (
-    front_distance,
-    mirror_pose,
-    object_distance,
-    place_aligned_camera,
-    place_mirror_camera,
-)
+from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.camera import inclination, look_at, orbit_pose
 from workers.geometry.frames import half_turn, pose, rotation_about, translation
+from workers.scene.pairs import front_distance, mirror_pose, object_distance, place_aligned_camera, place_mirror_camera
 
 JOB = Job(name="t")
 CAMERA = Camera(Intrinsics.of(JOB.cameras.sensor), orbit_pose(np.array([0, 0, 0.7]), 0.8, 1.0, 2.5))

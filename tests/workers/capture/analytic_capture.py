@@ -6,8 +6,8 @@ import numpy as np
 
 from schemas.base import frozen_array
 from schemas.job.captures import Board
-from schemas.scene.camera import Camera, Intrinsics
-from workers.capture.posed_view import PosedView
+from schemas.scene.view import Camera, Intrinsics
+from workers.capture.surface.posed_view import PosedView
 from workers.geometry.camera import look_at
 
 BOARD = Board()

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from schemas.base import Array, Pose
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from workers.geometry.frames import invert, transform, translation
 
 GROUND_M = 0.02

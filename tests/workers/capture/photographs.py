@@ -5,7 +5,7 @@ import numpy as np
 
 from schemas.base import Array, Pose
 from schemas.job.captures import Board
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from workers.geometry.camera import orbit_pose
 from workers.geometry.colour import encode_srgb
 from workers.geometry.frames import invert, rotation_about

@@ -6,8 +6,7 @@ import trimesh
 
 from schemas.errors import CaptureError
 from schemas.scene.shape import Mesh
-from workers.capture.align import align_mesh
-from workers.capture.evaluate import sample_surface
+from workers.capture.surface.evaluate import align_mesh, sample_surface
 from workers.geometry.frames import angle_between, pose, rotation_about, transform
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from schemas.scene.camera import Intrinsics
-from workers.capture.depth_fit import fit_depth
+from schemas.scene.view import Intrinsics
+from workers.capture.surface.tsdf import fit_depth
 
 K = Intrinsics(width=120, height=90, fx=912.0, fy=905.0, cx=61.0, cy=44.0)
 """A window of a Kinect's picture, where samples are two pixels apart."""

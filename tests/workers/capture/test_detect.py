@@ -6,8 +6,8 @@ import pytest
 
 from schemas.job.captures import Board
 from tests.workers.capture.photographs import HALF, KINECT, hand_held, photograph, printed, true_corners
+from workers.capture.board.detect import detect_markers, other_dictionaries
 from workers.capture.board.layout import marker_corners, open_dictionary
-from workers.capture.detect import detect_markers, other_dictionaries
 
 BOARD = Board()
 DICTIONARY = open_dictionary(BOARD)

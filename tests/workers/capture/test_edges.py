@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 
-from workers.capture.edges import refine_corners
+from workers.capture.board.detect import refine_corners
 from workers.geometry.colour import encode_srgb
 
 

@@ -5,12 +5,12 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.capture.estimate import Reconstruction, SynthesizedView
+from schemas.capture import Reconstruction, SynthesizedView
 from schemas.errors import CaptureError
-from schemas.scene.camera import Camera
 from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera
 from tests.workers.capture.analytic_capture import kinect
-from workers.capture.evaluate import (
+from workers.capture.surface.evaluate import (
     compare_poses,
     compare_surface,
     compare_view,
@@ -18,7 +18,7 @@ from workers.capture.evaluate import (
     sample_surface,
     true_view,
 )
-from workers.capture.posed_view import PosedView
+from workers.capture.surface.posed_view import PosedView
 from workers.geometry.camera import look_at
 from workers.geometry.frames import pose, rotation_about, translation
 

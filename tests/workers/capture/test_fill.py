@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from workers.capture.fill import fill_holes
+from workers.capture.surface.synthesize import fill_holes
 
 
 def scene():

@@ -6,8 +6,8 @@ import pytest
 from schemas.errors import CaptureError
 from schemas.job.captures import Fusion
 from tests.workers.capture.analytic_capture import BOARD, Thing, capture
-from workers.capture.fuse import fuse_views
-from workers.capture.object_region import find_object
+from workers.capture.surface.fusion import fuse_views
+from workers.capture.surface.object_mask import find_object
 
 
 def fuse(views, spec=None):

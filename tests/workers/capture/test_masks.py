@@ -6,9 +6,8 @@ import pytest
 from schemas.job.captures import Fusion
 from schemas.scene.shape import Mesh
 from tests.workers.capture.analytic_capture import BOARD, Thing, capture, cast
-from workers.capture.fuse import fuse_views
-from workers.capture.masks import down_to_board, silhouette
-from workers.capture.object_region import find_object
+from workers.capture.surface.fusion import fuse_views
+from workers.capture.surface.object_mask import down_to_board, find_object, silhouette
 
 
 @pytest.mark.parametrize("sigma_m", [0.0, 0.002])

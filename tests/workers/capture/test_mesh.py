@@ -5,8 +5,15 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from workers.capture.mesh import cut_below, extract_surface, face_areas, keep_vertices, large_parts, vertex_normals
-from workers.capture.tsdf import Volume
+from workers.capture.surface.tsdf import (
+    Volume,
+    cut_below,
+    extract_surface,
+    face_areas,
+    keep_vertices,
+    large_parts,
+    vertex_normals,
+)
 
 RADIUS = 0.02
 

@@ -6,7 +6,7 @@ import pytest
 from schemas.errors import CaptureError
 from schemas.job.captures import Fusion
 from tests.workers.capture.analytic_capture import BOARD, HIGH, RADIUS, SPHERE, Thing, capture
-from workers.capture.object_region import CELL_M, find_object
+from workers.capture.surface.object_mask import CELL_M, find_object
 
 FLAT = Thing(sphere=None, boxes=[(np.array([-0.04, -0.03, 0.0]), np.array([0.05, 0.03, 0.004]))])
 

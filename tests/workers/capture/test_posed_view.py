@@ -4,12 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from schemas.capture.estimate import DepthCorrection
-from schemas.capture.view import CaptureCamera, CapturedView
+from schemas.capture import CaptureCamera, CapturedView, DepthCorrection
 from schemas.errors import CaptureError
-from schemas.scene.camera import Intrinsics
-from workers.capture.posed_view import correct_depth, distort_mask, pose_view
-from workers.capture.poses.rays import opencv_matrix
+from schemas.scene.view import Intrinsics
+from workers.capture.poses.observation import opencv_matrix
+from workers.capture.surface.posed_view import correct_depth, distort_mask, pose_view
 
 K = Intrinsics(width=240, height=180, fx=200.0, fy=205.0, cx=121.3, cy=88.7)
 LENS = np.array([0.12, -0.2, 0.002, -0.003, 0.05, 0.0, 0.0, 0.0])

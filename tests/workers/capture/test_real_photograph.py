@@ -4,18 +4,16 @@ import cv2
 import numpy as np
 import pytest
 
-from schemas.capture.view import CaptureCamera
+from schemas.capture import CaptureCamera
 from schemas.job.captures import Board, Estimation
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from tests.conftest import SHARED_DATA
-from workers.capture.board.frames import frame_in_board
-from workers.capture.board.layout import marker_corners, open_dictionary
-from workers.capture.detect import detect_markers
-from workers.capture.poses.evidence import Evidence
-from workers.capture.poses.from_markers import estimate_markers
-from workers.capture.poses.observation import Setup
-from workers.capture.poses.observe import observe_view
-from workers.capture.poses.rays import pixels_of_points
+from workers.capture.board.detect import detect_markers
+from workers.capture.board.layout import frame_in_board, marker_corners, open_dictionary
+from workers.capture.poses.estimates import estimate_markers
+from workers.capture.poses.observation import Setup, pixels_of_points
+from workers.capture.poses.patches import observe_view
+from workers.capture.poses.verdict import Evidence
 
 FOLDER = SHARED_DATA / "board"
 BOARD = Board(dictionary="tutorial_dict.yml", columns=5, rows=7, marker_m=0.04, gap_m=0.01, width_m=0.26, height_m=0.36)

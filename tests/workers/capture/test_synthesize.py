@@ -6,11 +6,11 @@ import pytest
 from schemas.base import frozen_array
 from schemas.errors import CaptureError
 from schemas.job.captures import Synthesis
-from schemas.scene.camera import Camera
+from schemas.scene.view import Camera
 from tests.workers.capture.analytic_capture import Thing, capture, cast, kinect, poses
-from workers.capture.depth_fit import fit_depth
-from workers.capture.synthesize import merge_layers, rank_views, synthesize_view
-from workers.capture.warp import Layer, prepare_source
+from workers.capture.surface.synthesize import merge_layers, rank_views, synthesize_view
+from workers.capture.surface.tsdf import fit_depth
+from workers.capture.surface.warp import Layer, prepare_source
 from workers.geometry.camera import look_at
 
 K = kinect(0.25)

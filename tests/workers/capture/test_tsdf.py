@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from schemas.base import frozen_array
-from schemas.scene.camera import Camera, Intrinsics
-from workers.capture.depth_fit import fit_depth
-from workers.capture.tsdf import BACK_VOXELS, FRONT_VOXELS, empty_volume, integrate, sample_inverse
+from schemas.scene.view import Camera, Intrinsics
+from workers.capture.surface.tsdf import BACK_VOXELS, FRONT_VOXELS, empty_volume, fit_depth, integrate, sample_inverse
 from workers.geometry.camera import look_at
 
 K = Intrinsics(width=160, height=120, fx=300.0, fy=300.0, cx=80.0, cy=60.0)

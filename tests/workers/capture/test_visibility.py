@@ -4,9 +4,9 @@ import numpy as np
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.shape import Mesh
-from workers.capture.visibility import UNSEEN, facing_cosine, visible_points
+from schemas.scene.view import Camera, Intrinsics
+from workers.capture.surface.posed_view import UNSEEN, facing_cosine, visible_points
 from workers.geometry.camera import look_at
 
 K = Intrinsics(width=200, height=150, fx=200.0, fy=200.0, cx=100.0, cy=75.0)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from schemas.base import frozen_array
-from schemas.scene.camera import Camera
+from schemas.scene.view import Camera
 from tests.workers.capture.analytic_capture import Thing, cast, kinect
-from workers.capture.depth_fit import fit_depth
-from workers.capture.posed_view import PosedView
-from workers.capture.warp import move_depth, prepare_source, warp
+from workers.capture.surface.posed_view import PosedView
+from workers.capture.surface.tsdf import fit_depth
+from workers.capture.surface.warp import move_depth, prepare_source, warp
 from workers.geometry.camera import look_at
 from workers.geometry.frames import translation
 

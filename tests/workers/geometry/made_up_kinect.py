@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 
 from schemas.base import frozen_array
-from schemas.capture.depth_camera import DepthCamera
-from schemas.scene.camera import Intrinsics
+from schemas.capture import DepthCamera
+from schemas.scene.view import Intrinsics
 from workers.geometry.frames import pose, rotation_about
 
 COLOR = Intrinsics(width=1920, height=1080, fx=912.37, fy=912.25, cx=961.94, cy=548.79)

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from schemas.job.sensor import Distortion
-from schemas.scene.camera import Intrinsics
+from schemas.job.views import Distortion
+from schemas.scene.view import Intrinsics
 from workers.geometry.distortion import distort, undistort
 
 K = Intrinsics(width=640, height=480, fx=525.0, fy=520.0, cx=322.0, cy=239.0)

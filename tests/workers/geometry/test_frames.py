@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.camera import (
     inclination,
     is_outside_views,

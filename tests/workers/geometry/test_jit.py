@@ -32,7 +32,7 @@ TOGETHER = (
 SCENES = """
 from numba.core.event import install_recorder
 from workers.geometry.jit import compile_planned
-from workers.pipeline.run_shard import _fingerprint
+from workers.shard.run_shard import _fingerprint
 compile_planned()
 with install_recorder("numba:compile") as recorder:
     _fingerprint("raster")

@@ -15,8 +15,7 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 
-from schemas.job.assets import ProceduralSource
-from schemas.job.category import CATEGORIES
+from schemas.job.assets import CATEGORIES, ProceduralSource
 from schemas.scene.shape import Mesh
 from workers.assets.builtin.make import make_asset
 from workers.geometry.hull import MOST_VERTICES, convex_hull, depth_m, least_width_m

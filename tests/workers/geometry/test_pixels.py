@@ -8,7 +8,7 @@ with holes and without.
 import numpy as np
 import pytest
 
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.view import Camera, Intrinsics
 from tests.workers.labels.planes import HERE, plane_view
 from tests.workers.labels.planes import K as PLANE_K
 from workers.geometry.camera import unproject

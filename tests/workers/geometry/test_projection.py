@@ -9,11 +9,10 @@ import math
 import numpy as np
 import pytest
 
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.view import Camera, Intrinsics
 from tests.workers.labels.planes import HERE as PLANE_HERE
 from tests.workers.labels.planes import IMAGES, plane_view
 from tests.workers.labels.planes import THERE as PLANE_THERE
-from workers.cameras.placement import mirror_pose
 from workers.geometry.camera import orbit_pose, unproject
 from workers.geometry.frames import invert, pose, uniform_rotation
 from workers.geometry.projection import (
@@ -26,6 +25,7 @@ from workers.geometry.projection import (
     forward_project,
     sample_inverse_depth,
 )
+from workers.scene.pairs import mirror_pose
 
 HEIGHT, WIDTH, FOCAL_PX = BLOCK[0], 5 * BLOCK[1] + 7, 90.0
 RAY_X, RAY_Y = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL_PX, (np.arange(HEIGHT) + 0.5 - HEIGHT / 2) / FOCAL_PX

@@ -8,9 +8,9 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Part, Shape
+from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.camera import orbit_pose, project
 from workers.geometry.frames import pose, transform, translation, uniform_rotation
 from workers.geometry.raycast import (

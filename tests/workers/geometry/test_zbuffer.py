@@ -12,8 +12,8 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.shape import Mesh, Part, Shape
+from schemas.scene.view import Camera, Intrinsics
 from tests.kit.shapes import shape_of as shape_of_meshes
 from tests.workers.geometry.made_up_kinect import (
     CAMERA,

@@ -1,7 +1,7 @@
 """The agreement of two views of planes."""
 
 from tests.workers.labels.planes import HERE, IMAGES, THERE, plane_view
-from workers.labels.agreement import compare_views
+from workers.scene.labels import compare_views
 
 
 def test_two_views_of_one_plane_agree_to_the_quantisation():

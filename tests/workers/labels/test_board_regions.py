@@ -3,11 +3,11 @@ import numpy as np
 import pytest
 
 from schemas.job.captures import Board
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.view import Camera, Intrinsics
 from tests.captures import rolled_pose
+from workers.capture.rows import capture_regions
 from workers.geometry.camera import look_at
 from workers.geometry.frames import invert
-from workers.labels.board_regions import capture_regions
 
 K = Intrinsics(width=320, height=180, fx=152.0, fy=150.0, cx=160.4, cy=91.1)
 

@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 
-from schemas.job.images import Patch
+from schemas.job.views import Patch
 from schemas.scene.view import ObjectLabel
 from tests.workers.labels.planes import HERE, plane_view
-from workers.labels.patches import crop_box, patch_object_fraction
+from workers.scene.labels import crop_box, patch_object_fraction
 
 
 def label(u: int, v: int) -> ObjectLabel:

@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 
-from schemas.job.images import Projection
-from schemas.job.sensor import Distortion
-from schemas.scene.camera import Camera
-from schemas.scene.effects import EffectPlan
+from schemas.job.views import Distortion, Projection
+from schemas.scene.scene import EffectPlan
+from schemas.scene.view import Camera
 from tests.workers.labels.planes import HERE, IMAGES, THERE, K, plane_view
 from workers.geometry.camera import orbit_pose
 from workers.geometry.distortion import distort
-from workers.labels.projected_view import carry_depth, derive_projected, pixels_behind, projection_shares
+from workers.scene.labels import carry_depth, derive_projected, pixels_behind, projection_shares
 
 NO_EFFECTS = EffectPlan((), {})
 

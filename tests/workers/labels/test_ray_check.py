@@ -10,18 +10,16 @@ import pytest
 from schemas.base import Range
 from schemas.errors import LabelError
 from schemas.job.job import Job
-from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed, PosedScene
-from schemas.scene.view import Agreement, GBuffer
+from schemas.scene.view import Agreement, Camera, GBuffer, Intrinsics
 from tests.kit.shapes import asset_of, box, shape_of, table
 from tests.physics.settling import settle_single
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.geometry.raycast import cast_view, edge_distance_px
-from workers.labels.ray_check import STEEPEST_COS, check_against_rays, check_pair
-from workers.pipeline.make_scene import pose_scene
-from workers.plan.randomness import SceneChance
-from workers.plan.step import draw_scene
+from workers.scene.make_scene import pose_scene
+from workers.scene.plan import SceneChance, draw_scene
+from workers.scene.ray_check import STEEPEST_COS, check_against_rays, check_pair
 
 STORED = Range(0.2, 8.0)
 CAMERA = Camera(

@@ -9,9 +9,8 @@ from tests.kit.shapes import asset_of, box, table
 from tests.workers.labels.planes import HERE, K
 from workers.geometry.frames import translation
 from workers.geometry.pixels import Extent
-from workers.labels.regions import count_unoccluded, label_region, label_regions, label_things
-from workers.plan.randomness import SceneChance
-from workers.plan.step import draw_scene
+from workers.scene.labels import count_unoccluded, label_region, label_regions, label_things
+from workers.scene.plan import SceneChance, draw_scene
 
 
 def count_as_200(things, camera):

@@ -9,7 +9,7 @@ import trimesh
 
 from schemas.job.assets import ProceduralSource
 from schemas.job.job import Job
-from schemas.scene.plan import ObjectStart
+from schemas.scene.scene import ObjectStart
 from schemas.scene.shape import Asset
 from tests.kit.shapes import asset_of, box, shape_of, table
 from workers.assets.builtin.make import make_asset

@@ -11,8 +11,7 @@ import pytest
 
 from schemas.job.job import Job
 from schemas.job.physics import Physics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart
+from schemas.scene.scene import EffectPlan, ObjectStart
 from schemas.scene.shape import Mesh
 from tests.kit.shapes import asset_of, box, table
 from workers.geometry.frames import (

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.scene.plan import ObjectStart, Table
-from schemas.scene.region import REGION_TABLE
-from schemas.scene.shape import Asset
+from schemas.scene.scene import ObjectStart, Table
+from schemas.scene.shape import REGION_TABLE, Asset
 from tests.kit.contacts import mesh_of
 from tests.kit.shapes import asset_of, box, shape_of, table
 from workers.geometry.frames import pose, rotation_about, translation, uniform_rotation

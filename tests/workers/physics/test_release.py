@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from schemas.job.job import Job
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart, Table
+from schemas.scene.scene import EffectPlan, ObjectStart, Table
 from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import built_in, cube
 from tests.hard_cases.drops import X, Y, level, table_of, turn

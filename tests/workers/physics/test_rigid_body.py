@@ -5,8 +5,7 @@ import pytest
 import trimesh
 
 from schemas.job.job import Job
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart
+from schemas.scene.scene import EffectPlan, ObjectStart
 from schemas.scene.shape import Asset
 from tests.kit.shapes import asset_of, box
 from workers.geometry.frames import pose, transform, uniform_rotation

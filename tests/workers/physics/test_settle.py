@@ -14,9 +14,7 @@ import trimesh
 from schemas.errors import SettleError
 from schemas.job.job import Job
 from schemas.job.physics import Collision, Physics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.plan import ObjectStart
-from schemas.scene.scene import Settled
+from schemas.scene.scene import EffectPlan, ObjectStart, Settled
 from schemas.scene.shape import Asset, Mesh
 from tests.kit.shapes import asset_of, box, table
 from tests.physics.settling import effects_of, recheck, scene_of, settle_group, settle_single
@@ -36,8 +34,7 @@ from workers.physics.settle import (
     settle_scene,
 )
 from workers.physics.support import place_table
-from workers.plan.randomness import SceneChance
-from workers.plan.step import draw_scene
+from workers.scene.plan import SceneChance, draw_scene
 
 PHYSICS = Job(name="t").physics
 TABLE = place_table(table())

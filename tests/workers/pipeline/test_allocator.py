@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[3]
 FAULTS = """
 import resource, sys
 import numpy as np
-from workers.pipeline.allocator import keep_freed_memory
+from workers.scene.context import keep_freed_memory
 if sys.argv[1] == "keep":
     keep_freed_memory()
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

@@ -7,8 +7,8 @@ import pytest
 
 from schemas.errors import MachineError
 from tests.workers.pipeline.test_run_shard import run
-from workers.pipeline import run_shard as module
-from workers.pipeline.bugs import describe, explain, keep_traceback
+from workers.shard import run_shard as module
+from workers.shard.run_shard import describe, explain, keep_traceback
 from workers.store.commit import read_record
 from workers.store.ledger import range_rows
 from workers.store.local import LocalStore

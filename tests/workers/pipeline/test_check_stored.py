@@ -8,7 +8,7 @@ import pytest
 from services.job.record import require_job
 from services.read.dataset_reader import file_reader, iter_stored, read_image
 from tests.datasets import make_dataset
-from workers.pipeline.check_stored import check_stored_pair, check_stored_scene
+from workers.scene.check_stored import check_stored_pair, check_stored_scene
 
 
 @pytest.fixture(scope="module")

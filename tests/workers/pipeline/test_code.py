@@ -5,10 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from workers.pipeline.code import SOURCE_PACKAGES, code_digest
+from workers.shard.code import SOURCE_PACKAGES, code_digest
 
 ROOT = Path(__file__).resolve().parents[3]
-LOOK = "import sys; sys.path.insert(0, '.'); from workers.pipeline.code import code_digest"
+LOOK = "import sys; sys.path.insert(0, '.'); from workers.shard.code import code_digest"
 ASK = [sys.executable, "-P", "-c", f"{LOOK}; print(code_digest(), 'numpy' in sys.modules)"]
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from schemas.dataset.shard import JobChange
 from schemas.errors import MachineError
-from workers.pipeline.committer import Committer
+from workers.shard.run_shard import Committer
 
 CHANGE = JobChange(before="a", after="b")
 

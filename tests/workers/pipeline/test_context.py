@@ -6,7 +6,7 @@ import pytest
 from schemas.job.identity import settings_digest
 from schemas.job.job import Job
 from tests.workers.render.random_scenes import built_in_assets
-from workers.pipeline.context import open_worker
+from workers.scene.context import open_worker
 
 
 def digest(catalogue: str = "assets", **changes) -> str:

@@ -13,15 +13,14 @@ from schemas.dataset.layout import FINGERPRINT_FILE, IMAGES, commit_path
 from schemas.dataset.shard import ShardOrder
 from schemas.errors import JobError, MachineError
 from schemas.job.identity import settings_digest
-from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.scene.shape import REGION_FIRST_OBJECT
 from services.job.job_file import validate_job
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.frames import invert, transform
-from workers.pipeline.context import WorkerContext
-from workers.pipeline.make_scene import make_scene
-from workers.pipeline.run_shard import run_shard
-from workers.pipeline.stopwatch import Stopwatch
 from workers.render.raster.gbuffer import shared_renderer
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.make_scene import make_scene
+from workers.shard.run_shard import run_shard
 from workers.store.commit import committed_files, read_record
 from workers.store.images import decode_png
 from workers.store.local import LocalStore

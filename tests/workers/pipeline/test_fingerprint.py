@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from services.run.worker_entry import processor_flags
-from workers.pipeline.code import code_digest
-from workers.pipeline.fingerprint import TIER_LIBRARIES, maths_digest, numpy_simd, take_fingerprint
 from workers.render.raster.gbuffer import shared_renderer
+from workers.shard.code import code_digest
+from workers.shard.fingerprint import TIER_LIBRARIES, maths_digest, numpy_simd, take_fingerprint
 
 
 def test_the_same_stack_has_the_same_fingerprint_and_names_what_the_bytes_depend_on():
@@ -25,7 +25,7 @@ def test_the_same_stack_has_the_same_fingerprint_and_names_what_the_bytes_depend
 
 def maths_with(tunables: str) -> str:
     """The digest of the maths of a process whose C library is told to see a smaller processor."""
-    ask = [sys.executable, "-c", "from workers.pipeline.fingerprint import maths_digest; print(maths_digest())"]
+    ask = [sys.executable, "-c", "from workers.shard.fingerprint import maths_digest; print(maths_digest())"]
     environ = {**os.environ, "GLIBC_TUNABLES": tunables}
     root = Path(__file__).resolve().parents[3]
     return subprocess.run(ask, cwd=root, env=environ, capture_output=True, text=True, check=True).stdout.strip()

@@ -6,10 +6,9 @@ import hashlib
 import numpy as np
 import pytest
 
-from schemas.job.images import Images, Patch
-from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.view import ObjectLabel, Pair, View
-from workers.pipeline.image_files import encode_view, image_boxes, object_labels
+from schemas.job.views import Images, Patch
+from schemas.scene.view import Camera, Intrinsics, ObjectLabel, Pair, View
+from workers.scene.rows import encode_view, image_boxes, object_labels
 from workers.store.images import decode_png
 
 IMAGES = Images(patch=Patch(width=16, height=8))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from schemas.scene.camera import ROLES
+from schemas.scene.view import ROLES
 from tests.effects.scenes import Made, Setting, make
 from workers.geometry.frames import invert
 

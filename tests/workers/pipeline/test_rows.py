@@ -10,10 +10,9 @@ from schemas.errors import SettleError
 from services.job.job_file import validate_job
 from tests.datasets import SMALL, overlaid
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.context import open_worker
-from workers.pipeline.make_scene import make_scene
-from workers.pipeline.rows import failed_scene, record_scene, timing_row
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch, open_worker
+from workers.scene.make_scene import make_scene
+from workers.scene.rows import failed_scene, record_scene, timing_row
 from workers.store.manifest import table_of_rows
 
 

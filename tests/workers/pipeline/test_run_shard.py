@@ -9,14 +9,13 @@ from pathlib import Path
 import pytest
 
 from schemas.dataset.commit import CommitTerms, Span
-from schemas.dataset.fingerprint import Fingerprint
 from schemas.dataset.layout import FINGERPRINT_FILE, commit_path, range_table_path
-from schemas.dataset.shard import Blame, ShardOrder, ShardReport
+from schemas.dataset.shard import Blame, Fingerprint, ShardOrder, ShardReport
 from schemas.errors import FingerprintError, MachineError
 from services.job.job_file import validate_job
 from tests.effects.scenes import SMALL
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.run_shard import run_shard
+from workers.shard.run_shard import run_shard
 from workers.store.attempt import Attempt, blamed_scene, staged_attempts
 from workers.store.local import LocalStage, LocalStore
 from workers.store.manifest import decode_table

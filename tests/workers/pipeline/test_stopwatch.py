@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from workers.pipeline.rows import timing_row
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch
+from workers.scene.rows import timing_row
 
 
 def test_the_manifest_has_the_seconds_of_each_effect_and_they_add_nothing_to_the_scenes():
@@ -25,7 +25,7 @@ def test_the_manifest_has_the_seconds_of_each_effect_and_they_add_nothing_to_the
 
 def test_what_runs_twice_adds_up_and_a_block_that_raises_is_counted(monkeypatch):
     ticks = iter([0.0, 1.0, 10.0, 12.0, 20.0, 23.0])
-    monkeypatch.setattr("workers.pipeline.stopwatch.time.perf_counter", lambda: next(ticks))
+    monkeypatch.setattr("workers.scene.context.time.perf_counter", lambda: next(ticks))
     stopwatch = Stopwatch()
     for _ in range(2):
         with stopwatch.stage("render", "mirror"):

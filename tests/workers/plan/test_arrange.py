@@ -10,13 +10,11 @@ import trimesh
 
 from schemas.errors import StartError
 from schemas.job.job import Job
-from schemas.scene.plan import ObjectStart, ScenePlan
+from schemas.scene.scene import ObjectStart, ScenePlan
 from schemas.scene.shape import Asset
 from tests.kit.shapes import asset_of, box, table
 from workers.geometry.frames import transform
-from workers.plan.arrange import APART_M, columns_apart
-from workers.plan.randomness import SceneChance
-from workers.plan.step import choose_category, count_objects, draw_scene
+from workers.scene.plan import APART_M, SceneChance, choose_category, columns_apart, count_objects, draw_scene
 
 TABLE = table()
 SMALL = asset_of(box(0.08, 0.05, 0.1), category="box")

@@ -3,8 +3,8 @@
 import numpy as np
 
 from schemas.job.job import Job
-from workers.plan.effects import is_raycast_scene
-from workers.plan.randomness import SceneChance
+from workers.scene.effects import is_raycast_scene
+from workers.scene.plan import SceneChance
 
 
 def test_the_share_of_checked_scenes_is_the_jobs_and_a_function_of_the_scene():

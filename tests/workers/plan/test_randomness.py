@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from workers.plan.randomness import SceneChance, Stream
+from workers.scene.plan import SceneChance, Stream
 
 
 def test_a_stream_is_a_function_of_seed_scene_and_step():

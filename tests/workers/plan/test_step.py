@@ -12,8 +12,7 @@ from workers.geometry.camera import inclination, yaw
 from workers.geometry.frames import pose, rotation_about, transform, translation
 from workers.geometry.hull import hull_of
 from workers.physics.support import place_table
-from workers.plan.randomness import SceneChance
-from workers.plan.step import choose_category, draw_scene, stands_on
+from workers.scene.plan import SceneChance, choose_category, draw_scene, stands_on
 
 BOX = asset_of(box(0.1, 0.08, 0.2))
 TABLE = table()

@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 from schemas.base import Array, frozen_array
-from schemas.job.render import Render
-from schemas.scene.appearance import Appearance, Light
-from schemas.scene.camera import Camera
-from schemas.scene.effects import EffectPlan
-from schemas.scene.scene import Placed
-from schemas.scene.shape import Material, Part, Shape
+from schemas.job.views import Render
+from schemas.scene.scene import EffectPlan, Placed
+from schemas.scene.shape import Appearance, Light, Material, Part, Shape
+from schemas.scene.view import Camera
 from tests.workers.render.random_scenes import EYE, floor
 from workers.geometry.colour import decode_srgb
 from workers.geometry.frames import invert

@@ -7,16 +7,14 @@ import numpy as np
 import trimesh
 
 from schemas.base import Array, Pose, frozen_array
-from schemas.job.assets import Assets
-from schemas.job.category import CATEGORIES
-from schemas.scene.appearance import Appearance, Light
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.job.assets import CATEGORIES, Assets
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Material, Part, Shape
+from schemas.scene.shape import Appearance, Light, Material, Part, Shape
+from schemas.scene.view import Camera, Intrinsics
 from workers.assets.catalogue import Catalogue, choose_object, choose_table, load_asset, open_catalogue
-from workers.cameras.placement import mirror_pose
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, transform, uniform_rotation
+from workers.scene.pairs import mirror_pose
 
 VGA = Intrinsics(width=640, height=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
 FLOOR_HALF_M = 30.0

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import pytest
 
-from schemas.scene.camera import Camera
 from schemas.scene.scene import Placed
+from schemas.scene.view import Camera
 from tests.workers.render.random_scenes import (
     APPEARANCE,
     VGA,

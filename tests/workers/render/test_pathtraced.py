@@ -14,10 +14,8 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.scene.appearance import Appearance, Light
-from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Material, Part, Shape
+from schemas.scene.shape import REGION_FIRST_OBJECT, Appearance, Light, Material, Part, Shape
 from tests.workers.render.looks import BLACK, DOWN, matte, paths, traced, with_material, without
 from tests.workers.render.random_scenes import (
     APPEARANCE,

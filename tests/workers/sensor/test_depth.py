@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from schemas.job.sensor import DepthNoise
-from schemas.scene.camera import Camera, Intrinsics
-from workers.sensor.depth import near_edge, sense_depth
+from schemas.job.views import DepthNoise
+from schemas.scene.view import Camera, Intrinsics
+from workers.scene.sensor import near_edge, sense_depth
 
 K = Intrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=80.0, cy=60.0)
 CAMERA = Camera(K, np.eye(4))

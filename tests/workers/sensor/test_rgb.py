@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from schemas.job.sensor import Distortion, Exposure, RgbNoise, SensorEffects
-from schemas.scene.camera import Intrinsics
+from schemas.job.views import Distortion, Exposure, RgbNoise, SensorEffects
+from schemas.scene.view import Intrinsics
 from workers.geometry.colour import decode_codes as decode
 from workers.geometry.colour import encode_codes as encode
-from workers.sensor.rgb import add_noise, distort, expose, sense_rgb
+from workers.scene.sensor import add_noise, distort, expose, sense_rgb
 
 K = Intrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=80.0, cy=60.0)
 LENS = Distortion(k1=-0.2, k2=0.05, p1=0.002, p2=-0.001, k3=0.01)

@@ -6,11 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.job.images import Images
-from schemas.job.sensor import SensorEffects
-from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.view import View
+from schemas.job.views import Images, SensorEffects
+from schemas.scene.scene import EffectPlan
+from schemas.scene.view import Camera, Intrinsics, View
 from services.job.job_file import validate_job
 from services.read.query import query
 from services.read.verify import verify
@@ -18,7 +16,7 @@ from services.run.ray_cluster import Slots, private_ray
 from services.run.run_job import RunRequest, run_job
 from tests.services.run.test_step import SMALL
 from workers.geometry.colour import decode_codes
-from workers.sensor.step import SensorChance, planned_effects, sense_view
+from workers.scene.sensor import SensorChance, planned_effects, sense_view
 from workers.store.local import LocalStore
 
 EVERY = {

@@ -4,12 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from schemas.capture.view import CaptureCamera, CapturedView
+from schemas.capture import CaptureCamera, CapturedView
 from schemas.errors import CaptureError
 from schemas.job.captures import Board
-from schemas.scene.camera import Intrinsics
-from workers.geometry.frames import pose, rotation_about
-from workers.store.capture_folder import (
+from schemas.scene.view import Intrinsics
+from workers.capture.folder import (
     CaptureFile,
     derive_name,
     open_folder,
@@ -20,6 +19,7 @@ from workers.store.capture_folder import (
     write_pose,
     write_view,
 )
+from workers.geometry.frames import pose, rotation_about
 
 K = Intrinsics(width=40, height=30, fx=35.5, fy=35.25, cx=20.25, cy=15.75)
 CAMERA = CaptureCamera(K, np.array([0.1, -0.05, 1e-3, 0, 0, 0, 0, 0]))

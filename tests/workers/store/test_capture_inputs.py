@@ -1,8 +1,7 @@
 import pytest
 
 from schemas.errors import CaptureError
-from workers.store.capture_inputs import digest_inputs, list_inputs
-from workers.store.capture_results import write_results
+from workers.capture.results import digest_inputs, list_inputs, write_results
 
 
 @pytest.fixture

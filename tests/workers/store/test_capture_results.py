@@ -5,15 +5,7 @@ import pytest
 import trimesh
 
 from schemas.errors import CaptureError
-from workers.store.capture_results import (
-    cloud_ply,
-    mesh_ply,
-    own_files,
-    read_cloud,
-    read_mesh,
-    read_record,
-    write_results,
-)
+from workers.capture.results import cloud_ply, mesh_ply, own_files, read_cloud, read_mesh, read_record, write_results
 
 RNG = np.random.default_rng(5)
 POINTS = RNG.normal(0, 0.1, (50, 3))
@@ -64,7 +56,7 @@ def test_a_run_that_was_cut_off_leaves_no_file_that_looks_given(tmp_path, monkey
             raise OSError("cut off")
         real(source, target)
 
-    monkeypatch.setattr("workers.store.capture_results.os.replace", fail)
+    monkeypatch.setattr("workers.capture.results.os.replace", fail)
     with pytest.raises(OSError, match="cut off"):
         write_results(tmp_path, {"a.png": b"1", "b.png": b"2", "c.png": b"3"}, {})
     assert own_files(tmp_path) == {"a.png"}

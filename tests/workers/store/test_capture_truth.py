@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from schemas.capture.view import CaptureTruth
+from schemas.capture import CaptureTruth
 from schemas.errors import CaptureError
-from schemas.job.sensor import Distortion
+from schemas.job.views import Distortion
+from workers.capture.folder import TrueObject, read_truth, write_true_mask, write_truth
 from workers.geometry.frames import pose, uniform_rotation
-from workers.store.capture_truth import TrueObject, read_truth, write_true_mask, write_truth
 
 
 def made_up(lens=None):

@@ -3,9 +3,8 @@ import itertools
 import pyarrow as pa
 import pytest
 
-from schemas.dataset.commit import CommitSummary
+from schemas.dataset.commit import LEDGER_SCHEMA, CommitSummary, join_rows, rows_of
 from schemas.dataset.layout import LEDGER_FILE, STAGING, commit_path, range_table_path
-from schemas.dataset.ledger import LEDGER_SCHEMA, join_rows, rows_of
 from schemas.dataset.tables import TABLES
 from schemas.errors import CorruptError, MachineError, RunError
 from tests.made_up_scenes import attempt_at, failed_scene, made_scene, scene, terms

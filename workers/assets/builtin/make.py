@@ -6,8 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from schemas.base import frozen_array
-from schemas.job.assets import ProceduralSource
-from schemas.job.category import TABLE
+from schemas.job.assets import TABLE, ProceduralSource
 from schemas.scene.shape import Asset, Lofted, Shape
 from workers.assets.builtin.bottle import make_bottle
 from workers.assets.builtin.box import make_box

@@ -10,9 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job.assets import FolderSource, MeshLimits, ShapeNetSource, UpAxis
-from schemas.job.category import TABLE
-from schemas.job.pattern import matches
+from schemas.job.assets import TABLE, FolderSource, MeshLimits, ShapeNetSource, UpAxis, matches
 from workers.assets.external.formats import list_mesh_files
 from workers.assets.external.urdf import find_mesh, mesh_names, parse_urdf
 

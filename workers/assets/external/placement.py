@@ -16,8 +16,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from schemas.base import Array, frozen_array
 from schemas.errors import MeshError
-from schemas.job.assets import Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
-from schemas.job.category import TABLE
+from schemas.job.assets import TABLE, Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
 from schemas.scene.shape import Asset, Hull
 from workers.assets.external.caps import MOST_NOTES, one_line
 from workers.assets.external.listing import Entry, check_unchanged, mesh_root

@@ -12,8 +12,7 @@ from pydantic import TypeAdapter
 from scipy.spatial import QhullError
 
 from schemas.errors import MeshError
-from schemas.job.assets import Assets, FolderSource, ShapeNetSource
-from schemas.job.category import TABLE
+from schemas.job.assets import TABLE, Assets, FolderSource, ShapeNetSource
 from schemas.scene.shape import Asset, Hull
 from workers.assets.external.answers import Answer
 from workers.assets.external.asset_bytes import pack_asset

@@ -19,8 +19,7 @@ from pathlib import Path
 
 from schemas.environment import cache_folder
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job.assets import Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
-from schemas.job.category import TABLE
+from schemas.job.assets import TABLE, Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
 from schemas.scene.shape import Asset
 from workers.assets import mass
 from workers.assets.external.asset_bytes import unpack_asset

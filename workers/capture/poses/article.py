@@ -10,11 +10,10 @@ import numpy as np
 from scipy.optimize import minimize
 
 from schemas.base import Array, Pose
-from schemas.capture.estimate import CaptureEstimate, DepthCorrection, ViewEstimate
-from workers.capture.poses.evidence import Evidence
-from workers.capture.poses.motion import cross_matrix, exponential, moved
+from schemas.capture import CaptureEstimate, DepthCorrection, ViewEstimate
+from workers.capture.poses.markers import cross_matrix, exponential, moved
 from workers.capture.poses.observation import Corners
-from workers.capture.poses.verdict import Judged, judge
+from workers.capture.poses.verdict import Evidence, Judged, judge
 
 MIN_CORNERS = 4
 SCALE_M = 0.02

@@ -1,20 +1,237 @@
-"""The joint problem of a capture: corners, the board's depth and the object's, each weighed by its measured noise."""
+"""The joint estimate: all views, corners and depth in one problem.
+
+- Pairs of patches of the object, seen in two views, that lie on one piece of its surface.
+- How noisy a capture's depth is, by its own residuals: the sigma of a patch, and how much alike the patches of a view
+  err.
+- Levenberg-Marquardt over the poses of all views and the shared parameters, by dense normal equations.
+- The joint problem of a capture: corners, the board's depth and the object's, each weighed by its measured noise.
+
+Errors of depth are alike over an image (the lens, the distance, the shutter). Hundreds of patches that err together
+know no more than a few; so the variance of a term is inflated by what the misfit of whole views says over that of
+independent patches.
+"""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, cholesky
+from scipy.spatial import cKDTree
 
 from schemas.base import Array
 from schemas.job.captures import Estimation
-from workers.capture.poses.matches import Matches, match_patches
-from workers.capture.poses.noise import inflation, patch_sigma, row_inflation
+from workers.capture.poses.markers import moved
 from workers.capture.poses.observation import Observation, Patches
-from workers.capture.poses.rows import POSE, SHARED
-from workers.capture.poses.shared import Shared, prior_sigma
-from workers.capture.poses.solve import Problem, Solution, Term, minimise
-from workers.capture.poses.terms import BoardTerm, CornerTerm, ObjectTerm
+from workers.capture.poses.terms import (
+    POSE,
+    SHARED,
+    BoardTerm,
+    CornerTerm,
+    ObjectTerm,
+    Rows,
+    Shared,
+    normal_equations,
+    prior_sigma,
+)
+
+REACH_M = 0.012
+"""Patches of one surface lie at most so far apart: about their own width."""
+MIN_COSINE = 0.87
+"""And their normals at most 30 degrees."""
+NEIGHBOURS = 10
+PARTNERS = 3
+"""Of the nearest patches of other views, so many are paired with each."""
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """pairs [N, 2]: indices of patches, of two views, the lower first; normal [N, 3]: unit, their mean, board axes."""
+
+    pairs: NDArray[np.int64]
+    normal: Array
+
+
+def placed(patches: Patches, view: NDArray[np.int64], poses: Array, shared: Shared) -> tuple[Array, Array]:
+    """(points [P, 3], normals [P, 3]) of patches in the board frame; the normal of depth that is stretched is kept."""
+    R, t = poses[view, :3, :3], poses[view, :3, 3]
+    points = np.einsum("pij,pj->pi", R, shared.corrected(patches)) + t
+    return points, np.einsum("pij,pj->pi", R, patches.normal @ shared.T_cam_depth[:3, :3].T)
+
+
+def match_patches(patches: Patches, view: NDArray[np.int64], poses: Array, shared: Shared) -> Matches:
+    """The pairs at the present poses, each once, in order of index."""
+    if len(patches) < 2:
+        return Matches(np.zeros((0, 2), np.int64), np.zeros((0, 3)))
+    points, normals = placed(patches, view, poses, shared)
+    count = min(NEIGHBOURS + 1, len(points))
+    distance, neighbour = cKDTree(points).query(points, k=count, distance_upper_bound=REACH_M)
+    found = np.isfinite(distance)
+    neighbour = np.where(found, neighbour, 0)
+    alike = np.einsum("pi,pki->pk", normals, normals[neighbour]) > MIN_COSINE
+    normals = _smoothed(normals, neighbour, found & alike)
+    alike = np.einsum("pi,pki->pk", normals, normals[neighbour]) > MIN_COSINE
+    good = found & alike & (view[neighbour] != view[:, None])
+    good &= np.cumsum(good, axis=1) <= PARTNERS
+    first, column = np.nonzero(good)
+    pairs = np.sort(np.stack([first, neighbour[first, column]], axis=1), axis=1).astype(np.int64)
+    pairs = np.unique(pairs, axis=0)
+    normal = normals[pairs[:, 0]] + normals[pairs[:, 1]]
+    return Matches(pairs, normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+def _smoothed(normals: Array, neighbour: NDArray[np.intp], chosen: NDArray[np.bool_]) -> Array:
+    """[P, 3]: the mean of the normals around each patch: the surface bends less over a patch than its noise."""
+    total = (normals[neighbour] * chosen[..., None]).sum(axis=1)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(length > 0.5, total / np.maximum(length, 1e-9), normals)
+
+
+MAD = 1.4826
+FLOOR_M = 2e-4
+"""No patch is taken to be better than this at 1 m: stored depth has a step of 1 mm, and its errors are not all seen."""
+FEW_VIEWS = 4
+INFLATION_OF_FEW = 30.0
+"""Inflation where fewer views than this can tell: about as if a view's patches erred as one."""
+VIEW_FLOOR_M = 5e-4
+"""All the patches of a view together are not taken to be better than this: errors of depth that change with place and
+distance, and that no correction of the capture has, do not average out. Good corners place a camera to 0.1 mm."""
+
+
+def patch_sigma(residual_m: Array, growth: Array) -> float:
+    """Sigma of a patch at 1 m, metres, from residuals [P] that grow as `growth` [P] (the distance squared)."""
+    return max(FLOOR_M, MAD * float(np.median(np.abs(residual_m / growth)))) if len(residual_m) else FLOOR_M
+
+
+def inflation(residual: Array, by_view: Array, view: NDArray[np.int64], pose_covariance: Array) -> float:
+    """How many times larger the variance of a term is than its patches' sigma says, at least 1.
+
+    residual [N] in sigma, by_view [N, k] derivatives by what a view's patches tell (k numbers), view [N] index;
+    pose_covariance [V, k, k]: what is not known of each view beforehand, which makes residuals too. The misfit of a view,
+    g^T H^-1 g, is k on average where the patches are independent; the median over the views resists a bad one. It is
+    squared: what errs alike within a view does so between views too, of which the misfit of single views shows nothing.
+    """
+    ratios = []
+    for number in np.unique(view):
+        J, r = by_view[view == number], residual[view == number]
+        strength, directions = np.linalg.eigh(J.T @ J)
+        kept = strength > 1e-6 * max(float(strength[-1]), 1e-12)
+        rank = int(kept.sum())
+        if len(r) < 2 * rank or not rank:
+            continue
+        weighted = 1.0 / (1.0 + (r / 3.0) ** 2)
+        along = directions[:, kept].T @ (J.T @ (weighted * r))
+        misfit = float((along**2 / strength[kept]).sum())
+        known = float(np.trace(J.T @ J @ pose_covariance[number]))
+        ratios.append((misfit - known) / (rank * _median_of_chi_square(rank)))
+    if len(ratios) < FEW_VIEWS:
+        return INFLATION_OF_FEW
+    return max(1.0, float(np.median(ratios))) ** 2
+
+
+def _median_of_chi_square(degrees: int) -> float:
+    """Median over mean of a chi-square distribution (Wilson and Hilferty 1931)."""
+    return (1 - 2 / (9 * degrees)) ** 3
+
+
+def row_inflation(factor: float, sigma_m: Array, *views: NDArray[np.int64]) -> Array:
+    """[N]: inflation of each row of sigma_m [N], at least `factor`, so that no view's rows come to less than VIEW_FLOOR_M."""
+    count = np.max([np.bincount(view)[view] for view in views], axis=0)
+    return np.maximum(factor, count * (VIEW_FLOOR_M / sigma_m) ** 2)
+
+
+SETTLED = 1e-7
+"""A step of fewer metres and radians ends the iteration: a tenth of a micrometre."""
+
+
+class Term(Protocol):
+    """Something that is measured."""
+
+    def rows(self, poses: Array, shared: Shared) -> Rows:
+        """Its residuals and derivatives at the poses [V, 4, 4]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The terms; prior [9] sigma of the shared parameters, 0 for those that are fixed; fixed [V] poses that do not move."""
+
+    terms: Sequence[Term]
+    prior: Array
+    fixed: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """poses [V, 4, 4], the shared parameters, and the covariance [D, D], D = 6 V + 9, zero where nothing moves."""
+
+    poses: Array
+    shared: Shared
+    matrix: Array
+    iterations: int
+    converged: bool
+
+    def covariance(self) -> Array:
+        """[D, D]: the inverse of the normal equations at the solution."""
+        free = np.diag(self.matrix) > 0
+        found = np.zeros_like(self.matrix)
+        upper = cholesky(_regular(self.matrix[np.ix_(free, free)]))
+        half = np.linalg.inv(upper)
+        found[np.ix_(free, free)] = half @ half.T
+        return found
+
+
+def minimise(problem: Problem, poses: Array, shared: Shared, most: int) -> Solution:
+    """The poses and shared parameters of least robust cost near a start, in at most `most` steps."""
+    damping, converged, iterations = 1e-6, False, 0
+    matrix, gradient, cost = _linearise(problem, poses, shared)
+    while iterations < most and not converged:
+        iterations += 1
+        step = _step(matrix, gradient, damping)
+        new_poses = np.stack(
+            [moved(T, motion) for T, motion in zip(poses, step[:-SHARED].reshape(-1, POSE), strict=True)]
+        )
+        new_shared = shared.moved(step[-SHARED:])
+        new_matrix, new_gradient, new_cost = _linearise(problem, new_poses, new_shared)
+        small = float(np.abs(step).max()) < SETTLED
+        if new_cost <= cost:
+            poses, shared, matrix, gradient, cost = new_poses, new_shared, new_matrix, new_gradient, new_cost
+            damping *= 0.1
+            converged = small
+        else:
+            damping = max(damping, 1e-6) * 10
+            converged = small or damping > 1e6
+    return Solution(poses, shared, matrix, iterations, converged)
+
+
+def _step(matrix: Array, gradient: Array, damping: float) -> Array:
+    free = np.diag(matrix) > 0
+    part = matrix[np.ix_(free, free)]
+    step = np.zeros(len(gradient))
+    step[free] = cho_solve(cho_factor(_regular(part + damping * np.diag(np.diag(part)))), -gradient[free])
+    return step
+
+
+def _regular(matrix: Array) -> Array:
+    """The matrix with so little on its diagonal that directions without any information (10 m or rad) can be factored."""
+    return matrix + 1e-2 * np.eye(len(matrix))
+
+
+def _linearise(problem: Problem, poses: Array, shared: Shared) -> tuple[Array, Array, float]:
+    """(matrix, gradient, cost); rows and columns of what is fixed are zero."""
+    rows = [term.rows(poses, shared) for term in problem.terms]
+    matrix, gradient = normal_equations(rows, len(poses))
+    free = problem.prior > 0
+    sigma = np.where(free, problem.prior, 1.0)
+    deviation = shared.deviation()
+    first = len(gradient) - SHARED
+    matrix[range(first, len(gradient)), range(first, len(gradient))] += 1.0 / sigma**2
+    gradient[first:] += deviation / sigma**2
+    held = np.concatenate([np.repeat(problem.fixed, POSE), ~free])
+    matrix[held], matrix[:, held], gradient[held] = 0.0, 0.0, 0.0
+    return matrix, gradient, sum(r.cost for r in rows) + float(((deviation / sigma)[free] ** 2).sum())
+
 
 ROUNDS = 4
 """How often the object's patches are paired anew."""

@@ -1,4 +1,8 @@
-"""What becomes of a view's pose: used, flagged or refused, with reasons that name the number measured."""
+"""Which views fit an estimate, by which evidence.
+
+- What the three estimates of a capture are made from.
+- What becomes of a view's pose: used, flagged or refused, with reasons that name the number measured.
+"""
 
 import math
 from dataclasses import dataclass
@@ -6,12 +10,42 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.base import Array, Pose
-from schemas.capture.estimate import DepthCorrection, ViewEstimate, ViewStatus
-from schemas.capture.view import CaptureCamera
-from workers.capture.poses.evidence import Evidence
-from workers.capture.poses.observation import Observation, Patches
-from workers.capture.poses.rays import pixels_of_points
+from schemas.capture import CaptureCamera, DepthCorrection, ViewEstimate, ViewStatus
+from schemas.job.captures import Board, Estimation
+from workers.capture.poses.markers import MarkerPose, measured_corner_px
+from workers.capture.poses.observation import Observation, Patches, Setup, pixels_of_points
 from workers.geometry.frames import transform
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The views of a capture in order of number, each with its pose from markers; corner_px: measured sigma of a corner."""
+
+    setup: Setup
+    observations: tuple[Observation, ...]
+    markers: tuple[MarkerPose, ...]
+    corner_px: float
+
+    @staticmethod
+    def of(setup: Setup, observations: list[Observation], markers: list[MarkerPose]) -> "Evidence":
+        """With the sigma of a corner measured over all views."""
+        return Evidence(setup, tuple(observations), tuple(markers), measured_corner_px(markers, setup.spec))
+
+    @property
+    def camera(self) -> CaptureCamera:
+        """The colour camera."""
+        return self.setup.camera
+
+    @property
+    def board(self) -> Board:
+        """The board as board.json has it."""
+        return self.setup.board
+
+    @property
+    def spec(self) -> Estimation:
+        """How poses are estimated."""
+        return self.setup.spec
+
 
 MAX_SIGMA_M = 0.005
 MAX_SIGMA_RAD = math.radians(1.0)

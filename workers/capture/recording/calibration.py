@@ -13,10 +13,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from schemas.base import Pose, frozen_array
-from schemas.capture.depth_camera import DepthCamera
-from schemas.capture.view import CaptureCamera
+from schemas.capture import CaptureCamera, DepthCamera
 from schemas.errors import CaptureError
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from workers.geometry.frames import invert, pose
 
 DEPTH_UNITS_PER_M = 1000.0

@@ -1,21 +1,138 @@
-"""The tracks of an Azure Kinect recording, read by PyAV.
+"""The tracks of an Azure Kinect recording, read by PyAV, and how much of it is there.
 
-The layout is that of Microsoft's description ("Azure Kinect record file format") and its SDK: tracks named COLOR and DEPTH or
-marked by the tags K4A_COLOR_TRACK and K4A_DEPTH_TRACK, time stamps in microseconds of the device's clock, depth as 16-bit
-big-endian millimetres (b16g), the factory calibration as an attachment.
+- How long a Matroska file says that it is, read from its first bytes: what a cut file has lost follows from it.
+- The images of a recording, from the bytes of their frames.
+
+Elements and their coding: RFC 8794 (EBML) and RFC 9559 (Matroska).
+
+The layout is that of Microsoft's description ("Azure Kinect record file format") and its SDK: tracks named COLOR and
+DEPTH or marked by the tags K4A_COLOR_TRACK and K4A_DEPTH_TRACK, time stamps in microseconds of the device's clock,
+depth as 16-bit big-endian millimetres (b16g), the factory calibration as an attachment.
 """
 
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import av
+import cv2
+import numpy as np
 from av.container import InputContainer
 from av.video.stream import VideoStream
+from numpy.typing import NDArray
 
 from schemas.errors import CaptureError
-from workers.capture.recording.extent import HEAD_BYTES, Extent, read_extent
-from workers.capture.recording.images import DEPTH_FORMAT, FORMATS
+
+HEAD_BYTES = 1 << 20
+"""As many bytes from the start hold what comes before the first frame."""
+
+_EBML, _SEGMENT, _INFO, _CLUSTER = 0x1A45DFA3, 0x18538067, 0x1549A966, 0x1F43B675
+_SCALE, _DURATION = 0x2AD7B1, 0x4489
+
+
+@dataclass(frozen=True)
+class Extent:
+    """The size of the whole file and the length of the recording, each None where the file does not say."""
+
+    size_bytes: int | None = None
+    duration_us: float | None = None
+
+
+def read_extent(head: bytes) -> Extent:
+    """Of a file that starts with `head`; all None for what is no Matroska file."""
+    elements = list(_elements(head, 0, 2))
+    if [identity for identity, _, _ in elements] != [_EBML, _SEGMENT]:
+        return Extent()
+    _, start, size = elements[1]
+    whole = start + size if size else None  # a recorder that was interrupted has left 0 or `unknown`
+    for identity, at, length in _elements(head, start):
+        if identity == _CLUSTER:
+            break
+        if identity == _INFO and length is not None:
+            return Extent(whole, _duration_us(head[: at + length], at))
+    return Extent(whole)
+
+
+def _duration_us(data: bytes, start: int) -> float | None:
+    """Of the element Info whose content begins at `start` and ends with the data."""
+    found = {identity: data[at : at + (length or 0)] for identity, at, length in _elements(data, start)}
+    scale = int.from_bytes(found.get(_SCALE, b""), "big") or 1_000_000
+    duration = found.get(_DURATION, b"")
+    if len(duration) not in (4, 8):
+        return None
+    return float(struct.unpack(">f" if len(duration) == 4 else ">d", duration)[0]) * scale / 1000.0
+
+
+def _elements(data: bytes, at: int, most: int = 10_000) -> list[tuple[int, int, int | None]]:
+    """(identity, where its content begins, its length or None for unknown) of elements side by side from `at` on."""
+    found: list[tuple[int, int, int | None]] = []
+    while at + 2 <= len(data) and len(found) < most:
+        width = 9 - data[at].bit_length()
+        after = at + width
+        if width > 4 or after >= len(data) or data[after] == 0:
+            break
+        wide = 9 - data[after].bit_length()
+        coded = int.from_bytes(data[after : after + wide], "big") & ((1 << 7 * wide) - 1)
+        length = None if coded == (1 << 7 * wide) - 1 else coded
+        found.append((int.from_bytes(data[at:after], "big"), after + wide, length))
+        if length is None:
+            break
+        at = after + wide + length
+    return found
+
+
+FORMATS = ("MJPG", "NV12", "YUY2", "BGRA")
+"""Of colour frames, by their four-character code."""
+
+DEPTH_FORMAT = "b16g"
+
+
+def is_whole(data: bytes, fourcc: str, size: tuple[int, int]) -> bool:
+    """Whether a frame has all its bytes; `size` is (width, height)."""
+    if fourcc == "MJPG":
+        return data[:2] == b"\xff\xd8" and data.rstrip(b"\0")[-2:] == b"\xff\xd9"
+    pixels = size[0] * size[1]
+    return (
+        len(data) == {"NV12": pixels * 3 // 2, "YUY2": pixels * 2, "BGRA": pixels * 4, DEPTH_FORMAT: pixels * 2}[fourcc]
+    )
+
+
+def decode_depth(data: bytes, size: tuple[int, int]) -> NDArray[np.uint16]:
+    """[h, w] uint16 of 16-bit big-endian pixels."""
+    return np.frombuffer(data, ">u2").reshape(size[1], size[0]).astype(np.uint16)
+
+
+def decode_color(data: bytes, fourcc: str, size: tuple[int, int]) -> NDArray[np.uint8] | None:
+    """[H, W, 3] uint8 sRGB, or None for bytes that cannot be read or have another size."""
+    if fourcc == "MJPG":
+        rgb = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+    elif fourcc == "NV12":
+        rgb = cv2.cvtColor(_pixels(data, (size[1] * 3 // 2, size[0])), cv2.COLOR_YUV2RGB_NV12)
+    elif fourcc == "YUY2":
+        rgb = cv2.cvtColor(_pixels(data, (size[1], size[0], 2)), cv2.COLOR_YUV2RGB_YUY2)
+    else:
+        rgb = cv2.cvtColor(_pixels(data, (size[1], size[0], 4)), cv2.COLOR_BGRA2RGB)
+    return None if rgb is None or rgb.shape != (size[1], size[0], 3) else np.asarray(rgb, np.uint8)
+
+
+def decode_gray(data: bytes, fourcc: str, size: tuple[int, int]) -> NDArray[np.uint8] | None:
+    """[H / 2, W / 2] uint8, fast: what sharpness and movement are measured on. None for bytes that cannot be read."""
+    if fourcc == "MJPG":
+        gray = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_2)
+        return None if gray is None else np.asarray(gray, np.uint8)
+    if fourcc == "NV12":
+        whole = _pixels(data, (size[1] * 3 // 2, size[0]))[: size[1]]
+    elif fourcc == "YUY2":
+        whole = np.ascontiguousarray(_pixels(data, (size[1], size[0], 2))[:, :, 0])
+    else:
+        whole = np.asarray(cv2.cvtColor(_pixels(data, (size[1], size[0], 4)), cv2.COLOR_BGRA2GRAY), np.uint8)
+    return np.asarray(cv2.resize(whole, (size[0] // 2, size[1] // 2), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _pixels(data: bytes, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    return np.frombuffer(data, np.uint8).reshape(shape)
+
 
 AS_RECORDED = "take the file as k4arecorder or the SDK wrote it"
 PLACES = "or export its frames as rgb_00000.png and depth_00000.png (registered to colour) with a camera.json"

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.scene.region import REGION_FLOOR
+from schemas.scene.shape import REGION_FLOOR
 from workers.geometry.colour import SRGB_STEPS, encode_srgb
 from workers.geometry.jit import compiled, compiled_for
 

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
-from schemas.scene.region import REGION_FIRST_OBJECT, REGION_FLOOR
 from schemas.scene.scene import Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
 from workers.geometry.frames import transform
 from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import bounds_of

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import MachineError
-from schemas.scene.appearance import Appearance
-from schemas.scene.camera import Intrinsics
+from schemas.scene.shape import Appearance
+from schemas.scene.view import Intrinsics
 from workers.geometry.colour import encode_srgb
 from workers.render.raster.draw_calls import Program
 from workers.render.raster.lit_shaders import MASK_FRAGMENT, MASK_VERTEX

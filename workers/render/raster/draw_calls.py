@@ -14,12 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
-from schemas.scene.appearance import Appearance
-from schemas.scene.camera import Intrinsics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.region import REGION_FLOOR, REGION_TABLE
-from schemas.scene.scene import Placed
-from schemas.scene.shape import Shape
+from schemas.scene.scene import EffectPlan, Placed
+from schemas.scene.shape import REGION_FLOOR, REGION_TABLE, Appearance, Shape
+from schemas.scene.view import Intrinsics
 from workers.geometry.frames import transform
 from workers.render.raster.batches import Cover, is_matte, seen_ranges, texture_of
 from workers.render.raster.buffers import Uploaded, UploadedShape

@@ -31,13 +31,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.job.render import Render
-from schemas.scene.appearance import Appearance
-from schemas.scene.camera import Camera, Intrinsics
-from schemas.scene.effects import EffectPlan
-from schemas.scene.region import REGION_FLOOR
-from schemas.scene.scene import Placed
-from schemas.scene.view import GBuffer
+from schemas.job.views import Render
+from schemas.scene.scene import EffectPlan, Placed
+from schemas.scene.shape import REGION_FLOOR, Appearance
+from schemas.scene.view import Camera, GBuffer, Intrinsics
 from workers.geometry.frames import invert
 from workers.geometry.pixels import fill_plane_depth
 from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_edges, smooth_edges

@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
-from schemas.scene.camera import Intrinsics
-from schemas.scene.region import REGION_FLOOR
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Shape
+from schemas.scene.shape import REGION_FLOOR, Shape
+from schemas.scene.view import Intrinsics
 from workers.geometry.camera import project_bounds
 from workers.geometry.colour import decode_srgb
 from workers.geometry.frames import transform

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Pose
-from schemas.scene.appearance import Appearance
-from schemas.scene.region import REGION_FLOOR
 from schemas.scene.scene import Placed
+from schemas.scene.shape import REGION_FLOOR, Appearance
 from workers.render.raster import baking
 from workers.render.raster.baking import SHADOW_PX, Box
 from workers.render.raster.buffers import ShapeStore

@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 import pytest
 
-from schemas.dataset.fingerprint import Fingerprint
-from workers.pipeline.fingerprint import take_fingerprint
+from schemas.dataset.shard import Fingerprint
 from workers.render.raster.gbuffer import shared_renderer
+from workers.shard.fingerprint import take_fingerprint
 
 
 @pytest.fixture(scope="package")

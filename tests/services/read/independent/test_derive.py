@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-import workers.cameras.placement
 import workers.geometry.camera
 import workers.geometry.pixels
 import workers.geometry.projection
-import workers.labels.patches
 import workers.render.tiers
-from schemas.scene.camera import Camera, Intrinsics
-from services.read.verify_independent import verify_independently
+import workers.scene.labels
+import workers.scene.pairs
+from schemas.scene.view import Camera, Intrinsics
+from services.read.audit import verify_independently
 from tests.datasets import faults_of, make_dataset
 from workers.geometry.frames import pose, rotation_about, translation
 
@@ -36,21 +36,21 @@ def mirrored_phi(plant: Plant, _: Any) -> None:
         turn = pose(tilt @ np.diag([-1.0, 1.0, -1.0]) @ tilt.T, np.zeros(3))
         return T_world_cam @ translation(0, 0, d_z_m) @ turn @ translation(0, 0, -T_z_m)
 
-    plant(workers.cameras.placement.mirror_pose, planted)
+    plant(workers.scene.pairs.mirror_pose, planted)
 
 
 def wrong_T_z(plant: Plant, _: Any) -> None:
-    original = workers.cameras.placement.mirror_pose
+    original = workers.scene.pairs.mirror_pose
     plant(original, lambda T, d_z_m, T_z_m=1.3, *up: original(T, d_z_m, T_z_m + 1e-3, *up))
 
 
 def nearest_for_percentile(plant: Plant, _: Any) -> None:
-    original = workers.cameras.placement.front_distance
+    original = workers.scene.pairs.front_distance
     plant(original, lambda z, own, mirror: original(z, own, mirror.model_copy(update={"pivot_depth": "nearest"})))
 
 
 def offset_with_the_other_sign(plant: Plant, _: Any) -> None:
-    original = workers.cameras.placement.place_aligned_camera
+    original = workers.scene.pairs.place_aligned_camera
 
     def planted(camera, depth_camera):
         return original(camera, depth_camera.model_copy(update={"offset_m": tuple(-x for x in depth_camera.offset_m)}))
@@ -144,7 +144,7 @@ def rounded_image_coordinates(plant: Plant, _: Any) -> None:
 
 
 def patch_a_pixel_too_far_left(plant: Plant, _: Any) -> None:
-    original = workers.labels.patches.crop_box
+    original = workers.scene.labels.crop_box
 
     def planted(*arguments):
         box = original(*arguments)

@@ -4,7 +4,7 @@ import copy
 
 import pytest
 
-from services.read.independent.forces import check_forces
+from services.read.independent.derive import check_forces
 
 JOB = {"physics": {"friction": 0.7, "exact_rest": True}, "captures": None}
 LOW, HIGH = 2.0 * 9.81, 1.0 * 9.81

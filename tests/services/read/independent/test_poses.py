@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-import workers.cameras.placement
-from services.read.verify_independent import verify_independently
+import workers.scene.pairs
+from services.read.audit import verify_independently
 from tests.captures import CAMERA, captures_job, exact_capture, use_exact_captures
 from tests.datasets import faults_of, run_here
+from workers.capture import make_capture
 from workers.geometry.frames import pose, rotation_about, translation
-from workers.pipeline.captures import make_capture
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +32,7 @@ def farther(T_world_cam, d_z_m, T_z_m=1.3, up=None):
 
 @pytest.mark.parametrize("planted", [level_turn, farther])
 def test_a_wrong_mirror_camera_of_a_rolled_photograph_is_found(plant, tmp_path, planted):
-    plant(workers.cameras.placement.mirror_pose, planted)
+    plant(workers.scene.pairs.mirror_pose, planted)
     store, _ = run_here(captures_job(scenes=1), tmp_path)
     assert faults_of(store) == []
     found = verify_independently(store, 1, lambda _: None)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import services.merge.tables
-from services.read.verify_independent import describe_independent, verify_independently
+from services.read.audit import describe_independent, verify_independently
 from tests.datasets import faults_of, make_dataset
 
 Plant = Callable[[Callable, Callable], None]

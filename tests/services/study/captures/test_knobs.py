@@ -1,7 +1,6 @@
 from schemas.job.captures import ESTIMATES, Captures, Simulate
 from schemas.job.job import Job
-from services.study.captures.knobs import capture_knobs
-from services.study.knobs import apply, knobs_of, settings_of
+from services.study.knobs import apply, capture_knobs, knobs_of, settings_of
 
 
 def test_every_value_makes_a_job_that_differs_from_the_jobs_own():

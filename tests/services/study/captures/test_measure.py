@@ -4,14 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from schemas.capture.processed import CaptureScore
+from schemas.capture import CaptureScore
 from schemas.job.job import Job
-from services.study.captures.measure import errors_of, fewer_views, measure_capture
+from services.study.captures import errors_of, fewer_views, measure_capture
 from services.study.model import Setting
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.captures.make_capture import simulate_one
-from workers.pipeline.context import open_worker
-from workers.store.capture_folder import open_folder
+from workers.capture.folder import open_folder
+from workers.capture.make_capture import simulate_one
+from workers.scene.context import open_worker
 
 pytestmark = pytest.mark.minute
 

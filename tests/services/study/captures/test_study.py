@@ -6,10 +6,10 @@ import pytest
 from schemas.errors import InputError
 from schemas.job.job import Job
 from services.run.progress import ProgressLine
-from services.study.captures import study
-from services.study.captures.study import check_captures, rows_of, run_capture_study
-from services.study.journal import Journal
+from services.study import captures as study
+from services.study.captures import check_captures, rows_of, run_capture_study
 from services.study.model import Plan, Setting, Sizes
+from services.study.study import Journal
 
 OWN, COARSE, HOPELESS = Setting(), Setting((("voxel", "0.006"),)), Setting((("views", "4"),))
 

@@ -5,19 +5,17 @@ from types import SimpleNamespace
 import numpy as np
 
 from schemas.base import Range, frozen_array
-from schemas.job.images import Images
-from schemas.scene.appearance import Appearance
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.job.views import Images
 from schemas.scene.scene import Placed, PosedScene
-from schemas.scene.view import Pair, View
+from schemas.scene.shape import Appearance
+from schemas.scene.view import Camera, Intrinsics, Pair, View
 from services.job.job_file import validate_job
-from services.study.measure.image_errors import measure_images
-from services.study.measure.truth import Truth
+from services.study.measure.images import Truth, measure_images
 from tests.effects.scenes import SMALL, context_of, merged
 from tests.kit.shapes import box, shape_of
 from workers.geometry.camera import look_at
-from workers.pipeline.make_scene import make_scene
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch
+from workers.scene.make_scene import make_scene
 
 UNITS = 5000.0
 WIDTH, HEIGHT, F = 160, 120, 500.0

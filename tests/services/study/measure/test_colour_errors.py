@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from schemas.base import frozen_array
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.view import Camera, Intrinsics
 from services.job.job_file import validate_job
-from services.study.measure import colour_errors
-from services.study.measure.colour_errors import (
+from services.study.measure import colour as colour_errors
+from services.study.measure.colour import (
     ColourTruth,
     Crop,
     colour_truth_missing,
@@ -22,8 +22,8 @@ from services.study.measure.colour_errors import (
 from tests.effects.scenes import SMALL, context_of, merged
 from workers.geometry.camera import look_at, project
 from workers.geometry.frames import invert, transform
-from workers.pipeline.make_scene import make_scene
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch
+from workers.scene.make_scene import make_scene
 
 HERE = importlib.util.find_spec("mitsuba") is not None
 traced = pytest.mark.skipif(not HERE, reason="Mitsuba is not installed: truth of colour goes untested")

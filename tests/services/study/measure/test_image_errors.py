@@ -5,8 +5,7 @@ import pytest
 import trimesh
 
 from schemas.scene.view import Agreement, View
-from services.study.measure.image_errors import measure_images
-from services.study.measure.truth import truth_of
+from services.study.measure.images import measure_images, truth_of
 from tests.effects.scenes import SMALL
 from tests.kit.shapes import box
 from tests.services.study.measure.label_views import (

@@ -17,8 +17,8 @@ from tests.services.study.measure.label_views import (
     thing,
     view,
 )
-from workers.cameras.placement import mirror_pose
 from workers.geometry.camera import look_at
+from workers.scene.pairs import mirror_pose
 
 
 def ball(radius=0.1, at=(0.0, 0.0)):

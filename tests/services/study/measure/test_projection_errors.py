@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from schemas.base import frozen_array
-from schemas.scene.camera import Camera, Intrinsics
+from schemas.scene.view import Camera, Intrinsics
 from tests.services.study.measure.label_views import (
     HEIGHT,
     TABLE_Z,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from services.study.measure.truth import Truth, truth_of
+from services.study.measure.images import Truth, truth_of
 from tests.kit.shapes import box
 from tests.services.study.measure.label_views import (
     HEIGHT,

@@ -4,10 +4,10 @@ from pathlib import Path
 
 from schemas.job.job import Job
 from services.study.knobs import apply, knobs_of, settings_of
-from services.study.measure import scene_images
-from services.study.measure.scene_images import measure_colour
+from services.study.measure import images as scene_images
+from services.study.measure.images import measure_colour
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.context import open_worker
+from workers.scene.context import open_worker
 
 
 def test_four_samples_are_nearer_to_smooth_edges_than_one_and_flat_light_has_no_edges_to_compare(monkeypatch):

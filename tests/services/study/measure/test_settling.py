@@ -10,7 +10,7 @@ from services.study.knobs import apply, knobs_of
 from services.study.measure.settling import REFERENCES, measure_settling
 from services.study.model import Setting
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.context import WorkerContext
+from workers.scene.context import WorkerContext
 
 
 def setting(name: str, **changes: object) -> Setting:

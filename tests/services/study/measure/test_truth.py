@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from schemas.scene.scene import Placed
-from services.study.measure.truth import Truth, truth_of
+from services.study.measure.images import Truth, truth_of
 from tests.kit.shapes import shape_of
 from tests.services.study.measure.label_views import (
     HEIGHT,

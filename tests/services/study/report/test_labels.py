@@ -5,8 +5,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.text import Annotation, Text
 
-from services.study.report.axes import new_picture, renderer_of
-from services.study.report.labels import Label, marker_boxes, place_labels
+from services.study.report.axes import Label, marker_boxes, new_picture, place_labels, renderer_of
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from services.study.answer import answer
+from services.study.choose import answer
 from services.study.model import Study
 from services.study.report.page import page_of, write_page
 from tests.made_up_studies import large_study, row, study

@@ -13,15 +13,14 @@ from matplotlib.text import Annotation, Text
 from PIL import Image
 
 from services.study.model import Row, Study
-from services.study.report.axes import plain_style, renderer_of
-from services.study.report.labels import marker_boxes
-from services.study.report.panel import panels_of
+from services.study.report.axes import marker_boxes, plain_style, renderer_of
 from services.study.report.plots import (
     draw_knob,
     draw_tradeoff,
     headline,
     knob_rows,
     moved_errors,
+    panels_of,
     single_knobs,
     write_plots,
 )

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from schemas.job.job import Job
-from schemas.job.render import Render
+from schemas.job.views import Render
 from tests.kit.shapes import asset_of, box, table
 from workers.assets.appearance import draw_appearance
-from workers.plan.effects import Facts, plan_effects, write_receipt
-from workers.plan.randomness import SceneChance, Stream
-from workers.plan.step import draw_scene
+from workers.scene.effects import Facts, plan_effects, write_receipt
+from workers.scene.plan import SceneChance, Stream, draw_scene
 
 BOX, TABLE = asset_of(box(0.1, 0.08, 0.2)), table()
 JOBS = {tier: Job.model_validate({"name": "t", "seed": 5, "render": {"tier": tier}}) for tier in ("flat", "raster")}

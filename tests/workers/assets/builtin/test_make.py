@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.job.assets import ProceduralSource
-from schemas.job.category import CATEGORIES
+from schemas.job.assets import CATEGORIES, ProceduralSource
 from tests.workers.assets.oracles import faulty_rays, support_margin, welded
 from workers.assets.builtin.identity import instance_id
 from workers.assets.builtin.make import GENERATORS, make_asset, make_model, shape_digest

@@ -14,7 +14,7 @@ from tests.workers.assets.oracles import CUBE, textured_cube, write
 from workers.assets.catalogue import list_source
 from workers.assets.external.listing import find_files, locate_folder
 from workers.assets.external.placement import load_entry
-from workers.pipeline.rows import asset_row
+from workers.scene.rows import asset_row
 
 LIMITS, ASSETS = MeshLimits(), Assets(density_kg_m3=600.0, shell_kg_m2=3.0)
 SHARED = Path(__file__).resolve().parents[5] / "shared" / "data" / "meshes"

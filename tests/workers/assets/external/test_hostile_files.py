@@ -14,8 +14,7 @@ from workers.assets.catalogue import open_catalogue
 from workers.assets.external import urdf as urdf_file
 from workers.assets.external.mesh import load_shape
 from workers.assets.external.urdf import load_urdf
-from workers.plan.randomness import SceneChance
-from workers.plan.step import draw_scene
+from workers.scene.plan import SceneChance, draw_scene
 
 PLY = """ply
 format ascii 1.0

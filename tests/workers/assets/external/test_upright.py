@@ -5,8 +5,7 @@ import pytest
 import trimesh
 from shapely import Polygon
 
-from schemas.job.assets import ProceduralSource
-from schemas.job.category import CATEGORIES, TABLE
+from schemas.job.assets import CATEGORIES, TABLE, ProceduralSource
 from tests.workers.assets.oracles import support_margin
 from workers.assets.builtin.make import make_asset
 from workers.assets.external.placement import UP_AXES, Upright, find_upright, measure_stand

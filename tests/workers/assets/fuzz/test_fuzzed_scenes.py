@@ -10,9 +10,8 @@ from tests.workers.assets.fuzz.test_fuzz import SEED
 from tests.workers.assets.oracles import write
 from workers.assets.catalogue import open_catalogue
 from workers.assets.external.verdicts import Verdicts
-from workers.pipeline.context import open_worker
-from workers.pipeline.run_shard import run_scene
-from workers.pipeline.stopwatch import Stopwatch
+from workers.scene.context import Stopwatch, open_worker
+from workers.shard.run_shard import run_scene
 
 
 def make_scenes(folder, mutants, scenes):

@@ -4,8 +4,7 @@ import pytest
 
 from schemas.job.captures import Board
 from tests.workers.capture.photographs import hand_held
-from workers.capture.board.frames import correction_in_board, frame_in_board, in_board
-from workers.capture.board.layout import marker_corners, open_dictionary
+from workers.capture.board.layout import correction_in_board, frame_in_board, in_board, marker_corners, open_dictionary
 from workers.geometry.frames import invert, pose, rotation_about, transform
 
 BOARD = Board(columns=4, rows=3)

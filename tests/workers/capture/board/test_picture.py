@@ -9,9 +9,8 @@ from PIL import Image
 
 from schemas.errors import InputError
 from schemas.job.captures import Board
-from workers.capture.board.layout import open_dictionary
-from workers.capture.board.picture import board_png, draw_board
-from workers.capture.board.print_layout import nominal
+from workers.capture.board.layout import nominal, open_dictionary
+from workers.capture.board.sheets import board_png, draw_board
 
 SMALL = Board(dictionary="DICT_6X6_250", columns=3, rows=4, marker_m=0.031, gap_m=0.011, width_m=0.2, first_id=17)
 

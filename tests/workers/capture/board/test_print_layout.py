@@ -5,7 +5,7 @@ import pytest
 
 from schemas.errors import InputError
 from schemas.job.captures import Board
-from workers.capture.board.print_layout import lay_out_print, marker_cells, nominal
+from workers.capture.board.layout import lay_out_print, marker_cells, nominal
 
 BOARD = Board()
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from schemas.job.captures import Board
-from workers.capture.board.print_layout import lay_out_print
+from workers.capture.board.layout import lay_out_print
 from workers.capture.board.sheets import A4_M, EDGE_M, OVERLAP_M, board_pdf, tile_sheet, tiled_pdf
 
 POINT_M = 0.0254 / 72

@@ -6,15 +6,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from schemas.base import Pose
-from schemas.capture.estimate import CaptureEstimate
-from schemas.capture.view import CaptureCamera, Detection
+from schemas.capture import CaptureCamera, CaptureEstimate, Detection
 from schemas.job.captures import Board, Estimation
 from tests.workers.capture.depths import DepthErrors, measured_depth
 from tests.workers.capture.photographs import HALF, KINECT, QUARTER, hand_held
 from tests.workers.capture.poses.scenes import errors, observe
-from workers.capture.poses.evidence import Evidence
 from workers.capture.poses.observation import Setup, no_patches
-from workers.capture.poses.observe import observe_view
+from workers.capture.poses.patches import observe_view
+from workers.capture.poses.verdict import Evidence
 
 CAMERA = CaptureCamera(QUARTER, np.zeros(8))
 """A quarter of the Kinect's size, with a quarter of its error of a corner: the same accuracy in little time."""

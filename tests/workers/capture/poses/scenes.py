@@ -6,15 +6,14 @@ import cv2
 import numpy as np
 
 from schemas.base import Pose
-from schemas.capture.view import CaptureCamera
+from schemas.capture import CaptureCamera
 from schemas.job.captures import Board, Estimation
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from tests.workers.capture.photographs import KINECT
 from workers.capture.board.layout import marker_corners
-from workers.capture.poses.evidence import Evidence
 from workers.capture.poses.markers import fit_markers
-from workers.capture.poses.observation import Corners, Observation, Setup
-from workers.capture.poses.rays import rays_of_pixels
+from workers.capture.poses.observation import Corners, Observation, Setup, rays_of_pixels
+from workers.capture.poses.verdict import Evidence
 from workers.geometry.frames import angle_between, invert
 
 PINHOLE = CaptureCamera(KINECT, np.zeros(8))

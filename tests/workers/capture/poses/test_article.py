@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from tests.workers.capture.photographs import hand_held
 from tests.workers.capture.poses.scenes import LENS, PINHOLE, errors, evidence_of, observe, with_corner_depth
 from workers.capture.poses.article import estimate_article, fit_article, loss, right_jacobian
-from workers.capture.poses.motion import moved
+from workers.capture.poses.markers import moved
 
 
 def lifted(corners):

@@ -3,7 +3,7 @@ import re
 
 from schemas.job.captures import Board, Estimation
 from tests.workers.capture.poses.captures import CORNER_PX, Virtual, make, replaced, without_depth
-from workers.capture.poses.from_joint import estimate_joint
+from workers.capture.poses.estimates import estimate_joint
 
 SMALL = Virtual(views=6)
 _, EVIDENCE = make(SMALL)

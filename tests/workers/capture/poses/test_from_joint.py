@@ -5,11 +5,9 @@ import pytest
 
 from tests.workers.capture.poses.captures import FINER, Virtual, make, median_errors, replaced, without_depth
 from tests.workers.capture.poses.scenes import errors
-from workers.capture.poses.evidence import Evidence
-from workers.capture.poses.from_joint import estimate_joint
-from workers.capture.poses.from_markers import estimate_markers
-from workers.capture.poses.markers import fit_markers
-from workers.capture.poses.motion import moved
+from workers.capture.poses.estimates import estimate_joint, estimate_markers
+from workers.capture.poses.markers import fit_markers, moved
+from workers.capture.poses.verdict import Evidence
 
 QUICK = Virtual(views=10, camera=FINER)
 TRUTH, EVIDENCE = make(QUICK)

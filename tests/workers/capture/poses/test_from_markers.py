@@ -3,7 +3,7 @@ import pytest
 
 from tests.workers.capture.photographs import hand_held
 from tests.workers.capture.poses.scenes import errors, evidence_of, observe
-from workers.capture.poses.from_markers import estimate_markers
+from workers.capture.poses.estimates import estimate_markers
 
 
 def estimate(views):

@@ -6,8 +6,7 @@ import pytest
 from tests.workers.capture.depths import DepthErrors
 from tests.workers.capture.poses.captures import Virtual, make, median_errors, replaced
 from workers.capture.poses.article import estimate_article
-from workers.capture.poses.from_joint import estimate_joint
-from workers.capture.poses.from_markers import estimate_markers
+from workers.capture.poses.estimates import estimate_joint, estimate_markers
 from workers.capture.poses.joint import gather
 from workers.capture.poses.observation import no_patches
 

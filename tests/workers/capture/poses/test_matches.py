@@ -2,10 +2,9 @@ import numpy as np
 
 from tests.workers.capture.depths import BOX
 from tests.workers.capture.poses.captures import FINER, Virtual, make
-from workers.capture.poses.joint import gather
-from workers.capture.poses.matches import REACH_M, match_patches, placed
+from workers.capture.poses.joint import REACH_M, gather, match_patches, placed
 from workers.capture.poses.observation import no_patches
-from workers.capture.poses.shared import Shared
+from workers.capture.poses.terms import Shared
 
 TRUTH, EVIDENCE = make(Virtual(views=6, camera=FINER))
 PATCHES, VIEW = gather([o.object_patches for o in EVIDENCE.observations])

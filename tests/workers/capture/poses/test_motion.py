@@ -3,7 +3,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from workers.capture.poses.motion import cross_matrix, exponential, logarithm, moved
+from workers.capture.poses.markers import cross_matrix, exponential, logarithm, moved
 from workers.geometry.frames import pose
 
 

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from tests.workers.capture.poses.captures import FINER, Virtual, make
+from workers.capture.poses.estimates import moved_after
 from workers.capture.poses.joint import gather
-from workers.capture.poses.moved import moved_after
 from workers.capture.poses.observation import no_patches
-from workers.capture.poses.shared import Shared
+from workers.capture.poses.terms import Shared
 from workers.geometry.frames import translation
 
 TRUTH, EVIDENCE = make(Virtual(views=14, camera=FINER))

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from workers.capture.poses.noise import FLOOR_M, INFLATION_OF_FEW, VIEW_FLOOR_M, inflation, patch_sigma, row_inflation
+from workers.capture.poses.joint import FLOOR_M, INFLATION_OF_FEW, VIEW_FLOOR_M, inflation, patch_sigma, row_inflation
 
 V, N = 40, 60
 VIEW = np.repeat(np.arange(V), N)

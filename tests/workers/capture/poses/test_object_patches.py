@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
-from schemas.capture.view import CaptureCamera
+from schemas.capture import CaptureCamera
 from schemas.job.captures import Board, Estimation
 from tests.workers.capture.depths import BOX, DepthErrors, measured_depth
 from tests.workers.capture.photographs import HALF, hand_held
-from workers.capture.poses.object_patches import MOST, object_patches
 from workers.capture.poses.observation import Setup, no_patches
+from workers.capture.poses.patches import MOST, object_patches
 from workers.geometry.frames import transform
 
 SETUP = Setup(CaptureCamera(HALF, np.zeros(8)), Board(), Estimation())

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from schemas.capture.view import CaptureCamera, Detection
+from schemas.capture import CaptureCamera, Detection
 from schemas.job.captures import Board
 from tests.workers.capture.photographs import KINECT, hand_held
 from tests.workers.capture.poses.scenes import PINHOLE, project

@@ -1,12 +1,12 @@
 import numpy as np
 
-from schemas.capture.view import Detection
+from schemas.capture import Detection
 from schemas.job.captures import Board, Estimation
 from tests.workers.capture.photographs import hand_held
 from tests.workers.capture.poses.captures import CAMERA, Virtual, one_view
 from tests.workers.capture.poses.scenes import errors
 from workers.capture.poses.observation import Setup
-from workers.capture.poses.observe import observe_view
+from workers.capture.poses.patches import observe_view
 
 SETUP = Setup(CAMERA, Board(), Estimation())
 

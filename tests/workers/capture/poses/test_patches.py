@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from schemas.capture.view import CaptureCamera, Detection
+from schemas.capture import CaptureCamera, Detection
 from schemas.job.captures import Board
 from tests.workers.capture.depths import DepthErrors, measured_depth
 from tests.workers.capture.photographs import HALF, hand_held

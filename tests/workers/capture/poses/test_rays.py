@@ -3,7 +3,7 @@ import pytest
 
 from tests.workers.capture.photographs import KINECT, hand_held
 from tests.workers.capture.poses.scenes import LENS, PINHOLE, project
-from workers.capture.poses.rays import opencv_matrix, pixels_of_points, rays_of_pixels
+from workers.capture.poses.observation import opencv_matrix, pixels_of_points, rays_of_pixels
 from workers.geometry.frames import invert, transform
 
 

@@ -3,8 +3,7 @@ import pytest
 
 from tests.workers.capture.photographs import hand_held
 from tests.workers.capture.poses.scenes import LENS, errors, observe
-from workers.capture.poses.motion import moved
-from workers.capture.poses.reprojection import FAR, fit_pose, residuals_of, spread
+from workers.capture.poses.markers import FAR, fit_pose, moved, residuals_of, spread
 
 FOCAL = np.array([912.37, 912.25])
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from workers.capture.poses.rows import Rows, normal_equations
+from workers.capture.poses.terms import Rows, normal_equations
 
 V, N = 4, 60
 

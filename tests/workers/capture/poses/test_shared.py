@@ -3,7 +3,7 @@ import pytest
 
 from schemas.job.captures import Estimation
 from workers.capture.poses.observation import Patches
-from workers.capture.poses.shared import NAMES, Shared, identified, prior_sigma
+from workers.capture.poses.terms import NAMES, Shared, identified, prior_sigma
 
 RNG = np.random.default_rng(0)
 RAY = np.column_stack([RNG.uniform(-0.3, 0.3, (9, 2)), np.ones(9)])

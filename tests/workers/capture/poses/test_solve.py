@@ -4,10 +4,9 @@ import pytest
 from schemas.job.captures import Estimation
 from tests.workers.capture.photographs import hand_held
 from tests.workers.capture.poses.scenes import PINHOLE, errors, observe
-from workers.capture.poses.motion import logarithm, moved
-from workers.capture.poses.shared import NAMES, Shared, prior_sigma
-from workers.capture.poses.solve import Problem, minimise
-from workers.capture.poses.terms import CornerTerm
+from workers.capture.poses.joint import Problem, minimise
+from workers.capture.poses.markers import logarithm, moved
+from workers.capture.poses.terms import NAMES, CornerTerm, Shared, prior_sigma
 
 FOCAL = np.array([PINHOLE.intrinsics.fx, PINHOLE.intrinsics.fy])
 

@@ -2,10 +2,9 @@ import numpy as np
 import pytest
 
 from tests.workers.capture.photographs import hand_held
-from workers.capture.poses.motion import moved
+from workers.capture.poses.markers import moved
 from workers.capture.poses.observation import Patches
-from workers.capture.poses.shared import NAMES, Shared
-from workers.capture.poses.terms import BoardTerm, CornerTerm, ObjectTerm, robust
+from workers.capture.poses.terms import NAMES, BoardTerm, CornerTerm, ObjectTerm, Shared, robust
 
 RNG = np.random.default_rng(0)
 POSES = np.stack(hand_held(RNG, 3))

@@ -3,10 +3,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from schemas.capture.estimate import DepthCorrection
+from schemas.capture import DepthCorrection
 from tests.workers.capture.photographs import hand_held
 from tests.workers.capture.poses.scenes import evidence_of, observe
-from workers.capture.poses.motion import moved
+from workers.capture.poses.markers import moved
 from workers.capture.poses.observation import Patches
 from workers.capture.poses.verdict import Judged, corrected_points, judge
 from workers.geometry.frames import invert, transform, translation

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from schemas.job.captures import Board
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from tests.workers.capture.recording.matroska import Track, write_recording
 from tests.workers.geometry.made_up_kinect import (
     COLOR_LENS,
@@ -21,7 +21,7 @@ from tests.workers.geometry.made_up_kinect import (
     opencv_rays,
     sphere_depth,
 )
-from workers.capture.board.picture import draw_board
+from workers.capture.board.sheets import draw_board
 from workers.geometry.camera import look_at
 
 COLOR = Intrinsics(width=1280, height=720, fx=608.2, fy=607.9, cx=641.3, cy=365.9)

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from tests.workers.capture.recording.matroska import Track, element, write_recording
-from workers.capture.recording.extent import Extent, read_extent
+from workers.capture.recording.tracks import Extent, read_extent
 
 FRAMES = [(i * 33_333, bytes(100)) for i in range(10)]
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tests.workers.capture.recording.made_up_recording import color_bytes
-from workers.capture.recording.images import FORMATS, decode_color, decode_depth, decode_gray, is_whole
+from workers.capture.recording.tracks import FORMATS, decode_color, decode_depth, decode_gray, is_whole
 
 SIZE = (64, 48)
 SMOOTH = cv2.resize(np.random.default_rng(5).integers(60, 200, (3, 4, 3)).astype(np.uint8), SIZE)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from workers.capture.recording.extent import Extent
-from workers.capture.recording.pairs import Losses, count_losses, describe_losses, pair_frames
+from workers.capture.recording.choose import Losses, count_losses, describe_losses, pair_frames
+from workers.capture.recording.tracks import Extent
 
 PERIOD = 33_333.0
 COLOR = (np.arange(10) * PERIOD).astype(np.int64)

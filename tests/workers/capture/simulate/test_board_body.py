@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 from schemas.job.captures import Board
-from workers.capture.simulate.board_body import THICKNESS_M, board_body, marker_bits
+from workers.capture.simulate.photograph import THICKNESS_M, board_body, marker_bits
 
 
 def ink_at(shape, points):

@@ -6,7 +6,7 @@ from shapely import Polygon
 
 from schemas.job.captures import Board, HiddenMarkers
 from workers.capture.board.layout import marker_corners
-from workers.capture.simulate.cover import HEIGHT_M, cover_markers
+from workers.capture.simulate.camera import HEIGHT_M, cover_markers
 
 MARKERS = [Polygon(corners[:, :2]) for corners in marker_corners(Board())]
 

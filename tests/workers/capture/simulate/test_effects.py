@@ -3,7 +3,7 @@
 import pytest
 
 from schemas.job.captures import Simulate
-from workers.capture.simulate.effects import ASKED, plan_effects, planned_settings
+from workers.capture.simulate.simulate import ASKED, plan_effects, planned_settings
 
 EMPTY = {"print_scale": 1.02}
 """Settings that are numbers; the others are branches with defaults."""

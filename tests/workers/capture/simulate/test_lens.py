@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from schemas.errors import CaptureError
-from schemas.job.sensor import Distortion
-from workers.capture.simulate.lens import add_bent_light, nearest_pixels, opencv_lens, pinhole_lookup
-from workers.capture.simulate.rig import make_rig
+from schemas.job.views import Distortion
+from workers.capture.simulate.camera import add_bent_light, nearest_pixels, opencv_lens, pinhole_lookup
+from workers.capture.simulate.photograph import make_rig
 
 BARREL = Distortion(k1=-0.12, k2=0.05, p1=0.001, p2=-0.0007, k3=-0.01)
 PINCUSHION = Distortion(k1=0.08, k2=-0.05, p1=0.0005, p2=-0.0004, k3=0.02)

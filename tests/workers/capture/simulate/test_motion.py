@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from schemas.job.captures import MotionBlur
-from workers.capture.simulate.motion import AT_REST, draw_motion, pose_at
+from workers.capture.simulate.camera import AT_REST, draw_motion, pose_at
 from workers.geometry.frames import angle_between, pose, uniform_rotation
 
 BLUR = MotionBlur(exposure_s=0.02, speed_m_s=0.3, turn_deg_s=10.0)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from schemas.job.captures import KinectDepthNoise
-from schemas.scene.camera import Camera
-from workers.capture.simulate.noise import kinect_noise
-from workers.capture.simulate.rig import make_rig
-from workers.sensor.depth import sense_depth
+from schemas.scene.view import Camera
+from workers.capture.simulate.camera import kinect_noise
+from workers.capture.simulate.photograph import make_rig
+from workers.scene.sensor import sense_depth
 
 
 def measured(spec, z, seed=1):

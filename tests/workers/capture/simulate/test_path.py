@@ -7,7 +7,7 @@ import pytest
 
 from schemas.base import Range
 from schemas.job.captures import Simulate
-from workers.capture.simulate.path import plan_path
+from workers.capture.simulate.simulate import plan_path
 
 TARGET = np.array([0.0, 0.0, 0.1])
 SEEDS = range(20)

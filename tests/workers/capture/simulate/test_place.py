@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from schemas.job.assets import ProceduralSource
+from schemas.job.assets import CATEGORIES, ProceduralSource
 from schemas.job.captures import Board, Simulate
-from schemas.job.category import CATEGORIES
 from workers.assets.builtin.make import make_asset
 from workers.capture.board.layout import marker_corners
-from workers.capture.simulate.place import place_object, true_board
+from workers.capture.simulate.photograph import place_object, true_board
 from workers.geometry.frames import transform
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from schemas.job.captures import RegistrationError
-from workers.capture.simulate.rig import COLOR, assumed_device, make_rig
+from workers.capture.simulate.photograph import COLOR, assumed_device, make_rig
 from workers.geometry.frames import transform
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from schemas.scene.camera import Intrinsics
-from workers.capture.simulate.sampling import SAMPLES, add_light, light_table, make_samples, shift_camera
+from schemas.scene.view import Intrinsics
+from workers.capture.simulate.camera import SAMPLES, add_light, light_table, make_samples, shift_camera
 from workers.geometry.colour import decode_srgb
 
 

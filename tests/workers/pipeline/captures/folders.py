@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from schemas.base import Pose
-from schemas.capture.view import CaptureCamera, CapturedView
+from schemas.capture import CaptureCamera, CapturedView
 from schemas.job.captures import Board
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
 from tests.workers.capture.depths import DepthErrors, measured_depth, on_object
 from tests.workers.capture.photographs import HALF, hand_held, photograph, printed
-from workers.store.capture_folder import CaptureFile, write_description, write_view
+from workers.capture.folder import CaptureFile, write_description, write_view
 
 QUIET = DepthErrors(sigma_m=0.002)
 

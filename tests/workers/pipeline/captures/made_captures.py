@@ -5,20 +5,17 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from schemas.capture.view import CaptureCamera, CaptureTruth
+from schemas.capture import CaptureCamera, CaptureTruth
 from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Board, Simulate
-from schemas.scene.region import REGION_FIRST_OBJECT
 from schemas.scene.scene import Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT
 from workers.assets.builtin.make import make_asset
-from workers.capture.simulate.effects import plan_effects
-from workers.capture.simulate.lens import opencv_lens
-from workers.capture.simulate.path import plan_path
-from workers.capture.simulate.place import place_object
-from workers.pipeline.captures.photograph import build_studio, photograph
-from workers.pipeline.captures.simulate import simulate_capture
-from workers.plan.randomness import SceneChance, Stream
-from workers.store.capture_folder import CaptureFolder, open_folder
+from workers.capture.folder import CaptureFolder, open_folder
+from workers.capture.simulate.camera import opencv_lens
+from workers.capture.simulate.photograph import build_studio, photograph, place_object
+from workers.capture.simulate.simulate import plan_effects, plan_path, simulate_capture
+from workers.scene.plan import SceneChance, Stream
 
 KEPT = tempfile.TemporaryDirectory(prefix="verso-captures-")
 

@@ -5,15 +5,14 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from schemas.capture.estimate import CaptureEstimate, DepthCorrection, Estimates, ViewEstimate
+from schemas.capture import CaptureEstimate, DepthCorrection, Estimates, ViewEstimate
 from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Board, Captures, Estimation, KinectDepthNoise, Simulate
 from workers.assets.builtin.make import make_asset
-from workers.pipeline.captures.process import ProcessedFolder, process_folder
-from workers.pipeline.captures.simulate import simulate_capture
-from workers.plan.randomness import SceneChance
-from workers.store.capture_folder import open_folder
-from workers.store.capture_truth import read_truth
+from workers.capture.folder import open_folder, read_truth
+from workers.capture.process import ProcessedFolder, process_folder
+from workers.capture.simulate.simulate import simulate_capture
+from workers.scene.plan import SceneChance
 
 VIEWS = 10
 CAPTURES = Captures(estimation=Estimation(compare=True))

@@ -11,24 +11,20 @@ import numpy as np
 import pytest
 
 from schemas.base import frozen_array
-from schemas.capture.estimate import Estimates
+from schemas.capture import Estimates
 from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Board, Captures, KinectDepthNoise, RegistrationError, Simulate
-from schemas.job.sensor import RgbNoise
-from schemas.scene.region import REGION_FIRST_OBJECT
+from schemas.job.views import RgbNoise
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Asset
+from schemas.scene.shape import REGION_FIRST_OBJECT, Asset
 from workers.assets.builtin.make import make_asset
-from workers.capture.evaluate import compare_poses
-from workers.capture.simulate.effects import plan_effects
-from workers.capture.simulate.place import place_object
-from workers.pipeline.captures.photograph import DEPTH_UNITS_PER_M, build_studio, measure_depth
-from workers.pipeline.captures.process_capture import process_capture
-from workers.pipeline.captures.processor_clock import ProcessorClock
-from workers.pipeline.captures.simulate import simulate_capture
-from workers.plan.randomness import SceneChance, Stream
-from workers.store.capture_folder import open_folder
-from workers.store.capture_truth import read_truth
+from workers.capture.estimate import ProcessorClock
+from workers.capture.folder import open_folder, read_truth
+from workers.capture.make_capture import process_capture
+from workers.capture.simulate.photograph import DEPTH_UNITS_PER_M, build_studio, measure_depth, place_object
+from workers.capture.simulate.simulate import plan_effects, simulate_capture
+from workers.capture.surface.evaluate import compare_poses
+from workers.scene.plan import SceneChance, Stream
 from workers.store.images import encode_png
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]

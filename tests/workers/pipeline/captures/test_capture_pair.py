@@ -1,16 +1,16 @@
 import numpy as np
 import pytest
 
-from schemas.capture.processed import PosedImages
+from schemas.capture import PosedImages
 from schemas.errors import ViewError
 from schemas.job.assets import Assets
 from tests.captures import captures_job, exact_capture
 from workers.assets.captured import CaptureNames, board_asset, reconstructed_asset
+from workers.capture.make_capture import image_effects
+from workers.capture.rows import CapturedObject, CapturedPair, make_capture_pair
 from workers.geometry.camera import project
 from workers.geometry.frames import invert, transform
 from workers.geometry.projection import Bounds, Seen, compare_covisible
-from workers.pipeline.captures.capture_pair import CapturedObject, CapturedPair, make_capture_pair
-from workers.pipeline.captures.make_capture import image_effects
 from workers.render.raster.gbuffer import shared_renderer
 
 JOB = captures_job(cameras={"mirror": {"T_z_m": 0.6}})

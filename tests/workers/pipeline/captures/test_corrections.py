@@ -7,10 +7,10 @@ import pytest
 
 from schemas.errors import CaptureError
 from tests.workers.pipeline.captures.small_capture import copy_of, made, processed, true_estimates
+from workers.capture.folder import open_folder, pose_text, read_pose, write_pose
+from workers.capture.reconstruct import MANUAL, Given, correct_manually, corrections_of, given_files
+from workers.capture.results import write_results
 from workers.geometry.frames import invert, pose, rotation_about, translation
-from workers.pipeline.captures.corrections import MANUAL, Given, correct_manually, corrections_of, given_files
-from workers.store.capture_folder import open_folder, pose_text, read_pose, write_pose
-from workers.store.capture_results import write_results
 
 A = pose(rotation_about(np.array([0.0, 0.6, 0.8]), 0.3), np.array([0.1, 0.2, 0.3]))
 B = pose(np.eye(3), np.array([0.001, 0, 0]))

@@ -8,12 +8,12 @@ from schemas.errors import CaptureError
 from schemas.job.captures import Board, Estimation
 from tests.workers.capture.poses.scenes import errors
 from tests.workers.pipeline.captures.folders import write_capture
-from workers.capture.board.frames import frame_in_board
+from workers.capture.board.layout import frame_in_board
+from workers.capture.estimate import estimate_poses
+from workers.capture.folder import open_folder, pose_text, write_pose
+from workers.capture.reconstruct import given_files
+from workers.capture.results import write_results
 from workers.geometry.frames import invert, pose, rotation_about
-from workers.pipeline.captures.corrections import given_files
-from workers.pipeline.captures.estimate import estimate_poses
-from workers.store.capture_folder import open_folder, pose_text, write_pose
-from workers.store.capture_results import write_results
 
 
 @pytest.fixture(scope="module")

@@ -4,11 +4,10 @@ import dataclasses
 
 from schemas.job.captures import Captures, Estimation, Fusion
 from tests.workers.pipeline.captures.small_capture import copy_of, made, true_estimates
+from workers.capture.estimate import ProcessorClock, estimate_surface, with_notes
+from workers.capture.folder import open_folder, write_pose
+from workers.capture.reconstruct import MANUAL, given_files
 from workers.geometry.frames import translation
-from workers.pipeline.captures.corrections import MANUAL, given_files
-from workers.pipeline.captures.estimate_surface import estimate_surface, with_notes
-from workers.pipeline.captures.processor_clock import ProcessorClock
-from workers.store.capture_folder import open_folder, write_pose
 
 QUICK = Captures(estimation=Estimation(estimate="markers", compare=False), fusion=Fusion(voxel_m=0.004))
 

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.scene.camera import Camera
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Part, Shape
+from schemas.scene.view import Camera
 from tests.workers.pipeline.captures.edge_corners import corner_errors
 from tests.workers.pipeline.captures.made_captures import made
+from workers.capture.folder import open_folder, read_pose, read_view
+from workers.capture.simulate.simulate import VIEWS
 from workers.geometry.raycast import cast_view
-from workers.pipeline.captures.held_out import VIEWS
-from workers.store.capture_folder import open_folder, read_pose, read_view
 
 SMALL = {"views": 2, "image_scale": 0.25}
 EFFECTS = {"depth_noise": {}, "rgb_noise": {}, "distortion": {"k1": 0.08}, "exposure": {}, "motion_blur": {}}

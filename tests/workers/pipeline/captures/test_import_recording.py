@@ -24,8 +24,8 @@ from tests.workers.capture.recording.made_up_recording import (
 )
 from tests.workers.capture.recording.matroska import write_recording
 from workers.capture.board.layout import marker_corners, open_dictionary
-from workers.pipeline.captures.import_recording import Imported, import_recording
-from workers.store.capture_folder import CaptureFile, CaptureFolder, open_folder, read_view
+from workers.capture.folder import CaptureFile, CaptureFolder, open_folder, read_view
+from workers.capture.recording.import_recording import Imported, import_recording
 
 ABOUT = CaptureFile(name="made-up", category="ball")
 COUNT = 4

@@ -5,7 +5,7 @@ import pytest
 from schemas.errors import AssetSourceError
 from schemas.job.job import Job
 from workers.assets.catalogue import open_catalogue
-from workers.pipeline.captures.listing import open_sources
+from workers.capture.results import open_sources
 
 
 def job_of(*folders: str) -> Job:

@@ -8,11 +8,10 @@ from schemas.errors import CaptureError
 from schemas.job.job import Job
 from schemas.scene.scene import SceneOutput
 from tests.captures import captures_job, exact_capture, use_exact_captures, write_folder
-from workers.pipeline.captures import make_capture
-from workers.pipeline.captures.listing import open_sources
-from workers.pipeline.captures.make_capture import image_effects, run_capture
-from workers.pipeline.context import open_worker
-from workers.pipeline.stopwatch import Stopwatch
+from workers.capture import make_capture
+from workers.capture.make_capture import image_effects, run_capture
+from workers.capture.results import open_sources
+from workers.scene.context import Stopwatch, open_worker
 from workers.store.images import decode_png
 from workers.store.manifest import check_files, table_of_rows
 

@@ -9,10 +9,10 @@ from schemas.job.captures import Board
 from tests.workers.pipeline.captures.edge_corners import corner_errors, grey, project_opencv
 from tests.workers.pipeline.captures.made_captures import made, take_one
 from workers.capture.board.layout import marker_corners
-from workers.capture.simulate.noise import AXIAL_M, AXIAL_PER_M, OFFSET_M, OFFSET_SHARE
+from workers.capture.folder import read_view
+from workers.capture.simulate.camera import AXIAL_M, AXIAL_PER_M, OFFSET_M, OFFSET_SHARE
 from workers.geometry.colour import decode_codes
 from workers.geometry.frames import invert, transform
-from workers.store.capture_folder import read_view
 
 NEAR = {"views": 1, "image_scale": 0.5, "distance_m": [0.4, 0.45]}
 SMALL = {"views": 2, "image_scale": 0.25}

@@ -6,12 +6,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from schemas.capture.estimate import CaptureEstimate, Estimates, ViewEstimate
-from schemas.capture.view import CaptureCamera
+from schemas.capture import CaptureCamera, CaptureEstimate, Estimates, ViewEstimate
 from schemas.dataset.tables import SCHEMAS
-from schemas.scene.camera import Intrinsics
+from schemas.scene.view import Intrinsics
+from workers.capture.process import SCHEMA, pose_table
 from workers.geometry.frames import translation
-from workers.pipeline.captures.pose_table import SCHEMA, pose_table
 
 CAMERA = CaptureCamera(Intrinsics(width=1920, height=1080, fx=912.0, fy=911.0, cx=961.9, cy=548.8), np.zeros(8))
 

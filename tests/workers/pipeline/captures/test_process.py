@@ -9,11 +9,10 @@ import pytest
 
 from schemas.errors import CaptureError
 from tests.workers.pipeline.captures.small_capture import CAPTURES, VIEWS, copy_of, made, processed
+from workers.capture.folder import read_pose, read_truth, write_pose
+from workers.capture.process import process_folder
+from workers.capture.results import read_cloud
 from workers.geometry.frames import translation
-from workers.pipeline.captures.process import process_folder
-from workers.store.capture_folder import read_pose, write_pose
-from workers.store.capture_results import read_cloud
-from workers.store.capture_truth import read_truth
 
 
 def results(path):

@@ -5,17 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.capture.estimate import DepthCorrection
+from schemas.capture import DepthCorrection
 from schemas.job.assets import ProceduralSource
 from schemas.job.captures import Board, Captures, Estimation, KinectDepthNoise, Simulate
 from workers.assets.builtin.make import make_asset
+from workers.capture.folder import open_folder, read_truth, write_pose
+from workers.capture.make_capture import is_corrected, process_capture
+from workers.capture.simulate.simulate import simulate_capture
 from workers.geometry.frames import translation
-from workers.pipeline.captures.process_capture import is_corrected, process_capture
-from workers.pipeline.captures.simulate import simulate_capture
-from workers.pipeline.stopwatch import Stopwatch
-from workers.plan.randomness import SceneChance
-from workers.store.capture_folder import open_folder, write_pose
-from workers.store.capture_truth import read_truth
+from workers.scene.context import Stopwatch
+from workers.scene.plan import SceneChance
 
 CAPTURES = Captures(
     simulate=Simulate(views=6, image_scale=0.3, depth_noise=KinectDepthNoise()),

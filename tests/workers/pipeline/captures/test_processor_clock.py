@@ -2,7 +2,7 @@
 
 import time
 
-from workers.pipeline.captures.processor_clock import ProcessorClock
+from workers.capture.estimate import ProcessorClock
 
 
 def test_waiting_takes_no_processor_time_and_work_does():

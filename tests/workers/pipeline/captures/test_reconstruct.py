@@ -7,11 +7,10 @@ import pytest
 from schemas.errors import CaptureError
 from schemas.job.captures import Fusion
 from tests.workers.pipeline.captures.small_capture import VIEWS, copy_of, made, true_estimates
+from workers.capture.folder import open_folder
+from workers.capture.reconstruct import given_files, read_posed, reconstruct
+from workers.capture.score import read_whole_truth
 from workers.geometry.distance import distance_to_mesh
-from workers.pipeline.captures.corrections import given_files
-from workers.pipeline.captures.reconstruct import read_posed, reconstruct
-from workers.pipeline.captures.score import read_whole_truth
-from workers.store.capture_folder import open_folder
 
 
 def test_the_surface_lies_on_the_true_one():

@@ -5,15 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from schemas.capture.processed import ProcessedCapture
+from schemas.capture import ProcessedCapture
 from schemas.dataset.tables import CAPTURE_SCHEMAS, NOT_OF_CAPTURES, SCHEMAS
 from tests.captures import captures_job, exact_capture
 from workers.assets.catalogue import split_of
-from workers.pipeline.captures.listing import open_sources
-from workers.pipeline.captures.make_capture import make_pairs, place_capture
-from workers.pipeline.captures.rows import LeftOut, Origin, record_capture
-from workers.pipeline.context import WorkerContext, open_worker
-from workers.pipeline.stopwatch import Stopwatch
+from workers.capture.make_capture import make_pairs, place_capture
+from workers.capture.results import open_sources
+from workers.capture.rows import LeftOut, Origin, record_capture
+from workers.scene.context import Stopwatch, WorkerContext, open_worker
 
 JOB = captures_job()
 

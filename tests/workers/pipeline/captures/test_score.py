@@ -10,16 +10,10 @@ from schemas.base import frozen_array
 from schemas.errors import CaptureError
 from schemas.scene.shape import Mesh
 from tests.workers.pipeline.captures.small_capture import made, processed
+from workers.capture.folder import open_folder
+from workers.capture.score import read_mesh_file, read_whole_truth, score_capture, score_measured, score_surface
+from workers.capture.stored import read_result
 from workers.geometry.frames import translation
-from workers.pipeline.captures.score import (
-    read_mesh_file,
-    read_whole_truth,
-    score_capture,
-    score_measured,
-    score_surface,
-)
-from workers.pipeline.captures.stored_result import read_result
-from workers.store.capture_folder import open_folder
 
 
 def test_the_score_of_a_good_capture_is_good():

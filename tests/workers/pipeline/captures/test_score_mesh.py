@@ -4,10 +4,9 @@ import numpy as np
 
 from schemas.scene.shape import Mesh
 from tests.workers.pipeline.captures.small_capture import processed
+from workers.capture.score import read_whole_truth, score_against_mesh
+from workers.capture.stored import read_result
 from workers.geometry.frames import pose, rotation_about, transform
-from workers.pipeline.captures.score import read_whole_truth
-from workers.pipeline.captures.score_mesh import score_against_mesh
-from workers.pipeline.captures.stored_result import read_result
 
 
 def test_the_true_mesh_from_elsewhere_is_aligned_and_scored_as_in_place():

@@ -12,11 +12,9 @@ from schemas.job.captures import Board, Simulate
 from schemas.job.job import Job
 from tests.workers.pipeline.captures.made_captures import asset_of, made
 from workers.assets.catalogue import open_catalogue
-from workers.capture.simulate.effects import ASKED
-from workers.pipeline.captures.simulate import load_object, simulate_capture
-from workers.plan.randomness import SceneChance
-from workers.store.capture_folder import read_view
-from workers.store.capture_truth import read_truth
+from workers.capture.folder import read_truth, read_view
+from workers.capture.simulate.simulate import ASKED, load_object, simulate_capture
+from workers.scene.plan import SceneChance
 
 SMALL = {"views": 2, "image_scale": 0.25}
 

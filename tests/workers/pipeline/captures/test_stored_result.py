@@ -7,7 +7,7 @@ import pytest
 
 from schemas.errors import CaptureError
 from tests.workers.pipeline.captures.small_capture import CAPTURES, copy_of, made, processed
-from workers.pipeline.captures.stored_result import read_result
+from workers.capture.stored import read_result
 
 
 def test_poses_correction_and_surface_are_those_of_the_run():

@@ -8,9 +8,8 @@ import pytest
 
 from schemas.errors import OutputError
 from tests.workers.pipeline.captures.small_capture import processed
-from workers.pipeline.captures.stored_result import read_result
-from workers.pipeline.captures.synthesized_files import write_mirrors, write_synthesized
-from workers.store.capture_folder import read_pose
+from workers.capture.folder import read_pose
+from workers.capture.stored import read_result, write_mirrors, write_synthesized
 
 
 @pytest.fixture(scope="module")

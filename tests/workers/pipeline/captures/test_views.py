@@ -5,15 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from schemas.capture.estimate import DepthCorrection
+from schemas.capture import DepthCorrection
 from tests.workers.pipeline.captures.small_capture import CAPTURES, made, processed, true_estimates
-from workers.capture.evaluate import true_view
+from workers.capture.folder import open_folder, read_view
+from workers.capture.reconstruct import given_files
+from workers.capture.score import read_whole_truth
+from workers.capture.stored import read_result
+from workers.capture.surface.evaluate import true_view
+from workers.capture.views import CaptureViews
 from workers.geometry.frames import half_turn, translation
-from workers.pipeline.captures.corrections import given_files
-from workers.pipeline.captures.score import read_whole_truth
-from workers.pipeline.captures.stored_result import read_result
-from workers.pipeline.captures.views import CaptureViews
-from workers.store.capture_folder import open_folder, read_view
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from schemas.scene.appearance import Appearance
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Material
+from schemas.scene.shape import Appearance, Material
 from tests.workers.render.looks import BLACK, FLAT, FOUR, RASTER, without
 from tests.workers.render.random_scenes import camera, quad, small
 from workers.geometry.frames import translation

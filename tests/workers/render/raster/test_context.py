@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 
 from schemas.base import frozen_array
-from schemas.scene.appearance import Appearance
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Material, Part, Shape
+from schemas.scene.shape import Appearance, Material, Part, Shape
 from tests.workers.render.looks import BLACK, FOUR, RASTER
 from tests.workers.render.random_scenes import EYE, camera, facing, quad, small
 from workers.geometry.colour import encode_srgb

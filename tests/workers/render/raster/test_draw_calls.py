@@ -12,8 +12,8 @@ import pytest
 import trimesh
 
 import workers.render.raster.gbuffer
-from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed
+from schemas.scene.view import Camera, Intrinsics
 from tests.kit.shapes import shape_of
 from tests.workers.render.looks import FLAT, FOUR, RASTER, Look, forcing, without
 from tests.workers.render.random_scenes import APPEARANCE, VGA, orbit_and_mirror, procedural_things, random_things

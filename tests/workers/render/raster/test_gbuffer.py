@@ -15,10 +15,9 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.scene.appearance import Appearance, Light
-from schemas.scene.camera import Camera, Intrinsics
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Material, Part, Shape
+from schemas.scene.shape import Appearance, Light, Material, Part, Shape
+from schemas.scene.view import Camera, Intrinsics
 from tests.workers.render.looks import FLAT, FOUR, RASTER, Look, without
 from tests.workers.render.random_scenes import (
     APPEARANCE,

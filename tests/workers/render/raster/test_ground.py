@@ -11,9 +11,9 @@ import trimesh
 
 import workers.render.raster.gbuffer
 from schemas.base import frozen_array
-from schemas.scene.camera import Intrinsics
 from schemas.scene.scene import Placed
 from schemas.scene.shape import Part, Shape
+from schemas.scene.view import Intrinsics
 from tests.workers.render.looks import FLAT, RASTER, without
 from tests.workers.render.random_scenes import (
     APPEARANCE,

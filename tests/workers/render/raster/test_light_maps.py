@@ -13,9 +13,8 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.scene.appearance import Appearance, Light
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Shape
+from schemas.scene.shape import Appearance, Light, Shape
 from tests.workers.render.looks import (
     BLACK,
     DOWN,

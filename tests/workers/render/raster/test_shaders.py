@@ -9,9 +9,8 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.scene.appearance import Appearance, Light
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Material, Part, Shape
+from schemas.scene.shape import Appearance, Light, Material, Part, Shape
 from tests.workers.render.looks import BLACK, DOWN, FLAT, RASTER, brightness, pixel_of, white_floor, without
 from tests.workers.render.random_scenes import EYE, WHITE, camera, facing, floor, part_of, shape_of, small
 from workers.geometry.camera import orbit_pose

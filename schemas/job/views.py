@@ -1,0 +1,253 @@
+"""The branches of a job that shape its images: `cameras`, `images`, `render` and `sensor`.
+
+- The `cameras` branch of a job: where cameras stand and what their intrinsics are.
+- The `images` branch of a job: encodings, patches, and the projection of the input cloud.
+- The `render` branch of a job: how RGB is made.
+- The `sensor` branch of a job: effects of a real sensor on images, each off by default.
+"""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from schemas.base import Frozen, Interval, NonNegative, Positive, PositiveInt, Range, Share
+
+Focal = Annotated[float, Field(ge=1e-3, le=1e6)]
+Principal = Annotated[float, Field(ge=-1e6, le=1e6)]
+Reach = Annotated[float, Field(gt=0, le=1e3)]
+Offset = Annotated[float, Field(ge=-1e3, le=1e3)]
+"""Bounds far beyond any camera, within which float32 on the GPU does not overflow."""
+
+
+class Orbit(Frozen):
+    """Where input cameras stand: spherical coordinates about the centre of the table top [A]."""
+
+    inclination_rad: Interval = Range(0.7, 0.9)
+    """Angle of the optical axis below the horizontal."""
+    yaw_rad: Interval = Range(-math.pi, math.pi)
+    """Direction from the table to the camera."""
+    radius_m: Reach = 2.5
+    """Distance from the centre of the table top."""
+
+
+class Sensor(Frozen):
+    """A pinhole camera. cx, cy count from the image's left and upper edge: pixel centres lie at +0.5 [A, D]."""
+
+    width: Annotated[int, Field(ge=1, le=4096)] = 640
+    """Pixels."""
+    height: Annotated[int, Field(ge=1, le=4096)] = 480
+    """Pixels."""
+    fx: Focal = 525.0
+    """Focal length, pixels."""
+    fy: Focal = 525.0
+    """Focal length, pixels."""
+    cx: Principal = 320.0
+    """Principal point, pixels from the left edge."""
+    cy: Principal = 240.0
+    """Principal point, pixels from the upper edge."""
+
+
+class DepthCamera(Frozen):
+    """The depth camera's place in the RGB camera's optical axes, metres; same rotation [A]."""
+
+    enabled: bool = True
+    """Whether there are aligned views."""
+    offset_m: tuple[Offset, Offset, Offset] = (-0.051, 0.001, -0.001)
+    """Translation in the RGB camera's optical axes."""
+
+
+class Mirror(Frozen):
+    """The camera on the other side [A, C]."""
+
+    enabled: bool = True
+    """Whether there are mirror views; without them camPoses.csv has one row a pair, with an even id."""
+    T_z_m: Reach = 1.3
+    """Distance of the mirror camera from its pivot, the point it looks at."""
+    pivot_depth: Literal["percentile", "median", "nearest"] = "percentile"
+    """Estimator of d_z, the distance to the object's front surface, from the object's stored input depth."""
+    percentile: Annotated[float, Field(ge=0, le=100)] = 2.0
+    """Percentile of the object's depth pixels, for `pivot_depth: percentile`."""
+
+
+class Cameras(Frozen):
+    """Every camera of a pair."""
+
+    orbit: Orbit = Orbit()
+    """Where input cameras stand."""
+    sensor: Sensor = Sensor()
+    """The pinhole camera of every view."""
+    depth: DepthCamera = DepthCamera()
+    """The depth camera that is not aligned with the RGB camera."""
+    mirror: Mirror = Mirror()
+    """The camera on the other side."""
+
+
+class Patch(Frozen):
+    """Size of the crop about each object, pixels [A]."""
+
+    width: PositiveInt = 128
+    """Pixels."""
+    height: PositiveInt = 96
+    """Pixels."""
+
+
+class Projection(Frozen):
+    """How the input cloud is carried into the mirror view."""
+
+    enabled: bool = True
+    """Whether there are projected images; they need `cameras.mirror.enabled`."""
+    splat: Annotated[int, Field(ge=1, le=15)] = 1
+    """Side of the square of pixels that each point fills; odd."""
+    hidden_point_removal: bool = False
+    """Leave out points whose surface faces away from the mirror camera."""
+
+    @field_validator("splat")
+    @classmethod
+    def _odd(cls, value: int) -> int:
+        if value % 2 == 0:
+            raise ValueError(
+                f"splat {value} is even: a point's square needs a middle pixel, use {value - 1} or {value + 1}"
+            )
+        return value
+
+
+class Images(Frozen):
+    """Encodings [C, D]."""
+
+    depth_units_per_m: Positive = 5000.0
+    """Units of a depth image in a metre."""
+    depth_range_m: Interval = Range(0.2, 8.0)
+    """Depth outside this open interval is stored as 0."""
+    patch: Patch = Patch()
+    """Size of the crop about each object."""
+    projection: Projection = Projection()
+    """How the input cloud is carried into the mirror view."""
+    png_level: Annotated[int, Field(ge=0, le=9)] = 1
+    """Compression level of the PNG files; pixels do not change. 1 is the fastest. At 2 a scene's images are a quarter smaller and
+    take 12 ms more, at 6 more than a third smaller and 70 ms more."""
+
+    @model_validator(mode="after")
+    def _fits_16_bits(self) -> "Images":
+        units = self.depth_range_m.high * self.depth_units_per_m
+        if units > 65_535:
+            raise ValueError(
+                f"depth_range_m ends at {self.depth_range_m.high:g} m, which is {units:.0f} "
+                f"units of depth_units_per_m {self.depth_units_per_m:g}: a 16-bit image holds at most 65535"
+            )
+        return self
+
+
+Tier = Literal["flat", "raster", "pathtraced"]
+
+
+class Render(Frozen):
+    """RGB."""
+
+    rgb: bool = True
+    """Whether there are RGB images; without them no colour is computed."""
+    tier: Tier = "raster"
+    """raster: textured floors, a key light with soft shadows, contact shadows, transparent texels cut out, smooth edges;
+    flat: albedo and light from two directions, in less than half the time; pathtraced: global illumination, glass and
+    metal by Mitsuba, in seconds an image (`./verso extra pathtraced` installs it). Depth and masks are the same in all."""
+    samples: Literal[1, 4] = 1
+    """Colour samples in a pixel at an edge, for tier raster: 1 smooths edges by their neighbours, 4 draws them at three
+    more points, in twice the time. Labels are always those of the pixel centre."""
+    path_samples: Annotated[int, Field(ge=1, le=65_536)] = 16
+    """Paths through each pixel, for tier pathtraced: time grows with them. They fill a grid of nearly equal
+    sides, and are rounded up where they do not: 16 is 4 x 4, 13 becomes 15."""
+    path_bounces: Annotated[int, Field(ge=1, le=64)] = 8
+    """Largest number of scatterings and glass crossings of a path, for tier pathtraced."""
+
+
+class DepthNoise(Frozen):
+    """Noise of a time-of-flight depth camera. Every default is the preset `azure_kinect`.
+
+    What is published: Microsoft's specification (Azure Kinect DK hardware specifications) gives a random error of at
+    most 17 mm standard deviation, a systematic error below 11 mm + 0.1 % of the distance, and 0.5 to 3.86 m of operating
+    range in the mode NFOV unbinned; Tolgyessy et al. 2021 (Sensors 21(2):413) confirm the standard deviation of at most
+    17 mm and the distance error below 11 mm up to 3.5 m, and describe flying pixels at depth edges.
+
+    What is assumed: that the random error reaches those 17 mm at the far end of the range, so that the preset is an upper
+    bound and not a typical device; that it grows with the square of the distance and with 1 / cos of the angle of
+    incidence, as the returned light falls; and every number that says so below.
+    """
+
+    preset: Literal["azure_kinect"] = "azure_kinect"
+    """Names the defaults of this branch: mode NFOV unbinned."""
+    axial_m: NonNegative = 0.0
+    """Standard deviation along the optical axis that does not depend on the distance, metres [assumed]."""
+    axial_per_m: NonNegative = 17e-3 / 3.86**2
+    """The standard deviation at z grows by this times z squared: 17 mm at 3.86 m, and 1.1 mm at 1 m."""
+    incidence_power: NonNegative = 1.0
+    """The standard deviation is divided by the cosine of the angle of incidence to this power [assumed]."""
+    grazing_deg: Annotated[float, Field(gt=0, le=90)] = 80.0
+    """Pixels that see their surface at a larger angle of incidence have no depth [assumed]."""
+    offset_m: float = 0.0
+    """Systematic error, metres. 0: the specification bounds it by 11 mm, and leaves its sign open."""
+    offset_share: Annotated[float, Field(gt=-1, lt=1)] = 0.0
+    """Systematic error as a share of the distance; the specification bounds it by 0.001."""
+    lateral_px: NonNegative = 0.4
+    """Standard deviation, pixels, of the shift of a pixel's sample near a depth edge [assumed]."""
+    edge_step_m: Positive = 0.03
+    """Smallest second difference of 1/depth, times depth squared, metres, that counts as an edge [assumed]."""
+    edge_px: Annotated[int, Field(ge=1, le=8)] = 1
+    """Reach of an edge's effects, pixels [assumed]."""
+    flying_share: Share = 0.3
+    """Share of the pixels at an edge whose depth is a mixture of the surfaces before and behind [assumed]."""
+    edge_dropout: Share = 0.2
+    """Share of the pixels at an edge that have no depth [assumed]."""
+    range_m: Interval = Range(0.5, 3.86)
+    """Depth outside this interval is not measured."""
+
+
+class Distortion(Frozen):
+    """Lens distortion of the RGB camera: OpenCV's five coefficients. Depth and segment stay those of the pinhole camera.
+
+    Stored RGB is what the lens draws; where it sees past the edge of the pinhole's picture it is black.
+    """
+
+    k1: float = 0.0
+    """Radial, second power."""
+    k2: float = 0.0
+    """Radial, fourth power."""
+    p1: float = 0.0
+    """Tangential."""
+    p2: float = 0.0
+    """Tangential."""
+    k3: float = 0.0
+    """Radial, sixth power."""
+
+
+class RgbNoise(Frozen):
+    """Shot noise and read noise of the RGB sensor, in linear light; both numbers are of an assumed small sensor."""
+
+    full_well_e: Positive = 4000.0
+    """Electrons at full white: the variance of the shot noise is the mean over this, in units of white."""
+    read_noise_e: NonNegative = 3.0
+    """Standard deviation of the read noise, electrons."""
+
+
+class Exposure(Frozen):
+    """Gain of RGB before it is encoded; what was white already stays no brighter than it was stored."""
+
+    stops: Interval = Range(-1.0, 1.0)
+    """Drawn uniformly for each view: linear light is multiplied by 2 to this power. Equal ends fix it."""
+
+
+class SensorEffects(Frozen):
+    """What the sensors add to exact images; masks and labels stay exact."""
+
+    depth_noise: DepthNoise | None = None
+    """Noise of a time-of-flight camera in depth; `{}` for the preset. d_z and the projection follow stored depth."""
+    distortion: Distortion | None = None
+    """Lens distortion of stored RGB."""
+    rgb_noise: RgbNoise | None = None
+    """Shot and read noise of RGB."""
+    exposure: Exposure | None = None
+    """Exposure of RGB."""
+
+    @property
+    def changes_rgb(self) -> bool:
+        """Whether any effect on RGB is on."""
+        return any(effect is not None for effect in (self.distortion, self.rgb_noise, self.exposure))

@@ -1,0 +1,327 @@
+"""The commands `verso capture ...`.
+
+- The settings of `verso capture` commands: a job of one capture, with the keys that --set changes.
+"""
+
+import argparse
+import dataclasses
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from schemas.capture import CaptureEstimate
+from schemas.errors import CaptureError, InputError, OutputError
+from schemas.job.captures import Board, Captures
+from schemas.job.job import Job
+from schemas.job.keys import set_key
+from schemas.job.views import Render
+from services.job.job_file import change_key, validate_job
+
+if TYPE_CHECKING:
+    from workers.capture.folder import CaptureFile
+    from workers.capture.stored import StoredResult
+    from workers.capture.surface.evaluate import SurfaceErrors
+
+
+def capture_job(changes: Sequence[str] = (), keys: Mapping[str, Any] | None = None) -> Job:
+    """A job named `capture`: the dotted `keys` of a command's own options, then `path.to.key=value` of --set.
+
+    A key whose value is None is left at its default. Raises JobError, which is wrong input.
+    """
+    tree: dict[str, Any] = {"name": "capture", "scenes": 1, "captures": {}}
+    for path, value in (keys or {}).items():
+        if value is not None:
+            set_key(tree, path, value)
+    for change in changes:
+        change_key(tree, change)
+    return validate_job(tree, "verso capture")
+
+
+def capture_settings(changes: Sequence[str] = (), keys: Mapping[str, Any] | None = None) -> Captures:
+    """The branch `captures` of that job. Raises JobError."""
+    captures = capture_job(changes, keys).captures
+    assert captures is not None
+    return captures
+
+
+def board(options: argparse.Namespace) -> int:
+    """Writes options.file (.pdf or .png); reads `board`, `tiles` (None or "a4"), `dpi` and `json`. Returns 0."""
+    from workers.capture.board.sheets import board_pdf, board_png, tiled_pdf
+    from workers.capture.folder import read_board
+
+    path = Path(options.file)
+    spec = read_board(options.board) if options.board else Board()
+    kind = path.suffix.lower()
+    if kind == ".pdf":
+        data = tiled_pdf(spec) if options.tiles else board_pdf(spec)
+    elif kind == ".png":
+        if options.tiles:
+            raise InputError("--tiles makes pages, and a PNG has none: name a file that ends in .pdf")
+        data = board_png(spec, options.dpi)
+    else:
+        raise InputError(f"{path}: name a file that ends in .pdf or .png")
+    try:
+        path.write_bytes(data)
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror}") from error
+    told = "A4 pages to glue" if options.tiles else "print at 100 %"
+    print(f"{path}: {spec.columns} x {spec.rows} markers of {spec.marker_m * 1000:g} mm ({spec.dictionary}); {told}")
+    print(
+        f"measure the printed ruler; if it is not {spec.ruler_m * 1000:g} mm, say so in board.json (measured_ruler_m)"
+    )
+    if options.json:
+        print(json.dumps({"ok": True, "file": str(path), "board": spec.model_dump(mode="json")}))
+    return 0
+
+
+def simulate(options: argparse.Namespace) -> int:
+    """Writes the folder options.out; reads `views`, `seed`, `category`, `changes` (--set) and `json`. Returns 0.
+
+    Raises JobError for settings that cannot be, AssetSourceError where no source has the category, OutputError where the
+    folder has files.
+    """
+    keys = {"seed": options.seed, "categories": [options.category], "captures.simulate.views": options.views}
+    if options.views is not None:
+        keys["captures.most_views"] = options.views  # of a dataset, which this folder is not
+    job = capture_job(options.changes, keys)
+    assert job.captures is not None
+    path, begun = Path(options.out), time.perf_counter()
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise OutputError(f"{path} is there already: name a new or an empty folder")
+    from workers.assets.catalogue import open_catalogue
+    from workers.capture.simulate.simulate import ASKED, load_object, plan_effects, simulate_capture
+    from workers.render.tiers import require_tier
+    from workers.scene.plan import SceneChance
+
+    settings, chance = job.captures.simulate, SceneChance(job.seed, job.first_scene)
+    require_tier(Render(tier=settings.tier))
+    catalogue = open_catalogue(job.assets, Path.cwd(), job.categories)
+    asset = load_object(job, catalogue, chance)
+    plan = plan_effects(settings)
+    truth = simulate_capture(settings, job.captures.board, asset, chance, path)
+    seconds, ran = time.perf_counter() - begun, [name for name in ASKED if plan.runs(name)]
+    views = len(truth.T_board_cam)
+    print(f"{path}: {views} views of {asset.instance_id} in {seconds:.1f} s; effects: {', '.join(ran) or 'none'}")
+    print(f"{path / 'truth'}: poses and the true mesh, which only `verso capture evaluate` reads")
+    if options.json:
+        answer = {"ok": True, "out": str(path), "views": views, "category": asset.category}
+        answer |= {"instance_id": asset.instance_id, "seed": job.seed, "effects": ran, "seconds": seconds}
+        print(json.dumps(answer))
+    return 0
+
+
+def import_recording(options: argparse.Namespace) -> int:
+    """Reads options.recording, `out`, `frames`, `board` (a path or None), `name`, `category` and `json`. Returns 0.
+
+    Raises InputError and OutputError for what cannot be, CaptureError for a recording that cannot be used.
+    """
+    from workers.capture.folder import read_board
+    from workers.capture.recording import import_recording as work
+    from workers.capture.recording.choose import describe_losses
+
+    recording, out = Path(options.recording), Path(options.out)
+    about = _describe(options.name, options.category, out)
+    board = read_board(Path(options.board)) if options.board else Board()
+    if not recording.is_file():
+        raise InputError(f"{recording}: no such file")
+    made = work.import_recording(recording, _make_empty(out), about, board, options.frames)
+    notes = describe_losses(made.losses)
+    print(
+        f"{out}: {len(made.views)} views of {made.frames} frames, depth registered by the recording's own calibration"
+    )
+    print("\n".join(f"  {note}" for note in notes), end="\n" if notes else "")
+    if not options.board:
+        print(f"  no --board: board.json is the default board ({board.columns} x {board.rows}, {board.dictionary})")
+    if options.json:
+        told = {"ok": True, "out": str(out), "frames": made.frames, "notes": notes, "default_board": not options.board}
+        print(json.dumps({**told, "losses": asdict(made.losses), "views": [asdict(view) for view in made.views]}))
+    return 0
+
+
+def _describe(name: str | None, category: str, out: Path) -> "CaptureFile":
+    from workers.capture.folder import CaptureFile, derive_name
+
+    try:
+        return CaptureFile(name=name or derive_name(out.resolve().name), category=category)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(
+            f"--{first['loc'][0]} {first['input']!r}: letters, digits, - and _ only, at most 64"
+        ) from error
+
+
+def _make_empty(out: Path) -> Path:
+    """The folder, made if need be. Raises OutputError where it holds something or cannot be made."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if any(out.iterdir()):
+            raise OutputError(f"{out} is not empty: name a new folder, or remove it")
+    except OSError as error:
+        raise OutputError(f"{out} cannot be made: {error.strerror}") from error
+    return out
+
+
+def process(options: argparse.Namespace) -> int:
+    """Processes options.folder; reads `estimate`, `changes` (--set) and `json`. Returns 0. Raises JobError, CaptureError."""
+    captures = capture_settings(options.changes, {"captures.estimation.estimate": options.estimate})
+    from workers.capture.process import process_folder
+
+    done = process_folder(options.folder, captures)
+    for estimate in done.estimates.by_name.values():
+        chosen = " (chosen)" * (estimate.estimate == done.estimates.chosen)
+        print(f"{estimate.estimate:8} {_describe_process(estimate)}{chosen}")
+    for view in done.estimates.estimate.views:
+        if view.status != "used":
+            print(f"view {view.number} {view.status}: {'; '.join(view.reasons)}")
+    for note in done.notes:
+        print(f"note: {note}")
+    for name in done.users:
+        print(f"kept: {name}, which processing did not write")
+    surface, slowest = done.merged.surface, sorted(done.seconds.items(), key=lambda item: -item[1])
+    counts = f"{len(surface.points)} points, {len(surface.faces)} faces"
+    print(f"{options.folder}: {counts}, {done.seconds['total']:.1f} s of processor time")
+    print("  " + ", ".join(f"{name} {s:.1f} s" for name, s in slowest if name != "total"))
+    if options.json:
+        final = done.estimates.estimate
+        answer = {
+            "ok": True,
+            "folder": str(options.folder),
+            "estimate": final.estimate,
+            "views": len(final.views),
+            "used": len(final.used),
+            "points": len(surface.points),
+            "faces": len(surface.faces),
+            "notes": list(done.notes),
+            "kept": list(done.users),
+            "seconds": dict(done.seconds),
+        }
+        print(json.dumps(answer))
+    return 0
+
+
+def _describe_process(estimate: CaptureEstimate) -> str:
+    pixels = [view.reprojection_px for view in estimate.used if view.reprojection_px is not None]
+    depth = [view.depth_mm for view in estimate.used if view.depth_mm is not None]
+    words = [f"{len(estimate.used)} of {len(estimate.views)} views"]
+    words += [f"corners {np.median(pixels):.2f} px"] if pixels else []
+    words += [f"depth off the board {np.median(depth):.1f} mm"] if depth else []
+    correction = estimate.depth
+    words += (
+        [f"depth offset {1e3 * correction.offset_m:+.1f} mm, scale {correction.scale:.4f}"]
+        if correction.identified
+        else []
+    )
+    words += [f"print scale {estimate.print_scale:.4f}"] if estimate.print_scale != 1.0 else []
+    return ", ".join(words)
+
+
+def synthesize(options: argparse.Namespace) -> int:
+    """Writes views of options.folder to options.out: from the pose in the file `pose`, or with `mirror` one for each view.
+
+    Returns 0. Raises InputError where the pose file is missing, CaptureError where nothing was processed or nothing is seen.
+    """
+    from workers.capture.folder import read_pose
+    from workers.capture.stored import read_result, write_mirrors, write_synthesized
+
+    out = options.out or Path(options.folder) / "views"
+    result = read_result(options.folder)
+    if options.mirror:
+        made = write_mirrors(result, out)
+    else:
+        T_board_cam = read_pose(options.pose)
+        if T_board_cam is None:
+            raise InputError(f"{options.pose} is not there: it holds T_board_cam, 4 lines of 4 numbers")
+        made = [write_synthesized(result, T_board_cam, out)]
+    if not made:
+        raise CaptureError("nothing_seen", f"no view of {options.folder} has a view from the other side")
+    for one in made:
+        what = f"{one['name']}: {one['measured_share']:.1%} measured, from views {', '.join(map(str, one['sources']))}"
+        print(f"{what}; d_z {one['d_z_m']:.3f} m" if "d_z_m" in one else what)
+    print(f"{out}: {len(made)} view{'s' * (len(made) > 1)}")
+    if options.json:
+        print(json.dumps({"ok": True, "out": str(out), "views": made}))
+    return 0
+
+
+def evaluate(options: argparse.Namespace) -> int:
+    """Scores options.folder against truth/, or its surface against the file `mesh`, which is aligned to it first. Returns 0.
+
+    Raises CaptureError where the folder was not processed, or there is neither truth nor a mesh.
+    """
+    from workers.capture.stored import read_result
+
+    result = read_result(options.folder)
+    surface, answer = _against_truth(result) if options.mesh is None else _against_mesh(result, options)
+    _print_surface(surface)
+    if options.json:
+        known = {"ok": True, "folder": str(options.folder), "estimate": result.estimate.estimate}
+        print(json.dumps({**known, **answer, **dataclasses.asdict(surface)}))
+    return 0
+
+
+def _against_truth(result: "StoredResult") -> tuple["SurfaceErrors", dict[str, Any]]:
+    from workers.capture.score import read_whole_truth, score_capture, score_measured
+
+    truth = read_whole_truth(result.folder)
+    if truth is None:
+        raise CaptureError(
+            "no_truth",
+            f"{result.folder.path} has no truth/, which simulated captures have: give the object's mesh with --mesh",
+        )
+    score = score_capture(result.estimate, result.surface, result.views, truth)
+    one = score.summary
+    print(f"poses    median {one.pose_mm:.3f} mm, {one.pose_deg:.4f} degrees")
+    print(f"         worst {score.worst_mm:.3f} mm, {score.worst_deg:.4f} degrees")
+    for number, errors in score.held_out.items():
+        print(
+            f"view {number} made of the others: depth {errors.depth_median_mm:.2f} mm (95 %: {errors.depth_p95_mm:.2f}), "
+            f"colour {errors.color_error:.1f} of 255, covers {errors.covered:.1%}, {errors.measured_share:.1%} measured"
+        )
+    depth = score_measured(result.surface, result.views, truth)
+    print(
+        f"depth    of {depth.measured_of_visible:.1%} of what was visible in any view; {depth.completeness_of_measured:.1%} of "
+        "that has a point within 3 mm"
+    )
+    answer = {
+        **dataclasses.asdict(depth),
+        "aligned_by": None,
+        "pose_mm": one.pose_mm,
+        "pose_deg": one.pose_deg,
+        "pose_worst_mm": score.worst_mm,
+        "pose_worst_deg": score.worst_deg,
+        "depth_median_mm": one.depth_median_mm,
+        "held_out": {str(number): dataclasses.asdict(errors) for number, errors in score.held_out.items()},
+    }
+    return score.surface, answer
+
+
+def _against_mesh(result: "StoredResult", options: argparse.Namespace) -> tuple["SurfaceErrors", dict[str, Any]]:
+    from workers.capture.score import read_mesh_file, score_against_mesh
+
+    surface, alignment = score_against_mesh(result, read_mesh_file(options.mesh))
+    print(f"{options.mesh} was aligned to the cloud by ICP, which leaves {alignment.rms_mm:.2f} mm rms:")
+    print("poses are not scored, and errors that a rigid motion explains are not seen")
+    answer = {
+        **dict.fromkeys(("pose_mm", "pose_deg", "depth_median_mm")),
+        "aligned_by": "icp",
+        "icp_rms_mm": alignment.rms_mm,
+        "T_board_obj": alignment.T_board_obj.tolist(),
+    }
+    return surface, answer
+
+
+def _print_surface(errors: "SurfaceErrors") -> None:
+    print(
+        f"cloud    {errors.points} points; median {errors.cloud_median_mm:.3f} mm, 95 %: {errors.cloud_p95_mm:.3f} mm off "
+        "the surface"
+    )
+    print(f"surface  median {errors.surface_median_mm:.3f} mm, 95 %: {errors.surface_p95_mm:.3f} mm off the mesh")
+    print(
+        f"         {errors.completeness:.1%} of what was visible has a point within 3 mm; visible was {errors.visible_share:.1%}"
+    )

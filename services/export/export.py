@@ -1,0 +1,217 @@
+"""`verso export`: a dataset in another layout, scene by scene in constant memory, gone on with after a kill."""
+
+import argparse
+import csv
+import io
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.errors import OutputError
+from services.export.folder import ExportFolder
+from services.export.formats import SHARDED, Added, Choice, Chooser, ExportRequest, open_writer
+from services.export.source import iter_ranges, scenes_of
+from services.job.record import JobRecord, require_dataset, require_job
+from services.merge.merge import read_success
+from services.read.verdict import explain_damage
+from services.run.progress import ProgressLine
+from workers.store.commit import list_codes
+from workers.store.store import open_store
+
+LEFT_OUT: Final = "left_out.csv"
+VERSION: Final = 1
+"""Of export.json."""
+
+
+@dataclass(frozen=True)
+class ExportResult:
+    """What an export holds: its manifest, and how many pairs this call wrote."""
+
+    manifest: dict[str, Any]
+    pairs_now: int
+
+
+Report = Callable[[int, int], None]
+"""Is told how many committed scenes were gone through, and how many there are."""
+
+
+def export(request: ExportRequest, report: Report = lambda done, asked: None) -> ExportResult:
+    """Writes the export, or goes on where it was killed; a finished one is left as it is.
+
+    Raises OutputError where the folder is not this export's, InputError for a condition that cannot be asked, CorruptError
+    where a stored file is missing or damaged.
+    """
+    _refuse_inside(request)
+    record = require_job(request.store)
+    chooser = Chooser(request.choice, record.job.captures is not None)
+    folder = ExportFolder(request.target)
+    plan = _plan(request, record)
+    if (done := folder.finished()) is not None:
+        folder.refuse_other(done, plan)
+        return ExportResult(done, 0)
+    with folder.claimed(plan) as progress:
+        codes = _snapshot(request, folder, fresh=progress is None)
+        return _Export(request, record, chooser, folder, codes, progress).run(report)
+
+
+class _Export:
+    """An export on its way: counts, the writer, and the scene to go on from."""
+
+    def __init__(
+        self,
+        request: ExportRequest,
+        record: JobRecord,
+        chooser: Chooser,
+        folder: ExportFolder,
+        codes: NDArray[np.int64],
+        progress: dict[str, Any] | None,
+    ) -> None:
+        self._request, self._record, self._chooser, self._folder, self._codes = request, record, chooser, folder, codes
+        begun = progress or {"next_scene": 0, "finished": False, "counts": {}, "left_out": {}, "writer": None}
+        self._finished: bool = begun["finished"]
+        self._next_scene: int = begun["next_scene"]
+        self._counts = Counter(begun["counts"])
+        self._left_out = Counter(begun["left_out"])
+        self._writer = open_writer(request.format, request, record, folder, begun["writer"])
+        if progress is None:
+            folder.append(LEFT_OUT, b"scene_id,pose_id,reason\n")
+
+    def run(self, report: Report) -> ExportResult:
+        """Every chosen scene from the checkpoint on, then the manifest."""
+        before = self._counts["pairs"]
+        with closing(self._writer):
+            if not self._finished:
+                self._write_scenes(report)
+                self._writer.finish()
+                self._finished = True
+                self._checkpoint(self._next_scene)
+            manifest = self._manifest()
+        self._folder.finish(manifest)
+        return ExportResult(manifest, self._counts["pairs"] - before)
+
+    def _write_scenes(self, report: Report) -> None:
+        store = self._request.store
+        for stored in iter_ranges(store, self._codes, self._next_scene):
+            chosen = [scene for scene in self._chooser.choose(stored) if scene >= self._next_scene]
+            for scene in scenes_of(store, stored, chosen):
+                self._count(self._writer.add(scene))
+                self._checkpoint(scene.scene_id + 1)
+            self._checkpoint(max(self._next_scene, stored.stop))
+            report(stored.stop, self._record.job.stop_scene)
+
+    def _count(self, added: Added) -> None:
+        self._counts["scenes"] += bool(added.pairs)
+        self._counts["pairs"] += added.pairs
+        self._counts["pairs_left_out"] += len(added.left_out)
+        text = io.StringIO()
+        lines = csv.writer(text, lineterminator="\n")
+        for one in added.left_out:
+            self._left_out[one.reason] += 1
+            lines.writerow((one.scene_id, one.pose_id, one.reason))
+        if added.left_out:
+            self._folder.append(LEFT_OUT, text.getvalue().encode())
+
+    def _checkpoint(self, next_scene: int) -> None:
+        self._next_scene = next_scene
+        if (state := self._writer.state()) is not None:
+            counts = {"counts": dict(self._counts), "left_out": dict(self._left_out)}
+            now = {"next_scene": next_scene, "finished": self._finished, **counts, "writer": state}
+            self._folder.checkpoint(now)
+
+    def _manifest(self) -> dict[str, Any]:
+        counts = {name: self._counts[name] for name in ("scenes", "pairs", "pairs_left_out")}
+        return {
+            **self._folder.plan,
+            "ranges": len(self._codes),
+            **counts,
+            "left_out": dict(sorted(self._left_out.items())),
+            **self._writer.describe(),
+        }
+
+
+def _plan(request: ExportRequest, record: JobRecord) -> dict[str, Any]:
+    """What makes two exports the same: nothing of this machine."""
+    choice = request.choice.model_dump(mode="json", exclude_defaults=True)
+    return {
+        "verso_export": VERSION,
+        "format": request.format,
+        "dataset": record.job.name,
+        "job_digest": record.digest,
+        "dataset_digest": (read_success(request.store) or {}).get("digest"),
+        "choice": choice,
+        **({"shard_mb": request.shard_mb} if request.format in SHARDED else {}),
+    }
+
+
+def _snapshot(request: ExportRequest, folder: ExportFolder, fresh: bool) -> NDArray[np.int64]:
+    """The commits that the export is of: those that were there when it began, also where a run adds more."""
+    kept = folder.work / "commits.npy"
+    if fresh or not kept.exists():
+        codes = list_codes(request.store)
+        temporary = folder.temporary("commits.npy")
+        np.save(temporary, codes)
+        folder.install(temporary, f"{folder.work.name}/{kept.name}")
+    codes = np.load(kept)
+    if not len(codes):
+        raise OutputError(f"{request.store.name} has no finished scene yet: there is nothing to export")
+    return codes
+
+
+def _refuse_inside(request: ExportRequest) -> None:
+    """Raises OutputError for a folder in the dataset, where it would be a foreign file."""
+    root = request.store.root
+    if root is not None and request.target.resolve().is_relative_to(Path(root).resolve()):
+        raise OutputError(f"{request.target} lies in the dataset {request.store.name}: choose a DIR beside it")
+
+
+def main(options: argparse.Namespace) -> int:
+    """Export what the options ask for; returns 0, or 1 where no pair could be exported."""
+    if "://" in options.dir:
+        raise OutputError(f"{options.dir} is not a folder: export into one on this machine, and copy it there")
+    store = require_dataset(open_store(options.out))
+    first, last = options.scenes or (None, None)
+    choice = Choice(categories=tuple(options.category), first_scene=first, last_scene=last, where=options.where)
+    request = ExportRequest(store, Path(options.dir), options.format, choice, options.shard_mb)
+    begun = time.monotonic()
+    with explain_damage(store), closing(ProgressLine(0, "export")) as line:
+
+        def report(done: int, asked: int) -> None:
+            line.expect(asked)
+            line.show(done)
+
+        result = export(request, report)
+    _tell(options, result, time.monotonic() - begun)
+    return 0 if result.manifest["pairs"] else 1
+
+
+def _tell(options: argparse.Namespace, result: ExportResult, seconds: float) -> None:
+    """Prints what the export holds and what it leaves out."""
+    manifest = result.manifest
+    now = f" ({result.pairs_now} now, in {seconds:.1f} s)" if result.pairs_now else " (nothing was left to do)"
+    print(f"{options.dir}: {options.format}, {manifest['pairs']} pairs of {manifest['scenes']} scenes{now}")
+    for reason, count in manifest["left_out"].items():
+        print(f"  left out: {count} pairs, {reason}")
+    if manifest["pairs_left_out"]:
+        print(f"  {Path(options.dir) / LEFT_OUT} names each of them")
+    for line in manifest.get("not_exported", ()):
+        print(f"  not exported: {line}")
+    if not manifest["pairs"]:
+        told = "no scene was chosen" if not manifest["pairs_left_out"] else "every pair was left out"
+        print(f"verso: {options.dir} holds no pair: {told}", file=sys.stderr)
+    if options.json:
+        answer: dict[str, Any] = {
+            "ok": manifest["pairs"] > 0,
+            "dir": options.dir,
+            "pairs_now": result.pairs_now,
+            **manifest,
+        }
+        print(json.dumps(answer))

@@ -1,0 +1,201 @@
+"""Point clouds of a pair from both cameras with the posed mesh, packed for the page's 3-D view; world frame, metres, z up."""
+
+import base64
+import json
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from schemas.base import Array
+from schemas.dataset.codec import Row, read_camera, read_world_poses
+from schemas.errors import VersoError
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
+from services.look.pictures import PairImages, metres_of, read_pair
+from services.read.dataset_reader import file_reader, find_scene
+from services.read.scene_geometry import export_scene
+from workers.geometry.camera import unproject
+from workers.store.store import Store
+
+MOST_POINTS = 90_000
+"""Points of one cloud; of more, the floor is thinned first and objects last."""
+
+FLOOR_SHARE = 0.15
+"""Largest share of the points that the floor has, where there are too many."""
+
+REACH_M = 1.4
+"""Points of the floor beyond this horizontal distance from the objects are left out."""
+
+QUANTUM_M = 2e-4
+"""Points are packed as whole multiples of this, relative to the target: they reach 6.5 m."""
+
+MOST_FACES = 120_000
+"""A mesh with more is drawn with its corners moved to a grid."""
+
+GRID_STEPS = 160
+"""Cells of that grid along the longest side of the mesh."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The points of one view."""
+
+    role: str
+    points: Array
+    """[N, 3] metres, world."""
+    colors: NDArray[np.uint8]
+    """[N, 3] sRGB."""
+    size_m: float
+    """Distance between neighbouring points of an object that faces the camera."""
+    T_world_cam: Array
+
+
+@dataclass(frozen=True)
+class Body:
+    """A mesh of the scene."""
+
+    kind: str
+    """`object` or `table`."""
+    vertices: Array
+    """[V, 3] metres, world."""
+    faces: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Space:
+    """What the 3-D view shows of one scene."""
+
+    scene_id: int
+    category: str
+    target: Array
+    """[3] the middle of the objects' points, metres, world."""
+    clouds: tuple[Cloud, ...]
+    bodies: tuple[Body, ...]
+    missing: str
+    """Why there is no mesh; empty where there is."""
+
+
+def read_space(store: Store, scene_id: int) -> Space | None:
+    """Clouds and mesh of a scene's first pair; None where it has no depth. Raises CorruptError for damaged images."""
+    stored = find_scene(store, scene_id)
+    scene = stored.scene(scene_id)
+    if scene is None:
+        return None
+    views, _ = next(stored.pairs(scene_id))
+    images = read_pair(file_reader(store.read, stored), views)
+    target = np.mean([pose[:3, 3] for region, pose in read_world_poses(scene).items() if region > 2], axis=0)
+    clouds = tuple(
+        cloud_of(role, images, views[role], target) for role in ("input", "mirror") if (role, "depth") in images
+    )
+    if not clouds:
+        return None
+    bodies, missing = _read_bodies(store, scene_id)
+    return Space(scene_id, scene["category"], target, clouds, bodies, missing)
+
+
+def cloud_of(role: str, images: PairImages, view: Row, target: Array) -> Cloud:
+    """The cloud of one view's depth, in its colours; grey without RGB."""
+    camera = read_camera(view)
+    depth = metres_of(images[role, "depth"], view)
+    regions = images[role, "region"]
+    rows, columns = np.nonzero(depth > 0)
+    z = depth[rows, columns]
+    T = camera.T_world_cam
+    points = unproject(rows, columns, z, camera.intrinsics) @ T[:3, :3].T + T[:3, 3]
+    region = regions[rows, columns]
+    near = np.hypot(*(points[:, :2] - target[:2]).T) < REACH_M
+    groups = (near & (region >= REGION_FIRST_OBJECT), near & (region == REGION_TABLE), near & (region == REGION_FLOOR))
+    kept = _thin([np.flatnonzero(group) for group in groups])
+    rgb = images.get((role, "rgb"))
+    colors = np.full((len(kept), 3), 150, np.uint8) if rgb is None else rgb[rows[kept], columns[kept]]
+    ours = z[region >= REGION_FIRST_OBJECT]
+    size_m = float(np.median(ours if ours.size else z)) / camera.intrinsics.fx if z.size else 0.01
+    return Cloud(role, points[kept], colors, size_m, T)
+
+
+def _thin(groups: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """At most `MOST_POINTS` indices: of the first groups as many as there are, and then of the last, the floor, its share."""
+    floor = _evenly(groups[-1], max(int(FLOOR_SHARE * MOST_POINTS), MOST_POINTS - sum(map(len, groups[:-1]))))
+    room, chosen = MOST_POINTS - len(floor), [floor]
+    for group in groups[:-1]:
+        chosen.append(_evenly(group, room))
+        room -= len(chosen[-1])
+    return np.sort(np.concatenate(chosen))
+
+
+def _evenly(indices: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    return indices[:: -(-len(indices) // most)] if 0 < most < len(indices) else indices[: max(most, 0)]
+
+
+def _read_bodies(store: Store, scene_id: int) -> tuple[tuple[Body, ...], str]:
+    """(the meshes of a scene but for the floor, why there are none)."""
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "scene.glb"
+            export_scene(store, scene_id, file)
+            scene = trimesh.load_scene(file, process=False)
+    except VersoError as error:
+        return (), str(error)
+    bodies = []
+    for node in scene.graph.nodes_geometry:
+        T, name = scene.graph[node]
+        mesh = scene.geometry[name]
+        if node.split("/")[0] == "floor" or not len(mesh.faces):
+            continue
+        kind = "table" if node.startswith(("table ", "board ")) else "object"
+        vertices = mesh.vertices @ T[:3, :3].T + T[:3, 3]
+        bodies.append(coarsen(Body(kind, vertices, np.asarray(mesh.faces, np.int64))))
+    return tuple(bodies), ""
+
+
+def coarsen(body: Body) -> Body:
+    """The mesh itself, or, where it has more than `MOST_FACES`, its corners moved to a grid and what collapsed left out."""
+    if len(body.faces) <= MOST_FACES:
+        return body
+    low = body.vertices.min(axis=0)
+    cell = float(np.ptp(body.vertices, axis=0).max()) / GRID_STEPS
+    keys, of = np.unique(np.round((body.vertices - low) / cell).astype(np.int64), axis=0, return_inverse=True)
+    faces = of.reshape(-1)[body.faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return Body(body.kind, low + keys * cell, faces[np.sort(first)])
+
+
+def pack_space(space: Space) -> str:
+    """JSON for the page; arrays are base64 of little-endian numbers, points relative to the target."""
+    clouds = [
+        {
+            "role": cloud.role,
+            "points": _base64(np.clip(np.round((cloud.points - space.target) / QUANTUM_M), -32767, 32767), "<i2"),
+            "colors": _base64(cloud.colors, "u1"),
+            "size": round(cloud.size_m, 6),
+            "camera": [round(float(x), 6) for x in cloud.T_world_cam.ravel()],
+        }
+        for cloud in space.clouds
+    ]
+    bodies = [
+        {
+            "kind": body.kind,
+            "vertices": _base64(body.vertices - space.target, "<f4"),
+            "faces": _base64(body.faces, "<u4"),
+        }
+        for body in space.bodies
+    ]
+    packed: Mapping[str, Any] = {
+        "scene": space.scene_id,
+        "quantum": QUANTUM_M,
+        "target": [round(float(x), 6) for x in space.target],
+        "clouds": clouds,
+        "bodies": bodies,
+    }
+    return json.dumps(packed, separators=(",", ":"))
+
+
+def _base64(values: NDArray, kind: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode("ascii")

@@ -1,0 +1,353 @@
+"""The figures of a dataset from batches of its tables: rows of a large dataset are never all in memory.
+
+- Columns of the manifest tables in batches, finished or being made: rows of a large dataset are never all in memory.
+- The figures of a dataset from batches of its tables: counts, histograms, effects and their cost. Pure but for
+  reading.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import groupby
+from operator import itemgetter
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from schemas.dataset.commit import CommitRecord
+from schemas.dataset.layout import MANIFEST
+from schemas.dataset.tables import CAPTURE_SCHEMAS
+from services.look.charts import Histogram
+from services.merge.merge import read_success
+from services.read.stored_tables import category_of, read_merged
+from workers.store.commit import list_codes, split_code
+from workers.store.ledger import range_rows, read_range
+from workers.store.store import Store
+
+MOST_RANGES = 256
+"""Largest number of ranges that are read of a dataset that is not merged; more are sampled evenly."""
+
+BATCH_ROWS = 65_536
+
+_INNER = {"files": "files.list.element.bytes"}
+"""Columns of which a part is enough; names and digests of files are most of the bytes of `views`."""
+
+
+@dataclass(frozen=True)
+class Tables:
+    """The rows of a dataset: its merged files, or those of committed ranges."""
+
+    store: Store
+    merged: tuple[str, ...]
+    """Merged files; none while the dataset is being made."""
+    ranges: tuple[tuple[int, tuple[int, ...]], ...]
+    """(first scene, retries) of the ranges that are read where it is not merged."""
+    all_ranges: int
+
+    @property
+    def sampled(self) -> bool:
+        """Whether rows of some ranges only are read."""
+        return not self.merged and len(self.ranges) < self.all_ranges
+
+    def batches(self, table: str, columns: Sequence[str]) -> Iterator[pa.Table]:
+        """The rows in order of files, with these columns; those that old files lack are null.
+
+        Raises CorruptError where a range's file does not match its commit, pyarrow's errors where a merged one is damaged.
+        """
+        if self.merged:
+            prefix = f"{MANIFEST}/{table}/"
+            parts = (
+                part for key in self.merged if key.startswith(prefix) for part in self._merged(table, key, columns)
+            )
+        else:
+            parts = (range_rows(self.store, records, table) for records in self._records)
+        for part in parts:
+            if part.num_rows:
+                yield _with_columns(part, table, columns)
+
+    @cached_property
+    def _records(self) -> list[list[CommitRecord]]:
+        return [read_range(self.store, start, retries) for start, retries in self.ranges]
+
+    def _merged(self, table: str, key: str, columns: Sequence[str]) -> Iterator[pa.Table]:
+        if self.store.root is None:
+            yield read_merged(table, key, self.store.read(key))
+            return
+        with pq.ParquetFile(self.store.root / key, page_checksum_verification=True) as file:
+            stored = set(file.schema_arrow.names)
+            wanted = [_INNER.get(name, name) for name in columns if name in stored]
+            for batch in file.iter_batches(BATCH_ROWS, columns=wanted):
+                rows = pa.table(batch)
+                if "category" in columns and "category" not in stored:
+                    rows = rows.append_column("category", pa.repeat(pa.scalar(category_of(key)), rows.num_rows))
+                yield rows
+
+
+def open_tables(store: Store) -> Tables:
+    """The tables of a dataset as it is now, which may have no rows yet."""
+    done = read_success(store)
+    if done is not None:
+        return Tables(store, tuple(sorted(done["files"])), (), 0)
+    codes = map(split_code, list_codes(store))
+    ranges = [(start, tuple(retry for _, retry in group)) for start, group in groupby(codes, key=itemgetter(0))]
+    return Tables(store, (), tuple(choose_spread(ranges, MOST_RANGES)), len(ranges))
+
+
+def choose_spread(items: Sequence, count: int) -> list:
+    """`count` of the items, or all of them, evenly from the first to the last."""
+    if len(items) <= count:
+        return list(items)
+    return [items[round(i * (len(items) - 1) / max(count - 1, 1))] for i in range(count)]
+
+
+def _with_columns(rows: pa.Table, table: str, columns: Sequence[str]) -> pa.Table:
+    schema = CAPTURE_SCHEMAS[table]
+    for name in columns:
+        if name not in rows.column_names:
+            rows = rows.append_column(name, pa.nulls(rows.num_rows, schema.field(name).type))
+    return rows.select(list(columns))
+
+
+@dataclass
+class Cost:
+    """How often something ran and what it took."""
+
+    runs: int = 0
+    seconds: float = 0.0
+    timed: int = 0
+    """How many of the runs have a time."""
+    skips: Counter[str] = field(default_factory=Counter)
+    """How often it was left out, by reason."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Scenes that failed in one way, with an example."""
+
+    reason: str
+    kind: str
+    stage: str
+    scenes: int
+    examples: tuple[int, ...]
+    detail: str
+
+
+@dataclass(frozen=True)
+class CaptureQuality:
+    """The figures of one capture; None where there is no truth to compare with."""
+
+    scene_id: int
+    name: str
+    category: str
+    views: int
+    left_out: int
+    estimate: str
+    reprojection_px: float | None
+    measured_share: float | None
+    pose_mm: float | None
+    cloud_median_mm: float | None
+    completeness: float | None
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What the tables of a dataset say."""
+
+    scenes: int
+    """Rows of `scenes` that were read."""
+    by_category: dict[str, int]
+    instances: int
+    views: int
+    pairs: int
+    files: int
+    bytes: int
+    seconds: float
+    visibility: dict[str, Histogram]
+    """By role."""
+    inclination: dict[str, Histogram]
+    """By role, degrees below the horizontal."""
+    distance: Histogram
+    """d_z of each pair, metres."""
+    gap: Histogram
+    """Resting gap, decimal logarithm of millimetres; what is smaller than a nanometre counts as one."""
+    effects: dict[str, Cost]
+    stages: dict[str, Cost]
+    failures: tuple[Failure, ...]
+    captures: tuple[CaptureQuality, ...]
+    sampled: bool
+    """Whether some of the ranges only were read."""
+
+
+GROUNDS = ("table", "board")
+"""Categories of assets that objects stand on."""
+
+MOST_EXAMPLES = 5
+MOST_CAPTURES = 50
+DISTANCE_M = (0.0, 9.6)
+GAP_DECADES = (-6.0, 4.0)
+"""Range of the resting gap, from a nanometre to ten metres, as a power of ten of a millimetre."""
+
+
+def collect(tables: Tables) -> Figures:
+    """The figures of all rows, read once, by columns."""
+    scenes = _Scenes()
+    scenes.read(tables)
+    views = _Views()
+    views.read(tables)
+    stages, effects, seconds = _read_timings(tables)
+    for name, cost in scenes.effects.items():
+        timed = effects.get(name, Cost())
+        cost.seconds, cost.timed = timed.seconds, timed.timed
+    return Figures(
+        scenes=sum(scenes.by_category.values()),
+        by_category=dict(sorted(scenes.by_category.items())),
+        instances=_count_instances(tables),
+        views=views.count,
+        pairs=views.pairs,
+        files=views.files,
+        bytes=views.bytes,
+        seconds=seconds,
+        visibility=views.visibility,
+        inclination=views.inclination,
+        distance=views.distance,
+        gap=scenes.gap,
+        effects=dict(sorted(scenes.effects.items(), key=lambda item: (-item[1].seconds, -item[1].runs, item[0]))),
+        stages=dict(sorted(stages.items(), key=lambda item: -item[1].seconds)),
+        failures=_read_failures(tables),
+        captures=tuple(scenes.captures),
+        sampled=tables.sampled,
+    )
+
+
+class _Scenes:
+    """What `scenes` says, added up."""
+
+    def __init__(self) -> None:
+        self.by_category: Counter[str] = Counter()
+        self.gap = Histogram(*GAP_DECADES)
+        self.effects: dict[str, Cost] = {}
+        self.captures: list[CaptureQuality] = []
+
+    def read(self, tables: Tables) -> None:
+        columns = ("scene_id", "category", "effects", "skipped", "hover_gap_mm", "capture")
+        for rows in tables.batches("scenes", columns):
+            self.by_category.update(_counts(rows.column("category")))
+            self.gap = self.gap.add(np.log10(np.maximum(_numbers(rows, "hover_gap_mm"), 10 ** GAP_DECADES[0])))
+            for name, runs in _counts(_flat(rows, "effects")).items():
+                self.effects.setdefault(name, Cost()).runs += runs
+            skipped = _flat(rows, "skipped")
+            both = pc.binary_join_element_wise(
+                pc.struct_field(skipped, "effect"), pc.struct_field(skipped, "why"), "\0"
+            )
+            for told, times in _counts(both).items():
+                name, _, why = told.partition("\0")
+                self.effects.setdefault(name, Cost()).skips[why] += times
+            self.captures += _captures(rows, MOST_CAPTURES - len(self.captures))
+
+
+class _Views:
+    """What `views` says, added up."""
+
+    def __init__(self) -> None:
+        self.count = self.pairs = self.files = self.bytes = 0
+        self.visibility: dict[str, Histogram] = {}
+        self.inclination: dict[str, Histogram] = {}
+        self.distance = Histogram(*DISTANCE_M)
+
+    def read(self, tables: Tables) -> None:
+        for rows in tables.batches("views", ("role", "visible_fraction", "inclination_rad", "d_z_m", "files")):
+            self.count += rows.num_rows
+            sizes = pc.struct_field(_flat(rows, "files"), "bytes")
+            self.files += len(sizes)
+            self.bytes += pc.sum(sizes).as_py() or 0
+            roles = np.asarray(rows.column("role").to_pylist())
+            for role in ("input", "mirror"):
+                of = rows.filter(pa.array(roles == role))
+                if not of.num_rows:
+                    continue
+                visibility = self.visibility.get(role, Histogram(0.0, 1.0))
+                self.visibility[role] = visibility.add(_numbers(of, "visible_fraction"))
+                inclination = self.inclination.get(role, Histogram(-96.0, 96.0))
+                self.inclination[role] = inclination.add(np.degrees(_numbers(of, "inclination_rad")))
+                if role == "input":
+                    self.pairs += of.num_rows
+                    self.distance = self.distance.add(_numbers(of, "d_z_m"))
+
+
+def _read_timings(tables: Tables) -> tuple[dict[str, Cost], dict[str, Cost], float]:
+    """(stages, effects, seconds in all)."""
+    sums: dict[str, dict[str, Cost]] = {"stages": {}, "effects": {}}
+    total = 0.0
+    for rows in tables.batches("timings", ("stages", "effects", "total_s")):
+        total += float(_numbers(rows, "total_s").sum())
+        for column, costs in sums.items():
+            items = _flat(rows, column)
+            named = pa.table({"name": pc.struct_field(items, "name"), "seconds": pc.struct_field(items, "seconds")})
+            grouped = named.group_by("name").aggregate([("seconds", "sum"), ("seconds", "count")])
+            for one in grouped.to_pylist():
+                cost = costs.setdefault(one["name"], Cost())
+                cost.seconds += one["seconds_sum"]
+                cost.timed += one["seconds_count"]
+                cost.runs += one["seconds_count"]
+    return sums["stages"], sums["effects"], total
+
+
+def _read_failures(tables: Tables) -> tuple[Failure, ...]:
+    """Each way of failing, the most frequent first."""
+    counts: Counter[tuple[str, str, str]] = Counter()
+    examples: dict[tuple[str, str, str], list[int]] = {}
+    details: dict[tuple[str, str, str], str] = {}
+    for rows in tables.batches("failures", ("scene_id", "reason", "kind", "stage", "detail")):
+        for row in rows.to_pylist():
+            key = (row["reason"], row["kind"], row["stage"])
+            counts[key] += 1
+            details.setdefault(key, row["detail"])
+            if len(found := examples.setdefault(key, [])) < MOST_EXAMPLES:
+                found.append(row["scene_id"])
+    return tuple(Failure(*key, count, tuple(examples[key]), details[key]) for key, count in counts.most_common())
+
+
+def _count_instances(tables: Tables) -> int:
+    """Number of different objects; what they stand on is not counted."""
+    seen: set[str] = set()
+    unique = 0
+    for rows in tables.batches("assets", ("instance_id", "category")):
+        objects = rows.filter(pc.invert(pc.is_in(rows.column("category"), value_set=pa.array(GROUNDS))))
+        if tables.merged:  # each stands there once
+            unique += objects.num_rows
+        else:
+            seen.update(objects.column("instance_id").to_pylist())
+    return unique + len(seen)
+
+
+def _captures(rows: pa.Table, most: int) -> Iterator[CaptureQuality]:
+    """The rows that are captures, at most so many."""
+    column = rows.column("capture")
+    if column.null_count == len(column):
+        return
+    for row in rows.select(["scene_id", "category", "capture"]).slice(0, max(most, 0)).to_pylist():
+        if (one := row["capture"]) is not None:
+            plain = ("reprojection_px", "measured_share", "pose_mm", "cloud_median_mm", "completeness")
+            yield CaptureQuality(
+                row["scene_id"], one["name"], row["category"], one["views"], len(one["left_out"]), one["estimate"],
+                **{name: one[name] for name in plain},
+            )  # fmt: skip
+
+
+def _counts(values: pa.Array | pa.ChunkedArray) -> Counter[str]:
+    return Counter({one["values"]: one["counts"] for one in pc.value_counts(values).to_pylist()})
+
+
+def _flat(rows: pa.Table, column: str) -> pa.Array:
+    """The items of a list column."""
+    return pc.list_flatten(rows.column(column).combine_chunks())
+
+
+def _numbers(rows: pa.Table, column: str) -> np.ndarray:
+    """[N] float64, NaN for null."""
+    values = rows.column(column).cast(pa.float64())
+    return pc.fill_null(values, math.nan).to_numpy()

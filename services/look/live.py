@@ -1,0 +1,285 @@
+"""The live page: how far a dataset is, what the page shows of it, and a thread that follows it.
+
+- How far a dataset is: an empty folder, one being made, one that stands still, one that is finished.
+- The live part of the page: state, progress, failures so far, and the latest pictures. Pure: progress to HTML.
+- Follows a dataset for the live page: a thread that looks every few seconds and keeps the newest answers ready.
+"""
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from typing import Literal
+
+from schemas.dataset.layout import commit_path
+from schemas.errors import OutputError, VersoError, describe_seconds
+from services.job.record import read_job
+from services.look.charts import Histogram
+from services.look.pictures import DEPTH_M, Picture, ShownScene, show_scene
+from services.look.report import Section, View, page_of, read_report
+from services.look.sections import Address, strip_html
+from services.read.dataset_reader import file_reader, read_stored
+from services.read.status import Status, read_status
+from services.read.verdict import explain_damage
+from services.run.lock import shows_life
+from services.study.words import number
+from workers.store.commit import list_codes, split_code
+from workers.store.ledger import read_range
+from workers.store.store import Store
+
+Phase = Literal["empty", "making", "stopped", "finished", "unreadable"]
+
+LATEST = 4
+"""Scenes whose pictures the live page shows."""
+
+LOOKS = 64
+"""Ranges at the end of the dataset among which the latest are looked for."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a person who waits wants to know."""
+
+    phase: Phase
+    name: str = ""
+    """Of the job."""
+    asked: int = 0
+    made: int = 0
+    failed: Mapping[str, int] = field(default_factory=dict)
+    """By `kind: reason`."""
+    scenes_per_s: float | None = None
+    """Of the latest commits; None where nothing runs."""
+    left_s: float | None = None
+    running: tuple[int, ...] = ()
+    """Scenes in progress."""
+    told: tuple[str, ...] = ()
+    """What is wrong with the folder, a sentence each."""
+
+    @property
+    def done(self) -> int:
+        """Scenes made or failed."""
+        return self.made + sum(self.failed.values())
+
+
+def read_progress(store: Store) -> Progress:
+    """The progress of a folder; never raises for what the folder holds."""
+    try:
+        with explain_damage(store):
+            record = read_job(store)
+            if record is None:
+                return Progress("empty")
+            job = record.job
+            try:
+                status = read_status(store, job.first_scene, job.stop_scene)
+            except OutputError:  # the job is written, and nothing is begun
+                return Progress("empty", job.name, job.scenes)
+            lives = status.holder is not None and shows_life(store, status.holder)
+    except VersoError as error:
+        return Progress("unreadable", told=(str(error),))
+    return progress_of(job.name, status, lives)
+
+
+def progress_of(name: str, status: Status, lives: bool) -> Progress:
+    """The progress in a status; `lives`: whether a run shows life."""
+    begun = status.made or status.failed or status.lost
+    ended: Phase = "finished" if status.digest and not status.missing else "stopped" if begun else "empty"
+    phase: Phase = "making" if lives else ended
+    rate = status.scenes_per_s if lives else None
+    return Progress(
+        phase,
+        name,
+        status.asked,
+        status.made,
+        status.failed,
+        rate,
+        status.missing / rate if rate else None,
+        tuple(one.scene_id for one in status.running if lives and one.scene_id is not None),
+        status.lost,
+    )
+
+
+def latest_scenes(store: Store, count: int = LATEST) -> list[ShownScene]:
+    """The scenes of the newest commits, the newest first; those that cannot be read just now are left out."""
+    codes = [split_code(code) for code in list_codes(store)[-LOOKS:]]
+    found = {start: store.stat(commit_path(start, retry)) for start, retry in codes}
+    written = {start: entry.modified_s if entry else 0.0 for start, entry in found.items()}
+    shown: list[ShownScene] = []
+    for start in sorted(written, key=lambda start: (-written[start], -start)):
+        if len(shown) >= count:
+            break
+        try:
+            stored = read_stored(store, read_range(store, start, [retry for one, retry in codes if one == start]))
+            read, depth = file_reader(store.read, stored), {role: Histogram(*DEPTH_M) for role in ("input", "mirror")}
+            for row in stored.rows["scenes"][: -(count - len(shown)) - 1 : -1]:
+                shown.append(show_scene(read, stored, row, depth))
+        except VersoError:  # committed a moment ago and not in its place yet, or damaged, which the report tells
+            continue
+    return shown
+
+
+STATES: dict[Phase, str] = {
+    "empty": "Waiting for a job",
+    "making": "Making scenes",
+    "stopped": "Stopped",
+    "finished": "Finished",
+    "unreadable": "Cannot be read",
+}
+
+
+def live_html(progress: Progress, latest: Sequence[ShownScene], address: Address) -> str:
+    """The contents of the live section."""
+    return _state(progress) + _troubles(progress) + _latest(progress, latest, address)
+
+
+def title_of(progress: Progress) -> str:
+    """The title of the window: the share that is done, and the job."""
+    share = f"{progress.done / progress.asked:.0%} · " if progress.asked and progress.phase == "making" else ""
+    return f"{share}{progress.name or 'Verso'}"
+
+
+def _state(progress: Progress) -> str:
+    state = f'<span class="state {progress.phase}">{STATES[progress.phase]}</span>'
+    if progress.phase == "empty":
+        job = (
+            f"The job {progress.name} asks for {progress.asked:,} scenes." if progress.name else "There is no job yet."
+        )
+        return f'<p class="lead">{state}</p><p class="empty">{escape(job)} This page follows the folder.</p>'
+    if progress.phase == "unreadable":
+        return f'<p class="lead">{state}</p>'
+    facts = [f"{progress.done:,} of {progress.asked:,} scenes"]
+    if progress.scenes_per_s is not None:
+        facts.append(f"{number(float(f'{progress.scenes_per_s:.2g}'))} a second")
+    if progress.left_s:
+        facts.append(f"{describe_seconds(progress.left_s)} left")
+    facts.append(f"{sum(progress.failed.values()):,} failed")
+    if progress.running:
+        facts.append(
+            f"now at {', '.join(map(str, progress.running[:4]))}{' and more' if len(progress.running) > 4 else ''}"
+        )
+    bar = f'<progress max="{max(progress.asked, 1)}" value="{progress.done}" aria-label="Scenes done"></progress>'
+    return f'<p class="lead">{state} {escape(" · ".join(facts))}</p>{bar}'
+
+
+def _troubles(progress: Progress) -> str:
+    lines = [f"{count:,} failed, {told.replace('_', ' ')}" for told, count in progress.failed.items()]
+    items = "".join(f"<li>{escape(line)}</li>" for line in [*progress.told, *lines])
+    return f'<ul class="troubles">{items}</ul>' if items else ""
+
+
+def _latest(progress: Progress, latest: Sequence[ShownScene], address: Address) -> str:
+    if not latest or progress.phase == "unreadable":
+        return ""
+    return f'<div class="latest">{"".join(strip_html(scene, address) for scene in latest)}</div>'
+
+
+LOOK_S = 2.0
+"""Seconds between two looks, and at least four times as long as a look takes."""
+
+REPORT_S = 10.0
+"""Fewest seconds between two reports of a dataset that grows, and at least ten times as long as one takes."""
+
+SHELF_BYTES = 96_000_000
+"""Pictures of earlier looks that a page may still ask for."""
+
+
+class PictureShelf:
+    """Pictures by name; the oldest go where there are too many."""
+
+    def __init__(self, most_bytes: int = SHELF_BYTES) -> None:
+        self._most, self._bytes, self._lock = most_bytes, 0, threading.Lock()
+        self._pictures: OrderedDict[str, Picture] = OrderedDict()
+
+    def put(self, picture: Picture) -> str:
+        """Keeps a picture; returns its address on the server."""
+        with self._lock:
+            if picture.name not in self._pictures:
+                self._bytes += len(picture.data)
+            self._pictures[picture.name] = picture
+            self._pictures.move_to_end(picture.name)
+            while self._bytes > self._most and len(self._pictures) > 1:
+                self._bytes -= len(self._pictures.popitem(last=False)[1].data)
+        return f"/picture/{picture.name}"
+
+    def get(self, name: str) -> Picture | None:
+        """The picture of a name, None where it is not kept."""
+        with self._lock:
+            return self._pictures.get(name)
+
+
+class Follower:
+    """Keeps the `view` of a folder up to date, in a thread of its own between `start` and `stop`."""
+
+    def __init__(self, store: Store, scenes: int) -> None:
+        self.shelf = PictureShelf()
+        self._store, self._scenes = store, scenes
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="follower", daemon=True)
+        self._latest: list[ShownScene] = []
+        self._sections: tuple[Section, ...] = ()
+        self._version, self._reported, self._not_before = 0, (-1, ""), 0.0
+        self._shown = Progress("empty")
+        self.view = View("Verso", "Verso", live_html(self._shown, (), self.shelf.put), (), 0)
+
+    def start(self) -> None:
+        """Looks once, so that the first page has something to show, and goes on in the thread."""
+        self.look()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ends the thread, after the look that it is at."""
+        self._ended.set()
+        if self._thread.is_alive():
+            self._thread.join(10)
+
+    def look(self) -> None:
+        """One look at the folder, without the report."""
+        progress = read_progress(self._store)
+        if progress.done != self._shown.done or progress.phase != self._shown.phase:
+            self._latest = self._read_latest() if progress.phase in ("making", "stopped", "finished") else []
+        self._shown = progress
+        self._publish()
+
+    def report(self) -> None:
+        """Makes the sections anew where the dataset has changed and the last time is long enough ago."""
+        progress, now = self._shown, time.monotonic()
+        about = (progress.done, progress.phase)
+        if about == self._reported or now < self._not_before:
+            return
+        sections = self._read_sections() if progress.done else ()
+        self._not_before = time.monotonic() + max(REPORT_S, 10.0 * (time.monotonic() - now))
+        if sections is not None:
+            self._reported = about
+            if sections != self._sections:
+                self._sections, self._version = sections, self._version + 1
+                self._publish()
+
+    def _run(self) -> None:
+        pause = 0.0
+        while not self._ended.wait(pause):
+            began = time.monotonic()
+            self.look()
+            looked = time.monotonic() - began
+            self.report()
+            pause = max(LOOK_S, 4.0 * looked)
+
+    def _publish(self) -> None:
+        live = live_html(self._shown, self._latest, self.shelf.put)
+        self.view = View(self._shown.name or "Verso", title_of(self._shown), live, self._sections, self._version)
+
+    def _read_latest(self) -> list[ShownScene]:
+        try:
+            with explain_damage(self._store):
+                return latest_scenes(self._store)
+        except VersoError:  # told by the progress
+            return []
+
+    def _read_sections(self) -> tuple[Section, ...] | None:
+        """The sections of a report; None where a file is being moved or merged just now."""
+        try:
+            with explain_damage(self._store):
+                page = page_of(read_report(self._store, self._scenes), self.shelf.put)
+        except VersoError:
+            return None
+        return tuple(page.sections)

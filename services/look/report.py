@@ -1,0 +1,233 @@
+"""`verso report`: a dataset as one HTML page that needs nothing beside it; and the pages of the server.
+
+- The whole page from its sections, style and scripts: one file that fetches nothing, or the page of a server.
+- What the live page shows at a moment: as a page, and as answers to a page that asks for what is new. Pure.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from string import Template
+from urllib.parse import quote
+
+from schemas.errors import OutputError
+from schemas.job.job import Job
+from services.job.record import JobRecord, require_job
+from services.look.clouds import Space, pack_space, read_space
+from services.look.collect import Figures, collect, open_tables
+from services.look.pictures import Sample, choose_scenes, show_scenes
+from services.look.sections import (
+    Address,
+    Side,
+    beside_html,
+    captures_html,
+    charts_html,
+    compare_html,
+    effects_html,
+    failures_html,
+    overview_html,
+    sheets_html,
+    space_html,
+)
+from services.merge.merge import read_success
+from workers.store.store import Store
+
+WEB = Path(__file__).with_name("web")
+
+POLICY = (
+    '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
+    "style-src 'unsafe-inline'; script-src 'unsafe-inline'; base-uri 'none'; form-action 'none'\">"
+)
+"""The browser itself then holds the page to fetching nothing."""
+
+SCRIPTS = ("three.js", "page.js", "space.js")
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page: its id and place in the links, its heading, and its HTML."""
+
+    id: str
+    heading: str
+    html: str
+
+
+@dataclass(frozen=True)
+class Page:
+    """What the page says."""
+
+    title: str
+    subtitle: str
+    sections: Sequence[Section]
+    footer: str
+
+
+@dataclass(frozen=True)
+class Around:
+    """What is not the same in a file and on a server."""
+
+    policy: str
+    style: str
+    icon: str
+    scripts: str
+    data: str = ""
+    """Attributes of the body."""
+
+
+def whole_page(page: Page) -> str:
+    """The page with everything that it needs inside."""
+    style = f"<style>{read_web('page.css')}</style>"
+    icon = f"data:image/svg+xml,{quote(read_web('icon.svg').strip())}"
+    return fill_page(
+        page, Around(POLICY, style, icon, "".join(f"<script>{read_web(name)}</script>\n" for name in SCRIPTS))
+    )
+
+
+def section_html(section: Section) -> str:
+    """One section with its heading."""
+    head = f'<h2 id="{section.id}-heading">{escape(section.heading)}</h2>'
+    return f'<section id="{section.id}" aria-labelledby="{section.id}-heading">{head}\n{section.html}</section>\n'
+
+
+def read_web(name: str) -> str:
+    """A file of the folder `web`."""
+    return (WEB / name).read_text(encoding="utf-8")
+
+
+def fill_page(page: Page, around: Around) -> str:
+    """The template with all its places filled."""
+    shown = [section for section in page.sections if section.html]
+    return Template(read_web("page.html")).substitute(
+        policy=around.policy,
+        data=around.data,
+        icon=around.icon,
+        title=escape(page.title),
+        subtitle=f'<p class="sub">{escape(page.subtitle)}</p>' if page.subtitle else "",
+        style=around.style,
+        links="".join(f'<a href="#{section.id}">{escape(section.heading)}</a>' for section in shown),
+        sections="".join(map(section_html, shown)),
+        footer=f"<footer>{escape(page.footer)}</footer>" if page.footer else "",
+        scripts=around.scripts,
+    )
+
+
+_LIVE = (
+    '<div id="live-now" aria-live="polite">{}</div>'
+    '<p class="empty" id="live-gone" hidden>The server does not answer; this page asks again.</p>'
+    '<button type="button" class="quiet" id="live-newer" hidden>Show newer pictures</button>'
+)
+
+
+@dataclass(frozen=True)
+class View:
+    """What the page shows now."""
+
+    name: str
+    """Of the job."""
+    title: str
+    """Of the window."""
+    live: str
+    sections: tuple[Section, ...]
+    version: int
+    """Of the sections."""
+
+    @property
+    def shape(self) -> str:
+        """The sections that have something to show: a page of another shape is loaded anew."""
+        return " ".join(section.id for section in self.sections if section.html)
+
+    def state(self) -> dict[str, object]:
+        """What the page asks for every few seconds."""
+        shown = {"name": self.name, "title": self.title, "live": self.live}
+        return {**shown, "version": self.version, "shape": self.shape}
+
+    def fragments(self) -> dict[str, object]:
+        """The sections by id."""
+        return {"version": self.version, "sections": {one.id: section_html(one) for one in self.sections if one.html}}
+
+
+def live_page(view: View) -> str:
+    """The page of a server: its style and scripts lie beside it."""
+    page = Page(view.name, "", [Section("live", "Now", _LIVE.format(view.live)), *view.sections], "")
+    scripts = "".join(f'<script src="/{name}"></script>\n' for name in (*SCRIPTS, "live.js"))
+    data = f' data-version="{view.version}" data-shape="{escape(view.shape)}"'
+    return fill_page(page, Around("", '<link rel="stylesheet" href="/page.css">', "/icon.svg", scripts, data))
+
+
+SCENES = 24
+"""Scenes whose pictures are shown, unless told otherwise."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a page is made of."""
+
+    record: JobRecord
+    digest: str | None
+    """Of the finished dataset."""
+    figures: Figures
+    sample: Sample
+    space: Space | None
+
+
+def read_report(store: Store, scenes: int) -> Report:
+    """Figures of the whole dataset, and the pictures of about `scenes` scenes.
+
+    Raises OutputError where there is no dataset, CorruptError where a file is damaged.
+    """
+    record = require_job(store)
+    tables = open_tables(store)
+    figures = collect(tables)
+    sample = show_scenes(store, choose_scenes(tables, figures.by_category, scenes))
+    space = next(filter(None, (read_space(store, one.scene_id) for one in sample.scenes)), None)
+    return Report(record, (read_success(store) or {}).get("digest"), figures, sample, space)
+
+
+def page_of(report: Report, address: Address, other: Report | None = None) -> Page:
+    """The page of a report, with its pictures at these addresses; beside another dataset's, where there is one."""
+    figures, sample, job = report.figures, report.sample, report.record.job
+    failed = sum(one.scenes for one in figures.failures)
+    sections = (
+        Section("overview", "Overview", overview_html(figures, job, failed)),
+        Section("pictures", "Pictures", sheets_html(sample.scenes, address)),
+        Section("compare", "Compare", compare_html(sample.scenes)),
+        Section("space", "In space", space_html(report.space, pack_space(report.space) if report.space else "")),
+        Section("figures", "Figures", charts_html(figures, sample.depth)),
+        Section("effects", "Effects", effects_html(figures)),
+        Section("failures", "Failures", failures_html(figures.failures, figures.scenes + failed)),
+        Section("captures", "Captures", captures_html(figures)),
+        Section("beside", "Side by side", beside_html(_side(report), _side(other), address) if other else ""),
+    )
+    return Page(job.name, _subtitle(job, report.digest), sections, _footer(report))
+
+
+def write_report(store: Store, scenes: int, target: Path, beside: Store | None = None) -> tuple[int, Report]:
+    """(bytes written, what the page was made of). Raises OutputError where the file cannot be written."""
+    report = read_report(store, scenes)
+    other = None if beside is None else read_report(beside, scenes)
+    data = whole_page(page_of(report, lambda picture: picture.inline, other)).encode()
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(data)
+    except OSError as error:
+        raise OutputError(f"{target} cannot be written: {error.strerror or error}; choose another --out") from error
+    return len(data), report
+
+
+def _side(report: Report) -> Side:
+    return report.record.job.name, report.figures, report.sample
+
+
+def _subtitle(job: Job, digest: str | None) -> str:
+    what = "captures" if job.captures is not None else "scenes"
+    state = f"finished, digest {digest[:12]}" if digest else "not finished"
+    return f"{job.scenes:,} {what} asked, seed {job.seed}, {state}"
+
+
+def _footer(report: Report) -> str:
+    shown = len(report.sample.scenes)
+    return (
+        f"Pictures are of {shown} scenes, chosen evenly from each category. Job {report.record.digest[:12]}. "
+        "Made by verso report; this page fetches nothing."
+    )

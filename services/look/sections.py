@@ -1,0 +1,394 @@
+"""The sections of the page. Pure: figures and pictures to HTML.
+
+- Two datasets side by side, captures beside scenes above all: their figures, and a scene of each category. Pure.
+- The sections of the page that are pictures: sheets by category, the slider, the 3-D view. Pure: pictures to HTML.
+- The sections of the page that are figures: overview, histograms, effects, failures, captures. Pure: figures to HTML.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from html import escape
+
+import cv2
+import numpy as np
+
+from schemas.errors import describe_seconds
+from schemas.job.job import Job
+from services.look.charts import Chart, Histogram, amount, chart_html, length_of_decade
+from services.look.clouds import Space
+from services.look.collect import Cost, Failure, Figures
+from services.look.pictures import FIXED_REGIONS, OBJECT_REGIONS, Picture, Sample, ShownScene
+from services.study.words import milliseconds, number, size
+
+Side = tuple[str, Figures, Sample]
+"""Name, figures and shown scenes of one dataset."""
+
+
+Address = Callable[[Picture], str]
+"""Where a page finds a picture: in itself or on its server."""
+
+
+def beside_html(ours: Side, theirs: Side, address: Address) -> str:
+    """A table of both datasets' figures, and a scene of each category that both have."""
+    heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in ("", ours[0], theirs[0]))
+    rows = "".join(
+        f'<tr><th scope="row">{name}</th><td>{told(ours)}</td><td>{told(theirs)}</td></tr>'
+        for name, told in _ROWS.items()
+    )
+    caption = "<caption>Medians, where nothing else is said</caption>"
+    table = f"<table>{caption}<thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
+    first, second = ({scene.category for scene in side[2].scenes} for side in (ours, theirs))
+    pairs = "".join(_pair(category, (ours, theirs), address) for category in sorted(first & second))
+    only = "".join(
+        f'<p class="note">Only in {escape(side[0])}: {escape(", ".join(sorted(own)))}.</p>'
+        for side, own in ((ours, first - second), (theirs, second - first))
+        if own
+    )
+    return f'{table}<div class="pairs">{pairs}</div>{only}'
+
+
+def _pair(category: str, sides: Sequence[Side], address: Address) -> str:
+    cells = [
+        f'<div class="latest"><p class="note">{escape(name)}</p>{strip_html(_first(sample.scenes, category), address)}</div>'
+        for name, _, sample in sides
+    ]
+    return f'<div class="pair">{"".join(cells)}</div>'
+
+
+def _first(scenes: Sequence[ShownScene], category: str) -> ShownScene:
+    return next(scene for scene in scenes if scene.category == category)
+
+
+def _median(histograms: Mapping[str, Histogram], role: str, unit: str, times: float = 1.0) -> str:
+    one = histograms.get(role)
+    return amount(times * one.percentile(0.5), unit) if one is not None and one.count else "–"
+
+
+_ROWS: dict[str, Callable[[Side], str]] = {
+    "scenes": lambda side: f"{side[1].scenes:,}",
+    "pairs of views": lambda side: f"{side[1].pairs:,}",
+    "time of a scene, mean": lambda side: milliseconds(1e3 * side[1].seconds / max(side[1].scenes, 1)),
+    "depth of the objects, input": lambda side: _median(side[2].depth, "input", "m"),
+    "depth of the objects, mirror": lambda side: _median(side[2].depth, "mirror", "m"),
+    "visibility, input": lambda side: _median(side[1].visibility, "input", "%", 100.0),
+    "visibility, mirror": lambda side: _median(side[1].visibility, "mirror", "%", 100.0),
+    "inclination, input": lambda side: _median(side[1].inclination, "input", "°"),
+}
+
+
+CELLS = ("input rgb", "input depth", "input mask", "mirror rgb", "mirror depth", "mirror mask", "over")
+
+
+STRIP = ("input rgb", "mirror rgb", "mirror depth", "mirror mask")
+"""What is shown of a scene where there is little room."""
+
+
+def sheets_html(scenes: Sequence[ShownScene], address: Address) -> str:
+    """Buttons for the categories, a legend, and the pictures of each scene."""
+    if not scenes:
+        return '<p class="empty">There are no scenes to show yet.</p>'
+    names = sorted({scene.category for scene in scenes})
+    buttons = "".join(
+        f'<button type="button" data-show="{escape(name)}" aria-pressed="false">{escape(name or "all")}</button>'
+        for name in ("", *names)
+    )
+    chooser = f'<div class="chooser" role="group" aria-label="Category">{buttons}</div>' if len(names) > 1 else ""
+    return chooser + _legend() + "".join(_scene_html(scene, address) for scene in scenes)
+
+
+def _scene_html(scene: ShownScene, address: Address) -> str:
+    cells = "".join(_cell(scene, name, address) for name in CELLS if name in scene.pictures)
+    several = f" · {len(scene.instances)} objects" if len(scene.instances) > 1 else ""
+    compare = (
+        f'<button type="button" class="quiet" data-compare="{scene.scene_id}">Compare</button>'
+        if {"input rgb", "mirror rgb"} <= scene.pictures.keys()
+        else ""
+    )
+    return (
+        f'<article class="scene" data-category="{escape(scene.category)}" data-scene="{scene.scene_id}">'
+        f"<header><h3>{escape(scene.category)} <span>scene {scene.scene_id}{several}</span></h3>{compare}</header>"
+        f'<div class="cells">{cells}</div><p class="note">{escape(_facts(scene))}</p></article>\n'
+    )
+
+
+def _cell(scene: ShownScene, name: str, address: Address) -> str:
+    picture = scene.pictures[name]
+    words = f"{scene.category}, scene {scene.scene_id}: {picture.words}"
+    caption = picture.words.replace(" view, ", " · ").replace("colour", "RGB")
+    return (
+        f'<figure class="{name.replace(" ", "-")}"><img loading="lazy" decoding="async" width="{picture.width}" '
+        f'height="{picture.height}" alt="{escape(words)}" data-name="{name}" src="{address(picture)}">'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+    )
+
+
+def _facts(scene: ShownScene) -> str:
+    seen = [f"{share:.0%} visible in the {role} view" for role, share in scene.visible.items() if share is not None]
+    distance = [f"d_z {scene.d_z_m:.3f} m"] if scene.d_z_m is not None else []
+    return ", ".join([f"pose {scene.pose_id}", *seen, *distance])
+
+
+def _legend() -> str:
+    """Colours of depth and of regions."""
+    steps = cv2.applyColorMap(np.linspace(255, 0, 9).astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
+    width = 100 / len(steps)
+    ramp = "".join(
+        f'<rect x="{i * width:.2f}" width="{width + 0.5:.2f}" height="8" fill="{_hex(color)}"/>'
+        for i, color in enumerate(steps.tolist())
+    )
+    regions = (("floor", FIXED_REGIONS[1]), ("table", FIXED_REGIONS[2]))
+    swatches = "".join(f"<span>{_swatch([color])} {name}</span>" for name, color in regions)
+    swatches += f"<span>{_swatch(OBJECT_REGIONS[:4])} objects</span>"
+    return (
+        f'<p class="legend"><span>near <svg viewBox="0 0 100 8" preserveAspectRatio="none" class="ramp" aria-hidden="true">'
+        f"{ramp}</svg> far or farther</span><span>no depth: black</span>{swatches}</p>"
+    )
+
+
+def _swatch(colors: Iterable[Sequence[int]]) -> str:
+    parts = list(colors)
+    squares = "".join(f'<rect x="{12 * i}" width="10" height="10" fill="{_hex(c)}"/>' for i, c in enumerate(parts))
+    return f'<svg class="swatch" width="{12 * len(parts)}" height="10" aria-hidden="true">{squares}</svg>'
+
+
+def _hex(color: Sequence[int]) -> str:
+    return "#" + "".join(f"{value:02x}" for value in color)
+
+
+def compare_html(scenes: Sequence[ShownScene]) -> str:
+    """The slider between input and mirror view; the script takes the pictures from the sheets. Empty without pairs."""
+    pairs = [scene for scene in scenes if {"input rgb", "mirror rgb"} <= scene.pictures.keys()]
+    if not pairs:
+        return ""
+    options = "".join(
+        f'<option value="{scene.scene_id}">{escape(scene.category)}, scene {scene.scene_id}</option>' for scene in pairs
+    )
+    kinds = "".join(
+        f'<button type="button" data-kind="{kind}" aria-pressed="{"true" if kind == "rgb" else "false"}">{name}</button>'
+        for kind, name in (("rgb", "RGB"), ("depth", "depth"), ("mask", "regions"))
+    )
+    return (
+        f'<div class="tools"><label>Scene <select id="compare-scene">{options}</select></label>'
+        f'<div class="chooser" role="group" aria-label="Images">{kinds}</div></div>'
+        '<div class="wipe" id="wipe"><img id="wipe-mirror" alt=""><img id="wipe-input" alt=""><span class="tag left">input</span>'
+        '<span class="tag right">mirror</span><span class="edge" aria-hidden="true"></span>'
+        '<input id="wipe-range" type="range" min="0" max="100" value="50" aria-label="From mirror view to input view"></div>'
+    )
+
+
+def space_html(space: Space | None, data: str) -> str:
+    """The 3-D view with its controls; `data` is what its script reads. Empty where there is nothing to show."""
+    if space is None:
+        return ""
+    switches = [(f"{cloud.role} cloud", cloud.role) for cloud in space.clouds]
+    switches += [("mesh", "mesh")] if space.bodies else []
+    switches += [("cameras", "cameras")]
+    boxes = "".join(
+        f'<label><input type="checkbox" data-part="{part}" checked> {escape(name)}</label>' for name, part in switches
+    )
+    boxes += '<label><input type="checkbox" data-part="tint"> colour by camera</label>'
+    missing = f" There is no mesh: {escape(space.missing)}." if space.missing else ""
+    about = "the stored depth of both cameras as points, with the mesh as it was posed."
+    keys = "Arrow keys turn, plus and minus zoom, 0 resets."
+    return (
+        f'<p class="sub">{escape(space.category)}, scene {space.scene_id}: {about}{missing}</p>'
+        f'<div class="tools">{boxes}<button type="button" class="quiet" id="space-reset">Reset</button></div>'
+        '<div class="space"><canvas id="space-canvas" tabindex="0" role="img" '
+        f'aria-label="3-D view of the point clouds and the mesh. {keys}"></canvas></div>'
+        f'<p class="note" id="space-note">Drag to turn. {keys} Click it before you zoom with the wheel.</p>'
+        f'<script type="application/json" id="space-data">{data}</script>'
+    )
+
+
+def strip_html(scene: ShownScene, address: Address) -> str:
+    """Four pictures of a scene, and its name."""
+    pictures = [scene.pictures[name] for name in STRIP if name in scene.pictures]
+    images = "".join(
+        f'<img width="{one.width}" height="{one.height}" alt="{escape(f"scene {scene.scene_id}: {one.words}")}" '
+        f'src="{address(one)}">'
+        for one in pictures
+    )
+    name = f"{escape(scene.category)} <span>scene {scene.scene_id}</span>"
+    return f"<figure><div>{images}</div><figcaption>{name}</figcaption></figure>"
+
+
+def overview_html(figures: Figures, job: Job, failed: int) -> str:
+    """Totals, and the scenes of each category."""
+    tiles = [
+        ("scenes", f"{figures.scenes:,}", f"of {job.scenes:,} asked"),
+        ("failed", f"{failed:,}", f"{number(round(100 * failed / max(failed + figures.scenes, 1), 2))} % of those tried"),
+        ("pairs of views", f"{figures.pairs:,}", f"{figures.views:,} views"),
+        ("objects", f"{figures.instances:,}", f"different ones in {_plural(len(figures.by_category), 'category', 'categories')}"),
+        ("images", f"{figures.files:,}", size(figures.bytes / 1e3)),
+        ("time", describe_seconds(figures.seconds), f"{milliseconds(1e3 * figures.seconds / max(figures.scenes, 1))} a scene"),
+    ]  # fmt: skip
+    tiles_html = "".join(
+        f"<div><dt>{escape(name)}</dt><dd>{escape(value)}<small>{escape(more)}</small></dd></div>"
+        for name, value, more in tiles
+    )
+    most = max(figures.by_category.values(), default=1)
+    rows = "".join(
+        f'<tr><th scope="row">{escape(name)}</th><td class="wide">{_bar(count / most)}</td><td>{count:,}</td></tr>'
+        for name, count in figures.by_category.items()
+    )
+    table = f'<table class="bars"><caption>Scenes by category</caption><tbody>{rows}</tbody></table>' if rows else ""
+    return f'<dl class="tiles">{tiles_html}</dl>{table}{_sampled(figures)}'
+
+
+def charts_html(figures: Figures, depth: Mapping[str, Histogram]) -> str:
+    """The histograms."""
+    metres, degrees = partial(amount, unit="m"), partial(amount, unit="°")
+    shown = (
+        Chart(
+            "Depth of the objects", depth, "Along the optical axis, of object pixels in the scenes shown above.", metres
+        ),
+        Chart(
+            "Distance to the object",
+            {"": figures.distance},
+            "d_z of each pair, which places the mirror camera.",
+            metres,
+        ),
+        Chart(
+            "Visibility",
+            figures.visibility,
+            "Share of the object's own pixels that the frame holds and nothing covers.",
+            lambda share: amount(100.0 * share, "%"),
+        ),
+        Chart("Inclination", figures.inclination, "Angle of the optical axis below the horizontal.", degrees),
+        Chart(
+            "Resting gap",
+            {"": figures.gap},
+            "Largest height at which an object of the scene hovers; logarithmic, less than 1 nm counts as 1 nm.",
+            length_of_decade,
+        ),
+    )
+    return f'<div class="charts">{"".join(map(chart_html, shown))}</div>'
+
+
+def effects_html(figures: Figures) -> str:
+    """What ran, how often and for how long; what was left out and why; the time of each stage."""
+    ran = {name: cost for name, cost in figures.effects.items() if cost.runs}
+    plain = [name for name, cost in ran.items() if not cost.timed and not cost.skips]
+    never = {name: cost for name, cost in figures.effects.items() if not cost.runs}
+    head = ("effect", "scenes", "time", "each")
+    rows = [
+        (f"<code>{escape(name)}</code>{_why(cost)}", _share(cost.runs, figures.scenes), *_times(cost))
+        for name, cost in ran.items()
+        if name not in plain
+    ]
+    stages = [
+        (f"<code>{escape(name)}</code>", f"{cost.seconds / max(figures.seconds, 1e-9):.1%}", *_times(cost))
+        for name, cost in figures.stages.items()
+    ]
+    never_rows = "".join(
+        f"<dt><code>{escape(name)}</code></dt><dd>{escape('; '.join(cost.skips) or 'not told')}</dd>"
+        for name, cost in sorted(never.items())
+    )
+    left_out = (
+        f'<details><summary>{_plural(len(never), "effect")} that ran in no scene, and why</summary><dl class="why">{never_rows}'
+        "</dl></details>"
+    )
+    return (
+        f"{_table(head, rows, 'Effects that ran') if rows else ''}{_plain(plain)}"
+        f"{left_out if never else ''}{_table(('stage', 'share', 'time', 'each'), stages, 'Time by stage')}"
+    )
+
+
+def failures_html(failures: Iterable[Failure], scenes: int) -> str:
+    """Each way of failing, with its reason in full and scenes to look at."""
+    items = [
+        f'<li><p><strong>{escape(one.reason.replace("_", " "))}</strong> <span class="count">{_plural(one.scenes, "scene")}'
+        f"</span></p><p>{escape(one.detail)}</p><p class=\"note\">Stage {escape(one.stage)}, {escape(one.kind)}; for example "
+        f"{escape(_listed(one.examples))}.</p></li>"
+        for one in failures
+    ]  # fmt: skip
+    if not items:
+        return f'<p class="empty">No scene failed{f" of {scenes:,}" if scenes else ""}.</p>'
+    return f'<ul class="failures">{"".join(items)}</ul>'
+
+
+def captures_html(figures: Figures) -> str:
+    """The quality of each capture; empty where the dataset is of scenes."""
+    if not figures.captures:
+        return ""
+    head = ("capture", "views", "corner error", "pose", "cloud", "complete", "measured")
+    rows = [
+        (
+            f"{escape(one.name)}<small>{escape(one.category)}, scene {one.scene_id}, {escape(one.estimate)}</small>",
+            f"{one.views}{f'<small>{one.left_out} left out</small>' if one.left_out else ''}",
+            _figure(one.reprojection_px, "px"),
+            _figure(one.pose_mm, "mm"),
+            _figure(one.cloud_median_mm, "mm"),
+            _figure(one.completeness, "%", 100.0),
+            _figure(one.measured_share, "%", 100.0),
+        )
+        for one in figures.captures
+    ]
+    note = (
+        "Corner error: median over the views after estimation. Pose, cloud (median) and completeness are held against the"
+        " truth, which photographs do not have. Measured: share of the mirror views that is measured and not filled."
+    )
+    return f'{_table(head, rows, "Quality")}<p class="note">{note}</p>'
+
+
+def _table(head: Iterable[str], rows: Iterable[Iterable[str]], caption: str) -> str:
+    """A table of HTML cells; the first is the row's name."""
+    heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
+    body = "".join(
+        f'<tr><th scope="row">{first}</th>{"".join(f"<td>{cell}</td>" for cell in cells)}</tr>'
+        for first, *cells in rows
+    )
+    return f"<table><caption>{escape(caption)}</caption><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _bar(share: float) -> str:
+    return (
+        '<svg class="share" viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true">'
+        f'<rect class="bar" width="{100 * share:.1f}" height="8"/></svg>'
+    )
+
+
+def _why(cost: Cost) -> str:
+    """The most frequent reason for leaving an effect out."""
+    if not cost.skips:
+        return ""
+    (why, times), *others = cost.skips.most_common()
+    more = f", {len(others)} more {'reason' if len(others) == 1 else 'reasons'}" if others else ""
+    return f"<small>left out {times:,} ×: {escape(why)}{more}</small>"
+
+
+def _times(cost: Cost) -> tuple[str, str]:
+    """(in all, each run)."""
+    if not cost.timed:
+        return ("–", "–")
+    return describe_seconds(cost.seconds), milliseconds(1e3 * cost.seconds / cost.timed)
+
+
+def _plain(names: Iterable[str]) -> str:
+    """Effects of which there is no more to tell than that they ran."""
+    listed = ", ".join(f"<code>{escape(name)}</code>" for name in names)
+    every = f" Ran in every scene, and counted with its stage: {listed}." if listed else ""
+    return f'<p class="note">An effect without a time is counted with its stage.{every}</p>'
+
+
+def _share(part: int, whole: int) -> str:
+    return f"{part:,}<small>{part / max(whole, 1):.0%}</small>"
+
+
+def _figure(value: float | None, unit: str, times: float = 1.0) -> str:
+    return "–" if value is None else f"{number(value * times)} {unit}"
+
+
+def _plural(count: int, one: str, many: str | None = None) -> str:
+    return f"{count:,} {one if count == 1 else many or f'{one}s'}"
+
+
+def _listed(scenes: Iterable[int]) -> str:
+    numbers = [str(scene) for scene in scenes]
+    return f"scene{'s' if len(numbers) > 1 else ''} {', '.join(numbers)}"
+
+
+def _sampled(figures: Figures) -> str:
+    if not figures.sampled:
+        return ""
+    return '<p class="note">The dataset is not finished and large: the figures are of ranges chosen evenly from it.</p>'

@@ -1,0 +1,128 @@
+"""The posed geometry of one stored scene or capture.
+
+- A part of a shape as a mesh of trimesh's, with its material.
+- The posed geometry of a stored capture: its board, and the mesh that was reconstructed from it.
+"""
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+from trimesh.visual import ColorVisuals, TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from schemas.base import Array, Pose
+from schemas.dataset.codec import Row, read_world_poses
+from schemas.dataset.layout import asset_path
+from schemas.errors import CorruptError, InputError, OutputError
+from schemas.job.job import Job
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE, Part
+from services.job.record import require_job
+from services.read.dataset_reader import StoredRange, find_scene
+from services.read.replay import open_context
+from workers.assets.catalogue import Catalogue
+from workers.assets.external.formats import read_visual
+from workers.geometry.colour import decode_srgb
+from workers.scene.plan import SceneChance, plan_scene
+from workers.store.store import Store
+
+
+def mesh_of_part(part: Part) -> trimesh.Trimesh:
+    """The part in the shape's frame, metres. Its material is as glTF has it: colours linear, textures sRGB."""
+    return trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=_visual(part), process=False)
+
+
+def _visual(part: Part) -> TextureVisuals | ColorVisuals:
+    material = part.material
+    if part.colors is not None and material.texture is None:
+        return ColorVisuals(vertex_colors=linear_bytes(part.colors / 255.0))
+    pbr = PBRMaterial(
+        baseColorFactor=linear_bytes(np.array(material.base_color)),
+        metallicFactor=material.metallic,
+        roughnessFactor=material.roughness,
+        baseColorTexture=None if material.texture is None else Image.fromarray(material.texture),
+    )
+    return TextureVisuals(uv=part.uv, material=pbr)
+
+
+def linear_bytes(srgb: Array) -> NDArray[np.uint8]:
+    """[..., 4] colours and vertex colours as glTF has them: linear, where textures and ours are sRGB; alpha as it is."""
+    return np.rint(255.0 * np.concatenate([decode_srgb(srgb[..., :3]), srgb[..., 3:]], axis=-1)).astype(np.uint8)
+
+
+def captured_geometry(store: Store, stored: StoredRange, row: Row) -> Iterator[tuple[str, trimesh.Trimesh, Pose]]:
+    """(name, mesh, T_world_mesh) of board and object. Raises CorruptError where the stored shape cannot be read."""
+    T_world = read_world_poses(row)
+    board = next(asset for asset in stored.rows["assets"] if asset["instance_id"] == row["table_id"])
+    x, y, _ = (0.5 * size for size in board["extents_m"])
+    rectangle = trimesh.Trimesh([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
+    yield f"board {row['table_id']}", rectangle, T_world[REGION_TABLE]
+    path = asset_path(row["category"], row["instance_id"])
+    try:
+        scene = trimesh.load_scene(io.BytesIO(store.read(path)), file_type="glb", process=False)
+    except Exception as error:  # trimesh raises errors of many kinds for a damaged file
+        raise CorruptError(
+            f"{path} cannot be read: {error}; `verso replay {store.name} --repair` makes it again"
+        ) from error
+    for mesh in scene.geometry.values():
+        visual, _ = read_visual(mesh, linear=True)
+        mesh.visual = ColorVisuals(mesh, vertex_colors=visual.colors)
+        yield f"{row['category']} {row['instance_id']}", mesh, T_world[REGION_FIRST_OBJECT]
+
+
+def export_scene(store: Store, scene_id: int, target: Path) -> int:
+    """Write floor, table and objects where the stored rows put them; returns the bytes written.
+
+    World frame, z up, metres, as everywhere in a dataset. Shapes come from the job's sources; poses from the manifest.
+    Raises InputError where the scene was not made, OutputError where the file cannot be written.
+    """
+    record, stored = require_job(store), find_scene(store, scene_id)
+    row = stored.scene(scene_id)
+    if row is None:
+        reason = next((f["reason"] for f in stored.rows["failures"] if f["scene_id"] == scene_id), "unknown")
+        raise InputError(f"scene {scene_id} was not made ({reason}): it has no geometry")
+    if record.job.captures is not None:
+        scene = captured_scene(store, stored, row)
+    else:
+        context = open_context(record)
+        scene = planned_scene(context.job, context.catalogue, scene_id, row)
+    data: bytes = scene.export(file_type="glb")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(data)
+    except OSError as error:
+        raise OutputError(f"{target} cannot be written: {error.strerror or error}; choose another --glb") from error
+    return len(data)
+
+
+def captured_scene(store: Store, stored: StoredRange, row: Row) -> trimesh.Scene:
+    """Board and object of a capture, from its stored shape. Raises CorruptError where that cannot be read."""
+    scene = trimesh.Scene()
+    for name, mesh, T_world_mesh in captured_geometry(store, stored, row):
+        if isinstance(mesh.visual, ColorVisuals):
+            mesh.visual = ColorVisuals(mesh, vertex_colors=linear_bytes(mesh.visual.vertex_colors / 255.0))
+        scene.add_geometry(mesh, geom_name=name, node_name=name, transform=T_world_mesh)
+    return scene
+
+
+def planned_scene(job: Job, catalogue: Catalogue, scene_id: int, row: Row) -> trimesh.Scene:
+    """Floor, table and objects of a scene, from the job's sources. Raises SceneError where a shape cannot be made again."""
+    plan = plan_scene(job, catalogue, SceneChance(job.seed, scene_id))
+    T_world = {REGION_FLOOR: np.eye(4), **read_world_poses(row)}
+    table = plan.table.asset
+    placed = [("floor", REGION_FLOOR, plan.floor), (f"table {table.instance_id}", REGION_TABLE, table.shape)]
+    for start in plan.objects:
+        # Two objects may be of one instance: only the region id tells them apart.
+        region = f" {start.region_id}" if len(plan.objects) > 1 else ""
+        name = f"{start.asset.category} {start.asset.instance_id}{region}"
+        placed.append((name, start.region_id, start.asset.shape))
+    scene = trimesh.Scene()
+    for name, region_id, shape in placed:
+        for number, part in enumerate(shape.parts):
+            label = f"{name}/{number}-{part.name}"
+            scene.add_geometry(mesh_of_part(part), geom_name=label, node_name=label, transform=T_world[region_id])
+    return scene

@@ -1,0 +1,290 @@
+"""A whole folder against its commits: merged files, `_SUCCESS`, DATASET.md, and everything that is no part of the dataset.
+
+- Everything in an output folder that is no part of its dataset: files, folders, links.
+- A finished dataset against its commits: they are merged again, and `_SUCCESS`, the merged files and DATASET.md
+  compared.
+"""
+
+import hashlib
+import json
+import os
+import re
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import zip_longest
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, Literal
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from schemas.dataset.layout import (
+    COMMITS,
+    LOCK_FILE,
+    LOG_FOLDER,
+    MANIFEST,
+    PROBE_PREFIX,
+    RANGES,
+    README_FILE,
+    STAGING,
+    SUCCESS_FILE,
+    commit_path,
+    is_merged_path,
+    is_shape,
+    pose_of_image,
+)
+from services.merge.dataset_card import is_card_sealed
+from services.merge.merge import encode_success
+from services.read.verdict import MOVE, PathIndex, Verdict, describe_os_error, printable
+from workers.store.store import Store
+
+FREE = frozenset({LOCK_FILE, LOG_FOLDER, STAGING})
+"""What writers keep beside the dataset: no byte of it counts."""
+
+FRAME = frozenset({MANIFEST, COMMITS, RANGES})
+"""Folders that a run makes before it makes anything else."""
+
+_RANGE = re.compile(rf"{RANGES}/(\d{{10,19}})(?:\.retry-(\d{{1,9}}))?/")
+_TAR = re.compile(r"[^/]+/(\d{10,19})(?:\.retry-\d{1,9})?\.tar")
+
+Kind = Literal["file", "folder", "link", "special", "unreadable"]
+
+
+@dataclass(frozen=True)
+class Known:
+    """What belongs to the dataset, beside its commit records."""
+
+    index: PathIndex
+    merging: bool
+    """Whether merged files of an earlier merge may stand: there is no `_SUCCESS`."""
+    lost: tuple[tuple[int, int], ...]
+    """Scenes [start, stop), in order, whose commit is missing or damaged, which is told: their files are not told again."""
+    poses_per_scene: int
+
+    def has_lost(self, key: str) -> bool:
+        """Whether a file may belong to a commit that cannot be read."""
+        if not self.lost:
+            return False
+        if is_shape(key):
+            return True
+        start, pose = _RANGE.match(key) or _TAR.fullmatch(key), pose_of_image(key)
+        scene = int(start[1]) if start else pose // self.poses_per_scene if pose is not None else None
+        if scene is None:
+            return False
+        at = bisect_right(self.lost, scene, key=itemgetter(0)) - 1
+        return at >= 0 and scene < self.lost[at][1]
+
+
+def tell_strays(store: Store, known: Known, verdict: Verdict) -> None:
+    """Tells of everything that no commit names."""
+    if store.root is None:
+        for entry in store.files(""):
+            key = entry.key
+            if not FREE & {key, key.partition("/")[0]} and not _belongs(key, known):
+                _tell_file(store, key, verdict)
+        return
+    for kind, key in _walk(store.root, ""):
+        _tell_entry(store, store.root, kind, key, known, verdict)
+
+
+def _tell_entry(store: Store, root: Path, kind: Kind, key: str, known: Known, verdict: Verdict) -> None:
+    if kind == "link":
+        verdict.tell(
+            f"{key}: is a symbolic link", "put a copy of what it leads to in its place, or move it away", "stray"
+        )
+    elif kind == "unreadable":
+        verdict.tell(f"{key}: cannot be listed", "check its permissions and the disk", "stray")
+    elif kind == "special":
+        verdict.tell(f"{key}: is neither a file nor a folder", MOVE, "stray")
+    elif kind == "file" and not _belongs(key, known):
+        _tell_file(store, key, verdict)
+    elif kind == "folder" and not (known.merging or key in FRAME or key in known.index) and _is_empty(root / key):
+        verdict.tell(f"{key}: is an empty folder", "remove it", "stray")
+
+
+def _tell_file(store: Store, key: str, verdict: Verdict) -> None:
+    """Tells of a file that no commit names, and of the commit that would name it, where that is gone."""
+    found = _RANGE.match(key)
+    if found and store.size(commit := commit_path(int(found[1]), int(found[2] or 0))) is None:
+        told = f"{key}: is in no commit, and {commit} is missing"
+        verdict.tell(told, f"restore that from a copy, or {verdict.run_again} --retry-failed", "stray")
+    else:
+        verdict.tell(f"{key}: is in no commit", MOVE, "stray")
+
+
+def _is_empty(folder: Path) -> bool:
+    try:
+        with os.scandir(folder) as entries:
+            return next(entries, None) is None
+    except OSError:
+        return False
+
+
+def _belongs(key: str, known: Known) -> bool:
+    """Whether a file is the dataset's, or may be."""
+    name = key.rpartition("/")[2]
+    if key in known.index or (known.merging and is_merged_path(key)):
+        return True
+    if key.startswith(f"{COMMITS}/{PROBE_PREFIX}") and "/" not in name:
+        return True
+    return known.has_lost(key)
+
+
+def _walk(root: Path, folder: str) -> Iterator[tuple[Kind, str]]:
+    """(kind, key) of everything below the output folder, in no order, without a list of it."""
+    waiting = [folder]
+    while waiting:
+        above = waiting.pop()
+        try:
+            entries = os.scandir(root / above)
+        except OSError:
+            yield "unreadable", above
+            continue
+        with entries:
+            for entry in entries:
+                key = f"{above}/{entry.name}" if above else entry.name
+                if key in FREE:
+                    continue
+                if entry.is_symlink():
+                    yield "link", key
+                elif entry.is_dir():
+                    waiting.append(key)
+                    yield "folder", key
+                else:
+                    yield "file" if entry.is_file() else "special", key
+
+
+_ROWS = 4_096
+"""Rows of a merged table that are compared at once."""
+
+
+@dataclass(frozen=True)
+class Success:
+    """`_SUCCESS` as it was found."""
+
+    data: bytes | None
+    """None where there is no file that can be read."""
+    told: dict[str, Any]
+    """Its keys; none where it is damaged."""
+
+    @property
+    def files(self) -> dict[str, dict[str, Any]]:
+        """{bytes, sha256} of each merged file that it names, as far as it is well formed."""
+        files = self.told.get("files")
+        return {key: one for key, one in files.items() if isinstance(one, dict)} if isinstance(files, dict) else {}
+
+    @property
+    def asked(self) -> tuple[int, int] | None:
+        """First scene and stop."""
+        ends = [self.told.get(key) for key in ("first_scene", "stop_scene")]
+        return (ends[0], ends[1]) if all(type(end) is int and end >= 0 for end in ends) else None  # type: ignore[return-value]
+
+
+def read_stored_success(store: Store, verdict: Verdict) -> Success:
+    """`_SUCCESS`, and whether it is an object of JSON at all."""
+    try:
+        data = store.read(SUCCESS_FILE)
+    except FileNotFoundError:
+        return Success(None, {})
+    except OSError as error:
+        verdict.tell(f"{SUCCESS_FILE}: {describe_os_error(error)}", verdict.repair, "merge")
+        return Success(b"", {})
+    try:
+        told = json.loads(data)
+    except (ValueError, RecursionError):
+        told = None
+    if isinstance(told, dict):
+        return Success(data, told)
+    verdict.tell(f"{SUCCESS_FILE}: is {'damaged' if data else 'empty'}", verdict.repair, "merge")
+    return Success(data, {})
+
+
+def check_success(success: Success, expected: Mapping[str, Any], verdict: Verdict) -> None:
+    """Compares `_SUCCESS`, to the byte, with what merging the commits again gives."""
+    if success.data is None or not success.told or success.data == encode_success(expected):
+        return
+    wrong = sorted(key for key in {*success.told, *expected} if success.told.get(key) != expected.get(key))
+    told = f"its {', '.join(map(printable, wrong))} {'is' if len(wrong) == 1 else 'are'} not what the commits give"
+    verdict.tell(
+        f"{SUCCESS_FILE}: {told if wrong else 'was altered after the merge wrote it'}", verdict.repair, "merge"
+    )
+
+
+def check_merged(
+    store: Store, success: Success, remade: Mapping[str, Path], verdict: Verdict
+) -> dict[str, dict[str, object]]:
+    """Compares every merged file with the one that the commits give; {bytes, sha256} that `_SUCCESS` must hold for each.
+
+    Parquet bytes change with pyarrow's version: where `_SUCCESS` vouches for other bytes, their rows must be the same.
+    """
+    entries: dict[str, dict[str, object]] = {}
+    for path, local in sorted(remade.items()):
+        with open(local, "rb") as file:
+            entry = {"bytes": local.stat().st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+        entries[path] = entry
+        found = _hash_file(store, path, verdict)
+        if isinstance(found, str):
+            verdict.tell(f"{path}: {found}", verdict.repair, "merge")
+        elif found != entry:
+            if found == success.files.get(path) and path.endswith(".parquet") and _same_rows(store, path, local):
+                entries[path] = found
+            elif found == success.files.get(path):
+                verdict.tell(f"{path}: does not hold the rows of the commits", verdict.repair, "merge")
+            else:
+                verdict.tell(f"{path}: does not match the SHA-256 in {SUCCESS_FILE}", verdict.repair, "merge")
+    return entries
+
+
+def check_told(store: Store, success: Success, verdict: Verdict) -> None:
+    """Compares merged files with `_SUCCESS` alone, where the commits cannot be merged again."""
+    for path, entry in success.files.items():
+        found = _hash_file(store, path, verdict)
+        if isinstance(found, str):
+            verdict.tell(f"{path}: {found}", verdict.repair, "merge")
+        elif found != entry:
+            verdict.tell(f"{path}: does not match the SHA-256 in {SUCCESS_FILE}", verdict.repair, "merge")
+
+
+def check_card(store: Store, digest: str, sealed: bool, verdict: Verdict) -> None:
+    """DATASET.md: as it was written, and of this dataset. `sealed` says that job.yaml has a seal, so this has one too."""
+    try:
+        data = store.read(README_FILE)
+    except OSError as error:
+        verdict.tell(f"{README_FILE}: {describe_os_error(error)}", verdict.repair, "card")
+        return
+    if sealed and not is_card_sealed(data):
+        verdict.tell(
+            f"{README_FILE}: was altered after a run wrote it: its seal does not match", verdict.repair, "card"
+        )
+    elif f"| dataset digest | `{digest}` |".encode() not in data:
+        verdict.tell(f"{README_FILE}: does not name the dataset digest {digest[:12]}", verdict.repair, "card")
+
+
+def _hash_file(store: Store, path: str, verdict: Verdict) -> dict[str, object] | str:
+    """{bytes, sha256} of a stored file, or why it cannot be read; on a disk in constant memory."""
+    try:
+        if store.root is None:
+            data = store.read(path)
+            size, digest = len(data), hashlib.sha256(data).hexdigest()
+        else:
+            with open(store.root / path, "rb") as file:
+                digest, size = hashlib.file_digest(file, "sha256").hexdigest(), file.tell()
+    except FileNotFoundError:
+        return "is merged and missing"
+    except OSError as error:
+        return describe_os_error(error)
+    verdict.files += 1
+    verdict.bytes += size
+    return {"bytes": size, "sha256": digest}
+
+
+def _same_rows(store: Store, path: str, local: Path) -> bool:
+    try:
+        source = pa.BufferReader(store.read(path)) if store.root is None else store.root / path
+        with pq.ParquetFile(source, page_checksum_verification=True) as stored, pq.ParquetFile(local) as remade:
+            pairs = zip_longest(stored.iter_batches(_ROWS), remade.iter_batches(_ROWS))
+            return all(a is not None and b is not None and a.equals(b) for a, b in pairs)
+    except (pa.ArrowException, OSError, ValueError):
+        return False

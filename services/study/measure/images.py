@@ -1,0 +1,286 @@
+"""Errors of the images of a scene with each setting, against rays. Pure.
+
+- The ray casts of one scene's geometry, kept from setting to setting while its poses stay.
+- Errors of a made scene's depth, masks, mirror pose and projection against rays. Pure.
+- Measures the images of a scene with each setting, against rays and against very many paths.
+
+The rays are cast from the scene's own cameras at its own poses: through pixels' centres or, for errors that depend on
+the size of pixels, through places that do not depend on it. Views of all pairs count together.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
+
+import numpy as np
+from cachetools import LRUCache
+from numpy.typing import NDArray
+
+from schemas.base import Array
+from schemas.errors import SceneError
+from schemas.job.views import Images
+from schemas.scene.scene import Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
+from schemas.scene.view import Camera, Pair, View
+from services.study.knobs import size_value
+from services.study.measure.colour import (
+    ColourTruth,
+    Crop,
+    colour_truth_missing,
+    converged_colour,
+    crop_colour,
+    crop_of,
+    flip_error,
+)
+from services.study.measure.rays import Patch, Pixels, Seen, cast_patch, cast_pixels, seen_by_other
+from services.study.measure.settling import context_for
+from services.study.model import Setting
+from workers.geometry.pixels import dequantise_depth
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.make_scene import Scene, make_scene
+
+KEPT = 12
+"""Casts kept of a scene, some 0.3 MB each: the last ones used. Every setting uses the input camera's; the mirror camera moves
+whenever d_z changes."""
+
+Key = tuple[object, ...]
+Answer = TypeVar("Answer")
+
+
+class Truth:
+    """Casts of rays in one scene, with a cache of the last ones."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene_id = scene.plan.scene_id
+        self.things = scene.posed.things
+        self._kept: LRUCache[Key, object] = LRUCache(KEPT)
+
+    def fits(self, scene: Scene) -> bool:
+        """Whether the scene has the same shapes at the same poses."""
+        alike = self.scene_id == scene.plan.scene_id and len(self.things) == len(scene.posed.things)
+        return alike and all(map(_same, self.things, scene.posed.things))
+
+    def pixels(self, camera: Camera) -> Pixels:
+        """The view at its pixels."""
+        return self._keep(("pixels", *_key(camera)), lambda: cast_pixels(self.things, camera))
+
+    def patch(self, camera: Camera, pair: int) -> Patch:
+        """The objects in a pair's input view, the same for images of all sizes."""
+        k = camera.intrinsics
+        # To 12 digits: a camera scaled to another size is the same one but for rounding.
+        frame = [round(x, 12) for x in (k.fx / k.width, k.fy / k.height, k.cx / k.width, k.cy / k.height)]
+        key = ("patch", pair, *frame, camera.T_world_cam.tobytes())
+        return self._keep(key, lambda: cast_patch(self.things, camera, self.scene_id, pair))
+
+    def both(self, camera: Camera, other: Camera) -> NDArray[np.bool_]:
+        """[N] bool: which pixels of `pixels(camera).box` show an object point that the other camera sees too."""
+        key = ("both", *_key(camera), *_key(other))
+        return self._keep(key, lambda: seen_by_other(self.things, camera, self.pixels(camera).box, other))
+
+    def _keep(self, key: Key, cast: Callable[[], Answer]) -> Answer:
+        if key not in self._kept:
+            self._kept[key] = cast()
+        return self._kept[key]  # type: ignore[return-value]
+
+
+def truth_of(scene: Scene, kept: Truth | None = None) -> Truth:
+    """The truth of a scene: `kept`, of an earlier setting, where the geometry is the same, or a new one."""
+    return kept if kept is not None and kept.fits(scene) else Truth(scene)
+
+
+def _key(camera: Camera) -> Key:
+    return *camera.intrinsics.model_dump().values(), camera.T_world_cam.tobytes()
+
+
+def _same(mine: Placed, other: Placed) -> bool:
+    if mine.region_id != other.region_id or not np.array_equal(mine.T_world_shape, other.T_world_shape):
+        return False
+    return mine.shape is other.shape or (
+        np.array_equal(mine.shape.vertices, other.shape.vertices)
+        and np.array_equal(mine.shape.faces, other.shape.faces)
+    )
+
+
+PERCENTILE = 99.0
+"""Percentile of pixels: leaves out the few where a ray grazes an edge."""
+
+HIDDEN_M = 0.005
+"""A projected pixel this far behind the surface that the mirror camera sees shows a hidden surface."""
+
+
+def measure_images(context: WorkerContext, scene: Scene, truth: Truth) -> dict[str, float]:
+    """The errors of a made scene by names of `ERRORS`; an error without meaning there is left out.
+
+    Over the input, aligned and mirror views of all pairs, and over pixels of objects unless stated:
+
+    - depth_mm: the 99th percentile of |stored depth - ray's z| of pixels whose mask and ray name the same object. It
+      includes quantisation and the sensor's effects. Pixels without depth, stored as 0, are not counted.
+    - table_depth_mm: the same for the table, at pixels evenly over the image (`SPREAD_PIXELS`).
+    - mask_share: pixels whose mask and ray differ where either names an object, per object pixel by ray. It can exceed 1.
+    - between_mm: over `BETWEEN` random rays in the box about the objects' visible part in the input view: the median
+      of |stored depth of the pixel that the ray crosses - ray's z|, where mask and ray name the same object.
+    - outline_share: the share of these rays whose region differs from that of the pixel they cross.
+    - mirror_mm: |d_z - z of the objects' nearest point that the input camera sees|, the largest of all pairs.
+      `mirror_pose` sets the mirror camera T_z_m away from the point d_z ahead of the input camera, and turns it by the input
+      pose alone. So the camera is off by exactly this, along the input camera's optical axis, and is not turned.
+    - agreement_mm: the stored input depth projected into the mirror view against the stored mirror depth, the median
+      (workers/scene/labels.py), the largest of all pairs; it needs no rays.
+    - unfilled_share: of the mirror view's object pixels by ray whose point the input camera sees too, the share that the
+      projected depth leaves empty.
+    - hidden_share: of the projected depth's filled pixels, of objects and all else, evenly over the image: the share that
+      lies more than 5 mm behind what the mirror camera's ray meets.
+    """
+    images = context.job.images
+    views = [view for pair in scene.pairs for view in (pair.input, pair.aligned, pair.mirror) if view is not None]
+    patches = [truth.patch(pair.input.camera, number) for number, pair in enumerate(scene.pairs)]
+    projected = [pair for pair in scene.pairs if pair.projected is not None]
+    return (
+        _of_labels([(view, truth.pixels(view.camera)) for view in views], images)
+        | _of_patches(list(zip(scene.pairs, patches, strict=True)), images)
+        | _of_mirrors(list(zip(scene.pairs, patches, strict=True)))
+        | _of_projections(projected, truth, images)
+    )
+
+
+def _of_labels(views: Sequence[tuple[View, Pixels]], images: Images) -> dict[str, float]:
+    """Stored views against rays at their pixels' centres."""
+    objects_mm: list[Array] = []
+    table_mm: list[Array] = []
+    differ = pixels = 0
+    for view, truth in views:
+        assert view.region is not None
+        mask, by_ray = truth.box.of(view.region), truth.box.region >= REGION_FIRST_OBJECT
+        by_mask = mask >= REGION_FIRST_OBJECT
+        outside = np.count_nonzero(view.region >= REGION_FIRST_OBJECT) - np.count_nonzero(by_mask)
+        differ += int(np.count_nonzero((mask != truth.box.region) & (by_ray | by_mask)) + outside)
+        pixels += int(np.count_nonzero(by_ray))
+        table = truth.spread.region == REGION_TABLE
+        for found, seen, chosen in ((objects_mm, truth.box, by_ray), (table_mm, truth.spread, table)):
+            found.append(_off_mm(seen.of(view.depth), seen.of(view.region), seen, chosen, images))
+    return {
+        **_percentile("depth_mm", objects_mm, PERCENTILE),
+        **_percentile("table_depth_mm", table_mm, PERCENTILE),
+        **({"mask_share": differ / pixels} if pixels else {}),
+    }
+
+
+def _of_patches(pairs: Sequence[tuple[Pair, Patch]], images: Images) -> dict[str, float]:
+    off_mm, wrong = [], []
+    for pair, patch in pairs:
+        region, k = pair.input.region, pair.input.camera.intrinsics
+        assert region is not None
+        column, row = np.minimum((patch.at * (k.width, k.height)).astype(np.int64), (k.width - 1, k.height - 1)).T
+        mask, objects = region[row, column], patch.region >= REGION_FIRST_OBJECT
+        off_mm.append(_off_mm(pair.input.depth[row, column], mask, patch, objects, images))
+        wrong.append(mask != patch.region)
+    return _percentile("between_mm", off_mm, 50.0) | _mean("outline_share", wrong)
+
+
+def _of_mirrors(pairs: Sequence[tuple[Pair, Patch]]) -> dict[str, float]:
+    off = [
+        abs(pair.d_z_m - patch.front_m) * 1e3
+        for pair, patch in pairs
+        if pair.mirror is not None and patch.box is not None
+    ]
+    medians = [pair.agreement.median_mm for pair, _ in pairs if pair.agreement is not None]
+    known = [median for median in medians if median is not None]
+    return {name: max(values) for name, values in (("mirror_mm", off), ("agreement_mm", known)) if values}
+
+
+def _of_projections(pairs: Sequence[Pair], truth: Truth, images: Images) -> dict[str, float]:
+    empty, hidden = [], []
+    for pair in pairs:
+        assert pair.projected is not None
+        camera, depth = pair.projected.camera, pair.projected.depth
+        seen = truth.pixels(camera)
+        empty.append(seen.box.of(depth)[truth.both(camera, pair.input.camera)] == 0)
+        drawn, z = seen.spread.of(depth), seen.spread.depth_m
+        hidden.append(((z > 0.0) & (dequantise_depth(drawn, images) > z + HIDDEN_M))[drawn > 0])
+    return _mean("unfilled_share", empty) | _mean("hidden_share", hidden)
+
+
+def _off_mm(
+    stored: NDArray[np.uint16], mask: NDArray[np.uint8], seen: Seen | Patch, chosen: NDArray[np.bool_], images: Images
+) -> Array:
+    """[N] |stored depth - ray's z| of the chosen pixels that have depth and whose mask is the ray's region."""
+    same = chosen & (mask == seen.region) & (stored > 0)
+    return np.abs(dequantise_depth(stored[same], images) - seen.depth_m[same]) * 1e3
+
+
+def _percentile(name: str, errors: Iterable[Array], percent: float) -> dict[str, float]:
+    """The figure by its name, or none for no values."""
+    values = np.concatenate([np.empty(0), *errors])
+    return {name: float(np.percentile(values, percent))} if len(values) else {}
+
+
+def _mean(name: str, flags: Iterable[NDArray[np.bool_]]) -> dict[str, float]:
+    """The share of true flags by its name, or none for no flags."""
+    values = np.concatenate([np.empty(0, bool), *flags])
+    return {name: float(values.mean())} if len(values) else {}
+
+
+CONVERGED_PATHS = 256
+"""Two truths with other seeds differ by 0.012 to 0.02 in FLIP, a tenth of what tiers do."""
+
+INPUT_ALONE = dict.fromkeys(("cameras.depth.enabled", "cameras.mirror.enabled", "images.projection.enabled"), False)
+
+FINE_WIDTH = 2560
+"""Pixels: 4 times the width that colours are compared at."""
+
+
+def measure_scene_images(
+    context: WorkerContext, settings: Sequence[Setting], scene_id: int
+) -> dict[str, dict[str, float]]:
+    """Errors of depth, masks, mirror pose and projection by the settings' names, where the scene can be made."""
+    truth, answers = None, {}
+    for setting in settings:
+        found = _make(context_for(context, setting), scene_id)
+        if found is not None:
+            truth = truth_of(found[1], truth)
+            answers[setting.name] = measure_images(*found, truth)
+    return answers
+
+
+def measure_colour(context: WorkerContext, settings: Sequence[Setting], scene_id: int) -> dict[str, dict[str, float]]:
+    """FLIP of the input RGB by the settings' names: `flip` and `edge_flip`; nothing where no object is visible.
+
+    `flip` is against a path-traced image, where that tier is installed. `edge_flip`, of tier raster, is against the same
+    tier's own light at 64 samples a pixel, because FLIP against other light tells little of edges.
+    """
+    made = {setting.name: _make(_input_alone(context, setting), scene_id) for setting in settings}
+    found = {name: one for name, one in made.items() if one is not None}
+    if not found:
+        return {}
+    first = next(iter(found.values()))
+    crop = crop_of(first[1])
+    if crop is None:
+        return {}
+    traced = None if colour_truth_missing() else converged_colour(*first, CONVERGED_PATHS)
+    smooth = _smooth(context, scene_id, crop)
+    answers = {}
+    for name, (worker, scene) in found.items():
+        rgb = scene.pairs[0].input.rgb
+        truths = {"flip": traced, "edge_flip": smooth if worker.job.render.tier == "raster" else None}
+        if rgb is not None:
+            answers[name] = {error: flip_error(truth, rgb) for error, truth in truths.items() if truth is not None}
+    return answers
+
+
+def _input_alone(context: WorkerContext, setting: Setting) -> WorkerContext:
+    """The setting's job without the views whose colour is not compared."""
+    return context_for(context, Setting(setting.parts, {**setting.changes, **INPUT_ALONE}))
+
+
+def _smooth(context: WorkerContext, scene_id: int, crop: Crop) -> ColourTruth | None:
+    """The raster tier's image with 64 samples a pixel: drawn 4 times as wide with 4 samples each, averaged by area."""
+    fine = size_value(context.job, FINE_WIDTH).changes
+    setting = Setting((("truth", "edges"),), {**fine, "render.tier": "raster", "render.samples": 4})
+    made = _make(_input_alone(context, setting), scene_id)
+    rgb = None if made is None else made[1].pairs[0].input.rgb
+    return None if rgb is None else ColourTruth(crop, crop_colour(rgb, crop))
+
+
+def _make(context: WorkerContext, scene_id: int) -> tuple[WorkerContext, Scene] | None:
+    try:
+        return context, make_scene(context, scene_id, Stopwatch())
+    except SceneError:
+        return None

@@ -1,0 +1,172 @@
+"""One capture from its id to what is written: the list of steps.
+
+- A capture from its folder to poses, surface and views from elsewhere, without writing anything into the folder.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from schemas.capture import CaptureEstimate, CaptureScore, DepthCorrection, ProcessedCapture
+from schemas.errors import CaptureError, ViewError
+from schemas.job.captures import Captures
+from schemas.job.job import Job
+from schemas.scene.scene import EffectPlan, SceneOutput
+from workers.assets.captured import CaptureNames, board_asset, reconstructed_asset
+from workers.capture.estimate import estimate_surface
+from workers.capture.folder import CaptureFolder, open_folder, read_receipt, read_truth
+from workers.capture.reconstruct import Merged, given_files
+from workers.capture.results import digest_inputs
+from workers.capture.rows import CapturedObject, CapturedPair, LeftOut, Origin, make_capture_pair, record_capture
+from workers.capture.score import read_whole_truth, score_capture
+from workers.capture.simulate.simulate import load_object, simulate_capture
+from workers.capture.views import CaptureViews
+from workers.geometry.spread import spread_evenly
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.plan import SceneChance
+from workers.store.file_system import temporary_folder
+
+
+def process_capture(folder: CaptureFolder, captures: Captures, watch: Stopwatch) -> ProcessedCapture:
+    """Estimate, merge, score where there is truth. Raises CaptureError where the capture cannot be used."""
+    with watch.stage("read"):
+        given = given_files(folder)
+    estimates, merged = estimate_surface(given, captures, watch)
+    views = CaptureViews(given, estimates.estimate, captures, merged.body)
+    with watch.stage("score"):
+        score = score_against_truth(folder, estimates.estimate, merged, views)
+    return ProcessedCapture(
+        name=folder.about.name,
+        category=folder.about.category,
+        licence=folder.about.licence,
+        board=folder.board,
+        estimates=estimates,
+        surface=merged.surface,
+        images=views.images,
+        synthesize=views.synthesize,
+        undistorted=folder.camera.has_lens,
+        depth_corrected=is_corrected(estimates.estimate.depth),
+        score=score,
+    )
+
+
+def score_against_truth(
+    folder: CaptureFolder, estimate: CaptureEstimate, merged: Merged, views: CaptureViews
+) -> CaptureScore | None:
+    """The errors of a simulated capture, None of a real one."""
+    truth = read_whole_truth(folder)
+    return None if truth is None else score_capture(estimate, merged.surface, views, truth).summary
+
+
+def is_corrected(depth: DepthCorrection) -> bool:
+    """Whether an estimate changes what was measured."""
+    return depth.offset_m != 0.0 or depth.scale != 1.0 or not np.array_equal(depth.T_cam_depth, np.eye(4))
+
+
+SOURCE, SIMULATED = "capture", "simulated_capture"
+"""`scenes.source` and `assets.source` of captures; those of scenes are the source of the shape."""
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A folder to process, the name of its object where the job knows it, and where it came from."""
+
+    path: Path
+    name: str | None
+    origin: Origin
+
+
+def run_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> SceneOutput:
+    """Simulate or open, estimate, merge, draw the mirror views, score, record. Raises SceneError where it cannot be used."""
+    job, captures = context.job, require_captures(context.job)
+    with open_capture(context, scene_id, watch) as opened:
+        folder = open_folder(opened.path)
+        done = process_capture(folder, captures, watch)
+        done = replace(done, name=opened.name or done.name)
+        category = done.category if "category" in folder.about.model_fields_set else captures.category
+        with watch.stage("labels"):
+            source = SOURCE if read_truth(opened.path) is None else SIMULATED
+            thing = place_capture(job, scene_id, done, category, source)
+        return record_capture(context, thing, done, opened.origin, make_pairs(context, thing, done, watch), watch)
+
+
+def place_capture(job: Job, scene_id: int, done: ProcessedCapture, category: str, source: str) -> CapturedObject:
+    """The reconstructed object and the board as assets, where they are. Each capture of an object is an instance."""
+    names = CaptureNames(f"{done.name}-{scene_id:05d}", category, done.licence, source)
+    asset, T_world_obj = reconstructed_asset(done.surface, names, job.assets)
+    board = board_asset(done.board, job.assets)
+    return CapturedObject(scene_id, asset, T_world_obj, done.board, board, image_effects(job))
+
+
+@contextmanager
+def open_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Iterator[Opened]:
+    """The folder of a capture: one of the job's, or a simulated one that is gone afterwards."""
+    captures = require_captures(context.job)
+    if captures.source == "folders":
+        listing = context.catalogue.captures[scene_id]
+        with watch.stage("read"):
+            if digest_inputs(listing.folder) != listing.sha256:
+                raise CaptureError("changed", f"{listing.folder} does not hold what it held when the run began")
+        yield Opened(listing.folder, None, Origin(False, listing.sha256))
+        return
+    with temporary_folder("capture") as scratch:
+        path = scratch / "capture"
+        with watch.stage("simulate"):
+            instance_id = simulate_one(context, scene_id, path)
+            ran, skipped = read_receipt(path)
+        yield Opened(path, instance_id, Origin(True, None, ran, skipped))
+
+
+def simulate_one(context: WorkerContext, scene_id: int, path: Path) -> str:
+    """Simulates a capture of the job into an empty folder; the instance id of its object."""
+    captures, chance = require_captures(context.job), SceneChance(context.job.seed, scene_id)
+    asset = load_object(context.job, context.catalogue, chance)
+    simulate_capture(captures.simulate, captures.board, asset, chance, path)
+    return asset.instance_id
+
+
+def make_pairs(
+    context: WorkerContext, thing: CapturedObject, done: ProcessedCapture, watch: Stopwatch
+) -> Iterator[CapturedPair | LeftOut]:
+    """The pairs of the used views in order, and those views that have none. Raises CaptureError where none has one."""
+    used = [view.number for view in done.estimates.estimate.used]
+    chosen = [used[place] for place in spread_evenly(len(used), context.job.pairs_per_scene)]
+    made = 0
+    for at, number in enumerate(chosen):
+        try:
+            with watch.stage("views"):
+                images = done.images(number)
+                one: CapturedPair | LeftOut = make_capture_pair(
+                    context.job, thing, images, at, done.synthesize, context.renderer.count_pixels
+                )
+                made += 1
+        except (ViewError, CaptureError) as error:
+            one = LeftOut(number, "no_pair", error.detail)
+        yield one
+    for number in sorted(set(used) - set(chosen)):
+        yield LeftOut(number, "spare", f"captures.most_views is {context.job.pairs_per_scene}")
+    if not made:
+        raise CaptureError(
+            "no_pair", f"none of {len(chosen)} used views sees the object and has a view from the other side"
+        )
+
+
+def image_effects(job: Job) -> EffectPlan:
+    """The effects on the images of a dataset that a job of captures has: switches of its keys."""
+    projection = job.images.projection
+    switches = {
+        "mirror": job.cameras.mirror.enabled,
+        "projection": projection.enabled,
+        "splat": projection.enabled and projection.splat > 1,
+        "hidden_point_removal": projection.enabled and projection.hidden_point_removal,
+    }
+    return EffectPlan(tuple(name for name, runs in switches.items() if runs), {})
+
+
+def require_captures(job: Job) -> Captures:
+    """The branch `captures` of a job that has one."""
+    assert job.captures is not None
+    return job.captures

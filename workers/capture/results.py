@@ -1,0 +1,242 @@
+"""What a capture's folder holds: its inputs and their digest, what processing writes, and which files are the user's.
+
+- What processing writes into a capture's folder, and how a file of ours is told from one of the user's.
+- The input files of a capture's folder, and their digest: what a dataset that is made of it depends on.
+- The sources of a job: the catalogue of its shapes, and the folders of its captures.
+
+    process.json       settings, poses used, depth correction, notes, seconds, and the SHA-256 of every file below
+    board_00000.txt  correction_00000.txt  mask_00000.png      where the user gave none
+    cloud.ply  mesh.ply  poses.parquet
+
+A file that process.json does not name, or that has other bytes, is the user's: it is read, and never overwritten.
+"""
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array
+from schemas.capture import CaptureListing
+from schemas.errors import AssetSourceError, CaptureError
+from schemas.job.job import Job
+from workers.assets.catalogue import Catalogue, open_catalogue
+from workers.assets.watch import Watch, ignore
+from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, TRUTH
+
+PROCESS_FILE, CLOUD_FILE, MESH_FILE, POSES_FILE = "process.json", "cloud.ply", "mesh.ply", "poses.parquet"
+
+_CLOUD = np.dtype(
+    [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
+    + [(name, "u1") for name in ("red", "green", "blue")]
+    + [("views", "<u2")]
+)
+_VERTEX = np.dtype([(name, "<f4") for name in ("x", "y", "z")] + [(name, "u1") for name in ("red", "green", "blue")])
+_FACE = np.dtype([("count", "u1"), ("a", "<i4"), ("b", "<i4"), ("c", "<i4")])
+_WORDS = {"<f4": "float", "|u1": "uchar", "<u2": "ushort"}
+
+
+def read_record(path: Path) -> dict[str, Any] | None:
+    """process.json of a folder, None where it was not processed. Raises CaptureError where it cannot be read."""
+    try:
+        record = json.loads((path / PROCESS_FILE).read_bytes())
+    except FileNotFoundError:
+        return None
+    except ValueError as error:
+        raise CaptureError("unreadable", f"{path / PROCESS_FILE} is no JSON: {error}: delete it") from error
+    if not isinstance(record, dict) or not isinstance(record.get("files"), dict):
+        raise CaptureError("unreadable", f"{path / PROCESS_FILE} does not name what was written: delete it")
+    return record
+
+
+def own_files(path: Path) -> frozenset[str]:
+    """Names of the folder's files that processing wrote and nobody changed."""
+    record = read_record(path)
+    names = record["files"] if record is not None else {}
+    return frozenset(name for name, sha256 in names.items() if _digest_of(path / name) == sha256)
+
+
+def write_results(path: Path, files: Mapping[str, bytes], record: Mapping[str, Any]) -> list[str]:
+    """Writes files and process.json, in place of what processing wrote before; returns the names that stayed the user's.
+
+    process.json is written before the files that it names: where the work is cut off, what is there is known as ours.
+    """
+    for name in own_files(path):
+        (path / name).unlink()
+    users = sorted(name for name in files if (path / name).exists())
+    ours = {name: data for name, data in sorted(files.items()) if name not in users}
+    digests = {name: hashlib.sha256(data).hexdigest() for name, data in ours.items()}
+    text = json.dumps({**record, "files": digests}, indent=1) + "\n"
+    for name, data in ((PROCESS_FILE, text.encode()), *ours.items()):
+        scratch = path / f".{name}.part"
+        scratch.write_bytes(data)
+        os.replace(scratch, path / name)
+    return users
+
+
+def cloud_ply(points: Array, normals: Array, colors: NDArray[np.uint8], views: NDArray) -> bytes:
+    """A binary PLY of points [N, 3] with normals, colours and numbers of views."""
+    rows = np.zeros(len(points), _CLOUD)
+    _fill(rows, ("x", "y", "z"), points)
+    _fill(rows, ("nx", "ny", "nz"), normals)
+    _fill(rows, ("red", "green", "blue"), colors)
+    rows["views"] = np.minimum(views, 65_535)
+    return _head(rows) + rows.tobytes()
+
+
+def mesh_ply(vertices: Array, faces: NDArray[np.int32], colors: NDArray[np.uint8]) -> bytes:
+    """A binary PLY of a mesh with coloured vertices."""
+    rows = np.zeros(len(vertices), _VERTEX)
+    _fill(rows, ("x", "y", "z"), vertices)
+    _fill(rows, ("red", "green", "blue"), colors)
+    triangles = np.zeros(len(faces), _FACE)
+    triangles["count"] = 3
+    _fill(triangles, ("a", "b", "c"), faces)
+    return _head(rows, len(faces)) + rows.tobytes() + triangles.tobytes()
+
+
+def read_cloud(path: Path) -> tuple[Array, Array, NDArray[np.uint8], NDArray[np.int32]]:
+    """(points, normals, colours, views) of cloud.ply. Raises CaptureError where it is not there or another's."""
+    body = _body(path / CLOUD_FILE)
+    start, points, _ = _counts(path / CLOUD_FILE, body)
+    rows = _rows(path / CLOUD_FILE, body, _CLOUD, start, points)
+    return _take(rows, "x", "y", "z"), _take(rows, "nx", "ny", "nz"), _colors(rows), rows["views"].astype(np.int32)
+
+
+def read_mesh(path: Path) -> tuple[Array, NDArray[np.int32], NDArray[np.uint8]]:
+    """(vertices, faces, colours) of mesh.ply. Raises CaptureError where it is not there or another's."""
+    file = path / MESH_FILE
+    body = _body(file)
+    start, vertices, faces = _counts(file, body)
+    rows = _rows(file, body, _VERTEX, start, vertices)
+    triangles = _rows(file, body, _FACE, start + vertices * _VERTEX.itemsize, faces)
+    return _take(rows, "x", "y", "z"), _take(triangles, "a", "b", "c").astype(np.int32), _colors(rows)
+
+
+def _head(rows: NDArray, faces: int | None = None) -> bytes:
+    assert rows.dtype.names is not None
+    lines = ["ply", "format binary_little_endian 1.0", "comment board frame, metres", f"element vertex {len(rows)}"]
+    lines += [f"property {_WORDS[rows.dtype[name].str]} {name}" for name in rows.dtype.names]
+    if faces is not None:
+        lines += [f"element face {faces}", "property list uchar int vertex_indices"]
+    return "\n".join([*lines, "end_header", ""]).encode()
+
+
+def _fill(rows: NDArray, names: tuple[str, ...], values: NDArray) -> None:
+    for column, name in enumerate(names):
+        rows[name] = values[:, column]
+
+
+def _take(rows: NDArray, *names: str) -> Array:
+    return np.stack([rows[name] for name in names], axis=1).astype(np.float64)
+
+
+def _colors(rows: NDArray) -> NDArray[np.uint8]:
+    return _take(rows, "red", "green", "blue").astype(np.uint8)
+
+
+def _body(file: Path) -> bytes:
+    try:
+        return file.read_bytes()
+    except FileNotFoundError:
+        raise CaptureError("not_processed", f"{file} is not there: run `verso capture process {file.parent}`") from None
+
+
+def _counts(file: Path, body: bytes) -> tuple[int, int, int]:
+    """(where the data begins, vertices, faces) by the header."""
+    end = body.find(b"end_header\n")
+    words = [line.split() for line in body[: max(end, 0)].decode(errors="replace").splitlines()]
+    counts = {line[1]: int(line[2]) for line in words if line[:1] == ["element"] and line[2].isdigit()}
+    if end < 0 or "vertex" not in counts:
+        raise CaptureError("unreadable", f"{file} is no PLY that `verso capture process` wrote: delete it")
+    return end + len(b"end_header\n"), counts["vertex"], counts.get("face", 0)
+
+
+def _rows(file: Path, body: bytes, kind: np.dtype, start: int, count: int) -> NDArray:
+    if len(body) < start + count * kind.itemsize:
+        raise CaptureError("unreadable", f"{file} ends early: delete it, and process the capture again")
+    return np.frombuffer(body, kind, count, start)
+
+
+def _digest_of(file: Path) -> str | None:
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()
+    except OSError:
+        return None
+
+
+_IMAGE = re.compile(r"(?:rgb|depth|mask)_[0-9]{5,9}\.png|(?:board|correction)_[0-9]{5,9}\.txt")
+
+
+def list_inputs(path: Path) -> list[Path]:
+    """Every file that decides the result, sorted by name: descriptions, images, corrections, truth, a dictionary of markers.
+
+    Results that processing wrote beside them are none of them. Raises CaptureError where process.json cannot be read.
+    """
+    ours = own_files(path)
+    top = [file for file in path.iterdir() if file.is_file() and _is_input(file.name) and file.name not in ours]
+    truth = [file for file in (path / TRUTH).rglob("*") if file.is_file()] if (path / TRUTH).is_dir() else []
+    return sorted([*top, *truth, *_dictionary(path)])
+
+
+def digest_inputs(path: Path) -> str:
+    """64 hex characters: SHA-256 over the name and the SHA-256 of every input file. Raises CaptureError naming the folder."""
+    total = hashlib.sha256(b"verso capture 1\n")
+    try:
+        for file in list_inputs(path):
+            with open(file, "rb") as stream:
+                content = hashlib.file_digest(stream, "sha256").hexdigest()
+            total.update(f"{file.relative_to(path).as_posix()}\n{content}\n".encode())
+    except OSError as error:
+        raise CaptureError(
+            "unreadable", f"{error.filename or path} cannot be read: {error.strerror or error}"
+        ) from error
+    return total.hexdigest()
+
+
+def _is_input(name: str) -> bool:
+    return name in (CAMERA_FILE, BOARD_FILE, CAPTURE_FILE) or _IMAGE.fullmatch(name) is not None
+
+
+def _dictionary(path: Path) -> Iterator[Path]:
+    """The file of markers that board.json names, if it lies beside it."""
+    try:
+        found = re.search(rb'"dictionary"\s*:\s*"([^"/\\]+)"', (path / BOARD_FILE).read_bytes())
+    except FileNotFoundError:
+        return
+    if found and (file := path / found[1].decode(errors="replace")).is_file() and not _is_input(file.name):
+        yield file
+
+
+def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue:
+    """The job's catalogue; with folders of captures its digest covers every input file of theirs.
+
+    `watch` is told now and then how far it is. Raises AssetSourceError where a folder cannot be used.
+    """
+    catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories), watch)
+    if job.captures is None or not job.captures.folders:
+        return catalogue
+    listings = []
+    for number, name in enumerate(job.captures.folders):
+        watch("captures", number, len(job.captures.folders))
+        listings.append(list_capture((job_folder / Path(name).expanduser()).resolve(), f"captures.folders.{number}"))
+    watch("captures", len(listings), len(listings))
+    whole = "\n".join([catalogue.digest, *(listing.sha256 for listing in listings)])
+    return replace(catalogue, captures=tuple(listings), digest=hashlib.sha256(whole.encode()).hexdigest())
+
+
+def list_capture(folder: Path, key: str) -> CaptureListing:
+    """A folder and the digest of its input files. Raises AssetSourceError that names the key of the job file."""
+    if not folder.is_dir():
+        raise AssetSourceError(f"{key}: {folder} is no folder")
+    try:
+        return CaptureListing(folder, digest_inputs(folder))
+    except CaptureError as error:
+        raise AssetSourceError(f"{key}: {error.detail}") from error

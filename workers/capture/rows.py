@@ -1,0 +1,314 @@
+"""The output of a capture: pairs of views with their regions, encoded files, and rows in the tables that scenes have.
+
+- Regions of a capture's view: the object by its mask, and the board by the rays that meet it. Pure.
+- One pair of a capture: a captured view as it is stored, and its view from the other side.
+- The output of a capture: encoded files, and its rows in the tables that scenes have. Pure.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Pose
+from schemas.capture import CaptureEstimate, PosedImages, ProcessedCapture, SynthesizedView, ViewScore
+from schemas.dataset.codec import Row, matrix_column
+from schemas.dataset.layout import asset_path, file_pose_id, input_pose_id
+from schemas.dataset.tables import NOT_OF_CAPTURES
+from schemas.job.captures import Board
+from schemas.job.job import Job
+from schemas.scene.scene import EffectPlan, EncodedFile, Placed, SceneOutput, encoded_file
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_NOTHING, REGION_TABLE, Asset
+from schemas.scene.view import Camera, ObjectLabel, Pair, Role, View
+from workers.assets.catalogue import split_of
+from workers.assets.glb import asset_glb
+from workers.geometry.jit import compiled
+from workers.geometry.pixels import quantise_depth
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.labels import CountPixels, derive_projected, label_things, projection_shares
+from workers.scene.pairs import object_distance, place_mirror_camera
+from workers.scene.rows import asset_row, encode_view, object_rows, view_row
+from workers.store.images import encode_png
+
+
+def capture_regions(camera: Camera, board: Board, mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """[H, W] uint8: the object where `mask` is, the board where the ray through a pixel's centre meets it, else nothing.
+
+    The camera's pose is in the board frame, so the board is the rectangle z = 0 about the origin, at the print's true
+    size. Nothing means neither board nor object: what stands beside the board may have depth there.
+    """
+    k = camera.intrinsics
+    half = 0.5 * board.scale * np.array([board.width_m, board.height_m])
+    on_board = _meets_rectangle((k.height, k.width), (k.cx, k.cy, k.fx, k.fy), camera.T_world_cam, half[0], half[1])
+    region = np.where(on_board, np.uint8(REGION_TABLE), np.uint8(REGION_NOTHING))
+    region[mask] = REGION_FIRST_OBJECT
+    return region
+
+
+@compiled
+def _meets_rectangle(
+    shape: tuple[int, int],
+    k: tuple[float, float, float, float],
+    T: NDArray[np.float64],
+    half_x: float,
+    half_y: float,
+) -> NDArray[np.bool_]:
+    """[H, W] bool: whether the ray goes from above onto the rectangle |x| <= half_x, |y| <= half_y at z = 0."""
+    meets = np.zeros(shape, np.bool_)
+    if not T[2, 3] > 0.0:
+        return meets
+    for row in range(shape[0]):
+        ray_y = (row + 0.5 - k[1]) / k[3]
+        for column in range(shape[1]):
+            ray_x = (column + 0.5 - k[0]) / k[2]
+            down = T[2, 0] * ray_x + T[2, 1] * ray_y + T[2, 2]
+            if not down < 0.0:
+                continue
+            z = -T[2, 3] / down
+            x = T[0, 3] + z * (T[0, 0] * ray_x + T[0, 1] * ray_y + T[0, 2])
+            y = T[1, 3] + z * (T[1, 0] * ray_x + T[1, 1] * ray_y + T[1, 2])
+            meets[row, column] = abs(x) <= half_x and abs(y) <= half_y
+    return meets
+
+
+Synthesize = Callable[[Camera], SynthesizedView]
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedObject:
+    """The object of a capture on its board, in the board frame, which is the world of a capture.
+
+    `effects` of the dataset's images that the job asks for.
+    """
+
+    scene_id: int
+    asset: Asset
+    T_world_obj: Pose
+    board: Board
+    board_asset: Asset
+    effects: EffectPlan
+
+    @property
+    def things(self) -> tuple[Placed, Placed]:
+        """Board and object where they are."""
+        eye = np.eye(4)
+        return (
+            Placed(REGION_TABLE, self.board_asset.shape, eye),
+            Placed(REGION_FIRST_OBJECT, self.asset.shape, self.T_world_obj),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedPair:
+    """A pair as scenes have it; the number of its captured view, and its mirror view as it was made."""
+
+    number: int
+    pair: Pair
+    mirror: SynthesizedView | None
+
+
+def make_capture_pair(
+    job: Job, thing: CapturedObject, images: PosedImages, at: int, synthesize: Synthesize, count: CountPixels
+) -> CapturedPair:
+    """The views of captured view `at` (its place among the used ones) that the job asks for.
+
+    The mirror camera follows from the stored input depth as in scenes. Raises ViewError where the view has no depth of
+    the object, CaptureError where no captured view shows anything to the mirror camera.
+    """
+    parent_id = input_pose_id(thing.scene_id, at, job.pairs_per_scene)
+
+    def view(role: Role, camera: Camera, made: PosedImages | SynthesizedView) -> View:
+        region, depth = capture_regions(camera, thing.board, made.mask), quantise_depth(made.depth_m, job.images)
+        if role == "mirror":
+            region[depth == 0] = REGION_NOTHING
+        labels = _labels(thing, camera, region, count)
+        return View(role, file_pose_id(role, parent_id), parent_id, camera, made.rgb, depth, region, labels)
+
+    first = view("input", images.camera, images)
+    assert first.region is not None
+    pair = Pair(object_distance(first.depth, first.region, job.images, job.cameras.mirror), first, None)
+    if not thing.effects.runs("mirror"):
+        return CapturedPair(images.number, pair, None)
+    camera = place_mirror_camera(images.camera, pair.d_z_m, job.cameras.mirror)
+    made = synthesize(camera)
+    mirror = view("mirror", camera, made)
+    # No agreement: which pixels are co-visible follows from normals, which the noise of measured depth turns about.
+    pair = replace(pair, mirror=mirror)
+    if thing.effects.runs("projection"):
+        rgb, depth = derive_projected(first, camera, job.images, None, thing.effects)
+        filled, hidden = projection_shares(depth, mirror.depth, job.images)
+        projected = View("projected", first.pose_id, first.pose_id, camera, rgb, depth, None, ())
+        pair = replace(pair, projected=projected, filled_share=filled, hidden_share=hidden)
+    return CapturedPair(images.number, pair, made)
+
+
+def _labels(
+    thing: CapturedObject, camera: Camera, region: NDArray[np.uint8], count: CountPixels
+) -> tuple[ObjectLabel, ...]:
+    """Labels of board and object in a mask."""
+    assets = (thing.board_asset, thing.asset)
+    names = {
+        placed.region_id: (asset.category, asset.instance_id)
+        for placed, asset in zip(thing.things, assets, strict=True)
+    }
+    return label_things(thing.things, names, camera, region, count)
+
+
+SCORES = ("pose_mm", "pose_deg", "cloud_median_mm", "cloud_p95_mm", "completeness", "depth_median_mm")
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a capture came from.
+
+    `simulated` inside the job; `input_sha256` of its folder, None where it was simulated; `skipped`: [{effect, why}].
+    """
+
+    simulated: bool
+    input_sha256: str | None = None
+    effects: tuple[str, ...] = ()
+    skipped: tuple[Mapping[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A view that is not stored, and why."""
+
+    number: int
+    status: str
+    why: str
+
+
+def record_capture(
+    context: WorkerContext,
+    thing: CapturedObject,
+    done: ProcessedCapture,
+    origin: Origin,
+    pairs: Iterable[CapturedPair | LeftOut],
+    watch: Stopwatch,
+) -> SceneOutput:
+    """Files and rows of a capture, without its timings. Pairs are encoded one by one, so that one at a time is in memory."""
+    job, scene_id = context.job, thing.scene_id
+    files: list[EncodedFile] = []
+    views: list[Row] = []
+    objects: list[Row] = []
+    shares: list[float] = []
+    left_out: list[LeftOut] = []
+    for one in pairs:
+        if isinstance(one, LeftOut):
+            left_out.append(one)
+            continue
+        shares += [one.mirror.measured_share] if one.mirror is not None else []
+        with watch.stage("encode"):
+            for view in one.pair.views:
+                own = encode_view(view, one.pair, job.images)
+                files += own
+                row = view_row(scene_id, one.pair, view, own, job)
+                views.append(row | {"capture": view_columns(done, one, view.role)})
+                objects += object_rows(scene_id, view, job)
+    with watch.stage("encode"):
+        path = asset_path(thing.asset.category, thing.asset.instance_id)
+        files.append(encoded_file(path, asset_glb(thing.asset, encode_png)))
+    split = split_of(done.name, job.assets.split)  # of the object: no capture of it may fall into another
+    rows = {
+        "scenes": [scene_row(context, thing, done, origin, shares, left_out)],
+        "views": views,
+        "objects": objects,
+        "assets": [asset_row(thing.board_asset, job), asset_row(thing.asset, job) | {"split": split}],
+        "failures": [],
+    }
+    return SceneOutput(scene_id, tuple(files), rows)
+
+
+def scene_row(
+    context: WorkerContext,
+    thing: CapturedObject,
+    done: ProcessedCapture,
+    origin: Origin,
+    shares: Sequence[float],
+    left_out: Sequence[LeftOut],
+) -> Row:
+    """The row of `scenes`: the board is the table, and the board frame the world."""
+    absent: Row = dict.fromkeys(NOT_OF_CAPTURES)
+    return {
+        **absent,
+        "scene_id": thing.scene_id,
+        "category": thing.asset.category,
+        "instance_id": thing.asset.instance_id,
+        "source": thing.asset.source,
+        "table_id": thing.board_asset.instance_id,
+        "object_scale": thing.asset.scale,
+        "T_world_obj": matrix_column(thing.T_world_obj),
+        "T_world_table": matrix_column(np.eye(4)),
+        "redraws": 0,
+        "effects": [*origin.effects, *thing.effects.ran],
+        "skipped": [dict(one) for one in origin.skipped],
+        "raycast_checked": False,
+        "settings_digest": context.settings_digest,
+        "capture": quality_columns(done, origin, shares, left_out),
+    }
+
+
+def quality_columns(
+    done: ProcessedCapture, origin: Origin, shares: Sequence[float], left_out: Sequence[LeftOut]
+) -> Row:
+    """The column `capture` of `scenes`: how well the poses fit, what was corrected, and the errors where truth is known."""
+    chosen, used = done.estimates.estimate, done.estimates.estimate.used
+    numbers = {view.number for view in used}
+    refused = [
+        LeftOut(view.number, view.status, "; ".join(view.reasons) or "no reason was given")
+        for view in chosen.views
+        if view.status != "used"
+    ]
+    return {
+        "name": done.name,
+        "estimate": chosen.estimate,
+        "input_sha256": origin.input_sha256,
+        "views": len(used) - len(left_out),
+        "markers": sum(view.markers for view in used),
+        "reprojection_before_px": _median(
+            [view.reprojection_px for number, view in done.estimates.by_markers.items() if number in numbers]
+        ),
+        "reprojection_px": _median([view.reprojection_px for view in used]),
+        "depth_mm": _median([view.depth_mm for view in used]),
+        "depth_offset_m": chosen.depth.offset_m,
+        "depth_scale": chosen.depth.scale,
+        "print_scale": chosen.print_scale,
+        "identified": list(chosen.depth.identified),
+        "depth_corrected": done.depth_corrected,
+        "undistorted": done.undistorted,
+        "converged": chosen.converged,
+        "iterations": chosen.iterations,
+        "cloud_points": len(done.surface.points),
+        "measured_share": _median(list(shares)),
+        "left_out": [vars(one) for one in sorted([*refused, *left_out], key=lambda one: one.number)],
+        "notes": list(chosen.notes),
+        **{name: getattr(done.score, name) if done.score is not None else None for name in SCORES},
+    }
+
+
+def view_columns(done: ProcessedCapture, one: CapturedPair, role: Role) -> Row:
+    """The column `capture` of `views`: residuals and errors of the captured view, and of what the mirror view is made."""
+    estimate: CaptureEstimate = done.estimates.estimate
+    own = next(view for view in estimate.views if view.number == one.number)
+    before = done.estimates.by_markers.get(one.number)
+    score = done.score.views.get(one.number, ViewScore()) if done.score is not None else ViewScore()
+    made = one.mirror if role == "mirror" else None
+    return {
+        "number": one.number,
+        "markers": own.markers,
+        "reprojection_before_px": before.reprojection_px if before is not None else None,
+        "reprojection_px": own.reprojection_px,
+        "depth_mm": own.depth_mm,
+        "pose_mm": score.pose_mm,
+        "pose_deg": score.pose_deg,
+        "measured_share": made.measured_share if made is not None else None,
+        "depth_median_mm": score.depth_median_mm if role == "input" else None,
+        "sources": list(made.sources) if made is not None else None,
+    }
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None

@@ -1,0 +1,240 @@
+"""A virtual capture from its settings to its folder: effects, camera path, photographs, held-out views.
+
+- Which effects a simulated capture runs: one table of effects, and the plan that follows from its settings. Pure.
+- The path of a hand-held camera around an object, as poses at the moments of its photographs.
+- Views of a simulated capture that were not photographed: what synthesised views are compared with.
+- One virtual capture from its settings to its folder: the list of steps.
+
+The plan is of the same kind as that of scenes (schemas/scene/scene.py). Effects of the rendering are no-ops where a
+capture does not call for them; every other one is asked for by name in `captures.simulate`.
+"""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from schemas.base import Array, Pose, frozen_array
+from schemas.capture import CaptureCamera, CapturedView, CaptureTruth
+from schemas.errors import CaptureError
+from schemas.job.captures import Board, Simulate
+from schemas.job.job import Job
+from schemas.scene.scene import EffectPlan, Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT, Asset
+from schemas.scene.view import Camera
+from workers.assets.catalogue import Catalogue, load_asset
+from workers.assets.glb import asset_glb
+from workers.capture.folder import (
+    HELD_OUT,
+    TRUTH,
+    CaptureFile,
+    TrueObject,
+    write_description,
+    write_pose,
+    write_true_mask,
+    write_truth,
+    write_view,
+)
+from workers.capture.simulate.camera import opencv_lens
+from workers.capture.simulate.photograph import DEPTH_UNITS_PER_M as DEPTH_UNITS_PER_M_photograph
+from workers.capture.simulate.photograph import Studio, build_studio, draw_labels, photograph, place_object, take_light
+from workers.geometry.camera import orbit_pose
+from workers.geometry.colour import encode_codes
+from workers.geometry.frames import pose, rotation_about
+from workers.scene.plan import SceneChance, Stream, choose_assets
+
+ASKED = (
+    "hidden_markers",
+    "print_scale",
+    "motion_blur",
+    "distortion",
+    "exposure",
+    "rgb_noise",
+    "depth_noise",
+    "registration_error",
+)
+"""Effects that run where `captures.simulate` has a branch of this name. A receipt names them in this order."""
+
+RASTER = ("shadows", "ambient_occlusion", "light_maps")
+TRACED = ("global_illumination", "glass")
+DRAWN = ("rgb", "floor", "table", "textures", "transparency")
+"""What the renderers draw of every capture; antialiasing is not theirs, because photographs are averaged (sampling.py)."""
+
+
+def plan_effects(simulate: Simulate) -> EffectPlan:
+    """The effects that a capture runs, and why each of the others does not."""
+    of_tier = RASTER if simulate.tier == "raster" else TRACED
+    ran = [*DRAWN, *of_tier, *(name for name in ASKED if getattr(simulate, name) is not None)]
+    skipped = {name: f"tier is {simulate.tier}" for name in (*RASTER, *TRACED) if name not in of_tier}
+    skipped |= {name: f"captures.simulate.{name} is off" for name in ASKED if name not in ran}
+    return EffectPlan(tuple(ran), skipped)
+
+
+def planned_settings(simulate: Simulate, plan: EffectPlan) -> Simulate:
+    """The settings of those effects that the plan runs: every other one is off."""
+    return simulate.model_copy(update=dict.fromkeys(name for name in ASKED if not plan.runs(name)))
+
+
+VIEWS_PER_TURN = 14
+"""A turn around the object at one height has about as many views, and a path has at most `MOST_TURNS`."""
+
+MOST_TURNS = 3
+
+AIM_M = 0.02
+"""Standard deviation of the point that the camera looks at about the object's middle."""
+
+JITTER = 0.25
+"""Share of an irregular step from view to view in what otherwise changes smoothly."""
+
+OPTICAL_AXIS = np.array([0.0, 0.0, 1.0])
+
+
+def plan_path(simulate: Simulate, target: Array, rng: np.random.Generator) -> Array:
+    """[V, 4, 4] float64: poses in the frame of `target` [3], whose z points up, optical frame.
+
+    The camera goes around the target up to three times, higher each time, looks at it and rolls. Its distance and its
+    inclination stay within the intervals of `simulate`; the roll is normal with the standard deviation that it gives.
+    """
+    views = simulate.views
+    turns = min(max(round(views / VIEWS_PER_TURN), 1), MOST_TURNS)
+    time = (np.arange(views) + 0.5) / views
+    yaw0, way = rng.uniform(-math.pi, math.pi), rng.choice([-1.0, 1.0])
+    step = 2.0 * math.pi * turns / views
+    yaw = yaw0 + way * (2.0 * math.pi * turns * time + JITTER * step * rng.uniform(-1.0, 1.0, views))
+    level = (_climb(time, turns) + 0.5 * _sway(time, rng)) / turns
+    inclination = _within(simulate.inclination_rad, level)
+    distance = _within(simulate.distance_m, 0.5 + 0.5 * _sway(time, rng))
+    roll = np.radians(simulate.roll_deg) * _normal_sway(time, rng)
+    aim = target + AIM_M * rng.standard_normal((views, 3))
+    poses = [_rolled(orbit_pose(aim[n], inclination[n], yaw[n], distance[n]), float(roll[n])) for n in range(views)]
+    return np.stack(poses)
+
+
+def _within(interval: tuple[float, float], share: Array) -> Array:
+    """Values at shares of an interval; shares are clipped to [0, 1]."""
+    low, high = interval
+    return low + (high - low) * np.clip(share, 0.0, 1.0)
+
+
+def _climb(time: Array, turns: int) -> Array:
+    """0.5 on the first turn, 1.5 on the second, ..., rising smoothly in the last third of each but the last."""
+    at = time * turns
+    turn = np.minimum(np.floor(at), turns - 1)
+    late = np.clip(3.0 * (at - turn) - 2.0, 0.0, 1.0)
+    rise = late * late * (3.0 - 2.0 * late)
+    return turn + 0.5 + np.where(turn < turns - 1, rise, 0.0)
+
+
+def _sway(time: Array, rng: np.random.Generator) -> Array:
+    """Within [-1, 1]: a smooth swaying and a little irregular jitter."""
+    cycles, phase = rng.uniform(1.0, 5.0, 3), rng.uniform(0.0, 2.0 * math.pi, 3)
+    smooth = np.sin(2.0 * math.pi * cycles * time[:, None] + phase).mean(axis=1)
+    return (1.0 - JITTER) * smooth + JITTER * rng.uniform(-1.0, 1.0, len(time))
+
+
+def _normal_sway(time: Array, rng: np.random.Generator) -> Array:
+    """Standard normal at each moment; neighbours are alike, because a hand turns back slowly."""
+    keep = 0.7
+    drawn = rng.standard_normal(len(time))
+    value = np.empty(len(time))
+    for n in range(len(time)):
+        value[n] = drawn[n] if n == 0 else keep * value[n - 1] + math.sqrt(1.0 - keep * keep) * drawn[n]
+    return value
+
+
+def _rolled(T: Array, roll_rad: float) -> Array:
+    """The camera turned about its optical axis."""
+    return T @ pose(rotation_about(OPTICAL_AXIS, roll_rad), np.zeros(3))
+
+
+VIEWS = 3
+
+DEPTH_UNITS_PER_M = 10_000.0
+"""Finer than a capture's, so that rounding is no part of an error: 0.1 mm, up to 6.5 m."""
+
+
+def write_held_out(studio: Studio, board: Board, target: Array, path: Path) -> None:
+    """Write `VIEWS` exact views to `path`, a new folder of the same layout as a capture.
+
+    Their poses are drawn as those of a path around `target` [3], board frame, and stand in board_00000.txt. They are pictures
+    of the same things without the effects of any sensor or lens: depth and mask are those of the pixel centres.
+    """
+    path.mkdir(parents=True)
+    exact = without_sensors(studio)
+    spec = studio.simulate.model_copy(update={"views": VIEWS})
+    for number, T_board_cam in enumerate(plan_path(spec, target, studio.chance.stream(Stream.HELD_OUT))):
+        write_view(path, take_exact(exact, number, T_board_cam))
+        write_pose(path / f"board_{number:05d}.txt", T_board_cam)
+    camera = CaptureCamera(studio.rig.color, opencv_lens(None), DEPTH_UNITS_PER_M)
+    write_description(path, CaptureFile(name="held-out"), camera, board)
+
+
+def without_sensors(studio: Studio) -> Studio:
+    """The studio with the same things, seen by ideal cameras."""
+    simulate = studio.simulate.model_copy(update=dict.fromkeys(ASKED))
+    return replace(studio, simulate=simulate, drawn_color=studio.rig.color, lookup=None)
+
+
+def take_exact(studio: Studio, number: int, T_board_cam: Pose) -> CapturedView:
+    """One exact view, its depth in units of `DEPTH_UNITS_PER_M`."""
+    T_world_cam = studio.T_world_board @ T_board_cam
+    depth_m, mask = draw_labels(studio, Camera(studio.rig.color, T_world_cam))
+    depth = np.rint(np.clip(depth_m * DEPTH_UNITS_PER_M, 0.0, 65_535.0)).astype(np.uint16)
+    depth[depth == 65_535] = 0
+    return CapturedView(number, encode_codes(take_light(studio, number, T_world_cam)), depth, mask)
+
+
+def load_object(job: Job, catalogue: Catalogue, chance: SceneChance) -> Asset:
+    """The object of a capture, chosen as the first object of a scene is. Raises MeshError where its mesh is refused."""
+    (ref, *_), _ = choose_assets(job, catalogue, chance)
+    return load_asset(catalogue, ref)
+
+
+def simulate_capture(
+    simulate: Simulate,
+    board: Board,
+    asset: Asset,
+    chance: SceneChance,
+    path: Path,
+    effects: EffectPlan | None = None,
+) -> CaptureTruth:
+    """Photograph `asset` on the board and write the folder of a capture, with truth/, to `path`, a new or empty folder.
+
+    `chance` decides all that is random: the same arguments write the same bytes. `effects` is the plan for these settings
+    unless given. camera.json comes last, so that a capture that was cut off cannot be mistaken for a whole one. Raises
+    CaptureError where the folder has files or the lens cannot be.
+    """
+    path.mkdir(parents=True, exist_ok=True)
+    if any(path.iterdir()):
+        raise CaptureError("exists", f"{path} holds files already: name a new or an empty folder")
+    plan = plan_effects(simulate) if effects is None else effects
+    simulate = planned_settings(simulate, plan)
+    thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
+    studio = build_studio(simulate, board, thing, plan, chance)
+    target = thing.T_world_shape[:3, 3]
+    poses = plan_path(simulate, target, chance.stream(Stream.CAMERA))
+    for number, T_board_cam in enumerate(poses):
+        view, mask = photograph(studio, number, T_board_cam)
+        write_view(path, view)
+        write_true_mask(path, number, mask)
+    truth = CaptureTruth(
+        T_board_cam=frozen_array(poses),
+        T_board_obj=thing.T_world_shape,
+        print_scale=1.0 if simulate.print_scale is None else simulate.print_scale,
+        T_color_depth=studio.rig.depth.T_color_depth,
+        depth_bias_m=0.0 if simulate.depth_noise is None else simulate.depth_noise.bias_m,
+        lens=simulate.distortion,
+    )
+    write_held_out(studio, board, target, path / TRUTH / HELD_OUT)
+    write_truth(path, truth, TrueObject(asset.category, asset.instance_id, asset_glb(asset)), plan.ran, plan.skipped)
+    _describe(studio, board, asset, path)
+    return truth
+
+
+def _describe(studio: Studio, board: Board, asset: Asset, path: Path) -> None:
+    """Write camera.json, board.json and capture.json."""
+    name = f"{asset.category}-{studio.chance.scene_id:05d}"
+    about = CaptureFile(name=name, category=asset.category, licence=asset.licence)
+    camera = CaptureCamera(studio.rig.color, opencv_lens(studio.simulate.distortion), DEPTH_UNITS_PER_M_photograph)
+    write_description(path, about, camera, board)

@@ -1,0 +1,346 @@
+"""The surface of a capture's object: depth of all views merged, confirmed, and moved to where views face it.
+
+- What every view says about the points of a merged surface: where it really is, how many see it, and its colour.
+- One surface from the depth of all views: merged, confirmed, moved to where the views see it, and coloured.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from schemas.base import Array
+from schemas.capture import Reconstruction
+from schemas.errors import CaptureError
+from schemas.job.captures import Fusion
+from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera
+from workers.capture.surface.object_mask import ObjectRegion
+from workers.capture.surface.posed_view import PosedView, visible_points
+from workers.capture.surface.tsdf import (
+    FRONT_VOXELS,
+    FittedDepth,
+    cut_below,
+    empty_volume,
+    extract_surface,
+    fit_depth,
+    integrate,
+    keep_vertices,
+    large_parts,
+    sample_inverse,
+    vertex_normals,
+    views_near,
+)
+from workers.geometry.camera import project_bounds
+from workers.geometry.colour import SRGB_STEPS, encode_codes
+from workers.geometry.frames import invert, transform
+from workers.geometry.jit import compiled
+
+UNSEEN = 128
+"""The code of each channel where no view sees anything."""
+
+LEAST_LIGHT = 0.02
+"""Darker colours, in linear light, say nothing about a view's exposure."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A view ready to be asked: its pictures, the fit of its depth about the object, and the smallest cosine of incidence."""
+
+    view: PosedView
+    fitted: FittedDepth
+    least_cos: float
+
+
+@dataclass(frozen=True, eq=False)
+class Offsets:
+    """How far the views see the surface beyond each point along its normal: mean [N], metres; `views` [N] that see it."""
+
+    mean_m: Array
+    views: NDArray[np.int32]
+
+
+def measure_offsets(points: Array, normals: Array, sights: Sequence[Sight], within_m: float) -> Offsets:
+    """Mean over the views, weighted by inverse variance, of the distance to the surface that they see there."""
+    total, weight = np.zeros(len(points)), np.zeros(len(points))
+    views = np.zeros(len(points), np.int32)
+    for sight in sights:
+        offset, w = observe(points, normals, sight, within_m)
+        total += offset * w
+        weight += w
+        views += w > 0.0
+    return Offsets(np.where(weight > 0.0, total / np.where(weight > 0.0, weight, 1.0), 0.0), views)
+
+
+def observe(points: Array, normals: Array, sight: Sight, within_m: float) -> tuple[Array, Array]:
+    """(offset along the normal, weight), each [N]: weight 0 where the view does not see a point within `within_m`."""
+    offset, weight = np.zeros(len(points)), np.zeros(len(points))
+    camera, fitted = sight.view.depth_camera, sight.fitted
+    k = camera.intrinsics
+    intrinsics = (k.fx, k.fy, k.cx - fitted.left - 0.5, k.cy - fitted.top - 0.5)
+    T = invert(camera.T_world_cam)
+    _observe(points, normals, T, intrinsics, fitted.inverse, sight.least_cos, within_m, offset, weight)
+    return offset, weight
+
+
+@compiled
+def _observe(
+    points: Array,
+    normals: Array,
+    T: Array,
+    k: tuple[float, float, float, float],
+    inverse: NDArray[np.float32],
+    least_cos: float,
+    within_m: float,
+    offset: Array,
+    weight: Array,
+) -> None:
+    """A difference of z times (normal . ray) is the distance along the normal; weights as in the distance field."""
+    height, width = inverse.shape
+    for i in range(len(points)):
+        p, n = points[i], normals[i]
+        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+        if not z > 0.05:
+            continue
+        ray_x = (T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]) / z
+        ray_y = (T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]) / z
+        x, y = k[0] * ray_x + k[2], k[1] * ray_y + k[3]
+        if not (-0.5 < x < width - 0.5 and -0.5 < y < height - 0.5):
+            continue
+        q = sample_inverse(inverse, x, y)
+        if q == 0.0:
+            continue
+        slope = 0.0  # of the ray against the normal
+        for axis in range(3):
+            ray = T[0, axis] * ray_x + T[1, axis] * ray_y + T[2, axis]
+            slope -= n[axis] * ray
+        if slope < least_cos * math.sqrt(1.0 + ray_x * ray_x + ray_y * ray_y):
+            continue
+        s = (z - 1.0 / q) * slope
+        if abs(s) < within_m:
+            offset[i] = s
+            weight[i] = slope * slope * q * q * q * q
+
+
+def color_points(points: Array, normals: Array, sights: Sequence[Sight], within_m: float) -> NDArray[np.uint8]:
+    """[N, 3] uint8 sRGB: the mean of the views, mostly of those that see a point best, after their exposures were made alike.
+
+    A point that no view sees has the colour of the nearest one that is seen, grey where there is none.
+    """
+    light = np.zeros((len(sights), len(points), 3), np.float32)
+    score = np.zeros((len(sights), len(points)), np.float32)
+    for number, sight in enumerate(sights):
+        _, weight = observe(points, normals, sight, within_m)
+        seen = np.flatnonzero(weight > 0.0)
+        colors, inside = sample_light(sight.view.rgb, sight.view.camera, points[seen])
+        light[number, seen] = colors
+        score[number, seen] = np.where(inside, weight[seen], 0.0)
+    light *= exposure_gains(light, score)[:, None, None].astype(np.float32)
+    # Squares, so that the best views decide, without a seam where their order changes.
+    weight = score.astype(np.float64) ** 2
+    total = weight.sum(axis=0)
+    mean = np.einsum("vn,vnc->nc", weight, light) / np.where(total > 0.0, total, 1.0)[:, None]
+    codes = encode_codes(mean)
+    unseen = total == 0.0
+    if unseen.all():
+        codes[:] = UNSEEN
+    elif unseen.any():
+        _, nearest = cKDTree(points[~unseen]).query(points[unseen])
+        codes[unseen] = codes[~unseen][nearest]
+    return codes
+
+
+def exposure_gains(light: NDArray[np.float32], score: NDArray[np.float32]) -> Array:
+    """[V]: factors on the views' light [V, N, 3] that make what they see in common (score [V, N] > 0) equally bright.
+
+    Medians of ratios, so that gloss and misplaced edges do not count; the views' median factor is 1.
+    """
+    bright = light.mean(axis=2, dtype=np.float64)
+    known = (score > 0.0) & (bright > LEAST_LIGHT) & (bright < 0.9)
+    log = np.log(np.where(known, bright, 1.0))
+    gains = np.zeros(len(light))
+    for _ in range(4):
+        count = known.sum(axis=0)
+        mean = np.where(known, log + gains[:, None], 0.0).sum(axis=0) / np.maximum(count, 1)
+        for view in range(len(light)):
+            shared = known[view] & (count > 1)
+            gains[view] = np.median(mean[shared] - log[view, shared]) if shared.sum() >= 50 else 0.0
+        gains -= np.median(gains)
+    return np.asarray(np.exp(np.clip(gains, -1.5, 1.5)))
+
+
+def sample_light(rgb: NDArray[np.uint8], camera: Camera, points: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """(linear light [N, 3], inside the image [N]) of an image at points [N, 3], board frame; bilinear."""
+    k = camera.intrinsics
+    light, inside = np.zeros((len(points), 3)), np.zeros(len(points), np.bool_)
+    T = invert(camera.T_world_cam)
+    _sample_light(rgb, SRGB_STEPS, T, (k.fx, k.fy, k.cx_opencv, k.cy_opencv), points, light, inside)
+    return light, inside
+
+
+@compiled
+def _sample_light(
+    rgb: NDArray[np.uint8],
+    steps: Array,
+    T: Array,
+    k: tuple[float, float, float, float],
+    points: Array,
+    light: Array,
+    inside: NDArray[np.bool_],
+) -> None:
+    height, width = rgb.shape[0], rgb.shape[1]
+    for i in range(len(points)):
+        p = points[i]
+        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+        if not z > 0.05:
+            continue
+        x = k[0] * (T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]) / z + k[2]
+        y = k[1] * (T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]) / z + k[3]
+        if not (0.0 <= x < width - 1 and 0.0 <= y < height - 1):
+            continue
+        column, row = int(np.floor(x)), int(np.floor(y))
+        s, t = x - column, y - row
+        inside[i] = True
+        for c in range(3):
+            upper = steps[rgb[row, column, c]] * (1.0 - s) + steps[rgb[row, column + 1, c]] * s
+            lower = steps[rgb[row + 1, column, c]] * (1.0 - s) + steps[rgb[row + 1, column + 1, c]] * s
+            light[i, c] = upper * (1.0 - t) + lower * t
+
+
+MARGIN_PX = 12
+"""Width by which a view's window is larger than the object's box."""
+
+LEAST_PART = 0.02
+"""Share of the largest part's area below which a loose part is noise."""
+
+FACING_AWAY = -1.0
+"""Whichever way a rough point's normal turns, it is seen where nothing hides it."""
+
+LIFT_VOXELS = 0.25
+"""Points are looked at from so far above the surface: its roughness hides less."""
+
+STEPS = 2
+"""Times that points are moved along their normals to where the views see the surface."""
+
+
+def sight_object(views: Sequence[PosedView], region: ObjectRegion, spec: Fusion) -> list[Sight]:
+    """Each view's depth about the object, fitted; views that see nothing of it are left out."""
+    least_cos = math.cos(math.radians(spec.max_edge_deg))
+    sights = []
+    for view in views:
+        window = object_window(region, view.depth_camera)
+        fitted = fit_depth(without_others(view), view.depth_camera.intrinsics, spec.max_edge_deg, window)
+        if fitted.inverse.any():
+            sights.append(Sight(view, fitted, least_cos))
+    return sights
+
+
+def without_others(view: PosedView) -> NDArray[np.float32]:
+    """[H, W] depth; where a mask was given, none where it ends, so that no surface spans its edge."""
+    return view.depth_m
+
+
+def object_window(region: ObjectRegion, camera: Camera) -> tuple[int, int, int, int]:
+    """(top, left, bottom, right) of the pixels that can see the region's box."""
+    low, high = region.low, region.high
+    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    k = camera.intrinsics
+    left, top, right, bottom = project_bounds(transform(invert(camera.T_world_cam), corners), k, 0.05)
+    rows = np.clip([math.floor(top) - MARGIN_PX, math.ceil(bottom) + MARGIN_PX], 0, k.height)
+    columns = np.clip([math.floor(left) - MARGIN_PX, math.ceil(right) + MARGIN_PX], 0, k.width)
+    return int(rows[0]), int(columns[0]), int(rows[1]), int(columns[1])
+
+
+def fuse_views(
+    views: Sequence[PosedView], region: ObjectRegion, spec: Fusion, seconds: Mapping[str, float] | None = None
+) -> Reconstruction:
+    """The object's surface. Raises CaptureError where too few views see it, or none of it is confirmed."""
+    sights = sight_object(views, region, spec)
+    if len(sights) < spec.min_views:
+        raise CaptureError(
+            "too_few_views",
+            f"{len(sights)} of {len(views)} views have depth on the object, and fusion.min_views is {spec.min_views}: "
+            "take more pictures, or lower it",
+        )
+    volume = empty_volume(region.low, region.high, spec.voxel_m)
+    for sight in sights:
+        integrate(volume, sight.fitted, sight.view.depth_camera)
+    within_m = FRONT_VOXELS * spec.voxel_m
+    mesh = extract_surface(volume)
+    mesh, _ = keep_vertices(mesh, views_near(volume, mesh.vertices) >= spec.min_views)
+    mesh = _outside(mesh, sights, spec)
+    mesh = _settle(mesh, sights, within_m)
+    mesh = _clean(cut_below(mesh, region.plane, region.clearance_m), region)
+    if not len(mesh.faces):
+        raise CaptureError(
+            "no_surface",
+            f"no point of the object is seen alike by fusion.min_views = {spec.min_views} views: the poses are wrong, or the "
+            "object has no depth (shiny, black or transparent)",
+        )
+    normals = vertex_normals(mesh)
+    count = views_near(volume, mesh.vertices)
+    colors = color_points(mesh.vertices, normals, sights, within_m)
+    sure = count >= spec.min_views
+    return Reconstruction(
+        points=mesh.vertices[sure],
+        normals=normals[sure],
+        colors=colors[sure],
+        views=count[sure],
+        vertices=mesh.vertices,
+        faces=mesh.faces,
+        vertex_colors=colors,
+        seconds=dict(seconds or {}),
+    )
+
+
+def _outside(mesh: Mesh, sights: Sequence[Sight], spec: Fusion) -> Mesh:
+    """What a camera can see past what the views measured face to face.
+
+    A pixel that mixes two surfaces looks into the object, and there the field has a second surface behind the first.
+    """
+    if not len(mesh.faces):
+        return mesh
+    normals = vertex_normals(mesh)
+    faced = measure_offsets(mesh.vertices, normals, sights, FRONT_VOXELS * spec.voxel_m).views >= spec.min_views
+    hiding, _ = keep_vertices(mesh, faced)
+    if not len(hiding.faces):
+        return mesh
+    cameras = [sight.view.depth_camera for sight in sights]
+    seen = visible_points(hiding, mesh.vertices, normals, cameras, LIFT_VOXELS * spec.voxel_m, FACING_AWAY)
+    return keep_vertices(mesh, seen)[0]
+
+
+def _settle(mesh: Mesh, sights: Sequence[Sight], within_m: float) -> Mesh:
+    """The mesh after each vertex has moved to the mean of the surfaces that the views see there.
+
+    The field rounds edges and thickens thin walls, because it holds what views from the other side saw, too; a view that
+    faces a point knows only its own side.
+    """
+    vertices = mesh.vertices
+    for _ in range(STEPS):
+        if not len(mesh.faces):
+            break
+        normals = vertex_normals(Mesh(vertices, mesh.faces))
+        moved = measure_offsets(vertices, normals, sights, within_m).mean_m
+        vertices = vertices + normals * _smooth(moved, mesh)[:, None]
+    return Mesh(vertices, mesh.faces)
+
+
+def _smooth(values: Array, mesh: Mesh) -> Array:
+    """[V]: half of each vertex's value and half of its neighbours' mean, so that noise between neighbours does not fold faces."""
+    total, count = np.zeros(len(values)), np.zeros(len(values))
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        total += np.bincount(mesh.faces[:, i], weights=values[mesh.faces[:, j]], minlength=len(values))
+        count += np.bincount(mesh.faces[:, i], minlength=len(values))
+    return 0.5 * values + 0.5 * total / np.maximum(count, 1)
+
+
+def _clean(mesh: Mesh, region: ObjectRegion) -> Mesh:
+    """Without what is beside the footprint, and without small loose parts."""
+    # The cut lies on the clearance itself, and its points must not fall below it by rounding.
+    lifted = mesh.vertices + np.array([0.0, 0.0, 1e-6])
+    mesh, _ = keep_vertices(mesh, region.holds(lifted))
+    return keep_vertices(mesh, large_parts(mesh, LEAST_PART))[0]

@@ -1,0 +1,267 @@
+"""Where the object is: its footprint and height on the board, and its mask in each view.
+
+- Where the object stands on the board: its footprint and height, from the depth of all views together.
+- Masks of the object: the silhouette of the merged surface, down to the board.
+
+Heights above the board are collected in the cells of a grid, and a cell's height is their median: a hundred noisy
+pixels of many views fix it to some tenths of a millimetre, so that an object of 4 mm is found where no single view
+shows it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from schemas.base import Array
+from schemas.errors import CaptureError
+from schemas.job.captures import Board, Fusion
+from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera
+from workers.capture.surface.posed_view import PosedView
+from workers.geometry.jit import compiled
+from workers.geometry.zbuffer import draw_depth
+
+CELL_M = 0.004
+BIN_M = 0.0005
+REACH_M = 0.03
+"""Medians are resolved up to this far above and below the print's plane; what is higher counts as higher."""
+
+TALLEST_M = 0.6
+"""Nothing on the board is taller."""
+
+SAMPLES = 300_000
+"""Pixels of a view that are looked at, about."""
+
+LEAST_SAMPLES = 12
+"""A cell with as many is known; where views are few or small, one with a third of what most cells have."""
+
+LEAST_CELLS = 6
+"""A smaller thing, 1 cm^2, is noise."""
+
+BRIDGE_CELLS = 2
+"""Parts of one object are as near to one another as this."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """The board's surface z = a x + b y + c as depth measures it, `plane` (a, b, c); what is nearer than clearance_m is it."""
+
+    plane: tuple[float, float, float]
+    clearance_m: float
+
+    def height_m(self, points: Array) -> Array:
+        """[N] height of points [N, 3] above the surface."""
+        a, b, c = self.plane
+        return points[:, 2] - (a * points[:, 0] + b * points[:, 1] + c)
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectRegion(Ground):
+    """The object's surroundings, board frame, metres.
+
+    low, high [3]: a box around it; spread_m: standard deviation of the board's cells about its plane. `footprint` [cells in x,
+    cells in y] bool, cell (0, 0) beginning at `corner` [2]. `notes` for the user.
+    """
+
+    low: Array
+    high: Array
+    spread_m: float
+    footprint: NDArray[np.bool_]
+    corner: Array
+    notes: tuple[str, ...] = ()
+
+    def holds(self, points: Array) -> NDArray[np.bool_]:
+        """[N] bool: points [N, 3] above the footprint and above the clearance."""
+        cell = np.floor((points[:, :2] - self.corner) / CELL_M).astype(np.int64)
+        inside = ((cell >= 0) & (cell < self.footprint.shape)).all(axis=1)
+        cell[~inside] = 0
+        return inside & self.footprint[cell[:, 0], cell[:, 1]] & (self.height_m(points) > self.clearance_m)
+
+
+def find_object(views: Sequence[PosedView], board: Board, spec: Fusion) -> ObjectRegion:
+    """The object of a capture. Raises CaptureError where the board has no depth, or nothing stands on it."""
+    half = 0.5 * np.array([board.width_m, board.height_m]) * board.scale
+    cells = np.ceil(2.0 * half / CELL_M).astype(np.int64)
+    low_bins = np.zeros((cells[0], cells[1], round(2 * REACH_M / BIN_M) + 2), np.int32)
+    tall_bins = np.zeros((cells[0], cells[1], round(TALLEST_M / REACH_M)), np.int32)
+    for view in views:
+        k = view.depth_camera.intrinsics
+        stride = max(1, int(np.sqrt(k.width * k.height / SAMPLES)))
+        intrinsics = (k.fx, k.fy, k.cx, k.cy)
+        mask = np.ones((1, 1), np.bool_) if view.mask is None else view.mask
+        _collect(view.depth_m, mask, stride, intrinsics, view.depth_camera.T_world_cam, -half, low_bins, tall_bins)
+    height, count = _medians(low_bins)
+    usual = float(np.median(count[count > 0])) if count.any() else 0.0
+    known = count >= np.clip(usual / 3.0, 1.0, LEAST_SAMPLES)
+    if known.sum() < LEAST_CELLS:
+        raise CaptureError(
+            "no_depth",
+            f"{len(views)} views have depth on {int(known.sum())} cells of 4 mm of the board: depth images are empty, "
+            "or depth_units_per_m in camera.json is wrong",
+        )
+    x, y = (-half[0] + (np.arange(cells[0]) + 0.5) * CELL_M, -half[1] + (np.arange(cells[1]) + 0.5) * CELL_M)
+    grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+    plane, spread = _board_plane(grid[known], height[known])
+    above = height - (grid @ np.array(plane[:2]) + plane[2])
+    clearance = max(spec.board_clearance_m, 4.0 * spread)
+    found = known & (above > clearance)
+    footprint, others = _largest(found, np.where(found, above, 0.0))
+    if footprint is None:
+        highest = float(above[known].max())
+        raise CaptureError(
+            "no_object",
+            f"nothing on the board stands more than {clearance * 1e3:.1f} mm above it (highest: {highest * 1e3:.1f} mm): lower "
+            f"fusion.board_clearance_m ({spec.board_clearance_m * 1e3:g} mm) if the object is flat",
+        )
+    notes = [f"{others} other thing{'s' * (others > 1)} on the board left out"] if others else []
+    if clearance > spec.board_clearance_m:
+        notes.append(
+            f"the board's surface is uneven by {spread * 1e3:.2f} mm, so the clearance is {clearance * 1e3:.1f} mm"
+        )
+    return _region(footprint, tall_bins, -half, plane, (spread, clearance), tuple(notes))
+
+
+@compiled
+def _collect(
+    depth_m: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    stride: int,
+    k: tuple[float, float, float, float],
+    T: Array,
+    corner: Array,
+    low_bins: NDArray[np.int32],
+    tall_bins: NDArray[np.int32],
+) -> None:
+    """Counts heights by cell; with a mask, what is outside of it cannot be higher than the board."""
+    has_mask = mask.shape[0] > 1
+    for row in range(stride // 2, depth_m.shape[0], stride):
+        ray_y = (row + 0.5 - k[3]) / k[1]
+        for column in range(stride // 2, depth_m.shape[1], stride):
+            z = depth_m[row, column]
+            if not z > 0.0:
+                continue
+            x, y = (column + 0.5 - k[2]) / k[0] * z, ray_y * z
+            bx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+            by = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+            h = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+            i, j = int(np.floor((bx - corner[0]) / CELL_M)), int(np.floor((by - corner[1]) / CELL_M))
+            if i < 0 or j < 0 or i >= low_bins.shape[0] or j >= low_bins.shape[1] or h > TALLEST_M:
+                continue
+            if has_mask and not mask[row, column] and h > REACH_M:
+                continue
+            bin_ = int(np.floor((h + REACH_M) / BIN_M)) + 1
+            low_bins[i, j, min(max(bin_, 0), low_bins.shape[2] - 1)] += 1
+            if h > 0.0:
+                tall_bins[i, j, min(int(h / REACH_M), tall_bins.shape[2] - 1)] += 1
+
+
+def _medians(bins: NDArray[np.int32]) -> tuple[Array, NDArray[np.int64]]:
+    """(median height [X, Y], interpolated within its bin; samples [X, Y])."""
+    total = bins.sum(axis=2, dtype=np.int64)
+    below = np.cumsum(bins, axis=2)
+    at = (2 * below < total[..., None]).sum(axis=2).clip(0, bins.shape[2] - 1)
+    here = np.take_along_axis(bins, at[..., None], axis=2)[..., 0]
+    before = np.take_along_axis(below, at[..., None], axis=2)[..., 0] - here
+    share = (0.5 * total - before) / np.maximum(here, 1)
+    return (at - 1 + np.clip(share, 0.0, 1.0)) * BIN_M - REACH_M, total
+
+
+def _board_plane(xy: Array, height: Array) -> tuple[tuple[float, float, float], float]:
+    """((a, b, c) of z = a x + b y + c, spread) of the cells near z = 0, by Tukey's weights from their median."""
+    near = np.abs(height) < REACH_M - BIN_M
+    xy, height = xy[near], height[near]
+    if len(xy) < LEAST_CELLS:
+        raise CaptureError(
+            "no_depth", "no depth image shows the board's surface within 30 mm of the plane of its markers"
+        )
+    design = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    solution = np.array([0.0, 0.0, _mode(height)])
+    limit = 0.006
+    for _ in range(8):
+        residual = height - design @ solution
+        weight = np.clip(1.0 - (residual / limit) ** 2, 0.0, None)
+        root = np.sqrt(weight)[:, None]
+        solution = np.linalg.lstsq(design * root, height * root[:, 0], rcond=None)[0]
+        inliers = np.abs(height - design @ solution) < limit
+        spread = 1.4826 * float(np.median(np.abs(height - design @ solution)[inliers])) if inliers.any() else limit
+        limit = min(max(5.0 * spread, 0.0015), 0.006)
+    return (float(solution[0]), float(solution[1]), float(solution[2])), spread
+
+
+def _mode(height: Array) -> float:
+    """The middle of the fullest window of 4 mm, the lowest where several are: the board is the largest level thing."""
+    ordered = np.sort(height)
+    counts = np.searchsorted(ordered, ordered + 0.004, side="right") - np.arange(len(ordered))
+    return float(ordered[int(np.argmax(counts))]) + 0.002
+
+
+def _largest(found: NDArray[np.bool_], above: Array) -> tuple[NDArray[np.bool_] | None, int]:
+    """(cells of the thing with the largest volume, or None; number of others that are a tenth as large)."""
+    bridged = ndimage.binary_dilation(found, np.ones((3, 3), bool), iterations=BRIDGE_CELLS)
+    labels, count = ndimage.label(bridged)
+    labels = np.where(found, labels, 0)
+    cells = np.bincount(labels.ravel(), minlength=count + 1)[1:]
+    volume = np.bincount(labels.ravel(), weights=above.ravel(), minlength=count + 1)[1:]
+    volume = np.where(cells >= LEAST_CELLS, volume, 0.0)
+    if not volume.any():
+        return None, 0
+    best = int(np.argmax(volume))
+    return labels == best + 1, int((volume > 0.1 * volume[best]).sum()) - 1
+
+
+def _region(
+    footprint: NDArray[np.bool_],
+    tall_bins: NDArray[np.int32],
+    corner: Array,
+    plane: tuple[float, float, float],
+    spread_and_clearance: tuple[float, float],
+    notes: tuple[str, ...],
+) -> ObjectRegion:
+    """The region around a footprint, which grows by three cells, for what hangs over and for the error of its rim."""
+    levels = tall_bins[footprint].sum(axis=0)
+    filled = np.flatnonzero(levels > max(LEAST_SAMPLES, 2e-4 * levels.sum()))
+    top = (int(filled[-1]) + 1 if len(filled) else 1) * REACH_M
+    grown = ndimage.binary_dilation(footprint, np.ones((3, 3), bool), iterations=3)
+    i, j = np.nonzero(grown)
+    low = np.array([corner[0] + i.min() * CELL_M, corner[1] + j.min() * CELL_M, plane[2] - 0.008])
+    high = np.array([corner[0] + (i.max() + 1) * CELL_M, corner[1] + (j.max() + 1) * CELL_M, plane[2] + top + 0.01])
+    spread, clearance = spread_and_clearance
+    return ObjectRegion(plane, clearance, low, high, spread, grown, corner, notes)
+
+
+RIM_M = 0.0005
+"""Points of an open edge that lie nearer to the cut above the board than this are on it."""
+
+
+def silhouette(mesh: Mesh, camera: Camera) -> NDArray[np.bool_]:
+    """[H, W] bool: the pixels whose centres see the mesh; nothing hides it, because nothing else stands on the board."""
+    return draw_depth(mesh, camera) > 0.0
+
+
+def down_to_board(mesh: Mesh, ground: Ground) -> Mesh:
+    """The mesh with walls from its cut edge down to the board: the object goes on below the clearance."""
+    edges = _open_edges(mesh)
+    height = ground.height_m(mesh.vertices)
+    edges = edges[(height[edges] < ground.clearance_m + RIM_M).all(axis=1)]
+    if not len(edges):
+        return mesh
+    a, b, c = ground.plane
+    rim, local = np.unique(edges, return_inverse=True)
+    foot = mesh.vertices[rim].copy()
+    foot[:, 2] = a * foot[:, 0] + b * foot[:, 1] + c
+    low = local.reshape(-1, 2) + len(mesh.vertices)
+    upper = np.stack([edges[:, 1], edges[:, 0], low[:, 0]], axis=1)
+    lower = np.stack([edges[:, 1], low[:, 0], low[:, 1]], axis=1)
+    faces = np.concatenate([mesh.faces, upper, lower]).astype(np.int32)
+    return Mesh(np.concatenate([mesh.vertices, foot]), faces)
+
+
+def _open_edges(mesh: Mesh) -> NDArray[np.int64]:
+    """[E, 2] the directed edges that one face alone has."""
+    directed = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    key = np.sort(directed, axis=1) @ np.array([len(mesh.vertices), 1])
+    _, first, count = np.unique(key, return_index=True, return_counts=True)
+    return directed[first[count == 1]]

@@ -1,0 +1,155 @@
+"""A view with its pose, and which points of a surface it sees.
+
+- A view with its pose and without its lens: what merging and synthesis start from.
+- Which points of a mesh the cameras can see past the mesh itself, by rays.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array, Pose, frozen_array
+from schemas.capture import CaptureCamera, CapturedView, DepthCorrection
+from schemas.errors import CaptureError
+from schemas.scene.scene import Placed
+from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh, Part, Shape
+from schemas.scene.view import Camera
+from workers.capture.poses.observation import opencv_matrix
+from workers.geometry.camera import project
+from workers.geometry.frames import invert, transform
+from workers.geometry.jit import compiled
+from workers.geometry.projection import in_frame
+from workers.geometry.raycast import first_hit
+
+Depth = NDArray[np.float32]
+"""[H, W] z along the optical axis, metres, 0 where there is none."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosedView:
+    """The pictures of one view as pinholes see them, in the board frame.
+
+    `camera` took rgb [H, W, 3] uint8 and mask [H, W] bool (None where none was given). `depth_camera` took depth_m [H, W]
+    float32: it has the same intrinsics and stands where the estimate has the depth camera of the registered images.
+    """
+
+    number: int
+    camera: Camera
+    depth_camera: Camera
+    rgb: NDArray[np.uint8]
+    depth_m: Depth
+    mask: NDArray[np.bool_] | None = None
+
+
+def pose_view(view: CapturedView, camera: CaptureCamera, T_board_cam: Pose, depth: DepthCorrection) -> PosedView:
+    """The view without its lens, its depth corrected. Raises CaptureError where it has no depth image."""
+    if view.depth is None:
+        raise CaptureError("no_depth", f"view {view.number} has no depth image: depth_{view.number:05d}.png is missing")
+    k = camera.intrinsics
+    rgb, stored, mask = view.rgb, view.depth, view.mask
+    if camera.has_lens:
+        columns, rows = lens_map(camera)
+        rgb = cv2.remap(rgb, columns, rows, cv2.INTER_LINEAR).astype(np.uint8, copy=False)
+        stored = _nearest(stored, columns, rows)
+        mask = None if mask is None else _nearest(mask.view(np.uint8), columns, rows).view(np.bool_)
+    depth_m = correct_depth(stored, 1.0 / camera.depth_units_per_m, depth.scale, depth.offset_m)
+    T_board_depth = frozen_array(T_board_cam @ depth.T_cam_depth)
+    return PosedView(view.number, Camera(k, frozen_array(T_board_cam)), Camera(k, T_board_depth), rgb, depth_m, mask)
+
+
+@compiled
+def correct_depth(stored: NDArray[np.uint16], metres: float, scale: float, offset_m: float) -> Depth:
+    """[H, W] float32: stored depth in metres after a correction; 0 stays 0, and what is corrected to below 0 becomes 0."""
+    depth = np.zeros(stored.shape, np.float32)
+    for row in range(stored.shape[0]):
+        for column in range(stored.shape[1]):
+            if stored[row, column] > 0:
+                depth[row, column] = max(stored[row, column] * metres * scale + offset_m, 0.0)
+    return depth
+
+
+def lens_map(camera: CaptureCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(columns, rows), each [H, W] float32: where in the stored image each pixel of the pinhole's lies, OpenCV's convention."""
+    k = camera.intrinsics
+    matrix = opencv_matrix(k)
+    columns, rows = cv2.initUndistortRectifyMap(
+        matrix, camera.lens, np.eye(3), matrix, (k.width, k.height), cv2.CV_32FC1
+    )
+    return columns.astype(np.float32, copy=False), rows.astype(np.float32, copy=False)
+
+
+def distort_mask(mask: NDArray[np.bool_], camera: CaptureCamera) -> NDArray[np.bool_]:
+    """[H, W] bool: a pinhole's mask as the lens draws it, so that it fits the stored images."""
+    if not camera.has_lens:
+        return mask
+    k = camera.intrinsics
+    matrix = opencv_matrix(k)
+    rows, columns = np.mgrid[0 : k.height, 0 : k.width].astype(np.float64)
+    stored = np.stack([columns.ravel(), rows.ravel()], axis=1).reshape(-1, 1, 2)
+    straight = cv2.undistortPoints(stored, matrix, camera.lens, P=matrix).reshape(k.height, k.width, 2)
+    columns32, rows32 = (straight[..., i].astype(np.float32) for i in range(2))
+    return _nearest(mask.view(np.uint8), columns32, rows32).view(np.bool_)
+
+
+def _nearest(image: NDArray, columns: NDArray[np.float32], rows: NDArray[np.float32]) -> NDArray:
+    return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
+
+
+CLEAR_M = 1e-5
+"""A point is lifted off its face by so much before it is looked at, above float32's steps in the ray caster."""
+
+
+UNSEEN = -2.0
+"""Stands for the cosine of a point that is not in the image."""
+
+
+def visible_points(
+    mesh: Mesh,
+    points: Array,
+    normals: Array,
+    cameras: Sequence[Camera],
+    clear_m: float = CLEAR_M,
+    least_cos: float = 0.0,
+) -> NDArray[np.bool_]:
+    """[N] bool: points [N, 3] that a camera sees past the mesh, lifted along their unit normals by `clear_m`.
+
+    A camera counts where the cosine between the normal and the way to it is above `least_cos`: 0 for any angle from outside.
+    """
+    visible = np.zeros(len(points), np.bool_)
+    if not len(points) or not len(cameras):
+        return visible
+    positions = np.array([camera.position for camera in cameras])
+    cosine = np.stack([facing_cosine(points, normals, camera) for camera in cameras])
+    order = np.argsort(-cosine, axis=0, kind="stable")
+    first = 0
+    # The ray caster builds its tree at each call: few calls, the cameras that face a point most first.
+    for stop in (1, 4, len(cameras)):
+        point = np.repeat(np.flatnonzero(~visible), max(min(stop, len(cameras)) - first, 0))
+        if len(point):
+            place = np.tile(np.arange(first, min(stop, len(cameras))), int((~visible).sum()))
+            camera_of = order[place, point]
+            asked = cosine[camera_of, point] > least_cos
+            point, camera_of = point[asked], camera_of[asked]
+            origins = points[point] + clear_m * normals[point]
+            hits = first_hit([placed(mesh)], origins, positions[camera_of] - origins)
+            visible[point[hits.distance > 1.0]] = True
+        first = stop
+    return visible
+
+
+def facing_cosine(points: Array, normals: Array, camera: Camera) -> Array:
+    """[N] cosine between the normal of points [N, 3] and the way to a camera, `UNSEEN` where they are not in its image."""
+    seen = transform(invert(camera.T_world_cam), points)
+    front = seen[:, 2] > 0.05
+    u, v = project(np.where(front[:, None], seen, [0.0, 0.0, 1.0]), camera.intrinsics)
+    towards = camera.position - points
+    cosine = (towards * normals).sum(axis=1) / np.linalg.norm(towards, axis=1)
+    return np.where(front & in_frame(u, v, camera.intrinsics), cosine, UNSEEN)
+
+
+def placed(mesh: Mesh) -> Placed:
+    """The mesh as the ray caster takes it, in the frame that it is in."""
+    return Placed(REGION_FIRST_OBJECT, Shape((Part("mesh", mesh.vertices, mesh.faces),)), np.eye(4))

@@ -1,0 +1,371 @@
+"""Truncated signed distances from depth images, the error of depth that they correct, and meshes from them.
+
+- Planes fitted to the neighbourhood of each depth pixel: less noise, the angle of incidence, and no flying pixels.
+- A truncated signed distance field: the mean, weighted by inverse variance, of every view's distance to its surface.
+- Triangle meshes of a merged surface: extraction, cutting, loose parts, normals.
+
+On a plane 1/z is linear in the image, so the fit is exact there. Registered depth is coarser than the colour image that
+it fills, so the neighbourhood is sampled with a stride that grows with the focal length.
+
+Curless and Levoy 1996, with the distance along the surface's normal in place of the distance along the ray, because the
+latter grows with the angle of incidence.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
+
+from schemas.base import Array
+from schemas.scene.shape import Mesh
+from schemas.scene.view import Camera, Intrinsics
+from workers.geometry.frames import invert
+from workers.geometry.jit import compiled
+
+REACH = 2
+"""Samples to each side: 5 x 5."""
+
+STRIDE_FOCAL_PX = 456.0
+"""Focal length at which neighbouring samples are one pixel apart: two pixels at the Azure Kinect's 912, about a depth pixel."""
+
+WIDE = 0.035
+"""A sample that is farther from the middle one than this share of its depth belongs to another surface: a slope of 80 degrees
+across the neighbourhood."""
+
+GATE = 0.008
+"""A sample that is farther from the first fit than this share of its depth, over the cosine of incidence, belongs to another
+surface: 6 mm at 0.8 m, three times the noise of a depth pixel that has twice the noise of an Azure Kinect."""
+
+LEAST_SHARE = 0.44
+"""A pixel with fewer samples on its own surface, 11 of 25, is a speck or between two surfaces: it is left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedDepth:
+    """A window of a depth image after the fit; its first pixel is the image's (`top`, `left`).
+
+    inverse [h, w] float32: 1/z of the fitted plane, 1/m, 0 where there is none; facing [h, w] float32: the cosine of
+    incidence times the length of the pixel's ray at z = 1, which turns a difference of z into a distance from the plane.
+    """
+
+    top: int
+    left: int
+    inverse: NDArray[np.float32]
+    facing: NDArray[np.float32]
+
+
+def fit_depth(
+    depth_m: NDArray[np.float32], k: Intrinsics, max_edge_deg: float, window: tuple[int, int, int, int] | None = None
+) -> FittedDepth:
+    """The fit of depth [H, W] in a window (top, left, bottom, right), all of it by default."""
+    top, left, bottom, right = window or (0, 0, *depth_m.shape)
+    shape = (max(bottom - top, 0), max(right - left, 0))
+    inverse, facing = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    stride = max(1, round(k.fx / STRIDE_FOCAL_PX))
+    least_cos = math.cos(math.radians(max_edge_deg))
+    _fit(depth_m, (k.fx, k.fy, k.cx, k.cy), stride, least_cos, (top, left), inverse, facing)
+    return FittedDepth(top, left, inverse, facing)
+
+
+@compiled
+def _fit(
+    depth_m: NDArray[np.float32],
+    k: tuple[float, float, float, float],
+    stride: int,
+    least_cos: float,
+    corner: tuple[int, int],
+    inverse: NDArray[np.float32],
+    facing: NDArray[np.float32],
+) -> None:
+    """Two fits of 1/z = a + b du + c dv: to the samples at about the pixel's depth, then to those near the first plane."""
+    height, width = depth_m.shape
+    side = 2 * REACH + 1
+    least = int(np.ceil(LEAST_SHARE * side * side))
+    q, at_x, at_y = np.empty(side * side), np.empty(side * side), np.empty(side * side)
+    plane = np.empty(3)
+    for at_row in range(inverse.shape[0]):
+        row = at_row + corner[0]
+        ray_y = (row + 0.5 - k[3]) / k[1]
+        for at_column in range(inverse.shape[1]):
+            column = at_column + corner[1]
+            z0 = depth_m[row, column]
+            if not z0 > 0.0:
+                continue
+            n = 0
+            for i in range(-REACH, REACH + 1):
+                y = row + i * stride
+                for j in range(-REACH, REACH + 1):
+                    x = column + j * stride
+                    if 0 <= y < height and 0 <= x < width:
+                        z = depth_m[y, x]
+                        if z0 * (1.0 - WIDE) < z < z0 * (1.0 + WIDE):
+                            q[n], at_x[n], at_y[n] = 1.0 / z, j, i
+                            n += 1
+            if n < least or not _solve(q, at_x, at_y, n, plane):
+                continue
+            ray_x = (column + 0.5 - k[2]) / k[0]
+            ray = np.sqrt(1.0 + ray_x * ray_x + ray_y * ray_y)
+            slope = _facing(plane, stride, k, ray_x, ray_y)
+            # dz = z^2 dq, so a share of the depth is the same share of its inverse.
+            gate = min(GATE * ray / slope, WIDE) * plane[0]
+            kept = 0
+            for i in range(n):
+                if abs(q[i] - plane[0] - plane[1] * at_x[i] - plane[2] * at_y[i]) < gate:
+                    q[kept], at_x[kept], at_y[kept] = q[i], at_x[i], at_y[i]
+                    kept += 1
+            if kept < least or not _solve(q, at_x, at_y, kept, plane):
+                continue
+            slope = _facing(plane, stride, k, ray_x, ray_y)
+            if slope >= least_cos * ray and abs(1.0 / z0 - plane[0]) < gate:
+                inverse[at_row, at_column] = plane[0]
+                facing[at_row, at_column] = slope
+
+
+@compiled
+def _solve(q: Array, x: Array, y: Array, n: int, plane: Array) -> bool:
+    """Least squares of q = plane . (1, x, y) by Cramer's rule about the means; False where the samples lie in a line."""
+    mx = my = mq = 0.0
+    for i in range(n):
+        mx += x[i]
+        my += y[i]
+        mq += q[i]
+    mx, my, mq = mx / n, my / n, mq / n
+    cxx = cyy = cxy = cxq = cyq = 0.0
+    for i in range(n):
+        dx, dy, dq = x[i] - mx, y[i] - my, q[i] - mq
+        cxx += dx * dx
+        cyy += dy * dy
+        cxy += dx * dy
+        cxq += dx * dq
+        cyq += dy * dq
+    area = cxx * cyy - cxy * cxy
+    if not area > 1e-9:
+        return False
+    plane[1] = (cxq * cyy - cyq * cxy) / area
+    plane[2] = (cyq * cxx - cxq * cxy) / area
+    plane[0] = mq - plane[1] * mx - plane[2] * my
+    return bool(plane[0] > 0.0)
+
+
+@compiled
+def _facing(plane: Array, stride: int, k: tuple[float, float, float, float], ray_x: float, ray_y: float) -> float:
+    """Cosine of incidence times the ray's length: the plane is A x + B y + C z = 1 in camera coordinates."""
+    A, B = plane[1] / stride * k[0], plane[2] / stride * k[1]
+    C = plane[0] - A * ray_x - B * ray_y
+    return float(plane[0] / np.sqrt(A * A + B * B + C * C))
+
+
+FRONT_VOXELS = 3.0
+"""Distances in front of the surface are cut off here: above the noise of a view after its fit, which is about 1 mm."""
+
+BACK_VOXELS = 2.0
+"""Behind the surface nothing is known from here on: short, so that the two sides of a thin wall hardly touch."""
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Voxel centres at origin + voxel_m * (i, j, k), board frame; distance_m and weight [X, Y, Z] float32, near [X, Y, Z] uint16.
+
+    distance_m is positive outside; weight is 0 where no view has seen the voxel. near counts the views that have their surface
+    within the truncation.
+    """
+
+    origin: Array
+    voxel_m: float
+    distance_m: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    near: NDArray[np.uint16]
+
+
+def empty_volume(low: Array, high: Array, voxel_m: float) -> Volume:
+    """A volume without views that reaches from corner to corner, board frame, metres."""
+    shape = np.maximum(np.ceil((high - low) / voxel_m).astype(np.int64) + 1, 2)
+    distance_m, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    return Volume(np.array(low), voxel_m, distance_m, weight, np.zeros(shape, np.uint16))
+
+
+def views_near(volume: Volume, points: Array) -> NDArray[np.int32]:
+    """[N] views that have a surface near points [N, 3] on the edges between voxels: the more of an edge's two ends."""
+    at = (points - volume.origin) / volume.voxel_m
+    last = np.array(volume.near.shape) - 1
+    ends = [np.clip(turn(at).astype(np.int64), 0, last) for turn in (np.floor, np.ceil)]
+    return np.maximum(*(volume.near[end[:, 0], end[:, 1], end[:, 2]] for end in ends)).astype(np.int32)
+
+
+def integrate(volume: Volume, fitted: FittedDepth, camera: Camera) -> None:
+    """Adds one view's depth to the volume."""
+    k = camera.intrinsics
+    _integrate(
+        volume.distance_m,
+        volume.weight,
+        volume.near,
+        volume.origin,
+        volume.voxel_m,
+        invert(camera.T_world_cam),
+        (k.fx, k.fy, k.cx - fitted.left - 0.5, k.cy - fitted.top - 0.5),
+        fitted.inverse,
+        fitted.facing,
+    )
+
+
+@compiled
+def sample_inverse(inverse: NDArray[np.float32], x: float, y: float) -> float:
+    """1/z at (x, y), pixel centres on integers, 0 where there is none.
+
+    Bilinear where all four pixels are of one surface, else the nearest pixel's.
+    """
+    height, width = inverse.shape
+    near_column, near_row = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
+    if near_column < 0 or near_row < 0 or near_column >= width or near_row >= height:
+        return 0.0
+    nearest = inverse[near_row, near_column]
+    column, row = int(np.floor(x)), int(np.floor(y))
+    if nearest == 0.0 or column < 0 or row < 0 or column + 1 >= width or row + 1 >= height:
+        return nearest
+    a, b = inverse[row, column], inverse[row, column + 1]
+    c, d = inverse[row + 1, column], inverse[row + 1, column + 1]
+    least, most = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+    if not least > 0.988 * most:
+        return nearest
+    s, t = x - column, y - row
+    return (a * (1.0 - s) + b * s) * (1.0 - t) + (c * (1.0 - s) + d * s) * t
+
+
+@compiled
+def _integrate(
+    distance_m: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    near: NDArray[np.uint16],
+    origin: Array,
+    voxel_m: float,
+    T: Array,
+    k: tuple[float, float, float, float],
+    inverse: NDArray[np.float32],
+    facing: NDArray[np.float32],
+) -> None:
+    """T: board to camera; k: fx, fy, cx, cy of the window with pixel centres on integers."""
+    front, back, full = FRONT_VOXELS * voxel_m, BACK_VOXELS * voxel_m, 0.5 * BACK_VOXELS * voxel_m
+    height, width = inverse.shape
+    for i in range(distance_m.shape[0]):
+        for j in range(distance_m.shape[1]):
+            bx, by = origin[0] + i * voxel_m, origin[1] + j * voxel_m
+            for n in range(distance_m.shape[2]):
+                bz = origin[2] + n * voxel_m
+                z = T[2, 0] * bx + T[2, 1] * by + T[2, 2] * bz + T[2, 3]
+                if not z > 0.05:
+                    continue
+                x = k[0] * (T[0, 0] * bx + T[0, 1] * by + T[0, 2] * bz + T[0, 3]) / z + k[2]
+                y = k[1] * (T[1, 0] * bx + T[1, 1] * by + T[1, 2] * bz + T[1, 3]) / z + k[3]
+                if not (-0.5 < x < width - 0.5 and -0.5 < y < height - 0.5):
+                    continue
+                q = sample_inverse(inverse, x, y)
+                if q == 0.0:
+                    continue
+                slope = facing[int(np.floor(y + 0.5)), int(np.floor(x + 0.5))]
+                s = (1.0 / q - z) * slope
+                if s <= -back:
+                    continue
+                # Depth's standard deviation grows with z^2 and with 1 / cosine.
+                w = slope * slope * q * q * q * q
+                if s < -full:
+                    w *= (back + s) / (back - full)
+                total = weight[i, j, n] + w
+                if s > front:
+                    s = front
+                else:
+                    near[i, j, n] += 1
+                distance_m[i, j, n] = (distance_m[i, j, n] * weight[i, j, n] + s * w) / total
+                weight[i, j, n] = total
+
+
+EMPTY = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
+
+
+def extract_surface(volume: Volume) -> Mesh:
+    """The surface at distance 0 between voxels that were seen, wound outwards, board frame (Lewiner's marching cubes)."""
+    seen = volume.weight > 0.0
+    if not ((volume.distance_m > 0.0) & seen).any() or not ((volume.distance_m < 0.0) & seen).any():
+        return EMPTY
+    try:
+        vertices, faces, _, _ = marching_cubes(
+            volume.distance_m, 0.0, mask=_whole_cells(seen), allow_degenerate=False, gradient_direction="descent"
+        )
+    except RuntimeError:  # no surface in the cells that were seen
+        return EMPTY
+    return Mesh(volume.origin + volume.voxel_m * vertices.astype(np.float64), faces.astype(np.int32))
+
+
+def _whole_cells(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """[X, Y, Z] bool: voxels at the far corner of a cell whose eight voxels were seen, as skimage reads its mask."""
+    whole = np.zeros_like(seen)
+    cell = seen[1:, 1:, 1:].copy()
+    for i in (0, 1):
+        for j in (0, 1):
+            for k in (0, 1):
+                stop = [n - 1 + d for n, d in zip(seen.shape, (i, j, k), strict=True)]
+                cell &= seen[i : stop[0], j : stop[1], k : stop[2]]
+    whole[1:, 1:, 1:] = cell
+    return whole
+
+
+def cut_below(mesh: Mesh, plane: tuple[float, float, float], height_m: float) -> Mesh:
+    """What is above the plane z = a x + b y + c + height_m; faces across it are cut along it."""
+    a, b, c = plane
+    normal = np.array([-a, -b, 1.0])
+    normal /= np.linalg.norm(normal)
+    if not len(mesh.faces):
+        return mesh
+    vertices, faces, _ = trimesh.intersections.slice_faces_plane(
+        mesh.vertices, mesh.faces, normal, np.array([0.0, 0.0, c + height_m])
+    )
+    return Mesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int32).reshape(-1, 3))
+
+
+def keep_vertices(mesh: Mesh, keep: NDArray[np.bool_]) -> tuple[Mesh, NDArray[np.int64]]:
+    """(the faces whose three vertices are kept, with the vertices that they use; the old numbers of those)."""
+    faces = mesh.faces[keep[mesh.faces].all(axis=1)]
+    used = np.unique(faces)
+    number = np.zeros(len(mesh.vertices), np.int32)
+    number[used] = np.arange(len(used), dtype=np.int32)
+    return Mesh(mesh.vertices[used], number[faces]), used.astype(np.int64)
+
+
+def large_parts(mesh: Mesh, least_share: float) -> NDArray[np.bool_]:
+    """[V] bool: vertices of connected parts that have at least a share of the area of the largest one."""
+    count = len(mesh.vertices)
+    if not len(mesh.faces):
+        return np.zeros(count, bool)
+    i, j = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
+    graph = sparse.coo_matrix((np.ones(len(i), np.int8), (i, j)), shape=(count, count))
+    parts, label = connected_components(graph, directed=False)
+    area = np.bincount(label[mesh.faces[:, 0]], weights=face_areas(mesh), minlength=parts)
+    large: NDArray[np.bool_] = (area >= least_share * area.max())[label]
+    return large
+
+
+def face_areas(mesh: Mesh) -> Array:
+    """[F] areas, m^2."""
+    return 0.5 * np.linalg.norm(_face_normals(mesh), axis=1)
+
+
+def vertex_normals(mesh: Mesh) -> Array:
+    """[V, 3] unit normals, the mean of the faces' weighted by their area; up where a vertex has no face."""
+    normals = np.zeros((len(mesh.vertices), 3))
+    across = _face_normals(mesh)
+    for axis in range(3):
+        for corner in range(3):
+            normals[:, axis] += np.bincount(mesh.faces[:, corner], weights=across[:, axis], minlength=len(normals))
+    length = np.linalg.norm(normals, axis=1)
+    normals[length == 0.0] = [0.0, 0.0, 1.0]
+    return normals / np.where(length == 0.0, 1.0, length)[:, None]
+
+
+def _face_normals(mesh: Mesh) -> Array:
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    across: Array = np.cross(b - a, c - a)
+    return across

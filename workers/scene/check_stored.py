@@ -1,0 +1,213 @@
+"""Check of stored labels: derives each again from the stored images, the rows and the job, by the producer's functions."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from schemas.dataset.codec import Row, columns_of_bodies, read_camera, read_label, read_world_poses
+from schemas.dataset.layout import file_pose_id, image_path, stored_images
+from schemas.job.job import Job
+from schemas.scene.scene import EffectPlan
+from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.view import Role, View
+from workers.geometry.camera import image_coordinates
+from workers.geometry.frames import invert
+from workers.geometry.pixels import measure_regions
+from workers.scene.labels import compare_views, derive_projected, patch_object_fraction, projection_shares
+from workers.scene.pairs import object_distance, place_aligned_camera, place_mirror_camera
+from workers.scene.rows import image_boxes, view_pixels
+
+ROUNDING = 1e-12
+"""Largest difference of poses and distances that are computed again from the same doubles."""
+
+ReadImage = Callable[[str], NDArray]
+
+
+def check_stored_scene(scene: Row) -> list[str]:
+    """Columns of `scenes` that disagree with its bodies, a sentence each; none where it was stored without bodies."""
+    bodies = scene["bodies"]
+    if bodies is None:
+        return []
+    expected = columns_of_bodies(bodies)
+    where = f"scene {scene['scene_id']}"
+    faults = [
+        f"{where}: {name} is {scene[name]}, its bodies give {value}"
+        for name, value in expected.items()
+        if scene[name] != value
+    ]
+    regions = [body["region_id"] for body in bodies]
+    if regions != list(range(REGION_FIRST_OBJECT, REGION_FIRST_OBJECT + len(bodies))):
+        faults.append(f"{where}: its bodies have the regions {regions}")
+    return faults
+
+
+def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], scene: Row, read: ReadImage) -> list[str]:
+    """Labels of one pair that do not follow from its images and rows, a sentence each.
+
+    `views` holds the pair's rows by role, `objects` its rows of that table, `read` returns an image by its path.
+    """
+    faults: list[str] = []
+    stored = {role: _read_view(row, job, objects, read, faults) for role, row in views.items()}
+    if faults:
+        return faults
+    for role, view in stored.items():
+        if role != "projected":
+            faults += _check_labels(view, scene)
+            faults += _check_patch_shares(job, view, scene, objects)
+            faults += _check_images(view, scene)
+        faults += _check_patches(view, stored["mirror" if role == "projected" else role], job, read, views[role])
+    faults += _check_cameras(job, stored, views)
+    if "mirror" in stored and not _is_captured(scene):
+        faults += _check_agreement(job, stored, views)
+    if "projected" in stored:
+        faults += _check_projection(job, stored, views, EffectPlan(tuple(scene["effects"]), {}))
+    return faults
+
+
+def _read_view(row: Row, job: Job, objects: Sequence[Row], read: ReadImage, faults: list[str]) -> View:
+    """A stored view; images of a wrong size or type are added to the faults."""
+    role: Role = row["role"]
+    images: dict[str, NDArray] = {}
+    for image in stored_images(role, job):
+        path = image_path(row["category"], image.content, file_pose_id(role, row["parent_id"]))
+        pixels = read(path)
+        shape = (row["height"], row["width"], 3)[: 3 if image.pixels == "rgb" else 2]
+        dtype = np.uint16 if image.pixels == "depth" else np.uint8
+        if pixels.shape != shape or pixels.dtype != dtype:
+            faults.append(f"{path}: is {pixels.dtype} {pixels.shape}, and must be {dtype.__name__} {shape}")
+        images[image.pixels] = pixels
+    own = [one for one in objects if (one["pose_id"], one["role"]) == (row["pose_id"], role)]
+    labels = tuple(read_label(one) for one in sorted(own, key=lambda one: one["region_id"]))
+    camera, ids = read_camera(row), (row["pose_id"], row["parent_id"])
+    return View(role, *ids, camera, images.get("rgb"), images["depth"], images.get("region"), labels)
+
+
+def _differs(a: ArrayLike, b: ArrayLike) -> bool:
+    return bool(np.abs(np.asarray(a) - np.asarray(b)).max() > ROUNDING)
+
+
+def _check_labels(view: View, scene: Row) -> list[str]:
+    """Compare rows of `objects` with the mask and the poses."""
+    assert view.region is not None
+    where, faults = f"pose {view.pose_id} ({view.role})", []
+    T_world = read_world_poses(scene)
+    if {label.region_id for label in view.labels} != set(T_world):
+        found = [label.region_id for label in view.labels]
+        return [f"{where}: objects has the regions {found}, scenes {list(T_world)}"]
+    extents = measure_regions(view.region)
+    for label in view.labels:
+        pixels, box = extents[label.region_id]
+        name = f"{where}, region {label.region_id}"
+        if pixels != label.pixels:
+            faults.append(f"{name}: the mask has {pixels} pixels, objects says {label.pixels}")
+        if box != label.bbox_xywh:
+            faults.append(f"{name}: the mask's box is {box}, objects says {label.bbox_xywh}")
+        if image_coordinates(label.T_cam_obj, view.camera.intrinsics) != (label.u, label.v):
+            faults.append(f"{name}: T_cam_obj projects to another pixel than ({label.u}, {label.v})")
+        if _differs(invert(view.camera.T_world_cam) @ T_world[label.region_id], label.T_cam_obj):
+            faults.append(f"{name}: T_cam_obj does not follow from the camera's and the object's poses")
+        if not 0.0 <= label.visible_fraction <= 1.0:
+            faults.append(f"{name}: visible_fraction {label.visible_fraction} is no share")
+    return faults
+
+
+def _check_patch_shares(job: Job, view: View, scene: Row, objects: list[Row]) -> list[str]:
+    """Compare the share of its patch that each object fills; a dataset of scenes without bodies has no such column."""
+    if scene["bodies"] is None and not _is_captured(scene):
+        return []
+    own = [row for row in objects if (row["pose_id"], row["role"]) == (view.pose_id, view.role)]
+    shares, faults = {row["region_id"]: row["patch_object_fraction"] for row in own}, []
+    for label in view.labels:
+        told, share = shares[label.region_id], patch_object_fraction(view, label, job.images.patch)
+        if label.region_id >= REGION_FIRST_OBJECT and share != told:
+            where = f"pose {view.pose_id} ({view.role}), region {label.region_id}"
+            faults.append(f"{where}: fills {share} of its patch, objects says {told}")
+    return faults
+
+
+def _is_captured(scene: Row) -> bool:
+    """Whether a row of `scenes` is of a capture."""
+    return scene.get("capture") is not None
+
+
+def _check_images(view: View, scene: Row) -> list[str]:
+    """Compare the mask with the depth, and its regions with those of `objects`.
+
+    Nothing, in a photograph, is what is neither board nor object, and may have depth; a view that was made of photographs
+    shows nothing without depth.
+    """
+    assert view.region is not None
+    where, faults = f"pose {view.pose_id} ({view.role})", []
+    known = {0, 1} | {label.region_id for label in view.labels}
+    if foreign := set(np.unique(view.region).tolist()) - known:
+        faults.append(f"{where}: the mask has regions {sorted(foreign)} that objects lacks")
+    if not _is_captured(scene) and (view.depth[view.region == 0] != 0).any():
+        faults.append(f"{where}: depth where the mask says that nothing was hit")
+    if _is_captured(scene) and view.role == "mirror" and (view.region[view.depth == 0] != 0).any():
+        faults.append(f"{where}: the mask has regions where there is no depth")
+    return faults
+
+
+def _check_patches(view: View, labelled: View, job: Job, read: ReadImage, row: Row) -> list[str]:
+    """Patches that are not the crop of their image, and files that are missing or too many.
+
+    `labelled` is the view that holds the labels: the mirror view for a projected one, else the view itself.
+    """
+    listed, faults = {file["path"] for file in row["files"]}, []
+    objects = [label for label in labelled.labels if label.region_id >= REGION_FIRST_OBJECT]
+    expected = set()
+    for path, kind, box in image_boxes(view, objects, row["category"], job.images.patch):
+        expected.add(path)
+        full = view_pixels(view, kind)
+        if box is not None and path in listed and full is not None and not np.array_equal(read(path), full[box]):
+            faults.append(f"{path}: is not the crop of its image")
+    if expected != listed:
+        wrong = sorted(expected ^ listed)
+        faults.append(f"pose {view.pose_id} ({view.role}): files {wrong} should be there, or should not")
+    return faults
+
+
+def _check_cameras(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> list[str]:
+    """Compare d_z with the input's stored depth, and the aligned and mirror poses with the input pose and d_z."""
+    first, faults = stored["input"], []
+    assert first.region is not None
+    d_z = object_distance(first.depth, first.region, job.images, job.cameras.mirror)
+    poses = {
+        "aligned": place_aligned_camera(first.camera, job.cameras.depth),
+        "mirror": place_mirror_camera(first.camera, d_z, job.cameras.mirror),
+    }
+    poses["projected"] = poses["mirror"]
+    for role, camera in poses.items():
+        if role in stored and _differs(camera.T_world_cam, stored[role].camera.T_world_cam):
+            where = f"pose {stored[role].pose_id} ({role})"
+            faults.append(f"{where}: T_world_cam does not follow from the input pose and d_z")
+    for role, row in views.items():
+        if abs(row["d_z_m"] - d_z) > ROUNDING:
+            faults.append(f"pose {row['pose_id']} ({role}): d_z_m is {row['d_z_m']}, the input depth gives {d_z}")
+    return faults
+
+
+def _check_agreement(job: Job, stored: Mapping[str, View], views: Mapping[str, Row]) -> list[str]:
+    """Compare the agreement of the two views."""
+    mirror = stored["mirror"]
+    agreement = compare_views(stored["input"], mirror, job.images, job.check.mirror_agreement_mm)
+    told = views["mirror"]["mirror_agreement"]
+    found = None if agreement.median_mm is None else (agreement.median_mm, agreement.share)
+    if (told is None) != (found is None) or (found and _differs(np.array(found), [told["median_mm"], told["share"]])):
+        return [f"pose {mirror.pose_id} (mirror): the two views agree to {found}, views says {told}"]
+    return []
+
+
+def _check_projection(job: Job, stored: Mapping[str, View], views: Mapping[str, Row], effects: EffectPlan) -> list[str]:
+    """The projected images to the byte, and their shares; `effects` are those that the scene's receipt names."""
+    first, mirror, projected = stored["input"], stored["mirror"], stored["projected"]
+    where, faults = f"pose {projected.pose_id} (projected)", []
+    rgb, depth = derive_projected(first, mirror.camera, job.images, job.sensor.distortion, effects)
+    same_rgb = rgb is None or (projected.rgb is not None and np.array_equal(rgb, projected.rgb))
+    if not same_rgb or not np.array_equal(depth, projected.depth):
+        faults.append(f"{where}: the stored input depth projects to other images")
+    shares = projection_shares(depth, mirror.depth, job.images)
+    if _differs(shares, [views["projected"][f"projected_{name}_share"] for name in ("filled", "hidden")]):
+        faults.append(f"{where}: the shares filled and hidden are {shares}, and not what views says")
+    return faults

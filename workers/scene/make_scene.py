@@ -1,0 +1,70 @@
+"""One scene from its id to what is written: the list of steps."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.base import frozen_array
+from schemas.scene.scene import EffectPlan, Placed, PosedScene, ScenePlan, Settled
+from schemas.scene.shape import REGION_FLOOR, REGION_TABLE
+from schemas.scene.view import Pair
+from workers.physics.settle import recheck_scene, settle_scene
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.effects import Facts, is_raycast_scene, plan_effects
+from workers.scene.pairs import SettledScene, make_pair
+from workers.scene.plan import SceneChance, plan_scene
+from workers.scene.ray_check import check_pair
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A finished scene before it is encoded."""
+
+    plan: ScenePlan
+    settled: tuple[Settled, ...]
+    posed: PosedScene
+    pairs: tuple[Pair, ...]
+    effects: EffectPlan
+    called: Mapping[str, str]
+    """Effects that the plan left out and that ran after all, and why."""
+
+    @property
+    def raycast_checked(self) -> bool:
+        """Whether every view was checked against the ray caster."""
+        return self.effects.runs("raycast_check")
+
+
+def make_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> Scene:
+    """Plan, settle, render, derive, check. Raises SceneError where this scene cannot be made."""
+    job, chance = context.job, SceneChance(context.job.seed, scene_id)
+    with stopwatch.stage("assets"):
+        plan = plan_scene(job, context.catalogue, chance)
+    with stopwatch.stage("plan"):
+        facts = Facts(job, plan, is_raycast_scene(job.check, chance))
+        effects = plan_effects(facts, context.forced).without(*context.withdrawn)
+    with stopwatch.stage("physics", "dynamics" if effects.runs("dynamics") else None):
+        rest = settle_scene(plan, job.physics, effects)
+    if effects.runs("release_again"):
+        with stopwatch.stage("recheck", "release_again"):
+            rest = recheck_scene(plan, rest, job.physics, effects)
+    posed = pose_scene(plan, rest.settled)
+    scene = SettledScene(context, chance, plan, posed, effects, stopwatch)
+    with stopwatch.stage("render", "light_maps" if effects.runs("light_maps") else None):
+        context.renderer.prepare_light(posed.things, posed.appearance, job.render, effects)
+    pairs = tuple(make_pair(scene, camera, number) for number, camera in enumerate(plan.input_cameras))
+    with stopwatch.stage("check"):
+        for pair in pairs:
+            check_pair(pair, job.check)
+    return Scene(plan, rest.settled, posed, pairs, effects, rest.called)
+
+
+def pose_scene(plan: ScenePlan, settled: tuple[Settled, ...]) -> PosedScene:
+    """Floor, table and objects where they rest, in order of region id."""
+    objects = tuple(
+        Placed(start.region_id, start.asset.shape, rest.T_world_obj)
+        for start, rest in zip(plan.objects, settled, strict=True)
+    )
+    table = Placed(REGION_TABLE, plan.table.asset.shape, plan.table.T_world_table)
+    floor = Placed(REGION_FLOOR, plan.floor, frozen_array(np.eye(4)))
+    return PosedScene((floor, table, *objects), plan.appearance)

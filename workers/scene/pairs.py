@@ -1,0 +1,146 @@
+"""One pair of a settled scene: cameras that follow from the input camera, views as they are stored, and how they agree.
+
+- Poses of the cameras that follow from an input camera, and d_z: the depth of the pivot that the mirror camera turns
+  about.
+- One pair of a settled scene: its views as they are stored, and how they agree.
+"""
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Array, Pose, frozen_array
+from schemas.dataset.layout import file_pose_id, input_pose_id
+from schemas.errors import ViewError
+from schemas.job.views import DepthCamera, Images, Mirror
+from schemas.scene.scene import EffectPlan, PosedScene, ScenePlan
+from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.view import ROLES, Camera, Pair, Role, View
+from workers.geometry.frames import UP, half_turn, pose, translation
+from workers.geometry.pixels import dequantise_depth, quantise_depth
+from workers.geometry.ranks import median, percentile
+from workers.render.tiers import draw_view
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.labels import compare_views, count_unoccluded, derive_projected, label_regions, projection_shares
+from workers.scene.plan import SceneChance, Stream
+from workers.scene.ray_check import check_against_rays
+from workers.scene.sensor import SensorChance, sense_view
+
+
+def place_aligned_camera(camera: Camera, depth_camera: DepthCamera) -> Camera:
+    """The depth camera: T_world_depth = T_world_rgb Trans(t), t along the RGB camera's optical axes, same rotation [D]."""
+    return Camera(camera.intrinsics, frozen_array(camera.T_world_cam @ translation(*depth_camera.offset_m)))
+
+
+def place_mirror_camera(camera: Camera, d_z_m: float, mirror: Mirror) -> Camera:
+    """The camera on the other side of the object."""
+    return Camera(camera.intrinsics, frozen_array(mirror_pose(camera.T_world_cam, d_z_m, mirror.T_z_m)))
+
+
+def mirror_pose(T_world_cam: Pose, d_z_m: float, T_z_m: float = 1.3, up: Array = UP) -> Pose:
+    """Camera on the other side: half a turn about `up` through the pivot d_z_m ahead, and T_z_m away from it.
+
+    [4, 4] float64, camera to world, optical frame, any roll. The pivot is the point of the optical axis in the plane
+    of the object's front surface. Equals the product of transforms of Staszak and Belter 2024 at zero roll.
+    """
+    pivot = T_world_cam[:3, 3] + d_z_m * T_world_cam[:3, 2]
+    R = half_turn(up) @ T_world_cam[:3, :3]
+    return pose(R, pivot - T_z_m * R[:, 2])
+
+
+def object_distance(depth: NDArray[np.uint16], region: NDArray[np.uint8], images: Images, mirror: Mirror) -> float:
+    """`front_distance` of the object in a stored view; converts only the object's pixels to metres."""
+    return front_distance(dequantise_depth(depth[region >= REGION_FIRST_OBJECT], images), np.True_, mirror)
+
+
+def front_distance(depth_m: Array, object_pixels: NDArray[np.bool_] | np.bool_, mirror: Mirror) -> float:
+    """d_z: distance to the object's front surface along the optical axis, metres, from its stored depth.
+
+    A low percentile by default, because the nearest pixel is noisy. Raises ViewError where no pixel of the object has
+    depth.
+    """
+    z = depth_m[object_pixels & (depth_m > 0.0)]
+    if z.size == 0:
+        raise ViewError("object_not_seen", "the input view has no depth pixel of the object: narrow start.offset_m")
+    if mirror.pivot_depth == "nearest":
+        return float(z.min())
+    if mirror.pivot_depth == "median":
+        return median(z)
+    return percentile(z, mirror.percentile)
+
+
+@dataclass(frozen=True, eq=False)
+class SettledScene:
+    """A scene at rest, and what making its views needs."""
+
+    context: WorkerContext
+    chance: SceneChance
+    plan: ScenePlan
+    posed: PosedScene
+    effects: EffectPlan
+    stopwatch: Stopwatch
+
+
+def make_pair(scene: SettledScene, camera: Camera, number: int) -> Pair:
+    """The views of one pair that the plan has. Raises ViewError where the input camera sees no object."""
+    job, effects, stopwatch = scene.context.job, scene.effects, scene.stopwatch
+    images, bound_mm = job.images, job.check.mirror_agreement_mm
+    exact_input = render_view(scene, "input", number, camera)
+    first = sense(scene, exact_input, number)
+    aligned = None
+    if effects.runs("depth_camera"):
+        with stopwatch.effect("depth_camera"):
+            aligned_camera = place_aligned_camera(camera, job.cameras.depth)
+            aligned = sense(scene, render_view(scene, "aligned", number, aligned_camera), number)
+    assert first.region is not None
+    pair = Pair(object_distance(first.depth, first.region, images, job.cameras.mirror), first, aligned)
+    if not effects.runs("mirror"):
+        return pair
+    with stopwatch.effect("mirror"):
+        mirror_camera = place_mirror_camera(camera, pair.d_z_m, job.cameras.mirror)
+        exact_mirror = render_view(scene, "mirror", number, mirror_camera)
+        mirror = sense(scene, exact_mirror, number)
+    with stopwatch.stage("check"):
+        agreement = exact_agreement = compare_views(first, mirror, images, bound_mm)
+    if effects.runs("exact_agreement"):
+        with stopwatch.stage("check", "exact_agreement"):
+            exact_agreement = compare_views(exact_input, exact_mirror, images, bound_mm)
+    pair = replace(pair, mirror=mirror, agreement=agreement, exact_agreement=exact_agreement)
+    if not effects.runs("projection"):
+        return pair
+    with stopwatch.stage("projection", "projection"):
+        rgb, depth = derive_projected(first, mirror_camera, images, job.sensor.distortion, effects)
+        filled, hidden = projection_shares(depth, mirror.depth, images)
+    projected = View("projected", first.pose_id, first.pose_id, mirror_camera, rgb, depth, None, ())
+    return replace(pair, projected=projected, filled_share=filled, hidden_share=hidden)
+
+
+def render_view(scene: SettledScene, role: Role, number: int, camera: Camera) -> View:
+    """One rendered view: exact images in their stored encodings, and labels of the table and of every object."""
+    job, renderer, stopwatch = scene.context.job, scene.context.renderer, scene.stopwatch
+    parent_id = input_pose_id(scene.plan.scene_id, number, job.pairs_per_scene)
+    pose_id = file_pose_id(role, parent_id)
+    with stopwatch.stage("render"):
+        rng = partial(scene.chance.stream, Stream.PATHS, pose_id, parent_id, ROLES.index(role))
+        buffer = draw_view(renderer, scene.posed.things, scene.posed.appearance, camera, job.render, rng, scene.effects)
+    if scene.effects.runs("raycast_check"):
+        with stopwatch.stage("raycast", "raycast_check"):
+            check_against_rays(scene.posed, camera, buffer, job.images.depth_range_m)
+    with stopwatch.stage("labels"):
+        count = partial(count_unoccluded, count_drawn=renderer.count_pixels)
+        labels = label_regions(scene.plan, scene.posed, camera, buffer.region, count)
+        depth = quantise_depth(buffer.depth_m, job.images)
+    return View(role, pose_id, parent_id, camera, buffer.rgb, depth, buffer.region, labels)
+
+
+def sense(scene: SettledScene, exact: View, number: int) -> View:
+    """An exact view as the job's sensors store it."""
+    job, ran = scene.context.job, [name for name in scene.effects.ran if name.startswith("sensor_")]
+    if not ran:
+        return exact
+    streams = (Stream.SENSOR_DEPTH, Stream.SENSOR_RGB, Stream.SENSOR_EXPOSURE)
+    chance = SensorChance(*(scene.chance.stream(name, number, ROLES.index(exact.role)) for name in streams))
+    with scene.stopwatch.stage("sensor", ran[0] if len(ran) == 1 else None):
+        return sense_view(job.sensor, job.images, exact, chance, scene.effects)

@@ -1,0 +1,233 @@
+"""The draw of a scene: assets, starts, cameras and look, all before anything moves.
+
+- Named streams of random numbers: one for each step of a scene, append-only, so that adding a camera moves no object.
+- How several objects begin without touching: each on a place of its own, or one above another. Pure.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from schemas.base import Array, Pose, frozen_array
+from schemas.errors import StartError
+from schemas.job.job import Job
+from schemas.job.physics import Start
+from schemas.job.views import Cameras
+from schemas.scene.scene import ObjectStart, ScenePlan, Table
+from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Hull, Mesh
+from schemas.scene.view import Camera, Intrinsics
+from workers.assets.appearance import draw_appearance
+from workers.assets.catalogue import Catalogue, InstanceRef, choose_object, choose_table, load_asset
+from workers.geometry.camera import orbit_pose
+from workers.geometry.frames import UP, pose, rotation_about, transform, translation, uniform_rotation
+from workers.geometry.hull import hull_of
+from workers.physics.support import place_table, sample_elevation, support_height, support_margin
+
+
+class Stream(IntEnum):
+    """Every use of chance in a scene. A new one gets the next number; a number is never used for anything else."""
+
+    CATEGORY = 0
+    OBJECT = 1
+    TABLE = 2
+    START = 3
+    REDRAW = 4
+    CAMERA = 5
+    APPEARANCE = 6
+    RAYCAST_CHECK = 7
+    SENSOR_DEPTH = 8
+    SENSOR_RGB = 9
+    SENSOR_EXPOSURE = 10
+    PATHS = 11
+    COUNT = 12
+    HIDDEN_MARKERS = 13
+    MOTION = 14
+    HELD_OUT = 15
+
+
+@dataclass(frozen=True)
+class SceneChance:
+    """The random numbers of one scene: a function of the dataset's seed and the scene's id alone."""
+
+    seed: int
+    scene_id: int
+
+    def stream(self, name: Stream, *within: int) -> np.random.Generator:
+        """The generator of one step.
+
+        `within` names a part of a step that must not depend on how many parts there are: (pair, role) for a view's noise.
+        """
+        key = (self.scene_id, int(name), *within)
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
+
+    def object_stream(self, name: Stream, number: int) -> np.random.Generator:
+        """The generator of one step for an object by its number: the first object's is that of a scene with only one."""
+        return self.stream(name, *([number] if number else []))
+
+
+APART_M = 0.001
+"""Columns nearer to each other than this count as touching."""
+
+_ANGLES = math.pi * np.arange(90) / 90
+AXES = frozen_array(np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1))
+"""[90, 2] the horizontal axes that are tried for a separating plane. None is further than 1 degree from the best one, so
+that two footprints of 0.2 m that are more than 4 mm apart are found to be so."""
+
+
+def points_of(start: ObjectStart) -> Array:
+    """[N, 3] world: the corners of an object's hull where it begins."""
+    return transform(start.T_world_obj, start.hull.vertices)
+
+
+def columns_apart(points: Array, others: Array) -> bool:
+    """Whether a vertical plane separates two clouds [N, 3] by at least `APART_M` of air.
+
+    Two bodies that fall straight down then do not meet. The theorem of the separating axis, applied to `AXES` alone:
+    clouds that almost touch may count as touching.
+    """
+    mine, theirs = points[:, :2] @ AXES.T, others[:, :2] @ AXES.T
+    gap = np.maximum(theirs.min(axis=0) - mine.max(axis=0), mine.min(axis=0) - theirs.max(axis=0))
+    return bool(gap.max() >= APART_M)
+
+
+def has_room(points: Array, earlier: Sequence[ObjectStart]) -> bool:
+    """Whether a cloud [N, 3] stands in no earlier object's column."""
+    return all(columns_apart(points, points_of(other)) for other in earlier)
+
+
+def rise_above(points: Array, earlier: Sequence[ObjectStart]) -> float:
+    """Metres by which a cloud [N, 3] must be lifted for its lowest point to be level with the top of all earlier objects."""
+    top = max(float(points_of(other)[:, 2].max()) for other in earlier)
+    return max(0.0, top - float(points[:, 2].min()))
+
+
+RECESS_M = 0.05
+"""Table this far below its top still counts as table under an object: a tray's bottom does, a lower shelf does not."""
+
+CONTACT_M = 5e-5
+"""Distance below which a vertex touches the table."""
+
+
+def plan_scene(job: Job, catalogue: Catalogue, chance: SceneChance) -> ScenePlan:
+    """Everything about a scene that chance decides. Raises MeshError where an asset is unfit, StartError as `draw_scene`."""
+    objects, table = choose_assets(job, catalogue, chance)
+    assets = [load_asset(catalogue, ref) for ref in objects]
+    return draw_scene(job, chance, load_asset(catalogue, table), *assets)
+
+
+def choose_assets(job: Job, catalogue: Catalogue, chance: SceneChance) -> tuple[list[InstanceRef], InstanceRef]:
+    """The instances of a scene, before any is loaded: its objects in order, and its table."""
+    objects = []
+    for number in range(count_objects(job, chance)):
+        category = choose_category(job, chance, number)
+        objects.append(choose_object(catalogue, category, chance.object_stream(Stream.OBJECT, number)))
+    return objects, choose_table(catalogue, chance.stream(Stream.TABLE))
+
+
+def count_objects(job: Job, chance: SceneChance) -> int:
+    """How many objects the scene has."""
+    low, high = job.objects_per_scene
+    return low if low == high else int(chance.stream(Stream.COUNT).integers(low, high + 1))
+
+
+def choose_category(job: Job, chance: SceneChance, number: int = 0) -> str:
+    """The category of an object by its number, by the job's weights; the first one's is the scene's."""
+    names = sorted(job.categories)
+    weights = np.array([job.categories[name] for name in names])
+    edges = np.cumsum(weights) / weights.sum()
+    draw = chance.object_stream(Stream.CATEGORY, number).random()
+    return names[min(int(np.searchsorted(edges, draw, side="right")), len(names) - 1)]
+
+
+def draw_scene(job: Job, chance: SceneChance, table_asset: Asset, *assets: Asset) -> ScenePlan:
+    """Starts, cameras and look of a scene with these assets. Raises StartError where no start is valid."""
+    table = place_table(table_asset)
+    rng = chance.stream(Stream.CAMERA)
+    centre = np.array([0.0, 0.0, table.top.height_m])
+    floor, appearance = draw_appearance(chance.stream(Stream.APPEARANCE), job.render.tier)
+    objects: tuple[ObjectStart, ...] = ()
+    for asset in assets:
+        objects += (draw_start(job.start, chance, asset, table, objects),)
+    return ScenePlan(
+        scene_id=chance.scene_id,
+        category=assets[0].category,
+        table=table,
+        floor=floor,
+        objects=objects,
+        input_cameras=tuple(draw_camera(rng, job.cameras, centre) for _ in range(job.pairs_per_scene)),
+        appearance=appearance,
+    )
+
+
+def draw_start(
+    spec: Start, chance: SceneChance, asset: Asset, table: Table, earlier: tuple[ObjectStart, ...] = ()
+) -> ObjectStart:
+    """Position, rotation and clearance of one object. Raises StartError where no position is valid.
+
+    A position with no table under the centre of mass, or in the column of an earlier object, is redrawn. In a pile an
+    object begins above all earlier ones, about the place of the first.
+    """
+    number, piled = len(earlier), bool(earlier) and spec.arrange == "pile"
+    middle, reach = (earlier[0].T_world_obj[:2, 3], spec.pile_offset_m) if piled else (np.zeros(2), spec.offset_m)
+    rng = chance.object_stream(Stream.START, number)
+    xy = middle + rng.uniform(reach.low, reach.high, size=2)
+    yaw = rng.uniform(-math.pi, math.pi)
+    clearance = rng.uniform(spec.clearance_m.low, spec.clearance_m.high)
+    R = uniform_rotation(rng) if spec.pose == "tumbled" else rotation_about(UP, yaw)
+    hull = hull_of(asset.shape)
+    over_table, redraw_rng = False, None
+    for redraws in range(spec.max_redraws + 1):
+        com_xy = (R @ asset.mass.com)[:2] + xy
+        if sample_elevation(com_xy[None, :], table.mesh)[0] >= table.top.height_m - RECESS_M:  # nan compares false
+            over_table = True
+            rested = set_down(pose(R, np.array([xy[0], xy[1], 0.0])), hull, table.mesh)
+            points = transform(rested, hull.vertices)
+            if piled or has_room(points, earlier):
+                lift = rise_above(points, earlier) if piled else 0.0
+                placed = spec.pose == "placed" and not piled and stands_on(rested, hull, asset.mass.com, table.mesh)
+                T = rested if placed else translation(0.0, 0.0, lift + clearance) @ rested
+                return ObjectStart(asset, hull, REGION_FIRST_OBJECT + number, frozen_array(T), redraws, placed)
+        redraw_rng = redraw_rng or chance.object_stream(Stream.REDRAW, number)
+        xy = middle + redraw_rng.uniform(reach.low, reach.high, size=2)
+    raise _no_start(spec, number + 1, over_table)
+
+
+def _no_start(spec: Start, number: int, over_table: bool) -> StartError:
+    """Why no position was valid; `over_table` where at least one had table below."""
+    if over_table:
+        return StartError(
+            "no_room",
+            f"none of {spec.max_redraws + 1} positions in {list(spec.offset_m)} m had room for object {number} beside the "
+            "others: raise start.max_redraws, widen start.offset_m, ask for fewer or smaller objects, or set "
+            "start.arrange: pile",
+        )
+    return StartError(
+        "no_table_below",
+        f"none of {spec.max_redraws + 1} positions in {list(spec.offset_m)} m had table under the centre of mass: "
+        "narrow start.offset_m or use larger tables",
+    )
+
+
+def set_down(T_world_obj: Pose, hull: Hull, table: Mesh) -> Pose:
+    """The pose moved along z until its lowest point is level with the highest point of the table below it."""
+    points = transform(T_world_obj, hull.vertices)
+    return translation(0.0, 0.0, support_height(points[:, :2], table) - points[:, 2].min()) @ T_world_obj
+
+
+def stands_on(T_world_obj: Pose, hull: Hull, com: Array, table: Mesh) -> bool:
+    """Whether the centre of mass [3] lies inside the hull of the vertices that touch the table."""
+    points = transform(T_world_obj, hull.vertices)
+    gap_m = points[:, 2] - sample_elevation(points[:, :2], table)
+    contacts = points[np.isfinite(gap_m) & (np.abs(gap_m) <= CONTACT_M)]
+    return support_margin(contacts[:, :2], transform(T_world_obj, com[None, :])[0, :2]) > 0.0
+
+
+def draw_camera(rng: np.random.Generator, cameras: Cameras, centre: Array) -> Camera:
+    """An input camera on the job's orbit about the centre of the table top."""
+    inclination = rng.uniform(cameras.orbit.inclination_rad.low, cameras.orbit.inclination_rad.high)
+    yaw = rng.uniform(cameras.orbit.yaw_rad.low, cameras.orbit.yaw_rad.high)
+    T = orbit_pose(centre, inclination, yaw, cameras.orbit.radius_m)
+    return Camera(Intrinsics.of(cameras.sensor), frozen_array(T))

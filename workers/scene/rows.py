@@ -1,0 +1,210 @@
+"""The output of a scene: encoded images, and its rows in each manifest table. Pure.
+
+- The images that a view leaves, their names, and their bytes. Pure.
+- The output of a scene: encoded files, and its rows in each manifest table. Pure.
+"""
+
+from collections.abc import Iterator, Sequence
+from weakref import WeakKeyDictionary
+
+from numpy.typing import NDArray
+
+from schemas.dataset.codec import Row, body_columns, camera_columns, columns_of_bodies, label_columns, matrix_column
+from schemas.dataset.layout import IMAGES, PixelKind, asset_path, image_path, patch_index, patch_path
+from schemas.errors import SceneError
+from schemas.job.job import Job
+from schemas.job.views import Images, Patch
+from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
+from schemas.scene.shape import REGION_FIRST_OBJECT, Asset
+from schemas.scene.view import ObjectLabel, Pair, View
+from workers.assets.catalogue import split_of
+from workers.assets.glb import asset_glb
+from workers.geometry.camera import inclination, yaw
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.effects import write_receipt
+from workers.scene.labels import crop_box, patch_object_fraction
+from workers.scene.make_scene import Scene
+from workers.store.images import encode_png
+
+Box = tuple[slice, slice]
+
+
+def encode_view(view: View, pair: Pair, images: Images) -> tuple[EncodedFile, ...]:
+    """The view's images and their patches as PNG."""
+    files = []
+    objects = object_labels(view, pair)
+    for path, kind, box in image_boxes(view, objects, objects[0].category, images.patch):
+        pixels = view_pixels(view, kind)
+        assert pixels is not None
+        files.append(encoded_file(path, encode_png(pixels if box is None else pixels[box], images.png_level)))
+    return tuple(files)
+
+
+def image_boxes(
+    view: View, objects: Sequence[ObjectLabel], category: str, patch: Patch
+) -> Iterator[tuple[str, PixelKind, Box | None]]:
+    """Path, kind of pixels and crop (rows, columns; None for all) of each image that the view holds and of its patches.
+
+    objects: the labels that have patches. `category` is the scene's.
+    """
+    boxes = [(patch_index(label.region_id, len(objects)), crop_box(label, view.camera, patch)) for label in objects]
+    for image in IMAGES:
+        if image.role != view.role or view_pixels(view, image.pixels) is None:
+            continue
+        yield image_path(category, image.content, view.pose_id), image.pixels, None
+        for index, box in boxes:
+            if box is not None:
+                yield patch_path(category, image.content, view.pose_id, index), image.pixels, box
+
+
+def view_pixels(view: View, kind: PixelKind) -> NDArray | None:
+    """The array that images of a kind show; None where the view has none."""
+    images: dict[PixelKind, NDArray | None] = {"rgb": view.rgb, "depth": view.depth, "region": view.region}
+    return images[kind]
+
+
+def object_labels(view: View, pair: Pair) -> list[ObjectLabel]:
+    """Labels of the objects alone, by region id; a projected view is seen by the mirror camera and has its labels."""
+    labelled = pair.mirror if view.role == "projected" else view
+    assert labelled is not None
+    return [label for label in labelled.labels if label.region_id >= REGION_FIRST_OBJECT]
+
+
+ASSET_COLUMNS = ("instance_id", "category", "source", "licence", "path", "sha256", "volume_m3", "watertight", "scale")
+"""Columns of `assets` that are fields of an asset."""
+
+
+def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> SceneOutput:
+    """Files and rows of a finished scene, without its timings."""
+    files: list[EncodedFile] = []
+    views: list[Row] = []
+    with watch.stage("encode"):
+        for pair in scene.pairs:
+            for view in pair.views:
+                own = encode_view(view, pair, context.job.images)
+                files += own
+                views.append(view_row(scene.plan.scene_id, pair, view, own, context.job))
+        every = (scene.plan.table.asset, *(start.asset for start in scene.plan.objects))
+        assets = list({asset.instance_id: asset for asset in every}.values())
+        for asset in assets:
+            if asset.shareable:
+                files.append(shape_file(asset))
+    rows = {
+        "scenes": [scene_row(context, scene)],
+        "views": views,
+        "objects": [
+            row
+            for pair in scene.pairs
+            for view in pair.views
+            for row in object_rows(scene.plan.scene_id, view, context.job)
+        ],
+        "assets": [asset_row(asset, context.job) for asset in assets],
+        "failures": [],
+    }
+    return SceneOutput(scene.plan.scene_id, tuple(files), rows)
+
+
+def shape_file(asset: Asset) -> EncodedFile:
+    """The asset's file in the dataset, encoded once and kept as long as the asset."""
+    if (file := _shape_files.get(asset)) is None:
+        path = asset_path(asset.category, asset.instance_id)
+        file = _shape_files[asset] = encoded_file(path, asset_glb(asset, encode_png))
+    return file
+
+
+_shape_files: WeakKeyDictionary[Asset, EncodedFile] = WeakKeyDictionary()
+
+
+def scene_row(context: WorkerContext, scene: Scene) -> Row:
+    """The row of `scenes`: names of the first object, and the worst figures of all objects."""
+    ran, skipped = write_receipt(scene.effects, scene.called)
+    bodies = [body_columns(start, rest) for start, rest in zip(scene.plan.objects, scene.settled, strict=True)]
+    return {
+        "scene_id": scene.plan.scene_id,
+        "table_id": scene.plan.table.asset.instance_id,
+        "T_world_table": matrix_column(scene.plan.table.T_world_table),
+        "pose": context.job.start.pose,
+        "effects": ran,
+        "skipped": skipped,
+        **columns_of_bodies(bodies),
+        "settle_s": max(rest.settle_s for rest in scene.settled),
+        "raycast_checked": scene.raycast_checked,
+        "settings_digest": context.settings_digest,
+        "bodies": bodies,
+    }
+
+
+def view_row(scene_id: int, pair: Pair, view: View, files: Sequence[EncodedFile], job: Job) -> Row:
+    """The row of `views`, key (pose_id, role); the category is the first object's."""
+    labels = object_labels(view, pair)
+    projected = view.role == "projected"
+    agreement = pair.agreement if view.role == "mirror" else None
+    return {
+        "pose_id": view.pose_id,
+        "parent_id": view.parent_id,
+        "role": view.role,
+        "scene_id": scene_id,
+        "category": labels[0].category,
+        **camera_columns(view.camera),
+        "inclination_rad": inclination(view.camera.T_world_cam),
+        "yaw_rad": yaw(view.camera.T_world_cam),
+        "depth_units_per_m": job.images.depth_units_per_m,
+        "d_z_m": pair.d_z_m,
+        "files": [{"path": file.path, "bytes": len(file.data), "sha256": file.sha256} for file in files],
+        "object_pixels": None if projected else sum(label.pixels for label in labels),
+        "visible_fraction": None if projected else labels[0].visible_fraction,
+        "mirror_agreement": None
+        if agreement is None or agreement.median_mm is None
+        else {"median_mm": agreement.median_mm, "share": agreement.share},
+        "projected_filled_share": pair.filled_share if projected else None,
+        "projected_hidden_share": pair.hidden_share if projected else None,
+        "patch_object_fraction": None if projected else patch_object_fraction(view, labels[0], job.images.patch),
+    }
+
+
+def object_rows(scene_id: int, view: View, job: Job) -> list[Row]:
+    """The rows of `objects`, key (pose_id, role, region_id); the table has one too."""
+    return [
+        {
+            "pose_id": view.pose_id,
+            "role": view.role,
+            "scene_id": scene_id,
+            **label_columns(label),
+            "patch_object_fraction": None
+            if label.region_id < REGION_FIRST_OBJECT
+            else patch_object_fraction(view, label, job.images.patch),
+        }
+        for label in view.labels
+    ]
+
+
+def asset_row(asset: Asset, job: Job) -> Row:
+    """The row of `assets`."""
+    return {
+        **{name: getattr(asset, name) for name in ASSET_COLUMNS},
+        "extents_m": [float(x) for x in asset.extents_m],
+        "T_source_to_object": matrix_column(asset.T_source_to_object),
+        "split": split_of(asset.instance_id, job.assets.split),
+        "notes": list(asset.notes),
+    }
+
+
+def failed_scene(scene_id: int, category: str, error: SceneError, attempts: int = 1) -> SceneOutput:
+    """The output of a scene that cannot be made: no files, one row in `failures`."""
+    told = {name: getattr(error, name) for name in ("stage", "kind", "reason", "detail")}
+    row: Row = {"scene_id": scene_id, "category": category, **told, "attempts": attempts}
+    return SceneOutput(scene_id, (), {"failures": [row]})
+
+
+def timing_row(scene_id: int, category: str, watch: Stopwatch) -> Row:
+    """The row of `timings`, which alone is no function of job and seed."""
+    stages, effects = (
+        [{"name": name, "seconds": seconds} for name, seconds in one.items()] for one in (watch.seconds, watch.effects)
+    )
+    return {
+        "scene_id": scene_id,
+        "category": category,
+        "stages": stages,
+        "effects": effects,
+        "total_s": sum(watch.seconds.values()),
+    }

@@ -1,0 +1,105 @@
+"""The fingerprint of a stack: the digest of one small scene, versions of libraries, and the code."""
+
+import hashlib
+import math
+from importlib.metadata import version
+from itertools import pairwise
+from operator import attrgetter
+from pathlib import Path
+
+import numpy as np
+
+from schemas.dataset.shard import Fingerprint
+from schemas.job.identity import settings_digest
+from schemas.job.job import Job
+from schemas.job.views import Tier
+from workers.assets.catalogue import open_catalogue
+from workers.render.raster.gbuffer import Renderer
+from workers.scene.context import Stopwatch, WorkerContext
+from workers.scene.make_scene import make_scene
+from workers.scene.rows import record_scene
+from workers.shard.code import code_digest
+
+CANARY = Job(name="canary", seed=7, scenes=1)
+"""Changed with the schema version only: a new canary makes every stored fingerprint foreign."""
+
+CANARY_SCENE = 3
+
+LIBRARIES = (
+    "coacd",
+    "embreex",
+    "fpng",
+    "llvmlite",
+    "manifold3d",
+    "numba",
+    "numpy",
+    "opencv-contrib-python-headless",
+    "pillow",
+    "pybullet",
+    "pyrender",
+    "scipy",
+    "trimesh",
+    "zlib-ng",
+)
+"""Libraries that the bytes depend on."""
+
+TIER_LIBRARIES: dict[Tier, tuple[str, ...]] = {"pathtraced": ("mitsuba", "drjit")}
+"""Libraries that the bytes of one tier depend on; the canary scene is not drawn in it."""
+
+
+LIBM = (math.sin, math.cos, math.tan, math.atan, math.sinh, math.tanh, math.cbrt, math.expm1, math.log1p)
+"""Functions of the C library, of one number of any size."""
+
+
+def take_fingerprint(renderer: Renderer, tier: Tier) -> Fingerprint:
+    """The fingerprint of this process's stack, as far as a tier's bytes depend on it.
+
+    Takes about a second, most of it Python's and GL's first use.
+    """
+    return Fingerprint(
+        canary=canary_digest(renderer),
+        code=code_digest(),
+        libraries={name: version(name) for name in (*LIBRARIES, *TIER_LIBRARIES.get(tier, ()))},
+        simd=numpy_simd(),
+        renderer=renderer.name,
+        maths=maths_digest(),
+    )
+
+
+def canary_digest(renderer: Renderer) -> str:
+    """SHA-256, hex, of the canary scene's files and rows."""
+    catalogue = open_catalogue(CANARY.assets, Path(), tuple(CANARY.categories))
+    context = WorkerContext(CANARY, catalogue, renderer, settings_digest(CANARY, catalogue.digest))
+    stopwatch = Stopwatch()
+    output = record_scene(context, make_scene(context, CANARY_SCENE, stopwatch), stopwatch)
+    digest = hashlib.sha256()
+    for file in sorted(output.files, key=attrgetter("path")):
+        digest.update(file.path.encode())
+        digest.update(bytes.fromhex(file.sha256))
+    digest.update(repr(sorted(output.rows.items())).encode())
+    return digest.hexdigest()
+
+
+def maths_digest() -> str:
+    """SHA-256, hex, of elementary functions, products and decompositions of fixed numbers, in about 10 ms.
+
+    The C library chooses its own by the processor: without fused multiplication, scenes differ in their last bits.
+    """
+    numbers = [0.05 + 0.0037 * step for step in range(2000)]
+    one = [function(x) for function in (*LIBM, math.exp, math.log, math.sqrt) for x in numbers]
+    two = [function(x, y) for function in (math.atan2, math.pow, math.hypot) for x, y in pairwise(numbers)]
+    array = np.array(numbers)
+    several = [function(array) for function in (np.exp, np.log, np.sin, np.cos, np.arctan)]
+    matrix = np.sin(np.array(numbers[:1600])).reshape(40, 40)
+    several += [matrix @ matrix.T, np.linalg.inv(matrix + 40 * np.eye(40)), np.linalg.svd(matrix)[1]]
+    digest = hashlib.sha256(np.array([*one, *two]).tobytes())
+    for values in several:
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
+def numpy_simd() -> str:
+    """The instruction sets that numpy chooses from at run time and may use here, widest last."""
+    numbers = np._core._multiarray_umath  # type: ignore[attr-defined]
+    enabled = [name for name in numbers.__cpu_dispatch__ if numbers.__cpu_features__[name]]
+    return " ".join([*numbers.__cpu_baseline__[-1:], *enabled])
