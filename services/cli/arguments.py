@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from schemas.errors import plain_line
+from services.job.packed import MOST_CHARACTERS, is_packed
 
 JOB_ID: Final = r"j[0-9a-f]{8}"
 """An id of schemas/queue.py, which loads too much for a parser; a test compares the two."""
@@ -60,8 +61,6 @@ def read_path(text: str) -> Path:
 
 def read_job(text: str) -> Path:
     """A job file, or a packed one (`job:...`), which may be longer. Raises argparse.ArgumentTypeError."""
-    from services.job.job_file import MOST_CHARACTERS, is_packed  # loads the models of a job
-
     if is_packed(text) and len(text) <= MOST_CHARACTERS and text.isascii() and text.isprintable():
         return Path(text)
     return read_path(text)
