@@ -52,7 +52,7 @@ def export(request: ExportRequest, report: Report = lambda done, asked: None) ->
     """
     _refuse_inside(request)
     record = require_job(request.store)
-    chooser = Chooser(request.choice, record.job.captures is not None)
+    chooser = Chooser(request.choice)
     folder = ExportFolder(request.target)
     plan = _plan(request, record)
     if (done := folder.finished()) is not None:

@@ -14,7 +14,7 @@ from typing import Any, Final, Literal, Protocol, get_args
 import duckdb
 
 from schemas.base import Frozen
-from schemas.dataset.tables import CAPTURE_SCHEMAS, SCHEMAS
+from schemas.dataset.tables import SCHEMAS
 from schemas.errors import InputError
 from services.export.folder import ExportFolder
 from services.export.source import ExportScene
@@ -53,13 +53,12 @@ _EXAMPLE: Final = "it is an SQL condition on the columns of scenes, such as 'sup
 class Chooser:
     """Chooses scenes range by range."""
 
-    def __init__(self, choice: Choice, captures: bool) -> None:
+    def __init__(self, choice: Choice) -> None:
         """Raises InputError where the condition is no SQL that these tables can answer."""
         self._choice = choice
-        self._schemas = CAPTURE_SCHEMAS if captures else SCHEMAS
         self._db = duckdb.connect(":memory:", config=dict(_LOCKED))
         if choice.where is not None:
-            self._ask({table: self._schemas[table].empty_table() for table in _TABLES})
+            self._ask({table: SCHEMAS[table].empty_table() for table in _TABLES})
 
     def choose(self, stored: StoredRange) -> Sequence[int]:
         """The ids of the chosen scenes of a range, in order."""
@@ -80,7 +79,7 @@ class Chooser:
         return [scene_id for scene_id in ids if scene_id in fit]
 
     def _names(self) -> list[tuple[str, list[str]]]:
-        return [(table, self._schemas[table].names) for table in _TABLES]
+        return [(table, SCHEMAS[table].names) for table in _TABLES]
 
     def _ask(self, tables: dict) -> set[int]:
         """The ids of the scenes in `tables` that the condition holds for."""

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from schemas.dataset.codec import Row, columns_of_bodies, read_camera, read_label, read_world_poses
 from schemas.dataset.layout import file_pose_id, image_path, stored_images
+from schemas.dataset.tables import ALWAYS_OF_SCENES
 from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan
 from schemas.scene.shape import REGION_FIRST_OBJECT
@@ -25,12 +26,16 @@ ReadImage = Callable[[str], NDArray]
 
 
 def check_stored_scene(scene: Row) -> list[str]:
-    """Columns of `scenes` that disagree with its bodies, a sentence each; none where it was stored without bodies."""
-    bodies = scene["bodies"]
-    if bodies is None:
+    """Columns of `scenes` that disagree with its bodies, or are absent, a sentence each; a capture has no bodies."""
+    where, captured = f"scene {scene['scene_id']}", _is_captured(scene)
+    wrong = [name for name in ALWAYS_OF_SCENES if (scene[name] is None) != captured]
+    if wrong:
+        told = "are there in a capture" if captured else "are missing"
+        return [f"{where}: {', '.join(wrong)} {told}"]
+    if captured:
         return []
+    bodies = scene["bodies"]
     expected = columns_of_bodies(bodies)
-    where = f"scene {scene['scene_id']}"
     faults = [
         f"{where}: {name} is {scene[name]}, its bodies give {value}"
         for name, value in expected.items()
@@ -54,7 +59,7 @@ def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], sc
     for role, view in stored.items():
         if role != "projected":
             faults += _check_labels(view, scene)
-            faults += _check_patch_shares(job, view, scene, objects)
+            faults += _check_patch_shares(job, view, objects)
             faults += _check_images(view, scene)
         faults += _check_patches(view, stored["mirror" if role == "projected" else role], job, read, views[role])
     faults += _check_cameras(job, stored, views)
@@ -112,10 +117,8 @@ def _check_labels(view: View, scene: Row) -> list[str]:
     return faults
 
 
-def _check_patch_shares(job: Job, view: View, scene: Row, objects: list[Row]) -> list[str]:
-    """Compare the share of its patch that each object fills; a dataset of scenes without bodies has no such column."""
-    if scene["bodies"] is None and not _is_captured(scene):
-        return []
+def _check_patch_shares(job: Job, view: View, objects: list[Row]) -> list[str]:
+    """Compare the share of its patch that each object fills."""
     own = [row for row in objects if (row["pose_id"], row["role"]) == (view.pose_id, view.role)]
     shares, faults = {row["region_id"]: row["patch_object_fraction"] for row in own}, []
     for label in view.labels:
@@ -128,7 +131,7 @@ def _check_patch_shares(job: Job, view: View, scene: Row, objects: list[Row]) ->
 
 def _is_captured(scene: Row) -> bool:
     """Whether a row of `scenes` is of a capture."""
-    return scene.get("capture") is not None
+    return scene["capture"] is not None
 
 
 def _check_images(view: View, scene: Row) -> list[str]:

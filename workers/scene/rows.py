@@ -131,6 +131,7 @@ def scene_row(context: WorkerContext, scene: Scene) -> Row:
         "raycast_checked": scene.raycast_checked,
         "settings_digest": context.settings_digest,
         "bodies": bodies,
+        "capture": None,
     }
 
 
@@ -159,6 +160,7 @@ def view_row(scene_id: int, pair: Pair, view: View, files: Sequence[EncodedFile]
         "projected_filled_share": pair.filled_share if projected else None,
         "projected_hidden_share": pair.hidden_share if projected else None,
         "patch_object_fraction": None if projected else patch_object_fraction(view, labels[0], job.images.patch),
+        "capture": None,
     }
 
 

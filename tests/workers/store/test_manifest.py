@@ -34,7 +34,7 @@ def test_numpy_values_are_taken_as_plain_ones():
     ("table", "change", "message"),
     [
         ("scenes", {"colour": "red"}, "other columns than the schema: colour"),
-        ("scenes", {"settle_s": None}, "scenes.settle_s is missing in 1 of 1 rows"),
+        ("scenes", {"settle_s": None}, "scenes.settle_s is missing in scene"),
         ("scenes", {"settle_s": float("nan")}, "scenes.settle_s is not finite: nan"),
         ("scenes", {"T_world_obj": [float("inf")] * 16}, "scenes.T_world_obj is not finite: inf"),
         ("scenes", {"T_world_obj": [0.0] * 15}, "scenes.T_world_obj: .*16"),

@@ -6,14 +6,10 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
-from schemas.dataset.tables import CAPTURE_SCHEMAS, SCHEMAS
+from schemas.dataset.tables import SCHEMAS
 from workers.store.manifest import buffers_of, check_values, is_sound
 
-KINDS = {
-    f"{name}-{table}": pa.struct(list(schemas[table]))
-    for name, schemas in (("scenes", SCHEMAS), ("captures", CAPTURE_SCHEMAS))
-    for table in SCHEMAS
-}
+KINDS = {table: pa.struct(list(schema)) for table, schema in SCHEMAS.items()}
 
 
 def whole(kind: pa.DataType) -> Any:
@@ -64,6 +60,6 @@ def test_a_look_at_the_buffers_finds_what_a_walk_over_the_columns_finds(name):
 
 
 def test_of_rows_that_have_no_doubles_nothing_is_infinite():
-    kind = KINDS["scenes-failures"]
+    kind = KINDS["failures"]
     assert not buffers_of(kind).doubles
     assert is_sound(pa.array([whole(kind)], kind), buffers_of(kind))
