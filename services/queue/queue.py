@@ -21,11 +21,11 @@ from schemas.queue import (
     SHARE_FILE,
     JobEvent,
     JobRequest,
-    event_path,
     events_folder,
     log_path,
     request_path,
 )
+from workers.store.events import Events
 from workers.store.store import Store, open_store, retry_if_swept
 
 JobState = Literal["queued", "waiting", "running", "cancelling", "cancelled", "done", "failed", "lost"]
@@ -157,8 +157,10 @@ class Queue:
     def __init__(self, store: Store) -> None:
         self.store = store
         self.name = store.name
-        self._known: dict[str, Frozen] = {}
-        """Requests and events that were read, by key: they never change."""
+        self._requests: dict[str, JobRequest] = {}
+        """By job: its request, which never changes."""
+        self._logs: dict[str, Events] = {}
+        """By job: its events, of which each is read once."""
 
     def ids(self) -> list[str]:
         """The ids of all jobs."""
@@ -171,14 +173,15 @@ class Queue:
     def read(self, job: str) -> JobView:
         """A job as it is now. Raises InputError where there is none, CorruptError where it cannot be read."""
         try:
-            request = self._load(JobRequest, request_path(job))
+            request = self._request(job)
         except FileNotFoundError:
             raise InputError(
                 f"{self.name} has no job {plain_line(job)}: `verso jobs` lists those that there are"
             ) from None
         if request.id != job:
             raise CorruptError(f"{self.name}/{request_path(job)} is the request of another job, {request.id}")
-        return fold(request, self._events(job))
+        log = self._logs.setdefault(job, Events(self.store, events_folder(job)))
+        return fold(request, self._decoded(job, log.read()))
 
     def read_all(self, ids: Iterable[str]) -> tuple[list[JobView], dict[str, str]]:
         """The jobs as they are now; what cannot be read is told by id. A job whose request is not there yet is left out."""
@@ -199,16 +202,14 @@ class Queue:
         Whether it applies is decided by the very events before it: a writer who loses the number reads and decides again.
         So nothing is decided twice, however many supervisors, drivers and users there are.
         """
+        request = self.read(job).request
         event = JobEvent(kind=kind, attempt=attempt, at=time.time(), nonce=uuid.uuid4().hex, **fields)
-        pause_s = 0.01
-        while True:
-            view = self.read(job)
-            if not applies(view, event):
-                return None
-            if self.store.put_if_absent(event_path(job, view.events), _encode(event)):
-                return replace(apply(view, event), events=view.events + 1)
-            time.sleep(pause_s)  # over NFS, the listing may be old for some seconds
-            pause_s = min(1.0, 2 * pause_s)
+
+        def decide(before: Sequence[bytes]) -> bytes | None:
+            return _encode(event) if applies(fold(request, self._decoded(job, before)), event) else None
+
+        after = self._logs[job].append(decide)
+        return None if after is None else fold(request, self._decoded(job, after))
 
     def put_log(self, job: str, attempt: int, text: str) -> None:
         """Keeps the end of a driver's log, once."""
@@ -236,19 +237,16 @@ class Queue:
         """Tells the drivers how many jobs share the cluster."""
         self.store.put(SHARE_FILE, json.dumps({"running": running}).encode(), durable=False)
 
-    def _events(self, job: str) -> list[JobEvent]:
-        """A job's events from the first, in their order."""
-        names = self.store.names(events_folder(job))
-        expected = [event_path(job, number) for number in range(len(names))]
-        if [f"{events_folder(job)}/{name}" for name in names] != expected:
-            raise CorruptError(f"{self.name}/{events_folder(job)} lacks an event, or holds what is none")
-        return [self._load(JobEvent, key) for key in expected]
+    def _request(self, job: str) -> JobRequest:
+        if job not in self._requests:
+            key = request_path(job)
+            self._requests[job] = _decode(JobRequest, self.store.read(key), f"{self.name}/{key}")
+        return self._requests[job]
 
-    def _load(self, model: type[Model], key: str) -> Model:
-        known = self._known.get(key)
-        if not isinstance(known, model):
-            known = self._known[key] = _decode(model, self.store.read(key), f"{self.name}/{key}")
-        return known
+    def _decoded(self, job: str, events: Sequence[bytes]) -> list[JobEvent]:
+        """A job's events. Raises CorruptError naming one that this program did not write."""
+        name = f"{self.name}/{events_folder(job)}"
+        return [_decode(JobEvent, data, f"{name}/{number:08d}.json") for number, data in enumerate(events)]
 
 
 def open_queue(url: str) -> Queue:

@@ -11,13 +11,14 @@ import socket
 import threading
 import time
 import uuid
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from schemas.dataset.layout import LOCK_CLAIMS, LOCK_FILE
 from schemas.errors import CorruptError, InUseError, MachineError, RunError, VersoError
 from services.run.machine import read_process
+from workers.store.events import Events
 from workers.store.store import Store
 
 
@@ -28,11 +29,13 @@ class Beat:
     period_s: float = 2.0
     patience: int = 5
 
+    @property
+    def silence_s(self) -> float:
+        """How long a holder may show no life."""
+        return self.patience * self.period_s
+
 
 DEFAULT_BEAT = Beat()
-
-UNREADABLE = "unknown"
-"""The host of a holder whose lock file cannot be read."""
 
 
 @dataclass(frozen=True)
@@ -48,40 +51,51 @@ class Holder:
     pid: int
     machine: str
     born: str
-    beat: int = 0
+
+
+UNREADABLE = Holder(token="", host="unknown", pid=0, machine="", born="")
+"""The holder where what the store has of the lock cannot be read."""
 
 
 class Lock:
     """The right to be the one coordinator of a folder. Another may take it over while this process shows no life.
 
-    What decides is the store: a claim on this holder ends its right for good, whatever the lock file says. A lock file
-    that was removed or damaged by hand is written again.
+    What decides is the store: each process that takes the lock is one numbered event there, and the last one has it. The
+    heartbeat's file decides nothing: where it was removed or damaged by hand, it is written again.
     """
 
-    def __init__(self, store: Store, mine: Holder, beat: Beat, shown_at: float) -> None:
+    def __init__(self, store: Store, mine: Holder, beat: Beat) -> None:
         self._store = store
         self._mine = mine
-        self._silence_s = beat.patience * beat.period_s
-        self._shown_at = shown_at
-        """When the lock file last showed life, by the clock that also counts while the machine sleeps."""
+        self._silence_s = beat.silence_s
+        self._shown_at = _now_s()
+        """When this process last showed life, by the clock that also counts while the machine sleeps."""
+        self._beats = 0
         self._lost = False
         self._new_holder: Holder | None = None
         self._one_at_a_time = threading.Lock()
 
     @property
     def token(self) -> str:
-        """What the lock file holds as long as this process has the lock."""
+        """What the heartbeat's file holds as long as this process has the lock."""
         return self._mine.token
 
     @property
     def held(self) -> bool:
         """Whether this process still has the lock. Asks the store, and shows life there. Raises MachineError."""
         with self._one_at_a_time:
-            if not self._lost and not self._beat():
-                self._lost = True
-                self._new_holder = _claimant(self._store, self._mine) or read_holder(self._store)
-                self._give_back()
+            begun = _now_s()
+            if not self._lost and self._is_last() and self.show_life():
+                late = _now_s() - begun >= self._silence_s  # paused in between: another may have taken over meanwhile
+                self._shown_at = begun
+                self._lost = late and not self._is_last()
             return not self._lost
+
+    def show_life(self) -> bool:
+        """Writes the heartbeat's file anew; true."""
+        self._beats += 1
+        self._store.put(LOCK_FILE, json.dumps(asdict(self._mine) | {"beat": self._beats}).encode(), durable=False)
+        return True
 
     def require_held(self) -> None:
         """Raises RunError naming the process that took over. To be called before anything that would replace its work."""
@@ -95,42 +109,25 @@ class Lock:
         )
 
     def release(self) -> None:
-        """Gives the lock back, with the claims on earlier holders, unless it was lost."""
+        """Gives the lock back, with the events of earlier holders, unless it was lost."""
         with self._one_at_a_time:
-            if not self._lost and _is_held_by(self._store, self._mine):
+            if not self._lost and read_holder(self._store) == self._mine:
                 self._store.remove(LOCK_FILE)
-                self._store.remove_tree(LOCK_CLAIMS)
+                _clear(self._store)
 
-    def _beat(self) -> bool:
-        """Writes the lock file anew; False where the lock was lost, even if only while this function ran."""
-        begun = _now_s()
-        found = read_holder(self._store)
-        if _claimant(self._store, self._mine) is not None or not self._may_write(found, begun):
-            return False
-        self._mine = replace(self._mine, beat=self._mine.beat + 1)
-        if found is not None:
-            self._store.put(LOCK_FILE, _encode(self._mine), durable=False)
-        elif not self._store.put_if_absent(LOCK_FILE, _encode(self._mine)):
-            return False
-        if self._is_late() and _claimant(self._store, self._mine) is not None:
-            return False
-        self._shown_at = begun
-        return True
+    def _is_last(self) -> bool:
+        """Whether the last event is this process's.
 
-    def _may_write(self, found: Holder | None, now: float) -> bool:
-        """Whether what is in the lock file is this process's to replace."""
-        if found is None:  # removed by hand, unless somebody had the time to take over, to work and to end
-            return not self._is_late()
-        ours = found.token == self._mine.token or found.host == UNREADABLE
-        return ours or _claimant(self._store, found) is not None  # written late by a holder that was replaced
-
-    def _is_late(self) -> bool:
-        return _now_s() - self._shown_at >= self._silence_s
-
-    def _give_back(self) -> None:
-        """Removes a lock file that this process wrote before it saw that the lock was lost; its holder writes it again."""
-        if _is_held_by(self._store, self._mine):
-            self._store.remove(LOCK_FILE)
+        Where the events are gone, removed by hand, it takes the lock again, unless somebody had the time to take over, to
+        work and to end.
+        """
+        last = read_holder(self._store)
+        if last is None and _now_s() - self._shown_at < self._silence_s:
+            _take(self._store, self._mine, None)
+            last = read_holder(self._store)
+        self._lost = last != self._mine
+        self._new_holder = last if self._lost else None
+        return not self._lost
 
 
 @contextlib.contextmanager
@@ -141,18 +138,15 @@ def hold_lock(store: Store, beat: Beat = DEFAULT_BEAT) -> Iterator[Lock]:
     Raises InUseError naming a holder that lives.
     """
     mine = Holder(uuid.uuid4().hex, socket.gethostname(), os.getpid(), _machine(), _born(os.getpid()) or "")
-    shown_at = _now_s()
-    while not store.put_if_absent(LOCK_FILE, _encode(mine)):
-        gone = _find_gone(store, beat)
-        shown_at = _now_s()
-        if gone is not None and _take_over(store, gone, mine, beat.period_s):
-            break
-    lock = Lock(store, mine, beat, shown_at)
+    while not _take(store, mine, _find_gone(store, beat)):
+        pass
+    lock = Lock(store, mine, beat)
     ended = threading.Event()
     heartbeat = threading.Thread(
         target=_show_life, args=(lock, beat.period_s, ended), name="lock heartbeat", daemon=True
     )
     try:
+        lock.show_life()
         heartbeat.start()
         yield lock
     finally:
@@ -163,17 +157,24 @@ def hold_lock(store: Store, beat: Beat = DEFAULT_BEAT) -> Iterator[Lock]:
 
 
 def read_holder(store: Store) -> Holder | None:
-    """The holder of the lock, None where it is free. A lock file that cannot be read names `unknown`."""
-    return _holder_at(store, LOCK_FILE)
+    """The holder of the lock, None where it is free; `UNREADABLE` where the store's events cannot be read."""
+    try:
+        events = Events(store, LOCK_CLAIMS).read()
+        return Holder(**json.loads(events[-1])) if events else None
+    except FileNotFoundError:  # given back while it was read
+        return None
+    except (CorruptError, ValueError, TypeError):
+        return UNREADABLE
 
 
 def shows_life(store: Store, holder: Holder, beat: Beat = DEFAULT_BEAT) -> bool:
     """Whether a holder lives: by its process on this machine, elsewhere by a heartbeat that changes within the patience."""
     if is_here(holder):
         return _born(holder.pid) == holder.born
+    before = _read_beat(store)
     for _ in range(beat.patience):
         time.sleep(beat.period_s)
-        if read_holder(store) != holder:
+        if _read_beat(store) != before or read_holder(store) != holder:
             return True
     return False
 
@@ -183,19 +184,15 @@ def is_here(holder: Holder) -> bool:
     return bool(holder.machine) and holder.machine == _machine()
 
 
-def _holder_at(store: Store, key: str) -> Holder | None:
+def _read_beat(store: Store) -> bytes | None:
     try:
-        data = store.read(key)
+        return store.read(LOCK_FILE)
     except FileNotFoundError:
         return None
-    try:
-        return Holder(**json.loads(data))
-    except (ValueError, TypeError):
-        return Holder(token=f"unreadable {data[:40]!r}", host=UNREADABLE, pid=0, machine="", born="")
 
 
 def _show_life(lock: Lock, period_s: float, ended: threading.Event) -> None:
-    """Writes the lock file anew in each period, until another process took the lock over."""
+    """Shows life in each period, until another process took the lock over."""
     while not ended.wait(period_s):
         with contextlib.suppress(Exception):  # a full disk must not end the run: the lock is only advice
             if not lock.held:
@@ -220,45 +217,27 @@ def _find_gone(store: Store, beat: Beat) -> Holder | None:
     )
 
 
-def _take_over(store: Store, gone: Holder, mine: Holder, period_s: float) -> bool:
-    """Replaces a holder that is gone; False where another was faster.
+def _take(store: Store, mine: Holder, gone: Holder | None) -> bool:
+    """Puts the event by which this process follows `gone` (None: a lock that is free); False where another was faster."""
+    if gone == UNREADABLE:
+        _clear(store)
+        gone = None
 
-    One contender for each holder gets the claim, and it looks again before and after it writes. The claim stays while
-    the lock is held: it tells the old holder, should it wake, that it was replaced.
-    """
-    claim = _claim_on(gone)
-    if not store.put_if_absent(claim, _encode(mine)):
-        time.sleep(period_s)
-        if read_holder(store) == gone:  # the process with the claim died before it wrote
-            store.remove(claim)
+    def decide(before: Sequence[bytes]) -> bytes | None:
+        last = Holder(**json.loads(before[-1])) if before else None
+        return json.dumps(asdict(mine)).encode() if last == gone else None
+
+    try:
+        return Events(store, LOCK_CLAIMS).append(decide) is not None
+    except (CorruptError, FileNotFoundError, ValueError, TypeError):  # given back, or damaged, at this moment
         return False
-    if read_holder(store) != gone:
-        store.remove(claim)
-        return False
-    store.put(LOCK_FILE, _encode(mine))
-    if _claimant(store, gone) == mine:
-        return True
-    if _is_held_by(store, mine):
-        store.remove(LOCK_FILE)
-    return False
 
 
-def _claim_on(holder: Holder) -> str:
-    return f"{LOCK_CLAIMS}/{uuid.uuid5(uuid.NAMESPACE_OID, holder.token).hex}"
-
-
-def _claimant(store: Store, holder: Holder) -> Holder | None:
-    """The process that claimed the lock of `holder`, None where nobody did."""
-    return _holder_at(store, _claim_on(holder))
-
-
-def _is_held_by(store: Store, holder: Holder) -> bool:
-    current = read_holder(store)
-    return current is not None and current.token == holder.token
-
-
-def _encode(holder: Holder) -> bytes:
-    return json.dumps(asdict(holder)).encode()
+def _clear(store: Store) -> None:
+    """Removes the events, and the folder only where nobody has taken the lock meanwhile."""
+    for name in store.names(LOCK_CLAIMS):
+        store.remove(f"{LOCK_CLAIMS}/{name}")
+    store.remove_empty(LOCK_CLAIMS)
 
 
 def _machine() -> str:

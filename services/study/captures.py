@@ -22,7 +22,7 @@ from services.study.study import Journal
 from workers.capture.estimate import ProcessorClock
 from workers.capture.folder import CaptureFolder, open_folder
 from workers.capture.make_capture import process_capture, require_captures, simulate_one
-from workers.geometry.spread import spread_evenly
+from workers.geometry.camera import spread_evenly
 from workers.scene.context import WorkerContext
 from workers.store.file_system import temporary_folder
 

@@ -24,7 +24,7 @@ from workers.capture.rows import CapturedObject, CapturedPair, LeftOut, Origin, 
 from workers.capture.score import read_whole_truth, score_capture
 from workers.capture.simulate.simulate import load_object, simulate_capture
 from workers.capture.views import CaptureViews
-from workers.geometry.spread import spread_evenly
+from workers.geometry.camera import spread_evenly
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.plan import SceneChance
 from workers.store.file_system import temporary_folder

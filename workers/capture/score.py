@@ -35,8 +35,8 @@ from workers.capture.surface.evaluate import (
 )
 from workers.capture.surface.posed_view import visible_points
 from workers.capture.views import CaptureViews
+from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import transform
-from workers.geometry.spread import spread_evenly
 
 HELD_OUT = 6
 """Views that are left out in turn and made of the others."""

@@ -1,4 +1,4 @@
-"""The pinhole camera: its pose and frustum, projection of points, and unprojection of pixels."""
+"""The pinhole camera: its pose and frustum, projection of points, unprojection of pixels, and a choice among many views."""
 
 import math
 from collections.abc import Sequence
@@ -115,3 +115,10 @@ def _corner_rays(k: Intrinsics) -> Array:
     """[4, 3]: the rays through the image's corners, in the optical frame; every other is between them."""
     columns, rows = (-MARGIN_PX, k.width + MARGIN_PX), (-MARGIN_PX, k.height + MARGIN_PX)
     return np.array([[(u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0] for v in rows for u in columns])
+
+
+def spread_evenly(count: int, most: int) -> NDArray[np.int64]:
+    """[min(count, most)] ascending: places of at most so many of `count` things; of two or more, the first and the last."""
+    if count <= most:
+        return np.arange(count, dtype=np.int64)
+    return np.linspace(0, count - 1, most).round().astype(np.int64)

@@ -20,7 +20,6 @@ from workers.geometry.distortion import distort
 from workers.geometry.frames import invert
 from workers.geometry.pixels import Extent, count_filled, facing_cosine, gather_colours, measure_regions, quantise_depth
 from workers.geometry.projection import Bounds, Projected, Seen, compare_covisible, forward_project, in_frame
-from workers.geometry.ranks import median
 from workers.geometry.zbuffer import count_covered
 
 CountPixels = Callable[[Sequence[Placed], Camera], list[int]]
@@ -166,10 +165,10 @@ def compare_views(source: View, mirror: View, images: Images, bound_mm: float) -
     object_mm = difference_mm[own >= REGION_FIRST_OBJECT]
     enough = len(object_mm) >= FEWEST_POINTS
     return Agreement(
-        median_mm=median(object_mm) if enough else None,
+        median_mm=float(np.median(object_mm)) if enough else None,
         share=float((object_mm <= bound_mm).mean()) if enough else None,
         points=len(object_mm),
-        scene_median_mm=median(difference_mm) if len(difference_mm) >= FEWEST_POINTS else None,
+        scene_median_mm=float(np.median(difference_mm)) if len(difference_mm) >= FEWEST_POINTS else None,
     )
 
 

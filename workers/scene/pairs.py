@@ -20,7 +20,6 @@ from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import ROLES, Camera, Pair, Role, View
 from workers.geometry.frames import UP, half_turn, pose, translation
 from workers.geometry.pixels import dequantise_depth, quantise_depth
-from workers.geometry.ranks import median, percentile
 from workers.render.tiers import draw_view
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.labels import compare_views, count_unoccluded, derive_projected, label_regions, projection_shares
@@ -67,8 +66,8 @@ def front_distance(depth_m: Array, object_pixels: NDArray[np.bool_] | np.bool_, 
     if mirror.pivot_depth == "nearest":
         return float(z.min())
     if mirror.pivot_depth == "median":
-        return median(z)
-    return percentile(z, mirror.percentile)
+        return float(np.median(z))
+    return float(np.percentile(z, mirror.percentile))
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from workers.geometry.camera import (
     orbit_pose,
     project,
     project_bounds,
+    spread_evenly,
     unproject,
     yaw,
 )
@@ -132,3 +133,10 @@ def test_no_camera_on_the_way_sees_a_point_of_what_is_outside():
             u, v = project(seen[seen[:, 2] > 0.0], NARROW)
             assert not ((u > 0.0) & (u < NARROW.width) & (v > 0.0) & (v < NARROW.height)).any()
     assert outside > 1_000
+
+
+def test_of_many_views_the_first_the_last_and_others_evenly_between_are_chosen():
+    assert [spread_evenly(count, 4).tolist() for count in (0, 2, 10)] == [[], [0, 1], [0, 3, 6, 9]]
+    for most, count in ((2, 7), (3, 100), (40, 199)):
+        gaps = np.diff(spread_evenly(count, most))
+        assert len(gaps) == most - 1 and gaps.min() > 0 and np.ptp(gaps) <= 1

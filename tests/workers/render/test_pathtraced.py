@@ -16,7 +16,7 @@ import trimesh
 from schemas.base import frozen_array
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Appearance, Light, Material, Part, Shape
-from tests.workers.render.looks import BLACK, DOWN, matte, paths, traced, with_material, without
+from tests.workers.render.looks import BLACK, OVERHEAD, matte, paths, traced, with_material, without
 from tests.workers.render.random_scenes import (
     APPEARANCE,
     EYE,
@@ -231,7 +231,7 @@ def test_without_global_illumination_light_reaches_only_what_sees_a_lamp(tracer)
     ground = Placed(1, with_material(floor().shape, matte(0.8)), EYE)
     eye = np.eye(4)
     eye[:3, 3] = [0.0, 0.0, 0.2]
-    look, view = Appearance(BLACK, (DOWN,), BLACK), camera(small(9, 9, fx=40.0, fy=40.0), eye)
+    look, view = Appearance(BLACK, (OVERHEAD,), BLACK), camera(small(9, 9, fx=40.0, fy=40.0), eye)
 
     def seen(thing):
         full, direct = (tracer.radiance([ground, ceiling], look, thing, *one, 0).mean() for one in tiers)

@@ -8,7 +8,7 @@ import importlib.util
 import numpy as np
 import pytest
 
-import workers.render.tiers
+import workers.render.pathtraced
 from schemas.errors import InputError
 from tests.workers.render.looks import FLAT, FOUR, RASTER, paths, traced, without
 from tests.workers.render.random_scenes import APPEARANCE, camera, orbit_and_mirror, random_things, small
@@ -37,7 +37,7 @@ def test_labels_are_the_same_to_the_byte_in_all_tiers(renderer):
 
 
 def test_without_rgb_nothing_is_traced(renderer, monkeypatch):
-    monkeypatch.setattr(workers.render.tiers, "shared_tracer", lambda: pytest.fail("a path was traced"))
+    monkeypatch.setattr(workers.render.pathtraced, "shared_tracer", lambda: pytest.fail("a path was traced"))
     rng = np.random.default_rng(900)
     things, height = random_things(rng)
     view = camera(small(64, 48), orbit_and_mirror(rng, height)[0].T_world_cam)

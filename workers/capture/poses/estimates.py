@@ -22,8 +22,8 @@ from workers.capture.poses.markers import AMBIGUOUS, Fit, MarkerPose, focal_leng
 from workers.capture.poses.observation import Observation, Patches, no_patches
 from workers.capture.poses.terms import NAMES, POSE, PRINT_SCALE, SHARED, BoardTerm, ObjectTerm, Shared, identified
 from workers.capture.poses.verdict import Evidence, Judged, judge, median_reprojection
+from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import transform
-from workers.geometry.spread import spread_evenly
 
 
 def estimate_markers(evidence: Evidence) -> CaptureEstimate:

@@ -26,8 +26,8 @@ from workers.capture.poses.observation import (
     pixels_of_points,
     rays_of_pixels,
 )
+from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import transform
-from workers.geometry.spread import spread_evenly
 
 GRID = 12
 """Samples along each side of a marker or gap."""

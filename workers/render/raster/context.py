@@ -9,7 +9,9 @@ function that PyOpenGL checks: the read-back of the image at the latest.
 """
 
 import importlib
+import importlib.util
 import socket
+import sys
 from collections.abc import Callable, Mapping
 from ctypes import CFUNCTYPE, c_float, c_int, c_ssize_t, c_ubyte, c_uint, c_void_p
 from types import ModuleType
@@ -149,15 +151,25 @@ def require_device(name: str, device: Literal["any", "gpu"]) -> None:
         )
 
 
+def _pyrenders_egl() -> ModuleType:
+    """The module `pyrender.platforms.egl`, without the package, which imports pyglet, trimesh and more: 0.5 s a process."""
+    package = importlib.util.find_spec("pyrender")
+    if package is None or "pyrender" in sys.modules:
+        return importlib.import_module("pyrender.platforms.egl")
+    sys.modules["pyrender"] = importlib.util.module_from_spec(package)  # stands for the package, which is not run
+    try:
+        return importlib.import_module("pyrender.platforms.egl")
+    finally:
+        del sys.modules["pyrender"]
+
+
 def open_context() -> tuple[ModuleType, Any]:
     """(the functions of OpenGL.GL, pyrender's `EGLPlatform`); a core context of OpenGL 4.1 or later is current afterwards.
 
     Raises MachineError, with the packages to install, where this machine has no EGL, no OpenGL or too old a one.
     """
     try:
-        # pyrender imports pyglet's window, which wants X libraries unless told that there is no display.
-        importlib.import_module("pyglet").options["headless"] = True
-        platform = importlib.import_module("pyrender.platforms.egl").EGLPlatform(1, 1)
+        platform = _pyrenders_egl().EGLPlatform(1, 1)
         platform.init_context()
         gl = importlib.import_module("OpenGL.GL")
         gl.glGetString(gl.GL_RENDERER).decode()
