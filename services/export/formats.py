@@ -1,15 +1,14 @@
-"""What an export is: its request and choice of scenes, what every format has, and the table of formats.
+"""What an export is: its request and choice of scenes, and what every format has.
 
 - Which scenes of a dataset are exported: by id, by category, and by an SQL condition.
 - What an export is asked for: a dataset, a place, a format by name, and a choice of scenes.
 - What every format is: a writer that takes scenes in order and says which pairs it leaves out, and why.
-- The formats of `verso export`, by name; each is loaded when it is asked for.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol, get_args
+from typing import Any, Final, Protocol
 
 import duckdb
 
@@ -18,6 +17,7 @@ from schemas.dataset.tables import SCHEMAS
 from schemas.errors import InputError
 from services.export.folder import ExportFolder
 from services.export.source import ExportScene
+from services.export.table import FORMATS
 from services.job.record import JobRecord
 from services.read.dataset_reader import StoredRange
 from workers.store.manifest import table_of_rows
@@ -94,22 +94,22 @@ class Chooser:
         return {scene_id for (scene_id,) in found}
 
 
-FormatName = Literal["mirror-recon", "bop", "webdataset", "huggingface", "gltf"]
-FORMATS: tuple[FormatName, ...] = get_args(FormatName)
-SHARDED: tuple[FormatName, ...] = ("webdataset", "huggingface")
-"""Formats of which many pairs share a file."""
-
-
 @dataclass(frozen=True, eq=False)
 class ExportRequest:
     """What to export, where to, and how."""
 
     store: Store
     target: Path
-    format: FormatName
+    format: str
+    """A key of `services.export.table.FORMATS`."""
     choice: Choice = EVERYTHING
     shard_mb: int = 256
     """Size that ends a shard, of formats that have shards; 10^6 bytes."""
+
+    @property
+    def most_bytes(self) -> int:
+        """The same in bytes."""
+        return 1_000_000 * self.shard_mb
 
 
 @dataclass(frozen=True)
@@ -151,28 +151,8 @@ class Writer(Protocol):
 
 
 def open_writer(
-    name: FormatName, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
+    name: str, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
 ) -> Writer:
     """The writer of a format; `state` is what it said at the last checkpoint, None where it begins."""
-    most_bytes = 1_000_000 * request.shard_mb
-    match name:
-        case "mirror-recon":
-            from services.export.mirror_recon import MirrorRecon
-
-            return MirrorRecon(folder, state)
-        case "bop":
-            from services.export.bop import Bop
-
-            return Bop(request.store, record, folder, state)
-        case "webdataset":
-            from services.export.webdataset import WebDataset
-
-            return WebDataset(folder, most_bytes, state)
-        case "huggingface":
-            from services.export.huggingface import HuggingFace
-
-            return HuggingFace(record, folder, most_bytes, state)
-        case "gltf":
-            from services.export.gltf import Gltf
-
-            return Gltf(request.store, record, folder, state)
+    writer: Writer = FORMATS[name].load()(request, record, folder, state)
+    return writer

@@ -11,13 +11,13 @@ from schemas.dataset.tables import ALWAYS_OF_SCENES
 from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan
 from schemas.scene.shape import REGION_FIRST_OBJECT
-from schemas.scene.view import Role, View
+from schemas.scene.view import MODALITIES, Role, View
 from workers.geometry.camera import image_coordinates
 from workers.geometry.frames import invert
 from workers.geometry.pixels import measure_regions
 from workers.scene.labels import compare_views, derive_projected, patch_object_fraction, projection_shares
 from workers.scene.pairs import object_distance, place_aligned_camera, place_mirror_camera
-from workers.scene.rows import image_boxes, view_pixels
+from workers.scene.rows import image_boxes
 
 ROUNDING = 1e-12
 """Largest difference of poses and distances that are computed again from the same doubles."""
@@ -77,15 +77,17 @@ def _read_view(row: Row, job: Job, objects: Sequence[Row], read: ReadImage, faul
     for image in stored_images(role, job):
         path = image_path(row["category"], image.content, file_pose_id(role, row["parent_id"]))
         pixels = read(path)
-        shape = (row["height"], row["width"], 3)[: 3 if image.pixels == "rgb" else 2]
-        dtype = np.uint16 if image.pixels == "depth" else np.uint8
-        if pixels.shape != shape or pixels.dtype != dtype:
-            faults.append(f"{path}: is {pixels.dtype} {pixels.shape}, and must be {dtype.__name__} {shape}")
+        modality = MODALITIES[image.pixels]
+        shape = modality.shape(row["height"], row["width"])
+        if pixels.shape != shape or pixels.dtype != modality.dtype:
+            faults.append(f"{path}: is {pixels.dtype} {pixels.shape}, and must be {modality.dtype} {shape}")
         images[image.pixels] = pixels
     own = [one for one in objects if (one["pose_id"], one["role"]) == (row["pose_id"], role)]
     labels = tuple(read_label(one) for one in sorted(own, key=lambda one: one["region_id"]))
     camera, ids = read_camera(row), (row["pose_id"], row["parent_id"])
-    return View(role, *ids, camera, images.get("rgb"), images["depth"], images.get("region"), labels)
+    rgb, depth, region = (images.pop(name, None) for name in ("rgb", "depth", "region"))
+    assert depth is not None
+    return View(role, *ids, camera, rgb, depth, region, labels, images)
 
 
 def _differs(a: ArrayLike, b: ArrayLike) -> bool:
@@ -162,7 +164,7 @@ def _check_patches(view: View, labelled: View, job: Job, read: ReadImage, row: R
     expected = set()
     for path, kind, box in image_boxes(view, objects, row["category"], job.images.patch):
         expected.add(path)
-        full = view_pixels(view, kind)
+        full = view.images.get(kind)
         if box is not None and path in listed and full is not None and not np.array_equal(read(path), full[box]):
             faults.append(f"{path}: is not the crop of its image")
     if expected != listed:
