@@ -439,7 +439,9 @@ COMMANDS: dict[str, Command] = {
             option(
                 "--category", action="append", default=[], metavar="NAME", help="only scenes of it; may be repeated"
             ),
-            option("--scenes", type=read_span, metavar="FIRST-LAST", help="only scenes with these ids; one id is one scene"),
+            option(
+                "--scenes", type=read_span, metavar="FIRST-LAST", help="only scenes with these ids; one id is one scene"
+            ),
             option("--where", metavar="SQL", help="only scenes for which this holds, such as 'support_margin_mm > 5'"),
             option(
                 "--shard-mb",

@@ -40,11 +40,11 @@ class Block:
 
 @dataclass(frozen=True)
 class _RangeRead:
-    """A range as it was read: the files of each record, and the tables that have rows, as Parquet bytes or decoded."""
+    """A range as it was read: the files of each record, and the tables that have rows, in the schema of their files."""
 
     records: Range
     files: Sequence[Sequence[FileEntry]]
-    tables: Mapping[str, bytes | pa.Table]
+    tables: Mapping[str, pa.Table]
 
     @property
     def rows(self) -> int:
@@ -77,14 +77,17 @@ def _read_range(store: Store, records: Range) -> _RangeRead:
         files = [committed_files(store, record) for record in records]
         return _RangeRead(records, files, {table: range_rows(store, records, table) for table in TABLES})
     (record,) = records
-    tables = {
-        table: read_range_file(store, record, _table_path(record, table)) for table in TABLES if record.tables[table]
-    }
+    tables = {table: _read_table(store, record, table) for table in TABLES if record.tables[table]}
     return _RangeRead(records, [record.files], tables)
 
 
-def _table_path(record: CommitRecord, table: str) -> str:
-    return range_table_path(record.span.start, table, record.span.retry)
+def _read_table(store: Store, record: CommitRecord, table: str) -> pa.Table:
+    """The rows of one record. Raises CorruptError where the file is missing or altered, or has more rows or fewer."""
+    path = range_table_path(record.span.start, table, record.span.retry)
+    rows = decode_rows(read_range_file(store, record, path), path)
+    if len(rows) != record.tables[table]:
+        raise CorruptError(f"{path} has {len(rows)} rows, and its commit says {record.tables[table]}")
+    return rows
 
 
 def _joined(block: Sequence[_RangeRead]) -> Block:
@@ -99,7 +102,7 @@ def _joined(block: Sequence[_RangeRead]) -> Block:
     ]
     tables = {}
     for table in TABLES:
-        parts = [(read.records, _decoded(read, table)) for read in block if table in read.tables]
+        parts = [(read.records, read.tables[table]) for read in block if table in read.tables]
         if table == "assets":
             files += [(records[0], entry) for records, rows in parts for entry in _shapes(rows)]
         name = f"a table `{table}` of the ranges from scene {ranges[0][0].span.start}"
@@ -116,19 +119,6 @@ def _check_scenes(spans: Sequence[Span], rows: Mapping[str, pa.Table]) -> None:
     wrong = [*np.setxor1d(values, np.arange(spans[0].start, spans[-1].stop)), *values[counts > 1]]
     if wrong:
         raise _not_each_once(next(span.start for span in reversed(spans) if span.start <= wrong[0]))
-
-
-def _decoded(read: _RangeRead, table: str) -> pa.Table:
-    """A range's rows in the schema that they were written in. Raises CorruptError where there are more or fewer."""
-    data = read.tables[table]
-    if isinstance(data, pa.Table):
-        return data
-    awaited = read.records[0].tables[table]
-    path = _table_path(read.records[0], table)
-    rows = decode_rows(data, path)
-    if len(rows) != awaited:
-        raise CorruptError(f"{path} has {len(rows)} rows, and its commit says {awaited}")
-    return rows
 
 
 def _shapes(assets: pa.Table) -> Iterator[FileEntry]:

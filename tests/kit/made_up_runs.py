@@ -11,7 +11,7 @@ from schemas.scene.scene import SceneOutput
 from services.merge.merge import MergeResult, merge
 from services.run.lock import Lock
 from services.run.range_planner import committed_ranges, plan_ranges, plan_retries
-from tests.made_up_scenes import attempt_at, small_scene, terms
+from tests.made_up_scenes import attempt_at, failed_scene, small_scene, terms
 from workers.store.attempt import sweep
 from workers.store.ledger import list_commits
 from workers.store.store import Store
@@ -40,6 +40,20 @@ def make_dataset(
         again = {"retry": span.retry, "scenes": span.scenes}
         attempt_at(store, span.start, span.stop, settings_of(layout), make, **again).commit()
     return merge(store, FIRST, stop, *([lock.require_held] if lock else []))
+
+
+def half_merged(store: Store, layout: str = "files") -> None:
+    """Two ranges and a retry of a scene that was killed; the first range was merged before the others came."""
+
+    def first_try(scene_id: int) -> SceneOutput:  # its file of failures has no successor after the retry
+        return failed_scene(scene_id, "environmental") if scene_id == 1 else small_scene(scene_id)
+
+    settings = terms(layout=layout, range_size=2)
+    store.prepare()
+    attempt_at(store, 0, 2, settings, first_try).commit()
+    merge(store, 0, 2)
+    attempt_at(store, 0, 2, settings, small_scene, retry=1, scenes=(1,)).commit()
+    attempt_at(store, 2, 4, settings, small_scene).commit()
 
 
 def contents_of(path: Path) -> str:

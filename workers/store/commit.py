@@ -85,7 +85,7 @@ def decode_record(data: bytes, name: str) -> CommitRecord:
         where = plain_line("".join(f"{part}: " for part in (".".join(map(str, first["loc"])),) if part), 100)
         told = plain_line(first["msg"].removeprefix("Value error, "), 300)
         raise CorruptError(f"{name} is not a commit record: {where}{told}") from error
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise CorruptError(f"{name} is not a commit record: {error!r}"[:300]) from error
 
 

@@ -5,7 +5,7 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -23,45 +23,6 @@ from schemas.dataset.tables import (
 )
 from schemas.errors import CorruptError
 from schemas.scene.scene import SceneOutput
-
-
-class Buffers(NamedTuple):
-    """Numbers of the buffers of an array: of validity where values are required, and of doubles."""
-
-    required: tuple[int, ...]
-    doubles: tuple[int, ...]
-
-
-def buffers_of(kind: pa.DataType) -> Buffers:
-    """Those of an array of this type."""
-    roles = list(enumerate(_roles(kind, nullable=False)))
-    return Buffers(*(tuple(at for at, role in roles if role == one) for one in ("required", "doubles")))
-
-
-def is_sound(rows: pa.StructArray, where: Buffers) -> bool:
-    """True where no required value is absent and every double is finite; False also where that is not plain to see.
-
-    Looks at all buffers at once: a walk over the columns, as `check_values` does, takes twenty times as long. Where it is
-    False, `check_values` decides.
-    """
-    buffers = rows.buffers()
-    if any(buffers[at] is not None for at in where.required):  # Arrow keeps no validity where nothing is absent
-        return False
-    values = b"".join([buffers[at] for at in where.doubles if buffers[at] is not None])
-    return bool(np.isfinite(np.frombuffer(values)).all())
-
-
-def _roles(kind: pa.DataType, nullable: bool) -> list[str]:
-    """What each buffer of an array of this type holds, in Arrow's order: those of an array before those of its children."""
-    validity = "" if nullable else "required"
-    fields = [kind.field(n) for n in range(kind.num_fields)]
-    below = [role for field in fields for role in _roles(field.type, field.nullable)]
-    if pa.types.is_struct(kind) or pa.types.is_fixed_size_list(kind):
-        return [validity, *below]
-    if pa.types.is_floating(kind):
-        return [validity, "doubles"]
-    offsets = [""] if pa.types.is_string(kind) else []
-    return [validity, *offsets, "", *below]
 
 
 def check_values(where: str, field: pa.Field, array: pa.Array) -> None:
@@ -84,7 +45,6 @@ PARQUET_OPTIONS = {"compression": "zstd", "write_page_checksum": True}
 """For every Parquet file that users read: a flipped bit is found when the page is read."""
 _ROWS = {table: pa.struct(list(schema)) for table, schema in SCHEMAS.items()}
 """The type of a row, by table: all columns of a table are made in one call."""
-_BUFFERS = {key: buffers_of(kind) for key, kind in _ROWS.items()}
 _EMPTY = {table: schema.empty_table() for table, schema in SCHEMAS.items()}
 _RANGE_OPTIONS: dict[str, Any] = {
     "compression": "lz4",
@@ -113,13 +73,11 @@ def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
         if table == "scenes" and row["capture"] is None and (absent := [n for n in ALWAYS_OF_SCENES if row[n] is None]):
             raise ValueError(f"scenes.{absent[0]} is missing in scene {row['scene_id']}")
     try:
-        whole = pa.array(rows, _ROWS[table])
-        arrays, sound = whole.flatten(), is_sound(whole, _BUFFERS[table])
+        arrays = pa.array(rows, _ROWS[table]).flatten()
     except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):
-        arrays, sound = [_column(table, field, rows) for field in schema], False  # says which column it is
-    if not sound:
-        for field, array in zip(schema, arrays, strict=True):
-            check_values(f"{table}.{field.name}", field, array)
+        arrays = [_column(table, field, rows) for field in schema]  # says which column it is
+    for field, array in zip(schema, arrays, strict=True):
+        check_values(f"{table}.{field.name}", field, array)
     return pa.Table.from_arrays(arrays, schema=schema)
 
 

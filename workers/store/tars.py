@@ -158,11 +158,6 @@ def read_tar(category: str, data: bytes, name: str) -> Iterator[tuple[str, bytes
     return ((path, content) for path, _, content in _read_members(category, data, name) if path)
 
 
-def read_labels(category: str, data: bytes, name: str) -> Iterator[tuple[int, bytes]]:
-    """(pose id, JSON) of every pose, in order. Raises CorruptError as `read_tar`."""
-    return ((pose_id, content) for path, pose_id, content in _read_members(category, data, name) if not path)
-
-
 def check_labels(category: str, data: bytes, name: str, rows: Rows) -> list[tuple[int, str]]:
     """(pose id, how its labels differ from the rows of the range) of every pose in an archive whose labels are off.
 

@@ -1,3 +1,4 @@
+import contextlib
 import json
 
 import pyarrow as pa
@@ -8,7 +9,7 @@ from hypothesis import strategies as st
 from schemas.dataset.tables import SCHEMAS
 from schemas.errors import CommitConflict, CorruptError, MachineError
 from services.merge import shared as module
-from services.merge.shared import SharedRows
+from services.merge.shared import SharedRows, explain_full_disk, open_scratch
 from tests.made_up_scenes import made_scene
 
 NAMES = st.text(st.characters(blacklist_categories=["Cs"]), max_size=4)
@@ -99,3 +100,15 @@ def test_nothing_is_sorted_when_it_is_read(shared):
     assert len(asked) == 2
     for sql in asked:
         assert "TEMP B-TREE" not in str(list(shared._db.execute(f"EXPLAIN QUERY PLAN {sql}")))
+
+
+def test_a_full_table_is_explained(tmp_path):
+    with contextlib.closing(open_scratch(tmp_path / "a.sqlite", "CREATE TABLE rows (text TEXT)")) as table:
+        table.execute("PRAGMA max_page_count = 4")
+        with pytest.raises(MachineError, match=r"the merge could not write its files: .* full"), explain_full_disk():
+            table.executemany("INSERT INTO rows VALUES (?)", ((f"{i:0100d}",) for i in range(1000)))
+
+
+def test_a_folder_that_is_gone_is_explained(tmp_path):
+    with pytest.raises(MachineError, match="unable to open"), explain_full_disk():
+        open_scratch(tmp_path / "none" / "a.sqlite", "CREATE TABLE rows (text TEXT)")

@@ -1,28 +1,124 @@
+"""The seal of a text file: any change of any byte breaks it."""
+
 import copy
 import dataclasses
 import hashlib
+import json
+import random
 import re
 
 import pytest
 
 from schemas.dataset.commit import FileEntry
 from schemas.dataset.layout import RANGES, STAGING, commit_path, range_table_path
-from schemas.errors import CommitConflict, CorruptError
+from schemas.errors import CommitConflict, CorruptError, OutputError
+from tests.damage import cut, flip
 from tests.kit.faults import check_published
 from tests.made_up_scenes import attempt_at, made_scene, terms, with_shapes
+from tests.stored_images import iter_records
+from workers.store.attempt import sweep
 from workers.store.commit import (
     commit_names,
     commits_digest,
     committed_files,
+    decode_record,
+    encode_record,
+    is_sealed,
     publish,
     read_committed,
     read_record,
+    seal,
 )
 from workers.store.ledger import read_range_table, read_summary
 from workers.store.local import LocalStore
 from workers.store.manifest import encode_table, table_of_rows
 
 pytestmark = pytest.mark.usefixtures("unflushed")
+
+
+def test_a_record_reads_back_as_it_was_and_always_has_the_same_bytes(store):
+    record = attempt_at(store, 0, 4).commit().record
+    data = store.read(commit_path(0))
+    assert decode_record(data, "x") == record
+    assert encode_record(decode_record(data, "x")) == data
+    assert json.loads(data)["schema_version"] == 1
+    assert json.loads(data)["span"] == {"start": 0, "stop": 4, "retry": 0, "scenes": []}
+
+
+def test_a_record_is_small_and_grows_by_sixteen_characters_a_scene(store):
+    """The whole record of 16 scenes with all their images and shapes."""
+    record = attempt_at(store, 40, 44).commit().record
+    assert all(entry.path.startswith("manifest/_ranges/") for entry in record.files)
+    small = len(store.read(commit_path(attempt_at(store, 0, 4, make=made_scene).commit().record.span.start)))
+    large = len(store.read(commit_path(attempt_at(store, 20, 36, make=made_scene).commit().record.span.start)))
+    assert large < 2048
+    assert large - small < 12 * 16 + 50
+
+
+def test_every_altered_byte_of_a_record_is_found(store):
+    attempt_at(store, 0, 2).commit()
+    data = store.read(commit_path(0))
+    for position in range(0, len(data), 5):
+        damaged = bytearray(data)
+        damaged[position] ^= 1
+        with pytest.raises((CorruptError, OutputError)):
+            decode_record(bytes(damaged), "manifest/_commits/0.json")
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", b"null", b"[]", b'{"a": 1}', b"\x00\x01", b'{"kind": "verso-commit"}'])
+def test_a_foreign_record_is_refused_by_name(store, damage):
+    (store.root / commit_path(0)).write_bytes(damage)
+    for read in (lambda: read_record(store, 0), lambda: read_summary(store, 0), lambda: list(iter_records(store))):
+        with pytest.raises(CorruptError, match=r"manifest/_commits/0000000000\.json"):
+            read()
+
+
+def test_a_torn_record_is_refused_by_name(store):
+    attempt_at(store, 0, 2).commit()
+    data = store.read(commit_path(0))
+    (store.root / commit_path(0)).write_bytes(data[: len(data) // 2])
+    with pytest.raises(CorruptError, match=r"0000000000.json is torn"):
+        read_record(store, 0)
+
+
+def test_a_record_of_a_newer_version_is_refused_and_one_with_more_keys_is_read(store):
+    record = attempt_at(store, 0, 2).commit().record
+    newer = record.model_copy(update={"schema_version": 2})
+    with pytest.raises(OutputError, match="schema_version 2, and this program reads up to 1: install a newer"):
+        decode_record(encode_record(newer), "x")
+
+    class More(type(record)):
+        colour: str = "red"
+
+    more = More(**record.model_dump())
+    assert b"colour" in encode_record(more)
+    assert decode_record(encode_record(more), "x") == record
+
+
+TEXT = "key: 5\nname: kubek żółty\n"
+
+
+def test_a_sealed_text_is_whole_and_its_text_is_kept():
+    data = seal(TEXT, "seal: ")
+    assert data.startswith(TEXT.encode()) and data.count(b"\n") == 3
+    assert is_sealed(data, "seal: ")
+    assert not is_sealed(data, "other: ")
+
+
+def test_every_flipped_bit_and_every_cut_breaks_the_seal():
+    data = seal(TEXT, "<!-- ", " -->\n")
+    assert is_sealed(data, "<!-- ", " -->\n")
+    for at in range(8 * len(data)):
+        changed = bytearray(data)
+        changed[at // 8] ^= 1 << at % 8
+        assert not is_sealed(bytes(changed), "<!-- ", " -->\n")
+    assert not any(is_sealed(data[:length], "<!-- ", " -->\n") for length in range(len(data)))
+
+
+def test_the_damage_of_tests_changes_what_it_damages():
+    chance = random.Random(3)
+    for damage in (flip, cut):
+        assert all(damage(TEXT.encode(), chance) != TEXT.encode() for _ in range(50))
 
 
 def test_a_record_under_another_name_is_refused(store):
@@ -221,3 +317,34 @@ def test_an_image_of_another_range_is_refused_before_the_decision(store):
     with pytest.raises(ValueError, match="is not a file of the range from scene 0"):
         attempt.commit()
     assert read_record(store, 0) is None
+
+
+def test_sweeping_publishes_winners_drops_losers_and_leaves_the_undecided(store, undecided):
+    lost = attempt_at(store, 0, 4)
+    open_range = attempt_at(store, 4, 8)
+    dead = attempt_at(store, 8, 12)
+    assert sweep(store, fenced=[(8, dead.name)]) == [lost.name, dead.name]
+    check_published(store, undecided)
+    assert {entry.key.split("/")[2] for entry in store.files(STAGING)} == {open_range.name}
+    assert open_range.commit().won
+
+
+def test_a_retry_of_a_committed_range_is_not_swept_as_its_loser(store):
+    attempt_at(store, 0, 4).commit()
+    retry = attempt_at(store, 0, 4, retry=1, scenes=(2,))
+    assert sweep(store) == []
+    assert retry.commit().won
+
+
+def test_sweeping_leaves_what_is_not_ours_and_says_so(store):
+    store.put(f"{STAGING}/0000000000/mine/notes.txt", b"")
+    with pytest.raises(CorruptError, match=f"{STAGING}/0000000000/mine is not an attempt"):
+        sweep(store)
+
+
+def test_temporary_files_of_the_dead_are_swept(store):
+    store.put("manifest/_commits/.probe-1", b"")
+    store.put(f"{STAGING}/_tmp/.x", b"")
+    sweep(store)
+    assert not list(store.files("manifest/_commits"))
+    assert not list(store.files(STAGING))

@@ -6,7 +6,6 @@ import pytest
 from schemas.dataset.layout import TEMPORARY
 from schemas.errors import MachineError, OutputError
 from workers.store import file_system
-from workers.store.attempt import sweep
 from workers.store.file_system import explain_disk_errors, file_system_of
 from workers.store.local import LocalStore
 
@@ -113,21 +112,6 @@ def test_a_real_vfat_is_refused(tmp_path):
             LocalStore(mount / "out").prepare()
     finally:
         subprocess.run(["umount", str(mount)], check=True)
-
-
-def test_a_probe_whose_files_are_swept_by_a_coordinator_at_work_is_made_again(tmp_path, monkeypatch):
-    store = LocalStore(tmp_path)
-    store.prepare()
-    real, swept = os.link, []
-
-    def link(source, target):
-        if not swept:
-            swept.append(sweep(store))
-        real(source, target)
-
-    monkeypatch.setattr(os, "link", link)
-    store.prepare()
-    assert swept
 
 
 def test_a_full_disk_is_told_with_what_to_do(store, monkeypatch):

@@ -1,12 +1,77 @@
+"""Absent and infinite values, put one at a time into every place that a row of any table has."""
+
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from schemas.dataset.tables import SCHEMAS, TABLES
+from schemas.dataset.tables import CAPTURE_SCHEMAS, SCHEMAS, TABLES
 from schemas.errors import CorruptError
 from tests.made_up_scenes import failed_scene, made_scene
-from workers.store.manifest import decode_table, encode_table, scene_digest, sorted_rows, table_of_rows
+from workers.store.manifest import (
+    check_values,
+    decode_table,
+    encode_table,
+    scene_digest,
+    sorted_rows,
+    table_of_rows,
+)
+
+KINDS = {
+    f"{name}-{table}": pa.struct(list(schemas[table]))
+    for name, schemas in (("scenes", SCHEMAS), ("captures", CAPTURE_SCHEMAS))
+    for table in SCHEMAS
+}
+
+
+def whole(kind: pa.DataType) -> Any:
+    """A value of this type in which nothing is absent; lists have two items."""
+    if pa.types.is_struct(kind):
+        return {kind.field(n).name: whole(kind.field(n).type) for n in range(kind.num_fields)}
+    if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
+        return [whole(kind.value_type)] * (kind.list_size if pa.types.is_fixed_size_list(kind) else 2)
+    return {pa.float64(): 1.5, pa.int64(): 7, pa.string(): "x", pa.bool_(): True}[kind]
+
+
+def damaged(kind: pa.DataType, nullable: bool) -> Iterator[tuple[Any, bool]]:
+    """(a value in which one place holds what it may not or need not, whether it may) for every place within the type."""
+    yield None, nullable
+    if pa.types.is_struct(kind):
+        for n in range(kind.num_fields):
+            field = kind.field(n)
+            for value, allowed in damaged(field.type, field.nullable):
+                yield {**whole(kind), field.name: value}, allowed
+    elif pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
+        for value, allowed in damaged(kind.value_type, kind.value_field.nullable):
+            yield [*whole(kind)[:-1], value], allowed
+    elif pa.types.is_floating(kind):
+        yield float("nan"), False
+        yield float("-inf"), False
+
+
+def raises(rows: pa.StructArray) -> bool:
+    try:
+        for field, column in zip(rows.type, rows.flatten(), strict=True):
+            check_values(field.name, field, column)
+    except ValueError:
+        return True
+    return False
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_an_absent_or_infinite_value_is_found_at_every_place_of_a_row(name):
+    kind = KINDS[name]
+    good, places = whole(kind), 0
+    assert not raises(pa.array([good, good], kind))
+    for row, allowed in damaged(kind, nullable=True):
+        if row is not None:
+            rows = pa.array([good, row, good], kind)
+            assert raises(rows) != allowed, row
+            places += 1
+    assert places >= len(kind)
 
 
 def rows_of(table: str) -> list[dict]:

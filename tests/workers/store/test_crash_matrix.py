@@ -1,0 +1,386 @@
+"""One matrix of crashes: operation x point. Each ends in a dataset without loss or double, or in a refusal.
+
+An operation is killed, loses its power, or meets another process at a point: just before one of the steps that it takes on the
+disk, or of the requests that it makes to a bucket. By default each row tries two points; `--all` tries all of them.
+"""
+
+import hashlib
+import io
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import obstore
+import pyarrow.dataset as ds
+import pyarrow.parquet as pq
+import pytest
+from obstore.store import MemoryStore
+
+from schemas.errors import RunError
+from services.merge import merge as merge_module
+from services.merge import reading
+from services.merge.merge import merge, read_success
+from tests.kit.faults import REQUESTS, Disk, Killed, check_published, disk, lose_power, requests
+from tests.kit.made_up_runs import (
+    FIRST,
+    RANGE,
+    STOP,
+    broken_promises,
+    contents,
+    half_merged,
+    leftovers,
+    make_dataset,
+    settings_of,
+)
+from tests.made_up_scenes import TERMS, attempt_at, small_scene, terms
+from tests.stored_images import iter_records
+from workers.store import ledger
+from workers.store import store as store_module
+from workers.store.attempt import sweep
+from workers.store.commit import publish
+from workers.store.events import Events
+from workers.store.local import LocalStore
+from workers.store.objects import ObjectStore
+
+NEVER = 10**9
+every_point = pytest.mark.parametrize(
+    "every", [False, pytest.param(True, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])], ids=["two", "every"]
+)
+
+
+def points(steps: int, every: bool) -> tuple[int, ...]:
+    """Numbers of the steps before which something happens."""
+    return tuple(range(steps)) if every else (steps // 3, 2 * steps // 3)
+
+
+def work(root: Path, layout: str = "files", stop: int = STOP) -> str:
+    """A run from whatever is there; the dataset's digest."""
+    return make_dataset(LocalStore(root), layout, stop).digest
+
+
+def append_three(root: Path) -> list[bytes]:
+    """Three events, each decided on those before it, as a queue or a lock decides."""
+    log = Events(LocalStore(root), "jobs/j/events")
+    while log.append(lambda before: json.dumps(len(before)).encode() if len(before) < 3 else None):
+        pass
+    return log.read()
+
+
+class Operation(NamedTuple):
+    """What stands before an operation, and the operation, whose result is compared."""
+
+    before: Callable[[Path], object]
+    act: Callable[[Path], object]
+
+
+OPERATIONS = {
+    "a run of files": Operation(lambda root: None, work),
+    "a run of tars": Operation(lambda root: None, lambda root: work(root, "tar")),
+    "an extension": Operation(lambda root: work(root, stop=STOP - 1), work),
+    "a merge": Operation(lambda root: half_merged(LocalStore(root)), lambda root: merge(LocalStore(root), 0, 4).digest),
+    "events": Operation(lambda root: LocalStore(root).prepare(), append_three),
+}
+
+
+def killed_at(step: int, root: Path, act: Callable[[Path], object]) -> Disk:
+    """What the disk saw until the operation was killed; what lay there before is safe."""
+    with disk(at=step) as watched:
+        watched.synced |= {path.stat().st_ino for path in root.rglob("*")}
+        with pytest.raises(Killed):
+            act(root)
+    return watched
+
+
+@every_point
+@pytest.mark.parametrize("power", [False, True], ids=["killed", "without power"])
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_ended_at_a_point_and_done_again_it_comes_to_the_same(name, power, every, tmp_path):
+    before, act = OPERATIONS[name]
+    seed, whole = tmp_path / "seed", tmp_path / "whole"
+    seed.mkdir()
+    with disk() as watched:
+        before(seed)
+        shutil.copytree(seed, whole)
+        begun = watched.steps
+        result = act(whole)
+    kept = contents(whole)
+    for step in points(watched.steps - begun, every):
+        root = tmp_path / str(step)
+        shutil.copytree(seed, root)
+        ended = killed_at(step, root, act)
+        if power:
+            lose_power(ended, root)
+        assert not broken_promises(root), f"step {step}"
+        with disk():
+            assert act(root) == result, f"step {step}"
+            sweep(LocalStore(root))
+        assert contents(root) == kept, f"step {step}"
+        assert not leftovers(root), f"step {step}"
+
+
+def test_a_loss_of_power_after_the_end_costs_nothing_and_both_layouts_have_one_digest(tmp_path):
+    digests = set()
+    for layout in ("files", "tar"):
+        root = tmp_path / layout
+        with disk() as watched:
+            digests.add(work(root, layout))
+        before = contents(root)
+        lose_power(watched, root)
+        assert contents(root) == before and not broken_promises(root)
+        for record in iter_records(LocalStore(root)):
+            check_published(LocalStore(root), record)
+    assert len(digests) == 1
+
+
+def prepared(root: Path) -> LocalStore:
+    store = LocalStore(root)
+    with disk():
+        store.prepare()
+    return store
+
+
+def attempt_of(store: LocalStore):
+    return attempt_at(store, FIRST, FIRST + RANGE, settings_of("files"), small_scene)
+
+
+def commits(attempt) -> bool:
+    """Whether an attempt wins; False also where it was swept."""
+    try:
+        return attempt.commit().won
+    except RunError:
+        return False
+
+
+def swept(root: Path, step: int) -> tuple[int, object]:
+    """An attempt meets a coordinator that believes it dead."""
+    store = prepared(root)
+    with disk(at=step, then=lambda: sweep(LocalStore(root), fenced=None)) as watched:
+        won = commits(attempt_of(store))
+    with disk():
+        sweep(LocalStore(root))
+        records = list(iter_records(store))
+        assert len(records) == won, f"step {step}"
+        for record in records:
+            check_published(store, record)
+    return watched.steps, won
+
+
+def sweeping(root: Path, step: int, dies: bool = False) -> tuple[int, object]:
+    """A coordinator that sweeps meets an attempt that commits, and that dies, if it does, once it has decided."""
+    store, won = prepared(root), []
+    with disk():
+        attempt = attempt_of(store)
+
+    def commit():
+        with pytest.MonkeyPatch.context() as patch:
+            if dies:
+                patch.setattr("workers.store.attempt.publish", lambda *_: None)
+            won.append(commits(attempt))
+
+    with disk(at=step, then=commit) as watched:
+        sweep(LocalStore(root), fenced=None)
+    with disk():
+        assert [record.attempt for record in iter_records(store)] == [attempt.name] * sum(won), f"step {step}"
+    return watched.steps, won[0] if won else None
+
+
+def overtaken(root: Path, step: int) -> tuple[int, object]:
+    """An attempt meets a rival at the same range."""
+    store, rival = prepared(root), []
+    with disk(at=step, then=lambda: rival.append(attempt_of(LocalStore(root)).commit())) as watched:
+        mine = attempt_of(store).commit()
+    for theirs in rival:
+        assert mine.won != theirs.won and mine.record == theirs.record
+        assert mine.conflict is theirs.conflict is None
+        assert not leftovers(root), f"step {step}"
+    return watched.steps, rival[0].won if rival else None
+
+
+def published(root: Path, step: int) -> tuple[int, object]:
+    """A commit meets another process that publishes what is decided."""
+    store = prepared(root)
+
+    def roll_forward():
+        for record in iter_records(LocalStore(root)):
+            publish(LocalStore(root), record)
+
+    with disk(at=step, then=roll_forward) as watched:
+        result = attempt_of(store).commit()
+    assert result.won and not leftovers(root)
+    check_published(store, result.record)
+    return watched.steps, True
+
+
+MEETINGS = {
+    "an attempt is swept": (swept, {True, False}),
+    "a sweep meets a commit": (sweeping, {True, False}),
+    "a sweep meets a worker that dies decided": (lambda root, step: sweeping(root, step, dies=True), {True, False}),
+    "an attempt meets a rival": (overtaken, {True, False}),
+    "a commit is published by others": (published, {True}),
+}
+
+
+@every_point
+@pytest.mark.parametrize("name", MEETINGS)
+def test_meeting_another_process_at_a_point_nothing_is_lost_or_double(name, every, tmp_path):
+    meet, outcomes = MEETINGS[name]
+    with disk():
+        digest = work(tmp_path / "whole")
+    steps, _ = meet(tmp_path / "count", NEVER)
+    seen = set()
+    for step in points(steps, every):
+        root = tmp_path / str(step)
+        seen.add(meet(root, step)[1])
+        with disk():
+            assert work(root) == digest, f"step {step}"
+        assert not leftovers(root), f"step {step}"
+    assert seen == outcomes if every else seen <= outcomes
+
+
+def promised(store) -> str | None:
+    """The digest in `_SUCCESS`, all of which must be so; None where there is none."""
+    success = read_success(store)
+    if success is None:
+        return None
+    found = {entry.key for entry in store.files("manifest") if not entry.key.startswith("manifest/_")}
+    stray = found - set(success["files"])
+    assert store.root is None or not stray
+    assert not any(pq.read_metadata(io.BytesIO(store.read(key))).num_rows for key in stray)
+    for path, file in success["files"].items():
+        assert hashlib.sha256(store.read(path)).hexdigest() == file["sha256"], path
+    return success["digest"]
+
+
+class Newer(NamedTuple):
+    """A coordinator that took the lock while the merge was paused, and the end of the scenes that it merges."""
+
+    stop: int
+
+    def __call__(self, store) -> None:
+        layout = store.layouts[0]
+        if self.stop == 6:
+            attempt_at(store, 4, 6, terms(layout=layout, range_size=2), small_scene).commit()
+        merge(store, 0, self.stop)
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory):
+    """The digest of each dataset, made by one coordinator, and its rows of views; scene 5 fails."""
+    digests = {}
+    for stop in (4, 6):
+        store = prepared(tmp_path_factory.mktemp("alone"))
+        with disk():
+            for start in range(0, stop, 2):
+                attempt_at(store, start, start + 2, terms(range_size=2), small_scene).commit()
+            digests[stop] = merge(store, 0, stop).digest
+            assert ds.dataset(store.root / "manifest/views", partitioning="hive").count_rows() == {4: 8, 6: 10}[stop]
+    return digests
+
+
+def pause_on_disk(tmp_path: Path, newer: Newer):
+    """A function that pauses a merge at a step, and what is left then: (steps, store, what the merge said)."""
+    with disk():
+        half_merged(LocalStore(tmp_path / "seed"))
+
+    def pause(step: int):
+        root = tmp_path / str(step)
+        shutil.copytree(tmp_path / "seed", root)
+        with disk(at=step, then=lambda: newer(LocalStore(root))) as watched:
+            told = refusal(LocalStore(root))
+        return watched.steps, LocalStore(root), told
+
+    return pause
+
+
+def pause_in_bucket(_: Path, newer: Newer):
+    """The same at the requests to an object store."""
+    seed = MemoryStore()
+    half_merged(ObjectStore(seed, "memory://"), "tar")
+
+    def pause(step: int):
+        bucket = MemoryStore()
+        for meta in obstore.list(seed).collect():
+            obstore.put(bucket, meta["path"], obstore.get(seed, meta["path"]).bytes())
+        store = ObjectStore(bucket, "memory://")
+        with pytest.MonkeyPatch.context() as patch:
+            for module in (store_module, merge_module, reading, ledger):  # requests in the same order each time
+                patch.setattr(module, "map_ahead", lambda store, function, items, at_once=None: map(function, items))
+            with requests(at=step, then=lambda: newer(store), names=REQUESTS) as watched:
+                told = refusal(store)
+        return watched.count, store, told
+
+    return pause
+
+
+def refusal(store) -> str:
+    try:
+        merge(store, 0, 4)
+    except RunError as error:
+        return str(error)
+    return ""
+
+
+@every_point
+@pytest.mark.parametrize("stop", [6, 4], ids=["extends", "merges again"])
+@pytest.mark.parametrize("where", [pause_on_disk, pause_in_bucket], ids=["disk", "bucket"])
+def test_paused_at_a_point_while_a_newer_merge_completes_one_of_them_stands(where, stop, every, expected, tmp_path):
+    pause = where(tmp_path, Newer(stop))
+    steps = pause(NEVER)[0]
+    finished, refused = [], []
+    for step in points(steps, every):
+        _, store, told = pause(step)
+        assert not told or "start again" in told or "outside the 0 to 3" in told
+        refused.append(bool(told))
+        with disk():
+            digest = promised(store)
+            assert digest in (None, expected[stop]), f"step {step}"
+            finished.append(digest is not None)
+            assert merge(store, 0, stop).digest == promised(store) == expected[stop], f"step {step}"
+        merged = {entry.key for entry in store.files("manifest") if not entry.key.startswith("manifest/_")}
+        assert merged < set((read_success(store) or {})["files"]), f"step {step}"
+        assert not [entry for entry in store.files("_staging") if "_merge" in entry.key], f"step {step}"
+    if every:
+        assert sum(finished) > len(finished) // 2
+        assert sum(refused) > len(refused) // 3 or (stop == 4 and where is pause_in_bucket)  # which puts the same bytes
+
+
+RACER = """
+import sys, time
+from pathlib import Path
+from tests.made_up_scenes import attempt_at, small_scene, terms
+from workers.store.local import LocalStore
+store, me = LocalStore(sys.argv[1]), sys.argv[2]
+attempts = [attempt_at(store, start, start + 4, terms(fingerprint=me), small_scene) for start in range(0, 80, 4)]
+Path(sys.argv[1], me).touch()
+while not all(Path(sys.argv[1], name).exists() for name in "ab"):
+    pass
+for attempt in attempts:
+    result = attempt.commit()
+    print(result.won, result.conflict, result.record.terms.fingerprint)
+"""
+
+
+def test_of_two_processes_that_commit_the_same_ranges_one_wins_each_and_nothing_is_lost(tmp_path):
+    store = prepared(tmp_path)
+    racers = [
+        subprocess.Popen([sys.executable, "-c", RACER, os.fspath(tmp_path), name], stdout=subprocess.PIPE, text=True)
+        for name in "ab"
+    ]
+    told = [[line.split() for line in racer.communicate(timeout=120)[0].splitlines()] for racer in racers]
+    assert [racer.returncode for racer in racers] == [0, 0]
+    assert len(told[0]) == len(told[1]) == 20
+    for mine, theirs in zip(*told, strict=True):
+        won = [line[0] == "True" for line in (mine, theirs)]
+        assert sum(won) == 1 and mine[1] == theirs[1] == "None"
+        assert mine[2] == theirs[2] == "ab"[won.index(True)]
+    records = list(iter_records(store))
+    assert [record.span.start for record in records] == list(range(0, 80, TERMS.range_size))
+    for record in records:
+        check_published(store, record)
+    sweep(store)
+    assert not list(store.files("_staging"))
