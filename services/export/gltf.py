@@ -20,6 +20,7 @@ from services.export.source import ExportScene, unchanged_sources
 from services.job.record import JobRecord
 from services.read.scene_geometry import captured_scene, planned_scene
 from workers.assets.catalogue import Catalogue
+from workers.store.store import Store
 
 NO_SOURCES = "the sources of the shapes are not here, or have changed"
 
@@ -37,7 +38,8 @@ class Gltf:
     def __init__(
         self, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
     ) -> None:
-        self._store, self._record, self._folder = request.store, record, folder
+        self._store: Store = request.store
+        self._record, self._folder = record, folder
         self._files: dict[str, int] = dict((state or {}).get("files", {}))
 
     def add(self, scene: ExportScene) -> Added:

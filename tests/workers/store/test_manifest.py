@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from schemas.dataset.tables import CAPTURE_SCHEMAS, SCHEMAS, TABLES
+from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError
 from tests.made_up_scenes import failed_scene, made_scene
 from workers.store.manifest import (
@@ -20,11 +20,7 @@ from workers.store.manifest import (
     table_of_rows,
 )
 
-KINDS = {
-    f"{name}-{table}": pa.struct(list(schemas[table]))
-    for name, schemas in (("scenes", SCHEMAS), ("captures", CAPTURE_SCHEMAS))
-    for table in SCHEMAS
-}
+KINDS = {table: pa.struct(list(schema)) for table, schema in SCHEMAS.items()}
 
 
 def whole(kind: pa.DataType) -> Any:
