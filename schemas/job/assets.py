@@ -9,6 +9,7 @@ import itertools
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal
 
@@ -33,14 +34,55 @@ def matches(path: str, pattern: str) -> bool:
     return len(folders) in reached
 
 
-CATEGORIES = ("bottle", "camera", "can", "jar", "laptop", "mug", "bowl", "box")
-"""What the built-in shapes are; the article's categories."""
-
 TABLE = "table"
 """The category of tables, in `category_map` and in the tables of a dataset."""
 
-IN_SHAPENET = tuple(name for name in CATEGORIES if name != "box")
+
+@dataclass(frozen=True)
+class Category:
+    """A category that has built-in shapes.
+
+    generator: `module:function` of what makes one, below workers.assets.builtin, named and not imported because schemas load
+    nothing heavy. number: its place in a shape's seed; rows are numbered as they were added, and a number never changes.
+    synset: the folder of ShapeNetCore with the same kind of thing, None where ShapeNetCore has none.
+    """
+
+    name: str
+    number: int
+    generator: str
+    synset: str | None
+
+
+BUILT_IN: Mapping[str, Category] = {
+    row.name: row
+    for row in (
+        Category("bottle", 0, "bottle:make_bottle", "02876657"),
+        Category("camera", 1, "camera:make_camera", "02942699"),
+        Category("can", 2, "can:make_can", "02946921"),
+        Category("jar", 3, "jar:make_jar", "03593526"),
+        Category("laptop", 4, "laptop:make_laptop", "03642806"),
+        Category("mug", 5, "crockery:make_mug", "03797390"),
+        Category("bowl", 6, "crockery:make_bowl", "02880940"),
+        Category("box", 7, "box:make_box", None),
+        Category(TABLE, 8, "table:make_table", "04379243"),
+    )
+}
+"""The built-in categories by name."""
+
+CATEGORIES = tuple(name for name in BUILT_IN if name != TABLE)
+"""The built-in categories of objects; the first eight are the article's."""
+
+IN_SHAPENET = tuple(name for name in CATEGORIES if BUILT_IN[name].synset)
 """Those of them that ShapeNetCore has."""
+
+VERSION = 2
+"""Version of the built-in shapes, part of a catalogue's digest: raise it with every change to a vertex or colour."""
+
+
+def instance_id(category: str, seed: int, index: int) -> str:
+    """`mug-0-000123`: a built-in instance by category, seed, and the index in six digits, so that ids sort."""
+    return f"{category}-{seed}-{index:06d}"
+
 
 MOST_TOLD = 20
 """Categories that a message names."""

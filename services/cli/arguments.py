@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from schemas.errors import plain_line
-from services.job.job_file import MOST_CHARACTERS, is_packed
+from services.job.packed import MOST_CHARACTERS, is_packed
 
 JOB_ID: Final = r"j[0-9a-f]{8}"
 """An id of schemas/queue.py, which loads too much for a parser; a test compares the two."""

@@ -3,9 +3,7 @@
 glTF's y is up, the world's z is: a root node turns one into the other. Below it all is as in the dataset, in metres.
 """
 
-import json
 import math
-import struct
 from functools import cached_property
 from typing import Any
 
@@ -20,6 +18,7 @@ from services.export.source import ExportScene, unchanged_sources
 from services.job.record import JobRecord
 from services.read.scene_geometry import captured_scene, planned_scene
 from workers.assets.catalogue import Catalogue
+from workers.assets.glb import join_glb, split_glb
 from workers.store.store import Store
 
 NO_SOURCES = "the sources of the shapes are not here, or have changed"
@@ -28,7 +27,6 @@ _Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
 """x, y, z, w of the rotation that takes z to y."""
 _OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
 """A glTF camera looks along -z, and its y is up."""
-_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _NEAR_M = 0.05
 
 
@@ -101,23 +99,9 @@ def with_cameras(glb: bytes, views: list[Row]) -> bytes:
         cameras.append({"name": name, "type": "perspective", "perspective": _perspective(view)})
     tree["scenes"][0]["nodes"] = [len(nodes)]
     nodes.append({"name": "z up", "rotation": _Y_UP, "children": roots})
-    return _join_glb(tree, binary)
+    return join_glb(tree, binary)
 
 
 def _perspective(view: Row) -> dict[str, float]:
     width, height = view["width"] / view["fx"], view["height"] / view["fy"]
     return {"yfov": 2.0 * math.atan(0.5 * height), "aspectRatio": width / height, "znear": _NEAR_M}
-
-
-def split_glb(glb: bytes) -> tuple[dict[str, Any], bytes]:
-    """(the JSON of a GLB file, everything behind it)."""
-    size, _ = _CHUNK.unpack_from(glb, _HEADER.size)
-    begin = _HEADER.size + _CHUNK.size
-    return json.loads(glb[begin : begin + size]), glb[begin + size :]
-
-
-def _join_glb(tree: dict[str, Any], rest: bytes) -> bytes:
-    text = json.dumps(tree, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    length = _HEADER.size + _CHUNK.size + len(text) + len(rest)
-    return _HEADER.pack(b"glTF", 2, length) + _CHUNK.pack(len(text), b"JSON") + text + rest

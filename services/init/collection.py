@@ -10,10 +10,10 @@ from pathlib import Path, PurePosixPath
 
 from schemas.errors import AssetSourceError, MeshError, plain_line
 from schemas.job.assets import Assets, FolderSource, MeshLimits, UpAxis
+from workers.assets.external.formats import FORMATS
 from workers.assets.external.listing import Entry, SourceFile
-from workers.assets.external.placement import Measured, read_measured
-from workers.assets.external.reader import ask_all
-from workers.assets.external.reader_tasks import Kind, Request, Task
+from workers.assets.external.placement import ASSEMBLIES, Measured, read_measured
+from workers.assets.external.reader import Kind, Request, Task, ask_all
 
 PART = "part"
 """The reason why a mesh that a URDF names is not an object by itself."""
@@ -94,7 +94,7 @@ class Guess:
     """Category by pattern; the first match wins."""
 
 
-SUFFIXES = (".urdf", ".glb", ".gltf", ".obj", ".ply", ".stl")
+SUFFIXES = (*ASSEMBLIES, *FORMATS)
 """What is read; of one mesh in several formats, the first."""
 
 FOREIGN = (
@@ -203,7 +203,7 @@ def _parts_of_urdfs(request: Request, candidates: Sequence[Candidate], watch: Wa
     parts: dict[str, str] = {}
     for task, answer in _ask(request, "names", urdfs, [], watch):
         if not isinstance(answer, MeshError):
-            for path in json.loads(bytes(answer).rstrip(b"\0")):
+            for path in json.loads(answer):
                 parts.setdefault(path, task.path.relative_to(request.folder).as_posix())
     return parts
 
@@ -218,7 +218,7 @@ def _list(
         if isinstance(answer, MeshError):
             left_out.append(_refusal(one, request.folder, answer))
         else:
-            files = tuple(SourceFile(*file) for file in json.loads(bytes(answer).rstrip(b"\0")))
+            files = tuple(SourceFile(*file) for file in json.loads(answer))
             entries.append((one, Entry("", files, "")))
     return entries, left_out
 
@@ -234,13 +234,13 @@ def _measure(
             left_out.append(_refusal(one, request.folder, answer))
         else:
             digest = hashlib.sha256("".join(file.sha256 for file in entry.files).encode()).hexdigest()
-            items.append(Item(one.path, one.category, read_measured(bytes(answer).rstrip(b"\0")), digest))
+            items.append(Item(one.path, one.category, read_measured(answer), digest))
     return items, left_out
 
 
 def _ask(
     request: Request, kind: Kind, candidates: Sequence[Candidate], entries: Sequence[Entry | None], watch: Watch
-) -> Iterator[tuple[Task, memoryview | MeshError]]:
+) -> Iterator[tuple[Task, bytes | MeshError]]:
     asked = zip(candidates, entries or [None] * len(candidates), strict=True)
     tasks = tuple(Task(kind, request.folder / one.path, one.category, entry) for one, entry in asked)
     return ask_all(replace(request, tasks=tasks), partial(watch, DONE[kind]))

@@ -14,8 +14,8 @@ from schemas.job.assets import Assets, FolderSource, MeshLimits
 from schemas.scene.shape import Asset
 from tests.kit.shapes import box
 from tests.workers.assets.oracles import textured_cube, write
+from workers.assets.external.formats import load_shape
 from workers.assets.external.listing import Entry, hash_files
-from workers.assets.external.mesh import load_shape
 from workers.assets.external.placement import place_asset
 
 SIDE_M = 0.1

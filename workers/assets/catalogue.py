@@ -19,8 +19,9 @@ from cachetools import LRUCache
 from schemas.capture import CaptureListing
 from schemas.errors import AssetSourceError
 from schemas.job.assets import (
-    CATEGORIES,
+    BUILT_IN,
     TABLE,
+    VERSION,
     Assets,
     FolderSource,
     MeshLimits,
@@ -28,13 +29,12 @@ from schemas.job.assets import (
     ShapeNetSource,
     SplitShares,
     deciding_limits,
+    instance_id,
 )
 from schemas.scene.shape import Asset
-from workers.assets.builtin.identity import VERSION, instance_id
-from workers.assets.watch import Watch, ignore
+from workers.assets.external.listing import Listing, Watch, find_files, find_models, ignore
 
 if TYPE_CHECKING:
-    from workers.assets.external.listing import Listing
     from workers.assets.external.verdicts import Verdicts
 
 
@@ -77,7 +77,7 @@ class Catalogue:
         offers: list[tuple[int, AnySource, int]] = []
         for number, (settings, listing) in enumerate(self._sources(category)):
             if isinstance(settings, ProceduralSource):
-                if category in (*CATEGORIES, TABLE):
+                if category in BUILT_IN:
                     offers.append((number, settings, settings.instances))
             elif listing is not None and (count := listing.count(category)):
                 offers.append((number, settings, count))
@@ -161,7 +161,6 @@ def list_source(
     """What a source of files offers, None for built-in shapes; AssetSourceError where the folder cannot be used."""
     if isinstance(settings, ProceduralSource):
         return None
-    from workers.assets.external.listing import find_files, find_models
     from workers.assets.external.verdicts import read_listing
 
     if isinstance(settings, ShapeNetSource):
@@ -233,7 +232,8 @@ def _check_offered(catalogue: Catalogue, category: str) -> None:
     if not offers:
         listings = catalogue.tables if category == TABLE else catalogue.objects
         seen = [_describe(listing) for listing in listings if listing is not None]
-        hint = " ShapeNetCore has no box." if category == "box" else ""
+        foreign = category in BUILT_IN and BUILT_IN[category].synset is None
+        hint = f" ShapeNetCore has no {category}." if foreign else ""
         raise AssetSourceError(
             f"no source in {where} offers {category!r}: {'; '.join(seen)}.{hint} Add `- source: procedural` there, "
             + (f"or leave {category!r} out of `categories`." if category != TABLE else "or a folder that has tables.")

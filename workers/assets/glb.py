@@ -21,6 +21,8 @@ from workers.geometry.mesh import bounds_of
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
+_HEADER = struct.Struct("<4sIII4s")
+"""Magic, version and length of the file; length and kind of its first chunk."""
 PNG_LEVEL = 1
 """Textures are small and written often: the highest level saves a third of their size and costs four times the time."""
 
@@ -103,15 +105,28 @@ def asset_glb(asset: Asset, encode_opaque: EncodeImage = encode_with_pillow) -> 
         tree["images"] = writer.images
         tree["samplers"] = [{}]
         tree["textures"] = [{"source": number, "sampler": 0} for number in range(len(writer.images))]
-    return _container(json.dumps(tree, separators=(",", ":")).encode(), bytes(writer.binary))
+    return join_glb(tree, bytes(writer.binary))
 
 
-def _container(text: bytes, binary: bytes) -> bytes:
+def join_glb(tree: dict[str, Any], binary: bytes) -> bytes:
+    """A binary glTF file of a JSON tree and the bytes of its one buffer."""
+    text = json.dumps(tree, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     binary += b"\0" * (-len(binary) % 4)
-    length = 12 + 8 + len(text) + 8 + len(binary)
-    head = struct.pack("<4sII", b"glTF", 2, length)
-    return head + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    head = _HEADER.pack(b"glTF", 2, 28 + len(text) + len(binary), len(text), b"JSON")
+    return head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+
+
+def split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The JSON tree of a binary glTF file, and the bytes of its buffer, with up to 3 that fill it up.
+
+    Raises struct.error or ValueError where it is none.
+    """
+    magic, _, _, length, kind = _HEADER.unpack_from(data)
+    if magic != b"glTF" or kind != b"JSON":
+        raise ValueError("no glTF header")
+    tree: dict[str, Any] = json.loads(data[_HEADER.size : _HEADER.size + length])
+    return tree, data[_HEADER.size + length + 8 :]
 
 
 def _material(writer: _Writer, part: Part, rgb: list[float], watertight: bool) -> dict[str, Any]:

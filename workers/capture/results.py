@@ -28,7 +28,7 @@ from schemas.capture import CaptureListing
 from schemas.errors import AssetSourceError, CaptureError
 from schemas.job.job import Job
 from workers.assets.catalogue import Catalogue, open_catalogue
-from workers.assets.watch import Watch, ignore
+from workers.assets.external.listing import Watch, ignore
 from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, TRUTH
 
 PROCESS_FILE, CLOUD_FILE, MESH_FILE, POSES_FILE = "process.json", "cloud.ply", "mesh.ply", "poses.parquet"

@@ -1,9 +1,13 @@
 """What the commands print of a dataset, for people and, in the last line, for programs."""
 
+import argparse
 import json
 
 import pytest
 
+from services.cli import doctor
+from services.cli.commands import default_page
+from services.cli.doctor import Finding
 from services.cli.main import main
 from tests.datasets import make_dataset
 from workers.store.local import LocalStore
@@ -52,3 +56,37 @@ def test_query_replay_and_scene(made, capsys, tmp_path):
     code, lines, told = answer(capsys, "scene", made.name, "0", "--glb", str(tmp_path / "a.glb"))
     assert (code, told["bytes"]) == (0, (tmp_path / "a.glb").stat().st_size)
     assert lines[0].endswith("MB, world frame, z up, metres")
+
+
+def test_a_report_says_what_it_wrote_and_what_it_shows(tmp_path, capsys):
+    store, _ = make_dataset(tmp_path / "small", scenes=2, categories=["box"])
+    assert main(["report", str(store.root), "--scenes", "1", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out.splitlines()[-1])
+    page = tmp_path / "small-report.html"
+    assert answer["file"] == str(page) and answer["bytes"] == page.stat().st_size
+    assert (answer["scenes"], len(answer["shown"])) == (2, 1)
+
+
+def test_the_page_lies_beside_its_dataset_and_never_in_it(tmp_path):
+    assert default_page(f"{tmp_path}/small/") == tmp_path / "small-report.html"
+    assert str(default_page("s3://bucket/sets/small")) == "small-report.html"
+
+
+@pytest.mark.parametrize(
+    ("words", "told"), [(["extra", "audit"], "pip install 'verso-data[audit]'"), (["lock"], "type ./verso lock there")]
+)
+def test_the_launcher_is_named(words, told, capsys):
+    assert main(words) == 2
+    assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("suffices", "code"), [(True, 0), (False, 1)])
+def test_a_missing_part_is_told_with_its_remedy_and_exits_1(monkeypatch, capsys, suffices, code):
+    for name in ("_python", "_cores", "_memory", "_disk", "_shared_memory", "_ray", "_stack"):
+        monkeypatch.setattr(doctor, name, lambda name=name: Finding(name, True, "there"))
+    monkeypatch.setattr(doctor, "_renderer", lambda: Finding("GL", suffices, "found", "install it"))
+    assert doctor.main(argparse.Namespace(json=True)) == code
+    lines = capsys.readouterr().out.splitlines()
+    assert any("install it" in line for line in lines[:-1]) is not suffices
+    answer = json.loads(lines[-1])
+    assert answer["ok"] is suffices and len(answer["findings"]) == 8

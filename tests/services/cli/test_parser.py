@@ -1,33 +1,163 @@
+"""The table of commands: what may be typed, what is refused in a short line, and what is written from it."""
+
+import argparse
 import importlib
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
+from services.cli.arguments import Command, read_span
 from services.cli.parser import build_parser
+from services.cli.reference import page, script_for
 from services.cli.rows import COMMANDS
 
-
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("test", "capture")])
-def test_a_commands_example_is_accepted_and_its_handler_exists(name):
-    words = COMMANDS[name].example.replace('"', "").split()
-    if name == "query":
-        words = [words[0], " ".join(words[1:])]
-    options = build_parser().parse_args([name, *words])
-    module, _, function = options.handler.partition(":")
-    assert callable(getattr(importlib.import_module(module), function))
+ROOT = Path(__file__).resolve().parents[3]
 
 
-@pytest.mark.parametrize(
-    "words", [["run", "j", "--workers", "0"], ["replay", "o", "x"], ["verify", "o", "--audit", "x"]]
+def commands() -> Iterator[tuple[list[str], Command]]:
+    """Every command that has a handler, with its words."""
+    for name, command in COMMANDS.items():
+        yield from (
+            (([name, below], one) for below, one in command.commands.items())
+            if command.commands
+            else (([name], command),)
+        )
+
+
+def parse(*words: str) -> argparse.Namespace:
+    return build_parser().parse_args(words)
+
+
+def refusal(capsys, words: list[str]) -> str:
+    """The last line for words that are refused."""
+    with pytest.raises(SystemExit) as caught:
+        parse(*words)
+    assert caught.value.code == 2
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+def test_every_example_is_accepted_its_handler_exists_and_its_help_shows_it(capsys):
+    for words, command in commands():
+        options = parse(*words, *shlex.split(command.example))
+        module, _, function = options.handler.partition(":")
+        assert callable(getattr(importlib.import_module(module), function)), words
+        with pytest.raises(SystemExit) as caught:
+            parse(*words, "--help")
+        told = " ".join(capsys.readouterr().out.split())
+        assert caught.value.code == 0 and "--json" in told
+        assert f"example: verso {' '.join(words)} {command.example}".rstrip() in told
+
+
+def test_the_page_is_the_one_that_the_table_makes():
+    """Else: python -m services.cli.reference > docs/commands.md."""
+    assert (ROOT / "docs" / "commands.md").read_text() == page()
+    for words, _ in commands():
+        assert f"# {' '.join(words)}\n" in page()
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys\nfrom services.cli.parser import build_parser\n"
+        "try: build_parser().parse_args(['capture', '--help'])\nexcept SystemExit: pass\n"
+        "assert not {'numpy', 'cv2', 'scipy', 'ray', 'pydantic', 'av'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL, timeout=60)
+
+
+HOSTILE = (
+    (["run", "j", "--scenes", "9" * 100_000], "'999"),
+    (["run", "j", "--scenes", "²"], "whole number"),
+    (["run", "j", "--workers", "0"], "whole number"),
+    (["replay", "o", "x"], "whole number"),
+    (["verify", "o", "--audit", "x"], "whole number"),
+    (["report", "o", "--scenes", "0"], "0 is not a whole number from 1 up"),
+    (["run", "j", "--out", "a\0b"], "'a\\x00b'"),
+    (["run", "j", "--out", "a\udcff"], "'a\\udcff'"),
+    (["run", "j", "--out", ""], "''"),
+    (["run", "j", "--out", "\x1b[31m"], "\\x1b[31m"),
+    (["run", "x" * 100_000], "'xxx"),
+    (["status", "a\0b"], "'a\\x00b'"),
+    (["run", "j", "--address", "x" * 70 + ":6379"], "HOST:PORT"),
+    (["run", "j", "--address", "localhost:99999"], "HOST:PORT"),
+    (["run", "j", "--address", "localhost:²"], "HOST:PORT"),
+    (["run", "j", "--address", "a\0b:6379"], "HOST:PORT"),
+    (["run", "j", "--address", "nonsense"], "HOST:PORT"),
+    (
+        ["run", "j", "--address", "ray://head:10001"],
+        "HOST:PORT (port 6379 by default) on a machine of the cluster, or `ray submit",
+    ),
+    (["run", "j", "--metrics", "9464"], "HOST:PORT"),
+    (["run", "j", "--metrics", "auto"], "HOST:PORT"),
+    (["\x1b[31m" * 10_000], "\\x1b[31m"),
+    (["capture"], "COMMAND"),
+    (["capture", "board", "b.pdf", "--tiles", "a3"], "a3"),
+    (["capture", "simulate", "--views", "4"], "--out"),
+    (["capture", "simulate", "--out", "d", "--views", "0"], "whole number"),
+    (["capture", "import", "r.mkv"], "--out"),
+    (["capture", "process", "d", "--estimate", "best"], "best"),
+    (["capture", "synthesize", "d"], "--pose --mirror"),
+    (["capture", "synthesize", "d", "--mirror", "--pose", "p.txt"], "not allowed"),
+    (["logs", "../../etc"], "error: argument"),
+    (["cancel", "j0a1b2c3"], "error: argument"),
+    (["cancel", "J0A1B2C3D"], "error: argument"),
+    (["logs", "$(touch x)"], "error: argument"),
+    (["submit", "j.yaml", "--priority", "high"], "error: argument"),
+    (["submit", "j.yaml", "--priority", "1001"], "error: argument"),
+    (["supervise", "--at-once", "0"], "error: argument"),
+    (["supervise", "--address", "127.0.0.1:8265"], "error: argument"),
+    (["supervise", "--address", "http://user:secret@host:8265"], "error: argument"),
+    (["drive", "j0a1b2c3d", "0"], "error: argument"),
 )
-def test_a_number_that_cannot_be_is_refused(words, capsys):
-    with pytest.raises(SystemExit) as caught:
-        build_parser().parse_args(words)
-    assert caught.value.code == 2
-    assert "whole number" in capsys.readouterr().err
 
 
-def test_a_command_that_has_commands_asks_for_one(capsys):
-    with pytest.raises(SystemExit) as caught:
-        build_parser().parse_args(["capture"])
-    assert caught.value.code == 2
-    assert "COMMAND" in capsys.readouterr().err
+def test_what_cannot_be_meant_is_refused_in_a_short_line(capsys):
+    for words, told in HOSTILE:
+        line = refusal(capsys, words)
+        assert told in line, words
+        assert line.isprintable() and len(line) < 500, line
+    for text in ("", "-", "3-", "5-3", "a-b", "1-2-3"):
+        with pytest.raises(argparse.ArgumentTypeError):
+            read_span(text)
+
+
+def test_what_can_be_meant_is_taken():
+    assert (read_span("0-63"), read_span("7")) == ((0, 63), (7, 7))
+    for address in ("auto", "127.0.0.1:6379", "head.cluster.local:6379", "[::1]:6379", "a_b-c:1"):
+        assert parse("run", "j", "--address", address).address == address
+    assert parse("submit", "j.yaml", "--priority", "-5").priority == -5
+    one = parse("capture", "synthesize", "d", "--pose", "p.txt")
+    assert (str(one.pose), one.mirror, one.out) == ("p.txt", False, None)
+    assert parse("capture", "simulate", "--out", "d", "--set", "a=1", "--set", "b=2").changes == ["a=1", "b=2"]
+    starts = [parse("bench", *words) for words in ([], ["--workers", "2"], ["--nodes", "1,4"])]
+    assert [options.starts_ray(options) for options in starts] == [False, True, True]
+
+
+ASK = """
+source "$1"
+COMP_WORDS=({words}) COMP_CWORD={at} COMP_LINE="{words}" COMP_POINT=99
+_shtab_verso "verso" "{last}" ""
+printf '%s\\n' "${{COMPREPLY[@]}}"
+"""
+
+
+def test_bash_completes_commands_and_options(tmp_path):
+    assert shutil.which("bash")
+    script = tmp_path / "verso.bash"
+    script.write_text(script_for("bash"))
+    for typed, offered in (
+        ("verso trad", "tradeoff"),
+        ("verso run --dry", "--dry-run"),
+        ("verso capture bo", "board"),
+        ("verso query --fo", "--format"),
+    ):
+        words = typed.split()
+        ask = ASK.format(words=typed, at=len(words) - 1, last=words[-1])
+        done = subprocess.run(["bash", "-c", ask, "bash", str(script)], capture_output=True, text=True, check=True)
+        assert offered in done.stdout.split()
+    assert "#compdef verso" in script_for("zsh")
+    assert "complete verso" in script_for("tcsh")

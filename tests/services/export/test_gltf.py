@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from services.export.gltf import NO_SOURCES, split_glb
+from services.export.gltf import NO_SOURCES
 from services.job.record import require_job
 from tests.exported import export_to, source_poses, source_rows
+from workers.assets.glb import split_glb
 from workers.store.local import LocalStore
 
 
@@ -123,4 +124,4 @@ def test_scenes_whose_sources_are_gone_are_left_out(pile, tmp_path):
 def test_the_container_is_split_where_its_json_ends(exported):
     tree, rest = split_glb(exported[0].read_bytes())
     assert tree == read_glb(exported[0])[0]
-    assert rest[8:] == read_glb(exported[0])[1]
+    assert rest == read_glb(exported[0])[1]

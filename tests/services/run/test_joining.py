@@ -5,15 +5,17 @@ import re
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import pytest
 
 from schemas.dataset.layout import FINGERPRINT_FILE
 from schemas.dataset.shard import Fingerprint, ShardOrder
 from services.job.job_file import validate_job
-from services.run.joining import terms_of_driver, with_own_stack
-from services.run.worker_entry import processor_flags
+from services.run.joining import Pattern, terms_of_driver, with_own_stack
+from services.run.worker_entry import WorkerTerms, processor_flags
 from tests.kit.ray_head import BareCluster, bare_cluster
+from workers.assets.catalogue import Catalogue
 from workers.render.raster.gbuffer import shared_renderer
 from workers.shard.code import code_digest
 from workers.shard.fingerprint import take_fingerprint
@@ -110,3 +112,8 @@ def test_workers_are_to_have_what_the_driver_has(monkeypatch):
     terms = terms_of_driver()
     assert ("OPENBLAS_CORETYPE", "Haswell") in terms.environment and "LP_NUM_THREADS" not in dict(terms.environment)
     assert (terms.code, terms.driver) == (code_digest(), socket.gethostname())
+
+
+def test_workers_of_a_private_ray_are_set_no_variables():
+    order = ShardOrder.of("out", validate_job({"name": "small", "scenes": 2}, "test"), "j" * 64)
+    assert Pattern(order, cast(Catalogue, None), WorkerTerms((("A", "1"),), "", "")).env_vars == {}

@@ -14,7 +14,8 @@ from schemas.scene.shape import Material, Part, Shape
 from tests.kit.shapes import asset_of
 from tests.workers.assets.oracles import welded, write
 from workers.assets.builtin.make import make_asset
-from workers.assets.external.mesh import is_solid, load_shape
+from workers.assets.external.formats import load_shape
+from workers.assets.external.mesh import is_solid
 from workers.assets.glb import asset_glb
 
 SOURCE = ProceduralSource(source="procedural")

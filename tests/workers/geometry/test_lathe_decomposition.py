@@ -13,14 +13,10 @@ from scipy.spatial import ConvexHull
 
 from schemas.job.assets import ProceduralSource
 from workers.assets.builtin.make import make_asset
-from workers.assets.builtin.solid import lathe, union
-from workers.assets.builtin.sweeps import prism
 from workers.geometry.distance import nearest_on_mesh
 from workers.geometry.lathe_decomposition import (
     COARSE,
-    decompose_lofts,
     partition_outlines,
-    stack_slabs,
     trace_visible_border,
 )
 from workers.geometry.mesh import solid_of, weld
@@ -48,18 +44,6 @@ def test_cells_are_convex_and_tile_the_outline(name):
     )
 
 
-def test_a_shallow_arc_is_kept_whole_only_within_the_tolerance():
-    """Each of its corners is 0.0004 deep, all together 0.04: the hull must not reach over it by more than asked."""
-    x = np.linspace(-1.0, 1.0, 21)
-    arc = np.stack([x, 0.04 * (x * x - 1.0)], axis=1)[::-1]
-    outline = np.concatenate([arc, [(-1.0, -2.0), (1.0, -2.0)]])
-    assert len(polygons(outline, 0.041)) == 1
-    for cell in polygons(outline, 0.01):
-        over = cell.convex_hull.difference(shapely.Polygon(outline))
-        assert over.buffer(-0.0051).is_empty
-    assert len(polygons(outline, 0.01)) > 1
-
-
 def test_outlines_that_are_cut_alike_are_all_convex():
     """The second has a reflex corner where the first is straight."""
     first = np.array([(0, 0), (2, 0), (2, 1), (2, 2), (0, 2)], dtype=np.float64)
@@ -72,21 +56,9 @@ def test_outlines_that_are_cut_alike_are_all_convex():
         assert sum(cell.area for cell in cells) == pytest.approx(shapely.Polygon(outline).area)
 
 
-SPOOL = np.array([(0.0, 0.0), (3.0, 0.0), (3.0, 1.0), (1.0, 1.0), (1.0, 4.0), (3.0, 4.0), (3.0, 5.0), (0.0, 5.0)])
-
-
 def visible(outline) -> shapely.Polygon:
     border = trace_visible_border(outline)
     return shapely.Polygon([outline[0], *((ring.radius, ring.height) for ring in border), outline[-1]])
-
-
-def test_a_thin_neck_reaches_into_its_wider_neighbours():
-    neck = SPOOL.copy()
-    neck[4:, 1] -= 2.9
-    stacks = stack_slabs(trace_visible_border(neck), neck[None], visible(neck), 1e-3, 0.5)
-    heights = [ring.height for ring in stacks[1]]
-    assert heights == pytest.approx([1.0, 1.1, 0.5, 1.6])
-    assert [ring.scale for ring in stacks[1]] == [1.0, 1.0, 0.5, 0.5]
 
 
 AIM_M = 5e-5
@@ -98,8 +70,6 @@ TWISTED_M = 1.7e-4
 ROUND = [("mug", 0), ("mug", 2), ("bowl", 3), ("jar", 1), ("jar", 3), ("can", 0), ("can", 3), ("bottle", 0)]
 ANGULAR = [("box", 0), ("box", 4), ("laptop", 1), ("camera", 0), ("camera", 2)]
 TWISTED = [("bowl", 2), ("jar", 0), ("bottle", 1)]
-
-CUP = np.array([(0, 0), (40, 0), (42, 60), (38, 60), (36, 5), (0, 5)], dtype=np.float64) / 1e3
 
 
 def built_in(category, number):
@@ -160,21 +130,6 @@ def test_parts_have_the_volume_of_the_shape(category, number):
     beyond, missing = volumes(parts_of(asset), solid)
     assert beyond < 2e-4 * solid.volume()
     assert missing < 1e-5 * solid.volume()
-
-
-def test_a_union_has_the_parts_of_all_and_moves_with_them():
-    cup, bar = (
-        lathe(CUP, [0] * 5, 24),
-        prism(np.array([(0.0, 0.0), (0.0, 0.01)]), (0.2, 0.01), 0.001, [1, 1, 1]),
-    )
-    both = union([cup, bar.moved(z=0.02)]).placed(
-        np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0, 0, 1.0]]), np.ones(3)
-    )
-    parts = decompose_lofts(both.lofts)
-    assert len(parts) == 26
-    points = np.concatenate(parts)
-    assert points.min(axis=0) == pytest.approx(both.vertices.min(axis=0), abs=1e-12)
-    assert points.max(axis=0) == pytest.approx(both.vertices.max(axis=0), abs=1e-12)
 
 
 def test_built_in_shapes_are_never_handed_to_coacd(monkeypatch):

@@ -138,16 +138,6 @@ def test_the_hull_of_a_shape_is_the_one_that_qhull_finds(category):
         assert agreement.max(axis=0)[areas > 1e-9].min() > 1.0 - 1e-9
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.1])
-def test_repeated_points_change_no_bit_of_a_hull(scale):
-    lattice = np.stack(np.meshgrid(*[np.arange(-4.0, 5.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) * scale
-    ball = lattice[np.linalg.norm(lattice, axis=1) < 4.3 * scale]
-    shuffled = np.random.default_rng(4).permutation(np.repeat(ball, 3, axis=0))
-    once, often = convex_hull(ball), convex_hull(np.concatenate([ball, shuffled]))
-    assert np.array_equal(once.vertices, often.vertices)
-    assert np.array_equal(once.normals, often.normals)
-
-
 @pytest.mark.parametrize("thick", [0.0, 1e-8, 1e-6, 1e-5, 1e-3])
 def test_a_thin_sheet_keeps_its_thickness(thick):
     points = np.random.default_rng(1).random((200, 3)) * [1.0, 1.0, thick]

@@ -12,7 +12,7 @@ from schemas.scene.view import Camera, Intrinsics
 from tests.workers.labels.planes import HERE, plane_view
 from tests.workers.labels.planes import K as PLANE_K
 from workers.geometry.camera import unproject
-from workers.geometry.colour import SRGB_STEPS, decode_codes, encode_codes, encode_srgb, has_holes
+from workers.geometry.colour import SRGB_STEPS, decode_codes, encode_codes, encode_srgb
 from workers.geometry.pixels import (
     count_filled,
     facing_cosine,
@@ -159,10 +159,3 @@ def test_every_code_comes_back_and_light_between_two_codes_goes_to_the_nearest()
     light = np.random.default_rng(0).uniform(-0.1, 1.1, 2000)
     assert (encode_codes(light) == np.rint(255.0 * encode_srgb(light))).all()
     assert SRGB_STEPS.shape == (256,)
-
-
-@pytest.mark.parametrize(("alpha", "holes"), [(255, False), (128, False), (127, True), (0, True)])
-def test_a_texel_more_transparent_than_not_is_a_hole(alpha, holes):
-    texture = np.full((3, 4, 4), 255, np.uint8)
-    texture[1, 2, 3] = alpha
-    assert has_holes(texture) is holes

@@ -11,7 +11,6 @@ import pytest
 import trimesh
 
 from schemas.scene.shape import Mesh
-from tests.kit import shapes
 from tests.kit.contacts import UP as UPWARDS
 from tests.kit.contacts import box, contacts_between, mesh_of, tipped
 from workers.geometry.frames import pose, rotation_about, uniform_rotation
@@ -20,7 +19,6 @@ from workers.physics.contact_surface import (
     crop,
     faces_within,
     find_near,
-    is_closed,
     skin_of,
     surface_of,
 )
@@ -49,28 +47,6 @@ def test_a_box_has_eight_corners_twelve_edges_and_its_body_below_every_face():
     assert (surface.side == 1).all()
 
 
-def test_what_lies_within_a_plane_touches_nothing():
-    fine = trimesh.creation.box((0.1, 0.1, 0.1)).subdivide().subdivide()
-    surface = surface_of(mesh_of(fine), True)
-    assert len(surface.vertices) > 50
-    ends = surface.vertices[surface.corners]
-    assert (np.isclose(np.abs(ends), 0.05).sum(axis=1) >= 2).all()  # on the box's twelve edges
-
-
-def test_about_the_faces_of_a_hollow_the_body_is_neither_above_nor_below():
-    ring = trimesh.boolean.difference([trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.06, 0.06, 0.2))])
-    surface = surface_of(mesh_of(ring), True)
-    centres = surface.vertices[surface.faces].mean(axis=1)
-    inner = (np.abs(centres[:, :2]).max(axis=1) < 0.04) & (np.abs(centres[:, 2]) < 0.05 - 1e-9)
-    assert (surface.side[inner] <= 0).all() and inner.any()
-
-
-def test_a_sheet_is_bound_by_edges_with_one_vertex_across():
-    sheet = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]], np.int32))
-    surface = surface_of(sheet, False)
-    assert len(surface.edges) == 4 and (surface.across[:, 0] == surface.across[:, 1]).all()
-
-
 def test_a_part_has_all_that_shares_a_corner_with_what_overlaps_the_box():
     ball = mesh_of(trimesh.creation.icosphere(3, 0.05))
     low, high = np.array([-1.0, -1.0, -1.0]), np.array([1.0, 1.0, -0.045])
@@ -79,13 +55,6 @@ def test_a_part_has_all_that_shares_a_corner_with_what_overlaps_the_box():
     touched = np.unique(ball.faces[(ball.vertices[ball.faces][:, :, 2].min(axis=1) <= -0.045)])
     sharing = np.isin(ball.faces, touched).any(axis=1)
     assert {tuple(face) for face in ball.faces[sharing].tolist()} <= {tuple(face) for face in part.faces.tolist()}
-
-
-def test_a_surface_without_an_inside_has_its_body_on_neither_side():
-    cube = box((0.1, 0.1, 0.1))
-    open_box = Mesh(cube.vertices, cube.faces[2:])
-    assert is_closed(cube) and not is_closed(open_box)
-    assert (surface_of(open_box, is_closed(open_box)).side == 0).all()
 
 
 def surface(mesh: trimesh.Trimesh, closed: bool = True) -> Surface:
@@ -122,26 +91,6 @@ def middles(triangles: np.ndarray) -> np.ndarray:
     """The triangles at a third of their size, about their middles."""
     middle = triangles.mean(axis=1, keepdims=True)
     return np.ascontiguousarray(middle + (triangles - middle) / 3.0)
-
-
-def test_a_side_of_a_box_is_one_piece_with_its_four_corners_and_a_point_below():
-    pieces = skin_of(surface(shapes.box(0.2, 0.1, 0.06)), np.arange(12), DEEP_M)
-    assert len(pieces) == 6
-    for piece in pieces:
-        corners, below = piece[:-1], piece[-1]
-        assert len(corners) == 4
-        (axis,) = np.flatnonzero(np.ptp(corners, axis=0) == 0.0)
-        assert below[axis] == pytest.approx(corners[0, axis] - np.sign(corners[0, axis]) * DEEP_M)
-        assert np.allclose(np.delete(below, axis), 0.0)
-
-
-def test_faces_in_a_plane_that_fill_no_convex_outline_are_a_piece_each():
-    """The ends of a tube are rings; its sides are quadrilaterals, one piece each."""
-    tube = trimesh.creation.annulus(0.03, 0.05, 0.1, sections=24)
-    pieces = skin_of(surface(tube), np.arange(len(tube.faces)), DEEP_M)
-    assert sorted({len(one) for one in pieces}) == [4, 5]
-    assert sum(len(one) == 5 for one in pieces) == 2 * 24
-    assert sum(len(one) == 4 for one in pieces) == 2 * 2 * 24
 
 
 def wedge(angle_deg: float) -> trimesh.Trimesh:
@@ -231,14 +180,6 @@ def test_a_corner_leaves_a_body_the_shorter_way():
     found = touching(tip, GROUND)
     assert found.gaps.min() == pytest.approx(-2e-5, abs=1e-12)
     assert found.normals[np.argmin(found.gaps)] == pytest.approx(UPWARDS)
-
-
-def test_a_ring_hangs_on_a_peg():
-    """A square ring over a square bar: its concave side bears it."""
-    ring = trimesh.boolean.difference([trimesh.creation.box((0.1, 0.02, 0.1)), trimesh.creation.box((0.08, 0.1, 0.08))])
-    found = touching(mesh_of(ring), box((0.01, 0.2, 0.01), (0.0, 0.0, 0.035)))
-    assert found.points[:, 2] == pytest.approx(0.04, abs=1e-9)
-    assert found.normals == pytest.approx(np.tile(UPWARDS, (len(found.gaps), 1)), abs=1e-9)
 
 
 def test_a_ball_on_the_deepest_face_of_a_hollow_is_held_by_it():

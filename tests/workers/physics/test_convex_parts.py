@@ -17,9 +17,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from schemas.errors import MachineError, MeshError
-from schemas.job.assets import ProceduralSource
 from schemas.scene.shape import Mesh
-from workers.assets.builtin.make import make_asset
 from workers.geometry.hull import convex_hull
 from workers.geometry.mesh import components, weld
 from workers.physics import coacd_process
@@ -149,13 +147,6 @@ def test_nothing_stands_in_a_tray_and_nothing_out_of_it():
         assert any(holds(cloud, np.array([x, y, z])) for cloud in parts.clouds)
 
 
-@pytest.mark.parametrize("category", ["laptop", "bottle"])
-def test_the_parts_of_a_shape_have_its_hull(category):
-    mesh = make_asset(category, ProceduralSource(source="procedural"), 0, 600.0).shape.mesh
-    points = np.concatenate(decompose(mesh, category, threshold=0.1, folder=None).clouds)
-    assert ConvexHull(points).volume == pytest.approx(ConvexHull(mesh.vertices).volume, rel=1e-12)
-
-
 def test_pieces_are_those_that_touch_at_a_vertex_once_seams_are_closed():
     box = trimesh.creation.box((1, 1, 1))
     loose = Mesh(np.asarray(box.vertices)[np.asarray(box.faces).ravel()], np.arange(36, dtype=np.int32).reshape(-1, 3))
@@ -191,28 +182,6 @@ def test_where_coacd_gives_up_the_hulls_of_the_pieces_serve(monkeypatch):
     assert ConvexHull(parts.clouds[0]).volume == pytest.approx(0.2 * 0.2 * 0.05, rel=1e-6)
 
 
-SCRAPS = {
-    "triangle": [(0, 0, 0.2), (0.01, 0, 0.2), (0, 0.01, 0.2)],
-    "needle": [(0, 0, 0.2), (0.1, 1e-8, 0.2), (0.05, 0, 0.2 + 1e-8), (0.02, 1e-8, 0.2 - 1e-8)],
-    "dust": [(0, 0, 0.2), (1e-15, 0, 0.2), (0, 1e-15, 0.2), (0, 0, 0.2 + 1e-15)],
-}
-
-
-@pytest.mark.parametrize("scrap", SCRAPS)
-def test_a_loose_scrap_beside_a_body_has_a_part_with_a_hull_or_none(scrap):
-    """A part without a hull ended the whole job: a body is built of the hulls of its parts."""
-    body, points = angle_iron(), np.array(SCRAPS[scrap])
-    start = len(body.vertices)
-    faces = [(start, start + 1, start + 2), *([(start, start + 1, start + 3)] if len(points) > 3 else [])]
-    mesh = Mesh(np.concatenate([body.vertices, points]), np.concatenate([body.faces, np.array(faces, dtype=np.int32)]))
-    parts = decompose(mesh, scrap, folder=None)
-    assert len(parts.clouds) >= 2
-    hull = ConvexHull(mesh.vertices, qhull_options="Qt")
-    for cloud in parts.clouds:
-        convex_hull(cloud)
-        assert (cloud @ hull.equations[:, :3].T + hull.equations[:, 3]).max() < 1e-7
-
-
 def slow_mesh(monkeypatch):
     """An open tray, cut so finely that CoACD takes minutes, with a second of processor time for it."""
     monkeypatch.setattr(module, "OPEN", {"preprocess_mode": "on", "preprocess_resolution": 1000})
@@ -233,15 +202,6 @@ def test_a_mesh_whose_parts_take_too_much_processor_time_is_refused_and_the_refu
     monkeypatch.setattr(module, "_run", lambda *_: pytest.fail("tried once more"))
     with pytest.raises(MeshError, match="no_convex_parts"):
         decompose(mesh, "endless", folder=tmp_path)
-
-
-def test_where_coacd_has_too_little_memory_the_hulls_of_the_pieces_serve(monkeypatch):
-    """With 400 MiB it can be loaded and cuts an L, but has no room for 400 voxels along each axis."""
-    monkeypatch.setattr(module, "MEMORY_MB", 400)
-    assert decompose(angle_iron(), "enough memory", folder=None).method == "coacd"
-    monkeypatch.setattr(module, "OPEN", {"preprocess_mode": "on", "preprocess_resolution": 400})
-    mesh = tray()
-    assert decompose(Mesh(mesh.vertices, mesh.faces[2:]), "no memory", folder=None).method == "pieces"
 
 
 @pytest.mark.parametrize(("code", "message"), [(3, "not installed"), (-9, "killed")])

@@ -12,15 +12,11 @@ import pytest
 from schemas.job.job import Job
 from schemas.job.physics import Physics
 from schemas.scene.scene import EffectPlan, ObjectStart
-from schemas.scene.shape import Mesh
 from tests.kit.shapes import asset_of, box, table
 from workers.geometry.frames import (
     pose,
     quaternion_from_rotation,
-    rotation_about,
-    transform,
     translation,
-    uniform_rotation,
 )
 from workers.geometry.hull import convex_hull
 from workers.physics.bullet import GRAVITY_M_S2
@@ -110,18 +106,6 @@ def test_a_rise_is_measured_from_the_least_so_far_and_against_all_that_was_set_f
     assert record_of(*((height, AT_REST) for height in heights)) == pytest.approx(4e-4 / (SHARE * 1.0))
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_turning_counts_by_the_moments_along_the_bodys_axes_whatever_its_pose(seed):
-    rng = np.random.default_rng(seed)
-    R, spin = uniform_rotation(rng), rng.standard_normal(3)
-    at = ((0.3, -0.2, 0.0), tuple(quaternion_from_rotation(R)))
-    record = EnergyRecord([BODY], [at], [AT_REST])
-    record.add([at], [((0.0, 0.0, 0.0), tuple(spin))])
-    joules = spin @ (R @ np.diag(BODY.moments) @ R.T) @ spin / 2
-    assert record.rise() * LIFT_M * BODY.mass_kg * GRAVITY_M_S2 == pytest.approx(joules, rel=1e-12)
-
-
-Z = np.array([0.0, 0.0, 1.0])
 COARSE = StepSizes(PHYSICS.step_hz, math.inf)
 
 
@@ -179,40 +163,3 @@ def test_a_stop_condition_ends_the_fall_and_is_named():
     assert 0.9 - 8 * 2.0 / PHYSICS.step_hz <= motion.poses[0][2, 3] < 0.9
     after = motion.speed_m_s - math.sqrt(2 * GRAVITY_M_S2 * 0.1)
     assert 0.0 <= after <= 9 * GRAVITY_M_S2 / PHYSICS.step_hz  # it looks every eight steps
-
-
-def bevelled(heading: int) -> Mesh:
-    """Level up to x = 0, from there down by 22 degrees and by 63, turned about z by so many quarters."""
-    x, z = np.array([-0.5, 0.0, 0.004, 0.006]), np.array([0.0, 0.0, -0.0016, -0.0055])
-    vertices = np.stack([np.repeat(x, 2), np.tile([-0.5, 0.5], 4), np.repeat(z, 2)], axis=1)
-    faces = np.concatenate([2 * k + np.array([[0, 2, 3], [0, 3, 1]]) for k in range(3)])
-    return Mesh(transform(pose(rotation_about(Z, heading * math.pi / 2), np.zeros(3)), vertices), faces)
-
-
-@pytest.mark.parametrize("inside_m", [0.0005, 0.001, 0.0015, 0.002])
-@pytest.mark.parametrize("heading", range(4))
-def test_a_corner_that_comes_down_beside_an_edge_of_a_mesh_does_not_sink_in(heading, inside_m):
-    """A hundredth of a millimetre is what Bullet leaves: the steps that foresee a contact end at it."""
-    corners = 0.08 * np.concatenate([np.eye(3), -np.eye(3)])
-    body = Body(0.3, np.full(3, 4e-4), (corners,), 1e-4, reach_m=0.08)
-    start = rotation_about(Z, heading * math.pi / 2) @ np.array([-inside_m, 0.013, 0.0801 + 0.005])
-    steps = StepSizes(PHYSICS.step_hz, PHYSICS.max_step_travel_mm / 1e3)
-    end = fall([body], [translation(*start)], bevelled(heading), for_seconds(0.04), steps, 0.005)
-    lowest = transform(end.poses[0], corners)[:, 2].min() - 1e-4
-    assert end.seconds > 0.035
-    assert -1.3e-5 < lowest < 1e-5
-
-
-def test_a_domino_that_sleeps_is_knocked_over_as_one_that_is_awake():
-    domino = asset_of(box(0.01, 0.08, 0.2))
-    standing = ObjectStart(domino, convex_hull(domino.shape.vertices), 3, translation(0.0, 0.0, 0.1 + 2e-5), 0, False)
-    falling = start_at(pose(rotation_about(np.array([0.0, 1.0, 0.0]), 0.5), np.array([0.05, 0.0, 2.0])))
-    poses = [start.T_world_obj for start in (standing, falling)]
-    bodies = [make_body(start) for start in (standing, falling)]
-    awake, asleep = (
-        fall(bodies, poses, 0.0, for_seconds(5.0), StepSizes(960.0, 1e-3), 0.0, sleeping=sleeping)
-        for sleeping in (False, True)
-    )
-    assert awake.rested and asleep.rested
-    assert abs(awake.poses[0][2, 2]) < 1e-6  # flat
-    assert asleep.poses[0] == pytest.approx(awake.poses[0], abs=1e-3)

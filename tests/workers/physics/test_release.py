@@ -14,14 +14,13 @@ from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan, ObjectStart, Table
 from schemas.scene.shape import Asset
 from tests.hard_cases.bodies import built_in, cube
-from tests.hard_cases.drops import X, Y, level, table_of, turn
-from tests.hard_cases.groups import put, stack, together, tray
+from tests.hard_cases.drops import Y, level, table_of, turn
+from tests.hard_cases.groups import put, together, tray
 from tests.kit.shapes import asset_of, box, table
 from tests.physics.settling import recheck_group, settle_group
-from workers.geometry.frames import motion_between, pose, transform, translation
+from workers.geometry.frames import motion_between, pose, translation
 from workers.geometry.hull import convex_hull
 from workers.physics import release as module
-from workers.physics.exact_rest import rest
 from workers.physics.fall import LOOK_STEPS, SAMPLE_STEPS, fall
 from workers.physics.placement import Placement, forms_of, place
 from workers.physics.release import (
@@ -85,17 +84,6 @@ def falls_of(drop: Drop, rises: list[float], monkeypatch) -> list[tuple[float, i
     return falls
 
 
-def test_a_tall_stack_rests_where_not_all_of_an_impulse_is_kept_and_sways_where_it_is():
-    """Each of twenty-five cubes falls onto the one below, the highest by 12.5 mm, and slips by 0.1 mm at most."""
-    group, physics = stack(*[cube(0.05)] * 25), PHYSICS.model_copy(update={"max_settle_s": 0.4})
-    drop = Drop(group.starts, group.table, physics, EffectPlan(("dynamics", "fine_step", "object_contacts"), {}))
-    paces = [dataclasses.replace(PACES_TOGETHER[-1], speed=1.0, kept=kept) for kept in (1.0, 0.85)]
-    ends = [release(drop, True, (pace,)) for pace in paces]
-    assert [end.rested for end in ends] == [False, True] and PACES_TOGETHER[-1].kept == 0.85
-    moved = [T[:2, 3] - start.T_world_obj[:2, 3] for T, start in zip(ends[1].poses, group.starts, strict=True)]
-    assert np.linalg.norm(moved, axis=1).max() < 5e-4
-
-
 BRIEF = PHYSICS.model_copy(update={"max_settle_s": 0.01})
 ALONE = Drop((start_of(CUBE, 0, 0, 0.031),), TABLE, BRIEF, EffectPlan(("dynamics", "fine_step"), {}))
 
@@ -115,16 +103,6 @@ def test_what_gains_energy_falls_again_in_shorter_steps_until_it_gains_none(monk
 def many_mugs() -> Drop:
     starts = tuple(start_of(built_in("mug"), 0.2 * k - 0.3, 0.0, 0.06) for k in range(MANY))
     return Drop(starts, TABLE, BRIEF, EffectPlan(("dynamics", "fine_step", "object_contacts", "decomposition"), {}))
-
-
-def test_looks_at_the_energy_change_nothing_of_a_drop(monkeypatch):
-    start = start_of(CUBE, 0.0, 0.0, 0.1, turn(X, 40) @ turn(np.array([0.0, 1.0, 0.0]), 25))
-    drop = Drop((start,), TABLE, PHYSICS, EffectPlan(("dynamics", "fine_step"), {}))
-    seldom = release(drop, True, PACES[:1])
-    monkeypatch.setattr("workers.physics.release.LOOK_STEPS", 1)
-    often = release(drop, True, PACES[:1])
-    assert np.array_equal(often.poses[0], seldom.poses[0]) and often.seconds == seldom.seconds
-    assert often.rise >= seldom.rise
 
 
 @pytest.mark.parametrize("gap_m", [0.0001, 0.0002, 0.00046])
@@ -197,39 +175,6 @@ def leaning(degrees: float) -> tuple[tuple[ObjectStart, ...], Table]:
 def test_cubes_stay_on_a_ramp_a_degree_below_the_angle_of_friction_and_slide_on_one_a_degree_above():
     assert let_go_for(0.3, *leaning(25.1)) < HELD_M
     assert let_go_for(0.3, *leaning(27.1)) > FAR_M
-
-
-def test_a_small_cube_in_a_hollow_stays_where_exact_rest_puts_it():
-    """In a bowl, whose parts and whose hull would push it out."""
-    table = level()
-    bowl = put(built_in("bowl"), table, 0.0)
-    inner = float(transform(bowl.T_world_obj, bowl.asset.shape.vertices)[:, 2].max()) - table.top.height_m
-    starts = together(table, [bowl, put(cube(0.02), table, inner + 0.002)]).starts
-    settled = settle_group(starts, table, PHYSICS)
-    at = [dataclasses.replace(one, T_world_obj=rest.T_world_obj) for one, rest in zip(starts, settled, strict=True)]
-    assert let_go_for(0.25, at, table) < 1e-4
-    lifted = dataclasses.replace(at[1], T_world_obj=translation(0.0, 0.0, 3e-4) @ at[1].T_world_obj)
-    assert let_go_for(0.25, [at[0], lifted], table) > 1e-4
-
-
-def hanging() -> tuple[tuple[ObjectStart, ...], Table]:
-    """A cube of 50 mm in a slot of 50 mm, 20 mm above its floor, and one that lies beside the slot."""
-    walls = [box(0.02, 0.3, 0.1, (x, 0.0, 0.05)) for x in (-0.035, 0.035)]
-    table = table_of(box(0.4, 0.4, 0.03, (0.0, 0.0, -0.015)), *walls)
-    floor = float(np.sort(np.unique(np.round(table.mesh.vertices[:, 2], 9)))[1]) - table.top.height_m
-    starts = [put(cube(0.05), table, floor + 0.02), put(cube(0.05), table, floor, (0.12, 0.0))]
-    return together(table, starts).starts, table
-
-
-def test_what_friction_could_hold_but_does_not_is_balanced_and_falls_when_it_is_let_go(monkeypatch):
-    """Walls that squeeze the cube hard enough would hold it, and nothing squeezes it."""
-    starts, table = hanging()
-    drop, placement = released(starts, table)
-    poses = [one.T_world_obj for one in starts]
-    rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction)
-    assert rested.still and np.abs(np.subtract(rested.poses, poses)).max() < 1e-6
-    assert let_go_for(0.25, starts, table) > FAR_M
-    assert not hold(drop, placement, poses).still
 
 
 def beside(gap_m: float) -> tuple[tuple[ObjectStart, ...], Table]:

@@ -5,7 +5,6 @@ does what it says, and the defaults stay as they were.
 """
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ import trimesh
 
 from schemas.errors import SettleError
 from schemas.job.job import Job
-from schemas.job.physics import Collision, Physics
 from schemas.scene.scene import EffectPlan, ObjectStart, Settled
 from schemas.scene.shape import Asset, Mesh
 from tests.kit.shapes import asset_of, box, table
@@ -21,7 +19,7 @@ from tests.physics.settling import effects_of, recheck, scene_of, settle_group, 
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.geometry.hull import convex_hull
 from workers.physics import settle
-from workers.physics.effects import PREDICATES, called_for
+from workers.physics.effects import called_for
 from workers.physics.exact_rest import Rested
 from workers.physics.fall import FINEST, fall
 from workers.physics.settle import (
@@ -120,17 +118,6 @@ def test_the_same_starts_give_the_same_bits_whatever_was_simulated_before():
     settle_single(start_of(CUBE, 0, 0, 0.3, rotation_about(np.eye(3)[0], 0.7)), TABLE, PHYSICS)
     second = settle_group(starts, TABLE, PHYSICS, ALL)
     assert [a.T_world_obj.tobytes() for a in first] == [b.T_world_obj.tobytes() for b in second]
-
-
-def test_an_object_hollow_to_the_side_takes_another_in_only_in_parts():
-    """A U on its side, 60 mm open, with a cube of 40 mm let go within it: a hull would throw it out."""
-    walls = [box(0.1, 0.1, 0.01, (0, 0, z)) for z in (0.005, 0.085)]
-    back = box(0.01, 0.1, 0.07, (-0.045, 0, 0.045))
-    hollow = asset_of(*walls, back)
-    starts = [start_of(hollow, 0, 0, 0.0005), start_of(asset_of(box(0.04, 0.04, 0.04)), 0.01, 0, 0.0315)]
-    assert "decomposition" in called_for(starts, TABLE, PHYSICS)
-    rest = scene(starts)
-    assert heights_of(rest.settled)[1] == pytest.approx(0.03, abs=5e-5)
 
 
 def test_the_forces_of_a_pile_prove_its_balance():
@@ -232,45 +219,3 @@ def test_a_table_finer_than_the_simulator_takes_is_a_failure_with_its_counts():
     with pytest.raises(SettleError, match="takes 131072 and 174762") as error:
         settle_single(start_at(asset, translation(0.0, 0.0, TOP + 0.13)), fine, PHYSICS)
     assert error.value.reason == "table_too_fine"
-
-
-UPRIGHT = np.eye(3)
-CAN = asset_of(trimesh.creation.cylinder(0.04, 0.12, sections=48))
-TRAY = asset_of(box(0.2, 0.2, 0.05).difference(box(0.18, 0.18, 0.05).apply_translation([0, 0, 0.01])))
-
-
-def with_(**changes: object) -> Physics:
-    return Physics.model_validate({**PHYSICS.model_dump(), **changes})
-
-
-def start_above(asset, turn=UPRIGHT, height: float = 0.1) -> ObjectStart:
-    hull = convex_hull(asset.shape.vertices)
-    low = float((hull.vertices @ turn.T)[:, 2].min())
-    return ObjectStart(asset, hull, 3, pose(turn, np.array([0.0, 0.0, TOP + height - low])), 0, False)
-
-
-@pytest.mark.parametrize(
-    ("collision", "why"),
-    [
-        ("planned", "over a flat top an object touches with its hull alone"),
-        ("hull", "physics.collision is hull"),
-        ("box", "physics.collision is box"),
-        ("parts", None),
-    ],
-)
-def test_convex_parts_are_called_for_as_the_key_says(collision: Collision, why: str | None):
-    start, physics = start_above(TRAY), with_(collision=collision)
-    assert PREDICATES["decomposition"]((start,), TABLE, physics) == why
-    assert ("decomposition" in called_for((start,), TABLE, physics)) == (why is None)
-
-
-def test_without_exact_rest_an_object_stays_where_the_simulator_left_it():
-    """Bullet leaves what rests some micrometres deep or tilted; with exact rest nothing of that is left."""
-    tilted = rotation_about(np.array([0.8, 0.6, 0.0]), math.radians(3.0))
-    for asset in (CAN, TRAY):
-        raw = settle_single(start_above(asset, tilted, 0.005), TABLE, with_(exact_rest=False))
-        corrected = settle_single(start_above(asset, tilted, 0.005), TABLE, PHYSICS)
-        assert 0.0 < raw.penetration_mm + raw.hover_gap_mm < 0.1
-        assert corrected.penetration_mm + corrected.hover_gap_mm < 1e-9
-        assert np.abs(corrected.T_world_obj[2, :3]).max() == pytest.approx(1.0, abs=1e-12)
-        assert np.abs(raw.T_world_obj[2, :3]).max() == pytest.approx(1.0, abs=1e-5)

@@ -15,7 +15,7 @@ import trimesh
 
 from schemas.base import frozen_array
 from schemas.scene.scene import Placed
-from schemas.scene.shape import REGION_FIRST_OBJECT, Appearance, Light, Material, Part, Shape
+from schemas.scene.shape import REGION_FIRST_OBJECT, Appearance, Light, Material
 from tests.workers.render.looks import BLACK, OVERHEAD, matte, paths, traced, with_material, without
 from tests.workers.render.random_scenes import (
     APPEARANCE,
@@ -86,33 +86,6 @@ def through(tracer, material, look=None):
     pane = Placed(4, with_material(facing(2.0, 4.0), material), EYE)
     sky = Appearance((0.8, 0.8, 0.8), (), BLACK, (0.8, 0.8, 0.8))
     return tracer.radiance([wall, pane], sky, camera(small(9, 9)), *(look or paths(64)), 0).mean((0, 1))
-
-
-@traced
-def test_the_second_side_of_a_wall_changes_nothing(tracer):
-    behind = Material((0.7, 0.8, 0.8, 1.0), transmission=1.0, ior=1.0)
-    (part,) = facing(3.0, 9.0).parts
-    wall = Placed(3, with_material(facing(3.0, 9.0), RED), EYE)
-    look = Appearance((0.8, 0.8, 0.8), (), BLACK, (0.8, 0.8, 0.8))
-    alone = tracer.radiance([wall], look, camera(small(9, 9)), *paths(64), 0).mean((0, 1))
-    assert through(tracer, behind) == pytest.approx(alone, rel=0.02)
-    assert part.faces.shape == (2, 3)
-
-
-@traced
-def test_only_the_clear_part_of_a_labelled_glass_lets_light_through(tracer):
-    half = np.zeros((8, 8), np.uint8)
-    half[:4] = 255
-    (part,) = facing(2.0, 4.0).parts
-    uv = frozen_array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    paper = Material((0.2, 0.2, 0.9, 1.0), roughness=1.0, transmission=1.0, transmission_map=half)
-    pane = Placed(4, Shape((Part("pane", part.vertices, part.faces, paper, uv=uv),)), EYE)
-    wall = Placed(3, with_material(facing(3.0, 9.0), RED), EYE)
-    look = Appearance((0.8, 0.8, 0.8), (), BLACK, (0.8, 0.8, 0.8))
-    seen = tracer.radiance([wall, pane], look, camera(small(16, 16)), *paths(16), 0)
-    lower, upper = seen[:6].mean((0, 1)), seen[-6:].mean((0, 1))  # v runs up, and y of this camera down
-    assert upper[0] > 2.0 * upper[2]
-    assert lower[2] > 2.0 * lower[0]
 
 
 def cast(tracer, things, appearance, view):

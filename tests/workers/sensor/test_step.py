@@ -14,7 +14,7 @@ from services.read.query import query
 from services.read.verify import verify
 from services.run.ray_cluster import Slots, private_ray
 from services.run.run_job import RunRequest, run_job
-from tests.services.run.test_step import SMALL
+from tests.services.run.test_run_job import SMALL
 from workers.geometry.colour import decode_codes
 from workers.scene.sensor import SensorChance, planned_effects, sense_view
 from workers.store.local import LocalStore

@@ -1,46 +1,35 @@
 """Pure: the built-in assets; the same instance for the same category, seed and index, in every version."""
 
 import hashlib
+import importlib
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 
 from schemas.base import frozen_array
-from schemas.job.assets import TABLE, ProceduralSource
+from schemas.job.assets import BUILT_IN, TABLE, ProceduralSource, instance_id
 from schemas.scene.shape import Asset, Lofted, Shape
-from workers.assets.builtin.bottle import make_bottle
-from workers.assets.builtin.box import make_box
-from workers.assets.builtin.camera import make_camera
-from workers.assets.builtin.can import make_can
-from workers.assets.builtin.crockery import make_bowl, make_mug
-from workers.assets.builtin.identity import instance_id
-from workers.assets.builtin.jar import make_jar
-from workers.assets.builtin.laptop import make_laptop
 from workers.assets.builtin.parts import Model, cut_into_parts
-from workers.assets.builtin.table import make_table
 from workers.assets.mass import solid_mass
 from workers.geometry.frames import pose
 from workers.geometry.mesh import bounds_of
 
 LICENCE = "CC0-1.0"
-GENERATORS: dict[str, tuple[int, Callable[[np.random.Generator], Model]]] = {
-    "bottle": (0, make_bottle),
-    "camera": (1, make_camera),
-    "can": (2, make_can),
-    "jar": (3, make_jar),
-    "laptop": (4, make_laptop),
-    "mug": (5, make_mug),
-    "bowl": (6, make_bowl),
-    "box": (7, make_box),
-    TABLE: (8, make_table),
-}
-"""The number of each category in the seed's spawn key, which never changes, and its generator."""
 
 
 def make_model(category: str, seed: int, index: int) -> Model:
     """Instance `index` of a category, in true metres; the same bits for the same arguments."""
-    number, make = GENERATORS[category]
-    return make(np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, index))))
+    stream = np.random.SeedSequence(seed, spawn_key=(BUILT_IN[category].number, index))
+    return _generator(BUILT_IN[category].generator)(np.random.default_rng(stream))
+
+
+@cache
+def _generator(name: str) -> Callable[[np.random.Generator], Model]:
+    """The function of a `Category.generator`."""
+    module, _, function = name.partition(":")
+    make: Callable[[np.random.Generator], Model] = getattr(importlib.import_module(f"{__package__}.{module}"), function)
+    return make
 
 
 def make_asset(category: str, settings: ProceduralSource, index: int, density_kg_m3: float) -> Asset:

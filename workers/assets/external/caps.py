@@ -7,6 +7,8 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 from trimesh.resolvers import Resolver
 
@@ -186,3 +188,22 @@ def open_image(data: bytes, limits: MeshLimits) -> tuple[tuple[int, int], str | 
     if max(size) > limits.max_texture_px:
         return size, f"has {max(size)} px, over max_texture_px = {limits.max_texture_px}"
     return size, None
+
+
+def decode_picture(data: bytes, notes: list[str]) -> NDArray[np.uint8] | None:
+    """[h, w, 3 or 4] uint8, read-only, of bytes that `Budget.take_image` let pass; None with a note where they are damaged."""
+    try:
+        with warnings.catch_warnings(), Image.open(io.BytesIO(data), formats=tuple(_IMAGE_KINDS.values())) as image:
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            return picture_pixels(image)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
+        notes.append(f"a texture cannot be decoded ({describe_error(error)}): plain base colour used")
+        return None
+
+
+def picture_pixels(image: Image.Image) -> NDArray[np.uint8]:
+    """[h, w, 3 or 4] uint8, read-only: the pixels of a picture, with alpha where it has some."""
+    alpha = "A" in image.getbands() or "transparency" in image.info
+    pixels = np.array(image.convert("RGBA" if alpha else "RGB"), dtype=np.uint8)
+    pixels.setflags(write=False)
+    return pixels

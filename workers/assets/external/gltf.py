@@ -1,113 +1,329 @@
-"""Edge: .gltf and .glb files: packs the files that a .gltf names into one GLB, and checks a GLB against the caps."""
+"""Edge: reads .glb and .gltf files from outside: the JSON tree, and the accessors that its meshes name.
+
+A reader of its own, because none of the libraries fits: trimesh reads files and refuses `../` with a resolver, but decodes every
+picture, and ignores texCoord, sparse accessors, texture transforms, alphaMode and required extensions without a word; pygltflib
+reads the tree and leaves buffers, pictures, node poses and every check to its user, which is this file. Whatever a file states
+can be obeyed or named here: an attribute in `_mesh`, a property of a material in `_material`, a required extension in
+`_refuse_extensions`.
+
+Everything that the tree says is a stranger's: counts are held to the caps before anything is built, names go through the folder's
+resolver, and whatever malformed JSON raises becomes a MeshError.
+"""
 
 import base64
-import binascii
 import json
+import math
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.base import Pose
 from schemas.errors import MeshError
+from schemas.scene.shape import Material
 from workers.assets.external.caps import (
     LONGEST_NAME,
-    Budget,
     FolderResolver,
     check_counts,
     check_nodes,
+    decode_picture,
     describe_error,
-    open_image,
 )
+from workers.assets.external.mesh import DEFAULT, WHITE, MeshVisual, RawMesh, make_material
+from workers.assets.glb import split_glb
+from workers.geometry.colour import encode_srgb
 
 MALFORMED = (struct.error, ArithmeticError, ValueError, LookupError, TypeError, AttributeError, RecursionError)
 """What reading a stranger's JSON may raise."""
 
-GEOMETRY_EXTENSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 """Extensions that hide coordinates from a reader that does not know them."""
+
+_GLOSS = "KHR_materials_pbrSpecularGlossiness"
+_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 
 def named_by_gltf(path: Path, data: bytes) -> list[str]:
-    """Names of the files that a .gltf refers to, buffers first, each once; MeshError `unreadable`."""
+    """Names of the files that a glTF file refers to, buffers first, each once; MeshError `unreadable`."""
     try:
-        files = [uri for uri in _references(_parse(data)) if not uri.startswith("data:") and not _is_address(uri)]
-        return list(dict.fromkeys(map(unquote, files)))
+        tree, _ = _parse(path, data)
+        pictures = [
+            _picture_of(tree, reference) for material in tree.get("materials", []) if (reference := _colour(material))
+        ]
+        images = [tree["images"][number] for number in pictures if number is not None]
+        uris = [item["uri"] for item in (*tree.get("buffers", []), *images) if isinstance(item.get("uri"), str)]
+        return list(dict.fromkeys(unquote(uri) for uri in uris if not uri.startswith("data:") and not _is_address(uri)))
     except MALFORMED as error:
         raise _unreadable(path, error) from error
 
 
-def refuse_compressed(path: Path, tree: dict[str, Any]) -> None:
-    """MeshError `format` where the file keeps its coordinates in an extension that is not read."""
-    needed = tree.get("extensionsRequired", [])
-    for name in GEOMETRY_EXTENSIONS:
-        if name in needed:
-            raise MeshError("format", f"{path} needs the glTF extension {name}, which is not read: export it without")
+def read_gltf(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]:
+    """Every triangle mesh of the file's scene at the pose of each of its nodes, v upwards, colours sRGB.
 
-
-def pack_gltf(path: Path, data: bytes, resolver: FolderResolver) -> bytes:
-    """The .gltf as one GLB: its buffers one after another, the pictures of base colours behind them.
-
-    Other pictures are left out, because nothing reads them, and so is one that is missing or refused, with a note.
-    MeshError `missing` where a buffer is not below the resolver's root, `too_large` where it is over a cap, `format` or
-    `unreadable` where the file is not one that can be read.
+    A picture that is missing or refused leaves a note. MeshError `missing` where a buffer is not below the resolver's root,
+    `too_large` where something is over a cap, `format` or `unreadable` where the file is not one that can be read.
     """
     try:
-        tree = _parse(data)
-        refuse_compressed(path, tree)
-        binary = _Binary()
-        starts = [binary.add(_read_buffer(path, buffer, resolver)) for buffer in tree.get("buffers", [])]
-        for view in tree.get("bufferViews", []):
-            view["byteOffset"] = starts[view["buffer"]] + _inside(view, tree["buffers"][view["buffer"]])
-            view["buffer"] = 0
-        _embed_colours(tree, binary, resolver)
+        tree, chunk = _parse(path, data)
+        _refuse_extensions(path, tree)
+        _check_caps(path, tree, len(data), resolver)
+        with np.errstate(all="ignore"):  # what is not finite is refused where the mesh is placed
+            return list(_File(path, tree, chunk, resolver).meshes())
     except MALFORMED as error:
         raise _unreadable(path, error) from error
-    tree["buffers"] = [{"byteLength": len(binary.data)}]
-    text = json.dumps(tree).encode()
-    text += b" " * (-len(text) % 4)
-    length = 28 + len(text) + len(binary.data)
-    head = struct.pack("<4sIII4s", b"glTF", 2, length, len(text), b"JSON")
-    return head + text + struct.pack("<I4s", len(binary.data), b"BIN\0") + bytes(binary.data)
 
 
-class _Binary:
-    """Blocks of bytes, each aligned to four."""
-
-    def __init__(self) -> None:
-        self.data = bytearray()
-
-    def add(self, block: bytes) -> int:
-        """Appends a block; where it begins."""
-        start = len(self.data)
-        self.data += block + bytes(-len(block) % 4)
-        return start
-
-
-def _parse(data: bytes) -> dict[str, Any]:
-    tree = json.loads(data)
+def _parse(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The tree, and the bytes behind the JSON chunk of a GLB, empty for a .gltf."""
+    tree, binary = split_glb(data) if path.suffix.lower() == ".glb" else (json.loads(data), b"")
     if not isinstance(tree, dict) or not isinstance(tree.get("asset"), dict):
         raise ValueError("no glTF: it has no `asset`")
     if not str(tree["asset"].get("version", "")).startswith("2"):
         raise ValueError(f"glTF version {tree['asset'].get('version')!r:.20}: only 2.x is read")
-    return tree
+    return tree, binary
 
 
-def _references(tree: dict[str, Any]) -> Iterator[str]:
-    """What the buffers and the pictures of base colours refer to."""
-    numbers = [
-        _picture_of(tree, slot[key]) for material in tree.get("materials", []) for slot, key in _colours(material)
+def _refuse_extensions(path: Path, tree: dict[str, Any]) -> None:
+    """MeshError `format` where the file keeps its coordinates in an extension that is not read."""
+    needed = tree.get("extensionsRequired", [])
+    for name in COMPRESSED:
+        if name in needed:
+            raise MeshError("format", f"{path} needs the glTF extension {name}, which is not read: export it without")
+
+
+def _check_caps(path: Path, tree: dict[str, Any], size: int, resolver: FolderResolver) -> None:
+    """MeshError where nodes or the counts of what is drawn are over a cap, a mesh counted each time that a node shows it."""
+    counts = [int(accessor["count"]) for accessor in tree.get("accessors", [])]
+    size += sum(int(buffer["byteLength"]) for buffer in tree.get("buffers", []))
+    if min(counts, default=0) < 0 or sum(counts) > size:
+        raise MeshError("unreadable", f"{path} promises {min(sum(counts), 10**18)} elements in {size} bytes")
+    of_mesh = []
+    for mesh in tree.get("meshes", []):
+        primitives = [(p["attributes"]["POSITION"], p.get("indices")) for p in mesh["primitives"]]
+        faces = sum(counts[place if indices is None else indices] // 3 for place, indices in primitives)
+        of_mesh.append((sum(counts[place] for place, _ in primitives), faces, len(primitives)))
+    nodes = tree.get("nodes", [])
+    shown = [of_mesh[node["mesh"]] for node in nodes if "mesh" in node]
+    vertices, faces, parts = (sum(column) for column in zip((0, 0, 0), *shown, strict=True))
+    check_nodes(path, max(len(nodes), parts), "nodes or parts", resolver.limits)
+    check_counts(path, vertices, faces, resolver.limits)
+
+
+class _File:
+    """A file whose counts are within the caps: its buffers, accessors, materials and nodes."""
+
+    def __init__(self, path: Path, tree: dict[str, Any], chunk: bytes, resolver: FolderResolver) -> None:
+        self.path, self.tree, self.resolver = path, tree, resolver
+        self.buffers = [self._buffer(number, buffer, chunk) for number, buffer in enumerate(tree.get("buffers", []))]
+        self._pictures: dict[int, NDArray[np.uint8] | None] = {}
+        self._materials: dict[tuple[int, bool], Material] = {}
+
+    def meshes(self) -> Iterator[RawMesh]:
+        """The primitives of triangles, in the order in which a walk of the scene's nodes meets them."""
+        for node, matrix in self._nodes():
+            if "mesh" in node:
+                for primitive in self.tree["meshes"][node["mesh"]]["primitives"]:
+                    if primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN):
+                        yield self._mesh(primitive, matrix)
+
+    def _nodes(self) -> Iterator[tuple[dict[str, Any], Pose]]:
+        """The scene's nodes, each with its pose in the scene [4, 4]; ValueError where one is met twice."""
+        nodes, scenes = self.tree.get("nodes", []), self.tree.get("scenes", [])
+        children = {child for node in nodes for child in node.get("children", [])}
+        roots = scenes[self.tree.get("scene", 0)].get("nodes", []) if scenes else set(range(len(nodes))) - children
+        waiting = [(int(root), np.eye(4)) for root in sorted(roots, reverse=True)]
+        seen = set[int]()
+        while waiting:
+            number, above = waiting.pop()
+            if number in seen or number < 0:
+                raise ValueError("a node has two parents")
+            seen.add(number)
+            matrix = above @ _pose(nodes[number])
+            yield nodes[number], matrix
+            waiting += [(int(child), matrix) for child in reversed(nodes[number].get("children", []))]
+
+    def _mesh(self, primitive: dict[str, Any], matrix: Pose) -> RawMesh:
+        attributes = primitive["attributes"]
+        vertices = self._accessor(attributes["POSITION"], 3)
+        indices = primitive.get("indices")
+        corners = np.arange(len(vertices)) if indices is None else self._accessor(indices, 1)[:, 0].astype(np.int64)
+        normals = self._accessor(attributes["NORMAL"], 3) if "NORMAL" in attributes else None
+        number, uv, colors = primitive.get("material"), None, None
+        if number is not None:
+            reference = _colour(self.tree["materials"][number]) or {}
+            name = f"TEXCOORD_{int(reference.get('texCoord', 0))}"
+            uv = self._accessor(attributes[name], 2) if name in attributes else None
+            if uv is not None and (uv.shape != (len(vertices), 2) or not np.isfinite(uv).all()):
+                uv = None
+            if uv is not None:
+                uv = np.column_stack([uv[:, 0], 1.0 - uv[:, 1]])  # glTF's v runs down
+        if "COLOR_0" in attributes:
+            colors = _colors(self._accessor(attributes["COLOR_0"], None), len(vertices))
+        material = WHITE if colors is not None else DEFAULT
+        if number is not None:
+            material = self._material(number, uv is not None)
+        visual = MeshVisual(material, uv, colors)
+        return RawMesh(vertices, _triangles(corners, primitive.get("mode", _TRIANGLES)), normals, visual, matrix)
+
+    def _material(self, number: int, textured: bool) -> Material:
+        """A material; linear factors become sRGB. A picture only where the mesh has coordinates for it."""
+        if (number, textured) not in self._materials:
+            source = self.tree["materials"][number]
+            rough, gloss = source.get("pbrMetallicRoughness", {}), source.get("extensions", {}).get(_GLOSS)
+            reference = _colour(source)
+            picture = self._picture(reference) if reference and textured else None
+            if gloss is not None and not rough:
+                factor, metallic, roughness = (
+                    gloss.get("diffuseFactor"),
+                    0.0,
+                    1.0 - float(gloss.get("glossinessFactor", 1.0)),
+                )
+            else:
+                factor, metallic = rough.get("baseColorFactor"), float(rough.get("metallicFactor", 1.0))
+                roughness = float(rough.get("roughnessFactor", 1.0))
+            linear = np.ones(4) if factor is None else np.asarray(factor, dtype=np.float64).reshape(4)
+            color = np.append(encode_srgb(np.clip(linear[:3], 0.0, 1.0)), linear[3])
+            made, notes = make_material(color, metallic, roughness, picture)
+            self.resolver.notes += notes
+            self._materials[number, textured] = made
+        return self._materials[number, textured]
+
+    def _picture(self, reference: dict[str, Any]) -> NDArray[np.uint8] | None:
+        """The picture that a reference to a texture means, [h, w, 3 or 4] uint8; None with a note where it cannot be had."""
+        number = _picture_of(self.tree, reference)
+        if number is None:
+            self.resolver.note("a texture", "is neither PNG nor JPEG")
+            return None
+        if number not in self._pictures:
+            self._pictures[number] = self._decode(number)
+        return self._pictures[number]
+
+    def _decode(self, number: int) -> NDArray[np.uint8] | None:
+        image = self.tree["images"][number]
+        uri, name = image.get("uri"), f"image {number}"
+        if isinstance(uri, str):
+            name = name if uri.startswith("data:") else unquote(uri)
+            try:
+                data = _read(uri, self.resolver)
+            except FileNotFoundError:
+                return None  # the resolver has noted it
+        else:
+            data = self._view(image["bufferView"]).tobytes()
+        if (why := self.resolver.budget.take_image(data)) is not None:
+            self.resolver.note(name, why)
+            return None
+        return decode_picture(data, self.resolver.notes)
+
+    def _buffer(self, number: int, buffer: dict[str, Any], chunk: bytes) -> NDArray[np.uint8]:
+        """A buffer's bytes, as many as it declares."""
+        length, uri = int(buffer["byteLength"]), buffer.get("uri")
+        if isinstance(uri, str):
+            try:
+                chunk = _read(uri, self.resolver)
+            except FileNotFoundError as error:
+                reason = "too_large" if " max_" in str(error) else "missing"
+                raise MeshError(reason, f"{self.path}: its buffer {error}") from error
+        elif number or self.path.suffix.lower() != ".glb":
+            raise ValueError("a buffer without a file")
+        if not 0 <= length <= len(chunk):
+            raise ValueError(f"a buffer of {len(chunk)} bytes that declares {length}")
+        return np.frombuffer(chunk, np.uint8, length)
+
+    def _view(self, number: int) -> NDArray[np.uint8]:
+        view = self.tree["bufferViews"][number]
+        start, length, data = int(view.get("byteOffset", 0)), int(view["byteLength"]), self.buffers[view["buffer"]]
+        if start < 0 or length < 0 or start + length > len(data):
+            raise ValueError("a view beyond its buffer")
+        return data[start : start + length]
+
+    def _elements(self, place: dict[str, Any], component: int, width: int, count: int, stride: int) -> NDArray:
+        """[count, width] of a view, of the component's type."""
+        kind = np.dtype(_TYPES[component])
+        step, offset = stride or width * kind.itemsize, int(place.get("byteOffset", 0))
+        data = self._view(place["bufferView"])
+        if (
+            offset < 0
+            or step < width * kind.itemsize
+            or offset + step * (count - 1) + width * kind.itemsize > len(data)
+        ):
+            raise ValueError("an accessor beyond its view")
+        return np.ndarray((count, width), kind, data.tobytes(), offset, (step, kind.itemsize))
+
+    def _accessor(self, number: int, width: int | None) -> NDArray:
+        """An accessor [count, width]: float64, integers that are not normalised as they are. Sparse values are put in."""
+        accessor = self.tree["accessors"][number]
+        count, component, own = int(accessor["count"]), accessor["componentType"], _WIDTHS[accessor["type"]]
+        if number < 0 or own != (width or own) or count < 1:
+            raise ValueError(f"an accessor of {count} {accessor['type']}")
+        if "bufferView" in accessor:
+            stride = int(self.tree["bufferViews"][accessor["bufferView"]].get("byteStride", 0))
+            values = self._elements(accessor, component, own, count, stride)
+        elif "sparse" in accessor:
+            if count > max(self.resolver.limits.max_vertices, self.resolver.limits.max_faces):
+                raise ValueError(f"a sparse accessor of {count} elements")
+            values = np.zeros((count, own), _TYPES[component])
+        else:
+            raise ValueError("an accessor without a view")
+        if (sparse := accessor.get("sparse")) is not None:
+            few, values = int(sparse["count"]), values.copy()
+            at = self._elements(sparse["indices"], sparse["indices"]["componentType"], 1, few, 0)[:, 0].astype(np.int64)
+            values[at] = self._elements(sparse["values"], component, own, few, 0)
+        if accessor.get("normalized", False) and values.dtype.kind in "iu":
+            return np.maximum(values / np.iinfo(values.dtype).max, -1.0)
+        return values if width == 1 else values.astype(np.float64)
+
+
+def _pose(node: dict[str, Any]) -> Pose:
+    """A node's pose [4, 4] in its parent: a matrix by columns, or translation, rotation (x, y, z, w) and scale."""
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+    x, y, z, w = (float(value) for value in node.get("rotation", (0.0, 0.0, 0.0, 1.0)))
+    length = math.sqrt(x * x + y * y + z * z + w * w) or 1.0
+    x, y, z, w = x / length, y / length, z / length, w / length
+    turn = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    pictures = [tree["images"][number] for number in dict.fromkeys(numbers) if number is not None]
-    for item in (*tree.get("buffers", []), *pictures):
-        if isinstance(uri := item.get("uri"), str):
-            yield uri
+    result = np.eye(4)
+    result[:3, :3] = np.array(turn) * np.array(node.get("scale", (1.0, 1.0, 1.0)), dtype=np.float64).reshape(3)
+    result[:3, 3] = np.array(node.get("translation", (0.0, 0.0, 0.0)), dtype=np.float64).reshape(3)
+    return result
 
 
-def _colours(material: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
-    """Where a material refers to a picture of its base colour: the branch and its key."""
-    gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
-    slots = ((material.get("pbrMetallicRoughness", {}), "baseColorTexture"), (gloss, "diffuseTexture"))
-    return [(branch, key) for branch, key in slots if key in branch]
+def _triangles(corners: NDArray, mode: int) -> NDArray[np.int64]:
+    """[F, 3]: the faces that a list, strip or fan of corners draws; every second face of a strip is turned."""
+    corners = corners.astype(np.int64)
+    if mode == _TRIANGLES:
+        return corners[: len(corners) // 3 * 3].reshape(-1, 3)
+    if mode == _FAN:
+        return np.column_stack([np.full(max(len(corners) - 2, 0), corners[0]), corners[1:-1], corners[2:]])
+    faces = np.column_stack([corners[:-2], corners[1:-1], corners[2:]])
+    faces[1::2] = faces[1::2, [1, 0, 2]]
+    return faces
+
+
+def _colors(values: NDArray, count: int) -> NDArray[np.uint8] | None:
+    """[V, 4] uint8 sRGB of vertex colours, linear and in [0, 1] or in the whole range of their type."""
+    if values.shape not in ((count, 3), (count, 4)) or not np.isfinite(values).all():
+        return None
+    share = np.ones((count, 4))
+    share[:, : values.shape[1]] = np.clip(values, 0.0, 1.0)
+    share[:, :3] = encode_srgb(share[:, :3])
+    return np.round(255.0 * share).astype(np.uint8)
+
+
+def _colour(material: dict[str, Any]) -> dict[str, Any] | None:
+    """A material's reference to the texture of its base colour."""
+    gloss = material.get("extensions", {}).get(_GLOSS, {})
+    found = material.get("pbrMetallicRoughness", {}).get("baseColorTexture") or gloss.get("diffuseTexture")
+    return found if isinstance(found, dict) else None
 
 
 def _picture_of(tree: dict[str, Any], reference: dict[str, Any]) -> int | None:
@@ -129,155 +345,9 @@ def _read(uri: str, resolver: FolderResolver) -> bytes:
     head, comma, text = uri.partition(",")
     if not comma or not head.endswith(";base64"):
         raise ValueError(f"{head!r:.60} is not data in base64")
-    try:
-        return base64.b64decode(text, validate=True)
-    except binascii.Error as error:
-        raise ValueError(f"data that is not base64 ({error})") from error
-
-
-def _read_buffer(path: Path, buffer: dict[str, Any], resolver: FolderResolver) -> bytes:
-    """A buffer's bytes, as many as it declares."""
-    length, uri = int(buffer["byteLength"]), buffer.get("uri")
-    if not isinstance(uri, str):
-        raise ValueError("a buffer without a file")
-    try:
-        data = _read(uri, resolver)
-    except FileNotFoundError as error:
-        reason = "too_large" if " over max_" in f" {error}" or "larger than max_" in str(error) else "missing"
-        raise MeshError(reason, f"{path}: its buffer {error}") from error
-    if not 0 <= length <= len(data):
-        raise ValueError(f"a buffer of {len(data)} bytes that declares {length}")
-    return data[:length]
-
-
-def _inside(view: dict[str, Any], buffer: dict[str, Any]) -> int:
-    """Where a view begins in its own buffer; ValueError where it reaches over its ends, into another buffer's bytes."""
-    start, length = int(view.get("byteOffset", 0)), int(view["byteLength"])
-    if start < 0 or length < 0 or start + length > int(buffer["byteLength"]):
-        raise ValueError("a view beyond its buffer")
-    return start
-
-
-def _embed_colours(tree: dict[str, Any], binary: _Binary, resolver: FolderResolver) -> None:
-    """Puts the pictures of base colours behind the buffers and leaves all others out, which nothing reads."""
-    images: list[dict[str, Any]] = []
-    placed: dict[int | None, int | None] = {}
-    for material in tree.get("materials", []):
-        colours = _colours(material)
-        for branch, key in colours:
-            number = _picture_of(tree, branch[key])
-            if number not in placed:
-                placed[number] = _embed(tree, number, binary, images, resolver)
-            branch[key] = {**branch[key], "index": placed[number]}
-        _keep_references(material, [branch[key] for branch, key in colours if branch[key]["index"] is not None])
-    for key in ("images", "textures", "samplers"):
-        tree.pop(key, None)
-    if images:
-        tree |= {"images": images, "textures": [{"source": number} for number in range(len(images))]}
-
-
-def _embed(
-    tree: dict[str, Any],
-    number: int | None,
-    binary: _Binary,
-    images: list[dict[str, Any]],
-    resolver: FolderResolver,
-) -> int | None:
-    """Adds a picture to `images`; its number there, or None with a note where it cannot be had."""
-    if number is None:
-        resolver.note("a texture", "is neither PNG nor JPEG")
-        return None
-    picture = tree["images"][number]
-    view = picture.get("bufferView")
-    if view is None:
-        try:
-            data = _read(picture["uri"], resolver)
-        except FileNotFoundError:
-            return None
-        if (why := open_image(data, resolver.limits)[1]) is not None:
-            resolver.note("a picture within it" if picture["uri"].startswith("data:") else unquote(picture["uri"]), why)
-            return None
-        view = len(tree.setdefault("bufferViews", []))
-        tree["bufferViews"].append({"buffer": 0, "byteOffset": binary.add(data), "byteLength": len(data)})
-    images.append({"bufferView": view, "mimeType": picture.get("mimeType", "image/png")})
-    return len(images) - 1
-
-
-def _keep_references(branch: Any, kept: list[dict[str, Any]]) -> None:
-    """Deletes every reference to a texture from a material, but for those in `kept`."""
-    for key, value in list(branch.items()):
-        if key.endswith("Texture") and not any(value is one for one in kept):
-            del branch[key]
-        elif isinstance(value, dict) and not key.endswith("Texture"):
-            _keep_references(value, kept)
+    return base64.b64decode(text, validate=True)
 
 
 def _unreadable(path: Path, error: Exception) -> MeshError:
-    return MeshError("unreadable", f"{path} is not a gltf file that can be read: {describe_error(error):.200}")
-
-
-def check_glb(path: Path, data: bytes, resolver: FolderResolver) -> bytes:
-    """The bytes of a GLB without the textures that are refused; MeshError where its counts or its node tree are."""
-    try:
-        magic, _, _, length, kind = struct.unpack_from("<4sIII4s", data)
-        tree: dict[str, Any] = json.loads(data[20 : 20 + length])
-        if magic != b"glTF" or kind != b"JSON" or not isinstance(tree, dict):
-            raise ValueError("no glTF header")
-        refuse_compressed(path, tree)
-        counts = [int(accessor["count"]) for accessor in tree.get("accessors", [])]
-        vertices, faces, parts = _drawn_counts(tree, counts)
-        children = [int(child) for node in tree.get("nodes", []) for child in node.get("children", [])]
-        faults = _image_faults(tree, data[20 + length + 8 :], resolver.budget)
-    except MALFORMED as error:
-        raise MeshError(
-            "unreadable", f"{path} is not a glb file that can be read: {describe_error(error):.200}"
-        ) from error
-    if len(set(children)) != len(children):
-        raise MeshError("unreadable", f"{path}: a node has two parents")
-    if min(counts, default=0) < 0 or sum(counts) > len(data):
-        raise MeshError("unreadable", f"{path} promises {min(sum(counts), 10**18)} elements in {len(data)} bytes")
-    check_nodes(path, max(len(tree.get("nodes", [])), parts), "nodes or parts", resolver.limits)
-    check_counts(path, vertices, faces, resolver.limits)
-    if not faults:
-        return data
-    resolver.notes += faults
-    return _without_images(tree, data[20 + length :])
-
-
-def _drawn_counts(tree: dict[str, Any], counts: list[int]) -> tuple[int, int, int]:
-    """Vertices, faces and primitives of a glTF tree, counting a mesh each time that a node shows it."""
-    of_mesh = []
-    for mesh in tree.get("meshes", []):
-        primitives = [(p["attributes"]["POSITION"], p.get("indices")) for p in mesh["primitives"]]
-        vertices = sum(counts[position] for position, _ in primitives)
-        faces = sum(counts[p if indices is None else indices] // 3 for p, indices in primitives)
-        of_mesh.append((vertices, faces, len(primitives)))
-    shown = [of_mesh[node["mesh"]] for node in tree.get("nodes", []) if "mesh" in node]
-    vertices, faces, parts = (sum(counts) for counts in zip((0, 0, 0), *shown, strict=True))
-    return vertices, faces, parts
-
-
-def _image_faults(tree: dict[str, Any], binary: bytes, budget: Budget) -> list[str]:
-    faults = []
-    for number, image in enumerate(tree.get("images", [])):
-        if "bufferView" not in image:
-            faults.append(f"image {number} is not inside the file: plain base colour used")
-            continue
-        view = tree["bufferViews"][image["bufferView"]]
-        start = int(view.get("byteOffset", 0))
-        if (why := budget.take_image(binary[start : start + int(view["byteLength"])])) is not None:
-            faults.append(f"image {number} {why}: plain base colour used")
-    return faults
-
-
-def _without_images(tree: dict[str, Any], rest: bytes) -> bytes:
-    """The GLB again, with no images; `rest` is everything after the JSON chunk."""
-    bare = {key: value for key, value in tree.items() if key not in ("images", "textures", "samplers")}
-    for material in bare.get("materials", []):
-        for level in (material, material.get("pbrMetallicRoughness", {})):
-            for key in [key for key in level if key.endswith("Texture")]:
-                del level[key]
-        material.pop("extensions", None)
-    text = json.dumps(bare).encode()
-    text += b" " * (-len(text) % 4)
-    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
+    kind = path.suffix.lower()[1:]
+    return MeshError("unreadable", f"{path} is not a {kind} file that can be read: {describe_error(error):.200}")

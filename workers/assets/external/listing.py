@@ -5,17 +5,22 @@ ShapeNetCore is a user's own copy, version 1 or 2 (dataset.md section 1, "ShapeN
 
 import hashlib
 import importlib.util
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from schemas.errors import AssetSourceError, MeshError
-from schemas.job.assets import TABLE, FolderSource, MeshLimits, ShapeNetSource, UpAxis, matches
-from workers.assets.external.formats import list_mesh_files
-from workers.assets.external.urdf import find_mesh, mesh_names, parse_urdf
+from schemas.job.assets import BUILT_IN, TABLE, FolderSource, ShapeNetSource, UpAxis, matches
 
 UNKNOWN = "unknown"
 """The licence of a source whose user states none."""
+
+Watch = Callable[[str, int, int], None]
+"""Is told what is being done, and with how many of how many files."""
+
+
+def ignore(what: str, done: int, asked: int) -> None:
+    """A watch that says nothing."""
 
 
 @dataclass(frozen=True)
@@ -55,25 +60,6 @@ class Listing:
     def count(self, category: str) -> int:
         """How many entries of a category can be used."""
         return len(self.entries.get(category, ())) - len(self.refused.get(category, ()))
-
-
-def list_files(
-    settings: ShapeNetSource | FolderSource, folder: Path, path: Path, limits: MeshLimits
-) -> tuple[Path, ...]:
-    """A candidate and every file that it refers to, each once; MeshError where one of them, or all together, is refused."""
-    if path.suffix.lower() == ".urdf":
-        meshes = dict.fromkeys(find_mesh(name, path, folder) for name in mesh_names(parse_urdf(path, limits)))
-        files = [path, *(file for mesh in meshes for file in list_mesh_files(mesh, folder, limits))]
-    else:
-        files = list_mesh_files(path, mesh_root(settings, folder, path), limits)
-    files = list(dict.fromkeys(files))
-    size, cap = sum(file.stat().st_size for file in files), limits.max_asset_mb
-    if size > cap * 1e6:
-        raise MeshError("too_large", f"{path} and its files have {size / 1e6:.1f} MB, over max_asset_mb = {cap:g}")
-    for file in files:
-        if not str(file).isprintable():
-            raise MeshError("name", f"{file!s:.200} has a name that is not printable UTF-8, so no table can hold it")
-    return tuple(files)
 
 
 def mesh_root(settings: ShapeNetSource | FolderSource, folder: Path, mesh: Path) -> Path:
@@ -227,18 +213,6 @@ def _read_map(settings: FolderSource, folder: Path) -> Mapping[str, str]:
     return category_map
 
 
-SYNSETS: dict[str, str] = {
-    "bottle": "02876657",
-    "bowl": "02880940",
-    "camera": "02942699",
-    "can": "02946921",
-    "jar": "03593526",
-    "laptop": "03642806",
-    "mug": "03797390",
-    TABLE: "04379243",
-}
-"""ShapeNetCore's synset of each category; it has no box."""
-
 _MESHES = ("models/model_normalized.obj", "model.obj")
 """Where the mesh lies in a model's folder: version 2, version 1."""
 
@@ -256,7 +230,8 @@ def find_models(
             f"{folder} is not a folder. Set `folder` of the shapenet source to your copy of ShapeNetCore: the folder "
             "that holds synset folders such as 03797390."
         )
-    wanted = {category: folder / SYNSETS[category] for category in sorted(categories) if category in SYNSETS}
+    synsets = {category: BUILT_IN[category].synset for category in sorted(categories) if category in BUILT_IN}
+    wanted = {category: folder / synset for category, synset in synsets.items() if synset is not None}
     if wanted and not any(synset.is_dir() for synset in wanted.values()):
         names = ", ".join(f"{synset.name} ({category})" for category, synset in wanted.items())
         raise AssetSourceError(f"{folder} has none of the synset folders {names}; it has {describe_folder(folder)}.")

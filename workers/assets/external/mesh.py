@@ -1,4 +1,6 @@
-"""Cleans a mesh from outside: merges points, winds faces, finds closed bodies, drops doubled and empty faces.
+"""Pure: cleans a mesh from outside, whatever its format.
+
+Merges points, winds faces, finds closed bodies, drops doubled and empty faces.
 
 A mesh that cannot be used raises a MeshError that says why not.
 """
@@ -7,23 +9,27 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
-from schemas.job.assets import MeshLimits
-from schemas.scene.shape import Part, Shape
-from workers.assets.external.caps import Budget, FolderResolver, check_counts, check_nodes
-from workers.assets.external.formats import MeshVisual, read_bytes, read_scene, read_visual
+from schemas.scene.shape import Material, Part, Shape
 from workers.geometry.frames import transform
 
 MERGE_RELATIVE = 1e-8
 """Vertices within this share of the bounding box's diagonal are one point, which allows for the rounding of text files."""
 THIN_RELATIVE = 1e-6
 """A closed sheet whose volume is below this share of area times diagonal is a sheet with two sides, not a solid."""
+
+MIN_TINT = 0.02
+"""Darkest base colour that multiplies a texture; below it the colour is an exporter's leftover and is ignored."""
+MIN_ALPHA = 0.01
+"""Smallest alpha that is believed; below it alpha is 1, because some exporters write opacity inverted."""
+WHITE = Material(base_color=(1.0, 1.0, 1.0, 1.0))
+DEFAULT = Material()
+"""The material of a mesh that has none; parts with it are recognised by identity."""
 
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -160,8 +166,29 @@ class LoadedMesh:
 
 
 @dataclass(frozen=True, eq=False)
-class _Piece:
-    """One geometry in the frame of the scene: vertices [V, 3], faces [F, 3] int64, unit normals [V, 3] or None."""
+class MeshVisual:
+    """Material, uv [V, 2] or None, colors [V, 4] uint8 sRGB or None, face_colors [F, 4] uint8 sRGB or None."""
+
+    material: Material
+    uv: Array | None = None
+    colors: NDArray[np.uint8] | None = None
+    face_colors: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RawMesh:
+    """Triangles as a file has them: vertices [V, 3], faces [F, 3] int64, normals [V, 3] or None, and the node's pose [4, 4]."""
+
+    vertices: NDArray
+    faces: Indices
+    normals: NDArray | None
+    visual: MeshVisual
+    matrix: Pose
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A mesh in the frame of the scene: vertices [V, 3], faces [F, 3] int64, unit normals [V, 3] or None."""
 
     name: str
     vertices: Array
@@ -170,22 +197,19 @@ class _Piece:
     visual: MeshVisual
 
 
-def load_shape(path: Path, limits: MeshLimits, root: Path | None = None, budget: Budget | None = None) -> LoadedMesh:
-    """A mesh file's shape: finite, in range, no doubled or empty faces, wound outwards where it is closed.
-
-    Material files and textures are looked for below `root` (default: the mesh's own folder) and nowhere else; a
-    missing or refused one leaves the plain base colour and a note. `budget` counts what a whole asset reads. Raises
-    MeshError with one of the reasons `missing`, `format`, `too_large`, `unreadable`, `index_out_of_range`, `not_finite`,
-    `no_faces`.
-    """
-    resolver = FolderResolver(path, root or path.parent, limits, budget)
-    data = read_bytes(path, limits)
-    if (why := resolver.budget.take_file(len(data))) is not None:
-        raise MeshError("too_large", f"{path} {why}")
-    scene = read_scene(path, data, resolver)
-    pieces, notes = _pieces(path, scene, limits)
-    shape, mended = clean_shape(path, pieces)
-    return LoadedMesh(shape, tuple(dict.fromkeys([*resolver.notes, *notes, *mended])))
+def make_material(
+    color: Array, metallic: float, roughness: float, texture: NDArray[np.uint8] | None
+) -> tuple[Material, tuple[str, ...]]:
+    """A material that can be drawn, from a file's colour [4] (sRGB and alpha) and numbers, which may be anything; and notes."""
+    notes: tuple[str, ...] = ()
+    if color[3] < MIN_ALPHA:
+        color[3] = 1.0
+        notes = ("an alpha of 0 was read as 1",)
+    if texture is not None and color[:3].max() < MIN_TINT:
+        color[:3] = 1.0
+    red, green, blue, alpha = (float(c) for c in np.clip(np.nan_to_num(color, nan=0.7), 0.0, 1.0))
+    metallic, roughness = (float(np.clip(np.nan_to_num(value, nan=0.6), 0.0, 1.0)) for value in (metallic, roughness))
+    return Material((red, green, blue, alpha), metallic, roughness, texture), notes
 
 
 def transform_shape(shape: Shape, matrix: Pose) -> Shape:
@@ -201,44 +225,29 @@ def transform_shape(shape: Shape, matrix: Pose) -> Shape:
     return Shape(tuple(parts), shape.closed)
 
 
-def _pieces(path: Path, scene: trimesh.Scene, limits: MeshLimits) -> tuple[list[_Piece], list[str]]:
-    """Every mesh of the scene at the pose of each of its nodes, and notes."""
-    shown = [(scene.graph[node], node) for node in scene.graph.nodes_geometry]
-    meshes = [(matrix, scene.geometry[name]) for (matrix, name), _ in shown]
-    meshes = [(matrix, mesh) for matrix, mesh in meshes if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
-    check_nodes(path, len(meshes), "parts", limits)
-    check_counts(path, sum(len(m.vertices) for _, m in meshes), sum(len(m.faces) for _, m in meshes), limits)
-    pieces: list[_Piece] = []
-    notes: list[str] = []
-    for number, (matrix, mesh) in enumerate(meshes):
-        visual, why = read_visual(mesh, linear=path.suffix.lower() in (".glb", ".gltf"))
-        notes += why
-        pieces.append(_piece(path, f"part{number}", mesh, np.asarray(matrix, dtype=np.float64), visual))
-    if not pieces:
-        raise MeshError("no_faces", f"{path} has no triangles")
-    return pieces, notes
+def place_mesh(path: Path, name: str, mesh: RawMesh) -> Piece:
+    """A mesh in the frame of its scene, with corners of their own where faces have colours.
 
-
-def _piece(path: Path, name: str, mesh: trimesh.Trimesh, matrix: Pose, visual: MeshVisual) -> _Piece:
-    vertices = np.asarray(mesh.vertices, dtype=np.float64)
-    faces = np.asarray(mesh.faces, dtype=np.int64)
+    Raises MeshError `index_out_of_range` or `not_finite`.
+    """
+    vertices, faces, visual = mesh.vertices.astype(np.float64), mesh.faces, mesh.visual
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshError("index_out_of_range", f"{path}: a face names vertex {faces.max()} of {len(vertices)}")
     # Only vertices that a face names are checked: others may hold anything.
-    if not (np.isfinite(vertices[faces]).all() and np.isfinite(matrix).all()):
+    if not (np.isfinite(vertices[faces]).all() and np.isfinite(mesh.matrix).all()):
         raise MeshError("not_finite", f"{path} has a coordinate that is not a finite number")
     used = np.zeros(len(vertices), dtype=np.bool_)
     used[faces] = True
-    vertices = transform(matrix, np.where(used[:, None], vertices, 0.0))
+    vertices = transform(mesh.matrix, np.where(used[:, None], vertices, 0.0))
     check_coordinates(path, vertices[used])
-    if np.linalg.det(matrix[:3, :3]) < 0:
+    if np.linalg.det(mesh.matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]
-    normals = _file_normals(mesh, matrix)
-    if visual.face_colors is not None:  # a colour for each face needs corners of its own
+    normals = _placed_normals(mesh)
+    if visual.face_colors is not None:
         vertices, normals = vertices[faces.ravel()], None if normals is None else normals[faces.ravel()]
         visual = replace(visual, colors=np.repeat(visual.face_colors, 3, axis=0), face_colors=None)
         faces = np.arange(3 * len(faces)).reshape(-1, 3)
-    return _Piece(name, vertices, faces, normals, visual)
+    return Piece(name, vertices, faces, normals, visual)
 
 
 def check_coordinates(path: Path, vertices: Array) -> None:
@@ -248,14 +257,13 @@ def check_coordinates(path: Path, vertices: Array) -> None:
         raise MeshError("not_finite", f"{path} has a coordinate of {largest:g}, over {LARGEST_COORDINATE:g}")
 
 
-def _file_normals(mesh: trimesh.Trimesh, matrix: Pose) -> Array | None:
-    """The file's own unit shading normals [V, 3], rotated with the node; None where it has no usable ones."""
-    if "vertex_normals" not in mesh._cache.cache:  # trimesh would compute them
+def _placed_normals(mesh: RawMesh) -> Array | None:
+    """The file's own unit shading normals [V, 3], turned with the node; None where it has no usable ones."""
+    if mesh.normals is None or mesh.normals.shape != mesh.vertices.shape or not np.isfinite(mesh.normals).all():
         return None
-    normals = np.asarray(mesh.vertex_normals, dtype=np.float64)
-    if normals.shape != mesh.vertices.shape or not np.isfinite(normals).all() or np.linalg.det(matrix[:3, :3]) == 0:
+    if np.linalg.det(mesh.matrix[:3, :3]) == 0:
         return None
-    turned = normals @ np.linalg.inv(matrix[:3, :3])
+    turned = mesh.normals @ np.linalg.inv(mesh.matrix[:3, :3])
     return None if (np.linalg.norm(turned, axis=1) < 1e-9).any() else _unit(turned)
 
 
@@ -264,7 +272,7 @@ def _unit(vectors: Array) -> Array:
     return vectors / np.where(length == 0, 1.0, length)
 
 
-def clean_shape(path: Path, pieces: list[_Piece]) -> tuple[Shape, list[str]]:
+def clean_shape(path: Path, pieces: list[Piece]) -> tuple[Shape, list[str]]:
     """The pieces as one clean shape, and what was mended.
 
     Drops collapsed and doubled faces, but keeps two faces back to back where two solids touch. Winds neighbours alike
@@ -334,7 +342,7 @@ def _slivers(vertices: Array, faces: Indices) -> Mask:
     return np.linalg.norm(np.cross(b - a, c - a), axis=1) <= 1e-12 * longest
 
 
-def _part(piece: _Piece, faces: Indices) -> Part:
+def _part(piece: Piece, faces: Indices) -> Part:
     """A part with the remaining faces and the vertices that they name."""
     used, index = np.unique(faces, return_inverse=True)
     vertices, corners = piece.vertices[used], index.reshape(-1, 3)

@@ -6,7 +6,7 @@ file (`measure_asset`).
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -19,9 +19,10 @@ from schemas.errors import MeshError
 from schemas.job.assets import TABLE, Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
 from schemas.scene.shape import Asset, Hull
 from workers.assets.external.caps import MOST_NOTES, one_line
+from workers.assets.external.formats import list_mesh_files, load_shape
 from workers.assets.external.listing import Entry, check_unchanged, mesh_root
-from workers.assets.external.mesh import LoadedMesh, load_shape, transform_shape
-from workers.assets.external.urdf import load_urdf
+from workers.assets.external.mesh import LoadedMesh, transform_shape
+from workers.assets.external.urdf import load_urdf, seen_meshes
 from workers.assets.mass import mass_properties
 from workers.geometry.frames import pose
 
@@ -35,14 +36,45 @@ OBJECT_SCALE, TABLE_SCALE = 0.25, 1.5
 """The article's factors on ShapeNetCore's normalised units."""
 
 
+@dataclass(frozen=True)
+class Assembly:
+    """How a kind of file that poses mesh files is read: which files it shows, and its shape; both MeshError."""
+
+    meshes: Callable[[Path, Path, MeshLimits], list[Path]]
+    load: Callable[[Path, MeshLimits, Path], LoadedMesh]
+
+
+ASSEMBLIES: Mapping[str, Assembly] = {".urdf": Assembly(seen_meshes, load_urdf)}
+"""The formats of files that pose meshes, by suffix."""
+
+
+def list_files(
+    settings: ShapeNetSource | FolderSource, folder: Path, path: Path, limits: MeshLimits
+) -> tuple[Path, ...]:
+    """A candidate and every file that it refers to, each once; MeshError where one of them, or all together, is refused."""
+    if (assembly := ASSEMBLIES.get(path.suffix.lower())) is not None:
+        meshes = assembly.meshes(path, folder, limits)
+        files = [path, *(file for mesh in meshes for file in list_mesh_files(mesh, folder, limits))]
+    else:
+        files = list_mesh_files(path, mesh_root(settings, folder, path), limits)
+    files = list(dict.fromkeys(files))
+    size, cap = sum(file.stat().st_size for file in files), limits.max_asset_mb
+    if size > cap * 1e6:
+        raise MeshError("too_large", f"{path} and its files have {size / 1e6:.1f} MB, over max_asset_mb = {cap:g}")
+    for file in files:
+        if not str(file).isprintable():
+            raise MeshError("name", f"{file!s:.200} has a name that is not printable UTF-8, so no table can hold it")
+    return tuple(files)
+
+
 def load_entry(
     settings: ShapeNetSource | FolderSource, folder: Path, entry: Entry, category: str, assets: Assets
 ) -> Asset:
     """One instance, cleaned, z up, scaled; MeshError where its mesh is refused or has changed."""
     check_unchanged(folder, entry)
     path = folder / entry.files[0].path
-    if path.suffix.lower() == ".urdf":
-        loaded = load_urdf(path, assets.limits, folder)
+    if (assembly := ASSEMBLIES.get(path.suffix.lower())) is not None:
+        loaded = assembly.load(path, assets.limits, folder)
     else:
         loaded = load_shape(path, assets.limits, mesh_root(settings, folder, path))
     return place_asset(loaded, entry, category, settings, assets)

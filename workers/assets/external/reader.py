@@ -1,187 +1,364 @@
-"""Edge: the limited processes that read files from outside, seen from the process that asks."""
+"""Edge: reads files from outside in limited processes, which a file may end but whose end harms nobody else.
 
-import atexit
+multiprocessing's fork server has imported everything once and starts a child for each batch of tasks. The child sets its limits,
+answers each task with one message through a pipe, and ends. What it answered before a crash is kept, and the rest goes to
+another child; a file is blamed only where it was the first that its child read. Messages are bytes, JSON and arrays in numpy's
+file format, and never pickle, because they come from a process that has read a stranger's file.
+"""
+
+import ctypes
+import errno
+import gc
+import io
 import json
+import multiprocessing
 import os
-import queue
+import resource
 import signal
-import socket
-import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
+from math import ceil
+from multiprocessing.connection import Connection
 from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import QhullError
 
+from schemas.base import frozen_array
 from schemas.errors import MachineError, MeshError
-from schemas.job.assets import MeshLimits
-from workers.assets.external.answers import read_answers
-from workers.assets.external.reader_process import NO_MEMORY, send
-from workers.assets.external.reader_tasks import ANSWER, Request, Task, encode_request
+from schemas.job.assets import TABLE, Assets, FolderSource, MeshLimits, ShapeNetSource
+from schemas.scene.shape import Asset, Hull, MassProperties, Material, Part, Shape
+from workers.assets.external.caps import describe_error, one_line
+from workers.assets.external.listing import Entry, hash_files
+from workers.assets.external.placement import find_doubt, list_files, load_entry, measure_asset
+from workers.assets.external.urdf import all_mesh_names, find_mesh, parse_urdf
+from workers.geometry.hull import convex_hull
 
-ROOT = Path(__file__).resolve().parents[3]
-BATCH = {"list": 128, "names": 128, "check": 32, "measure": 32, "load": 1}
-"""Tasks that one child works on: a fork costs some milliseconds, and a child that ends is replaced for what is left."""
+Kind = Literal["list", "check", "load", "measure", "names"]
+
+BATCH: dict[Kind, int] = {"list": 128, "names": 128, "check": 32, "measure": 32, "load": 1}
+"""Tasks that one child works on: a child costs some milliseconds, and one that ends is replaced for what is left."""
+
 MOST_PROCESSES = 8
 """Processes that read a source in parallel: each may take the memory that the limits allow."""
-WORTH_A_PROCESS = {"list": 4096, "names": 4096, "check": 96, "measure": 96, "load": 96}
-"""Tasks for which one more process is started, which takes a second or two."""
+
+NO_MEMORY = 12
+"""Exit code of a child that had no memory left."""
+
+PR_SET_PDEATHSIG = 1
+"""The option of prctl(2) by which a child ends with its parent."""
+
+ANSWER, REFUSAL = b"+", b"-"
+"""The first byte of a message."""
 
 Watch = Callable[[int, int], None]
 """Is told how many tasks of how many are done."""
 
 
 @dataclass(frozen=True)
-class Usage:
-    """How a child ended and what it used: exit code (negative: signal), processor seconds, greatest resident memory."""
+class Task:
+    """One question about one asset of a source.
 
-    exit: int
-    cpu_s: float
-    rss_kb: int
+    By the `path` of its first file: `list`, all its files; `names`, what a URDF refers to. By an `entry`: `check`, whether it
+    can be used; `load`, all of it; `measure`, what a person asks about it.
+    """
+
+    kind: Kind
+    path: Path
+    category: str = ""
+    entry: Entry | None = None
 
 
-class Reader:
-    """One server process, started when it is first needed and again where it has ended. One thread at a time."""
+@dataclass(frozen=True)
+class Request:
+    """Tasks of one kind about one source, whose folder is `folder`; `assets` has the limits and the densities."""
 
-    def __init__(self) -> None:
-        self.last = Usage(0, 0.0, 0)
-        self._process: subprocess.Popen[bytes] | None = None
-        self._socket: socket.socket | None = None
-        self._lock = threading.Lock()
+    settings: ShapeNetSource | FolderSource
+    folder: Path
+    assets: Assets
+    tasks: tuple[Task, ...]
 
-    def ask(self, request: Request) -> Iterator[memoryview | MeshError]:
-        """For each task what it answers, or why its file is refused, in their order.
 
-        Raises MachineError where the process cannot be started, or was killed from outside.
-        """
-        left = request.tasks
-        while left:
-            answers = self._exchange(replace(request, tasks=left))
-            if (
-                not answers
-            ):  # it ended in the first, before which it had read nothing else: the verdict is the file's own
-                answers = [_describe_end(self.last, left[0].path, request.assets.limits)]
-            yield from answers
-            left = left[len(answers) :]
+def ask(request: Request) -> Iterator[bytes | MeshError]:
+    """For each task what it answers, or why its file is refused, in their order.
 
-    def close(self) -> None:
-        """Ends the process."""
-        process, self._process = self._process, None
-        if process is not None and self._socket is not None:
-            self._socket.close()
-            process.kill()
-            process.wait()
-
-    def _exchange(self, request: Request) -> list[memoryview | MeshError]:
-        """Answers up to the task in which the child ended; `last` says how."""
-        data = encode_request(request)
-        with self._lock:
-            for _ in range(2):  # the server ends when it has been idle for long
-                try:
-                    return self._try(data)
-                except OSError:
-                    self.close()
-        raise MachineError("the process that reads meshes ends at once: see the lines above, and `verso doctor`")
-
-    def _try(self, data: bytes) -> list[memoryview | MeshError]:
-        if self._process is None or self._socket is None:
-            self._start()
-        assert self._socket is not None
-        send(self._socket, data)
-        head, files, _, _ = socket.recv_fds(self._socket, 4096, 1)
-        if not files:
-            raise BrokenPipeError
-        with open(files[0], "rb") as answers:
-            # Not mapped: each cached asset would hold a file descriptor.
-            body = np.empty(os.fstat(answers.fileno()).st_size, dtype=np.uint8)
-            answers.seek(0)
-            answers.readinto(body.data)
-        tree = json.loads(head)
-        self.last = Usage(tree["exit"], tree["cpu_s"], tree["rss_kb"])
-        if self.last.exit in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP):
+    Raises MachineError where no process can be started, or one was killed from outside.
+    """
+    left = request.tasks
+    while left:
+        answers, code = _exchange(replace(request, tasks=left))
+        if code in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP):
             raise MachineError("a process that reads meshes was killed from outside, perhaps for want of memory")
-        return [_open_answer(kind, blocks) for kind, blocks in read_answers(body.data.toreadonly())]
-
-    def _start(self) -> None:
-        script = Path(__file__).with_name("reader_process.py")
-        command = [sys.executable, "-P", str(script), str(ROOT)]
-        self._socket, theirs = socket.socketpair()
-        with theirs:
-            self._process = subprocess.Popen(command, stdin=theirs.fileno(), stdout=subprocess.DEVNULL)
+        if (
+            not answers
+        ):  # it ended in the first task, before which it had read nothing else: the verdict is the file's own
+            answers = [_describe_end(code, left[0].path, request.assets.limits)]
+        yield from answers
+        left = left[len(answers) :]
 
 
-def _open_answer(kind: bytes, blocks: memoryview) -> memoryview | MeshError:
-    if kind == ANSWER:
-        return blocks
-    reason, detail, kind_of_failure = json.loads(bytes(blocks).rstrip(b"\0"))
-    error = MeshError(reason, detail)
-    error.kind = kind_of_failure
-    return error
-
-
-def _describe_end(used: Usage, path: Path, limits: MeshLimits) -> MeshError:
-    """Why the child ended, in terms of the file that it was reading."""
-    if used.exit == -signal.SIGXCPU:
-        more = f"takes more than assets.limits.max_cpu_s = {limits.max_cpu_s:g} s of processor time"
-        return MeshError("too_slow", f"{path} {more}: make it simpler, or raise the limit")
-    if used.exit == NO_MEMORY:
-        more = f"takes more memory than assets.limits.max_memory_mb = {limits.max_memory_mb}"
-        return MeshError("too_large", f"{path} {more}: make it simpler, or raise the limit")
-    how = signal.Signals(-used.exit).name if used.exit < 0 else f"exit code {used.exit}"
-    return MeshError("unreadable", f"{path} crashes the process that reads it ({how})")
-
-
-def ask_all(request: Request, watch: Watch) -> Iterator[tuple[Task, memoryview | MeshError]]:
-    """Every task, all of one kind, with its answer, in their order, by as many processes as are worth it."""
+def ask_all(request: Request, watch: Watch) -> Iterator[tuple[Task, bytes | MeshError]]:
+    """Every task with its answer, in their order, by as many processes at once as there are cores."""
     tasks = request.tasks
     if not tasks:
         return
-    size, worth = BATCH[tasks[0].kind], WORTH_A_PROCESS[tasks[0].kind]
+    size, done = BATCH[tasks[0].kind], 0
     batches = iter([replace(request, tasks=tasks[at : at + size]) for at in range(0, len(tasks), size)])
-    count = min(len(os.sched_getaffinity(0)), MOST_PROCESSES, 1 + len(tasks) // worth)
-    free: queue.SimpleQueue[Reader] = queue.SimpleQueue()
-    readers = [shared_reader(), *(Reader() for _ in range(count - 1))]
-    for reader in readers:
-        free.put(reader)
+    count = min(len(os.sched_getaffinity(0)), MOST_PROCESSES)
+    with ThreadPoolExecutor(count) as pool:
+        waiting = [pool.submit(_ask_batch, batch) for batch in islice(batches, 2 * count)]
+        while waiting:
+            answers = waiting.pop(0).result()
+            waiting += [pool.submit(_ask_batch, batch) for batch in islice(batches, 1)]
+            yield from answers
+            done += len(answers)
+            watch(done, len(tasks))
 
-    def ask(batch: Request) -> list[tuple[Task, memoryview | MeshError]]:
-        reader = free.get()
+
+def _ask_batch(batch: Request) -> list[tuple[Task, bytes | MeshError]]:
+    return list(zip(batch.tasks, ask(batch), strict=True))
+
+
+_processes = multiprocessing.get_context("forkserver")
+_processes.set_forkserver_preload([__name__])
+_lock = threading.Lock()
+"""Held while a child is started or joined: multiprocessing looks after its children in whichever thread starts the next."""
+
+
+def _exchange(request: Request) -> tuple[list[bytes | MeshError], int]:
+    """Answers up to the task in which the child ended, and its exit code, negative for a signal."""
+    for _ in range(2):  # the fork server may have been killed
+        source, sink = _processes.Pipe(duplex=False)
+        child = _processes.Process(target=_work, args=(request, sink), daemon=True)
+        with source:
+            with sink, suppress(OSError, EOFError):
+                _start(child)
+            answers: list[bytes | MeshError] = []
+            with suppress(EOFError, OSError):
+                while child.pid is not None:
+                    answers.append(_open_answer(source.recv_bytes(request.assets.limits.max_memory_mb << 20)))
+        if child.pid is not None:
+            with _lock:
+                child.join()
+            assert child.exitcode is not None
+            if child.exitcode != LOST_SERVER:
+                return answers, child.exitcode
+    raise MachineError("the process that reads meshes ends at once: see the lines above, and `verso doctor`")
+
+
+LOST_SERVER = 255
+"""The exit code that multiprocessing gives a child whose fork server has ended."""
+
+
+def _start(child: Any) -> None:
+    """Starts a child without this process's main module, which it does not need: a script without a guard would run again."""
+    with _lock:
+        main = sys.modules["__main__"]
+        sys.modules["__main__"] = ModuleType("__main__")
         try:
-            return list(zip(batch.tasks, reader.ask(batch), strict=True))
+            child.start()
         finally:
-            free.put(reader)
+            sys.modules["__main__"] = main
 
-    done = 0
+
+def _open_answer(message: bytes) -> bytes | MeshError:
+    if message[:1] == ANSWER:
+        return message[1:]
+    reason, detail, kind = json.loads(message[1:])
+    error = MeshError(reason, detail)
+    error.kind = kind
+    return error
+
+
+def _describe_end(code: int, path: Path, limits: MeshLimits) -> MeshError:
+    """Why a child ended, in terms of the file that it was reading."""
+    if code == -signal.SIGXCPU:
+        more = f"takes more than assets.limits.max_cpu_s = {limits.max_cpu_s:g} s of processor time"
+        return MeshError("too_slow", f"{path} {more}: make it simpler, or raise the limit")
+    if code == NO_MEMORY:
+        more = f"takes more memory than assets.limits.max_memory_mb = {limits.max_memory_mb}"
+        return MeshError("too_large", f"{path} {more}: make it simpler, or raise the limit")
+    how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    return MeshError("unreadable", f"{path} crashes the process that reads it ({how})")
+
+
+def _work(request: Request, answers: Connection) -> NoReturn:
+    """In the child: answers every task under the limits, and exits."""
+    code = 1
     try:
-        with ThreadPoolExecutor(count) as pool:
-            waiting = [pool.submit(ask, batch) for batch in islice(batches, 2 * count)]
-            while waiting:
-                answers = waiting.pop(0).result()
-                waiting += [pool.submit(ask, batch) for batch in islice(batches, 1)]
-                yield from answers
-                done += len(answers)
-                watch(done, len(tasks))
+        _set_limits(request.assets.limits.max_memory_mb << 20)
+        for task in request.tasks:
+            # Processor time, so that the verdict is the same on a busy machine; for each task alone, not for the batch.
+            most = ceil(time.process_time() + request.assets.limits.max_cpu_s)
+            resource.setrlimit(resource.RLIMIT_CPU, (most, resource.RLIM_INFINITY))
+            answers.send_bytes(answer_task(request, task))
+        code = 0
+    except MemoryError:
+        code = NO_MEMORY
+    except OSError as error:
+        code = NO_MEMORY if error.errno in (errno.ENOMEM, errno.EFBIG) else 1
     finally:
-        for reader in readers[1:]:
-            reader.close()
+        os._exit(code)
 
 
-def shared_reader() -> Reader:
-    """This process's reader."""
-    if os.getpid() not in _shared:
-        _shared.clear()  # in a fork: the pipes are the parent's
-        _shared[os.getpid()] = Reader()
-    return _shared[os.getpid()]
+def _set_limits(most_bytes: int) -> None:
+    """In the child: ends with the fork server, says nothing, leaves no core, and has so much address space and file size."""
+    gc.freeze()  # the collector would copy every page of what was imported
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that asks decides when to stop
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    for standard in (1, 2):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), standard)
+    for limit in (resource.RLIMIT_AS, resource.RLIMIT_FSIZE):
+        resource.setrlimit(limit, (most_bytes, most_bytes))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-_shared: dict[int, Reader] = {}
+def answer_task(request: Request, task: Task) -> bytes:
+    """`ANSWER` with what was asked for, or `REFUSAL` with reason, detail and kind as JSON. Raises MemoryError alone."""
+    try:
+        return ANSWER + _answer(request, task)
+    except MeshError as error:
+        refusal = error
+    except MemoryError:
+        raise
+    except Exception as error:  # whatever a stranger's bytes made a library raise, it is they that are refused
+        if isinstance(error, OSError) and error.errno in (errno.ENOMEM, errno.EFBIG):
+            raise MemoryError from error
+        refusal = MeshError("unreadable", f"{task.path} cannot be read: {describe_error(error)}")
+    detail = refusal.detail if task.path.name in refusal.detail else f"{task.path}: {refusal.detail}"
+    return REFUSAL + json.dumps([refusal.reason, one_line(detail), refusal.kind]).encode()
 
 
-@atexit.register
-def _close() -> None:
-    if (reader := _shared.pop(os.getpid(), None)) is not None:
-        reader.close()
+def _answer(request: Request, task: Task) -> bytes:
+    if task.kind == "list":
+        paths = list_files(request.settings, request.folder, task.path, request.assets.limits)
+        files = hash_files(paths, request.folder)
+        return json.dumps([[file.path, file.size, file.sha256] for file in files]).encode()
+    if task.kind == "names":
+        return json.dumps(
+            [file.relative_to(request.folder).as_posix() for file in _named_files(task.path, request)]
+        ).encode()
+    assert task.entry is not None
+    asset = load_entry(request.settings, request.folder, task.entry, task.category, request.assets)
+    if task.kind == "load":
+        return pack_asset(asset)
+    hull = _check_fit(asset, task.path)
+    if task.kind == "measure":
+        return measure_asset(asset, hull).encode()
+    doubt = None if hull is None else find_doubt(asset, request.settings, hull.vertices)
+    return (doubt or "").encode()
+
+
+def _named_files(urdf: Path, request: Request) -> list[Path]:
+    """The meshes below the folder that a URDF names, for what is seen and for what collides. MeshError as parse_urdf."""
+    found = []
+    for name in all_mesh_names(parse_urdf(urdf, request.assets.limits)):
+        with suppress(MeshError):
+            found.append(find_mesh(name, urdf, request.folder))
+    return found
+
+
+def _check_fit(asset: Asset, path: Path) -> Hull | None:
+    """The convex hull, which is what an object collides and is placed by; None for a table. MeshError `no_hull`."""
+    if asset.category == TABLE:
+        return None
+    try:
+        return convex_hull(asset.shape.vertices)
+    except (QhullError, ValueError) as error:
+        raise MeshError("no_hull", f"{path} is no body: it needs four points apart that are not in a line") from error
+
+
+_PLAIN = (
+    *("instance_id", "category", "source", "licence", "path", "sha256"),
+    *("scale", "watertight", "volume_m3", "shareable"),
+)
+"""Fields of an asset that JSON holds as they are."""
+_ARRAYS = ("vertices", "faces", "normals", "uv", "colors")
+"""Arrays of a part."""
+
+
+def pack_asset(asset: Asset) -> bytes:
+    """The asset as the length of a JSON text, the text, and its arrays.
+
+    An array comes back bit by bit and in its memory order, on which the last bits of sums depend; one that parts share is
+    written once and shared again. Built-in shapes have fields that files have not, and are not packed.
+    """
+    arrays: dict[int, NDArray] = {}
+
+    def number(array: NDArray | None) -> int | None:
+        if array is None:
+            return None
+        arrays.setdefault(id(array), array)
+        return list(arrays).index(id(array))
+
+    parts = [
+        {name: number(getattr(part, name)) for name in _ARRAYS}
+        | {"name": part.name, "color": part.material.base_color, "texture": number(part.material.texture)}
+        | {"metallic": part.material.metallic, "roughness": part.material.roughness}
+        for part in asset.shape.parts
+    ]
+    mass = asset.mass
+    tree = {name: getattr(asset, name) for name in _PLAIN} | {
+        "notes": asset.notes,
+        "parts": parts,
+        "closed": asset.shape.closed,
+        "mass": [mass.mass_kg, mass.com.tolist(), mass.inertia.tolist(), mass.solid],
+        "T_source_to_object": asset.T_source_to_object.tolist(),
+        "arrays": len(arrays),
+    }
+    text, stream = json.dumps(tree).encode(), io.BytesIO()
+    stream.write(len(text).to_bytes(8, "little") + text)
+    for array in arrays.values():
+        np.lib.format.write_array(stream, array, allow_pickle=False)
+    return stream.getvalue()
+
+
+def unpack_asset(data: bytes) -> Asset:
+    """The asset of `pack_asset`. MeshError `unreadable` where the bytes are not such, or the arrays do not fit."""
+    try:
+        stream = io.BytesIO(data)
+        tree = json.loads(stream.read(int.from_bytes(stream.read(8), "little")))
+        arrays = [np.lib.format.read_array(stream, allow_pickle=False) for _ in range(tree["arrays"])]
+        for array in arrays:
+            array.setflags(write=False)
+        mass_kg, com, inertia, solid = tree["mass"]
+        return Asset(
+            **{name: tree[name] for name in _PLAIN},
+            shape=Shape(tuple(_part(part, arrays) for part in tree["parts"]), tree["closed"]),
+            mass=MassProperties(mass_kg, frozen_array(com), frozen_array(inertia), solid),
+            T_source_to_object=frozen_array(tree["T_source_to_object"]),
+            notes=tuple(tree["notes"]),
+        )
+    except (ValueError, LookupError, TypeError, EOFError, MemoryError, OverflowError) as error:
+        raise MeshError("unreadable", f"the mesh reader's answer makes no sense: {error!r:.200}") from error
+
+
+def _part(tree: dict[str, Any], arrays: list[NDArray]) -> Part:
+    given = {name: None if tree[name] is None else arrays[tree[name]] for name in (*_ARRAYS, "texture")}
+    vertices, faces, texture = given["vertices"], given["faces"], given.pop("texture")
+    if vertices is None or faces is None:
+        raise ValueError("a part without a mesh")
+    count = len(vertices)
+    kinds = (np.float64, np.int32, np.float64, np.float64, np.uint8)
+    shapes = (count, 3), (len(faces), 3), (count, 3), (count, 2), (count, 4)
+    for (name, array), kind, shape in zip(given.items(), kinds, shapes, strict=True):
+        if array is None:
+            continue
+        if array.dtype != kind or array.shape != shape or (kind is np.float64 and not np.isfinite(array).all()):
+            raise ValueError(f"{name} {array.shape} of {array.dtype}")
+    if texture is not None and (texture.dtype != np.uint8 or texture.ndim != 3 or texture.shape[2] not in (3, 4)):
+        raise ValueError(f"a texture {texture.shape} of {texture.dtype}")
+    if not len(faces) or int(faces.min()) < 0 or int(faces.max()) >= count:
+        raise ValueError("a face names a vertex that is not there")
+    red, green, blue, alpha = (float(value) for value in tree["color"])
+    material = Material((red, green, blue, alpha), float(tree["metallic"]), float(tree["roughness"]), texture)
+    return Part(str(tree["name"]), vertices, faces, material, given["normals"], given["uv"], given["colors"])

@@ -14,8 +14,8 @@ from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Material, Part, Shape
 from workers.assets.external.caps import LONGEST_NAME, Budget, check_counts, check_nodes, find_inside
-from workers.assets.external.formats import DEFAULT
-from workers.assets.external.mesh import LoadedMesh, check_coordinates, load_shape, transform_shape
+from workers.assets.external.formats import load_shape
+from workers.assets.external.mesh import DEFAULT, LoadedMesh, check_coordinates, transform_shape
 from workers.geometry.frames import pose
 
 _DECLARATION = re.compile(rb"^\s*<\?xml[^>]*\?>")
@@ -53,6 +53,11 @@ def parse_urdf(path: Path, limits: MeshLimits) -> ElementTree.Element:
 def mesh_names(robot: ElementTree.Element) -> list[str]:
     """The file names of the meshes of all visuals, each once, in their order."""
     return list(dict.fromkeys(mesh.get("filename", "") for mesh in robot.iterfind("link/visual/geometry/mesh")))
+
+
+def seen_meshes(urdf: Path, root: Path, limits: MeshLimits) -> list[Path]:
+    """The files of the meshes of all visuals, each once; MeshError where one is not inside `root`."""
+    return list(dict.fromkeys(find_mesh(name, urdf, root) for name in mesh_names(parse_urdf(urdf, limits))))
 
 
 def all_mesh_names(robot: ElementTree.Element) -> list[str]:

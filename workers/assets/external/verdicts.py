@@ -22,19 +22,18 @@ from schemas.errors import AssetSourceError, MeshError
 from schemas.job.assets import TABLE, Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
 from schemas.scene.shape import Asset
 from workers.assets import mass
-from workers.assets.external.asset_bytes import unpack_asset
 from workers.assets.external.listing import (
     UNKNOWN,
     Entry,
     Listing,
     SourceFile,
+    Watch,
     find_licence,
+    ignore,
     instance_id_of,
     list_licences,
 )
-from workers.assets.external.reader import BATCH, ask_all, shared_reader
-from workers.assets.external.reader_tasks import Request, Task
-from workers.assets.watch import Watch, ignore
+from workers.assets.external.reader import BATCH, Request, Task, ask, ask_all, unpack_asset
 from workers.geometry import hull
 
 LIBRARIES = ("manifold3d", "numpy", "pillow", "scipy", "trimesh")
@@ -152,7 +151,7 @@ def read_listing(
             skipped[answer.reason] += 1
             examples += [_describe(task.path, folder, answer)][: EXAMPLES - len(examples)]
         else:
-            files = tuple(SourceFile(*file) for file in json.loads(bytes(answer).rstrip(b"\0")))
+            files = tuple(SourceFile(*file) for file in json.loads(answer))
             licence = find_licence(task.path, folder, stated, licences)
             entries[task.category].append(Entry(instance_id_of(settings, files[0]), files, licence))
     found = {category: tuple(listed) for category, listed in entries.items()}
@@ -179,7 +178,7 @@ def check_listing(
     asked = ask_all(Request(settings, listing.folder, assets, tuple(tasks)), partial(watch, "checked"))
     new: list[tuple[str, Verdict]] = []
     for key, (_, answer) in zip(unknown, asked, strict=True):
-        verdict = answer if isinstance(answer, MeshError) else _AXES.get(bytes(answer[:1]))
+        verdict = answer if isinstance(answer, MeshError) else _AXES.get(answer)
         if isinstance(verdict, MeshError) and verdict.kind == "environmental":
             raise AssetSourceError(f"{verdict.detail}, while its folder was read: start again when nobody writes there")
         new.append((key, verdict))
@@ -223,9 +222,9 @@ def _describe(path: Path, folder: Path, error: MeshError) -> str:
 def load_asset_file(
     settings: ShapeNetSource | FolderSource, folder: Path, entry: Entry, category: str, assets: Assets
 ) -> Asset:
-    """One instance, read by this process's reader; MeshError where it is refused, is missing or has changed."""
+    """One instance, read by a limited process; MeshError where it is refused, is missing or has changed."""
     task = Task("load", folder / entry.files[0].path, category, entry)
-    (answer,) = shared_reader().ask(Request(settings, folder, assets, (task,)))
+    (answer,) = ask(Request(settings, folder, assets, (task,)))
     if isinstance(answer, MeshError):
         raise answer
     return unpack_asset(answer)

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.job.assets import CATEGORIES, ProceduralSource
+from schemas.job.assets import CATEGORIES, ProceduralSource, instance_id
 from tests.workers.assets.oracles import faulty_rays, support_margin, welded
-from workers.assets.builtin.identity import instance_id
-from workers.assets.builtin.make import GENERATORS, make_asset, make_model, shape_digest
+from workers.assets.builtin.make import make_asset, make_model, shape_digest
 
 SOURCE = ProceduralSource(source="procedural")
 METRIC = ProceduralSource(source="procedural", size="metric")
@@ -144,22 +143,22 @@ def test_instances_differ_and_stay_within_their_budget_of_faces(category):
 
 def test_the_same_instance_comes_again_from_another_process_with_another_hash_seed():
     code = (
-        "from workers.assets.builtin.make import *;"
+        "from workers.assets.builtin.make import *; from schemas.job.assets import CATEGORIES;"
         "s = ProceduralSource(source='procedural');"
-        "print(' '.join(make_asset(c, s, 5, 600.0).sha256 for c in GENERATORS))"
+        "print(' '.join(make_asset(c, s, 5, 600.0).sha256 for c in (*CATEGORIES, 'table')))"
     )
     env = {**os.environ, "PYTHONHASHSEED": "77", "OMP_NUM_THREADS": "3"}
     out = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY, env=env
     )
-    assert out.stdout.split() == [asset(category, 5).sha256 for category in GENERATORS]
+    assert out.stdout.split() == [asset(category, 5).sha256 for category in EVERYTHING]
 
 
 def test_shapes_have_the_same_bits_with_and_without_wide_vector_instructions():
     """Dispatch in numpy differs with AVX-512 and AVX2 off; coordinates do not."""
     code = (
-        "from workers.assets.builtin.make import *;"
-        "print(' '.join(str(hash(make_model(c, 0, 5).solid.vertices.tobytes())) for c in GENERATORS))"
+        "from workers.assets.builtin.make import *; from schemas.job.assets import CATEGORIES;"
+        "print(' '.join(str(hash(make_model(c, 0, 5).solid.vertices.tobytes())) for c in (*CATEGORIES, 'table')))"
     )
     digests = []
     for off in ("", "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX2 FMA3"):

@@ -12,7 +12,7 @@ from schemas.job.job import Job
 from tests.workers.assets.oracles import CUBE, textured_cube, write
 from workers.assets.catalogue import open_catalogue
 from workers.assets.external import urdf as urdf_file
-from workers.assets.external.mesh import load_shape
+from workers.assets.external.formats import load_shape
 from workers.assets.external.urdf import load_urdf
 from workers.scene.plan import SceneChance, draw_scene
 

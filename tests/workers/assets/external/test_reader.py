@@ -1,109 +1,176 @@
-"""The process that reads files from outside, as its worker sees it."""
+"""The limited processes that read files from outside: their limits, their verdicts, and what comes back."""
 
+import ctypes
+import errno
+import faulthandler
+import json
+import os
+import resource
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
+from schemas.base import frozen_array
 from schemas.errors import MachineError, MeshError
 from schemas.job.assets import Assets, FolderSource, MeshLimits
+from schemas.scene.shape import Asset, MassProperties, Material, Part, Shape
 from tests.workers.assets.oracles import CUBE, textured_cube, write
-from workers.assets.external import reader as module
+from workers.assets.external import reader
 from workers.assets.external.listing import Entry, hash_files
-from workers.assets.external.reader import ROOT, Reader, ask_all, shared_reader
-from workers.assets.external.reader_tasks import Request, Task
+from workers.assets.external.placement import read_measured
+from workers.assets.external.reader import (
+    ANSWER,
+    REFUSAL,
+    Request,
+    Task,
+    answer_task,
+    ask,
+    ask_all,
+    pack_asset,
+    unpack_asset,
+)
 
 SETTINGS = FolderSource(source="urdf", folder=".")
+ROOT = Path(__file__).resolve().parents[4]
 
 
-def request(folder, *paths, kind="list", **limits):
-    entries = [None if kind == "list" else Entry("a", hash_files([path], folder), "MIT") for path in paths]
-    tasks = [Task(kind, path, "mug", entry) for path, entry in zip(paths, entries, strict=True)]
+def request(folder, *paths, kind="list", category="mug", **limits):
+    entries = [None if kind in ("list", "names") else Entry("a", hash_files([path], folder), "MIT") for path in paths]
+    tasks = [Task(kind, path, category, entry) for path, entry in zip(paths, entries, strict=True)]
     return Request(SETTINGS, folder, Assets(limits=MeshLimits(**limits)), tuple(tasks))
 
 
-def many_triangles(path, count):
-    """An OBJ file that takes some seconds of processor time for each million triangles."""
-    corners = "".join(f"v {k % 1000 / 1e3} {k // 1000 / 1e3} {k % 7 / 1e3}\n" for k in range(count + 2))
-    return write(path, corners + "".join(f"f {k} {k + 1} {k + 2}\n" for k in range(1, count + 1)))
+def spin(seconds):
+    begun = time.process_time()
+    while time.process_time() < begun + seconds:
+        pass
+    return "list"
 
 
-def test_processor_time_and_memory_are_verdicts_on_the_file_and_the_files_beside_it_are_read(tmp_path):
-    good, slow = write(tmp_path / "good.obj", CUBE), many_triangles(tmp_path / "slow.obj", 1_400_000)
-    limits = {"max_cpu_s": 1.0, "max_vertices": 2_000_000, "max_faces": 2_000_000}
-    answers = list(shared_reader().ask(request(tmp_path, good, slow, good, kind="check", **limits)))
-    assert [isinstance(answer, MeshError) for answer in answers] == [False, True, False]
-    assert (answers[1].reason, answers[1].kind) == ("too_slow", "intrinsic")
-    assert "slow.obj takes more than assets.limits.max_cpu_s = 1 s of processor time" in answers[1].detail
+def crash():
+    faulthandler.disable()
+    ctypes.string_at(0)
 
 
-def test_textures_too_large_for_the_memory_refuse_their_mesh(tmp_path):
-    mesh = textured_cube(tmp_path)
-    Image.new("L", (9400, 9400)).save(tmp_path / "skin.png")
-    limits = {"max_texture_px": 9400, "max_memory_mb": 1024}
-    (answer,) = shared_reader().ask(request(tmp_path, mesh, kind="check", **limits))
-    assert answer.reason == "too_large"
-    assert "cube.obj takes more memory than assets.limits.max_memory_mb = 1024" in answer.detail
+def fail(number):
+    raise OSError(number, "x")
 
 
-def test_a_server_that_has_ended_is_started_again(tmp_path):
+def tell_limits():
+    kinds = (resource.RLIMIT_AS, resource.RLIMIT_FSIZE, resource.RLIMIT_CORE)
+    raise MeshError("told", f"a.obj {[resource.getrlimit(kind)[1] >> 20 for kind in kinds]}")
+
+
+ACTS = {
+    "fine": lambda: "list",
+    "half": lambda: spin(0.6),
+    "endless": lambda: spin(1e9),
+    "crash": crash,
+    "memory": lambda: bytes(8 << 30),
+    "file": lambda: fail(errno.EFBIG),
+    "exit": lambda: os._exit(3),
+    "killed": lambda: os.kill(os.getpid(), signal.SIGKILL),
+    "limits": tell_limits,
+}
+
+
+@dataclass(frozen=True)
+class Act:
+    """A task that does in the child what a stranger's file may make a parser do."""
+
+    what: str
+    path: Path
+    category: str = ""
+    entry: None = None
+
+    @property
+    def kind(self):
+        """Does it."""
+        return ACTS[self.what]()
+
+
+def act(folder, *what, **limits):
+    path = write(folder / "a.obj", CUBE)
+    tasks = tuple(Act(one, path) for one in what)
+    answers = ask(Request(SETTINGS, folder, Assets(limits=MeshLimits(**limits)), tasks))
+    return [answer.reason if isinstance(answer, MeshError) else "read" for answer in answers]
+
+
+@pytest.mark.parametrize(
+    ("what", "reason"),
+    [
+        ("crash", "unreadable"),
+        ("endless", "too_slow"),
+        ("memory", "too_large"),
+        ("file", "too_large"),
+        ("exit", "unreadable"),
+    ],
+)
+def test_what_ends_a_child_is_a_verdict_on_its_file_alone_and_leaves_no_core(tmp_path, monkeypatch, what, reason):
+    monkeypatch.chdir(tmp_path)
+    assert act(tmp_path, "fine", what, "fine", max_cpu_s=1.0) == ["read", reason, "read"]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.obj"]
+
+
+def test_every_task_has_the_processor_time_for_itself(tmp_path):
+    assert act(tmp_path, *["half"] * 4, max_cpu_s=1.0) == ["read"] * 4
+
+
+def test_limits_are_hard_ones(tmp_path):
     path = write(tmp_path / "a.obj", CUBE)
-    reader = Reader()
-    try:
-        first = list(reader.ask(request(tmp_path, path)))
-        reader._process.kill()
-        reader._process.wait()
-        assert list(reader.ask(request(tmp_path, path))) == first
-    finally:
-        reader.close()
-        reader.close()
-
-
-def test_a_server_that_cannot_start_is_the_machine_s_fault(tmp_path, monkeypatch):
-    monkeypatch.setattr(module.sys, "executable", "/bin/false")
-    reader = Reader()
-    with pytest.raises(MachineError, match="ends at once"):
-        list(reader.ask(request(tmp_path, write(tmp_path / "a.obj", CUBE))))
+    (told,) = ask(Request(SETTINGS, tmp_path, Assets(limits=MeshLimits(max_memory_mb=3000)), (Act("limits", path),)))
+    assert told.detail == "a.obj [3000, 3000, 0]"
 
 
 def test_a_child_that_is_killed_from_outside_is_no_verdict(tmp_path):
-    reader = Reader()
-    try:
-        reader.last = module.Usage(0, 0.0, 0)
-        asked = reader.ask(request(tmp_path, many_triangles(tmp_path / "slow.obj", 500_000), kind="check"))
-        list(reader.ask(request(tmp_path, write(tmp_path / "a.obj", CUBE))))
-        killer = subprocess.Popen([sys.executable, "-c", KILLER, str(reader._process.pid)])
-        with pytest.raises(MachineError, match="killed from outside"):
-            list(asked)
-        assert killer.wait() == 0
-    finally:
-        reader.close()
+    with pytest.raises(MachineError, match="killed from outside"):
+        act(tmp_path, "fine", "killed")
+    assert act(tmp_path, "fine") == ["read"]
 
 
-KILLER = """
-import os, sys, time
-for _ in range(3000):
-    children = open(f"/proc/{sys.argv[1]}/task/{sys.argv[1]}/children").read().split()
-    if children:
-        os.kill(int(children[0]), 9)
-        break
-    time.sleep(0.01)
-"""
+def test_an_answer_without_bounds_is_not_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(reader.Connection, "recv_bytes", _short(reader.Connection.recv_bytes))
+    assert act(tmp_path, "fine") == ["unreadable"]
 
 
-def test_a_server_ends_when_its_worker_is_killed(tmp_path):
+def _short(receive):
+    return lambda self, most: receive(self, 10)
+
+
+def test_a_fork_server_that_has_ended_is_started_again_and_one_that_cannot_start_is_the_machine_s_fault(tmp_path):
     code = (
-        "import sys, time; from pathlib import Path; from tests.workers.assets.external.test_reader import request, Reader;"
-        "reader = Reader(); p = Path(sys.argv[1]); list(reader.ask(request(p.parent, p)));"
-        "print(reader._process.pid, flush=True); time.sleep(60)"
+        "import os, signal, sys, time, multiprocessing.forkserver as f, multiprocessing.spawn as s\n"
+        "from pathlib import Path; from tests.workers.assets.external.test_reader import *\n"
+        "def kill(): os.kill(f._forkserver._forkserver_pid, signal.SIGKILL); time.sleep(1)\n"
+        "folder = Path(sys.argv[1]); print(act(folder, 'fine')); kill(); print(act(folder, 'fine')); kill()\n"
+        "s.set_executable('/bin/false')\n"
+        "try: act(folder, 'fine')\n"
+        "except MachineError as error: print(error)"
     )
-    path = write(tmp_path / "a.obj", CUBE)
-    command = [sys.executable, "-c", code, str(path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as worker:
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    out = subprocess.run(command, capture_output=True, text=True, cwd=ROOT).stdout.splitlines()
+    assert out[:2] == ["['read']"] * 2 and "ends at once" in out[2]
+
+
+def test_a_script_without_a_guard_is_not_run_again_and_its_reader_ends_with_it(tmp_path):
+    script = write(
+        tmp_path / "script.py",
+        "import os, sys, time; from pathlib import Path; from tests.workers.assets.external.test_reader import *;"
+        "print('once', act(Path(sys.argv[1]), 'fine'), flush=True);"
+        "import multiprocessing.forkserver as f; print(f._forkserver._forkserver_pid, flush=True); time.sleep(60)",
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(script), str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=tmp_path, env=environment, text=True) as worker:
+        assert worker.stdout.readline() == "once ['read']\n"
         server = int(worker.stdout.readline())
         worker.send_signal(signal.SIGKILL)
     ends = time.monotonic() + 30
@@ -119,12 +186,146 @@ def is_running(pid):
         return False
 
 
+def test_time_and_memory_are_verdicts_on_real_files_and_name_the_limit(tmp_path):
+    count = 400_000
+    corners = "".join(f"v {k % 1000 / 1e3} {k // 1000 / 1e3} {k % 7 / 1e3}\n" for k in range(count + 2))
+    slow = write(tmp_path / "slow.obj", corners + "".join(f"f {k} {k + 1} {k + 2}\n" for k in range(1, count + 1)))
+    (answer,) = ask(request(tmp_path, slow, kind="check", max_cpu_s=1.0))
+    assert (answer.reason, answer.kind) == ("too_slow", "intrinsic")
+    assert "slow.obj takes more than assets.limits.max_cpu_s = 1 s of processor time" in answer.detail
+    Image.new("L", (9400, 9400)).save(tmp_path / "skin.png")
+    mesh = textured_cube(tmp_path)
+    (answer,) = ask(request(tmp_path, mesh, kind="check", max_texture_px=9400, max_memory_mb=1024))
+    assert answer.reason == "too_large"
+    assert "cube.obj takes more memory than assets.limits.max_memory_mb = 1024" in answer.detail
+
+
 def test_many_files_are_answered_in_their_order_by_several_processes(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "WORTH_A_PROCESS", {"list": 4})
-    monkeypatch.setattr(module, "BATCH", {"list": 3})
+    monkeypatch.setitem(reader.BATCH, "list", 3)
     paths = [write(tmp_path / f"{k}.obj", CUBE + "#" * k) for k in range(20)]
     told = []
     answers = list(ask_all(request(tmp_path, *paths), lambda *step: told.append(step)))
     assert [task.path for task, _ in answers] == paths
-    assert len({bytes(answer) for _, answer in answers}) == 20
+    assert len({answer for _, answer in answers}) == 20
     assert told == [(done, 20) for done in (3, 6, 9, 12, 15, 18, 20)]
+
+
+def answer(folder, text, kind="check", name="a.obj", category="mug"):
+    asked = request(folder, write(folder / name, text), kind=kind, category=category)
+    return answer_task(asked, asked.tasks[0])
+
+
+def test_a_mesh_is_listed_passes_or_is_refused_with_its_reason(tmp_path):
+    ((name, size, sha256),) = json.loads(answer(tmp_path, CUBE, "list")[1:])
+    assert (name, size, len(sha256)) == ("a.obj", len(CUBE), 64)
+    assert answer(tmp_path, CUBE) == ANSWER
+    refused = answer(tmp_path, "v 0 0 0\n")
+    assert refused[:1] == REFUSAL
+    assert json.loads(refused[1:]) == ["no_faces", f"{tmp_path}/a.obj has no triangles", "intrinsic"]
+    triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"  # no body, but it may be a table
+    reason, detail, _ = json.loads(answer(tmp_path, triangle)[1:])
+    assert reason == "no_hull" and "four points apart" in detail
+    assert answer(tmp_path, triangle, category="table") == ANSWER
+
+
+def test_whatever_is_raised_is_a_refusal_in_one_line_that_names_the_file_and_memory_is_told_apart(
+    tmp_path, monkeypatch
+):
+    def load(*_):
+        raise errors[0]
+
+    monkeypatch.setattr(reader, "load_entry", load)
+    errors = [ValueError("a\nb\x00\ud800"), RecursionError(), AssertionError(), OSError(5, "I/O")]
+    while errors:
+        reason, detail, _ = json.loads(answer(tmp_path, CUBE)[1:])
+        assert reason == "unreadable" and f"{tmp_path}/a.obj" in detail and detail.isprintable()
+        errors.pop(0)
+    for error in (MemoryError(), OSError(12, "Cannot allocate memory")):
+        errors[:] = [error]
+        with pytest.raises(MemoryError):
+            answer(tmp_path, CUBE)
+
+
+def test_a_urdf_names_what_is_seen_and_what_collides_below_the_folder(tmp_path):
+    for name in ("seen.obj", "hit.obj"):
+        write(tmp_path / "parts" / name, CUBE)
+    mesh = '<geometry><mesh filename="{}"/></geometry>'.format
+    text = f"<visual>{mesh('parts/seen.obj')}</visual><visual>{mesh('none.obj')}</visual>"
+    text += f"<collision>{mesh('package://parts/hit.obj')}</collision>"
+    urdf = f'<robot name="r"><link name="l">{text}</link></robot>'
+    assert json.loads(answer(tmp_path, urdf, "names", "a.urdf")[1:]) == ["parts/seen.obj", "parts/hit.obj"]
+
+
+def test_a_lying_can_tells_its_size_and_the_axis_that_it_stands_on(tmp_path):
+    can = trimesh.creation.cylinder(0.04, 0.1, sections=48)
+    can.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0)))
+    found = read_measured(answer(tmp_path, can.export(file_type="stl"), "measure", "can.stl")[1:])
+    assert found.extents == pytest.approx((0.08, 0.1, 0.08), abs=1e-6)
+    assert (found.faces, found.watertight, found.up, found.confidence) == (len(can.faces), True, "y", "sure")
+    assert found.vertices >= len(can.vertices) and found.textures == 0 and found.notes == ()
+
+
+def test_pictures_are_counted_and_missing_ones_are_named(tmp_path):
+    mesh = textured_cube(tmp_path)
+    found = [read_measured(answer(tmp_path, mesh.read_bytes(), "measure", "cube.obj")[1:])]
+    Image.new("RGB", (4, 4)).save(tmp_path / "skin.png")
+    found.append(read_measured(answer(tmp_path, mesh.read_bytes(), "measure", "cube.obj")[1:]))
+    assert [one.textures for one in found] == [0, 1]
+    assert [one.notes for one in found] == [("skin.png is missing: plain base colour used",), ()]
+
+
+PICTURE = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+VERTICES = np.asfortranarray(np.random.default_rng(0).random((4, 3)))
+
+
+def part(texture=None, **more):
+    faces = frozen_array([[0, 1, 2], [0, 2, 3]], np.int32)
+    material = Material((0.1, 1 / 3, 0.3, 1.0), 0.2, 0.7, texture)
+    return Part("a", frozen_array(VERTICES), faces, material, **more)
+
+
+def asset():
+    rich = part(PICTURE, normals=VERTICES, uv=frozen_array(np.zeros((4, 2))), colors=np.zeros((4, 4), np.uint8))
+    mass = MassProperties(0.1 + 0.2, frozen_array([1 / 3, 0, 0]), frozen_array(np.eye(3) / 7), False)
+    return Asset(
+        "id", "mug", "urdf", "MIT", "a.obj", "e" * 64, Shape((rich, part(PICTURE), part()), True), mass,
+        frozen_array(np.eye(4)), 1 / 3, False, None, True, ("a note",),
+    )  # fmt: skip
+
+
+def test_an_asset_comes_back_bit_by_bit_in_its_memory_order_with_its_shared_texture():
+    sent = asset()
+    back = unpack_asset(pack_asset(sent))
+    assert (back.mass.mass_kg, back.scale, back.notes, back.shape.closed) == (0.1 + 0.2, 1 / 3, ("a note",), True)
+    assert back.mass.inertia.tobytes() == sent.mass.inertia.tobytes()
+    one, two, three = back.shape.parts
+    assert one.vertices.tobytes("A") == sent.shape.parts[0].vertices.tobytes("A")
+    assert one.vertices.strides == sent.shape.parts[0].vertices.strides == (8, 32)
+    assert one.material.texture is two.material.texture and three.material.texture is None
+    assert (one.material.texture == PICTURE).all() and one.material.base_color == (0.1, 1 / 3, 0.3, 1.0)
+    assert (three.normals, three.uv, three.colors) == (None, None, None)
+    assert not any(array.flags.writeable for array in (one.vertices, one.faces, one.normals, one.uv, one.colors))
+
+
+def test_bytes_that_make_no_sense_are_refused():
+    good = pack_asset(asset())
+    size = int.from_bytes(good[:8], "little")
+
+    def changed(**change):
+        text = json.dumps(json.loads(good[8 : 8 + size]) | change).encode()
+        return len(text).to_bytes(8, "little") + text + good[8 + size :]
+
+    assert unpack_asset(changed()).instance_id == "id"
+    arrays = good[8 + size :]
+    huge = arrays.replace(b"(4, 3)", b"(9**9,)"), arrays.replace(b"(4, 3)", b"(1<<6,)")
+    large = arrays.replace(b"'shape': (4, 3), }" + b" " * 11, b"'shape': (99999999999, 3), }" + b" ")
+    pickled = arrays.replace(b"'<f8'", b"'|O' ")
+    nan, face = asset(), asset()
+    for values, bad in ((nan.shape.parts[0].vertices, np.nan), (face.shape.parts[0].faces, 9)):
+        values.setflags(write=True)
+        values[0, 0] = bad
+    cases = [b"", bytes(64), good[:-20], changed(parts=[{"name": "a"}]), changed(arrays=2), changed(mass=[1.0])]
+    cases += [good[: 8 + size] + one for one in (*huge, large, pickled)] + [pack_asset(nan), pack_asset(face)]
+    for data in cases:
+        with pytest.raises(MeshError, match="makes no sense"):
+            unpack_asset(data)

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from schemas.base import frozen_array
-from schemas.scene.shape import Material, Part, Shape
+from schemas.scene.shape import Part, Shape
 from tests.workers.render.random_scenes import part_of
 from workers.render.raster.batches import own_vertices, pack_shape
 
@@ -56,15 +56,6 @@ def test_faces_of_the_top_come_first():
     assert highest.all(axis=1).tolist() == [True] * 2 + [False] * 10
     upside_down = Part("p", box.vertices, frozen_array(box.faces[:, ::-1], np.int32))
     assert pack_shape(Shape((upside_down,)))[0].top_faces == 0, "a face seen from below only is no top"
-
-
-def test_a_batch_is_matte_where_all_of_it_is():
-    (plain,) = Shape((part_of(BODIES["box"]),)).parts
-    for materials, matte in (((0.9, 0.0), True), ((0.9, 0.5), False), ((0.5, 0.0), False)):
-        roughness, metallic = materials
-        other = Part("p", plain.vertices, plain.faces, Material(roughness=roughness, metallic=metallic))
-        dull = Part("p", plain.vertices, plain.faces, Material(roughness=1.0))
-        assert pack_shape(Shape((dull, other)))[0].matte == matte
 
 
 def test_the_top_is_planar_where_its_normals_are_upright_and_its_colours_one():

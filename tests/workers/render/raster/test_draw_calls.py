@@ -17,18 +17,10 @@ from schemas.scene.view import Camera, Intrinsics
 from tests.kit.shapes import shape_of
 from tests.workers.render.looks import FLAT, FOUR, RASTER, Look, forcing, without
 from tests.workers.render.random_scenes import APPEARANCE, VGA, orbit_and_mirror, procedural_things, random_things
-from workers.geometry.camera import orbit_pose, project
+from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import translation
-from workers.render.raster.draw_calls import NEAR_M, clip_from_cam, rank_regions, sort_draws
+from workers.render.raster.draw_calls import NEAR_M, clip_from_cam, sort_draws
 from workers.render.raster.light_maps import LightMaps
-
-
-def test_clip_space_gives_the_cameras_image_coordinates():
-    k = Intrinsics(width=641, height=333, fx=512.3, fy=498.7, cx=301.4, cy=177.9)
-    points = np.random.default_rng(0).uniform([-2, -2, 0.1], [2, 2, 9], (50, 3))
-    clip = np.column_stack([points, np.ones(50)]) @ clip_from_cam(k).T
-    window = (clip[:, :2] / clip[:, 3:] + 1.0) / 2.0 * [k.width, k.height]
-    np.testing.assert_allclose(window, np.stack(project(points, k), axis=1), rtol=1e-12)
 
 
 def test_the_near_plane_cuts_and_nothing_is_cut_far_away():
@@ -42,7 +34,6 @@ DRAWN = ("floor", "light_maps", "table", "textures", "transparency")
 """The no-ops that the renderer knows of."""
 
 CUBE = shape_of(trimesh.creation.box((0.1, 0.1, 0.1)))
-CORNERS = CUBE.vertices
 
 
 def scenes(count: int):
@@ -111,14 +102,6 @@ def test_a_forced_pass_does_its_work_where_nothing_calls_for_it(renderer):
 
 def cubes(*spots: tuple[float, float, float], first: int = 3) -> list[Placed]:
     return [Placed(first + k, CUBE, translation(*spot)) for k, spot in enumerate(spots)]
-
-
-def ranks(things: list[Placed]) -> dict[int, int]:
-    return rank_regions(things, [CORNERS] * len(things))
-
-
-def test_a_stack_stands_back_step_by_step_and_what_stands_beside_it_does_not():
-    assert ranks(cubes((0, 0, 0), (0, 0, 0.1), (0, 0, 0.2), (1, 0, 0.2))) == {3: 0, 4: 1, 5: 2, 6: 0}
 
 
 def test_the_twentieth_of_many_is_not_lost_behind_what_it_lies_closely_over(renderer):

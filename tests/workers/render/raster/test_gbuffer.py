@@ -40,7 +40,6 @@ from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import pose, translation, uniform_rotation
 from workers.geometry.raycast import cast_view
 from workers.geometry.zbuffer import count_covered
-from workers.render.raster import draw_calls as programs
 from workers.render.raster.buffers import MAX_SHAPES
 
 
@@ -156,46 +155,6 @@ def test_of_coplanar_faces_the_lowest_region_id_wins(renderer, turned):
     assert wrong == 0
 
 
-def test_the_base_of_a_thing_on_a_table_belongs_to_the_table_seen_from_below(renderer):
-    """A single-sided table top without thickness, and a box that stands on it with no gap, seen from under the table."""
-    top = Placed(2, quad([[-0.5, -0.4, 0.7], [0.5, -0.4, 0.7], [0.5, 0.4, 0.7], [-0.5, 0.4, 0.7]]), np.eye(4))
-    box = Placed(3, shape_of(trimesh.creation.box((0.2, 0.15, 0.1))), translation(0.03, 0.02, 0.75))
-    beyond = Placed(4, shape_of(trimesh.creation.box((0.2, 0.2, 0.1))), translation(0.5, 0.0, 0.75))
-    view = camera(T=orbit_pose(np.array([0.0, 0.0, 0.7]), -0.6, 0.4, 1.2))
-    seen = renderer.draw([box, beyond, top], APPEARANCE, view)
-    depth, region, _ = cast_view([box, beyond, top], view)
-    assert not (region == 3).any()
-    assert (region == 4).sum() > 1000, "half of the second box hangs over the edge"
-    same = seen.region == region
-    assert (raycast.edge_distance_px([box, beyond, top], view, np.argwhere(~same)) < 1 / 64).all()
-    assert np.abs(seen.depth_m - depth)[same].max() * 1e3 < 0.05
-
-
-def test_what_is_nearer_than_the_near_plane_is_not_seen_by_renderer_or_rays(renderer):
-    assert programs.NEAR_M == raycast.NEAR_M
-    things = [Placed(3, facing(0.049), EYE), Placed(4, facing(0.051, 0.02), EYE), Placed(5, facing(1.0), EYE)]
-    seen = renderer.draw(things, APPEARANCE, camera(small(64, 64)))
-    depth, region, _ = cast_view(things, camera(small(64, 64)))
-    assert set(np.unique(region)) == {4, 5}
-    np.testing.assert_array_equal(seen.region, region)
-    np.testing.assert_allclose(seen.depth_m, depth, atol=1e-6)
-
-
-def test_drawing_again_gives_the_same_bytes(renderer):
-    """Also after other scenes, other sizes, counts, and after the shapes were pushed out of the GPU's store."""
-    rng = np.random.default_rng(21)
-    things, height = random_things(rng)
-    view = orbit_and_mirror(rng, height)[0]
-    first = renderer.draw(things, APPEARANCE, view)
-    for seed in range(30):
-        others, _ = random_things(np.random.default_rng(100 + seed))
-        renderer.draw(others, APPEARANCE, camera(small(100 + seed, 50), view.T_world_cam))
-        renderer.count_pixels([others[-1]], view)
-    again = renderer.draw(things, APPEARANCE, view)
-    for name in ("rgb", "depth_m", "region"):
-        assert getattr(first, name).tobytes() == getattr(again, name).tobytes(), name
-
-
 @pytest.mark.parametrize("inclination", [-0.9, 0.05, 0.3, 0.9])
 def test_nothing_of_the_image_before_is_left_whether_or_not_the_floor_fills_the_image(renderer, inclination):
     """With a horizon in two of these views, which show the background above it; from below and from above."""
@@ -248,18 +207,6 @@ def test_memory_stays_flat_over_scenes_with_new_meshes(renderer, record_figure):
 def resident_mib() -> float:
     with open("/proc/self/statm") as file:
         return int(file.read().split()[1]) * 4096 / 2**20
-
-
-@pytest.mark.parametrize("render", [RASTER, FOUR])
-def test_labels_are_the_flat_tiers_to_the_byte(renderer, render):
-    for seed in range(12):
-        rng = np.random.default_rng(900 + seed)
-        things, height = procedural_things(rng) if seed % 2 else random_things(rng)
-        for view in orbit_and_mirror(rng, height):
-            flat, raster = (renderer.draw(things, APPEARANCE, view, *one) for one in (FLAT, render))
-            assert flat.depth_m.tobytes() == raster.depth_m.tobytes()
-            assert flat.region.tobytes() == raster.region.tobytes()
-            assert not np.array_equal(flat.rgb, raster.rgb)
 
 
 WITHDRAWN = [

@@ -10,14 +10,11 @@ import pytest
 import trimesh
 
 import workers.render.raster.gbuffer
-from schemas.base import frozen_array
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Part, Shape
 from schemas.scene.view import Intrinsics
 from tests.workers.render.looks import FLAT, RASTER, without
 from tests.workers.render.random_scenes import (
     APPEARANCE,
-    EYE,
     FLOOR_HALF_M,
     camera,
     floor,
@@ -74,19 +71,6 @@ def test_a_floor_that_fills_the_image_is_met_by_the_ray_of_every_pixel():
     every, fills = np.array(agreed).T
     assert 30 < fills.sum() < 270
     assert fills.sum() >= 0.95 * every.sum()
-
-
-def test_only_a_rectangle_of_two_triangles_fills_an_image():
-    corners, above = [[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], invert(orbit_pose(np.zeros(3), 1.0, 0.0, 1.0))
-    whole = np.array(corners, float)
-    tilted, slanted = whole.copy(), whole.copy()
-    tilted[2:, 2] = slanted[2, 0] = 10.0
-    halves, twice = [[0, 1, 2], [0, 2, 3]], [[0, 1, 2], [1, 2, 3]]
-    cases = [(whole, halves, True), (whole, twice, False), (tilted, halves, False), (slanted, halves, False)]
-    cases += [(whole, halves[:1] * 2, False), (whole, halves[:1], False), (0.01 * whole, halves, False)]
-    for vertices, faces, fills in cases:
-        shape = Shape((Part("p", frozen_array(vertices), np.array(faces, np.int32)),))
-        assert fills_image(shape, above, K) == fills
 
 
 def cosines(T_world_cam: np.ndarray) -> np.ndarray:
@@ -197,22 +181,3 @@ def test_the_window_holds_all_that_is_low(renderer):
         assert ((u >= left) & (u <= right) & (v >= top) & (v <= bottom))[seen].all()
         inside += seen.sum()
     assert inside > 10_000
-
-
-def test_where_the_depth_test_may_decide_everywhere_the_window_is_the_image(renderer):
-    box = shape_of(trimesh.creation.box((0.2, 0.2, 0.2)))
-    view = camera(small(40, 30), orbit_pose(np.zeros(3), 0.9, 0.0, 1.0))
-    whole = (0, 0, 40, 30)
-    assert window_of(renderer, Placed(3, box, EYE), view) != whole
-    assert (
-        window_of(renderer, Placed(3, box, EYE), camera(small(40, 30), orbit_pose(np.zeros(3), -0.9, 0.0, 1.0)))
-        == whole
-    )
-    wide = shape_of(trimesh.creation.box((9.0, 9.0, 0.2)))
-    assert window_of(renderer, Placed(3, wide, EYE), view) == whole, "it reaches behind the camera"
-    left, top, right, bottom = window_of(renderer, Placed(3, box, translation(0.0, 0.0, 0.3)), view)
-    assert left >= right or top >= bottom, "it hovers"
-    narrow = small(40, 30, fx=400.0, fy=400.0)
-    far = camera(narrow, orbit_pose(np.zeros(3), 0.9, 0.0, 6.0))
-    left, top, right, bottom = window_of(renderer, Placed(3, box, translation(1.5, 1.5, 0.0)), far)
-    assert left >= right or top >= bottom, "it is beside the image"

@@ -12,11 +12,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from schemas.base import frozen_array
 from schemas.scene.scene import Placed
-from schemas.scene.shape import Appearance, Light, Shape
+from schemas.scene.shape import Shape
 from tests.workers.render.looks import (
-    BLACK,
     DOWN,
     FOUR,
     RASTER,
@@ -36,15 +34,11 @@ from tests.workers.render.random_scenes import (
     small,
 )
 from workers.geometry.camera import orbit_pose
-from workers.geometry.frames import transform, translation
+from workers.geometry.frames import translation
 from workers.render.raster.baking import (
     MAP_PX,
-    SCENE_MARGIN_M,
     SHADOW_PX,
-    light_box,
-    shadow_casters,
     sky_visibility,
-    triangles_of,
 )
 from workers.render.raster.light_maps import LightMaps
 
@@ -70,23 +64,11 @@ def test_a_board_overhead_hides_the_sky_and_lets_light_in_from_the_sides():
     assert higher[40, 40] > seen[40, 40]
 
 
-TOWARDS = np.array([0.6, 0.0, 0.8])
 BOX = shape_of(trimesh.creation.box((0.2, 0.2, 0.2)))
 
 
 def things():
     return [floor(), Placed(2, BOX, translation(0.0, 0.0, 0.1)), Placed(3, BOX, translation(0.3, 0.1, 0.3))]
-
-
-def test_the_lights_box_holds_every_vertex_and_its_depth_grows_away_from_the_light():
-    vertices, _ = triangles_of(shadow_casters(things()))
-    box = light_box(vertices, TOWARDS)
-    unit = transform(box.unit_from_world, vertices)
-    assert (unit > 0.0).all() and (unit < 1.0).all()
-    size = box.bounds[1] - box.bounds[0]
-    assert unit.min(axis=0) * size == pytest.approx(SCENE_MARGIN_M) == (1.0 - unit.max(axis=0)) * size
-    assert np.ptp(unit[:, 2] * size[2] + vertices @ TOWARDS) < 1e-12
-    assert transform(box.clip_from_world, vertices) == pytest.approx(2.0 * unit - 1.0)
 
 
 def counted(name: str):
@@ -141,24 +123,3 @@ def test_without_shadows_a_point_behind_a_box_has_lamberts_brightness(renderer, 
     assert brightness(lit.rgb)[v, u] == pytest.approx(0.9 * 0.8, rel=0.02)
     assert lit.depth_m.tobytes() == shadowed.depth_m.tobytes()
     assert lit.region.tobytes() == shadowed.region.tobytes()
-
-
-def wall_on_a_table():
-    """(things, a view, pixel of a point x metres in front of the wall)."""
-    wall = shape_of(trimesh.creation.box((0.02, 0.5, 0.3)))
-    slab = shape_of(trimesh.creation.box((2.0, 2.0, 0.05)))
-    things = [floor(), Placed(2, slab, translation(0, 0, 0.575)), Placed(3, wall, translation(0, 0, 0.75))]
-    view = camera(T=orbit_pose(np.array([0.0, 0.0, 0.6]), 0.9, -0.3, 1.5))
-    return things, view, lambda x: tuple(int(c) for c in pixel_of(np.array([x, 0.0, 0.6]), view)[::-1])
-
-
-SKY = Appearance((0.5,) * 3, (Light(frozen_array([0.0, 0.0, 1.0]), BLACK),), BLACK)
-
-
-def test_where_a_thing_stands_the_table_is_darker_without_any_light_but_the_sky(renderer):
-    """Beside a wall the sky is half hidden; half a metre from it hardly."""
-    things, view, pixel = wall_on_a_table()
-    seen = brightness(renderer.draw(things, SKY, view, *RASTER).rgb)
-    at = {x: seen[pixel(x)] for x in (0.03, 0.1, 0.5)}
-    assert 0.4 < at[0.03] / at[0.5] < 0.75
-    assert at[0.03] < at[0.1] < at[0.5]

@@ -14,8 +14,8 @@ from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from tests.workers.assets.external.test_hostile_files import opened, scene_of
 from tests.workers.assets.oracles import CUBE, write
+from workers.assets.external.formats import load_shape
 from workers.assets.external.gltf import named_by_gltf
-from workers.assets.external.mesh import load_shape
 
 
 def png(size=(4, 4), colour=(255, 0, 0)):

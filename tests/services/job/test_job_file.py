@@ -1,12 +1,19 @@
 """From a job file to a `Job`: every fault by file, key, value and what is allowed."""
 
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from schemas.errors import JobError
 from schemas.job.job import Job
-from services.job.job_file import load_job
+from services.job.job_file import describe_fault, load_job, pack_job
+from services.job.packed import MARK, MOST_CHARACTERS, is_packed, pack, unpack
+from services.job.reference import allowed_keys, describe_allowed, list_keys, write_doc
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -213,3 +220,114 @@ def test_a_hostile_change_is_told_in_a_line(tmp_path, change, words):
     message = fault(tmp_path, "name: a\nassets: {objects: [{source: procedural}]}", change)
     assert all(word in message for word in words), message
     assert message.isprintable() and len(message) < 700 + len(str(tmp_path)), message
+
+
+def told(**keys) -> list[str]:
+    with pytest.raises(ValidationError) as refusal:
+        Job.model_validate({"name": "t", **keys})
+    return [describe_fault(fault) for fault in refusal.value.errors()]
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"name": "a b"}, "name: 'a b': a name is 1 to 64 letters, digits, ., - and _"),
+        ({"physics": 3}, "physics: 3: must hold keys with values"),
+        ({"assets": {"objects": 3}}, "assets.objects: 3: must be a list"),
+        ({"assets": {"objects": [3]}}, "assets.objects.0: 3: must hold keys with values"),
+        ({"assets": {"objects": [{}]}}, "assets.objects.0: {}: must have a key 'source'"),
+        ({"assets": {"objects": [{"source": "urd"}]}}, "its 'source' did you mean 'urdf'? must be 'procedural', "),
+        ({"start": {"offset_m": 3}}, "start.offset_m: 3: must be two numbers: [low, high]"),
+        ({"start": {"offset_m": [3]}}, "start.offset_m.1: is missing"),
+        ({"start": {"offset_m": [1, 2, 3]}}, "start.offset_m: [1, 2, 3]: must have at most 2 of them"),
+        (
+            {"start": {"pose": "uprigth"}},
+            "start.pose: 'uprigth': did you mean 'upright'? must be 'upright', 'tumbled' or",
+        ),
+        ({"scenes": "x"}, "scenes: 'x': must be a whole number"),
+        ({"scenes": 2.5}, "scenes: 2.5: must be a whole number"),
+        ({"scenes": 0}, "scenes: 0: must be at least 1"),
+        ({"categories": []}, "categories: {}: must have at least 1 of them"),
+        ({"check": {"raycast_share": 2}}, "check.raycast_share: 2: must be at most 1"),
+        ({"check": {"raycast_share": "half"}}, "check.raycast_share: 'half': must be a number"),
+        ({"physics": {"exact_rest": "maybe"}}, "physics.exact_rest: 'maybe': must be true or false"),
+        ({"phisics": 1}, "phisics: there is no such key; did you mean 'physics'?"),
+    ],
+)
+def test_a_fault_is_one_line_of_plain_words(keys, words):
+    lines = told(**keys)
+    assert any(line.startswith(words) or words in line for line in lines), lines
+    for line in lines:
+        assert "\n" not in line
+        for jargon in ("pattern", "dictionary", "instance of", "tuple", "discriminator", "Input", "parse"):
+            assert jargon not in line
+
+
+HOSTILE = "verso: 1\nname: odd\nscenes: 4  # $(touch x); `touch y` | 'quote' \"quote\" && > < * ? ~ \\\n"
+
+
+@given(st.binary(max_size=2000))
+def test_what_is_packed_comes_back_from_a_word_that_no_shell_changes(data):
+    word = pack(data)
+    assert re.fullmatch(r"job:[A-Za-z0-9_-]*", word) and is_packed(word)
+    assert unpack(word, 2000) == data
+
+
+def test_a_packed_job_is_the_same_job(tmp_path):
+    file = tmp_path / "odd.yaml"
+    file.write_text(HOSTILE)
+    word = pack_job(file)
+    assert load_job(Path(word), ["scenes=9"]) == load_job(file, ["scenes=9"])
+
+
+@pytest.mark.parametrize(
+    "change", [lambda w: w[:-6], lambda w: w[:9] + "A" + w[10:], lambda w: w + "$", lambda w: MARK]
+)
+def test_a_word_that_was_cut_or_changed_is_told(change):
+    with pytest.raises(JobError, match="pack it again"):
+        unpack(change(pack(HOSTILE.encode())), 2000)
+
+
+def test_a_small_word_cannot_become_a_large_file():
+    bomb = pack(bytes(50_000_000))
+    assert len(bomb) < 70_000
+    assert len(unpack(bomb, 250_000)) == 250_001
+
+
+def test_a_file_that_is_too_long_for_a_command_line_is_refused_with_the_way_out():
+    random = np.random.default_rng(1).bytes(MOST_CHARACTERS)
+    with pytest.raises(JobError, match="file_mounts"):
+        pack(random)
+
+
+def test_folders_of_a_packed_job_have_whole_paths(tmp_path):
+    file = tmp_path / "meshes.yaml"
+    file.write_text("name: meshes\nscenes: 2\ncategories: [mug]\nassets: {objects: [{source: urdf, folder: meshes}]}\n")
+    with pytest.raises(JobError, match=r"assets\.objects\.0\.folder: 'meshes': a packed job has no folder of its own"):
+        pack_job(file)
+    file.write_text(file.read_text().replace("folder: meshes", "folder: /srv/meshes"))
+    assert is_packed(pack_job(file))
+
+
+def test_every_key_is_documented_and_the_page_is_current():
+    assert [path for path, field in list_keys() if not field.description] == []
+    assert (ROOT / "docs" / "job.md").read_text() == write_doc()
+
+
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        ("images.projection.splat", "whole number, >= 1, <= 15"),
+        ("start.offset_m", "[low, high]"),
+        ("cameras.depth.offset_m", "list of 3 numbers"),
+        ("run.workers", "whole number, >= 1, <= 100000 or nothing"),
+        ("assets.objects[urdf].up", "`x`, `y`, `z` or map"),
+    ],
+)
+def test_types_and_bounds_are_told_in_words(key, words):
+    assert describe_allowed(dict(list_keys())[key]) == words
+
+
+def test_allowed_keys_are_the_siblings_also_below_a_position_in_a_list():
+    assert allowed_keys(["assets", "split", "trian"]) == ["test", "train", "val"]
+    assert {"diagonal_m", "folder", "instances"} <= set(allowed_keys(["assets", "objects", "0", "wieght"]))

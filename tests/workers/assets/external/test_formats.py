@@ -1,4 +1,4 @@
-"""What a mesh file may hold and refer to: counts, material files, textures."""
+"""What a mesh file may hold and refer to: counts, material files, textures, colours."""
 
 import io
 import struct
@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-from schemas.errors import MeshError
 from schemas.job.assets import MeshLimits
 from tests.workers.assets.oracles import CUBE, textured_cube, write
-from workers.assets.external.caps import FolderResolver, check_counts, declared_counts, open_image
-from workers.assets.external.mesh import load_shape
+from workers.assets.external.caps import FolderResolver, declared_counts
+from workers.assets.external.formats import list_mesh_files, load_shape, material_files, read_visual
+from workers.assets.external.mesh import DEFAULT
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".ply"])
@@ -23,20 +24,6 @@ def test_the_counts_that_a_file_declares_are_those_that_it_holds(suffix):
     vertices, faces = declared_counts(suffix, mesh.export(file_type=suffix[1:]))
     assert faces == len(mesh.faces)
     assert vertices in (len(mesh.vertices), 3 * len(mesh.faces))
-
-
-def test_an_obj_is_counted_by_its_lines():
-    assert declared_counts(".obj", CUBE.encode()) == (8, 6)
-
-
-def test_ascii_stl_is_counted_by_its_facets():
-    text = trimesh.creation.box((1, 1, 1)).export(file_type="stl_ascii")
-    assert declared_counts(".stl", text.encode())[1] == 12
-
-
-def test_a_count_over_its_cap_names_the_cap(tmp_path):
-    with pytest.raises(MeshError, match="6 faces, over max_faces = 5"):
-        check_counts(tmp_path / "x.obj", 8, 6, MeshLimits(max_faces=5))
 
 
 def load(path, **limits):
@@ -50,12 +37,6 @@ def test_names_with_backslashes_and_folders_that_do_not_exist_are_found_beside_t
         assert resolver.find(name) == tmp_path / "mesh" / "skin.png"
     assert resolver.find("../../etc/passwd") is None
     assert resolver.find("bad\0name") is None
-
-
-def test_a_picture_that_cannot_be_read_says_why():
-    assert "not a PNG or JPEG" in str(open_image(b"BM123", MeshLimits())[1])
-    torn = b"\x89PNG\r\n\x1a\n" + bytes(9)
-    assert "cannot be opened" in str(open_image(torn, MeshLimits())[1])
 
 
 def test_a_texture_comes_along_with_its_coordinates_right_way_up(tmp_path):
@@ -73,12 +54,6 @@ def test_alpha_is_kept(tmp_path):
     part = load(textured_cube(tmp_path, more="d 0.5\n")).shape.parts[0]
     assert part.material.texture.shape == (2, 2, 4)
     assert part.material.base_color[3] == 0.5
-
-
-def test_a_missing_texture_leaves_the_base_colour_and_a_note(tmp_path):
-    loaded = load(textured_cube(tmp_path))
-    assert loaded.shape.parts[0].material.texture is None
-    assert "skin.png is missing" in loaded.notes[0]
 
 
 @pytest.mark.parametrize("name", ["skin.gif", "skin.png"])
@@ -139,3 +114,54 @@ def test_a_texture_outside_the_root_is_not_read(tmp_path):
     (tmp_path / "inner" / "link.png").symlink_to(tmp_path / "secret.png")
     path = textured_cube(tmp_path / "inner", picture="link.png")
     assert load(path).shape.parts[0].material.texture is None
+
+
+def box_with(material):
+    mesh = trimesh.creation.box((1, 1, 1))
+    mesh.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)
+    return mesh
+
+
+def test_gltf_colours_are_linear_and_become_srgb(tmp_path):
+    skin = PBRMaterial(baseColorFactor=[0.2158605, 1, 0, 0.5], metallicFactor=0.25)
+    path = write(tmp_path / "a.glb", box_with(skin).export(file_type="glb"))
+    material = load_shape(path, MeshLimits()).shape.parts[0].material
+    assert material.base_color == pytest.approx((0.5028, 1.0, 0.0, 0.5), abs=0.005)
+    assert material.metallic == 0.25
+    assert material.roughness == 1.0  # what glTF means by leaving it out
+
+
+def test_a_shiny_mtl_is_smoother_than_a_dull_one():
+    dull, shiny = (read_visual(box_with(SimpleMaterial(glossiness=g)))[0].material for g in (2.0, 900.0))
+    assert dull.roughness == pytest.approx((2 / 4) ** 0.25)
+    assert shiny.roughness < 0.3 < dull.roughness
+
+
+def test_an_alpha_of_zero_is_read_as_one_and_told():
+    visual, notes = read_visual(box_with(SimpleMaterial(diffuse=[0.5, 0.5, 0.5], d=["0.0"])))
+    assert visual.material.base_color[3] == 1.0
+    assert notes == ("an alpha of 0 was read as 1",)
+
+
+def test_colours_of_vertices_and_of_faces_are_kept_and_a_bare_mesh_has_the_default():
+    mesh = trimesh.creation.box((1, 1, 1))
+    assert read_visual(mesh)[0].material is DEFAULT
+    mesh.visual.vertex_colors = np.tile([255, 0, 128, 255], (8, 1)).astype(np.uint8)
+    assert read_visual(mesh)[0].colors[0].tolist() == [255, 0, 128, 255]
+    mesh = trimesh.creation.box((1, 1, 1))
+    mesh.visual.face_colors = np.tile([10, 20, 30, 255], (12, 1)).astype(np.uint8)
+    assert read_visual(mesh)[0].face_colors.shape == (12, 4)
+
+
+def test_material_files_are_found_wherever_they_are_named():
+    text = b"# xmtllib no\r\nmtllib a b.mtl\r\nv 0 0 0\nmtllib c.mtl\n"
+    assert material_files(text) == ["a b.mtl", "c.mtl"]
+    assert material_files(b"mtllib first.mtl") == ["first.mtl"]
+
+
+def test_an_obj_comes_with_its_materials_and_their_textures(tmp_path):
+    write(tmp_path / "m" / "cube.obj", "mtllib cube.mtl\n" + CUBE)
+    write(tmp_path / "m" / "cube.mtl", "newmtl a\nmap_Kd ../t/a.png\nnewmtl b\nmap_Kd none.png\n")
+    write(tmp_path / "t" / "a.png", b"png")
+    files = list_mesh_files(tmp_path / "m" / "cube.obj", tmp_path, MeshLimits())
+    assert [file.relative_to(tmp_path).as_posix() for file in files] == ["m/cube.obj", "m/cube.mtl", "t/a.png"]
