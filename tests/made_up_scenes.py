@@ -147,6 +147,7 @@ def _scene(scene_id: int, category: str, instance: str, table: str) -> dict[str,
         "raycast_checked": scene_id % 2 == 0,
         "settings_digest": "d" * 64,
         "bodies": [_body(scene_id, region, category, instance) for region in (3, 4)],
+        "capture": None,
     }
 
 
@@ -215,6 +216,7 @@ def _view(scene_id: int, category: str, pose_id: int, role: str, files: list[dic
         "projected_filled_share": 0.5 if projected else None,
         "projected_hidden_share": 0.4 if projected else None,
         "patch_object_fraction": None,
+        "capture": None,
     }
 
 

@@ -93,10 +93,7 @@ def columns_of_bodies(bodies: Sequence[Mapping[str, Any]]) -> Row:
 
 
 def read_world_poses(scene: Mapping[str, Any]) -> dict[int, Pose]:
-    """[4, 4] pose of the table and of every object in the world, by region id in order.
-
-    A scene that was stored before there were bodies has one object.
-    """
+    """[4, 4] pose of the table and of every object in the world, by region id in order; a capture has one object."""
     bodies = scene["bodies"] or [{"region_id": REGION_FIRST_OBJECT, "T_world_obj": scene["T_world_obj"]}]
     objects = {body["region_id"]: read_matrix(body["T_world_obj"]) for body in bodies}
     return {REGION_TABLE: read_matrix(scene["T_world_table"]), **objects}

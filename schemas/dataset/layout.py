@@ -4,11 +4,10 @@ import re
 import urllib.parse
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Literal
 
 from schemas.job.job import Job
 from schemas.scene.shape import REGION_FIRST_OBJECT
-from schemas.scene.view import ROLES, Role
+from schemas.scene.view import MODALITIES, ROLES, PixelKind, Role
 
 JOB_FILE = "job.yaml"
 README_FILE = "DATASET.md"
@@ -43,12 +42,8 @@ MAX_SCENE = 10**15
 MAX_RETRIES = 1 << 13
 _PLAIN_COMMIT = len("0000000000.json")
 
-Content = Literal[
-    "RGB", "depth", "segment", "RGBaligned", "depthAligned", "segmentAligned", "RGBprojected", "depthProjected"
-]
-
-PixelKind = Literal["rgb", "depth", "region"]
-"""The array of a view that an image holds."""
+Content = str
+"""The word in an image's name."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +55,12 @@ class Image:
     pixels: PixelKind
 
 
-_CONTENTS: dict[Role, dict[PixelKind, Content]] = {
-    "input": {"rgb": "RGB", "depth": "depth", "region": "segment"},
-    "aligned": {"rgb": "RGBaligned", "depth": "depthAligned", "region": "segmentAligned"},
-    "mirror": {"rgb": "RGB", "depth": "depth", "region": "segment"},
-    "projected": {"rgb": "RGBprojected", "depth": "depthProjected"},
-}
-IMAGES = tuple(Image(word, role, kind) for role, words in _CONTENTS.items() for kind, word in words.items())
+IMAGES = tuple(
+    Image(modality.words[role], role, modality.name)
+    for role in ROLES
+    for modality in MODALITIES.values()
+    if role in modality.words
+)
 """(a)-(k) of the article's figure 1; each also has a patch of every object, (l)-(u)."""
 
 
@@ -85,7 +79,7 @@ SWITCHES: dict[Role | PixelKind, str] = {
     "aligned": "cameras.depth.enabled",
     "mirror": "cameras.mirror.enabled",
     "projected": "images.projection.enabled",
-    "rgb": "render.rgb",
+    **{modality.name: modality.switch for modality in MODALITIES.values() if modality.switch is not None},
 }
 """The key of the job that switches a view, or the colour of every view, on and off. What is not here is always stored."""
 

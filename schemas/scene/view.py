@@ -4,7 +4,8 @@
 - Views of a scene: raw buffers, stored views with their labels, and pairs of views.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -15,6 +16,47 @@ from schemas.job.views import Patch, Sensor
 
 Role = Literal["input", "aligned", "mirror", "projected"]
 ROLES: tuple[Role, ...] = ("input", "aligned", "mirror", "projected")
+
+PixelKind = str
+"""The name of a modality."""
+
+
+@dataclass(frozen=True)
+class Modality:
+    """A kind of image that views have, stored as PNG without loss."""
+
+    name: PixelKind
+    words: Mapping[Role, str]
+    """The word in the file's name, by each role that has such an image."""
+    dtype: str
+    channels: int = 1
+    switch: str | None = None
+    """The key of the job that switches it on and off in every view; None where it is always stored."""
+
+    def shape(self, height: int, width: int) -> tuple[int, ...]:
+        """Of the array of an image of this size."""
+        return (height, width) if self.channels == 1 else (height, width, self.channels)
+
+
+MODALITIES: dict[PixelKind, Modality] = {
+    modality.name: modality
+    for modality in (
+        Modality(
+            "rgb",
+            {"input": "RGB", "aligned": "RGBaligned", "mirror": "RGB", "projected": "RGBprojected"},
+            "uint8",
+            3,
+            "render.rgb",
+        ),
+        Modality(
+            "depth",
+            {"input": "depth", "aligned": "depthAligned", "mirror": "depth", "projected": "depthProjected"},
+            "uint16",
+        ),
+        Modality("region", {"input": "segment", "aligned": "segmentAligned", "mirror": "segment"}, "uint8"),
+    )
+}
+"""Every modality there is. Files, `verify`, the Python door and the exports take from here which images there are."""
 
 
 class Intrinsics(Frozen):
@@ -108,6 +150,14 @@ class View:
     depth: NDArray[np.uint16]
     region: NDArray[np.uint8] | None
     labels: tuple[ObjectLabel, ...]
+    further: Mapping[PixelKind, NDArray] = field(default_factory=dict)
+    """Images of the other modalities."""
+
+    @property
+    def images(self) -> Mapping[PixelKind, NDArray]:
+        """Every image that the view has, by modality."""
+        known = {"rgb": self.rgb, "depth": self.depth, "region": self.region, **self.further}
+        return {name: pixels for name, pixels in known.items() if pixels is not None}
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,8 @@ from services.cli.arguments import (
     read_priority,
     read_span,
 )
+from services.export.table import FORMATS
 
-EXPORT_FORMATS: Final = ("mirror-recon", "bop", "webdataset", "huggingface", "gltf")
 """Those of services/export/formats.py, which a test compares."""
 
 KEPT: Final = "what is committed is kept, the same command goes on from there"
@@ -419,11 +419,13 @@ COMMANDS: dict[str, Command] = {
         (
             OUT,
             option("dir", type=read_place, metavar="DIR", help="a new or an empty folder, or one to go on in"),
-            option("--format", choices=EXPORT_FORMATS, required=True, help="docs/export.md describes each"),
+            option("--format", choices=tuple(FORMATS), required=True, help="docs/export.md describes each"),
             option(
                 "--category", action="append", default=[], metavar="NAME", help="only scenes of it; may be repeated"
             ),
-            option("--scenes", type=read_span, metavar="FIRST-LAST", help="only scenes with these ids"),
+            option(
+                "--scenes", type=read_span, metavar="FIRST-LAST", help="only scenes with these ids; one id is one scene"
+            ),
             option("--where", metavar="SQL", help="only scenes for which this holds, such as 'support_margin_mm > 5'"),
             option(
                 "--shard-mb",

@@ -19,7 +19,7 @@ import pyarrow.dataset as ds
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
-from schemas.dataset.tables import CAPTURE_SCHEMAS, SCHEMAS, TABLES
+from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import InputError, did_you_mean
 from schemas.job.job import Job
 from schemas.scene.view import ROLES
@@ -132,8 +132,7 @@ class Dataset:
         """
         if not 0 <= part[0] < part[1]:
             raise InputError(f"part {part} must be (k, n) with 0 <= k < n")
-        schemas = SCHEMAS if self.job.captures is None else CAPTURE_SCHEMAS
-        choose_pairs(pair_table({table: schemas[table].empty_table() for table in PAIR_TABLES}), where)
+        choose_pairs(pair_table({table: SCHEMAS[table].empty_table() for table in PAIR_TABLES}), where)
         return self._pairs(where, part)
 
     def _pairs(self, where: pc.Expression | None, part: tuple[int, int]) -> Iterator[Pair]:

@@ -69,6 +69,10 @@ class Pixels:
         """Paths below the dataset's folder of the images that there are, by kind: rgb, depth, region."""
         return self._paths
 
+    def image(self, kind: PixelKind) -> NDArray:
+        """The pixels of an image of any kind in `images`, as they are stored."""
+        return self._decode(kind)
+
     def rgb(self) -> NDArray[np.uint8]:
         """[H, W, 3] uint8 sRGB."""
         return self._decode("rgb")

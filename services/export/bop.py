@@ -26,22 +26,23 @@ from schemas.dataset.codec import Row, read_matrix
 from schemas.scene.shape import REGION_FIRST_OBJECT, Part
 from schemas.scene.view import Role
 from services.export.folder import ExportFolder
-from services.export.formats import Added, LeftOut
+from services.export.formats import Added, ExportRequest, LeftOut
 from services.export.shapes import ColoredShape, Shapes, Silhouette, box_of, whole_silhouette
 from services.export.source import ExportPair, ExportScene
 from services.job.record import JobRecord
 from workers.geometry.frames import invert
 from workers.geometry.hull import convex_hull
 from workers.store.images import decode_png, encode_mask
-from workers.store.store import Store
 
 
 class Bop:
     """Writes train/, val/ and test/ with a folder for each scene, and models/."""
 
-    def __init__(self, store: Store, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None) -> None:
+    def __init__(
+        self, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
+    ) -> None:
         self._folder = folder
-        self._shapes = Shapes(store, record)
+        self._shapes = Shapes(request.store, record)
         self._models = BopModels(folder, None if state is None else state["models"])
         self._camera: dict[str, Any] | None = None if state is None else state["camera"]
         self._splits: dict[str, int] = {} if state is None else dict(state["splits"])

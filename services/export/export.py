@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from schemas.errors import OutputError
 from services.export.folder import ExportFolder
-from services.export.formats import SHARDED, Added, Choice, Chooser, ExportRequest, open_writer
+from services.export.formats import Added, Choice, Chooser, ExportRequest, open_writer
 from services.export.source import iter_ranges, scenes_of
+from services.export.table import FORMATS
 from services.job.record import JobRecord, require_dataset, require_job
 from services.merge.merge import read_success
 from services.read.verdict import explain_damage
@@ -52,7 +53,7 @@ def export(request: ExportRequest, report: Report = lambda done, asked: None) ->
     """
     _refuse_inside(request)
     record = require_job(request.store)
-    chooser = Chooser(request.choice, record.job.captures is not None)
+    chooser = Chooser(request.choice)
     folder = ExportFolder(request.target)
     plan = _plan(request, record)
     if (done := folder.finished()) is not None:
@@ -148,7 +149,7 @@ def _plan(request: ExportRequest, record: JobRecord) -> dict[str, Any]:
         "job_digest": record.digest,
         "dataset_digest": (read_success(request.store) or {}).get("digest"),
         "choice": choice,
-        **({"shard_mb": request.shard_mb} if request.format in SHARDED else {}),
+        **({"shard_mb": request.shard_mb} if FORMATS[request.format].sharded else {}),
     }
 
 

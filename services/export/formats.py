@@ -1,23 +1,23 @@
-"""What an export is: its request and choice of scenes, what every format has, and the table of formats.
+"""What an export is: its request and choice of scenes, and what every format has.
 
 - Which scenes of a dataset are exported: by id, by category, and by an SQL condition.
 - What an export is asked for: a dataset, a place, a format by name, and a choice of scenes.
 - What every format is: a writer that takes scenes in order and says which pairs it leaves out, and why.
-- The formats of `verso export`, by name; each is loaded when it is asked for.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol, get_args
+from typing import Any, Final, Protocol
 
 import duckdb
 
 from schemas.base import Frozen
-from schemas.dataset.tables import CAPTURE_SCHEMAS, SCHEMAS
+from schemas.dataset.tables import SCHEMAS
 from schemas.errors import InputError
 from services.export.folder import ExportFolder
 from services.export.source import ExportScene
+from services.export.table import FORMATS
 from services.job.record import JobRecord
 from services.read.dataset_reader import StoredRange
 from workers.store.manifest import table_of_rows
@@ -53,13 +53,12 @@ _EXAMPLE: Final = "it is an SQL condition on the columns of scenes, such as 'sup
 class Chooser:
     """Chooses scenes range by range."""
 
-    def __init__(self, choice: Choice, captures: bool) -> None:
+    def __init__(self, choice: Choice) -> None:
         """Raises InputError where the condition is no SQL that these tables can answer."""
         self._choice = choice
-        self._schemas = CAPTURE_SCHEMAS if captures else SCHEMAS
         self._db = duckdb.connect(":memory:", config=dict(_LOCKED))
         if choice.where is not None:
-            self._ask({table: self._schemas[table].empty_table() for table in _TABLES})
+            self._ask({table: SCHEMAS[table].empty_table() for table in _TABLES})
 
     def choose(self, stored: StoredRange) -> Sequence[int]:
         """The ids of the chosen scenes of a range, in order."""
@@ -80,7 +79,7 @@ class Chooser:
         return [scene_id for scene_id in ids if scene_id in fit]
 
     def _names(self) -> list[tuple[str, list[str]]]:
-        return [(table, self._schemas[table].names) for table in _TABLES]
+        return [(table, SCHEMAS[table].names) for table in _TABLES]
 
     def _ask(self, tables: dict) -> set[int]:
         """The ids of the scenes in `tables` that the condition holds for."""
@@ -95,22 +94,22 @@ class Chooser:
         return {scene_id for (scene_id,) in found}
 
 
-FormatName = Literal["mirror-recon", "bop", "webdataset", "huggingface", "gltf"]
-FORMATS: tuple[FormatName, ...] = get_args(FormatName)
-SHARDED: tuple[FormatName, ...] = ("webdataset", "huggingface")
-"""Formats of which many pairs share a file."""
-
-
 @dataclass(frozen=True, eq=False)
 class ExportRequest:
     """What to export, where to, and how."""
 
     store: Store
     target: Path
-    format: FormatName
+    format: str
+    """A key of `services.export.table.FORMATS`."""
     choice: Choice = EVERYTHING
     shard_mb: int = 256
     """Size that ends a shard, of formats that have shards; 10^6 bytes."""
+
+    @property
+    def most_bytes(self) -> int:
+        """The same in bytes."""
+        return 1_000_000 * self.shard_mb
 
 
 @dataclass(frozen=True)
@@ -152,28 +151,8 @@ class Writer(Protocol):
 
 
 def open_writer(
-    name: FormatName, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
+    name: str, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
 ) -> Writer:
     """The writer of a format; `state` is what it said at the last checkpoint, None where it begins."""
-    most_bytes = 1_000_000 * request.shard_mb
-    match name:
-        case "mirror-recon":
-            from services.export.mirror_recon import MirrorRecon
-
-            return MirrorRecon(folder, state)
-        case "bop":
-            from services.export.bop import Bop
-
-            return Bop(request.store, record, folder, state)
-        case "webdataset":
-            from services.export.webdataset import WebDataset
-
-            return WebDataset(folder, most_bytes, state)
-        case "huggingface":
-            from services.export.huggingface import HuggingFace
-
-            return HuggingFace(record, folder, most_bytes, state)
-        case "gltf":
-            from services.export.gltf import Gltf
-
-            return Gltf(request.store, record, folder, state)
+    writer: Writer = FORMATS[name].load()(request, record, folder, state)
+    return writer

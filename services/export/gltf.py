@@ -13,7 +13,7 @@ from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import SceneError
 from schemas.scene.view import ROLES
 from services.export.folder import ExportFolder
-from services.export.formats import Added, LeftOut
+from services.export.formats import Added, ExportRequest, LeftOut
 from services.export.source import ExportScene, unchanged_sources
 from services.job.record import JobRecord
 from services.read.scene_geometry import captured_scene, planned_scene
@@ -33,8 +33,11 @@ _NEAR_M = 0.05
 class Gltf:
     """Writes <category>/<scene id>.glb."""
 
-    def __init__(self, store: Store, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None) -> None:
-        self._store, self._record, self._folder = store, record, folder
+    def __init__(
+        self, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
+    ) -> None:
+        self._store: Store = request.store
+        self._record, self._folder = record, folder
         self._files: dict[str, int] = dict((state or {}).get("files", {}))
 
     def add(self, scene: ExportScene) -> Added:

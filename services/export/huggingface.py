@@ -19,7 +19,7 @@ from schemas.dataset.layout import stored_images, stored_roles
 from schemas.dataset.tables import SCHEMAS
 from schemas.job.job import Job
 from services.export.folder import ExportFolder, Rounds
-from services.export.formats import Added
+from services.export.formats import Added, ExportRequest
 from services.export.source import ExportPair, ExportScene
 from services.job.record import JobRecord
 
@@ -40,10 +40,12 @@ _NOT_OF_OBJECTS: Final = ("scene_id", "pose_id")
 class HuggingFace:
     """Writes data/train-00000.parquet and so on, and README.md."""
 
-    def __init__(self, record: JobRecord, folder: ExportFolder, most_bytes: int, state: dict[str, Any] | None) -> None:
+    def __init__(
+        self, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
+    ) -> None:
         self._folder, self._job = folder, record.job
         self._schema = schema_of_pairs(record.job)
-        self._rounds = Rounds(folder, self._open, _PATTERN, most_bytes, state and state["rounds"])
+        self._rounds = Rounds(folder, self._open, _PATTERN, request.most_bytes, state and state["rounds"])
         self._rows: dict[str, int] = dict(state["rows"]) if state else {}
         self._licences: set[str] = set(state["licences"]) if state else set()
 

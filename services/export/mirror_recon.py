@@ -16,8 +16,9 @@ from schemas.dataset.layout import PixelKind
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import Role
 from services.export.folder import ExportFolder
-from services.export.formats import Added, LeftOut
+from services.export.formats import Added, ExportRequest, LeftOut
 from services.export.source import ExportPair, ExportScene
+from services.job.record import JobRecord
 from services.merge.tables import escaped
 from workers.store.images import decode_png, encode_png
 
@@ -33,7 +34,9 @@ _KINDS: tuple[tuple[PixelKind, str], ...] = (("rgb", "rgb"), ("depth", "depth"),
 class MirrorRecon:
     """Writes pairs of scenes with one object, whose every image and patch exists."""
 
-    def __init__(self, folder: ExportFolder, state: dict[str, Any] | None) -> None:
+    def __init__(
+        self, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
+    ) -> None:
         self._folder = folder
         self._next: dict[str, int] = dict((state or {}).get("next", {}))
         """The next even id by category."""

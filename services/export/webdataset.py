@@ -16,14 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
-from schemas.dataset.layout import PixelKind
-from schemas.scene.view import ROLES
+from schemas.scene.view import MODALITIES, ROLES
 from services.export.folder import ExportFolder, Rounds
-from services.export.formats import Added
+from services.export.formats import Added, ExportRequest
 from services.export.source import ExportPair, ExportScene
+from services.job.record import JobRecord
 
 _PATTERN: Final = "{split}-{number:06d}.tar"
-_PICTURES: Final[tuple[PixelKind, ...]] = ("rgb", "region")
+_PICTURES: Final = tuple(name for name in MODALITIES if name != "depth")
+"""Modalities that are stored as PNG files; depth is an array."""
 _OF_SCENE: Final = (
     "scene_id",
     "category",
@@ -41,8 +42,10 @@ _NOT_OF_OBJECTS: Final = ("scene_id", "pose_id", "role")
 class WebDataset:
     """Writes train-000000.tar and so on; every pair that the dataset has is a sample."""
 
-    def __init__(self, folder: ExportFolder, most_bytes: int, state: dict[str, Any] | None) -> None:
-        self._rounds = Rounds(folder, _Tar, _PATTERN, most_bytes, state and state["rounds"])
+    def __init__(
+        self, request: ExportRequest, record: JobRecord, folder: ExportFolder, state: dict[str, Any] | None
+    ) -> None:
+        self._rounds = Rounds(folder, _Tar, _PATTERN, request.most_bytes, state and state["rounds"])
         self._samples: dict[str, int] = dict(state["samples"]) if state else {}
 
     def add(self, scene: ExportScene) -> Added:

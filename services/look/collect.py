@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from schemas.dataset.commit import CommitRecord
 from schemas.dataset.layout import MANIFEST
-from schemas.dataset.tables import CAPTURE_SCHEMAS
+from schemas.dataset.tables import SCHEMAS
 from services.look.charts import Histogram
 from services.merge.merge import read_success
 from services.read.stored_tables import category_of, read_merged
@@ -105,7 +105,7 @@ def choose_spread(items: Sequence, count: int) -> list:
 
 
 def _with_columns(rows: pa.Table, table: str, columns: Sequence[str]) -> pa.Table:
-    schema = CAPTURE_SCHEMAS[table]
+    schema = SCHEMAS[table]
     for name in columns:
         if name not in rows.column_names:
             rows = rows.append_column(name, pa.nulls(rows.num_rows, schema.field(name).type))

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from schemas.dataset.layout import CAM_POSES, CAMERAS, OBJECTS, merged_table_path
-from schemas.dataset.tables import SCHEMAS, SORT_KEYS, schema_of
+from schemas.dataset.tables import SCHEMAS, SORT_KEYS
 from schemas.errors import CorruptError
 from schemas.scene.view import ROLES
 from workers.store.canonical import TableDigest, text_bytes
@@ -106,7 +106,8 @@ class _Parts:
         self._table = table
         self._category = category
         self._folder = folder
-        self._schema: pa.Schema | None = None
+        schema = SCHEMAS[table]
+        self._schema = schema.remove(schema.get_field_index("category"))
         self._waiting: list[pa.Table] = []
         self.waiting_bytes = 0
         self._writer: pq.ParquetWriter | None = None
@@ -115,11 +116,8 @@ class _Parts:
         self._files: dict[str, Path] = {}
 
     def write(self, rows: pa.Table) -> None:
-        """Takes the next rows; the first ones decide whether the files are of scenes or of captures."""
+        """Takes the next rows."""
         self._waiting.append(rows.drop_columns("category"))
-        if self._schema is None:
-            schema = schema_of(self._table, rows.column_names)
-            self._schema = schema.remove(schema.get_field_index("category"))
         self.waiting_bytes += self._waiting[-1].nbytes
         if sum(map(len, self._waiting)) >= ROWS_PER_GROUP:
             self.flush()

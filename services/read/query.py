@@ -17,7 +17,7 @@ import duckdb
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.dataset.tables import TABLES
+from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError, InputError, VersoError
 from services.read.stored_tables import StoredTables
 from services.read.verdict import explain_damage
@@ -110,7 +110,7 @@ def _register(connection: duckdb.DuckDBPyConnection, store: Store) -> None:
         parts = tables.parts(table)
         for number, part in enumerate(parts):
             connection.register(f"_{table}_{number}", part)
-        columns = ", ".join(f'"{name}"' for name in tables.schemas[table].names)
+        columns = ", ".join(f'"{name}"' for name in SCHEMAS[table].names)
         union = " UNION ALL ".join(f"SELECT {columns} FROM _{table}_{number}" for number in range(len(parts)))
         once = "DISTINCT ON (instance_id)" if table == "assets" else ""
         connection.execute(f"CREATE VIEW {table} AS SELECT {once} {columns} FROM ({union})")

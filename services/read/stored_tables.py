@@ -4,7 +4,6 @@
 - The files of a dataset as a file system of pyarrow's, so that a bucket is scanned as a folder is, a file at a time.
 """
 
-import contextlib
 import urllib.parse
 from collections.abc import Iterable, Mapping
 from functools import cached_property
@@ -30,9 +29,8 @@ from schemas.dataset.layout import (
     range_name,
     range_table_path,
 )
-from schemas.dataset.tables import CAPTURE_SCHEMAS, SCHEMAS, TABLES, schema_of
+from schemas.dataset.tables import SCHEMAS, TABLES
 from schemas.errors import CorruptError, OutputError
-from services.job.record import read_job
 from services.merge.merge import read_success
 from workers.store.commit import commit_names, read_record
 from workers.store.ledger import range_rows
@@ -122,15 +120,6 @@ class StoredTables:
         self._committed = _Committed(store) if self._done is None else None
 
     @cached_property
-    def schemas(self) -> Mapping[str, pa.Schema]:
-        """The schemas of the tables: by job.yaml those of scenes or of captures."""
-        with contextlib.suppress(CorruptError):  # the tables can be asked without it
-            record = read_job(self._store)
-            if record is not None and record.job.captures is not None:
-                return CAPTURE_SCHEMAS
-        return SCHEMAS
-
-    @cached_property
     def _merged_files(self) -> list[str]:
         """The merged files that `_SUCCESS` names. Raises CorruptError where it does not name a file of each table."""
         files = (self._done or {}).get("files")
@@ -143,7 +132,7 @@ class StoredTables:
 
     def parts(self, table: str) -> list[Rows]:
         """The rows of one table in one or two pieces. In `assets` of an unfinished dataset an instance may be repeated."""
-        schema = self.schemas[table]
+        schema = SCHEMAS[table]
         if self._committed is not None:
             return self._committed.parts(table, schema)
         return [_merged(self._store, self._merged_files, table, schema)]
@@ -173,7 +162,7 @@ def read_merged(table: str, key: str, data: bytes) -> pa.Table:
     """The rows in the bytes of one merged file, with the category that its folder names."""
     rows = pq.read_table(pa.BufferReader(data), page_checksum_verification=True)
     column = pa.repeat(pa.scalar(category_of(key)), rows.num_rows)
-    schema = schema_of(table, rows.column_names)
+    schema = SCHEMAS[table]
     return rows.append_column("category", column).select(schema.names).cast(schema)
 
 

@@ -7,16 +7,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from schemas.dataset.codec import Row, columns_of_bodies, read_camera, read_label, read_world_poses
 from schemas.dataset.layout import file_pose_id, image_path, stored_images
+from schemas.dataset.tables import ALWAYS_OF_SCENES
 from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan
 from schemas.scene.shape import REGION_FIRST_OBJECT
-from schemas.scene.view import Role, View
+from schemas.scene.view import MODALITIES, Role, View
 from workers.geometry.camera import image_coordinates
 from workers.geometry.frames import invert
 from workers.geometry.pixels import measure_regions
 from workers.scene.labels import compare_views, derive_projected, patch_object_fraction, projection_shares
 from workers.scene.pairs import object_distance, place_aligned_camera, place_mirror_camera
-from workers.scene.rows import image_boxes, view_pixels
+from workers.scene.rows import image_boxes
 
 ROUNDING = 1e-12
 """Largest difference of poses and distances that are computed again from the same doubles."""
@@ -25,12 +26,16 @@ ReadImage = Callable[[str], NDArray]
 
 
 def check_stored_scene(scene: Row) -> list[str]:
-    """Columns of `scenes` that disagree with its bodies, a sentence each; none where it was stored without bodies."""
-    bodies = scene["bodies"]
-    if bodies is None:
+    """Columns of `scenes` that disagree with its bodies, or are absent, a sentence each; a capture has no bodies."""
+    where, captured = f"scene {scene['scene_id']}", _is_captured(scene)
+    wrong = [name for name in ALWAYS_OF_SCENES if (scene[name] is None) != captured]
+    if wrong:
+        told = "are there in a capture" if captured else "are missing"
+        return [f"{where}: {', '.join(wrong)} {told}"]
+    if captured:
         return []
+    bodies = scene["bodies"]
     expected = columns_of_bodies(bodies)
-    where = f"scene {scene['scene_id']}"
     faults = [
         f"{where}: {name} is {scene[name]}, its bodies give {value}"
         for name, value in expected.items()
@@ -54,7 +59,7 @@ def check_stored_pair(job: Job, views: Mapping[str, Row], objects: list[Row], sc
     for role, view in stored.items():
         if role != "projected":
             faults += _check_labels(view, scene)
-            faults += _check_patch_shares(job, view, scene, objects)
+            faults += _check_patch_shares(job, view, objects)
             faults += _check_images(view, scene)
         faults += _check_patches(view, stored["mirror" if role == "projected" else role], job, read, views[role])
     faults += _check_cameras(job, stored, views)
@@ -72,15 +77,17 @@ def _read_view(row: Row, job: Job, objects: Sequence[Row], read: ReadImage, faul
     for image in stored_images(role, job):
         path = image_path(row["category"], image.content, file_pose_id(role, row["parent_id"]))
         pixels = read(path)
-        shape = (row["height"], row["width"], 3)[: 3 if image.pixels == "rgb" else 2]
-        dtype = np.uint16 if image.pixels == "depth" else np.uint8
-        if pixels.shape != shape or pixels.dtype != dtype:
-            faults.append(f"{path}: is {pixels.dtype} {pixels.shape}, and must be {dtype.__name__} {shape}")
+        modality = MODALITIES[image.pixels]
+        shape = modality.shape(row["height"], row["width"])
+        if pixels.shape != shape or pixels.dtype != modality.dtype:
+            faults.append(f"{path}: is {pixels.dtype} {pixels.shape}, and must be {modality.dtype} {shape}")
         images[image.pixels] = pixels
     own = [one for one in objects if (one["pose_id"], one["role"]) == (row["pose_id"], role)]
     labels = tuple(read_label(one) for one in sorted(own, key=lambda one: one["region_id"]))
     camera, ids = read_camera(row), (row["pose_id"], row["parent_id"])
-    return View(role, *ids, camera, images.get("rgb"), images["depth"], images.get("region"), labels)
+    rgb, depth, region = (images.pop(name, None) for name in ("rgb", "depth", "region"))
+    assert depth is not None
+    return View(role, *ids, camera, rgb, depth, region, labels, images)
 
 
 def _differs(a: ArrayLike, b: ArrayLike) -> bool:
@@ -112,10 +119,8 @@ def _check_labels(view: View, scene: Row) -> list[str]:
     return faults
 
 
-def _check_patch_shares(job: Job, view: View, scene: Row, objects: list[Row]) -> list[str]:
-    """Compare the share of its patch that each object fills; a dataset of scenes without bodies has no such column."""
-    if scene["bodies"] is None and not _is_captured(scene):
-        return []
+def _check_patch_shares(job: Job, view: View, objects: list[Row]) -> list[str]:
+    """Compare the share of its patch that each object fills."""
     own = [row for row in objects if (row["pose_id"], row["role"]) == (view.pose_id, view.role)]
     shares, faults = {row["region_id"]: row["patch_object_fraction"] for row in own}, []
     for label in view.labels:
@@ -128,7 +133,7 @@ def _check_patch_shares(job: Job, view: View, scene: Row, objects: list[Row]) ->
 
 def _is_captured(scene: Row) -> bool:
     """Whether a row of `scenes` is of a capture."""
-    return scene.get("capture") is not None
+    return scene["capture"] is not None
 
 
 def _check_images(view: View, scene: Row) -> list[str]:
@@ -159,7 +164,7 @@ def _check_patches(view: View, labelled: View, job: Job, read: ReadImage, row: R
     expected = set()
     for path, kind, box in image_boxes(view, objects, row["category"], job.images.patch):
         expected.add(path)
-        full = view_pixels(view, kind)
+        full = view.images.get(kind)
         if box is not None and path in listed and full is not None and not np.array_equal(read(path), full[box]):
             faults.append(f"{path}: is not the crop of its image")
     if expected != listed:

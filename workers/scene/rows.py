@@ -7,16 +7,14 @@
 from collections.abc import Iterator, Sequence
 from weakref import WeakKeyDictionary
 
-from numpy.typing import NDArray
-
 from schemas.dataset.codec import Row, body_columns, camera_columns, columns_of_bodies, label_columns, matrix_column
-from schemas.dataset.layout import IMAGES, PixelKind, asset_path, image_path, patch_index, patch_path
+from schemas.dataset.layout import IMAGES, asset_path, image_path, patch_index, patch_path
 from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.job.views import Images, Patch
 from schemas.scene.scene import EncodedFile, SceneOutput, encoded_file
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset
-from schemas.scene.view import ObjectLabel, Pair, View, crop_box
+from schemas.scene.view import ObjectLabel, Pair, PixelKind, View, crop_box
 from workers.assets.catalogue import split_of
 from workers.assets.glb import asset_glb
 from workers.geometry.camera import inclination, yaw
@@ -34,8 +32,7 @@ def encode_view(view: View, pair: Pair, images: Images) -> tuple[EncodedFile, ..
     files = []
     objects = object_labels(view, pair)
     for path, kind, box in image_boxes(view, objects, objects[0].category, images.patch):
-        pixels = view_pixels(view, kind)
-        assert pixels is not None
+        pixels = view.images[kind]
         files.append(encoded_file(path, encode_png(pixels if box is None else pixels[box], images.png_level)))
     return tuple(files)
 
@@ -49,18 +46,12 @@ def image_boxes(
     """
     boxes = [(patch_index(label.region_id, len(objects)), crop_box(label, view.camera, patch)) for label in objects]
     for image in IMAGES:
-        if image.role != view.role or view_pixels(view, image.pixels) is None:
+        if image.role != view.role or image.pixels not in view.images:
             continue
         yield image_path(category, image.content, view.pose_id), image.pixels, None
         for index, box in boxes:
             if box is not None:
                 yield patch_path(category, image.content, view.pose_id, index), image.pixels, box
-
-
-def view_pixels(view: View, kind: PixelKind) -> NDArray | None:
-    """The array that images of a kind show; None where the view has none."""
-    images: dict[PixelKind, NDArray | None] = {"rgb": view.rgb, "depth": view.depth, "region": view.region}
-    return images[kind]
 
 
 def object_labels(view: View, pair: Pair) -> list[ObjectLabel]:
@@ -131,6 +122,7 @@ def scene_row(context: WorkerContext, scene: Scene) -> Row:
         "raycast_checked": scene.raycast_checked,
         "settings_digest": context.settings_digest,
         "bodies": bodies,
+        "capture": None,
     }
 
 
@@ -159,6 +151,7 @@ def view_row(scene_id: int, pair: Pair, view: View, files: Sequence[EncodedFile]
         "projected_filled_share": pair.filled_share if projected else None,
         "projected_hidden_share": pair.hidden_share if projected else None,
         "patch_object_fraction": None if projected else patch_object_fraction(view, labels[0], job.images.patch),
+        "capture": None,
     }
 
 

@@ -4,8 +4,7 @@ Each column is hashed as a few streams: which values are present (one byte each)
 values themselves (doubles as IEEE-754 little-endian, so -0.0 is not 0.0; integers as 8 bytes little-endian; booleans as
 one byte; strings as UTF-8). A missing value counts as absent and as zero or empty; items below an absent list are left
 out. A column's digest is the hash of its streams' digests, a table's digest the hash of its name, its number of rows
-and its columns in the order of the schema. It does not depend on how rows were cut into batches. Tables of captures have one
-column more than those of scenes (`schemas.dataset.tables`), which the digest of a scene's rows does not know.
+and its columns in the order of the schema. It does not depend on how rows were cut into batches.
 """
 
 import hashlib
@@ -15,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, schema_of
+from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS
 
 _PRIMITIVES: dict[pa.DataType, tuple[str, float | bool]] = {
     pa.float64(): ("<f8", 0.0),
@@ -67,22 +66,12 @@ class TableDigest:
 
     def __init__(self, table: str) -> None:
         self._name = table
-        self._begin(SCHEMAS[table])
+        self._schema = SCHEMAS[table]
+        self._streams = [_Stream(field.type) for field in self._schema]
         self.rows = 0
 
-    def _begin(self, schema: pa.Schema) -> None:
-        self._schema = schema
-        self._streams = [_Stream(field.type) for field in schema]
-
     def update(self, rows: pa.Table | pa.RecordBatch) -> None:
-        """Takes the next rows, which must have exactly the table's columns, in any number of chunks.
-
-        The first rows decide whether the columns are those of scenes or of captures; later ones must have the same.
-        """
-        if not self.rows:
-            self._begin(schema_of(self._name, rows.schema.names))
-        if rows.num_rows and rows.schema.names != self._schema.names:
-            raise ValueError(f"{self._name}: rows with the columns {rows.schema.names} follow others")
+        """Takes the next rows, which must have exactly the table's columns, in any number of chunks."""
         for batch in rows.to_batches() if isinstance(rows, pa.Table) else [rows]:
             self.rows += batch.num_rows
             for stream, name in zip(self._streams, self._schema.names, strict=True):

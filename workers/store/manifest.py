@@ -15,12 +15,11 @@ import pyarrow.parquet as pq
 from schemas.dataset.commit import FileEntry, Outcome
 from schemas.dataset.layout import asset_path, is_plain_path, is_shape
 from schemas.dataset.tables import (
-    CAPTURE_SCHEMAS,
+    ALWAYS_OF_SCENES,
     DETERMINISTIC_TABLES,
     SCHEMAS,
     SHAPE_FILE_COLUMNS,
     SORT_KEYS,
-    schema_of,
 )
 from schemas.errors import CorruptError
 from schemas.scene.scene import SceneOutput
@@ -44,12 +43,8 @@ def check_values(where: str, field: pa.Field, array: pa.Array) -> None:
 
 PARQUET_OPTIONS = {"compression": "zstd", "write_page_checksum": True}
 """For every Parquet file that users read: a flipped bit is found when the page is read."""
-_ROWS = {
-    (table, len(schema)): pa.struct(list(schema))
-    for table in SCHEMAS
-    for schema in (SCHEMAS[table], CAPTURE_SCHEMAS[table])
-}
-"""The type of a row, by table and number of columns: all columns of a table are made in one call."""
+_ROWS = {table: pa.struct(list(schema)) for table, schema in SCHEMAS.items()}
+"""The type of a row, by table: all columns of a table are made in one call."""
 _EMPTY = {table: schema.empty_table() for table, schema in SCHEMAS.items()}
 _RANGE_OPTIONS: dict[str, Any] = {
     "compression": "lz4",
@@ -62,21 +57,23 @@ _RANGE_OPTIONS: dict[str, Any] = {
 
 
 def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
-    """Rows as an Arrow table with exactly the schema of `table`, of scenes or of captures.
+    """Rows as an Arrow table with exactly the schema of `table`.
 
     Raises ValueError naming the table and the column where a key is unknown or missing, a value has the wrong type, a
     required one is absent or a number is not finite.
     """
     if not rows:
         return _EMPTY[table]
-    schema = schema_of(table, rows[0].keys())
+    schema = SCHEMAS[table]
     names = set(schema.names)
     for row in rows:
         if row.keys() != names:
             wrong = sorted(names.symmetric_difference(row.keys()))
             raise ValueError(f"{table}: a row has other columns than the schema: {', '.join(wrong)}")
+        if table == "scenes" and row["capture"] is None and (absent := [n for n in ALWAYS_OF_SCENES if row[n] is None]):
+            raise ValueError(f"scenes.{absent[0]} is missing in scene {row['scene_id']}")
     try:
-        arrays = pa.array(rows, _ROWS[table, len(names)]).flatten()
+        arrays = pa.array(rows, _ROWS[table]).flatten()
     except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):
         arrays = [_column(table, field, rows) for field in schema]  # says which column it is
     for field, array in zip(schema, arrays, strict=True):
@@ -232,20 +229,9 @@ def conform(table: str, rows: pa.Table, name: str) -> pa.Table:
 
     A schema only grows. So rows that lack a column and have an unknown one have a damaged column name.
     """
-    return _fitted(table, rows, schema_of(table, rows.column_names), name)
-
-
-def join_rows(table: str, parts: Sequence[pa.Table]) -> pa.Table:
-    """Rows one after another, in the schema of captures where one of them is of a capture."""
-    schema = schema_of(table, {name for part in parts for name in part.column_names})
-    fitted = [part if part.schema == schema else _fitted(table, part, schema, table) for part in parts]
-    return pa.concat_tables(fitted) if fitted else schema.empty_table()
-
-
-def _fitted(table: str, rows: pa.Table, schema: pa.Schema, name: str) -> pa.Table:
-    """Rows with exactly this schema. Raises as `conform`."""
+    schema = SCHEMAS[table]
     missing = [column for column in schema.names if column not in rows.column_names]
-    known = {*CAPTURE_SCHEMAS[table].names, *(field.name for field in SHAPE_FILE_COLUMNS)}
+    known = {*schema.names, *(field.name for field in SHAPE_FILE_COLUMNS)}
     foreign = [column for column in rows.column_names if column not in known]
     if missing and foreign:
         raise CorruptError(f"{name} lacks the column {missing[0]} of the table {table}, and has {foreign[0]!r}")
@@ -258,3 +244,10 @@ def _fitted(table: str, rows: pa.Table, schema: pa.Schema, name: str) -> pa.Tabl
         return rows.select(schema.names).cast(schema)  # Parquet has other names inside lists
     except (pa.ArrowException, ValueError) as error:
         raise CorruptError(f"{name} cannot be read: {error}; `verso verify` lists every damaged file") from error
+
+
+def join_rows(table: str, parts: Sequence[pa.Table]) -> pa.Table:
+    """Rows one after another, in today's schema."""
+    schema = SCHEMAS[table]
+    fitted = [part if part.schema == schema else conform(table, part, table) for part in parts]
+    return pa.concat_tables(fitted) if fitted else schema.empty_table()

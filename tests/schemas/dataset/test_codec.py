@@ -88,10 +88,10 @@ def test_a_scene_has_its_first_bodys_names_and_its_worst_bodys_figures(name, fir
     assert columns_of_bodies([{**BODY, name: first}, {**BODY, "region_id": 4, name: second}])[name] == expected
 
 
-def test_poses_are_by_region_also_where_a_scene_was_stored_without_bodies():
+def test_poses_are_by_region_of_a_scene_and_of_a_capture_which_has_no_bodies():
     table = np.eye(4)
-    scene = {"T_world_table": table.ravel().tolist(), "T_world_obj": BODY["T_world_obj"], "bodies": None}
-    for row in (scene, {**scene, "bodies": [BODY]}):
+    capture = {"T_world_table": table.ravel().tolist(), "T_world_obj": BODY["T_world_obj"], "bodies": None}
+    for row in (capture, {**capture, "bodies": [BODY]}):
         poses = read_world_poses(row)
         assert list(poses) == [2, 3]
         assert np.array_equal(poses[2], table) and np.array_equal(poses[3], T)

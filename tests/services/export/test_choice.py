@@ -6,8 +6,8 @@ from services.export.source import iter_ranges
 from workers.store.commit import list_codes
 
 
-def chosen(store, captures=False, **asked):
-    chooser = Chooser(Choice(**asked), captures)
+def chosen(store, **asked):
+    chooser = Chooser(Choice(**asked))
     return [scene for one in iter_ranges(store, list_codes(store), 0) for scene in chooser.choose(one)]
 
 
@@ -25,10 +25,10 @@ def test_a_condition_may_ask_the_other_tables_about_its_scene(files):
 
 
 def test_a_condition_on_captures_may_name_their_column(captures):
-    assert chosen(captures, captures=True, where="capture.views >= 1") == [0, 1]
+    assert chosen(captures, where="capture.views >= 1") == [0, 1]
 
 
 @pytest.mark.parametrize("where", ["nosuch = 1", "category =", "scene_id in (select * from read_csv('/etc/passwd'))"])
 def test_a_condition_that_cannot_be_asked_is_refused_before_anything_is_read(where):
     with pytest.raises(InputError, match="cannot be asked"):
-        Chooser(Choice(where=where), captures=False)
+        Chooser(Choice(where=where))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from services.cli.main import main
-from services.export.formats import FORMATS
+from services.export.table import FORMATS
 from tests.exported import contents
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "export.md").read_text()

@@ -14,7 +14,7 @@ import pytest
 from obstore.store import MemoryStore
 
 from schemas.errors import CorruptError, InputError, OutputError
-from services.export.formats import FORMATS
+from services.export.table import FORMATS
 from tests.exported import contents, export_to
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore

@@ -3,8 +3,9 @@ import json
 import pytest
 
 from services.export.folder import ExportFolder
-from services.export.formats import FORMATS, Added, ExportRequest, open_writer
+from services.export.formats import Added, ExportRequest, open_writer
 from services.export.source import iter_ranges, scenes_of
+from services.export.table import FORMATS
 from services.job.record import require_job
 from workers.store.commit import list_codes
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas.dataset.tables import CAPTURE_SCHEMAS, TABLES
+from schemas.dataset.tables import SCHEMAS, TABLES
 from services.cli.main import main
 from services.read.columns_page import describe_columns, list_columns, write_page
 
@@ -20,7 +20,7 @@ def test_the_page_is_up_to_date():
 @pytest.mark.parametrize("table", TABLES)
 def test_every_column_stands_on_the_page_and_in_the_terminal(table):
     section = write_page().partition(f"\n## {table}\n")[2].partition("\n## ")[0]
-    for name in CAPTURE_SCHEMAS[table].names:
+    for name in SCHEMAS[table].names:
         assert f"- `{name}` (" in section
         assert any(line.startswith(f"  {name}  (") for line in describe_columns(table))
         assert any(one["path"] == name for one in list_columns(table))

@@ -5,7 +5,7 @@ import math
 import pyarrow as pa
 import pytest
 
-from schemas.dataset.tables import CAPTURE_SCHEMAS
+from schemas.dataset.tables import SCHEMAS
 from services.look.collect import collect
 
 SCENES = [
@@ -52,7 +52,7 @@ class Handmade:
         self.tables = tables
 
     def batches(self, table, columns):
-        schema = pa.schema([CAPTURE_SCHEMAS[table].field(name).with_nullable(True) for name in columns])
+        schema = pa.schema([SCHEMAS[table].field(name).with_nullable(True) for name in columns])
         rows = [{name: row.get(name) for name in columns} for row in self.tables.get(table, [])]
         yield from (pa.Table.from_pylist(part, schema) for part in (rows[:1], rows[1:]) if part)
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from schemas.capture import ProcessedCapture
-from schemas.dataset.tables import CAPTURE_SCHEMAS, NOT_OF_CAPTURES, SCHEMAS
 from tests.captures import captures_job, exact_capture
 from workers.assets.catalogue import split_of
 from workers.capture.make_capture import make_pairs, place_capture
@@ -26,13 +25,6 @@ def rows_of(context: WorkerContext, done: ProcessedCapture, scene_id: int = 0, m
     thing = place_capture(context.job, scene_id, done, "mug", "capture")
     pairs = [*make_pairs(context, thing, done, Stopwatch()), *more]
     return record_capture(context, thing, done, Origin(False, "f" * 64), pairs, Stopwatch()).rows
-
-
-def test_columns_that_a_capture_cannot_have_are_those_that_its_schema_lets_be_absent():
-    optional = {field.name for field in CAPTURE_SCHEMAS["scenes"] if field.nullable} - {"capture"}
-    assert set(NOT_OF_CAPTURES) == optional
-    required = {field.name for field in SCHEMAS["scenes"] if not field.nullable}
-    assert set(NOT_OF_CAPTURES) & required
 
 
 def test_residuals_before_and_after_are_those_of_the_used_views(context):

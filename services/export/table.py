@@ -1,0 +1,33 @@
+"""The table of export formats: one row a format. It loads no writer, so that the command line starts at once.
+
+To add a format: write its file, a class that is made of (request, record, folder, state) and is a
+`services.export.formats.Writer`, and add its row here.
+"""
+
+import importlib
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Format:
+    """A layout that `verso export` writes."""
+
+    module: str
+    writer: str
+    """The class in the module."""
+    sharded: bool = False
+    """Whether many pairs share a file."""
+
+    def load(self) -> Any:
+        """The class of the writer."""
+        return getattr(importlib.import_module(self.module), self.writer)
+
+
+FORMATS = {
+    "mirror-recon": Format("services.export.mirror_recon", "MirrorRecon"),
+    "bop": Format("services.export.bop", "Bop"),
+    "webdataset": Format("services.export.webdataset", "WebDataset", sharded=True),
+    "huggingface": Format("services.export.huggingface", "HuggingFace", sharded=True),
+    "gltf": Format("services.export.gltf", "Gltf"),
+}
