@@ -34,7 +34,7 @@ def test_the_command_prints_one_table_or_all(capsys):
         "  key: scene_id",
     ]
     assert main(["columns"]) == 0
-    assert all(f"\n{table}: " in "\n" + capsys.readouterr().out for table in TABLES[:1])
+    assert all(f"\n{table}: " in "\n" + capsys.readouterr().out for table in list(TABLES)[:1])
     assert main(["columns", "view"]) == 2
     assert "there is no table 'view'; did you mean 'views'? Tables are scenes, views" in capsys.readouterr().err
     assert main(["columns", "failures", "--json"]) == 0
