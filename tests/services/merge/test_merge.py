@@ -182,7 +182,7 @@ def test_the_digest_is_what_its_definition_says(merged):
     success = json.loads((store.root / "_SUCCESS").read_text())
     files = {file.path: file.data for i in range(FIRST, STOP) for file in scene(i).files}
     files |= {name: (store.root / name).read_bytes() for name in ("camPoses.csv", "cameras.csv", "objects.dat")}
-    text = "verso dataset 1\n" + "".join(f"{table} {success['tables'][table]}\n" for table in TABLES[:5])
+    text = "verso dataset 1\n" + "".join(f"{table} {success['tables'][table]}\n" for table in list(TABLES)[:5])
     for name in sorted(files, key=str.encode):
         text += f"{name}\n{hashlib.sha256(files[name]).hexdigest()}\n"
     assert result.digest == hashlib.sha256(text.encode()).hexdigest()
