@@ -4,14 +4,18 @@
 - What the live page shows at a moment: as a page, and as answers to a page that asks for what is new. Pure.
 """
 
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from html import escape
 from pathlib import Path
 from string import Template
 from urllib.parse import quote
 
-from schemas.errors import OutputError
+import trimesh
+
+from schemas.errors import MachineError, OutputError
 from schemas.job.job import Job
 from services.job.record import JobRecord, require_job
 from services.look.clouds import Space, pack_space, read_space
@@ -91,8 +95,19 @@ def section_html(section: Section) -> str:
 
 
 def read_web(name: str) -> str:
-    """A file of the folder `web`."""
-    return (WEB / name).read_text(encoding="utf-8")
+    """A file of the folder `web`, or `three.js`."""
+    return read_three() if name == "three.js" else (WEB / name).read_text(encoding="utf-8")
+
+
+@cache
+def read_three() -> str:
+    """three.js with its licence line, cut out of the viewer page that trimesh carries: the first block of its script."""
+    with zipfile.ZipFile(Path(trimesh.__file__).with_name("resources") / "templates" / "viewer.zip") as packed:
+        page = packed.read("viewer.html.template").decode("utf-8")
+    script = page.partition("<script>")[2].partition("\n(function(){")[0]
+    if "SPDX-License-Identifier: MIT" not in script or "</script" in script:
+        raise MachineError("trimesh's viewer does not begin with three.js: install the version in requirements.lock")
+    return script
 
 
 def fill_page(page: Page, around: Around) -> str:

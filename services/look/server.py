@@ -145,7 +145,6 @@ STATIC = {
     "/live.js": "text/javascript",
     "/icon.svg": "image/svg+xml",
     "/three.js": "text/javascript",
-    "/three.LICENSE": "text/plain",
 }
 """Files of the page, by their whole path: nothing is looked up on the disk by what a request names."""
 

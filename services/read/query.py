@@ -7,10 +7,8 @@ import csv
 import io
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from functools import partial
-from itertools import chain, islice
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from typing import IO, Literal
 
 import duckdb
@@ -118,34 +116,33 @@ def _register(connection: duckdb.DuckDBPyConnection, store: Store) -> None:
 
 Format = Literal["table", "csv", "parquet", "json"]
 
-_WIDEST_CELL = 60
-"""Characters; longer cells are cut in a table that goes to no terminal."""
+_SHOWN_OF = 10_000
+"""DuckDB counts so many rows for a box; of more it says that there are more."""
 
-_CUT = "…"
-
-_MEASURED_ROWS = 1000
-"""The first rows, which decide how wide the columns of a table are; wider cells of later ones push their line."""
+_ALL_COLUMNS = 100_000
+"""Characters of a line where no terminal bounds it."""
 
 _ROW_GROUP_BYTES = 4 << 20
 """Bytes in memory of a row group of the Parquet format."""
 
 Record = tuple[object, ...]
-_Writer = Callable[[pa.Schema, Iterable[Record]], Iterator[str]]
 
 
 def write_rows(rows: pa.RecordBatchReader, style: Format, sink: IO[bytes], wide: int | None = None) -> None:
     """Writes the rows in one of four formats, a batch in memory at a time.
 
-    A list or struct is JSON in its cell; the JSON format is one array of objects. A table that a terminal of `wide` columns has
-    no room for is written row by row, a line for each cell; without a width long cells are cut, and the last line says so.
+    A list or struct is JSON in a cell of CSV; the JSON format is one array of objects. A table is DuckDB's box, with its first
+    and last rows where there are many, and as many columns as `wide` characters have room for (None: all of them).
     """
+    if style == "table":
+        sink.write(_box(rows, wide).encode())
+        return
     if style == "parquet":
         with pq.ParquetWriter(_Counted(sink), rows.schema, compression="zstd") as writer:
             for group in _row_groups(rows):
                 writer.write_table(group)
         return
-    writers: dict[str, _Writer] = {"json": _json, "csv": _csv, "table": partial(_table, wide=wide)}
-    for text in writers[style](rows.schema, _records(rows)):
+    for text in (_json if style == "json" else _csv)(rows.schema, _records(rows)):
         sink.write(text.encode())
 
 
@@ -221,51 +218,13 @@ def _csv(schema: pa.Schema, records: Iterable[Record]) -> Iterator[str]:
     yield text.getvalue()
 
 
-def _table(schema: pa.Schema, records: Iterable[Record], wide: int | None) -> Iterator[str]:
-    records = iter(records)
-    most = _WIDEST_CELL if wide is None else None
-    first = [_cells(record, most) for record in islice(records, _MEASURED_ROWS)]
-    widths = [max(map(len, column)) for column in zip(schema.names, *first, strict=True)]
-    rest = (_cells(record, most) for record in records)
-    if wide is not None and sum(widths) + 2 * (len(widths) - 1) > wide:
-        yield from _one_by_one(schema.names, chain(first, rest))
-        return
-    numeric = [pa.types.is_integer(kind) or pa.types.is_floating(kind) for kind in schema.types]
-    signs = [f"{'>' if right else '<'}{width}" for right, width in zip(numeric, widths, strict=True)]
-    count, cut = 0, False
-    for cells in (schema.names, ["-" * width for width in widths]):
-        yield _line(cells, signs)
-    for cells in chain(first, rest):
-        count += 1
-        cut = cut or any(cell.endswith(_CUT) for cell in cells)
-        yield _line(cells, signs)
-    told = (
-        f"; cells of over {_WIDEST_CELL} characters end in {_CUT}: --format csv or json has them whole" if cut else ""
-    )
-    yield f"({_count(count)}{told})\n"
-
-
-def _one_by_one(names: Sequence[str], rows: Iterable[list[str]]) -> Iterator[str]:
-    """A line for each cell: `category  mug`, and a line of dashes above each row."""
-    longest, count = max(map(len, names)), 0
-    for cells in rows:
-        count += 1
-        yield f"-- row {count}\n"
-        yield from (f"{name:{longest}}  {cell}".rstrip() + "\n" for name, cell in zip(names, cells, strict=True))
-    yield f"({_count(count)})\n"
-
-
-def _count(rows: int) -> str:
-    return f"{rows} row{'' if rows == 1 else 's'}"
-
-
-def _line(cells: Iterable[str], signs: Iterable[str]) -> str:
-    return "  ".join(map(format, cells, signs)).rstrip() + "\n"
-
-
-def _cells(record: Record, most: int | None) -> list[str]:
-    return [_cut(_cell(value).replace("\n", " "), most) for value in record]
-
-
-def _cut(text: str, most: int | None) -> str:
-    return text if most is None or len(text) <= most else text[: most - 1] + _CUT
+def _box(rows: pa.RecordBatchReader, wide: int | None) -> str:
+    kept: list[pa.RecordBatch] = []
+    for batch in rows:
+        kept.append(batch)
+        if sum(one.num_rows for one in kept) > _SHOWN_OF:
+            break
+    shown = io.StringIO()
+    with duckdb.connect(":memory:") as connection, redirect_stdout(shown):
+        connection.from_arrow(pa.Table.from_batches(kept, rows.schema)).show(max_width=wide or _ALL_COLUMNS)
+    return shown.getvalue()

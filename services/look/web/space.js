@@ -1,10 +1,9 @@
-// The 3-D view: two point clouds, the posed mesh and the cameras, drawn when something changes. Needs three.js, which is a
-// bundle of these exports of three 0.187.0: BufferAttribute BufferGeometry Color DirectionalLight DoubleSide GridHelper Group
-// HemisphereLight LineBasicMaterial LineSegments Matrix4 Mesh MeshStandardMaterial PerspectiveCamera Points PointsMaterial
-// Scene SRGBColorSpace Vector3 WebGLRenderer, and OrbitControls of three/addons/controls/OrbitControls.js.
+// The 3-D view: two point clouds, the posed mesh and the cameras, drawn when something changes. Needs three.js (r140 or later, global
+// `THREE`), which services/look/report.py takes from trimesh's viewer.
 "use strict";
-const space = { parts: {}, clouds: [] };
+const space = { parts: {}, clouds: [], eye: { target: new THREE.Vector3() } };
 const FIELD_DEG = 38; // three.js takes the size of points for a field of 90 degrees
+THREE.ColorManagement.legacyMode = false; // colours are given in sRGB and lit in linear light
 const TINTS = { input: "#2f7fd6", mirror: "#e07b39" };
 
 function bytes(text) { return Uint8Array.from(atob(text), (one) => one.charCodeAt(0)).buffer; }
@@ -15,7 +14,7 @@ function cloudOf(cloud, quantum) {
   shape.setAttribute("position", new THREE.BufferAttribute(Float32Array.from(whole, (one) => one * quantum), 3));
   const photo = new Float32Array(whole.length), seen = new Uint8Array(bytes(cloud.colors)), color = new THREE.Color();
   for (let i = 0; i < seen.length; i += 3) {
-    color.setRGB(seen[i] / 255, seen[i + 1] / 255, seen[i + 2] / 255, THREE.SRGBColorSpace).toArray(photo, i);
+    color.fromArray([seen[i] / 255, seen[i + 1] / 255, seen[i + 2] / 255]).convertSRGBToLinear().toArray(photo, i);
   }
   shape.setAttribute("color", new THREE.BufferAttribute(photo, 3));
   return new THREE.Points(shape, new THREE.PointsMaterial({ size: cloud.size * 1.1 / Math.tan(FIELD_DEG * Math.PI / 360), vertexColors: true }));
@@ -49,18 +48,61 @@ function fill(data) {
   }
   data.bodies.forEach((body) => mesh.add(bodyOf(body)));
   Object.assign(space.parts, { mesh, cameras });
-  const light = new THREE.DirectionalLight("#ffffff", 1.6);
+  const light = new THREE.DirectionalLight("#ffffff", 0.5);
   light.position.set(1, -2, 3);
-  space.scene.add(...Object.values(space.parts), new THREE.HemisphereLight("#ffffff", "#777777", 1.6), light);
+  space.scene.add(...Object.values(space.parts), new THREE.HemisphereLight("#ffffff", "#777777", 0.5), light);
   const input = new THREE.Vector3(data.clouds[0].camera[3], data.clouds[0].camera[7], 0).sub(new THREE.Vector3(target.x, target.y, 0));
   space.yaw = Math.atan2(input.y, input.x) + 1.2;
 }
 function reset() {
-  const away = 0.95, low = 0.55;
-  space.camera.position.set(away * Math.cos(low) * Math.cos(space.yaw), away * Math.cos(low) * Math.sin(space.yaw), away * Math.sin(low));
-  space.controls.target.set(0, 0, 0);
-  space.controls.update();
+  Object.assign(space.eye, { yaw: space.yaw, low: 0.55, far: 0.95 });
+  space.eye.target.set(0, 0, 0);
+  look();
+}
+function look() { // puts the camera where yaw, height, distance and target say
+  const { yaw, low, far, target } = space.eye;
+  space.camera.position.set(Math.cos(low) * Math.cos(yaw), Math.cos(low) * Math.sin(yaw), Math.sin(low)).multiplyScalar(far).add(target);
+  space.camera.lookAt(target);
   draw();
+}
+function orbit(yaw, low, zoom = 1) {
+  space.eye.yaw += yaw;
+  space.eye.low = Math.max(-1.5, Math.min(1.5, space.eye.low + low));
+  space.eye.far = Math.max(0.05, Math.min(40, space.eye.far * zoom));
+  look();
+}
+function pan(right, up) { // metres, in the plane of the picture
+  const { target } = space.eye, axis = new THREE.Vector3();
+  target.addScaledVector(axis.setFromMatrixColumn(space.camera.matrix, 0), right);
+  target.addScaledVector(axis.setFromMatrixColumn(space.camera.matrix, 1), up);
+  look();
+}
+function connectPointer(canvas) { // drag: turn; with Shift, Ctrl or the right button: move; two fingers: zoom and move; wheel: zoom
+  const down = new Map(), middle = () => [...down.values()].reduce(([x, y], one) => [x + one[0] / down.size, y + one[1] / down.size], [0, 0]);
+  const apart = () => { const [a, b] = [...down.values()]; return b ? Math.hypot(a[0] - b[0], a[1] - b[1]) : 0; };
+  canvas.style.touchAction = "none";
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    down.set(event.pointerId, [event.clientX, event.clientY]);
+    canvas.focus({ preventScroll: true });
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    if (!down.has(event.pointerId)) return;
+    const before = middle(), wide = apart();
+    down.set(event.pointerId, [event.clientX, event.clientY]);
+    const [x, y] = middle(), dx = x - before[0], dy = y - before[1];
+    const metres = 2 * space.eye.far * Math.tan(FIELD_DEG * Math.PI / 360) / canvas.clientHeight; // of a pixel at the target
+    if (down.size > 1) orbit(0, 0, wide / Math.max(apart(), 1));
+    if (down.size > 1 || event.shiftKey || event.ctrlKey || event.metaKey || event.buttons & 2) pan(-dx * metres, dy * metres);
+    else orbit(-2 * Math.PI * dx / canvas.clientHeight, 2 * Math.PI * dy / canvas.clientHeight);
+  });
+  for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => down.delete(event.pointerId));
+  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+  canvas.addEventListener("wheel", (event) => { // scrolls the page until the view is clicked
+    if (document.activeElement !== canvas) return;
+    event.preventDefault();
+    orbit(0, 0, event.deltaY > 0 ? 1 / 0.95 : 0.95);
+  }, { passive: false });
 }
 function draw() {
   const canvas = space.renderer.domElement, width = canvas.clientWidth, height = canvas.clientHeight;
@@ -87,13 +129,7 @@ function turn(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || !(step || zoom || event.key === "0")) return;
   event.preventDefault();
   if (event.key === "0") { reset(); return; }
-  const away = space.camera.position.clone().sub(space.controls.target), far = away.length() * (zoom || 1);
-  const yaw = Math.atan2(away.y, away.x) + (step ? step[0] : 0);
-  const low = Math.max(-1.5, Math.min(1.5, Math.asin(away.z / away.length()) + (step ? step[1] : 0)));
-  away.set(far * Math.cos(low) * Math.cos(yaw), far * Math.cos(low) * Math.sin(yaw), far * Math.sin(low));
-  space.camera.position.copy(space.controls.target).add(away);
-  space.controls.update();
-  draw();
+  orbit(...(step || [0, 0]), zoom);
 }
 
 function begin(canvas, data) {
@@ -103,15 +139,11 @@ function begin(canvas, data) {
     return;
   }
   space.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
+  space.renderer.outputEncoding = THREE.sRGBEncoding;
   space.scene = new THREE.Scene();
   space.camera = new THREE.PerspectiveCamera(FIELD_DEG, 1, 0.02, 60);
   space.camera.up.set(0, 0, 1);
-  space.controls = new THREE.OrbitControls(space.camera, canvas);
-  space.controls.enableZoom = false; // the wheel scrolls the page until the view is clicked
-  space.controls.addEventListener("change", draw);
-  canvas.addEventListener("focus", () => { space.controls.enableZoom = true; });
-  canvas.addEventListener("blur", () => { space.controls.enableZoom = false; });
-  canvas.addEventListener("pointerdown", () => canvas.focus({ preventScroll: true }));
+  connectPointer(canvas);
   canvas.addEventListener("keydown", turn);
   fill(data);
   document.querySelectorAll("[data-part]").forEach((box) => {

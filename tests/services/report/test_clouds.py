@@ -87,7 +87,7 @@ def test_without_the_jobs_shapes_there_are_clouds_and_the_reason(shown, monkeypa
     def gone(*_):
         raise MachineError("the files of the asset folders do not hold what they held")
 
-    monkeypatch.setattr(module, "export_scene", gone)
+    monkeypatch.setattr(module, "scene_glb", gone)
     found = read_space(shown, 1)
     assert len(found.clouds) == 2 and found.bodies == ()
     assert "asset folders" in found.missing

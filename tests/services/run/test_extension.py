@@ -19,7 +19,7 @@ from workers.assets.catalogue import open_catalogue
 from workers.shard import run_shard as module
 from workers.shard.run_shard import run_shard
 from workers.store.ledger import list_commits
-from workers.store.local import LocalStore
+from workers.store.local import LocalStage, LocalStore
 
 KEPT = (JOB_FILE, SUCCESS_FILE, FINGERPRINT_FILE, "DATASET.md", "camPoses.csv")
 
@@ -71,7 +71,7 @@ def test_a_worker_that_fails_in_its_first_scene_leaves_it_finished(finished, mon
         raise MachineError("the disk is full")
 
     before = kept(finished)
-    monkeypatch.setattr(LocalStore, "make_durable", full)
+    monkeypatch.setattr(LocalStage, "flush", full)
     with pytest.raises(MachineError, match="the disk is full"):
         run_shard(*order_of(finished))
     assert kept(finished) == before
@@ -79,13 +79,13 @@ def test_a_worker_that_fails_in_its_first_scene_leaves_it_finished(finished, mon
 
 def test_the_first_new_commit_reopens_it_and_writes_the_larger_job(finished, monkeypatch):
     seen = []
-    whole = LocalStore.put_if_absent
+    whole = LocalStage.put_if_absent
 
-    def put(store, key, data, staging=None):
-        seen.append((key, store.size(SUCCESS_FILE), require_job(store).job.scenes))
-        return whole(store, key, data, staging)
+    def put(stage, key, data):
+        seen.append((key, finished.size(SUCCESS_FILE), require_job(finished).job.scenes))
+        return whole(stage, key, data)
 
-    monkeypatch.setattr(LocalStore, "put_if_absent", put)
+    monkeypatch.setattr(LocalStage, "put_if_absent", put)
     run_shard(*order_of(finished))
     assert seen == [("manifest/_commits/0000000002.json", None, 3)]
 
