@@ -88,7 +88,9 @@ def test_status_tells_a_run_that_was_killed_from_one_that_runs(tmp_path, capsys)
     store, job = LocalStore(tmp_path), validate_job({"name": "small", "scenes": 8}, "test")
     store.prepare()
     store.put(JOB_FILE, encode_job(record_job(job, "c" * 64, Path())))
-    begin_attempt(store, Span(start=0, stop=8), CommitTerms(job_digest="j" * 64, fingerprint="f" * 64)).begin_scene(3)
+    begin_attempt(
+        store, Span(start=0, stop=8), CommitTerms(job_digest="j" * 64, fingerprint="f" * 64, pairs_per_scene=1)
+    ).begin_scene(3)
     holder = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE)
     assert holder.stdout is not None
     try:
