@@ -175,7 +175,7 @@ def process(options: argparse.Namespace) -> int:
     done = process_folder(options.folder, captures)
     for estimate in done.estimates.by_name.values():
         chosen = " (chosen)" * (estimate.estimate == done.estimates.chosen)
-        print(f"{estimate.estimate:8} {_describe_process(estimate)}{chosen}")
+        print(f"{estimate.estimate:8} {_describe_estimate(estimate)}{chosen}")
     for view in done.estimates.estimate.views:
         if view.status != "used":
             print(f"view {view.number} {view.status}: {'; '.join(view.reasons)}")
@@ -205,7 +205,7 @@ def process(options: argparse.Namespace) -> int:
     return 0
 
 
-def _describe_process(estimate: CaptureEstimate) -> str:
+def _describe_estimate(estimate: CaptureEstimate) -> str:
     pixels = [view.reprojection_px for view in estimate.used if view.reprojection_px is not None]
     depth = [view.depth_mm for view in estimate.used if view.depth_mm is not None]
     words = [f"{len(estimate.used)} of {len(estimate.views)} views"]

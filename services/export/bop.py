@@ -241,7 +241,6 @@ def _info(thing: "_Thing", depth: NDArray) -> Row:
 
 
 _INFO, _NAMES = "models/models_info.json", "objects.csv"
-_MM_bop_models = 1000.0
 _AT_ONCE = 512
 """Rows of a block of distances: some tens of megabytes at most."""
 
@@ -280,7 +279,7 @@ class BopModels:
             self.without += 1
             return number
         self._folder.put(f"models/obj_{number:06d}.ply", b"".join(ply_lines(shape)))
-        entry = f'{"" if self._first else ","}\n "{number}": {json.dumps(model_info(_MM_bop_models * shape.shape.vertices))}'
+        entry = f'{"" if self._first else ","}\n "{number}": {json.dumps(model_info(_MM * shape.shape.vertices))}'
         self._folder.append(_INFO, entry.encode())
         self._first = False
         return number
@@ -328,7 +327,7 @@ def ply_lines(colored: ColoredShape) -> Iterator[bytes]:
     header += [f"property float {name}" for name in floats] + [f"property uchar {name}" for name in letters]
     header += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header"]
     yield "".join(f"{line}\n" for line in header).encode()
-    rows = zip((_MM_bop_models * mesh.vertices).tolist(), normals.tolist(), colored.colors.tolist(), strict=True)
+    rows = zip((_MM * mesh.vertices).tolist(), normals.tolist(), colored.colors.tolist(), strict=True)
     line = "%.9g %.9g %.9g %.6g %.6g %.6g %d %d %d\n"
     yield "".join(line % (*xyz, *normal, *rgb) for xyz, normal, rgb in rows).encode()
     yield "".join(f"3 {a} {b} {c}\n" for a, b, c in mesh.faces.tolist()).encode()

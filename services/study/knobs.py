@@ -55,9 +55,9 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
     if job.captures is not None:
         return capture_knobs(job.captures)
     physics = {
-        "step": _values_knobs("physics.step_hz", (60, 120, 240, 480, 960, 1920)),
-        "step_travel": _values_knobs("physics.max_step_travel_mm", (1.0, 0.3, 0.1, 0.05, 0.035)),
-        "iterations": _values_knobs("physics.solver_iterations", (5, 10, 25, 50, 100, 200)),
+        "step": _job_values("physics.step_hz", (60, 120, 240, 480, 960, 1920)),
+        "step_travel": _job_values("physics.max_step_travel_mm", (1.0, 0.3, 0.1, 0.05, 0.035)),
+        "iterations": _job_values("physics.solver_iterations", (5, 10, 25, 50, 100, 200)),
         "rest": [
             Value(f"{v:g}", {"physics.rest.speed_mm_s": v, "physics.rest.spin_rad_s": SPIN_PER_SPEED * v})
             for v in (30.0, 10.0, 3.0, 1.0, 0.3)
@@ -75,7 +75,7 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
     return (
         *(Knob(name, "physics", tuple(values)) for name, values in physics.items()),
         Knob("size", "labels", tuple(size_value(job, width) for width in WIDTHS)),
-        Knob("units", "labels", tuple(_values_knobs("images.depth_units_per_m", units))),
+        Knob("units", "labels", tuple(_job_values("images.depth_units_per_m", units))),
         Knob("pivot_depth", "mirror", tuple(_pivot_depths())),
         Knob("splat", "mirror", tuple(splats)),
         Knob("sensor", "labels", tuple(sensors)),
@@ -83,7 +83,7 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
     )
 
 
-def _values_knobs(key: str, values: Iterable[float]) -> list[Value]:
+def _job_values(key: str, values: Iterable[float]) -> list[Value]:
     return [Value(f"{value:g}", {key: value}) for value in values]
 
 

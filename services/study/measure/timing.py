@@ -99,12 +99,12 @@ def image_figures(scenes: Sequence[Mapping[str, float]]) -> dict[str, Figure]:
 
 WARM_SCENES = 4
 
-Answer_timing = dict[str, Any]
+SceneTimes = dict[str, Any]
 
 
 def time_scene(
     context: WorkerContext, whole: Sequence[Setting], settling: Sequence[Setting], scene_id: int, lap: int
-) -> Answer_timing:
+) -> SceneTimes:
     """Seconds of processor by setting: of the whole scene up to its encoded files, or of `settling` alone.
 
     The first run, of the job itself, builds the scene's shapes, as a job does in every scene; all others find them in caches,
@@ -114,7 +114,7 @@ def time_scene(
     began = time.process_time()
     run_scene(context, scene_id, Stopwatch())
     cold = time.process_time() - began
-    answer: Answer_timing = {"whole": {}, "settling": {}, "bytes": {}, "cold": cold}
+    answer: SceneTimes = {"whole": {}, "settling": {}, "bytes": {}, "cold": cold}
     order = np.random.default_rng([scene_id, lap])
     for setting in [whole[k] for k in order.permutation(len(whole))]:
         worker = context_for(context, setting)
@@ -155,20 +155,20 @@ class Cost:
     scenes: int
 
 
-def job_cost(laps: Sequence[Mapping[int, Answer_timing]], own: str) -> tuple[float, float]:
+def job_cost(laps: Sequence[Mapping[int, SceneTimes]], own: str) -> tuple[float, float]:
     """(milliseconds of processor, kilobytes) a scene of the job itself: medians over rounds, shapes new."""
     made = [[_own_s(lap, laps[0], scene, own) for scene, one in lap.items() if own in one["whole"]] for lap in laps]
     sizes = [answer["bytes"][own] for answer in laps[0].values() if own in answer["bytes"]]
     return median(fmean(times) for times in made if times) * 1e3, fmean(sizes) / 1e3
 
 
-def _own_s(lap: Mapping[int, Answer_timing], first: Mapping[int, Answer_timing], scene: int, own: str) -> float:
+def _own_s(lap: Mapping[int, SceneTimes], first: Mapping[int, SceneTimes], scene: int, own: str) -> float:
     """Seconds of the job's own scene in this round, plus the cost of new shapes, which is measured once."""
     new = max(0.0, first[scene]["cold"] - first[scene]["whole"].get(own, first[scene]["cold"]))
     return float(lap[scene]["whole"][own]) + new
 
 
-def timed_rows(settings: Sequence[Setting], laps: Sequence[Mapping[int, Answer_timing]]) -> Iterator[tuple[Row, int]]:
+def timed_rows(settings: Sequence[Setting], laps: Sequence[Mapping[int, SceneTimes]]) -> Iterator[tuple[Row, int]]:
     """(row without errors, scenes timed) of each setting that has a time; the first setting is the job itself."""
     own = settings[0].name
     own_ms, own_kb = job_cost(laps, own)
@@ -189,7 +189,7 @@ def timed_rows(settings: Sequence[Setting], laps: Sequence[Mapping[int, Answer_t
         yield row, cost.scenes
 
 
-def cost_of(name: str, own: str, laps: Sequence[Mapping[int, Answer_timing]]) -> Cost | None:
+def cost_of(name: str, own: str, laps: Sequence[Mapping[int, SceneTimes]]) -> Cost | None:
     """A setting's cost over the scenes that it and the job made in a round; None where there are none.
 
     A setting that only settles is compared by settling: its difference to the job's own is added to the whole.

@@ -37,8 +37,15 @@ from workers.capture.folder import (
     write_view,
 )
 from workers.capture.simulate.camera import opencv_lens
-from workers.capture.simulate.photograph import DEPTH_UNITS_PER_M as DEPTH_UNITS_PER_M_photograph
-from workers.capture.simulate.photograph import Studio, build_studio, draw_labels, photograph, place_object, take_light
+from workers.capture.simulate.photograph import (
+    DEPTH_UNITS_PER_M,
+    Studio,
+    build_studio,
+    draw_labels,
+    photograph,
+    place_object,
+    take_light,
+)
 from workers.geometry.camera import orbit_pose
 from workers.geometry.colour import encode_codes
 from workers.geometry.frames import pose, rotation_about
@@ -150,7 +157,7 @@ def _rolled(T: Array, roll_rad: float) -> Array:
 
 VIEWS = 3
 
-DEPTH_UNITS_PER_M = 10_000.0
+HELD_OUT_UNITS_PER_M = 10_000.0
 """Finer than a capture's, so that rounding is no part of an error: 0.1 mm, up to 6.5 m."""
 
 
@@ -166,7 +173,7 @@ def write_held_out(studio: Studio, board: Board, target: Array, path: Path) -> N
     for number, T_board_cam in enumerate(plan_path(spec, target, studio.chance.stream(Stream.HELD_OUT))):
         write_view(path, take_exact(exact, number, T_board_cam))
         write_pose(path / f"board_{number:05d}.txt", T_board_cam)
-    camera = CaptureCamera(studio.rig.color, opencv_lens(None), DEPTH_UNITS_PER_M)
+    camera = CaptureCamera(studio.rig.color, opencv_lens(None), HELD_OUT_UNITS_PER_M)
     write_description(path, CaptureFile(name="held-out"), camera, board)
 
 
@@ -177,10 +184,10 @@ def without_sensors(studio: Studio) -> Studio:
 
 
 def take_exact(studio: Studio, number: int, T_board_cam: Pose) -> CapturedView:
-    """One exact view, its depth in units of `DEPTH_UNITS_PER_M`."""
+    """One exact view, its depth in units of `HELD_OUT_UNITS_PER_M`."""
     T_world_cam = studio.T_world_board @ T_board_cam
     depth_m, mask = draw_labels(studio, Camera(studio.rig.color, T_world_cam))
-    depth = np.rint(np.clip(depth_m * DEPTH_UNITS_PER_M, 0.0, 65_535.0)).astype(np.uint16)
+    depth = np.rint(np.clip(depth_m * HELD_OUT_UNITS_PER_M, 0.0, 65_535.0)).astype(np.uint16)
     depth[depth == 65_535] = 0
     return CapturedView(number, encode_codes(take_light(studio, number, T_world_cam)), depth, mask)
 
@@ -236,5 +243,5 @@ def _describe(studio: Studio, board: Board, asset: Asset, path: Path) -> None:
     """Write camera.json, board.json and capture.json."""
     name = f"{asset.category}-{studio.chance.scene_id:05d}"
     about = CaptureFile(name=name, category=asset.category, licence=asset.licence)
-    camera = CaptureCamera(studio.rig.color, opencv_lens(studio.simulate.distortion), DEPTH_UNITS_PER_M_photograph)
+    camera = CaptureCamera(studio.rig.color, opencv_lens(studio.simulate.distortion), DEPTH_UNITS_PER_M)
     write_description(path, about, camera, board)
