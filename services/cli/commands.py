@@ -257,7 +257,7 @@ def _repair(options: argparse.Namespace) -> int:
 def _dataset(out: str) -> "Store":
     """The store of an output folder. Raises OutputError where it is none."""
     from services.job.record import require_dataset
-    from workers.store.store import open_store
+    from workers.store.local import open_store
 
     return require_dataset(open_store(out))
 
@@ -265,7 +265,7 @@ def _dataset(out: str) -> "Store":
 def _committed(out: str) -> "Store":
     """The store of an output folder, also of one that lost its job.yaml. Raises OutputError where it is none."""
     from schemas.dataset.layout import COMMITS
-    from workers.store.store import open_store
+    from workers.store.local import open_store
 
     store = open_store(out)
     return store if next(iter(store.files(COMMITS)), None) is not None else _dataset(out)
@@ -275,7 +275,7 @@ def report(options: argparse.Namespace) -> int:
     """`verso report`."""
     from services.look.report import write_report
     from services.read.verdict import explain_damage
-    from workers.store.store import open_store
+    from workers.store.local import open_store
 
     began = time.monotonic()
     store = open_store(options.out)
@@ -294,7 +294,7 @@ def serve(options: argparse.Namespace) -> int:
     """`verso serve`."""
     from services.look.live import Follower
     from services.look.server import choose_place, ended_by_signal, serving
-    from workers.store.store import open_store
+    from workers.store.local import open_store
 
     place = choose_place(options.host, options.port, options.token)
     follower = Follower(open_store(options.out), options.scenes)

@@ -30,7 +30,8 @@ from services.merge.merge import read_success
 from services.read.dataset_reader import find_records
 from services.read.stored_tables import StoredTables
 from workers.store.ledger import iter_committed, range_rows
-from workers.store.store import Store, open_store
+from workers.store.local import open_store
+from workers.store.store import Store
 
 PAIR_TABLES = ("scenes", "views", "assets")
 """The tables that a choice of pairs reads."""

@@ -26,7 +26,7 @@ from services.merge.merge import read_success
 from services.read.verdict import explain_damage
 from services.run.progress import ProgressLine
 from workers.store.commit import list_codes
-from workers.store.store import open_store
+from workers.store.local import open_store
 
 LEFT_OUT: Final = "left_out.csv"
 VERSION: Final = 1

@@ -10,7 +10,7 @@ from schemas.queue import submission_id
 from services.queue.queue import JobView, Queue
 from services.queue.supervise import Drivers, turn, waiting_for_folder
 from workers.store.ledger import list_commits
-from workers.store.store import open_store
+from workers.store.local import open_store
 
 MOST_LOOKS: Final = 20
 """Output folders that are looked into for one listing: those of the latest jobs."""

@@ -27,7 +27,8 @@ from workers.capture.results import open_sources
 from workers.render.tiers import require_tier
 from workers.store.attempt import sweep
 from workers.store.ledger import LedgerKeeper, list_commits
-from workers.store.store import Store, open_store
+from workers.store.local import open_store
+from workers.store.store import Store
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ def test_the_commands_of_the_page_answer(here, monkeypatch, capfdbinary):
         assert main(words) == 0
         answers.append(capfdbinary.readouterr().out)
     table, csv, listed, paths, parquet, columns = answers
-    assert table.splitlines()[-1] == b"(2 rows)" and b"settle_s" in table
+    assert b"settle_s" in table and b"mug" in table
     assert csv.splitlines()[0] == b"scene_id,role,u,v" and len(csv.splitlines()) > 6
     assert {row["scene_id"] for row in json.loads(listed)} <= set(range(6))
     assert all((here / "data/tabletop" / path.decode()).is_file() for path in paths.splitlines()[1:])

@@ -44,7 +44,8 @@ from workers.scene.plan import SceneChance, choose_assets, choose_category
 from workers.scene.rows import failed_scene, record_scene, timing_row
 from workers.shard.fingerprint import take_fingerprint
 from workers.store.attempt import TIMED_OUT, Attempt, begin_attempt
-from workers.store.store import Store, open_store
+from workers.store.local import open_store
+from workers.store.store import Store
 
 
 class UnexpectedError(SceneError):

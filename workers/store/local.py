@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Callable, Iterable, Iterator
@@ -23,6 +24,8 @@ from workers.store.file_system import (
     temporary_file,
 )
 from workers.store.store import Entry, Stage, Store, retry_if_swept
+
+_URL = re.compile(r"[a-z][a-z0-9+.-]+://")
 
 
 class LocalStore(Store):
@@ -293,3 +296,15 @@ def _folders_above(path: str) -> list[str]:
     """The folders on the way to a file, the nearest first."""
     parts = path.split("/")
     return ["/".join(parts[:end]) for end in range(len(parts) - 1, 0, -1)]
+
+
+def open_store(out: str) -> Store:
+    """The store that a user's --out means: an object store for a URL such as s3://bucket/path, otherwise a folder.
+
+    Reads and writes nothing yet. Raises OutputError for a URL of an unknown kind.
+    """
+    if _URL.match(out):
+        from workers.store.objects import open_object_store  # obstore loads only where it is needed
+
+        return open_object_store(out)
+    return LocalStore(out)

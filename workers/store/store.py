@@ -5,7 +5,6 @@ other key appears whole, in one step: by `put`, `put_if_absent`, `move` or `repl
 """
 
 import contextlib
-import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -16,8 +15,6 @@ from schemas.dataset.layout import BEGUN
 
 A = TypeVar("A")
 B = TypeVar("B")
-
-_URL = re.compile(r"[a-z][a-z0-9+.-]+://")
 
 
 class Entry(NamedTuple):
@@ -139,20 +136,6 @@ class Store(Protocol):
 
     def withdraw(self, key: str, folder: Path) -> bool:
         """Takes a file away if `folder`, a scratch folder, is still there; False where the place has no such condition."""
-
-
-def open_store(out: str) -> Store:
-    """The store that a user's --out means: an object store for a URL such as s3://bucket/path, otherwise a folder.
-
-    Reads and writes nothing yet. Raises OutputError for a URL of an unknown kind.
-    """
-    if _URL.match(out):
-        from workers.store.objects import open_object_store  # obstore loads only where it is needed
-
-        return open_object_store(out)
-    from workers.store.local import LocalStore
-
-    return LocalStore(out)
 
 
 def is_live(store: Store, staging: str) -> bool:

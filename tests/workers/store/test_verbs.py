@@ -21,9 +21,9 @@ from tests.kit.s3_server import Bucket, s3_server
 from workers.store.attempt import sweep
 from workers.store.events import Events
 from workers.store.file_system import remove_abandoned, temporary_folder
-from workers.store.local import LocalStore
+from workers.store.local import LocalStore, open_store
 from workers.store.objects import ObjectStore
-from workers.store.store import Store, is_live, map_ahead, open_store, retry_if_swept, stat_all
+from workers.store.store import Store, is_live, map_ahead, retry_if_swept, stat_all
 
 KEY = "manifest/_commits/a.json"
 
@@ -227,7 +227,7 @@ def test_what_a_coordinator_at_work_sweeps_away_is_written_again(tmp_path, monke
 
 
 def test_a_url_opens_an_object_store_and_anything_else_a_folder(tmp_path):
-    code = f"import sys; from workers.store.store import open_store; open_store({str(tmp_path)!r})"
+    code = f"import sys; from workers.store.local import open_store; open_store({str(tmp_path)!r})"
     subprocess.run([sys.executable, "-c", f"{code}; sys.exit('obstore' in sys.modules)"], check=True)
     assert isinstance(open_store(str(tmp_path)), LocalStore) and not list(tmp_path.iterdir())
     opened = open_store("s3://bucket/a/dataset")
