@@ -118,7 +118,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 LONGEST_FIRST = (
     "services/study/test_command.py",
-    "services/run/test_step.py",
+    "services/run/test_run_job.py",
     "services/run/test_several_objects.py",
     "effects/test_random_scenes.py",
     "effects/test_physics_effects.py",

@@ -10,7 +10,7 @@ PYTHON_IMAGE = "python:3.11-slim-bookworm"
 DEBIAN_IMAGE = "debian:bookworm-slim"
 
 COUNT_COMPILED = """
-from workers.pipeline import run_shard
+from workers.shard import run_shard
 from workers.geometry.jit import compile_planned
 print(compile_planned())
 """

@@ -12,7 +12,6 @@ COMMANDS = (
     ("verify", "{out}"),
     ("status", "{out}"),
     ("query", "{out}", SQL),
-    ("scene", "{out}", "1", "--glb", "{out}.glb"),
 )
 
 

@@ -20,6 +20,6 @@ def test_a_copy_has_the_same_digest_and_a_changed_line_another(tmp_path):
         return subprocess.run(ASK, cwd=tmp_path, capture_output=True, text=True, check=True).stdout.split()
 
     assert ask() == [code_digest(), "False"]
-    with (tmp_path / "workers" / "plan" / "step.py").open("a") as file:
+    with (tmp_path / "workers" / "scene" / "plan.py").open("a") as file:
         file.write("# changed\n")
     assert ask()[0] != code_digest()
