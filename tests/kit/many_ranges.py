@@ -60,7 +60,7 @@ def record_of(scene_id: int, tables: dict[str, bytes]) -> CommitRecord:
         terms=TERMS,
         files=tuple(FileEntry(path=path, bytes=size, sha256=sha) for path, (size, sha) in sorted(files.items())),
         tables={table: rows[table].num_rows for table in TABLES},
-        scenes=(SceneMark(scene_id=scene_id, outcome="made" if made else "intrinsic", digest="0" * 64),),
+        scenes=(SceneMark(scene_id=scene_id, outcome="made" if made else "intrinsic", digest="0" * 16),),
     )
 
 
