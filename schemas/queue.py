@@ -104,11 +104,6 @@ def events_folder(job: str) -> str:
     return f"{JOBS}/{job}/events"
 
 
-def event_path(job: str, number: int) -> str:
-    """The key of a job's event `number`, from 0."""
-    return f"{events_folder(job)}/{number:08d}.json"
-
-
 def log_path(job: str, attempt: int) -> str:
     """The key of the copy of an attempt's log."""
     return f"{JOBS}/{job}/logs/{attempt:04d}.txt"

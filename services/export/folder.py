@@ -14,7 +14,7 @@ import shutil
 import urllib.parse
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, Any
 
 from schemas.errors import CorruptError, InUseError, OutputError
 
@@ -177,16 +177,6 @@ def _read_tree(path: Path) -> Tree | None:
     if not isinstance(tree, dict):
         raise CorruptError(f"{path} is damaged: remove the folder {path.parent.parent}, and export again")
     return tree
-
-
-class Shard(Protocol):
-    """A file that is being written."""
-
-    bytes: int
-    """About how large it is."""
-
-    def close(self) -> None:
-        """Ends the file; nothing is added afterwards."""
 
 
 class Rounds:

@@ -3,7 +3,7 @@ import re
 import pytest
 from pydantic import ValidationError
 
-from schemas.queue import ID_PATTERN, SUBMISSION_PATTERN, JobEvent, event_path, submission_id
+from schemas.queue import ID_PATTERN, SUBMISSION_PATTERN, JobEvent, submission_id
 from services.cli.arguments import JOB_ID
 
 NONCE = "0" * 32
@@ -11,12 +11,6 @@ NONCE = "0" * 32
 
 def test_the_parser_and_the_files_agree_on_what_an_id_is():
     assert f"^{JOB_ID}$" == ID_PATTERN
-
-
-def test_names_of_events_sort_as_their_numbers():
-    assert sorted(event_path("j00000001", number) for number in (10, 9, 100)) == [
-        event_path("j00000001", number) for number in (9, 10, 100)
-    ]
 
 
 def test_a_submission_id_holds_nothing_that_a_shell_or_a_url_reads():

@@ -26,7 +26,7 @@ class Events:
     def read(self) -> list[bytes]:
         """All events from the first. Raises CorruptError where one is missing, or the folder holds what is none."""
         names = self._store.names(self._folder)
-        if names != [_name(number) for number in range(len(names))]:
+        if names != [event_path("", number)[1:] for number in range(len(names))]:
             raise CorruptError(f"{self._store.name}/{self._folder} lacks an event, or holds what is none")
         return [self._read(number) for number in range(len(names))]
 
@@ -42,16 +42,17 @@ class Events:
             event = decide(before)
             if event is None:
                 return None
-            if self._store.put_if_absent(f"{self._folder}/{_name(len(before))}", event):
+            if self._store.put_if_absent(event_path(self._folder, len(before)), event):
                 return [*before, event]
             time.sleep(pause_s)
             pause_s = min(LONGEST_PAUSE_S, 2 * pause_s)
 
     def _read(self, number: int) -> bytes:
         if number not in self._known:
-            self._known[number] = self._store.read(f"{self._folder}/{_name(number)}")
+            self._known[number] = self._store.read(event_path(self._folder, number))
         return self._known[number]
 
 
-def _name(number: int) -> str:
-    return f"{number:08d}.json"
+def event_path(folder: str, number: int) -> str:
+    """The key of event `number`, from 0, of the log in a folder; keys sort as their numbers."""
+    return f"{folder}/{number:08d}.json"

@@ -9,10 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.errors import CorruptError, InputError
-from schemas.queue import MARK_FILE, JobEvent, event_path, request_path
+from schemas.queue import MARK_FILE, JobEvent, events_folder, request_path
 from services.queue.queue import RESTARTS, JobView, Queue, apply, fold, make_queue, open_queue
 from tests.kit.queue_world import ids, queue_of, request_of
 from tests.kit.s3_server import Bucket, s3_server
+from workers.store.events import event_path
 from workers.store.local import LocalStore
 from workers.store.objects import ObjectStore
 
@@ -95,9 +96,9 @@ def test_an_unknown_id_is_told_in_one_line(queue):
         (request_path(A), b"{", "is damaged"),
         (request_path(A), b'{"queue": 2}', "is newer than this program"),
         (request_path(A), b'{"queue": 1, "id": "j1"}', "was not written by this program"),
-        (event_path(A, 0), b"[]", "was not written by this program"),
-        (event_path(A, 3), b"{}", "lacks an event"),
-        (event_path(A, 0), b"x" * (2 << 20), "should have less"),
+        (event_path(events_folder(A), 0), b"[]", "was not written by this program"),
+        (event_path(events_folder(A), 3), b"{}", "lacks an event"),
+        (event_path(events_folder(A), 0), b"x" * (2 << 20), "should have less"),
     ],
 )
 def test_a_damaged_job_is_told_by_file_and_leaves_the_others_alone(tmp_path, key, data, words):
@@ -290,3 +291,10 @@ def test_whatever_comes_an_ended_job_stays_as_it_is_and_attempts_only_count_up(e
         assert view.attempt <= following.attempt <= view.attempt + 1
         assert following.deaths <= following.attempt
         view = following
+
+
+def test_names_of_events_sort_as_their_numbers():
+    folder = events_folder("j00000001")
+    assert sorted(event_path(folder, number) for number in (10, 9, 100)) == [
+        event_path(folder, number) for number in (9, 10, 100)
+    ]
