@@ -70,7 +70,7 @@ def docker_answers() -> bool:
 
 NEEDS = {
     "docker": ("deploy", "docker-compose.yml", ".dockerignore", "pyproject.toml", "requirements.lock", "tests/deploy"),
-    "browser": ("services/report", "tests/services/report"),
+    "browser": ("services/look", "tests/services/report"),
 }
 """What tests with these markers are about: --ci runs them where some of it differs from the base."""
 
@@ -123,7 +123,7 @@ LONGEST_FIRST = (
     "effects/test_random_scenes.py",
     "effects/test_physics_effects.py",
     "services/bench/test_command.py",
-    "test_energy_minimum.py",
+    "kit/test_energy_minimum.py",
 )
 """Files of a minute or so: a process that begins one last works on alone."""
 

@@ -1,8 +1,4 @@
-"""The `start` and `physics` branches of a job: how objects begin, and how they come to rest.
-
-- The `start` branch of a job: how objects begin, and how many there are.
-- The `physics` branch of a job.
-"""
+"""The `start` and `physics` branches of a job: how objects begin, and how they come to rest."""
 
 from typing import Annotated, Literal
 

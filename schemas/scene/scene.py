@@ -2,7 +2,6 @@
 
 - Which effects a scene runs: what the plan decides, and what every step asks.
 - The plan of a scene: all that is random, drawn before anything moves.
-- A scene from rest to output: settled objects, posed geometry, and all that is written of it.
 """
 
 import hashlib

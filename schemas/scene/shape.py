@@ -1,8 +1,6 @@
 """What is in a scene: region ids, shapes with materials and mass, lights and background. Arrays are read-only.
 
 - Region ids: the pixel values of segment images; objects count from REGION_FIRST_OBJECT.
-- Shapes: meshes, parts with materials, mass, and assets. Arrays are read-only.
-- Lights and background of a scene: what only RGB depends on.
 """
 
 from dataclasses import dataclass

@@ -1,6 +1,5 @@
 """Memory and pace of one worker over many scenes, and several workers against one.
 
-- Memory and pace of one worker over many scenes, in a process of its own.
 - Scaling: several workers against one through the coordinator, and several plain processes against one.
 
 Two processes that share nothing but the machine seldom do twice the work of one: cores share caches, memory and clock,

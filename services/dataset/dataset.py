@@ -1,10 +1,7 @@
 """A dataset opened in Python: its tables as pyarrow datasets, and its pairs one after the other.
 
-- Pairs of a range as one Arrow table, so that one expression chooses among scenes, views and assets. Pure.
-
-from services.dataset.dataset import open_dataset
-
-for pair in open_dataset("data/tabletop").pairs(pc.field("category") == "mug"): depth_m = pair.mirror.depth_m()
+A choice of pairs is one expression over one Arrow table a range, which has the columns of scenes, views and assets. `verso.open`
+is the door to this file.
 """
 
 from collections import defaultdict

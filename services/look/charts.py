@@ -1,6 +1,5 @@
 """Histograms: counts over equal steps, added up batch by batch, and HTML figures of them with SVG bars. Pure.
 
-- Counts of a figure over equal steps, added up batch by batch. Pure.
 - Histograms as HTML figures with SVG bars, which take their colours from the page's style. Pure.
 """
 

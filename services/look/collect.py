@@ -1,6 +1,5 @@
 """The figures of a dataset from batches of its tables: rows of a large dataset are never all in memory.
 
-- Columns of the manifest tables in batches, finished or being made: rows of a large dataset are never all in memory.
 - The figures of a dataset from batches of its tables: counts, histograms, effects and their cost. Pure but for
   reading.
 """

@@ -2,7 +2,6 @@
 
 - Pictures of stored images for a page: colour, depth in viridis, regions, the projection over the mirror view. Pure.
 - The full images of a stored pair, read by role and kind of pixels.
-- Scenes chosen evenly from each category, with their pictures. Reads stored rows and images.
 """
 
 import base64

@@ -4,7 +4,7 @@
   changes.
 
 Exact no-ops: the scene is made again with them forced, and every byte must equal what is stored. Approximations: the
-scene at rest is released again with every effect of physics on (audit_motion.py). Where MuJoCo is installed, it holds
+scene at rest is released again with every effect of physics on. Where MuJoCo is installed, it holds
 every scene as a referee (referee.py): its figures are told, and have no bound.
 """
 

@@ -1,9 +1,4 @@
-"""A whole folder against its commits: merged files, `_SUCCESS`, DATASET.md, and everything that is no part of the dataset.
-
-- Everything in an output folder that is no part of its dataset: files, folders, links.
-- A finished dataset against its commits: they are merged again, and `_SUCCESS`, the merged files and DATASET.md
-  compared.
-"""
+"""A whole folder against its commits: merged files, `_SUCCESS`, DATASET.md, and everything that is no part of the dataset."""
 
 import hashlib
 import json

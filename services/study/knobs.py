@@ -1,8 +1,4 @@
-"""The knobs that a study turns, of scenes and of captures, and the settings made of them. Pure.
-
-- The knobs of captures that the study turns. Pure.
-- The knobs that the study turns, and the settings made of them. Pure.
-"""
+"""The knobs that a study turns, of scenes and of captures, and the settings made of them. Pure."""
 
 import copy
 import itertools

@@ -3,7 +3,6 @@
 - The journal of a study: a file of answers, with which the same command goes on where it stopped.
 - Chooses the combinations of settings to measure, once each knob has been measured by itself. Pure.
 - A round of the study: settings that are measured side by side, the units of work, and the resulting table.
-- The whole study: every knob by itself, then promising combinations, and the table of both.
 """
 
 import hashlib

@@ -2,7 +2,6 @@
 
 - Regions of a capture's view: the object by its mask, and the board by the rays that meet it. Pure.
 - One pair of a capture: a captured view as it is stored, and its view from the other side.
-- The output of a capture: encoded files, and its rows in the tables that scenes have. Pure.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -1,7 +1,4 @@
-"""A processed capture against truth: that of its simulation, or a mesh that the user gives.
-
-- A processed capture against a mesh that the user gives, in a frame of its own.
-"""
+"""A processed capture against truth: that of its simulation, or a mesh that the user gives."""
 
 import io
 from collections.abc import Mapping, Sequence

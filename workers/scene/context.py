@@ -1,7 +1,6 @@
 """The context of a worker process: the job, its assets, the renderer, and where the time goes.
 
 - The C library's allocator, set to keep the memory that freed arrays give back.
-- Where the time of a scene goes.
 """
 
 import contextlib

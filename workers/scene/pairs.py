@@ -2,7 +2,6 @@
 
 - Poses of the cameras that follow from an input camera, and d_z: the depth of the pivot that the mirror camera turns
   about.
-- One pair of a settled scene: its views as they are stored, and how they agree.
 """
 
 from dataclasses import dataclass, replace

@@ -1,7 +1,6 @@
 """The output of a scene: encoded images, and its rows in each manifest table. Pure.
 
 - The images that a view leaves, their names, and their bytes. Pure.
-- The output of a scene: encoded files, and its rows in each manifest table. Pure.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,6 +1,5 @@
 """Effects of real sensors on depth and colour. Pure: the same generator state gives the same image.
 
-- Noise of a time-of-flight depth camera. Pure: the same generator state gives the same image.
 - Lens distortion, exposure, shot noise and read noise of an RGB camera, in linear light. Pure.
 - Sensing of one view: what the sensors store of exact images. Masks and labels stay exact.
 

@@ -1,7 +1,6 @@
 """A shard: ranges of scenes made one after another in one process, each committed while the next is made.
 
 - What is told of a scene in which something was raised that is no refusal: a bug, or memory that ran out.
-- Ranges that are committed while the next one is made.
 
 A commit computes little and waits long: for a disk to flush, or for an object store to take and copy archives. So it
 runs in a thread of its own. One range at a time is committed, in order, and nothing else of a worker runs in two

@@ -1,7 +1,6 @@
 """Errors of settling: rest against finer steps than any that is measured, and the order of convergence of the integrator.
 
 - Order of convergence of the integrator, on two smooth cases with a closed-form answer.
-- Errors of settling: a scene's rest with each setting against finer steps than any that is measured.
 """
 
 import dataclasses

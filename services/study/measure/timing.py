@@ -1,6 +1,5 @@
 """Processor time of a scene with each setting, and a setting's errors with their confidence intervals.
 
-- A setting's errors with their confidence intervals, from the figures of scenes. Pure.
 - Processor time of a scene with each setting, in turn within a round, on one core.
 """
 

@@ -1,6 +1,5 @@
 """Style, palette, axes and labels of all plots.
 
-- Style, palette and logarithmic axes of all plots.
 - Labels beside the points of a plot, placed where they hide nothing.
 """
 

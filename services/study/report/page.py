@@ -1,6 +1,5 @@
 """The files of a study: Parquet tables, the whole study as JSON, and one HTML page.
 
-- The files of a study: two Parquet tables, and the whole study as JSON.
 - A study as one HTML page that needs nothing beside it: no file, no script, no network.
 """
 

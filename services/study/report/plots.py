@@ -1,7 +1,6 @@
 """The plots of a study: what accuracy costs in time, and each knob by itself.
 
 - One panel: an error over processor time, a point for each setting that was measured.
-- All plots of a study: what accuracy costs in time, and each knob by itself.
 """
 
 import math

@@ -1,7 +1,6 @@
 """Detection of a board's markers in a photograph, with corners refined along their edges.
 
 - Corners of a printed square where lines through its four edges meet, to a few hundredths of a pixel.
-- Detection of a board's markers in a photograph, by OpenCV's ArucoDetector, with corners refined along their edges.
 
 An edge is found on short profiles across it, at the centroid of the gradient of light, which blur moves less than it
 moves the corner itself. Measured on pictures drawn in linear light and stored in sRGB: 0.04 px (rms an axis); OpenCV's

@@ -1,9 +1,7 @@
 """The estimates `markers` and `joint` of a whole capture, and what they found out about it.
 
-- The estimate `markers` of a whole capture.
 - What a joint estimate found out about a capture and its user must know, in words.
 - Whether the object moved on the board in the middle of a capture, by what views before and after see of it.
-- The estimate `joint` of a whole capture.
 """
 
 import dataclasses

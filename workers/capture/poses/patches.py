@@ -1,8 +1,6 @@
 """Samples of one view's depth: planar pieces on the board, around its markers' corners, and on what stands on it.
 
-- Small planar pieces of a depth image: on the markers of the board, and around their corners.
 - Pieces of the surface of what stands on the board, found by depth alone: no mask is needed.
-- What one view's images come to: its corners, its pose from markers, and samples of its depth.
 
 A piece of plane has an inverse depth that is affine in the ray (x, y): 1 / z = a x + b y + c, with the plane's normal
 along (a, b, c). So one robust linear fit gives the piece's middle, its normal and its noise.

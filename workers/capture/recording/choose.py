@@ -1,7 +1,6 @@
 """Choice of a recording's frames: pairs of colour and depth, sharp, and spread over all that the camera has seen.
 
 - Which depth frame belongs to which colour frame, and how many frames a recording has lost.
-- Choice of a recording's frames: sharp ones, and spread over all that the camera has seen.
 """
 
 from dataclasses import dataclass

@@ -3,7 +3,6 @@
 - Which effects a simulated capture runs: one table of effects, and the plan that follows from its settings. Pure.
 - The path of a hand-held camera around an object, as poses at the moments of its photographs.
 - Views of a simulated capture that were not photographed: what synthesised views are compared with.
-- One virtual capture from its settings to its folder: the list of steps.
 
 The plan is of the same kind as that of scenes (schemas/scene/scene.py). Effects of the rendering are no-ops where a
 capture does not call for them; every other one is asked for by name in `captures.simulate`.
@@ -66,7 +65,7 @@ ASKED = (
 RASTER = ("shadows", "ambient_occlusion", "light_maps")
 TRACED = ("global_illumination", "glass")
 DRAWN = ("rgb", "floor", "table", "textures", "transparency")
-"""What the renderers draw of every capture; antialiasing is not theirs, because photographs are averaged (sampling.py)."""
+"""What the renderers draw of every capture; antialiasing is not theirs, because photographs are averaged (camera.py)."""
 
 
 def plan_effects(simulate: Simulate) -> EffectPlan:

@@ -1,7 +1,6 @@
 """The surface of a capture's object: depth of all views merged, confirmed, and moved to where views face it.
 
 - What every view says about the points of a merged surface: where it really is, how many see it, and its colour.
-- One surface from the depth of all views: merged, confirmed, moved to where the views see it, and coloured.
 """
 
 import math
