@@ -133,6 +133,7 @@ def test_the_list_of_this_project_expects_what_the_markers_skip():
     assert not expected.unexpected()
 
 
+@pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
 def test_a_change_is_told_from_none(tmp_path, monkeypatch):
     def git(*words: str) -> None:
         who = ("-c", "user.name=a", "-c", "user.email=a@b")

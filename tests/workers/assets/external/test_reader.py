@@ -187,7 +187,7 @@ def is_running(pid):
 
 
 def test_time_and_memory_are_verdicts_on_real_files_and_name_the_limit(tmp_path):
-    count = 400_000
+    count = 1_400_000  # several seconds of the fastest processor, where a limit of 1 s is kept to the next whole second
     corners = "".join(f"v {k % 1000 / 1e3} {k // 1000 / 1e3} {k % 7 / 1e3}\n" for k in range(count + 2))
     slow = write(tmp_path / "slow.obj", corners + "".join(f"f {k} {k + 1} {k + 2}\n" for k in range(1, count + 1)))
     (answer,) = ask(request(tmp_path, slow, kind="check", max_cpu_s=1.0))
