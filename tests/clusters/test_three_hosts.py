@@ -112,7 +112,7 @@ def test_a_host_that_would_make_other_bytes_or_keep_them_is_refused_before_the_f
         "install the same wheel or image": "sed '$a # changed' {1} > {0}; mount --bind {0} {1}",
         "does not share the output folder": "mount -t tmpfs none {2}",
     }
-    code = ROOT / "schemas" / "plain_line.py"
+    code = ROOT / "schemas" / "errors.py"
     places = {"(no avx2)": "/proc/cpuinfo", "install the same wheel or image": code}
     for number, (told, change) in enumerate(cases.items()):
         hosts("run", "3", "sh", "-c", change.format(tmp_path / str(number), code, cluster.storage))
