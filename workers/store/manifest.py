@@ -3,7 +3,9 @@
 import hashlib
 import io
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any, cast
 
@@ -24,27 +26,57 @@ from schemas.dataset.tables import (
 from schemas.errors import CorruptError
 from schemas.scene.scene import SceneOutput
 
+_Check = Callable[[str, Any], None]
 
-def check_values(where: str, field: pa.Field, array: pa.Array) -> None:
-    """Raises ValueError for an absent value that the schema requires, or a double that is not finite, at any depth."""
-    if not field.nullable and array.null_count:
-        raise ValueError(f"{where} is missing in {array.null_count} of {len(array)} rows")
-    kind, present = field.type, array.drop_null() if array.null_count else array
+
+def _check_of(field: pa.Field) -> _Check:
+    """What a value of this field must pass: ValueError where one is absent that must not be, or a number is not finite.
+
+    Rows are checked as Python values: a scene has few of them, and each call into Arrow costs more than a value.
+    """
+    kind, inside = field.type, _pass
     if pa.types.is_floating(kind):
-        values = present.to_numpy()
-        if not np.isfinite(values).all():
-            raise ValueError(f"{where} is not finite: {values[~np.isfinite(values)][0]}")
+        inside = _check_finite
     elif pa.types.is_struct(kind):
-        for i in range(kind.num_fields):
-            check_values(f"{where}.{kind.field(i).name}", kind.field(i), present.field(i))
-    elif pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
-        check_values(where, kind.value_field, array.flatten())
+        children = [(child.name, _check_of(child)) for child in kind]
+        if any(check is not _pass for _, check in children):
+            inside = partial(_check_struct, children)
+    elif (pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind)) and _check_of(kind.value_field) is not _pass:
+        inside = partial(_check_list, _check_of(kind.value_field))
+    return inside if field.nullable and inside is _pass else partial(_check_present, inside, field.nullable)
+
+
+def _pass(where: str, value: Any) -> None:
+    """Any value does."""
+
+
+def _check_present(inside: _Check, nullable: bool, where: str, value: Any) -> None:
+    if value is not None:
+        inside(where, value)
+    elif not nullable:
+        raise ValueError(f"{where} is missing")
+
+
+def _check_finite(where: str, value: Any) -> None:
+    if not math.isfinite(value):
+        raise ValueError(f"{where} is not finite: {value}")
+
+
+def _check_struct(children: Sequence[tuple[str, _Check]], where: str, value: Any) -> None:
+    for name, check in children:
+        check(f"{where}.{name}", value.get(name))
+
+
+def _check_list(check: _Check, where: str, value: Any) -> None:
+    for one in value:
+        check(where, one)
 
 
 PARQUET_OPTIONS = {"compression": "zstd", "write_page_checksum": True}
 """For every Parquet file that users read: a flipped bit is found when the page is read."""
 _ROWS = {table: pa.struct(list(schema)) for table, schema in SCHEMAS.items()}
 """The type of a row, by table: all columns of a table are made in one call."""
+_CHECKS = {table: [(field.name, _check_of(field)) for field in schema] for table, schema in SCHEMAS.items()}
 _EMPTY = {table: schema.empty_table() for table, schema in SCHEMAS.items()}
 _RANGE_OPTIONS: dict[str, Any] = {
     "compression": "lz4",
@@ -76,8 +108,9 @@ def table_of_rows(table: str, rows: Sequence[Mapping[str, object]]) -> pa.Table:
         arrays = pa.array(rows, _ROWS[table]).flatten()
     except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):
         arrays = [_column(table, field, rows) for field in schema]  # says which column it is
-    for field, array in zip(schema, arrays, strict=True):
-        check_values(f"{table}.{field.name}", field, array)
+    for row in rows:
+        for name, check in _CHECKS[table]:
+            check(f"{table}.{name}", row[name])
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
