@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 from services.study.model import Figure, Row, Setting, Study
-from services.study.report.page import STUDY_FILE, STUDY_VERSION
+from services.study.page import STUDY_FILE, STUDY_VERSION
 
 
 def read_study(folder: Path) -> Study:

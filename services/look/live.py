@@ -24,7 +24,7 @@ from services.read.dataset_reader import file_reader, read_stored
 from services.read.status import Status, read_status
 from services.read.verdict import explain_damage
 from services.run.lock import shows_life
-from services.study.words import number
+from services.study.model import number
 from workers.store.commit import list_codes, split_code
 from workers.store.ledger import read_range
 from workers.store.store import Store

@@ -18,7 +18,7 @@ from services.look.charts import Chart, Histogram, amount, chart_html, length_of
 from services.look.clouds import Space
 from services.look.collect import Cost, Failure, Figures
 from services.look.pictures import FIXED_REGIONS, OBJECT_REGIONS, Picture, Sample, ShownScene
-from services.study.words import milliseconds, number, size
+from services.study.model import milliseconds, number, size
 
 Side = tuple[str, Figures, Sample]
 """Name, figures and shown scenes of one dataset."""

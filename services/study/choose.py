@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from decimal import ROUND_CEILING, Context
 
 from schemas.errors import InputError, RunError, describe_seconds, did_you_mean
-from services.study.model import ERRORS, Figure, Row, Study
-from services.study.words import amount, listed, milliseconds, short, size, times, unit
+from services.study.model import ERRORS, Figure, Row, Study, amount, listed, milliseconds, short, size, times, unit
 
 Targets = Mapping[str, float]
 """The greatest allowed value of each error, by name of `ERRORS`, in the unit of the table: shares from 0 to 1."""
@@ -18,9 +17,24 @@ AS_CHEAP = 1.05
 MORE_FAILED = 0.01
 """A setting may fail this share of scenes more than the job; one that fails more is cheap because it leaves work out."""
 
-
 NOISE = 0.02
 """Relative noise of a ratio: the difference of interleaved medians on one core from run to run."""
+
+DEFAULT_TARGETS: Targets = {
+    "penetration_mm": 0.1,
+    "gap_mm": 0.1,
+    "unbalanced_share": 0.01,
+    "pose_mm": 0.1,
+    "depth_mm": 0.1,
+    "mask_share": 0.001,
+    "camera_mm": 0.5,
+    "camera_deg": 0.05,
+    "cloud_mm": 1.0,
+    "cloud_p95_mm": 3.0,
+    "missing_share": 0.05,
+    "view_depth_mm": 1.5,
+}
+"""The targets without a wish of the user: the accuracy that a dataset's labels promise."""
 
 
 class TargetError(RunError):
@@ -29,10 +43,10 @@ class TargetError(RunError):
 
 def own_row(rows: Sequence[Row]) -> Row:
     """The row of the job as it is. Raises ValueError where there is none."""
-    own = [row for row in rows if not row.setting.parts]
-    if not own:
-        raise ValueError("a study has one row for the job as it is; here there is none")
-    return own[0]
+    for row in rows:
+        if not row.setting.parts:
+            return row
+    raise ValueError("a study has one row for the job as it is; here there is none")
 
 
 def error_of(row: Row, name: str, rows: Sequence[Row]) -> Figure | None:
@@ -134,10 +148,8 @@ def _unknown(name: str) -> str:
     return f"--target {name}: there is no such error; {did_you_mean(name, ERRORS)}Known: {', '.join(ERRORS)}"
 
 
-def close_calls(
-    rows: Sequence[Row], targets: Targets, bounds: Targets | None = None, noise: float = NOISE
-) -> list[Row]:
-    """The settings whose time decides the choice: were one of them off by `noise`, another setting would be chosen.
+def close_calls(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None) -> list[Row]:
+    """The settings whose time decides the choice: were one of them off by `NOISE`, another setting would be chosen.
 
     They are to be timed for some more rounds; an empty list means that the choice holds. No rule makes it always hold: in
     made-up studies with 5 to 45 settings and ratios off by 1 %, two runs agree on the cheapest setting in 93 of 100, and on
@@ -152,32 +164,18 @@ def close_calls(
     # The job's own ratio is 1 whatever the noise.
     turned = [row for row in candidates(rows, targets) if row.setting.parts]
     meeting = [row for row in turned if meets(row, {**(bounds or {}), **targets}, rows)]
-    noises = (1.0 - noise, 1.0 + noise)
+    noises = (1.0 - NOISE, 1.0 + NOISE)
     return [row for row in meeting if any(chosen_if(row, off).setting != chosen.setting for off in noises)]
 
 
 # ---------------------------------------------------------------------------------------------- no setting meets them
 
 
-def describe_miss(rows: Sequence[Row], targets: Targets) -> str:
-    """The nearest setting, by how much it misses the targets, and which targets it would meet."""
-    missed, loosened = _describe_nearest(rows, targets)
-    asked = ", ".join(f"{name}={target:g}" for name, target in targets.items())
-    remedy = f". Loosen to at least {_as_option(loosened)}" if loosened else ""
-    return f"no setting meets {asked}. {missed}{remedy}"
+def describe_miss(rows: Sequence[Row], targets: Targets, default: bool = False) -> str:
+    """The nearest setting, by how much it misses the targets, and which targets it would meet.
 
-
-def describe_default_miss(rows: Sequence[Row], targets: Targets) -> str:
-    """As `describe_miss`, for targets that nobody asked for: with the option that sets others."""
-    missed, loosened = _describe_nearest(rows, targets)
-    asked = {name: f"{target:g}" for name, target in targets.items()}
-    return (
-        f"no setting meets the default targets. {missed}. Set others with --target {_as_option({**asked, **loosened})}"
-    )
-
-
-def _describe_nearest(rows: Sequence[Row], targets: Targets) -> tuple[str, dict[str, str]]:
-    """(a sentence on the nearest setting and what it misses; by error the targets that it would meet, of those missed)."""
+    For `default` targets, which nobody asked for, with the option that sets others.
+    """
     nearest = nearest_row(rows, targets)
     told, loosened = [], {}
     for name, target in targets.items():
@@ -190,16 +188,18 @@ def _describe_nearest(rows: Sequence[Row], targets: Targets) -> tuple[str, dict[
             told.append(f"{name}, {amount(name, found.value)} is {over}{ratio}")
             above = Context(prec=2, rounding=ROUND_CEILING).create_decimal(repr(found.value))  # so that it is met
             loosened[name] = f"{above:f}"
+    asked = {name: f"{target:g}" for name, target in targets.items()}
     missed = listed(told) or "none of them, and is worse than the job in another error"
-    return (
-        f"The nearest is {nearest.setting.name}, at {times(nearest.ratio)} the job's time: it misses {missed}",
-        loosened,
-    )
+    miss = f"The nearest is {nearest.setting.name}, at {times(nearest.ratio)} the job's time: it misses {missed}"
+    if default:
+        others = _as_option({**asked, **loosened}, ",")
+        return f"no setting meets the default targets. {miss}. Set others with --target {others}"
+    remedy = f". Loosen to at least {_as_option(loosened, ',')}" if loosened else ""
+    return f"no setting meets {_as_option(asked, ', ')}. {miss}{remedy}"
 
 
-def _as_option(targets: Mapping[str, str]) -> str:
-    """As `--target` takes them: "depth_mm=0.1,pose_mm=0.2"."""
-    return ",".join(f"{name}={most}" for name, most in targets.items())
+def _as_option(targets: Mapping[str, str], between: str) -> str:
+    return between.join(f"{name}={most}" for name, most in targets.items())
 
 
 def nearest_row(rows: Sequence[Row], targets: Targets) -> Row:
@@ -207,9 +207,11 @@ def nearest_row(rows: Sequence[Row], targets: Targets) -> Row:
 
     def key(row: Row) -> tuple[float, float, str]:
         """How many times its target the worst error is, a target of 0 counting as a millionth; time; and name."""
-        found = [(error_of(row, name, rows), target) for name, target in targets.items()]
-        values = [(math.inf if figure is None else figure.value, target) for figure, target in found]
-        worst = max(value / max(target, 1e-6) if value > target else 1.0 for value, target in values)
+        worst = 1.0
+        for name, target in targets.items():
+            found = error_of(row, name, rows)
+            value = math.inf if found is None else found.value
+            worst = max(worst, value / max(target, 1e-6) if value > target else 1.0)
         return worst, row.ratio, row.setting.name
 
     return min(candidates(rows, targets), key=key)
@@ -237,23 +239,6 @@ def parse_targets(text: str) -> dict[str, float]:
             example = ", a share such as 0.001 for 0.1 %" if unit(name) == "%" else ""
             raise InputError(f"--target {name}={value}: must be a number from 0 up{example}")
     return targets
-
-
-DEFAULT_TARGETS: Targets = {
-    "penetration_mm": 0.1,
-    "gap_mm": 0.1,
-    "unbalanced_share": 0.01,
-    "pose_mm": 0.1,
-    "depth_mm": 0.1,
-    "mask_share": 0.001,
-    "camera_mm": 0.5,
-    "camera_deg": 0.05,
-    "cloud_mm": 1.0,
-    "cloud_p95_mm": 3.0,
-    "missing_share": 0.05,
-    "view_depth_mm": 1.5,
-}
-"""The targets without a wish of the user: the accuracy that a dataset's labels promise."""
 
 
 def answer(study: Study, targets: Targets | None = None) -> str:
@@ -298,7 +283,7 @@ def recommend(study: Study, targets: Targets | None = None) -> Row:
     try:
         return choose(seeing, asked, bounds)
     except TargetError:
-        raise TargetError(describe_default_miss(seeing, asked)) from None
+        raise TargetError(describe_miss(seeing, asked, default=True)) from None
 
 
 def default_targets(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]:

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from pydantic_core import to_jsonable_python
 
 from schemas.errors import InputError, did_you_mean
-from schemas.job.captures import ESTIMATES, Captures
+from schemas.job.captures import ESTIMATES
 from schemas.job.job import PRESETS, Job
 from schemas.job.keys import set_key
 from services.job.job_file import describe_fault
@@ -18,26 +18,6 @@ from services.study.model import Changes, Group, Knob, Setting, Value
 
 VIEWS = (4, 6, 10, 20, 40)
 """Numbers of views, as far as the job's captures have as many."""
-
-
-def capture_knobs(captures: Captures) -> tuple[Knob, ...]:
-    """Every knob of a job of simulated captures, from coarse to fine where its values have an order.
-
-    `markers` and `article` estimate each view by itself, `joint` all together.
-    """
-    knobs = {
-        "views": _values("captures.simulate.views", (n for n in VIEWS if n < captures.simulate.views)),
-        "estimate": [Value(name, {"captures.estimation.estimate": name}) for name in ESTIMATES],
-        "iterations": _values("captures.estimation.max_iterations", (1, 2, 5, 20)),
-        "voxel": _values("captures.fusion.voxel_m", (0.006, 0.004, 0.002, 0.0015)),
-        "merged_views": _values("captures.synthesis.views", (1, 3, 6, 12)),
-    }
-    return tuple(Knob(name, "capture", tuple(values)) for name, values in knobs.items())
-
-
-def _values(key: str, values: Iterable[float]) -> list[Value]:
-    return [Value(f"{value:g}", {key: value}) for value in values]
-
 
 SPIN_PER_SPEED = 0.01
 """rad/s of `physics.rest.spin_rad_s` for each mm/s of `physics.rest.speed_mm_s`: their defaults' ratio."""
@@ -47,22 +27,28 @@ WIDTHS = (160, 320, 640, 1280)
 
 
 def knobs_of(job: Job) -> tuple[Knob, ...]:
-    """Every knob, with the values that mean something for this job."""
-    if job.captures is not None:
-        return capture_knobs(job.captures)
+    """Every knob, with the values that mean something for this job, from coarse to fine where they have an order."""
+    if (captures := job.captures) is not None:
+        simulated = {
+            "views": _values("captures.simulate.views", [n for n in VIEWS if n < captures.simulate.views]),
+            # `markers` and `article` estimate each view by itself, `joint` all together.
+            "estimate": [Value(name, {"captures.estimation.estimate": name}) for name in ESTIMATES],
+            "iterations": _values("captures.estimation.max_iterations", (1, 2, 5, 20)),
+            "voxel": _values("captures.fusion.voxel_m", (0.006, 0.004, 0.002, 0.0015)),
+            "merged_views": _values("captures.synthesis.views", (1, 3, 6, 12)),
+        }
+        return tuple(Knob(name, "capture", tuple(values)) for name, values in simulated.items())
+    speed, spin = "physics.rest.speed_mm_s", "physics.rest.spin_rad_s"
     physics = {
-        "step": _job_values("physics.step_hz", (60, 120, 240, 480, 960, 1920)),
-        "step_travel": _job_values("physics.max_step_travel_mm", (1.0, 0.3, 0.1, 0.05, 0.035)),
-        "iterations": _job_values("physics.solver_iterations", (5, 10, 25, 50, 100, 200)),
-        "rest": [
-            Value(f"{v:g}", {"physics.rest.speed_mm_s": v, "physics.rest.spin_rad_s": SPIN_PER_SPEED * v})
-            for v in (30.0, 10.0, 3.0, 1.0, 0.3)
-        ],
+        "step": _values("physics.step_hz", (60, 120, 240, 480, 960, 1920)),
+        "step_travel": _values("physics.max_step_travel_mm", (1.0, 0.3, 0.1, 0.05, 0.035)),
+        "iterations": _values("physics.solver_iterations", (5, 10, 25, 50, 100, 200)),
+        "rest": [Value(f"{v:g}", {speed: v, spin: SPIN_PER_SPEED * v}) for v in (30.0, 10.0, 3.0, 1.0, 0.3)],
         "collision": _collisions(job),
         "exact_rest": [Value("off", {"physics.exact_rest": False}), Value("on", {"physics.exact_rest": True})],
     }
     units = [n for n in (1000, 2000, 5000, 8000) if n * job.images.depth_range_m.high <= 65_535]
-    sensors = [Value("exact", {"sensor.depth_noise": None}), Value("azure-kinect", {"sensor.depth_noise": {}})]
+    sensors = (Value("exact", {"sensor.depth_noise": None}), Value("azure-kinect", {"sensor.depth_noise": {}}))
     key, removal = "images.projection.splat", "images.projection.hidden_point_removal"
     splats = [
         Value(f"{size}{' without backs' if removed else ''}", {key: size, removal: removed})
@@ -71,15 +57,15 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
     return (
         *(Knob(name, "physics", tuple(values)) for name, values in physics.items()),
         Knob("size", "labels", tuple(size_value(job, width) for width in WIDTHS)),
-        Knob("units", "labels", tuple(_job_values("images.depth_units_per_m", units))),
-        Knob("pivot_depth", "mirror", tuple(_pivot_depths())),
+        Knob("units", "labels", tuple(_values("images.depth_units_per_m", units))),
+        Knob("pivot_depth", "mirror", _pivot_depths()),
         Knob("splat", "mirror", tuple(splats)),
-        Knob("sensor", "labels", tuple(sensors)),
-        Knob("colour", "colour", tuple(_tiers())),
+        Knob("sensor", "labels", sensors),
+        Knob("colour", "colour", _tiers()),
     )
 
 
-def _job_values(key: str, values: Iterable[float]) -> list[Value]:
+def _values(key: str, values: Iterable[float]) -> list[Value]:
     return [Value(f"{value:g}", {key: value}) for value in values]
 
 
@@ -104,22 +90,18 @@ def size_value(job: Job, width: int) -> Value:
     return Value(str(width), {f"cameras.sensor.{name}": value for name, value in values.items()})
 
 
-def _pivot_depths() -> list[Value]:
+def _pivot_depths() -> tuple[Value, ...]:
     key, percentile = "cameras.mirror.pivot_depth", "cameras.mirror.percentile"
-    return [
-        Value("median", {key: "median"}),
-        *(Value(f"{p:g}%", {key: "percentile", percentile: p}) for p in (10.0, 5.0, 2.0, 0.5)),
-        Value("nearest", {key: "nearest"}),
-    ]
+    shares = [Value(f"{p:g}%", {key: "percentile", percentile: p}) for p in (10.0, 5.0, 2.0, 0.5)]
+    return Value("median", {key: "median"}), *shares, Value("nearest", {key: "nearest"})
 
 
-def _tiers() -> list[Value]:
-    rasters = [("flat", "flat", 1), ("raster", "raster", 1), ("raster-4", "raster", 4)]
-    traced = {f"path-{paths}": {"render.tier": "pathtraced", "render.path_samples": paths} for paths in (1, 4, 16)}
-    return [
+def _tiers() -> tuple[Value, ...]:
+    rasters = (("flat", "flat", 1), ("raster", "raster", 1), ("raster-4", "raster", 4))
+    return (
         *(Value(label, {"render.tier": tier, "render.samples": samples}) for label, tier, samples in rasters),
-        *(Value(label, changes, package="mitsuba") for label, changes in traced.items()),
-    ]
+        *(Value(f"path-{n}", {"render.tier": "pathtraced", "render.path_samples": n}, "mitsuba") for n in (1, 4, 16)),
+    )
 
 
 def choose_knobs(knobs: Sequence[Knob], names: Sequence[str] | None) -> tuple[Knob, ...]:
@@ -140,13 +122,10 @@ def settings_of(job: Job, knobs: Sequence[Knob]) -> tuple[tuple[Setting, ...], t
     for knob in knobs:
         missing = [value for value in knob.values if value.package and not find_spec(value.package)]
         if missing:
-            labels, package = ", ".join(value.label for value in missing), missing[0].package
-            left_out.append(
-                f"{knob.name} {labels}: the package `{package}` is not installed: `./verso extra pathtraced`"
-            )
-        for value in knob.values:
-            if value in missing:
-                continue
+            labels = ", ".join(value.label for value in missing)
+            why = f"the package `{missing[0].package}` is not installed: `./verso extra pathtraced`"
+            left_out.append(f"{knob.name} {labels}: {why}")
+        for value in [value for value in knob.values if value not in missing]:
             setting = Setting(((knob.name, value.label),), value.changes)
             try:
                 changed = apply(job, value.changes)

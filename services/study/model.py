@@ -1,7 +1,6 @@
-"""The models of a study of accuracy against time, and the errors that it measures.
+"""The models of a study of accuracy against time, the errors that it measures, and how amounts are written. Pure.
 
-- The models of a study of accuracy against time: knobs, settings, its plan, and rows of its table.
-- The errors that the study measures, each with the truth it is held against, which is never the setting under test.
+An error names the truth that it is held against, which is never the setting under test.
 """
 
 from collections.abc import Mapping
@@ -209,7 +208,8 @@ ERRORS = {kind.name: kind for kind in (
               "object pixels of the mirror view seen by both that stay empty", _RAYS, "mirror"),
     ErrorKind("hidden_share", "", "projected pixels that show through",
               "projected pixels that show what the mirror camera cannot see", _RAYS, "mirror"),
-    ErrorKind("camera_mm", "mm", "camera position", "camera position off, median of a capture's views", _TRUTH, "capture"),
+    ErrorKind("camera_mm", "mm", "camera position",
+              "camera position off, median of a capture's views", _TRUTH, "capture"),
     ErrorKind("camera_deg", "deg", "camera rotation", "camera rotation off, median of its views", _TRUTH, "capture"),
     ErrorKind("cloud_mm", "mm", "merged cloud", "points of the merged cloud off, median", _TRUTH, "capture"),
     ErrorKind("cloud_p95_mm", "mm", "merged cloud, 95 %",
@@ -224,3 +224,67 @@ ERRORS = {kind.name: kind for kind in (
 )}
 # fmt: on
 """By name."""
+
+# ---------------------------------------------------------------------------------------------- in words
+
+_SIZES = ((1e3, 1.0, "kB"), (1e6, 1e3, "MB"), (1e9, 1e6, "GB"), (float("inf"), 1e9, "TB"))
+
+
+def short(name: str) -> str:
+    """An error's name in a few words."""
+    return ERRORS[name].short
+
+
+def unit(name: str) -> str:
+    """The unit that an error is shown in: "mm", "deg", "%" for shares, or nothing."""
+    return "%" if name.endswith("_share") else ERRORS[name].unit
+
+
+def shown(name: str, value: float) -> float:
+    """An error in the unit that it is shown in."""
+    return value * 100.0 if name.endswith("_share") else value
+
+
+def amount(name: str, value: float) -> str:
+    """An error with its unit, three digits: "0.1 mm", "0.25 %"."""
+    return f"{number(shown(name, value))} {unit(name)}".strip()
+
+
+def number(value: float) -> str:
+    """Three digits: "0", "0.00012", "13.4", "1,250"; below a ten-thousandth and from a million on "3.5e-5"."""
+    if value != 0.0 and not 1e-4 <= abs(value) < 1e6:
+        digits, _, exponent = f"{value:.3g}".partition("e")
+        return f"{digits}e{int(exponent)}" if exponent else digits
+    return f"{float(f'{value:.3g}'):,.8f}".rstrip("0").rstrip(".")
+
+
+def as_often(ratio: float) -> str:
+    """A ratio of times in two digits: "1" within the noise of 5 %, "0.62", "1.6", "47"."""
+    return "1" if abs(ratio - 1.0) < 0.05 else number(float(f"{ratio:.2g}"))
+
+
+def cost(ratio: float) -> str:
+    """A ratio of times as a cost: "2 × the time", or "no more time" within the noise."""
+    often = as_often(ratio)
+    return "no more time" if often == "1" else f"{often} × the time"
+
+
+def times(ratio: float) -> str:
+    """A ratio of times with its word, and a third digit near 1: "1.07 times"."""
+    return f"{number(round(ratio, 2)) if 0.9 <= ratio < 1.1 else as_often(ratio)} times"
+
+
+def milliseconds(ms: float) -> str:
+    """The time of a scene: "118 ms", "11.2 s"."""
+    return f"{number(ms)} ms" if ms < 9999.5 else f"{number(ms / 1e3)} s"
+
+
+def size(kilobytes: float) -> str:
+    """The size of a job's files: "15 MB"."""
+    value, name = next((kilobytes / one, name) for most, one, name in _SIZES if kilobytes < most)
+    return f"{number(float(f'{value:.2g}') if value < 100.0 else round(value))} {name}"
+
+
+def listed(words: list[str]) -> str:
+    """Words in one phrase: "a", "a and b" or "a, b and c"."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

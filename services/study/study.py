@@ -1,8 +1,7 @@
 """The whole study: its journal, every knob by itself, then promising combinations, and the table of both.
 
-- The journal of a study: a file of answers, with which the same command goes on where it stopped.
-- Chooses the combinations of settings to measure, once each knob has been measured by itself. Pure.
-- A round of the study: settings that are measured side by side, the units of work, and the resulting table.
+The journal is a file of answers, with which the same command goes on where it stopped. A round is settings that are
+measured side by side, in units of one scene.
 """
 
 import hashlib
@@ -22,10 +21,17 @@ from schemas.job.job import Job
 from services.bench.figures import describe_machine, pinned
 from services.run.progress import ProgressLine
 from services.study.choose import DEFAULT_TARGETS, TargetError, close_calls, default_targets
+from services.study.images import measure_colour, measure_scene_images
 from services.study.knobs import apply, groups_of, joined
-from services.study.measure.images import measure_colour, measure_scene_images
-from services.study.measure.settling import measure_settling, slopes
-from services.study.measure.timing import image_figures, settling_figures, time_scene, timed_rows, warm_up
+from services.study.measure import (
+    image_figures,
+    measure_settling,
+    settling_figures,
+    slopes,
+    time_scene,
+    timed_rows,
+    warm_up,
+)
 from services.study.model import ERRORS, Figure, Group, Plan, Row, Setting, Study
 from workers.assets.catalogue import open_catalogue
 from workers.scene.context import WorkerContext, open_worker
@@ -192,46 +198,37 @@ class Round:
     def errors(self) -> list[Unit]:
         """The units of errors."""
         first, sizes = self.plan.job.first_scene, self.plan.sizes
-        kinds: list[tuple[str, tuple[Setting, ...], int]] = [
+        kinds = (
             ("colour", self.of("colour"), sizes.coloured),
             ("images", self.of("labels", "mirror"), sizes.scenes),
             ("settling", self.of("physics"), sizes.settled),
-        ]
-        return [
-            Unit(
-                f"{self.name}/{kind}/{first + number}",
-                kind,
-                settings,
-                first + number,
-                posed=number < sizes.posed,
-                released=number < sizes.released,
-            )
-            for kind, settings, count in kinds
-            for number in range(count)
-            if len(settings) > 1 and not self.times_only
-        ]
+        )
+        units = []
+        for kind, settings, count in kinds:
+            for number in range(count if len(settings) > 1 and not self.times_only else 0):
+                name, part = f"{self.name}/{kind}/{first + number}", (number < sizes.posed, number < sizes.released)
+                units.append(Unit(name, kind, settings, first + number, 0, *part))
+        return units
 
     def rows(self, journal: Journal) -> tuple[Row, ...]:
         """The round's table, from the answers in the journal; settings without a time are left out."""
         laps: list[dict[int, dict[str, Any]]] = [{} for _ in range(self.plan.sizes.laps)]
         for unit in self.timings():
             laps[unit.lap][unit.scene_id] = journal[unit.name]
-        return tuple(self._with_errors(journal, row, scenes) for row, scenes in timed_rows(self.settings, laps))
-
-    def _with_errors(self, journal: Journal, row: Row, scenes: int) -> Row:
-        errors = self._errors(journal, row.setting.name)
-        return replace(
-            row,
-            errors=errors,
-            failed_share=errors["failed_share"].value if "failed_share" in errors else 0.0,
-            notes=() if scenes >= self.plan.sizes.timed else (f"timed in {scenes} scenes",),
-        )
-
-    def _errors(self, journal: Journal, name: str) -> dict[str, Figure]:
-        """A setting's errors, `failed_share` last and the others in the order of `ERRORS`."""
         answers: dict[str, list[dict[str, Any]]] = {"settling": [], "images": [], "colour": []}
         for unit in self.errors():
             answers[unit.kind].append(journal[unit.name])
+        rows = []
+        for row, scenes in timed_rows(self.settings, laps):
+            errors = self._errors(answers, row.setting.name)
+            failed = errors["failed_share"].value if "failed_share" in errors else 0.0
+            notes = () if scenes >= self.plan.sizes.timed else (f"timed in {scenes} scenes",)
+            rows.append(replace(row, errors=errors, failed_share=failed, notes=notes))
+        return tuple(rows)
+
+    @staticmethod
+    def _errors(answers: Mapping[str, Sequence[Mapping[str, Any]]], name: str) -> dict[str, Figure]:
+        """A setting's errors, `failed_share` last and the others in the order of `ERRORS`."""
         found = settling_figures(name, answers["settling"])
         for kind in ("images", "colour"):
             found |= image_figures([one[name] for one in answers[kind] if name in one])
@@ -260,7 +257,7 @@ def run_study(
     try:
         close = close_calls(rows, asked, bounds)
     except TargetError:  # no setting meets the targets, however long it is timed
-        return rows
+        close = []
     if not close:
         return rows
     again = (Setting(), *(row.setting for row in close))
@@ -301,17 +298,14 @@ class _Bench:
         self.done = self.asked - len(untimed) - len(missing)
         self.progress.expect(self.asked)
         if untimed:
-            self._take_times(part, untimed)
+            with pinned():
+                quick = [setting for setting in part.settings if not _is_slow(self.context.job, setting)]
+                warm_up(self.context, quick, part.plan.job.first_scene + part.plan.sizes.timed)
+                for unit in untimed:
+                    self._keep(unit.name, _time(part, self.context, unit))
         for name, answer in measure_in_pool(self.context.job, part.plan.job_folder, self.processes, missing):
             self._keep(name, answer)
         return part.rows(self.journal)
-
-    def _take_times(self, part: Round, missing: Sequence[Unit]) -> None:
-        with pinned():
-            quick = [setting for setting in part.settings if not _is_slow(self.context.job, setting)]
-            warm_up(self.context, quick, part.plan.job.first_scene + part.plan.sizes.timed)
-            for unit in missing:
-                self._keep(unit.name, _time(part, self.context, unit))
 
     def _keep(self, name: str, answer: Any) -> None:
         self.journal.add(name, answer)

@@ -1,7 +1,6 @@
 """Errors: each has a name, a unit, and a short name of its own."""
 
-from services.study.model import ERRORS
-from services.study.words import short
+from services.study.model import ERRORS, short
 
 
 def test_every_error_has_a_short_name():

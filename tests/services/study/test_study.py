@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from schemas.job.job import Job
-from services.study.measure.settling import measure_settling
+from services.study.measure import measure_settling
 from services.study.model import Plan, Setting, Sizes
 from services.study.study import Unit, header_of, measure_in_pool, with_time_of
 from tests.made_up_studies import row

@@ -2,7 +2,7 @@
 
 import pytest
 
-from services.study.words import amount, as_often, listed, milliseconds, number, size, times
+from services.study.model import amount, as_often, listed, milliseconds, number, size, times
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 
 from schemas.capture import CaptureScore
 from schemas.job.job import Job
-from services.study.captures import errors_of, fewer_views, measure_capture
+from services.study.command import errors_of, fewer_views, measure_capture
 from services.study.model import Setting
 from workers.assets.catalogue import open_catalogue
 from workers.capture.folder import open_folder

@@ -6,8 +6,8 @@ import pytest
 from schemas.errors import InputError
 from schemas.job.job import Job
 from services.run.progress import ProgressLine
-from services.study import captures as study
-from services.study.captures import check_captures, rows_of, run_capture_study
+from services.study import command as study
+from services.study.command import check_captures, rows_of, run_capture_study
 from services.study.model import Plan, Setting, Sizes
 from services.study.study import Journal
 

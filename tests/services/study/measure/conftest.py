@@ -1,6 +1,5 @@
 import pytest
-
-from tests.services.study.measure.label_views import camera_above, seen_of_block
+from tests.services.study.label_views import camera_above, seen_of_block
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from schemas.scene.scene import Placed, PosedScene
 from schemas.scene.shape import Appearance
 from schemas.scene.view import Camera, Intrinsics, Pair, View
 from services.job.job_file import validate_job
-from services.study.measure.images import Truth, measure_images
+from services.study.images import Truth, measure_images
 from tests.effects.scenes import SMALL, context_of, merged
 from tests.kit.shapes import box, shape_of
 from workers.geometry.camera import look_at

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-
-from schemas.scene.view import View
-from tests.services.study.measure.label_views import (
+from tests.services.study.label_views import (
     HEIGHT,
     TOP_Z,
     WIDTH,
@@ -18,6 +16,8 @@ from tests.services.study.measure.label_views import (
     table_and,
     view,
 )
+
+from schemas.scene.view import View
 from workers.geometry.frames import rotation_about
 
 

@@ -4,12 +4,12 @@ import importlib.util
 
 import numpy as np
 import pytest
+from services.study.measure import colour as colour_errors
 
 from schemas.base import frozen_array
 from schemas.scene.view import Camera, Intrinsics
 from services.job.job_file import validate_job
-from services.study.measure import colour as colour_errors
-from services.study.measure.colour import (
+from services.study.colour import (
     ColourTruth,
     Crop,
     colour_truth_missing,

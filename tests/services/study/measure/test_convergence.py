@@ -2,7 +2,7 @@
 
 import pytest
 
-from services.study.measure.settling import slopes
+from services.study.measure import slopes
 
 
 def test_errors_fall_with_the_step_in_the_order_of_the_integrator():

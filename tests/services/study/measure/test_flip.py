@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.study.measure.colour import flip_between
+from services.study.colour import flip_between
 
 D = 6 / 29
 """Of CIELAB."""
@@ -89,7 +89,7 @@ def test_images_of_two_sizes_or_of_another_kind_are_refused_and_end_no_process()
 
 def test_flip_prints_nothing_writes_nothing_and_is_the_same_on_any_number_of_threads(tmp_path):
     code = (
-        "import numpy as np; from services.study.measure.colour import flip_between;"
+        "import numpy as np; from services.study.colour import flip_between;"
         "rng = np.random.default_rng(0); a = rng.integers(0, 256, (150, 170, 3), dtype=np.uint8);"
         "b = np.clip(a + rng.normal(0, 20, a.shape), 0, 255).astype(np.uint8);"
         "print(*{flip_between(a, b).hex() for _ in range(3)})"

@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-
-from schemas.scene.view import Agreement, View
-from services.study.measure.images import measure_images, truth_of
-from tests.effects.scenes import SMALL
-from tests.kit.shapes import box
-from tests.services.study.measure.label_views import (
+from tests.services.study.label_views import (
     HEIGHT,
     TABLE_Z,
     TOP_Z,
@@ -24,6 +19,11 @@ from tests.services.study.measure.label_views import (
     table_and,
     view,
 )
+
+from schemas.scene.view import Agreement, View
+from services.study.images import measure_images, truth_of
+from tests.effects.scenes import SMALL
+from tests.kit.shapes import box
 
 
 def test_views_that_are_as_the_formulas_say_have_no_error(seen):

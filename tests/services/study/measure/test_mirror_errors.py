@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-
-from schemas.scene.view import Agreement
-from tests.kit.shapes import box
-from tests.services.study.measure.label_views import (
+from tests.services.study.label_views import (
     TOP_Z,
     block,
     camera_above,
@@ -17,6 +14,9 @@ from tests.services.study.measure.label_views import (
     thing,
     view,
 )
+
+from schemas.scene.view import Agreement
+from tests.kit.shapes import box
 from workers.geometry.camera import look_at
 from workers.scene.pairs import mirror_pose
 

@@ -2,10 +2,7 @@
 
 import numpy as np
 import pytest
-
-from schemas.base import frozen_array
-from schemas.scene.view import Camera, Intrinsics
-from tests.services.study.measure.label_views import (
+from tests.services.study.label_views import (
     HEIGHT,
     TABLE_Z,
     WIDTH,
@@ -16,6 +13,9 @@ from tests.services.study.measure.label_views import (
     table_and,
     view,
 )
+
+from schemas.base import frozen_array
+from schemas.scene.view import Camera, Intrinsics
 from workers.geometry.camera import look_at
 
 

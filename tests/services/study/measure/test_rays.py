@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-
-from services.study.measure.images import Truth, truth_of
-from tests.kit.shapes import box
-from tests.services.study.measure.label_views import (
+from tests.services.study.label_views import (
     HEIGHT,
     TOP_Z,
     WIDTH,
@@ -18,6 +15,9 @@ from tests.services.study.measure.label_views import (
     table_and,
     thing,
 )
+
+from services.study.images import Truth, truth_of
+from tests.kit.shapes import box
 from workers.geometry.raycast import cast_view
 
 

@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
-from schemas.job.job import Job
-from services.study.knobs import apply, knobs_of, settings_of
 from services.study.measure import images as scene_images
-from services.study.measure.images import measure_colour
+
+from schemas.job.job import Job
+from services.study.images import measure_colour
+from services.study.knobs import apply, knobs_of, settings_of
 from workers.assets.catalogue import open_catalogue
 from workers.scene.context import open_worker
 

@@ -7,7 +7,7 @@ import pytest
 
 from schemas.job.job import Job
 from services.study.knobs import apply, knobs_of
-from services.study.measure.settling import REFERENCES, measure_settling
+from services.study.measure import REFERENCES, measure_settling
 from services.study.model import Setting
 from workers.assets.catalogue import open_catalogue
 from workers.scene.context import WorkerContext

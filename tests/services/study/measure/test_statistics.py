@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.study.measure.timing import apart, figure_over_scenes, image_figures, settling_figures, share
+from services.study.measure import apart, figure_over_scenes, image_figures, settling_figures, share
 
 
 def test_an_error_is_the_95th_percentile_of_the_scenes_and_lies_in_its_interval():

@@ -2,7 +2,7 @@
 
 import pytest
 
-from services.study.measure.timing import cost_of, job_cost, timed_rows
+from services.study.measure import cost_of, job_cost, timed_rows
 from services.study.model import Setting
 
 OWN = "the job"

@@ -2,11 +2,7 @@
 
 import numpy as np
 import trimesh
-
-from schemas.scene.scene import Placed
-from services.study.measure.images import Truth, truth_of
-from tests.kit.shapes import shape_of
-from tests.services.study.measure.label_views import (
+from tests.services.study.label_views import (
     HEIGHT,
     WIDTH,
     F,
@@ -19,6 +15,10 @@ from tests.services.study.measure.label_views import (
     thing,
     view,
 )
+
+from schemas.scene.scene import Placed
+from services.study.images import Truth, truth_of
+from tests.kit.shapes import shape_of
 
 
 def test_truth_is_kept_while_the_poses_are_the_same_and_no_longer(seen):

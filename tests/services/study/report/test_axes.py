@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
-
-from services.study.report.axes import MOST_TICKS, new_picture, round_ticks, set_scale
+from services.study.axes import MOST_TICKS, new_picture, round_ticks, set_scale
 
 POSITIVE = st.floats(1e-9, 1e9)
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.text import Annotation, Text
-
-from services.study.report.axes import Label, marker_boxes, new_picture, place_labels, renderer_of
+from services.study.axes import Label, marker_boxes, new_picture, place_labels, renderer_of
 
 
 @pytest.fixture

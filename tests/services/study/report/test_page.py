@@ -10,7 +10,7 @@ import pytest
 
 from services.study.choose import answer
 from services.study.model import Study
-from services.study.report.page import page_of, write_page
+from services.study.page import page_of, write_page
 from tests.made_up_studies import large_study, row, study
 
 VOID = {"meta", "img", "br"}

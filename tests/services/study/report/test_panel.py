@@ -1,7 +1,8 @@
 """Panels: which error and which settings each shows, and how knobs look."""
 
-from services.study.report.axes import COLORS
-from services.study.report.plots import half_row, looks_of, moving_rows, panels_of
+from services.study.axes import COLORS
+
+from services.study.plots import half_row, looks_of, moving_rows, panels_of
 from tests.made_up_studies import large_study, row
 
 OWN = row(moved_mm=0.1, depth_mm=0.1, mirror_mm=1.0)

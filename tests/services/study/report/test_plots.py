@@ -11,10 +11,10 @@ import pytest
 from matplotlib.figure import Figure as Picture
 from matplotlib.text import Annotation, Text
 from PIL import Image
+from services.study.axes import marker_boxes, plain_style, renderer_of
 
 from services.study.model import Row, Study
-from services.study.report.axes import marker_boxes, plain_style, renderer_of
-from services.study.report.plots import (
+from services.study.plots import (
     draw_knob,
     draw_tradeoff,
     headline,
@@ -160,7 +160,7 @@ def test_the_same_study_gives_the_same_bytes(tmp_path: Path):
 
 
 def test_drawing_needs_no_window_and_no_state_of_pyplot():
-    code = "import sys, services.study.report.plots; sys.exit('matplotlib.pyplot' in sys.modules)"
+    code = "import sys, services.study.plots; sys.exit('matplotlib.pyplot' in sys.modules)"
     root = Path(__file__).resolve().parents[4]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, timeout=60, check=False).returncode == 0
 

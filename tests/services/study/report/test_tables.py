@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.study.model import ERRORS, Figure, Row, Setting, Study
-from services.study.report.page import wide_schema, write_tables
+from services.study.page import wide_schema, write_tables
 from tests.made_up_studies import large_study, row, study
 from tests.stored_studies import read_study
 

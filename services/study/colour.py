@@ -1,11 +1,9 @@
 """Errors of colour: FLIP of the input view against a converged path-traced image.
 
-- FLIP (Andersson et al. 2020) by flip-evaluator: the visible difference on flipping between two images, 0 to 1.
-
-The observer is the authors' default: 0.7 m before a screen 0.7 m and 3840 pixels wide, 67 of the image's pixels in a
-degree. The package calls `sys.exit` on wrong arguments and misreads integers, so it only gets float32 in [0, 1]. Its
-map is the same on one thread (`OMP_NUM_THREADS`) and on several; its mean, summed in float32, is not, so it is not
-used.
+FLIP (Andersson et al. 2020) by flip-evaluator is the visible difference on flipping between two images, 0 to 1. The
+observer is the authors' default: 0.7 m before a screen 0.7 m and 3840 pixels wide, 67 of the image's pixels in a degree.
+The package calls `sys.exit` on wrong arguments and misreads integers, so it only gets float32 in [0, 1]. Its map is the
+same on one thread (`OMP_NUM_THREADS`) and on several; its mean, summed in float32, is not, so it is not used.
 """
 
 import importlib.util
@@ -21,7 +19,7 @@ from schemas.job.views import Render
 from schemas.scene.scene import Placed, ScenePlan
 from schemas.scene.shape import REGION_FLOOR
 from schemas.scene.view import Camera, Intrinsics
-from services.study.measure.rays import Box, cast_patch
+from services.study.rays import Box, cast_patch
 from workers.assets.appearance import draw_appearance
 from workers.render.tiers import draw_view, require_tier
 from workers.scene.context import WorkerContext

@@ -1,7 +1,4 @@
-"""The files of a study: Parquet tables, the whole study as JSON, and one HTML page.
-
-- A study as one HTML page that needs nothing beside it: no file, no script, no network.
-"""
+"""The files of a study: Parquet tables, the whole study as JSON, and one HTML page that needs nothing beside it."""
 
 import base64
 import json
@@ -18,8 +15,7 @@ import pyarrow.parquet as pq
 
 from schemas.errors import describe_seconds
 from services.study.choose import Targets, answer, as_cheap, front, own_row
-from services.study.model import ERRORS, Row, Study
-from services.study.words import milliseconds, number, short, shown, size, times, unit
+from services.study.model import ERRORS, Row, Study, milliseconds, number, short, shown, size, times, unit
 
 STUDY_FILE = "study.json"
 WIDE_FILE = "tradeoff.parquet"
@@ -78,11 +74,12 @@ def _wide(row: Row) -> dict[str, Any]:
 
 
 def _long(row: Row) -> list[dict[str, Any]]:
-    setting, lines = _names(row) | {"ms": row.ms, "ratio": row.ratio}, []
-    for name, figure in row.errors.items():
-        error = {"error": name, "unit": ERRORS[name].unit, "group": ERRORS[name].group, "amount": figure.value}
-        lines.append({**asdict(figure), **error, **setting})
-    return lines
+    setting = {**_names(row), "ms": row.ms, "ratio": row.ratio}
+    return [
+        {**asdict(figure), **setting, "amount": figure.value, "error": name}
+        | {"unit": ERRORS[name].unit, "group": ERRORS[name].group}
+        for name, figure in row.errors.items()
+    ]
 
 
 def _plain(value: Any) -> Any:
@@ -119,7 +116,7 @@ def write_page(study: Study, plots: Sequence[Path], file: Path, targets: Targets
 
 def page_of(study: Study, plots: Sequence[Path], targets: Targets | None = None) -> str:
     """The whole page."""
-    tables = {name: _group_table(study, group) for group, name in GROUPS.items()}
+    tables = {name: table for group, name in GROUPS.items() if (table := _group_table(study, group))}
     knobs = [_picture(plot, f"Errors over time along the knob {plot.stem.removeprefix('knob_')}") for plot in plots[1:]]
     summary = '<details open class="knobs"><summary>Each knob by itself</summary>'
     slopes = _table([(name, number(order)) for name, order in study.slopes.items()], ("case", "order in the step"))
@@ -127,7 +124,7 @@ def page_of(study: Study, plots: Sequence[Path], targets: Targets | None = None)
         job=escape(study.job),
         answer=escape(answer(study, targets)),
         tradeoff="".join(_picture(plot, "Errors over processor time, a point for each setting") for plot in plots[:1]),
-        groups="\n".join(f"<h2>{name}</h2>{table}" for name, table in tables.items() if table),
+        groups="\n".join(f"<h2>{name}</h2>{table}" for name, table in tables.items()),
         errors=_errors(study),
         slopes="<h2>How errors fall with the step on smooth cases</h2>" + slopes if study.slopes else "",
         notes="".join(f"<li>{escape(line)}</li>" for line in _notes(study) or ["Nothing was left out."]),
@@ -141,15 +138,12 @@ def _picture(plot: Path, what: str) -> str:
     return f'<img alt="{escape(what)}" src="data:image/png;base64,{data}">\n'
 
 
-def _table(rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
-    """A table of words."""
-    return _framed("".join(f"<tr>{_cells('td', row)}</tr>\n" for row in rows), head, ' class="words"')
-
-
-def _framed(body: str, head: Sequence[str], kind: str = "") -> str:
-    """A table with its head, of which there may be none."""
+def _table(body: str | Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
+    """A table of words, or of lines in HTML, with its head, of which there may be none."""
+    kind = "" if isinstance(body, str) else ' class="words"'
+    lines = body if isinstance(body, str) else "".join(f"<tr>{_cells('td', row)}</tr>\n" for row in body)
     heads = f"<thead><tr>{_cells('th', head)}</tr></thead>" if head else ""
-    return f'<div class="scroll"><table{kind}>{heads}\n<tbody>{body}</tbody></table></div>'
+    return f'<div class="scroll"><table{kind}>{heads}\n<tbody>{lines}</tbody></table></div>'
 
 
 def _cells(kind: str, words: Iterable[str]) -> str:
@@ -215,7 +209,7 @@ def _group_table(study: Study, group: str) -> str:
     for section, rows in _sections(study.rows, names).items():
         title = f'<tr><th class="knob" colspan="{len(head)}">{escape(section)}</th></tr>\n' if section else ""
         body += title + "".join(_line(study, row, best) for row in rows)
-    return _framed(body, head)
+    return _table(body, head)
 
 
 def _sections(rows: Sequence[Row], names: Sequence[str]) -> dict[str, list[Row]]:

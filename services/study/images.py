@@ -1,18 +1,14 @@
-"""Errors of the images of a scene with each setting, against rays. Pure.
-
-- The ray casts of one scene's geometry, kept from setting to setting while its poses stay.
-- Errors of a made scene's depth, masks, mirror pose and projection against rays. Pure.
-- Measures the images of a scene with each setting, against rays and against very many paths.
+"""Errors of the images of a scene with each setting, against rays and against very many paths.
 
 The rays are cast from the scene's own cameras at its own poses: through pixels' centres or, for errors that depend on
 the size of pixels, through places that do not depend on it. Views of all pairs count together.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import TypeVar
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
-from cachetools import LRUCache
+from cachetools import LRUCache, cachedmethod
 from numpy.typing import NDArray
 
 from schemas.base import Array
@@ -21,8 +17,7 @@ from schemas.job.views import Images
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
 from schemas.scene.view import Camera, Pair, View
-from services.study.knobs import size_value
-from services.study.measure.colour import (
+from services.study.colour import (
     ColourTruth,
     Crop,
     colour_truth_missing,
@@ -31,9 +26,10 @@ from services.study.measure.colour import (
     crop_of,
     flip_error,
 )
-from services.study.measure.rays import Patch, Pixels, Seen, cast_patch, cast_pixels, seen_by_other
-from services.study.measure.settling import context_for
+from services.study.knobs import size_value
+from services.study.measure import context_for
 from services.study.model import Setting
+from services.study.rays import Patch, Pixels, Seen, cast_patch, cast_pixels, seen_by_other
 from workers.geometry.pixels import dequantise_depth
 from workers.scene.context import Stopwatch, WorkerContext
 from workers.scene.make_scene import Scene, make_scene
@@ -43,43 +39,35 @@ KEPT = 12
 whenever d_z changes."""
 
 Key = tuple[object, ...]
-Answer = TypeVar("Answer")
 
 
 class Truth:
-    """Casts of rays in one scene, with a cache of the last ones."""
+    """Casts of rays in one scene, with a cache of the last ones, which is kept from setting to setting while poses stay."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene_id = scene.plan.scene_id
         self.things = scene.posed.things
-        self._kept: LRUCache[Key, object] = LRUCache(KEPT)
+        self._kept: LRUCache[Key, Any] = LRUCache(KEPT)
 
     def fits(self, scene: Scene) -> bool:
         """Whether the scene has the same shapes at the same poses."""
         alike = self.scene_id == scene.plan.scene_id and len(self.things) == len(scene.posed.things)
         return alike and all(map(_same, self.things, scene.posed.things))
 
+    @cachedmethod(lambda self: self._kept, key=lambda self, camera: ("pixels", *_key(camera)))
     def pixels(self, camera: Camera) -> Pixels:
         """The view at its pixels."""
-        return self._keep(("pixels", *_key(camera)), lambda: cast_pixels(self.things, camera))
+        return cast_pixels(self.things, camera)
 
+    @cachedmethod(lambda self: self._kept, key=lambda self, camera, pair: ("patch", pair, *_frame(camera)))
     def patch(self, camera: Camera, pair: int) -> Patch:
         """The objects in a pair's input view, the same for images of all sizes."""
-        k = camera.intrinsics
-        # To 12 digits: a camera scaled to another size is the same one but for rounding.
-        frame = [round(x, 12) for x in (k.fx / k.width, k.fy / k.height, k.cx / k.width, k.cy / k.height)]
-        key = ("patch", pair, *frame, camera.T_world_cam.tobytes())
-        return self._keep(key, lambda: cast_patch(self.things, camera, self.scene_id, pair))
+        return cast_patch(self.things, camera, self.scene_id, pair)
 
+    @cachedmethod(lambda self: self._kept, key=lambda self, camera, other: ("both", *_key(camera), *_key(other)))
     def both(self, camera: Camera, other: Camera) -> NDArray[np.bool_]:
         """[N] bool: which pixels of `pixels(camera).box` show an object point that the other camera sees too."""
-        key = ("both", *_key(camera), *_key(other))
-        return self._keep(key, lambda: seen_by_other(self.things, camera, self.pixels(camera).box, other))
-
-    def _keep(self, key: Key, cast: Callable[[], Answer]) -> Answer:
-        if key not in self._kept:
-            self._kept[key] = cast()
-        return self._kept[key]  # type: ignore[return-value]
+        return seen_by_other(self.things, camera, self.pixels(camera).box, other)
 
 
 def truth_of(scene: Scene, kept: Truth | None = None) -> Truth:
@@ -89,6 +77,13 @@ def truth_of(scene: Scene, kept: Truth | None = None) -> Truth:
 
 def _key(camera: Camera) -> Key:
     return *camera.intrinsics.model_dump().values(), camera.T_world_cam.tobytes()
+
+
+def _frame(camera: Camera) -> Key:
+    """To 12 digits: a camera scaled to another size is the same one but for rounding."""
+    k = camera.intrinsics
+    shares = (k.fx / k.width, k.fy / k.height, k.cx / k.width, k.cy / k.height)
+    return *(round(share, 12) for share in shares), camera.T_world_cam.tobytes()
 
 
 def _same(mine: Placed, other: Placed) -> bool:
