@@ -1,0 +1,44 @@
+"""Studies of accuracy against time: rows that were made up, and the study that is kept in docs/tradeoff."""
+
+import json
+from functools import cache
+from pathlib import Path
+
+from services.study.model import Figure, Row, Setting, Study
+from services.study.page import STUDY_FILE, STUDY_VERSION
+
+EVIDENCE = Path(__file__).resolve().parents[3] / "docs" / "tradeoff"
+
+
+def row(name: str = "", ratio: float = 1.0, noise: float = 0.02, failed: float = 0.0, **errors: float) -> Row:
+    """`row("step=240, tier=flat", 0.8, depth_mm=0.1)`; without a name the job itself. Intervals are 10 % to each side."""
+    parts = tuple((part.split("=")[0], part.split("=")[1]) for part in name.split(", ")) if name else ()
+    setting = Setting(parts, {f"made.{knob}": label for knob, label in parts})
+    figures = {error: Figure(value, value * 0.9, value * 1.1, value * 0.4, 48) for error, value in errors.items()}
+    noise = noise if parts else 0.0
+    return Row(setting, 118.0 * ratio, ratio, ratio * (1 - noise), ratio * (1 + noise), 235.0, figures, failed)
+
+
+def study(*rows: Row, job_scenes: int = 64, notes: tuple[str, ...] = ()) -> Study:
+    machine = {"cpu": "A made-up processor", "cores": 2, "gl_renderer": "llvmpipe", "versions": {"numpy": "2.4.6"}}
+    command = "verso tradeoff deploy/jobs/tabletop.yaml --out data/tradeoff"
+    return Study("tabletop", command, machine, 48, 500, rows, {"step": 1.02}, "balanced", job_scenes, notes)
+
+
+def read_study(folder: Path) -> Study:
+    """What `write_tables` was given; a tuple among the values of changes or machine comes back as a list."""
+    tree = json.loads((folder / STUDY_FILE).read_text(encoding="utf-8"))
+    assert tree.pop("verso_study") == STUDY_VERSION
+    return Study(**(tree | {"rows": tuple(map(_row, tree["rows"])), "notes": tuple(tree["notes"])}))
+
+
+def _row(tree: dict) -> Row:
+    setting = Setting(tuple((knob, label) for knob, label in tree["setting"]["parts"]), tree["setting"]["changes"])
+    errors = {name: Figure(**figure) for name, figure in tree["errors"].items()}
+    return Row(**(tree | {"setting": setting, "errors": errors, "notes": tuple(tree["notes"])}))
+
+
+@cache
+def stored() -> Study:
+    """The study of docs/tradeoff: 51 settings as measured."""
+    return read_study(EVIDENCE)

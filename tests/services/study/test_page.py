@@ -1,0 +1,180 @@
+"""What a study writes: tables that are read back exactly, and a page that needs nothing beside it and escapes what is foreign."""
+
+import base64
+import dataclasses
+import json
+import math
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import MappingProxyType
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from services.study.choose import answer
+from services.study.model import ERRORS, Figure, Row, Setting, Study
+from services.study.page import page_of, wide_schema, write_page, write_tables
+from tests.services.study.made_up import read_study, row, stored, study
+
+# ---------------------------------------------------------------------------------------------- tables
+
+TEXT, NUMBER = st.text(max_size=8), st.floats(allow_nan=False)
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**60), 2**60) | NUMBER | TEXT, lambda inner: st.lists(inner, max_size=2)
+)
+FIGURES = st.dictionaries(
+    st.sampled_from(sorted(ERRORS)),
+    st.builds(Figure, NUMBER, NUMBER, NUMBER, NUMBER, st.integers(0, 10**6)),
+    max_size=4,
+)
+PARTS, CHANGES = st.lists(st.tuples(TEXT, TEXT), max_size=2).map(tuple), st.dictionaries(TEXT, JSON, max_size=2)
+NOTES = st.lists(TEXT, max_size=2).map(tuple)
+ROWS = st.builds(Row, st.builds(Setting, PARTS, CHANGES), *[NUMBER] * 5, FIGURES, NUMBER, NOTES)
+STUDIES = st.builds(
+    Study,
+    *(TEXT, TEXT, st.dictionaries(TEXT, JSON, max_size=3), st.integers(0, 100), st.integers(0, 1000)),
+    *(
+        st.lists(ROWS, max_size=3).map(tuple),
+        st.dictionaries(TEXT, NUMBER, max_size=2),
+        TEXT,
+        st.integers(0, 10**9),
+        NOTES,
+    ),
+)
+
+
+@settings(max_examples=25)
+@given(STUDIES)
+def test_a_study_comes_back_exactly(made: Study):
+    with TemporaryDirectory() as folder:
+        for _ in range(2):
+            written = write_tables(made, Path(folder) / "new")
+        assert read_study(Path(folder) / "new") == made
+        assert sorted(Path(folder, "new").iterdir()) == sorted(written)
+
+
+def test_numbers_of_numpy_and_of_nothing_come_back_as_plain_ones(tmp_path: Path):
+    made = study(row(depth_mm=np.float64(0.1), flip=math.inf, gap_mm=math.nan))
+    machine = MappingProxyType({"cores": np.int64(2), "of": MappingProxyType({"a": 1})})
+    write_tables(dataclasses.replace(made, machine=machine), tmp_path)
+    read = read_study(tmp_path)
+    errors = read.rows[0].errors
+    assert read.machine == {"cores": 2, "of": {"a": 1}} and errors["depth_mm"] == made.rows[0].errors["depth_mm"]
+    assert math.isnan(errors["gap_mm"].value) and errors["flip"].value == math.inf
+
+
+def test_the_wide_table_has_a_row_a_setting_and_the_long_one_a_row_an_error(tmp_path: Path):
+    write_tables(study(row(depth_mm=0.1), row("step=240, tier=flat", 0.5, failed=0.01, flip=0.2)), tmp_path)
+    table = pq.read_table(tmp_path / "tradeoff.parquet")
+    assert table.schema.equals(wide_schema()) and set(ERRORS) <= set(table.column_names)
+    own, pair = table.to_pylist()
+    assert (own["setting"], own["knob"], own["value"], own["depth_mm"], own["flip"]) == ("the job", "", "", 0.1, None)
+    assert own["depth_mm_low"] == pytest.approx(0.09) and own["depth_mm_high"] == pytest.approx(0.11)
+    assert (pair["setting"], pair["knob"], pair["value"]) == ("step=240, tier=flat", "step, tier", "240, flat")
+    assert json.loads(pair["changes"]) == {"made.step": "240", "made.tier": "flat"}
+    assert (pair["ms"], pair["ratio"], pair["kilobytes"], pair["failed_share"]) == (59.0, 0.5, 235.0, 0.01)
+    assert (pair["ratio_least"], pair["ratio_most"]) == pytest.approx((0.49, 0.51))
+    first, last = pq.read_table(tmp_path / "errors.parquet").to_pylist()
+    assert (first["setting"], first["error"], first["amount"]) == ("the job", "depth_mm", 0.1)
+    expected = {"setting": "step=240, tier=flat", "value": "240, flat", "error": "flip", "unit": "", "group": "colour"}
+    assert last.items() >= {**expected, "ms": 59.0, "amount": 0.2, "scenes": 48}.items()
+
+
+# ---------------------------------------------------------------------------------------------- the page
+
+
+class Reader(HTMLParser):
+    """Holds that every element that is opened is closed, and collects texts, links and the cells of tables."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.texts: dict[str, list[str]] = {}
+        self.links: list[str] = []
+        self.rows: list[list[str]] = []
+        self.feed(page)
+        self.close()
+        assert self.open == [] and "script" not in self.texts and "link" not in self.texts
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.texts.setdefault(tag, [])
+        self.links += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in {"meta", "img", "br"}:
+            self.open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.texts[self.open[-1]].append(data) if self.open else None
+        if {"td", "th"} & set(self.open):
+            self.rows[-1][-1] += data
+
+
+def test_the_page_answers_first_and_needs_no_network_no_script_and_no_file(tmp_path: Path):
+    picture = tmp_path / "tradeoff.png"
+    picture.write_bytes(b"\x89PNG made up")
+    write_page(stored(), [picture, picture], tmp_path / "new" / "index.html")
+    page = (tmp_path / "new" / "index.html").read_text(encoding="utf-8")
+    reader = Reader(page)
+    assert reader.texts["p"][0] == answer(stored())
+    assert reader.texts["h1"] == ["What accuracy costs in time: tabletop"]
+    assert len(reader.links) == 2 and all(link.startswith("data:image/png;base64,") for link in reader.links)
+    assert base64.b64decode(reader.links[0].partition(",")[2]) == picture.read_bytes()
+    assert not re.search(r"https?:|url\(|@import", page)
+    assert Reader(page_of(stored(), [], {"between_mm": 1.0})).texts["p"][0] == answer(stored(), {"between_mm": 1.0})
+
+
+def test_what_comes_from_outside_is_escaped():
+    evil = '<script>alert("x")</script>&'
+    rows = [row(depth_mm=0.1), row(f"{evil}={evil}", 0.5, depth_mm=0.2), row(f"a=1, {evil}={evil}", 0.4, depth_mm=0.3)]
+    noted = tuple(dataclasses.replace(one, notes=(evil,)) for one in rows)
+    page = page_of(Study(evil, evil, {evil: {evil: [evil]}}, 1, 2, noted, {evil: 1.0}, evil, 64, (evil,)), [])
+    assert "<script" not in page and evil in " ".join(Reader(page).texts["li"])
+
+
+def test_every_setting_and_error_is_in_tables_of_even_rows():
+    rows = Reader(page_of(stored(), [])).rows
+    first = {cells[0] for cells in rows if cells}
+    for one in stored().rows:
+        assert (one.setting.name if len(one.setting.parts) != 1 else one.setting.parts[0][1]) in first
+    assert set(ERRORS) | {"the job", "command"} <= first
+    wide = 0
+    for cells in rows[: next(place for place, cells in enumerate(rows) if cells and cells[0] == "target")]:
+        wide = len(cells) if cells[0] == "setting" else wide
+        assert len(cells) in (1, wide)
+    assert wide
+
+
+def test_a_row_says_what_the_job_costs_and_what_differs_by_more_than_colour():
+    rows = [
+        row(depth_mm=0.1),
+        row("a=1", 0.5, depth_mm=0.2),
+        row("a=2", 2.0, depth_mm=0.05),
+        row("a=3", 3.0, depth_mm=0.1),
+    ]
+    cells = {cells[0]: cells for cells in Reader(page_of(study(*rows, job_scenes=100_000), [])).rows if len(cells) == 6}
+    assert (
+        cells["1"][-1].startswith("▲ 0.2") and cells["2"][-1].startswith("▼ 0.05") and cells["3"][-1].startswith("0.1")
+    )
+    assert cells["2"][1:5] == ["2 times1.96 – 2.04", "236 ms", "6.6 h6.56 core-hours", "24 GB"]
+
+
+def test_the_machine_the_command_and_what_was_left_out_are_told():
+    noted = [dataclasses.replace(row(name, depth_mm=0.1), notes=("31 scenes differ",)) for name in ("", "a=1")]
+    reader = Reader(page_of(study(*noted, notes=("sensor: not of this job",)), []))
+    assert reader.texts["li"] == ["sensor: not of this job", "31 scenes differ (the job, a=1)"]
+    assert Reader(page_of(study(row(depth_mm=0.1)), [])).texts["li"] == ["Nothing was left out."]
+    rows = {cells[0]: cells[-1] for cells in reader.rows if len(cells) == 2}
+    assert rows["command"] == "verso tradeoff deploy/jobs/tabletop.yaml --out data/tradeoff"
+    assert rows["cpu"] == "A made-up processor" and rows["versions"] == "numpy 2.4.6" and rows["step"] == "1.02"
+    assert rows["the job's 64 scenes"] == "7.6 s on one core (0.0021 core-hours), 15 MB"

@@ -1,0 +1,285 @@
+"""What is measured: knobs, presets, rounds of settings, promising combinations, and the journal of what is done."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from schemas.errors import InputError, OutputError
+from schemas.job.captures import ESTIMATES
+from schemas.job.identity import settings_digest
+from schemas.job.job import PRESETS, Job
+from services.study import knobs as study_knobs
+from services.study.choose import error_of, own_row
+from services.study.knobs import apply, choose_knobs, groups_of, job_tree_with, joined, knobs_of, settings_of
+from services.study.measure import REFERENCES, measure_settling
+from services.study.model import ERRORS, Plan, Row, Setting, Sizes
+from services.study.study import (
+    JOURNAL_FILE,
+    NEGLIGIBLE,
+    Journal,
+    Round,
+    Unit,
+    header_of,
+    measure_in_pool,
+    promising,
+    with_time_of,
+)
+from tests.services.study.made_up import row, stored
+from workers.assets.catalogue import open_catalogue
+from workers.scene.context import open_worker
+
+JOB = Job(name="t", seed=2024, first_scene=100)
+CAPTURES = Job.model_validate({"name": "t", "scenes": 2, "captures": {"simulate": {"views": 12}}})
+SIZES = Sizes(scenes=3, settled=5, released=1, posed=2, timed=2, laps=2, coloured=1)
+
+
+def labels(job: Job, name: str) -> list[str]:
+    return [value.label for knob in knobs_of(job) if knob.name == name for value in knob.values]
+
+
+# ---------------------------------------------------------------------------------------------- knobs
+
+
+def test_every_value_makes_a_job_that_is_allowed_and_is_not_the_job_itself():
+    for job, least in ((JOB, 40), (CAPTURES, 10)):
+        settings, _ = settings_of(job, knobs_of(job))
+        assert settings[0] == Setting() and settings[0].name == "the job"
+        assert len({setting.name for setting in settings}) == len(settings) > least
+        assert all(apply(job, setting.changes) != job for setting in settings[1:])
+    for knob in knobs_of(JOB):  # of each the defaults have a value, which is not measured twice
+        own = [value.label for value in knob.values if apply(JOB, value.changes) == JOB]
+        assert own and f"{knob.name}={own[0]}" not in {setting.name for setting in settings_of(JOB, [knob])[0]}
+    assert {knob.group for knob in (*knobs_of(JOB), *knobs_of(CAPTURES))} == {kind.group for kind in ERRORS.values()}
+
+
+def test_a_knob_has_the_values_that_mean_something_for_the_job(tmp_path):
+    far = apply(JOB, {"images.depth_range_m": [0.2, 20.0], "images.depth_units_per_m": 1000})
+    outside = apply(JOB, {"assets.objects": [{"source": "urdf", "folder": str(tmp_path)}]})
+    assert labels(far, "units") == ["1000", "2000"]  # more units than 16 bits hold are no values
+    assert labels(JOB, "collision") == ["box", "hull", "planned", "parts"]
+    assert labels(outside, "collision") == ["box", "hull", "planned", "parts to 0.1", "parts to 0.05", "parts to 0.02"]
+    assert labels(CAPTURES, "views") == ["4", "6", "10"] and labels(CAPTURES, "estimate") == list(ESTIMATES)
+    size = next(knob for knob in knobs_of(JOB) if knob.name == "size")
+    small, whole = apply(JOB, size.values[0].changes).cameras.sensor, JOB.cameras.sensor
+    assert (small.width, small.height, small.fx / small.width) == (160, 120, pytest.approx(whole.fx / whole.width))
+
+
+def test_the_reference_is_finer_than_anything_that_a_knob_can_be():
+    values = [value.changes for knob in knobs_of(JOB) if knob.group == "physics" for value in knob.values]
+    for reference in REFERENCES:
+        assert all(v.get("physics.step_hz", 0) < reference["step_hz"] for v in values)
+        assert all(v.get("physics.max_step_travel_mm", 1.0) >= reference["max_step_travel_mm"] for v in values)
+        assert all(v.get("physics.solver_iterations", 0) < reference["solver_iterations"] for v in values)
+
+
+def test_what_cannot_be_turned_is_told(monkeypatch):
+    known = knobs_of(JOB)
+    with pytest.raises(InputError, match=r"--knobs stepp: there is no such knob; did you mean 'step'\?.*iterations"):
+        choose_knobs(known, ["stepp"])
+    assert [knob.name for knob in choose_knobs(known, ["size", "step", "size"])] == ["size", "step"]
+    with pytest.raises(InputError, match=r"physics\.step_hz"):
+        apply(JOB, {"physics.step_hz": 1})
+    monkeypatch.setattr(study_knobs, "find_spec", lambda name: None)
+    settings, left_out = settings_of(JOB, known)
+    assert not [setting for setting in settings if "path" in setting.name]
+    assert len(left_out) == 1 and "./verso extra pathtraced" in left_out[0] and "path-16" in left_out[0]
+
+
+def test_settings_are_named_by_their_parts_and_have_all_their_keys():
+    both = joined([Setting((("a", "1"),), {"x.y": 1}), Setting((("b", "2"),), {"x.z": 2})])
+    assert both.name == "a=1, b=2" and dict(both.changes) == {"x.y": 1, "x.z": 2}
+    kinds = [Setting(parts).kind for parts in ((), (("preset", "fast"),), (("step", "240"),), both.parts)]
+    assert kinds == ["own", "preset", "single", "several"]
+    known = {knob.name: knob for knob in knobs_of(JOB)}
+    assert groups_of(Setting((("step", "60"), ("colour", "flat"))), known) == {"physics", "colour"}
+    everything = {"physics", "labels", "mirror", "colour", "capture"}
+    assert groups_of(Setting(), known) == groups_of(Setting((("preset", "fast"),)), known) == everything
+
+
+def test_changes_are_nested_into_a_copy_of_what_is_there():
+    tree = {"physics": {"max_step_travel_mm": 1.0, "step_hz": 120}, "name": "tabletop"}
+    made = job_tree_with({"physics.step_hz": 240, "render.raster.samples": (1, 2)}, tree)
+    physics = {"max_step_travel_mm": 1.0, "step_hz": 240}
+    assert made == {"physics": physics, "name": "tabletop", "render": {"raster": {"samples": [1, 2]}}}
+    assert tree["physics"] == {"max_step_travel_mm": 1.0, "step_hz": 120}
+    with pytest.raises(ValueError, match="'physics' is 3 and has no keys"):
+        job_tree_with({"physics.step_hz": 240}, {"physics": 3})
+
+
+# ---------------------------------------------------------------------------------------------- presets
+
+SLACK = 0.1
+"""A preset may take a tenth more time than a setting that is as good, and have errors a tenth larger than one as cheap."""
+
+BY_EFFORT = {*PRESETS["balanced"], "physics.max_step_travel_mm", "physics.solver_iterations", "physics.collision"} | {
+    *("physics.rest.speed_mm_s", "physics.rest.spin_rad_s", "physics.exact_rest", "render.path_samples")
+}
+"""The keys that presets choose or could. Settings that change other keys store other things, and are no rivals."""
+
+
+def better_than(preset: Row, rows: Sequence[Row]) -> list[str]:
+    """Names of rivals that put a preset off the front.
+
+    One that is no worse in any error, and cheaper by more than the slack; or one that is no dearer and no worse in any
+    error, and better in one by more than the slack, beyond the noise of either.
+    """
+    found = []
+    for rival in [one for one in rows if set(one.setting.changes) <= BY_EFFORT and one.setting != preset.setting]:
+        both = {name: (error_of(rival, name, rows), error_of(preset, name, rows)) for name in ERRORS}
+        pairs = [(a, b, NEGLIGIBLE[ERRORS[name].unit]) for name, (a, b) in both.items() if a and b]
+        if any(theirs.value > max(ours.value, least) for theirs, ours, least in pairs):
+            continue
+        better = any(ours.value > least and theirs.high * (1.0 + SLACK) < ours.low for theirs, ours, least in pairs)
+        if rival.ratio * (1.0 + SLACK) < preset.ratio or (rival.ratio <= preset.ratio and better):
+            found.append(rival.setting.name)
+    return found
+
+
+def test_no_measured_setting_is_better_than_a_preset_by_more_than_the_slack():
+    rows = stored().rows
+    assert sum(set(one.setting.changes) <= BY_EFFORT for one in rows) > 8
+    for name, changes in PRESETS.items():
+        preset = next((one for one in rows if one.setting.parts == (("preset", name),)), own_row(rows))
+        assert preset.setting.parts or name == "balanced"
+        assert dict(preset.setting.changes) in ({}, changes), "measure docs/tradeoff again: its preset has other keys"
+        assert better_than(preset, rows) == []
+
+
+def test_a_preset_is_off_the_front_where_a_rival_beats_it_by_more_than_the_slack():
+    def made(name: str, ratio: float, depth: float, key: str) -> Row:
+        made = row(f"{name}=x" if name else "", ratio, depth_mm=depth)
+        return replace(made, setting=Setting(made.setting.parts, {key: 1}))
+
+    own, preset = made("", 3.0, 9.0, "physics.step_hz"), made("preset", 1.0, 1.0, "render.tier")
+    for ratio, depth, off in (
+        (0.92, 1.0, False),
+        (0.8, 1.0, True),
+        (0.8, 1.05, False),
+        (1.0, 0.7, True),
+        (1.01, 0.7, False),
+    ):
+        assert (
+            better_than(preset, [own, preset, made("rival", ratio, depth, "physics.step_hz")]) == ["rival=x"]
+        ) == off
+    assert better_than(preset, [own, preset, made("size", 0.1, 0.1, "cameras.sensor.width")]) == []
+
+
+def test_a_preset_gives_every_key_that_the_job_does_not():
+    def spelt(job: Job) -> str:
+        return settings_digest(job, "x")
+
+    for name, changes in PRESETS.items():
+        job = Job.model_validate({"name": "t", "preset": name})
+        assert spelt(job) == spelt(apply(Job(name="t"), changes)) and changes.keys() == PRESETS["balanced"].keys()
+        assert Job.model_validate_json(job.model_dump_json()) == job
+    assert spelt(Job(name="t", preset="exact")) != spelt(Job(name="t")) == spelt(Job(name="t", preset="balanced"))
+    job = Job.model_validate({"name": "t", "preset": "fast", "render": {"tier": "raster"}})
+    assert job.render.tier == "raster" and job.physics.step_hz == PRESETS["fast"]["physics.step_hz"]
+
+
+# ---------------------------------------------------------------------------------------------- rounds
+
+
+def round_of(*names: str, times_only: bool = False) -> Round:
+    chosen = choose_knobs(knobs_of(JOB), names)
+    settings, _ = settings_of(JOB, chosen)
+    return Round(Plan(JOB, Path(), chosen, settings, (), None, SIZES), "alone", settings, times_only)
+
+
+def test_times_are_taken_lap_by_lap_and_a_scene_is_measured_only_of_the_parts_that_a_setting_changes():
+    part = round_of("step", "units")
+    assert [unit.name for unit in part.timings()] == [f"alone/time/{lap}/{n}" for lap in (0, 1) for n in (100, 101)]
+    assert all(unit.settings == part.settings for unit in part.timings())
+    kinds = [(unit.kind, unit.scene_id) for unit in part.errors()]
+    assert kinds == [*(("images", n) for n in range(100, 103)), *(("settling", n) for n in range(100, 105))]
+    for unit in part.errors():
+        assert unit.settings[0].name == "the job" and len(unit.settings) > 1
+        assert {setting.knob for setting in unit.settings[1:]} == {{"images": "units", "settling": "step"}[unit.kind]}
+    settling = [unit for unit in part.errors() if unit.kind == "settling"]
+    assert [unit.posed for unit in settling] == [True, True, False, False, False]
+    assert [unit.released for unit in settling] == [True, False, False, False, False]
+    assert round_of("step", times_only=True).errors() == []
+
+
+@pytest.mark.minute
+def test_a_pool_gives_the_answers_of_one_process_by_the_units_names():
+    unit = Unit("alone/settling/0", "settling", (Setting(),), 0)
+    context = open_worker(JOB, open_catalogue(JOB.assets, Path(), tuple(JOB.categories)))
+    expected = measure_settling(context, unit.settings, 0, posed=False, released=False)
+    assert dict(measure_in_pool(JOB, Path(), 1, [unit])) == {unit.name: expected}
+
+
+def test_a_longer_measurement_gives_the_time_and_nothing_else():
+    found = with_time_of(row("step=1", 2.0, depth_mm=0.1), row("step=1", 1.5), 100.0)
+    assert (found.ms, found.ratio, found.ratio_least) == (150.0, 1.5, 1.5 * 0.98)
+    assert found.errors["depth_mm"].value == 0.1
+
+
+OWN = row(depth_mm=0.1, mask_share=0.01)
+
+PROMISING = (
+    ({"a=1": (0.8, 0.1), "b=1": (0.9, 0.12)}, {"a=1, b=1"}),  # both save time and keep every error
+    ({"a=1": (0.8, 0.1), "b=1": (0.5, 0.2)}, set()),  # an error grows
+    ({"a=1": (0.8, 0.1), "b=1": (0.5, 0.1, 0.1)}, set()),
+    ({"a=1": (0.8, 0.1), "a=2": (0.7, 0.1), "b=1": (0.9, 0.1)}, {"a=2, b=1"}),  # the cheapest value of a knob
+    ({"a=1": (1.5, 0.02), "b=1": (1.1, 0.1, 0.002)}, {"a=1, b=1"}),  # more exact
+    ({"a=1": (9.0, 0.001), "b=1": (1.1, 0.1, 0.002)}, set()),  # takes many times as long
+    (
+        {"a=1": (0.8, 0.1), "b=1": (0.8001, 0.1)},
+        {"a=1, b=1"},
+    ),  # in the order of the table, whatever noise makes of ranks
+    ({"a=1": (0.8001, 0.1), "b=1": (0.8, 0.1)}, {"a=1, b=1"}),
+    (
+        {"a=1": (0.8, 0.1), "b=1": (0.9, 0.1), "c=1": (0.7, 0.1)},
+        {"a=1, b=1", "a=1, c=1", "b=1, c=1", "a=1, b=1, c=1"},
+    ),
+)
+
+
+def test_what_is_measured_together_saves_time_or_is_more_exact_or_meets_the_targets():
+    def names(turned: dict[str, tuple[float, ...]], targets: dict[str, float], own: Row = OWN) -> set[str]:
+        rows = [row(name, ratio, depth_mm=d, mask_share=(*m, 0.01)[0]) for name, (ratio, d, *m) in turned.items()]
+        return {setting.name for setting in promising([own, *rows], targets)}
+
+    for turned, found in PROMISING:
+        assert names(turned, {"depth_mm": 0.0}) == found, turned
+    assert names({"a=1": (0.5, 0.5), "b=1": (0.6, 0.4), "a=2": (0.4, 0.9)}, {"depth_mm": 0.5}) == {"a=1, b=1"}
+    tiny = row(depth_mm=1e-6, mask_share=0.01)  # what stays negligible may grow by any factor
+    assert names({"a=1": (0.8, 1e-3), "b=1": (0.9, 1e-4)}, {"depth_mm": 0.0}, tiny) == {"a=1, b=1"}
+
+
+# ---------------------------------------------------------------------------------------------- the journal
+
+HEADER = {"job": "abc", "sizes": {"scenes": 4}}
+
+
+def test_what_was_added_is_there_when_the_journal_is_opened_again_but_for_a_line_that_was_cut_off(tmp_path):
+    answer = {"whole": {"the job": 0.1 + 0.2}}
+    with Journal(tmp_path / "study", HEADER) as first:
+        first.add("time/0/3", answer)
+        first.add("time/0/4", 2)
+    file = tmp_path / "study" / JOURNAL_FILE
+    file.write_text(file.read_text()[:-5])
+    with Journal(tmp_path / "study", HEADER) as second:
+        assert second == {"time/0/3": answer}
+        second.add("time/0/4", 3)
+    with Journal(tmp_path / "study", HEADER) as last:
+        assert last == {"time/0/3": answer, "time/0/4": 3}
+
+
+def test_a_journal_of_another_study_and_a_folder_that_cannot_be_written_are_refused(tmp_path):
+    with Journal(tmp_path, HEADER) as journal:
+        journal.add("a", 1)
+    before = (tmp_path / JOURNAL_FILE).read_bytes()
+    with pytest.raises(OutputError, match=r"another study \(other sizes\): choose another --out"):
+        Journal(tmp_path, {**HEADER, "sizes": {"scenes": 8}})
+    assert (tmp_path / JOURNAL_FILE).read_bytes() == before
+    with pytest.raises(OutputError, match="choose another --out"):
+        Journal(tmp_path / JOURNAL_FILE / "study", HEADER)
+    plan = Plan(JOB, Path(), (), (Setting(),), (), None, SIZES)
+    header = header_of(plan, "digest", "code")
+    assert header == header_of(replace(plan, targets={"depth_mm": 0.1}), "digest", "code")
+    assert header != header_of(replace(plan, sizes=Sizes(scenes=5)), "digest", "code")
+    assert header != header_of(plan, "digest", "other") and header != header_of(plan, "other", "code")
