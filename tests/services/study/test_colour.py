@@ -1,0 +1,205 @@
+"""Errors of colour: FLIP by its formula, the part of a picture that is compared, and truth that no setting decides."""
+
+import itertools
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from schemas.base import frozen_array
+from schemas.scene.view import Camera, Intrinsics
+from services.job.job_file import validate_job
+from services.study import colour, images
+from services.study.colour import (
+    ColourTruth,
+    Crop,
+    colour_truth_missing,
+    converged_colour,
+    crop_about,
+    crop_camera,
+    crop_colour,
+    flip_between,
+    flip_error,
+)
+from services.study.images import measure_colour
+from services.study.knobs import knobs_of, settings_of
+from tests.effects.scenes import SMALL, context_of, merged
+from workers.geometry.camera import look_at, project
+from workers.geometry.frames import invert, transform
+from workers.scene.context import Stopwatch
+from workers.scene.make_scene import make_scene
+
+HERE = colour.importlib.util.find_spec("mitsuba") is not None
+traced = pytest.mark.skipif(not HERE, reason="Mitsuba is not installed: truth of colour goes untested")
+
+# ---------------------------------------------------------------------------------------------- FLIP
+
+D = 6 / 29
+"""Of CIELAB."""
+
+
+def plain(color, shape=(60, 80)):
+    return np.broadcast_to(np.array(color, np.uint8), (*shape, 3))
+
+
+def noise(scale, seed=3):
+    rng = np.random.default_rng(seed)
+    return np.clip(128 + scale * rng.standard_normal((60, 80, 3)), 0, 255).astype(np.uint8)
+
+
+def hunt_lab(rgb) -> np.ndarray:
+    """CIELAB of an sRGB colour under D65, its chroma scaled by lightness (Hunt), as FLIP's authors write it."""
+    s = np.array(rgb) / 255
+    light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+    matrix = np.array(
+        [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+    )
+    x, y, z = (t ** (1 / 3) if t > D**3 else t / (3 * D**2) + 4 / 29 for t in matrix @ light / matrix.sum(axis=1))
+    lightness = 116 * y - 16
+    return np.array([lightness, 0.01 * lightness * 500 * (x - y), 0.01 * lightness * 200 * (y - z)])
+
+
+def flip_of_colours(a, b) -> float:
+    """FLIP where two images have one colour each, so no features: HyAB to the power 0.7, then 0.4 of green and blue's maps
+    to 0.95 (Andersson et al. 2020, sections 4.1.2 and 4.1.3)."""
+
+    def distance(p, q):
+        d = hunt_lab(p) - hunt_lab(q)
+        return (abs(d[0]) + np.hypot(d[1], d[2])) ** 0.7
+
+    largest, found = distance((0, 255, 0), (0, 0, 255)), distance(a, b)
+    knee = 0.4 * largest
+    return 0.95 * found / knee if found < knee else 0.95 + 0.05 * (found - knee) / (largest - knee)
+
+
+def test_between_two_plain_images_flip_is_its_formula_and_grows_with_noise():
+    for a, b in (
+        ((0, 0, 0), (255, 255, 255)),
+        ((0, 255, 0), (0, 0, 255)),
+        ((128, 128, 128), (140, 128, 120)),
+        ((200, 30, 40), (190, 60, 40)),
+        ((12, 14, 10), (14, 12, 10)),
+    ):
+        assert flip_between(plain(a), plain(b)) == pytest.approx(flip_of_colours(a, b), rel=2e-3)
+        assert flip_between(plain(b), plain(a)) == pytest.approx(flip_of_colours(a, b), rel=2e-3)
+    assert flip_between(noise(40), noise(40).copy()) == 0.0
+    errors = [flip_between(plain((128, 128, 128)), noise(scale)) for scale in (0.0, 2.0, 5.0, 10.0, 20.0, 40.0)]
+    assert errors[0] == 0.0 and all(a < 0.8 * b for a, b in itertools.pairwise(errors))
+
+
+def test_images_of_two_sizes_or_of_another_kind_are_refused_and_end_no_process():
+    image = noise(10)
+    others = (image[:-1], image[..., :2], image[..., 0], image.astype(np.float32))
+    for one, other in (*((image, other) for other in others), (image.astype(np.float32), image)):
+        with pytest.raises(ValueError, match="uint8 of one size"):
+            flip_between(one, other)
+
+
+def test_flip_prints_nothing_writes_nothing_and_is_the_same_on_any_number_of_threads(tmp_path):
+    code = (
+        "import numpy as np; from services.study.colour import flip_between;"
+        "rng = np.random.default_rng(0); a = rng.integers(0, 256, (150, 170, 3), dtype=np.uint8);"
+        "b = np.clip(a + rng.normal(0, 20, a.shape), 0, 255).astype(np.uint8);"
+        "print(*{flip_between(a, b).hex() for _ in range(3)})"
+    )
+    plain_environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), "PYTHONDONTWRITEBYTECODE": "1"}
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=tmp_path,
+            env={**plain_environment, "OMP_NUM_THREADS": threads},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        for threads in ("1", "3")
+    ]
+    assert said[0].stdout == said[1].stdout and len(said[0].stdout.split()) == 1
+    assert said[0].stderr == said[1].stderr == "" and list(tmp_path.iterdir()) == []
+
+
+# ---------------------------------------------------------------------------------------------- what is compared
+
+
+def test_points_are_where_the_crop_of_the_image_has_them():
+    # 80 pixels wide: a margin of 24, inside the image alone.
+    assert crop_about((0.0, 0.5, 0.125, 0.5 + 20 / 480)) == Crop(0, 240 - 24, 80 + 24, 260 + 24)
+    k = Intrinsics(width=320, height=360, fx=300.0, fy=280.0, cx=150.0, cy=190.0)
+    camera = Camera(k, frozen_array(look_at(np.array([1.0, 1.5, 2.0]), np.zeros(3))))
+    cropped = crop_camera(camera, Crop(200, 100, 400, 300))
+    points = transform(invert(camera.T_world_cam), np.random.default_rng(1).uniform(-0.2, 0.2, (30, 3)))
+    (u, v), (across, down) = project(points, k), project(points, cropped.intrinsics)
+    assert across == pytest.approx(u * 640 / 320 - 200) and down == pytest.approx(v * 480 / 360 - 100)
+    assert (cropped.intrinsics.width, cropped.intrinsics.height) == (200, 200)
+
+
+def test_images_of_all_sizes_are_cropped_to_the_same_part_of_the_picture():
+    """In the crop red rises evenly across and green down, by 2 and 6 for each of its pixels."""
+    across, down = np.arange(100, 180) + 0.5, np.arange(60, 90) + 0.5
+    for size in ((480, 640), (240, 320), (960, 1280), (720, 960)):
+        v, u = ((np.arange(n) + 0.5) * full / n for n, full in zip(size, (480, 640), strict=True))
+        image = np.zeros((*size, 3), np.uint8)
+        image[..., 0] = np.rint(np.clip(2 * (u - 80), 0, 255))
+        image[..., 1] = np.rint(np.clip(6 * (v - 54), 0, 255))[:, None]
+        cut = crop_colour(image, Crop(100, 60, 180, 90)).astype(float)
+        assert cut.shape == (30, 80, 3)
+        assert np.abs(cut[..., 0] - 2 * (across - 80)).max() <= 1.0
+        assert np.abs(cut[..., 1] - 6 * (down - 54)[:, None]).max() <= 1.0
+
+
+def test_only_the_crop_is_compared():
+    image = noise(20).repeat(8, axis=0).repeat(8, axis=1)
+    truth, other = ColourTruth(Crop(100, 60, 180, 90), image[60:90, 100:180]), 255 - image
+    assert flip_error(truth, other) > 0.1
+    other[60:90, 100:180] = image[60:90, 100:180]
+    assert flip_error(truth, other) == 0.0
+
+
+# ---------------------------------------------------------------------------------------------- the truth
+
+
+def scene_with(**changes):
+    context = context_of(validate_job(merged(SMALL, changes), "a test"))
+    return context, make_scene(context, 0, Stopwatch())
+
+
+@pytest.mark.minute
+@traced
+def test_no_setting_of_the_image_decides_its_truth_whose_noise_is_far_below_what_is_measured():
+    """Noise falls by the root of the paths, or nearly: 4 times as many leave at most 0.75 of it."""
+    own = scene_with()
+    settings = (
+        {"render": {"tier": "flat"}},
+        {"render": {"rgb": False}},
+        {"render": {"samples": 4, "path_samples": 1, "path_bounces": 2}, "sensor": {"exposure": {"stops": [1, 1]}}},
+    )
+    truths = [converged_colour(*made, 4) for made in (own, *(scene_with(**changes) for changes in settings))]
+    assert len({(truth.rgb.tobytes(), truth.crop) for truth in truths}) == 1
+    errors, truth = [], truths[0]
+    for paths in (9, 36):
+        truth, again = converged_colour(*own, paths), converged_colour(*own, paths, salt=1)
+        errors.append(flip_between(truth.rgb, again.rgb))
+    assert 0.0 < errors[1] < 0.75 * errors[0]
+    tiers = [scene_with(render={"tier": tier})[1].pairs[0].input.rgb for tier in ("pathtraced", "raster", "flat")]
+    by_tier = [flip_error(truth, rgb) for rgb in tiers]
+    assert by_tier == sorted(by_tier) and by_tier[1] > 4 * errors[1]
+
+
+@pytest.mark.minute
+def test_four_samples_are_nearer_to_smooth_edges_than_one_and_flat_light_has_no_edges_to_compare(monkeypatch):
+    monkeypatch.setattr(images, "colour_truth_missing", lambda: "not here")
+    context = context_of(validate_job({"name": "t", "seed": 2024, "check": {"raycast_share": 0.0}}, "a test"))
+    settings, _ = settings_of(context.job, [knob for knob in knobs_of(context.job) if knob.name == "colour"])
+    for scene_id in (0, 2):
+        found = measure_colour(context, [one for one in settings if "path" not in one.name], scene_id)
+        assert found["colour=raster-4"]["edge_flip"] < 0.8 * found["the job"]["edge_flip"] < 0.1
+        assert found["colour=flat"] == {}
+
+
+def test_where_mitsuba_is_missing_the_remedy_is_told(monkeypatch):
+    assert (colour_truth_missing() is None) == HERE
+    monkeypatch.setattr(colour.importlib.util, "find_spec", lambda name: None)
+    assert "`./verso extra pathtraced`" in str(colour_truth_missing())
