@@ -41,8 +41,7 @@ def thing(region_id, mesh, T=None) -> Placed:
 
 def table_and(*meshes, roof=None) -> tuple[Placed, ...]:
     """A table that fills the image, its top at z = 0, with a roof above it, and objects."""
-    table = box(4, 4, 0.02, (0, 0, -0.01))
-    table = table if roof is None else trimesh.util.concatenate([table, roof])
+    table = trimesh.util.concatenate([box(4, 4, 0.02, (0, 0, -0.01)), *([] if roof is None else [roof])])
     return (thing(2, table), *(thing(3 + i, mesh) for i, mesh in enumerate(meshes)))
 
 
@@ -70,10 +69,10 @@ def scene_of(things, *pairs, scene_id=5):
     return SimpleNamespace(plan=SimpleNamespace(scene_id=scene_id), posed=posed, pairs=pairs)
 
 
-def measure(things, *pairs, truth=None, units=UNITS) -> dict[str, float]:
+def measure(things, *pairs, units=UNITS):
     scene = scene_of(things, *pairs)
     images = Images(depth_units_per_m=units, depth_range_m=Range(0.2, 2.1))
-    return measure_images(SimpleNamespace(job=SimpleNamespace(images=images)), scene, truth or Truth(scene))
+    return measure_images(SimpleNamespace(job=SimpleNamespace(images=images)), scene, Truth(scene))
 
 
 def pair_of(first, mirror=None, d_z_m=TOP_Z, aligned=None, projected=None, agreement=None) -> Pair:
@@ -199,7 +198,7 @@ def test_rays_by_a_straight_outline_are_wrong_by_the_strip_that_no_pixel_s_centr
 # ---------------------------------------------------------------------------------------------- the other side
 
 
-def mirror_mm(d_z_m: float, *meshes, roof=None) -> float:
+def mirror_mm(d_z_m, *meshes, roof=None):
     first = view(*seen_of_block(camera_above()))
     return measure(table_and(*meshes, roof=roof), pair_of(first, first, d_z_m=d_z_m))["mirror_mm"]
 
@@ -227,7 +226,7 @@ def test_of_several_pairs_the_worst_is_told(seen):
     assert found["mirror_mm"] == pytest.approx(4.0, abs=1e-3) and found["agreement_mm"] == 0.3
 
 
-def projected_errors(things, first, depth_m, camera=None) -> dict[str, float]:
+def projected_errors(things, first, depth_m, camera=None):
     return measure(things, pair_of(first, first, projected=view(depth_m, None, "projected", camera)))
 
 

@@ -35,7 +35,7 @@ COARSE = setting("coarse", step_hz=60, max_step_travel_mm=1.0, solver_iterations
 @cache
 def answers(scene_id: int, **start: object) -> dict[str, dict]:
     job = Job.model_validate({"name": "t", "seed": 2024, "start": start})
-    context = WorkerContext(job, open_catalogue(job.assets, Path(), tuple(job.categories)), None, "")  # draws nothing
+    context = WorkerContext(job, open_catalogue(job.assets, Path(), tuple(job.categories)), None, "")  # type: ignore[arg-type]  # draws nothing
     settings = [Setting(), COARSE, setting("box", collision="box")]
     return measure_settling(context, settings, scene_id, posed=True, released=True)
 

@@ -219,7 +219,7 @@ def test_a_longer_measurement_gives_the_time_and_nothing_else():
 
 OWN = row(depth_mm=0.1, mask_share=0.01)
 
-PROMISING = (
+PROMISING: tuple[tuple[dict[str, tuple[float, ...]], set[str]], ...] = (
     ({"a=1": (0.8, 0.1), "b=1": (0.9, 0.12)}, {"a=1, b=1"}),  # both save time and keep every error
     ({"a=1": (0.8, 0.1), "b=1": (0.5, 0.2)}, set()),  # an error grows
     ({"a=1": (0.8, 0.1), "b=1": (0.5, 0.1, 0.1)}, set()),
