@@ -16,16 +16,8 @@ NUMBERS: tuple[Any, ...] = (
 PIECES: tuple[bytes, ...] = (
     *(b"\0", b"\x1b[31m", b"\xff\xfe", b"\xed\xa0\x80", b"\xef\xbb\xbf", b"\t", b"\n", b"\r", b"\\", b"\\u0000"),
     *(b": ", b"- ", b"? ", b"[", b"]", b"{", b"}", b'"', b"'", b"#", b"|\n", b">\n", b"~", b"../"),
-    *(
-        b"&a ",
-        b"*a ",
-        b"!!int ",
-        b"!!python/object/apply:os.system [true]",
-        b"<<: ",
-        b"---\n",
-        b"...\n",
-        b"%YAML 9.9\n",
-    ),
+    *(b"&a ", b"*a ", b"!!int ", b"!!python/object/apply:os.system [true]", b"<<: "),
+    *(b"---\n", b"...\n", b"%YAML 9.9\n"),
     *(b"0x", b"1e999", b".nan", b".inf", b"9" * 400, b"1:2:3", b"2024-13-45", b"[" * 200, b"{a: " * 200),
 )
 
@@ -53,19 +45,19 @@ def mutated_tree(dice: random.Random, tree: Any) -> Any:
     """A copy of a tree of values with one to four of them replaced, nested, renamed, repeated, moved or taken out."""
     tree = copy.deepcopy(tree)
     for _ in range(dice.randint(1, 4)):
-        places = list(_places(tree))
-        if places:
-            branch, key = dice.choice(places)
-            _mutate(dice, branch, key, places)
+        found = list(places(tree))
+        if found:
+            branch, key = dice.choice(found)
+            _mutate(dice, branch, key, found)
     return tree
 
 
-def _places(tree: Any) -> Any:
+def places(tree: Any) -> Any:
     """(branch, key) of every value below the top."""
     items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
     for key, value in list(items):
         yield tree, key
-        yield from _places(value)
+        yield from places(value)
 
 
 def _mutate(dice: random.Random, branch: Any, key: Any, places: Any) -> None:

@@ -18,7 +18,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from schemas.environment import cache_folder
-from schemas.errors import AssetSourceError, MeshError
+from schemas.errors import AssetSourceError, MeshError, plain_line
 from schemas.job.assets import TABLE, Assets, FolderSource, MeshLimits, ShapeNetSource, UpAxis
 from schemas.scene.shape import Asset
 from workers.assets import mass
@@ -216,7 +216,7 @@ def _describe(path: Path, folder: Path, error: MeshError) -> str:
     name = path.relative_to(folder).as_posix()
     why = error.detail.replace(f"{folder}/", "")
     why = why.removeprefix(name).lstrip(": ")
-    return f"{name} ({error.reason}: {why:.300})"
+    return plain_line(f"{name} ({error.reason}: {why:.300})", 1000)
 
 
 def load_asset_file(

@@ -1,10 +1,12 @@
-"""The limited processes that read files from outside: their limits, their verdicts, and what comes back."""
+"""The limited processes that read files from outside: their limits, what comes back, and verdicts that are kept."""
 
 import ctypes
 import errno
 import faulthandler
 import json
+import multiprocessing
 import os
+import pickle
 import resource
 import signal
 import subprocess
@@ -19,13 +21,14 @@ import trimesh
 from PIL import Image
 
 from schemas.base import frozen_array
-from schemas.errors import MachineError, MeshError
+from schemas.errors import AssetSourceError, MachineError, MeshError
 from schemas.job.assets import Assets, FolderSource, MeshLimits
 from schemas.scene.shape import Asset, MassProperties, Material, Part, Shape
-from tests.workers.assets.oracles import CUBE, textured_cube, write
+from tests.workers.assets.oracles import CUBE, picture, textured_cube, write
 from workers.assets.external import reader
-from workers.assets.external.listing import Entry, hash_files
-from workers.assets.external.placement import read_measured
+from workers.assets.external import verdicts as verdict_file
+from workers.assets.external.listing import Entry, SourceFile, hash_files
+from workers.assets.external.placement import load_entry, read_measured
 from workers.assets.external.reader import (
     ANSWER,
     REFUSAL,
@@ -37,9 +40,10 @@ from workers.assets.external.reader import (
     pack_asset,
     unpack_asset,
 )
+from workers.assets.external.verdicts import Verdicts, check_listing, load_asset_file, read_listing, verdict_key
 
 SETTINGS = FolderSource(source="urdf", folder=".")
-ROOT = Path(__file__).resolve().parents[4]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def request(folder, *paths, kind="list", category="mug", **limits):
@@ -104,36 +108,30 @@ def act(folder, *what, **limits):
     return [answer.reason if isinstance(answer, MeshError) else "read" for answer in answers]
 
 
-@pytest.mark.parametrize(
-    ("what", "reason"),
-    [
+def test_what_ends_a_child_is_a_verdict_on_its_file_alone_and_leaves_no_core(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for what, reason in (
         ("crash", "unreadable"),
-        ("endless", "too_slow"),
         ("memory", "too_large"),
         ("file", "too_large"),
         ("exit", "unreadable"),
-    ],
-)
-def test_what_ends_a_child_is_a_verdict_on_its_file_alone_and_leaves_no_core(tmp_path, monkeypatch, what, reason):
-    monkeypatch.chdir(tmp_path)
-    assert act(tmp_path, "fine", what, "fine", max_cpu_s=1.0) == ["read", reason, "read"]
+    ):
+        assert act(tmp_path, "fine", what, "fine") == ["read", reason, "read"]
     assert [path.name for path in tmp_path.iterdir()] == ["a.obj"]
+    with pytest.raises(MachineError, match="killed from outside"):
+        act(tmp_path, "fine", "killed")  # is no verdict
+    assert act(tmp_path, "fine") == ["read"]
 
 
-def test_every_task_has_the_processor_time_for_itself(tmp_path):
-    assert act(tmp_path, *["half"] * 4, max_cpu_s=1.0) == ["read"] * 4
+@pytest.mark.minute
+def test_every_task_has_the_processor_time_for_itself_and_no_more(tmp_path):
+    assert act(tmp_path, *["half"] * 3, "endless", "fine", max_cpu_s=1.0) == [*["read"] * 3, "too_slow", "read"]
 
 
 def test_limits_are_hard_ones(tmp_path):
     path = write(tmp_path / "a.obj", CUBE)
     (told,) = ask(Request(SETTINGS, tmp_path, Assets(limits=MeshLimits(max_memory_mb=3000)), (Act("limits", path),)))
     assert told.detail == "a.obj [3000, 3000, 0]"
-
-
-def test_a_child_that_is_killed_from_outside_is_no_verdict(tmp_path):
-    with pytest.raises(MachineError, match="killed from outside"):
-        act(tmp_path, "fine", "killed")
-    assert act(tmp_path, "fine") == ["read"]
 
 
 def test_an_answer_without_bounds_is_not_read(tmp_path, monkeypatch):
@@ -145,10 +143,11 @@ def _short(receive):
     return lambda self, most: receive(self, 10)
 
 
+@pytest.mark.minute
 def test_a_fork_server_that_has_ended_is_started_again_and_one_that_cannot_start_is_the_machine_s_fault(tmp_path):
     code = (
         "import os, signal, sys, time, multiprocessing.forkserver as f, multiprocessing.spawn as s\n"
-        "from pathlib import Path; from tests.workers.assets.external.test_reader import *\n"
+        "from pathlib import Path; from tests.workers.assets.test_reader import *\n"
         "def kill(): os.kill(f._forkserver._forkserver_pid, signal.SIGKILL); time.sleep(1)\n"
         "folder = Path(sys.argv[1]); print(act(folder, 'fine')); kill(); print(act(folder, 'fine')); kill()\n"
         "s.set_executable('/bin/false')\n"
@@ -160,10 +159,11 @@ def test_a_fork_server_that_has_ended_is_started_again_and_one_that_cannot_start
     assert out[:2] == ["['read']"] * 2 and "ends at once" in out[2]
 
 
+@pytest.mark.minute
 def test_a_script_without_a_guard_is_not_run_again_and_its_reader_ends_with_it(tmp_path):
     script = write(
         tmp_path / "script.py",
-        "import os, sys, time; from pathlib import Path; from tests.workers.assets.external.test_reader import *;"
+        "import os, sys, time; from pathlib import Path; from tests.workers.assets.test_reader import *;"
         "print('once', act(Path(sys.argv[1]), 'fine'), flush=True);"
         "import multiprocessing.forkserver as f; print(f._forkserver._forkserver_pid, flush=True); time.sleep(60)",
     )
@@ -186,6 +186,7 @@ def is_running(pid):
         return False
 
 
+@pytest.mark.minute
 def test_time_and_memory_are_verdicts_on_real_files_and_name_the_limit(tmp_path):
     count = 1_400_000  # several seconds of the fastest processor, where a limit of 1 s is kept to the next whole second
     corners = "".join(f"v {k % 1000 / 1e3} {k // 1000 / 1e3} {k % 7 / 1e3}\n" for k in range(count + 2))
@@ -235,13 +236,12 @@ def test_whatever_is_raised_is_a_refusal_in_one_line_that_names_the_file_and_mem
         raise errors[0]
 
     monkeypatch.setattr(reader, "load_entry", load)
-    errors = [ValueError("a\nb\x00\ud800"), RecursionError(), AssertionError(), OSError(5, "I/O")]
-    while errors:
+    for one in (ValueError("a\nb\x00\ud800"), RecursionError(), AssertionError(), OSError(5, "I/O")):
+        errors = [one]
         reason, detail, _ = json.loads(answer(tmp_path, CUBE)[1:])
         assert reason == "unreadable" and f"{tmp_path}/a.obj" in detail and detail.isprintable()
-        errors.pop(0)
-    for error in (MemoryError(), OSError(12, "Cannot allocate memory")):
-        errors[:] = [error]
+    for one in (MemoryError(), OSError(12, "Cannot allocate memory")):
+        errors = [one]
         with pytest.raises(MemoryError):
             answer(tmp_path, CUBE)
 
@@ -266,12 +266,11 @@ def test_a_lying_can_tells_its_size_and_the_axis_that_it_stands_on(tmp_path):
 
 
 def test_pictures_are_counted_and_missing_ones_are_named(tmp_path):
-    mesh = textured_cube(tmp_path)
-    found = [read_measured(answer(tmp_path, mesh.read_bytes(), "measure", "cube.obj")[1:])]
-    Image.new("RGB", (4, 4)).save(tmp_path / "skin.png")
-    found.append(read_measured(answer(tmp_path, mesh.read_bytes(), "measure", "cube.obj")[1:]))
-    assert [one.textures for one in found] == [0, 1]
-    assert [one.notes for one in found] == [("skin.png is missing: plain base colour used",), ()]
+    mesh = textured_cube(tmp_path).read_bytes()
+    for count, notes in ((0, ("skin.png is missing: plain base colour used",)), (1, ())):
+        found = read_measured(answer(tmp_path, mesh, "measure", "cube.obj")[1:])
+        assert (found.textures, found.notes) == (count, notes)
+        write(tmp_path / "skin.png", picture())
 
 
 PICTURE = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
@@ -329,3 +328,127 @@ def test_bytes_that_make_no_sense_are_refused():
     for data in cases:
         with pytest.raises(MeshError, match="makes no sense"):
             unpack_asset(data)
+
+
+# ------------------------------------------------------------------------------------------------ verdicts
+
+ENTRY = Entry("a", (SourceFile("a.obj", 3, "e" * 64),), "MIT")
+MIT = FolderSource(source="urdf", folder=".", licence="MIT")
+
+
+def key(settings=SETTINGS, assets=None, category="mug", entry=ENTRY):
+    return verdict_key(settings, assets or Assets(), category, entry)
+
+
+def test_a_verdict_depends_on_files_settings_and_limits_and_not_on_folder_weight_or_licence():
+    others = [
+        key(settings=SETTINGS.model_copy(update={"scale": 2.0})),
+        key(assets=Assets(limits={"max_faces": 7})),
+        key(category="table"),
+        key(entry=Entry("a", (SourceFile("a.obj", 3, "f" * 64),), "MIT")),
+    ]
+    assert len({key(), *others}) == 5
+    assert key(settings=SETTINGS.model_copy(update={"folder": "y", "weight": 2.0, "licence": "MIT"})) == key()
+    assert key(category="can") == key()
+
+
+def test_what_was_found_out_is_read_again_and_names_the_folder_that_it_is_asked_for(tmp_path):
+    (tmp_path / "file").write_text("no folder")
+    kept = Verdicts(tmp_path / "kept")
+    kept.put([("a", None), ("b", MeshError("no_faces", "/one/b.obj has no triangles")), ("c", "y")], "/one")
+    for verdicts in (kept, Verdicts(tmp_path / "kept")):
+        assert "a" in verdicts and "d" not in verdicts
+        assert (verdicts.get("a", "/two"), verdicts.get("c", "/two")) == (None, "y")
+        assert verdicts.get("b", "/two").detail == "/two/b.obj has no triangles"
+    for folder in (None, tmp_path / "file" / "verdicts"):  # that cannot be written
+        verdicts = Verdicts(folder)
+        verdicts.put([("a", None)], "/one")
+        assert "a" in verdicts
+
+
+def test_a_torn_line_or_a_flipped_bit_is_found_out_again_and_the_next_line_is_whole(tmp_path):
+    for cut in range(1, 60, 7):
+        folder = tmp_path / str(cut)
+        Verdicts(folder).put([("a", None), ("b", MeshError("no_faces", "none"))], "/one")
+        (path,) = folder.iterdir()
+        whole = path.read_bytes()
+        path.write_bytes(whole.replace(b"none", b"nOne"))
+        assert "b" not in Verdicts(folder)
+        path.write_bytes(whole[:-cut])
+        torn = Verdicts(folder)
+        assert "b" not in torn or cut == 1
+        torn.put([("c", None)], "/one")
+        assert "c" in Verdicts(folder)
+
+
+def _put(folder, name):
+    verdicts = Verdicts(folder)
+    for number in range(50):
+        verdicts.put([(f"{name}{number}", None)], "/one")
+
+
+@pytest.mark.minute
+def test_processes_that_write_at_once_lose_nothing(tmp_path):
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        pool.starmap(_put, [(tmp_path, "a"), (tmp_path, "b")])
+    verdicts = Verdicts(tmp_path)
+    assert all(f"{name}{number}" in verdicts for name in "ab" for number in range(50))
+
+
+def listed(folder, *names):
+    return read_listing(MIT, folder, {"mug": [folder / name for name in names]}, MeshLimits())
+
+
+def test_refused_candidates_are_counted_by_reason_and_others_keep_their_order(tmp_path):
+    for name in ("c.obj", "d.obj", "b.obj"):
+        write(tmp_path / name, CUBE)
+    candidates = {"mug": [tmp_path / name for name in ("none.obj", "d.obj", "b.obj")], "can": [tmp_path / "a.dae"]}
+    listing = read_listing(MIT, tmp_path, candidates, MeshLimits())
+    found = {name: [entry.files[0].path for entry in entries] for name, entries in listing.entries.items()}
+    assert found == {"mug": ["d.obj", "b.obj"], "can": []}
+    assert list(listing.skipped.items()) == [("format", 1), ("missing", 1)]
+    assert listing.examples[0].startswith("none.obj (missing: cannot be read")
+
+
+def test_what_cannot_be_used_is_marked_and_what_was_found_out_is_not_found_out_again(tmp_path, monkeypatch):
+    path = write(tmp_path / "a.obj", CUBE)
+    write(tmp_path / "b.obj", "v 0 0 0\n")
+    listing, verdicts = listed(tmp_path, "a.obj", "b.obj"), Verdicts(tmp_path / "kept")
+    checked = check_listing(MIT, listing, Assets(), verdicts)
+    assert (checked.refused, checked.skipped) == ({"mug": frozenset({1})}, {"no_faces": 1})
+    assert checked.examples == ("b.obj (no_faces: has no triangles)",)
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            verdict_file,
+            "ask_all",
+            lambda request, watch: iter([]) if not request.tasks else pytest.fail("asked again"),
+        )
+        for kept in (verdicts, Verdicts(tmp_path / "kept")):
+            assert check_listing(MIT, listing, Assets(), kept) == checked
+    write(path, CUBE + "#")
+    with pytest.raises(AssetSourceError, match="has changed"):
+        check_listing(MIT, listing, Assets(), Verdicts(None))
+    with pytest.raises(MeshError, match="changed") as error:
+        load_asset_file(MIT, tmp_path, listing.entries["mug"][0], "mug", Assets())
+    path.unlink()
+    with pytest.raises(MeshError, match="missing") as missing:
+        load_asset_file(MIT, tmp_path, listing.entries["mug"][0], "mug", Assets())
+    # Neither is a function of job and seed, and it stays so on the way to another process.
+    assert {pickle.loads(pickle.dumps(one.value)).kind for one in (error, missing)} == {"environmental"}
+
+
+def test_an_asset_read_by_another_process_is_the_one_that_is_read_here_and_holds_no_open_file(tmp_path):
+    textured_cube(tmp_path)
+    write(tmp_path / "skin.png", picture(colour=None))
+    (entry,) = listed(tmp_path, "cube.obj").entries["mug"]
+    files = len(list(Path("/proc/self/fd").iterdir()))
+    there = [load_asset_file(MIT, tmp_path, entry, "mug", Assets()) for _ in range(2)][1]
+    assert len(list(Path("/proc/self/fd").iterdir())) == files
+    here = load_entry(MIT, tmp_path, entry, "mug", Assets())
+    assert (there.instance_id, there.notes, there.scale) == (here.instance_id, here.notes, here.scale)
+    assert there.mass.inertia.tobytes() == here.mass.inertia.tobytes()
+    for one, two in zip(there.shape.parts, here.shape.parts, strict=True):
+        assert one.vertices.tobytes() == two.vertices.tobytes()
+        assert one.vertices.strides == two.vertices.strides and not one.vertices.flags.writeable
+        assert (one.faces == two.faces).all() and one.faces.dtype == two.faces.dtype
+        assert (one.material.texture == two.material.texture).all()

@@ -1,0 +1,319 @@
+"""What is read of good files: the same geometry of every format, colours, materials, pictures, and where things stand."""
+
+import base64
+import io
+import math
+import struct
+import warnings
+import zlib
+from dataclasses import replace
+from urllib.parse import quote
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from trimesh.visual.material import PBRMaterial
+
+from schemas.job.assets import CATEGORIES, MeshLimits, ProceduralSource
+from schemas.scene.shape import Material, Part, Shape
+from tests.kit.shapes import asset_of
+from tests.workers.assets.mutants import exported, png_of, textured_scene
+from tests.workers.assets.oracles import (
+    CUBE,
+    gltf,
+    picture,
+    textured_cube,
+    textured_obj,
+    urdf,
+    visual,
+    welded,
+    write,
+    write_all,
+)
+from workers.assets.builtin.make import make_asset
+from workers.assets.external.formats import list_mesh_files, load_shape
+from workers.assets.external.mesh import DEFAULT, is_solid
+from workers.assets.external.urdf import load_urdf
+from workers.assets.glb import asset_glb, split_glb
+
+
+def load(path, **limits):
+    return load_shape(path, MeshLimits(**limits))
+
+
+def only_part(path, **limits):
+    """The one part of a file, of which nothing was left out."""
+    loaded = load(path, **limits)
+    (part,) = loaded.shape.parts
+    assert loaded.notes == ()
+    return part
+
+
+def test_every_format_gives_the_same_geometry(tmp_path):
+    mesh = trimesh.creation.icosphere(2, 0.1)
+    for suffix in ("obj", "stl", "ply", "glb", "gltf"):
+        if suffix == "gltf":
+            for name, data in trimesh.exchange.gltf.export_gltf(trimesh.Scene(mesh)).items():
+                write(tmp_path / name.replace("model", "ball"), data)
+        else:
+            mesh.export(tmp_path / f"ball.{suffix}")
+        shape = load(tmp_path / f"ball.{suffix}", max_faces=len(mesh.faces)).shape
+        assert is_solid(shape.vertices, shape.faces) and len(shape.faces) == len(mesh.faces), suffix
+        assert welded(shape).volume == pytest.approx(mesh.volume, rel=1e-5)
+
+
+def test_a_glb_and_a_gltf_of_one_scene_are_the_same_shape(tmp_path):
+    for name, data in trimesh.exchange.gltf.export_gltf(textured_scene()).items():
+        write(tmp_path / name, data)
+    ours = load(tmp_path / "model.gltf").shape.parts
+    theirs = load(write(tmp_path / "m.glb", exported(textured_scene(), "glb"))).shape.parts
+    assert len(ours) == 3
+    for one, two in zip(ours, theirs, strict=True):
+        assert np.array_equal(one.vertices, two.vertices) and np.array_equal(one.faces, two.faces)
+        assert np.array_equal(one.uv, two.uv) and np.array_equal(one.material.texture, two.material.texture)
+        assert one.material.texture is ours[0].material.texture, "shared"
+
+
+def test_every_geometry_of_a_scene_stands_where_its_node_puts_it_and_mirrored_ones_face_outwards(tmp_path):
+    scene, mirror = trimesh.Scene(), np.diag([-1.0, 1.0, 1.0, 1.0])
+    mirror[:3, 3] = (-5, 0, 0)
+    scene.add_geometry(trimesh.creation.box((1, 2, 3)), node_name="a", geom_name="g")
+    scene.graph.update(frame_to="b", frame_from="world", matrix=mirror, geometry="g")
+    shape = load(write(tmp_path / "scene.glb", exported(scene, "glb"))).shape
+    assert is_solid(shape.vertices, shape.faces) and welded(shape).volume == pytest.approx(12.0, rel=1e-6)
+    assert shape.bounds == pytest.approx(np.array([[-5.5, -1, -1.5], [0.5, 1, 1.5]]))
+    sheet = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False)
+    scene = trimesh.Scene()
+    scene.add_geometry(sheet, transform=np.diag([-1.0, 1.0, 1.0, 1.0]))
+    part = load(write(tmp_path / "sheet.glb", exported(scene, "glb"))).shape.parts[0]
+    a, b, c = part.vertices[part.faces[0]]
+    assert np.cross(b - a, c - a) == pytest.approx([0, 0, 1]), "a mirrored sheet still faces the same way"
+
+
+# ------------------------------------------------------------------------------------------------ what a file refers to
+
+
+def test_files_are_listed_with_all_that_they_refer_to_and_nothing_outside_the_folder(tmp_path):
+    write_all(tmp_path / "m", textured_obj("../t/a.png", more="map_Kd none.png\n"))
+    write(tmp_path / "m/more.obj", b"# xmtllib no.mtl\r\nmtllib cube.mtl\r\nv 0 0 0\nmtllib last one.mtl")
+    write(
+        tmp_path / "m/last one.mtl", "newmtl a\nmap_Kd \\\\server\\..\\skin.png\nmap_Kd /abs/b.png\nmap_Kd bad\0.png\n"
+    )
+    write_all(tmp_path / "m", gltf())
+    write(tmp_path / "m/a.ply", "ply\nformat ascii 1.0\ncomment TextureFile skin.png\nend_header\n")
+    for name in ("t/a.png", "m/skin.png", "m/b.png"):
+        write(tmp_path / name, picture())
+    for first, others in (
+        ("cube.obj", ["m/cube.mtl", "t/a.png"]),
+        ("more.obj", ["m/cube.mtl", "m/last one.mtl", "t/a.png", "m/skin.png", "m/b.png"]),
+        ("cube.gltf", ["m/cube.bin", "m/skin.png"]),
+        ("a.ply", ["m/skin.png"]),
+    ):
+        files = list_mesh_files(tmp_path / "m" / first, tmp_path, MeshLimits())
+        assert [file.relative_to(tmp_path).as_posix() for file in files] == [f"m/{first}", *others]
+    assert len(list_mesh_files(tmp_path / "m/cube.obj", tmp_path / "m", MeshLimits())) == 2
+
+
+def test_a_texture_outside_the_root_is_not_read(tmp_path):
+    write(tmp_path / "secret.png", picture())
+    path = textured_cube(tmp_path / "inner", picture="../secret.png")
+    assert load(path).shape.parts[0].material.texture is None
+    assert load_shape(path, MeshLimits(), root=tmp_path).shape.parts[0].material.texture is not None
+    (tmp_path / "inner" / "link.png").symlink_to(tmp_path / "secret.png")
+    assert load(textured_cube(tmp_path / "inner", picture="link.png")).shape.parts[0].material.texture is None
+
+
+def bomb() -> bytes:
+    """A header that promises 10,000 x 10,000 pixels: Pillow warns from 89 million on, and refuses only twice as many."""
+    return png_of(struct.pack(">IIBBBBB", 10000, 10000, 8, 2, 0, 0, 0), zlib.compress(b""))
+
+
+NOISE = picture("PNG", (64, 64), None), picture("JPEG", (64, 64), None)
+PICTURES = {
+    "none.png": (None, "none.png is missing"),
+    "../outside.png": (None, "../outside.png is missing"),
+    "/etc/hostname": (None, "/etc/hostname is missing"),
+    "skin.gif": (picture("GIF"), "is not a PNG or JPEG"),
+    "gif.png": (picture("GIF"), "is not a PNG or JPEG"),
+    "large.png": (picture(size=(2049, 1)), "over max_texture_px = 2048"),
+    "bomb.png": (bomb(), "cannot be opened"),
+    "half.png": (NOISE[0][: len(NOISE[0]) // 2], "cannot be decoded"),
+    "half.jpg": (NOISE[1][: len(NOISE[1]) // 2], "cannot be decoded"),
+}
+"""A picture's name and bytes, and what the note on it says."""
+
+
+def test_a_picture_that_cannot_be_had_is_a_note_and_the_mesh_stays(tmp_path):
+    write(tmp_path / "outside.png", picture())
+    names = {**PICTURES, "http://example.org/a.png": (None, ""), "file:///etc/hostname": (None, "")}
+    for name, (data, says) in names.items():
+        if data is not None:
+            write(tmp_path / "in" / name, data)
+        limits = {"max_texture_px": 100_000 if name == "bomb.png" else 2048}
+        for files in (textured_obj(name), gltf(picture=name)):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                loaded = load(write_all(tmp_path / "in", files), **limits)
+            (note,) = loaded.notes
+            assert says in note and note.endswith("plain base colour used") and " at 0x" not in note, (name, note)
+            assert loaded.shape.parts[0].material.texture is None and loaded.shape.closed
+    assert "is an address" in note, "of a glTF file"
+    write(tmp_path / "in/skin.png", picture(size=(MeshLimits().max_texture_px, 2)))
+    part = only_part(textured_cube(tmp_path / "in"))
+    assert part.material.texture.shape == (2, MeshLimits().max_texture_px, 3), "as large as the cap allows"
+
+
+def test_data_within_the_file_and_names_with_escapes_are_read_and_what_is_no_colour_is_not_asked_for(tmp_path):
+    inside = "data:application/octet-stream;base64," + base64.b64encode(gltf()["cube.bin"]).decode()
+    data = "data:image/png;base64," + base64.b64encode(picture(colour=(0, 0, 255))).decode()
+    write(tmp_path / "my skin ü.png", picture())
+    for files, colour in (
+        (gltf(buffer=inside, picture=data), [0, 0, 255]),
+        (gltf(picture=quote("my skin ü.png")), [255, 0, 0]),
+    ):
+        part = only_part(write_all(tmp_path, files))
+        assert part.material.texture.tolist() == [[colour] * 4] * 4
+        assert part.vertices.min() == -0.5 and part.vertices.max() == 0.5 and len(part.faces) == 12
+
+
+# ------------------------------------------------------------------------------------------------ materials and colours
+
+
+def test_a_texture_comes_along_with_its_coordinates_right_way_up_and_its_alpha(tmp_path):
+    pixels = np.zeros((4, 6, 3), np.uint8)
+    pixels[0, :, 0], pixels[-1, :, 2] = 255, 255
+    Image.fromarray(pixels).save(tmp_path / "skin.png")
+    part = only_part(textured_cube(tmp_path))
+    assert part.material.texture.tolist() == pixels.tolist() and part.material.base_color == (1.0, 1.0, 1.0, 1.0)
+    assert sorted(map(tuple, np.unique(part.uv, axis=0))) == [(0, 0), (0, 1), (1, 0), (1, 1)]
+    Image.fromarray(np.full((2, 2, 4), 77, np.uint8)).save(tmp_path / "skin.png")
+    part = only_part(textured_cube(tmp_path, more="d 0.5\n"))
+    assert part.material.texture.shape == (2, 2, 4) and part.material.base_color[3] == 0.5
+
+
+def test_colours_of_gltf_are_linear_and_become_srgb(tmp_path):
+    skin = PBRMaterial(baseColorFactor=[0.2158605, 1, 0, 0.5], metallicFactor=0.25)
+    mesh = trimesh.creation.box((1, 1, 1))
+    mesh.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=skin)
+    material = only_part(write(tmp_path / "a.glb", exported(mesh, "glb"))).material
+    assert material.base_color == pytest.approx((0.5028, 1.0, 0.0, 0.5), abs=0.005)
+    assert (material.metallic, material.roughness) == (0.25, 1.0), "what glTF means by leaving roughness out"
+
+
+def test_an_mtl_gives_colour_roughness_and_opacity(tmp_path):
+    found = {}
+    for name, more in (("dull", "Ns 2\n"), ("shiny", "Ns 900\n"), ("clear", "d 0.0\n"), ("red", "Kd 0.5 0 0\n")):
+        write(tmp_path / "skin.png", picture())
+        loaded = load(textured_cube(tmp_path, more=more))
+        found[name] = loaded.shape.parts[0].material
+        assert loaded.notes == (("an alpha of 0 was read as 1",) if name == "clear" else ())
+    assert found["dull"].roughness == pytest.approx((2 / 4) ** 0.25)
+    assert found["shiny"].roughness < 0.3 and found["clear"].base_color[3] == 1.0
+    assert found["red"].base_color == pytest.approx((0.5, 0.0, 0.0, 1.0), abs=0.005)
+
+
+def test_colours_of_vertices_and_of_faces_are_kept_and_a_bare_mesh_has_the_default(tmp_path):
+    mesh = trimesh.creation.box((1, 1, 1))
+    assert only_part(write(tmp_path / "a.stl", exported(mesh, "stl"))).material is DEFAULT
+    mesh.visual.vertex_colors = np.tile([255, 0, 128, 255], (8, 1)).astype(np.uint8)
+    for name in ("a.ply", "a.glb"):
+        part = only_part(write(tmp_path / name, exported(mesh, name[2:])))
+        assert part.colors.shape == (8, 4) and part.material.base_color == (1.0, 1.0, 1.0, 1.0)
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    colours = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    header = f"element vertex 3\n{axes}element face 1\nproperty list uchar int vertex_indices\n{colours}end_header\n"
+    text = f"ply\nformat ascii 1.0\n{header}0 0 0\n1 0 0\n0 1 0\n3 0 1 2 10 20 30\n"
+    part = only_part(write(tmp_path / "a.ply", text))
+    assert part.colors.tolist() == [[10, 20, 30, 255]] * 3, "a face's corners have its colour"
+
+
+# ------------------------------------------------------------------------------------------------ URDF
+
+
+def load_body(folder, text, **limits):
+    return load_urdf(write(folder / "a.urdf", text), MeshLimits(**limits), folder).shape
+
+
+def test_visuals_are_scaled_then_turned_then_shifted_about_the_fixed_axes(tmp_path):
+    write(tmp_path / "cube.obj", CUBE)
+    origin = f'<origin xyz="10 0 0" rpy="0 0 {math.pi / 2}"/>'
+    for name in ("cube.obj", "package://thing/cube.obj", ".\\cube.obj"):
+        shape = load_body(tmp_path, urdf(visual(f'<mesh filename="{name}" scale="1 2 3"/>', origin)))
+        # x goes to y and y to -x: [0, 1] x [0, 2] x [0, 3] becomes [-2, 0] x [0, 1] x [0, 3], then x is moved by 10.
+        assert shape.bounds == pytest.approx(np.array([[8, 0, 0], [10, 1, 3]]))
+        assert welded(shape).volume == pytest.approx(6.0)
+    turned = load_body(tmp_path, urdf(visual('<box size="2 4 6"/>', '<origin rpy="0.3 0.5 0.7"/>')))
+    expected = trimesh.creation.box((2, 4, 6), transform=trimesh.transformations.euler_matrix(0.3, 0.5, 0.7, "sxyz"))
+    assert turned.bounds == pytest.approx(expected.bounds)
+
+
+def test_primitives_have_the_volumes_of_the_textbook(tmp_path):
+    for geometry, volume, height in (
+        ('<box size="1 2 3"/>', 6.0, 3.0),
+        ('<cylinder radius="0.5" length="2"/>', math.pi * 0.25 * 2, 2.0),
+        ('<sphere radius="0.5"/>', math.pi / 6, 1.0),
+        ('<capsule radius="0.5" length="2"/>', math.pi * (0.5 + 1 / 6), 3.0),
+    ):
+        shape = load_body(tmp_path, '<?xml version="0.0"?><!-- fine -->' + urdf(visual(geometry)))
+        assert welded(shape).volume == pytest.approx(volume, rel=0.01)
+        assert shape.bounds[:, 2] == pytest.approx([-0.5 * height, 0.5 * height])
+
+
+def test_links_stand_where_their_joints_put_them(tmp_path):
+    joint = '<joint name="{0}{1}" type="fixed"><parent link="{0}"/><child link="{1}"/>'
+    joint += '<origin xyz="0 0 2" rpy="{2} 0 0"/></joint>'
+    box = visual('<box size="1 1 1"/>')
+    links = "".join(f'<link name="{name}">{box}</link>' for name in "abc")
+    shape = load_body(
+        tmp_path, f'<robot name="r">{links}{joint.format("b", "c", 0)}{joint.format("a", "b", math.pi / 2)}</robot>'
+    )
+    # b stands 2 above a and is turned about x: its own up, along which c stands 2 further, is -y.
+    middles = np.array([part.vertices.mean(axis=0) for part in shape.parts])
+    assert middles == pytest.approx(np.array([[0, 0, 0], [0, 0, 2], [0, -2, 2]]), abs=1e-12)
+
+
+def test_the_colour_of_the_urdf_goes_on_what_brings_none(tmp_path):
+    own, named = '<material name="m"><color rgba="1 0.2 0 1"/></material>', '<material name="m"/>'
+    box = '<box size="1 1 1"/>'
+    for text in (urdf(visual(box, material=own)), urdf(visual(box, material=named), more=own)):
+        assert load_body(tmp_path, text).parts[0].material.base_color == (1.0, 0.2, 0.0, 1.0)
+    textured_cube(tmp_path)
+    write(tmp_path / "skin.png", picture())
+    part = load_body(tmp_path, urdf(visual('<mesh filename="cube.obj"/>', material=own))).parts[0]
+    assert part.material.texture is not None and part.material.base_color == (1.0, 1.0, 1.0, 1.0)
+
+
+# ------------------------------------------------------------------------------------------------ what a dataset stores
+
+
+def test_a_stored_glb_holds_the_same_shape_for_another_library_and_for_the_door(tmp_path):
+    for category in (*CATEGORIES, "table"):
+        asset = make_asset(category, ProceduralSource(source="procedural"), 3, 600.0)
+        data = asset_glb(asset)
+        assert data == asset_glb(make_asset(category, ProceduralSource(source="procedural"), 3, 600.0))
+        scene = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
+        ours = load(write(tmp_path / "a.glb", data)).shape
+        assert is_solid(ours.vertices, ours.faces)
+        for part, mesh, again in zip(asset.shape.parts, scene.geometry.values(), ours.parts, strict=True):
+            assert mesh.vertex_normals == pytest.approx(part.normals, abs=1e-6)
+            assert len(mesh.faces) == len(part.faces)
+            assert again.vertices == pytest.approx(part.vertices, abs=1e-7)
+            assert again.material.base_color == pytest.approx(part.material.base_color, abs=0.01)
+        assert scene.bounds == pytest.approx(asset.shape.bounds, abs=1e-7)
+    tree, binary = split_glb(data)
+    assert "z up" in tree["asset"]["extras"]["frame"] and tree["asset"]["copyright"] == "CC0-1.0"
+    assert struct.unpack_from("<I", data, 8)[0] == len(data) and len(binary) == tree["buffers"][0]["byteLength"]
+
+
+def test_texture_coordinates_alpha_and_vertex_colours_of_a_stored_glb_come_back(tmp_path):
+    pixels, uv = np.random.default_rng(0).integers(0, 255, (4, 8, 4), np.uint8), np.random.default_rng(1).random((3, 2))
+    triangle, face = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]], np.int32)
+    colors = np.array([[255, 0, 0, 255], [0, 128, 0, 255], [3, 20, 255, 128]], np.uint8)
+    textured = Part("t", triangle, face, Material(texture=pixels, base_color=(1, 1, 1, 0.5)), uv=uv)
+    colored = Part("c", triangle + 2, face, Material((1, 1, 1, 1)), colors=colors)
+    asset = replace(asset_of(trimesh.creation.box((1, 1, 1))), shape=Shape((textured, colored)))
+    one, two = load(write(tmp_path / "x.glb", asset_glb(asset))).shape.parts
+    assert one.material.texture.tolist() == pixels.tolist() and one.uv == pytest.approx(uv, abs=1e-6)
+    assert one.material.base_color[3] == pytest.approx(0.5, abs=0.01)
+    assert np.abs(two.colors.astype(int) - colors.astype(int)).max() <= 1
