@@ -87,6 +87,7 @@ def check_asset(category: str, index: int) -> None:
         a, b, c = (part.vertices[part.faces[:, k]] for k in range(3))
         across = np.cross(b - a, c - a)
         area = np.linalg.norm(across, axis=1)
+        assert part.normals is not None
         cosine = (across[:, None] * part.normals[part.faces]).sum(axis=2) / np.maximum(area, 1e-300)[:, None]
         assert np.linalg.norm(part.normals, axis=1) == pytest.approx(np.ones(len(part.normals)))
         assert cosine[area > 1e-9].min() > 0.2, part.name
